@@ -3,7 +3,7 @@
 Speed, yaw rate and the accelerations are accepted where only one choice of columns satisfies a_y = v r and a_x = v̇ at
 once, with slopes that units explain: the second slope gives the units of speed and accelerations, the ratio of the two
 that of the yaw rate. A steering angle resembles a yaw rate over a speed too, but for that ratio. Left and
-right are not observable. Choices that are not accepted remain candidates that are not taken.
+right are not observable.
 """
 
 from __future__ import annotations
@@ -46,8 +46,6 @@ COPY = 0.98
 ITSELF = 0.999
 #: A steering angle follows the path's curvature so well.
 STEERS = 0.9
-#: Choices that are shown where none is accepted.
-MOST_DOUBTFUL = 3
 #: Strength of a name that values give without deciding.
 WEAK = 0.3
 _UNITS = HYPOTHESES | {"acceleration": (("m/s²", 1.0), ("g", G_M_S2))}
@@ -57,45 +55,36 @@ _UNITS = HYPOTHESES | {"acceleration": (("m/s²", 1.0), ("g", G_M_S2))}
 class _Choice:
     """Columns that are speed, yaw rate, a_y and a_x, the relations between them, and the units of the first three.
 
-    ``x`` and ``speeding`` are None where no column is the speed's change. ``is_plausible``: its slopes are near to what
-    units explain, and a_y is as large as one; ``is_strict``: both relations fit so well that it is accepted if no
-    other is as near. ``ahead_s`` : how far a_y is ahead of v r.
+    ``is_strict``: both relations fit so well, with slopes so near to what units explain, and a_y is as large as one,
+    that it is accepted if no other is as near. ``ahead_s`` : how far a_y is ahead of v r.
     """
 
     v: Field
     r: Field
     y: Field
-    x: Field | None
+    x: Field
     turning: Fit
-    speeding: Fit | None
+    speeding: Fit
     units: tuple[tuple[str, float], tuple[str, float], tuple[str, float]]
     is_strict: bool
-    is_plausible: bool
     ahead_s: float
 
     @property
     def columns(self) -> tuple[Field, ...]:
         """All that there are."""
-        return (self.v, self.r, self.y, *([] if self.x is None else [self.x]))
-
-    @property
-    def conversions(self) -> int:
-        """How many of the units are not SI."""
-        return sum(factor != 1.0 for _, factor in self.units)
+        return (self.v, self.r, self.y, self.x)
 
     @property
     def score(self) -> float:
         """How well the relations fit."""
-        return abs(self.turning.correlation) * (0.0 if self.speeding is None else abs(self.speeding.correlation))
+        return abs(self.turning.correlation * self.speeding.correlation)
 
     @property
     def evidence(self) -> str:
         """The relations in words."""
         first = f"{self.y.path} goes with {self.v.path} times {self.r.path} ({self.turning.correlation:.2f})"
-        if self.x is None or self.speeding is None:
-            return f"{first}, but nothing with the change of {self.v.path}"
         second = f"{self.x.path} with the change of {self.v.path} ({self.speeding.correlation:.2f})"
-        return f"{first} and {second}" + (", and units explain both slopes" if self.is_strict else "")
+        return f"{first} and {second}, and units explain both slopes"
 
 
 def unlabelled_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], pieces: Pieces) -> list[Field]:
@@ -127,7 +116,7 @@ def unlabelled_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], 
 
 
 def identified(fields: Fields, unlabelled: Sequence[Field]) -> tuple[list[Field], str, str]:
-    """Return what unlabelled columns are, or may be with weak names; topic and evidence of the accepted choice.
+    """Return what unlabelled columns are, topic and evidence, where one choice is accepted and no other is as near.
 
     Parameters
     ----------
@@ -136,39 +125,28 @@ def identified(fields: Fields, unlabelled: Sequence[Field]) -> tuple[list[Field]
     order = sorted(_choices(fields, unlabelled), key=lambda c: (-c.score, -abs(c.turning.correlation)))
     best = next((c for c in order if c.is_strict), None)
     # What is behind v r is no a_y, where there is one ahead of it.
-    others = [c for c in order if best is not None and c.x is not None and c.ahead_s > 0.0 and not _same(best, c)]
-    rivals = [c for c in others if best is not None and c.score > best.score - CLEARER]
-    if best is not None and not rivals:
-        results = _as_chosen(fields, unlabelled, best, best.evidence, sure=True)
-        return results, next(f.topic.name for f in best.columns if _open(f)), best.evidence
-    likely = sorted(order, key=lambda c: (not c.is_plausible, c.conversions, -abs(c.turning.correlation)))
-    likely = likely if best is None else [best, *rivals]
-    results = []
-    for choice in likely[:MOST_DOUBTFUL]:
-        for item in _as_chosen(fields, unlabelled, choice, choice.evidence, sure=False):
-            keys = ((f.meaning.quantity, f.meaning.part, f.path) for f in results)
-            if (item.meaning.quantity, item.meaning.part, item.path) not in keys:
-                results.append(item)
-    return results, "", ""
+    others = (c for c in order if best is not None and c.ahead_s > 0.0 and not _same(best, c))
+    if best is None or any(c.score > best.score - CLEARER for c in others):
+        return [], "", ""
+    topic = next(f.topic.name for f in best.columns if _open(f))
+    return _as_chosen(fields, unlabelled, best, best.evidence), topic, best.evidence
 
 
-def _as_chosen(fields: Fields, unlabelled: Sequence[Field], choice: _Choice, why: str, *, sure: bool) -> list[Field]:
+def _as_chosen(fields: Fields, unlabelled: Sequence[Field], choice: _Choice, why: str) -> list[Field]:
     """Return the columns of a choice as what they are in it, and the one that steers."""
     speed_unit, rate_unit, unit = choice.units
-    speed_is_sure = sure and _speed_is_sure(fields, choice.v, speed_unit)
+    speed_is_sure = _speed_is_sure(fields, choice.v, speed_unit)
     speed_why = why if speed_is_sure else f"{why}; a wheel that turns in rad/s may look the same"
+    signs = [math.copysign(1.0, relation.slope) for relation in (choice.turning, choice.speeding)]
     meanings = [
-        (choice.v, Meaning("speed", "x", 1.0, *speed_unit, speed_why), 1.0, speed_is_sure),
-        (choice.r, Meaning("rate", "z", 1.0, *rate_unit, why), 1.0, sure),
-        (choice.y, Meaning("acceleration", "y", 1.0, *unit, why), math.copysign(1.0, choice.turning.slope), sure),
+        (choice.v, Meaning("speed", "x", 1.0, *speed_unit, speed_why), 1.0),
+        (choice.r, Meaning("rate", "z", 1.0, *rate_unit, why), 1.0),
+        (choice.y, Meaning("acceleration", "y", 1.0, *unit, why), signs[0]),
+        (choice.x, Meaning("acceleration", "x", 1.0, *unit, why), signs[1]),
     ]
-    if choice.x is not None and choice.speeding is not None:
-        sign = math.copysign(1.0, choice.speeding.slope)
-        meanings.append((choice.x, Meaning("acceleration", "x", 1.0, *unit, why), sign, sure))
-    results = [_named(item, meaning, sign, sure=is_sure) for item, meaning, sign, is_sure in meanings if _open(item)]
+    results = [_named(f, m, sign, sure=f is not choice.v or speed_is_sure) for f, m, sign in meanings if _open(f)]
     rest = [f for f in unlabelled if not any(f is c for c in choice.columns)]
-    speed, rate = _values(choice.v) * speed_unit[1], _values(choice.r) * rate_unit[1]
-    return results + _steering(fields, rest, speed, rate, sure=sure)
+    return results + _steering(fields, rest, _values(choice.v) * speed_unit[1], _values(choice.r) * rate_unit[1])
 
 
 def _choices(fields: Fields, unlabelled: Sequence[Field]) -> Iterator[_Choice]:
@@ -182,8 +160,7 @@ def _choices(fields: Fields, unlabelled: Sequence[Field]) -> Iterator[_Choice]:
         change = fields.pieces.rate_of(_values(v))
         fits = [(x, fit(change, smooth[id(x)])) for x in axs if x is not v]
         # The slope the way round in which grade and noise of a_x do not make it smaller.
-        ways: list[tuple[Field | None, Fit | None]] = [(None, None)]
-        ways += [
+        ways = [
             (x, replace(relation, slope=relation.correlation**2 / relation.slope))
             for x, relation in fits
             if relation is not None and abs(relation.correlation) > LOOSE_SPEEDS_UP
@@ -196,7 +173,7 @@ def _choices(fields: Fields, unlabelled: Sequence[Field]) -> Iterator[_Choice]:
 
 
 def _choices_of(
-    fields: Fields, columns: tuple[Field, Field, Field], ay: FloatArray, ways: Sequence[tuple[Field | None, Fit | None]]
+    fields: Fields, columns: tuple[Field, Field, Field], ay: FloatArray, ways: Sequence[tuple[Field, Fit]]
 ) -> Iterator[_Choice]:
     """Yield the choices of one speed, yaw rate and a_y."""
     turning, by_speed, ahead_s = _turning(fields, *columns[:2], ay)
@@ -204,9 +181,9 @@ def _choices_of(
         explained = None if turning is None else _explained((*columns, x), turning, speeding)
         if turning is not None and explained is not None:
             units, off = explained
-            plausible = off < math.log(SLOPE) and spread(ay) * units[2][1] > LEAST_AY_M_S2
-            strict = by_speed and plausible and speeding is not None and abs(speeding.correlation) > SPEEDS_UP
-            yield _Choice(*columns, x, turning, speeding, units, strict, plausible, ahead_s)
+            fits = by_speed and abs(speeding.correlation) > SPEEDS_UP
+            strict = fits and off < math.log(SLOPE) and spread(ay) * units[2][1] > LEAST_AY_M_S2
+            yield _Choice(*columns, x, turning, speeding, units, strict, ahead_s)
 
 
 def _turning(fields: Fields, v: Field, r: Field, ay: FloatArray) -> tuple[Fit | None, bool, float]:
@@ -225,7 +202,7 @@ def _turning(fields: Fields, v: Field, r: Field, ay: FloatArray) -> tuple[Fit | 
 
 
 def _explained(
-    columns: tuple[Field, Field, Field, Field | None], turning: Fit, speeding: Fit | None
+    columns: tuple[Field, Field, Field, Field], turning: Fit, speeding: Fit
 ) -> tuple[tuple[tuple[str, float], tuple[str, float], tuple[str, float]], float] | None:
     """Return the units of speed, yaw rate and accelerations that explain the slopes, and the logarithm of how far off.
 
@@ -234,9 +211,8 @@ def _explained(
     v, r, y, x = columns
     ways = []
     for speed, rate, unit in itertools.product(_units(v, "speed"), _units(r, "rate"), _units(y, "acceleration")):
-        off = [abs(math.log(abs(turning.slope) * unit[1] / (speed[1] * rate[1])))]
-        if x is not None and speeding is not None:
-            off.append(abs(math.log(abs(speeding.slope) * (unit[1] if _open(x) else 1.0) / speed[1])))
+        slopes = abs(turning.slope) * unit[1] / rate[1], abs(speeding.slope) * (unit[1] if _open(x) else 1.0)
+        off = [abs(math.log(slope / speed[1])) for slope in slopes]
         if max(off) < math.log(LOOSE_SLOPE):
             ways.append((sum(off), (speed, rate, unit), max(off)))
     return min(ways)[1:] if ways else None
@@ -298,9 +274,7 @@ def _named(item: Field, meaning: Meaning, sign: float, *, sure: bool) -> Field:
     return named
 
 
-def _steering(
-    fields: Fields, columns: Sequence[Field], speed: FloatArray, rate: FloatArray, *, sure: bool
-) -> list[Field]:
+def _steering(fields: Fields, columns: Sequence[Field], speed: FloatArray, rate: FloatArray) -> list[Field]:
     """Return the column that follows the path's curvature far better than others, as a steering angle."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         slow = max(1.0, 0.25 * float(np.nanquantile(speed, 0.95)))
@@ -315,11 +289,8 @@ def _steering(
     first, best = ranked[0]
     rivals = [o for c, o in ranked[1:] if c > first - CLEARER and not _is_copy(best, o)]
     why = f"it follows the path's curvature (correlation {first:.2f})"
-    meaning = Meaning("steering", "", 1.0 if sure and not rivals else WEAK, "", None, why)
-    doubts = [] if sure else ["its name gives no quantity, and its values do not decide"]
-    doubts += [
-        f"its name gives no quantity, and {f.path} follows the path's curvature equally well" for f in rivals[:1]
-    ]
+    meaning = Meaning("steering", "", WEAK if rivals else 1.0, "", None, why)
+    doubts = [f"its name gives no quantity, and {f.path} follows the path's curvature equally well" for f in rivals[:1]]
     return [replace(best, meaning=meaning, factors=ANGLES, reasons=[], doubts=doubts, is_weak=bool(doubts))]
 
 

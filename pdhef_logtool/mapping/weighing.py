@@ -20,7 +20,6 @@ from pdhef_logtool.mapping.candidates import (
     Field,
     Role,
     anchor_of,
-    leaf_group,
     look,
     named_fields,
     triad_of,
@@ -171,7 +170,6 @@ class _Weighing:
         for name, quantity, part in _SENSORS:
             if name not in have and not (wheels and quantity == "speed"):
                 self._take(name, [f for f in usable if f.meaning.quantity == quantity and f.meaning.part in part])
-        self._one_imu()
         self._turn_about()
         if not wheels:
             self._wheels(usable)
@@ -263,20 +261,6 @@ class _Weighing:
             if value > best[0] + 0.1:
                 best = (value, item)
         return best[1]
-
-    def _one_imu(self) -> None:
-        """Take accelerations from the message of the yaw rate where it has them: they share stamps and mounting."""
-        rate = self._chosen("yaw_rate_rad_s")
-        if rate is None:
-            return
-        for name, part in (("ax_m_s2", "x"), ("ay_m_s2", "y")):
-            if name in self.taken and leaf_group(self.taken[name]) != leaf_group(rate):
-                same = [
-                    f for f in self.fields.candidates if f.meaning.quantity == "acceleration" and f.meaning.part == part
-                ]
-                same = [f for f in same if leaf_group(f) == leaf_group(rate) and f.score > self.taken[name].score - 0.2]
-                if same:
-                    self.taken[name] = max(same, key=lambda f: f.score)
 
     def _turn_about(self) -> None:
         """Take the yaw rate about the axis that a_y ≈ v r shows, where a_y names the car's axis and it a device's."""
