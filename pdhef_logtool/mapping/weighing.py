@@ -175,7 +175,6 @@ class _Weighing:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
             self._steering([f for f in usable if f.meaning.quantity == "steering"])
-        self._rate_by_track()
         self._follow()
         for name, item in self.taken.items():
             self._tell(name, item)
@@ -366,21 +365,6 @@ class _Weighing:
             item.doubts.append(f"it could be {rest[0][0]} in {rest[0][1][0]} as well")
         return name, True
 
-    def _rate_by_track(self) -> None:
-        """Find the unit of a yaw rate by the track that it gives with the wheels' difference: model cars to lorries."""
-        rate, wheels = self._chosen("yaw_rate_rad_s"), self._wheels_turn()
-        if rate is None or wheels is None or rate.unit_known or rate.fixed:
-            return
-        relation = fit(wheels, self.fields.pieces.smooth(rate.si))
-        if relation is None or abs(relation.correlation) <= CLEAR:
-            return
-        for unit, factor in rate.factors:
-            track_m = abs(relation.slope) * rate.factors[0][1] / factor
-            if 0.1 < track_m < 3.0:
-                rate.use(unit)
-                rate.reasons.append(f"unit {unit} by the wheels' difference: a track of {track_m:.2f} m")
-                return
-
     def _open_signs(self) -> tuple[tuple[str, ...], ...]:
         """Return the signals whose sign no documentation, name or mounting gives; those that share an axis together."""
         open_fields = {n: f for n, f in self.taken.items() if n in _SIGNED and _has_open_sign(f)}
@@ -430,16 +414,6 @@ class _Weighing:
     def _chosen(self, *names: str) -> Field | None:
         """Return what is taken for the first of these signals that there is, or mapped already."""
         return next((f for n in names if (f := self.taken.get(n) or self.fields.anchors.get(n)) is not None), None)
-
-    def _wheels_turn(self) -> FloatArray | None:
-        """Return right minus left wheel speed, positive in a turn to the left; None without two of an axle."""
-        every = {**self.fields.anchors, **self.taken}
-        for unit in ("m_s", "rad_s"):
-            for axle in ("r", "f"):
-                left, right = (every.get(f"wheel_speed_{axle}{side}_{unit}") for side in "lr")
-                if left is not None and right is not None:
-                    return self.fields.pieces.smooth(right.si - left.si)
-        return None
 
     # ------------------------------------------------------------------------------------------------ ground truth
 
