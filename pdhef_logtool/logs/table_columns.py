@@ -56,14 +56,10 @@ _SIGNAL = re.compile(
 )
 _VALUE = re.compile(r"(?:physical_|signal_|phys_|telemetry_|metric_)?(?:value|val|wert)")
 _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
-_FACTORS_NS = dict.fromkeys(("s", "sec", "secs", "seconds"), 10**9) | {
-    "millis": 10**6,
-    "micros": 10**3,
-    "ms": 10**6,
-    "us": 10**3,
-    "µs": 10**3,
-    "ns": 1,
-}
+_FACTORS_NS = {
+    **dict.fromkeys(("s", "sec", "secs", "seconds"), 10**9), **dict.fromkeys(("ms", "millis"), 10**6),
+    **dict.fromkeys(("us", "µs", "micros"), 10**3), "ns": 1,
+}  # fmt: skip
 _GPS_EPOCH_NS = 315_964_800 * 10**9
 _WEEK_S = 604_800
 #: GPS time minus UTC in s, from a time in s since 1970 on.

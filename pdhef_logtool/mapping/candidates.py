@@ -196,13 +196,13 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
     results = []
     for topic, role in topics:
         fields = log.fields(topic.name, quiet=True)
-        if len(fields) > MOST_FIELDS or vendors.why_left_out(topic.type_name):
+        if len(fields) > MOST_FIELDS or vendors.of(topic.type_name).left_out:
             continue
         if is_joints(topic):
             joints = () if role == "command" else joint_meanings(log, topic)
             results += [(topic, role, FieldInfo(path, "number"), meaning, False) for path, meaning in joints]
             continue
-        documented_fields = vendors.fields_of(topic.type_name)
+        documented_fields = vendors.of(topic.type_name).fields
         signs = _signs_of({f.path for f in fields})
         no_values = {*signs.values(), *(signs if topic.encoding == "can" else ())}
         for info in fields:
@@ -212,7 +212,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
                 continue
             if info.path in documented_fields:
                 results.append((topic, role, info, documented_fields[info.path].meaning, True))
-            elif not documented_fields or info.path.count(".") or vendors.is_export(topic.type_name):
+            elif not documented_fields or info.path.count(".") or bool(vendors.of(topic.type_name).has):
                 meaning = _meaning_by_names(topic, info, {f.path for f in fields})
                 results += [] if meaning is None else [(topic, role, info, meaning, False)]
     return results
@@ -303,7 +303,7 @@ def _weighable(
             item.unit_known = True
             item.reasons.append("a nested sensor_msgs/Imu, in SI units")
         if documented:
-            _document(item, vendors.fields_of(topic.type_name)[info.path])
+            _document(item, vendors.of(topic.type_name).fields[info.path])
         elif its.scale is not None:
             item.unit_known = True
             item.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")

@@ -38,12 +38,9 @@ OWN_PREFIX = "/pdhef/"
 
 PROBE_NS = 2_000_000_000
 PROBE_AT = (0.0, 0.25, 0.5, 0.75, 1.0)
-#: How near to 1 the mean acceleration is where it is in g.
-NEAR_1_G = 0.08
-#: Samples between the positions that give a course, and the least way between them.
-COURSE_SAMPLES, COURSE_M = 10, 0.3
-#: Mean of unit vectors of headings from which on they are of one direction.
-STRAIGHT = 0.995
+#: How near to 1 the mean acceleration is where it is in g. Samples between the positions that give a course, the least
+#: way between them, and the mean of unit vectors of headings from which on they are of one direction.
+NEAR_1_G, COURSE_SAMPLES, COURSE_M, STRAIGHT = 0.08, 10, 0.3, 0.995
 
 #: Types whose velocities are in the body frame by convention.
 BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove.Odometry"})
@@ -253,7 +250,7 @@ def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
 def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Weighed:
     """Take candidates for what no well-known type gives."""
     for topic in topics:
-        reason = vendors.why_left_out(topic.type_name)
+        reason = vendors.of(topic.type_name).left_out
         if reason:
             draft.notes.append(f"{topic.name} ({topic.type_name.replace('/msg/', '/')}) is left out: {reason}")
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
@@ -297,10 +294,10 @@ def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendo
         fields = draft.log.fields(topic.name, quiet=True)
         sources = [
             SignalSource(f.name, topic.name, path, stamp_path_of(fields), f.scale, f.offset)
-            for path, f in vendors.fields_of(topic.type_name).items()
+            for path, f in vendors.of(topic.type_name).fields.items()
             if f.section == "truth" and has_path(fields, path)
         ]
-        vectors = [v for v in vendors.vectors_of(topic.type_name) if all(has_path(fields, p) for p in v.paths)]
+        vectors = [v for v in vendors.of(topic.type_name).vectors if all(has_path(fields, p) for p in v.paths)]
         sources += [replace(v, topic=topic.name, stamp=stamp_path_of(fields)) for v in vectors]
         if vectors:
             whole[topic.name] = {s.name: s for s in sources}
@@ -318,7 +315,7 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
     """Take ground truth from a navigation system by the names of its vectors, where there is a position at most."""
     if set(draft.truth) - {"lat_deg", "lon_deg", "alt_m", "course_rad"}:
         return
-    unknown = [t for t in topics if not _is_well_known(t) and not vendors.fields_of(t.type_name)]
+    unknown = [t for t in topics if not _is_well_known(t) and not vendors.of(t.type_name).fields]
     truth = navigation_truth(draft.log, [t for t in unknown if _role(t) in ("navigation", "truth")])
     if truth is None or (draft.truth and len(truth[0]) <= len(draft.truth)):
         return
@@ -631,13 +628,12 @@ def _truth_group(topic: TopicInfo) -> str:
 def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
     types = set(TWIST_FIELDS) | set(_FIELDS["pose"]) | FIX_TYPES
     candidates = [t for t in topics if _type(t) in types and (_is_truth(t) or _type(t) in FIX_TYPES)]
-    simulated = [t for t in topics if t not in candidates and _is_of_simulator(draft, t)]
-    if simulated and not any(_type(t) in TWIST_FIELDS for t in candidates):
-        candidates += simulated
-        names = ", ".join(t.name for t in simulated)
-        draft.notes.append(
-            f"{names} is taken as ground truth: its name is of a simulator, and it has a lateral velocity"
-        )
+    if not any(_type(t) in TWIST_FIELDS for t in candidates):
+        odometry = [t for t in topics if _type(t) in BODY_TWIST_TYPES and _words(t.name) & _TOPICS["simulators"]]
+        # Wheels give no lateral velocity.
+        simulated = [t for t in odometry if _span(draft.values(t.name, _twist(t, "linear", "y"))) > 0.0]
+        candidates += [t for t in simulated if t not in candidates]
+        draft.notes += [f"{t.name} is taken as ground truth: a simulator's, with a lateral velocity" for t in simulated]
     groups = {_truth_group(t) for t in candidates}
     if len(groups) > 1:
         kept = [t for t in candidates if _truth_group(t) == prefer]
@@ -649,13 +645,6 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
             draft.doubt("ground-truth position", (topic.name,), None, _FIELDS["several_positions"][_type(topic)])
     velocity = _map_truth_velocity(draft, candidates)
     _map_truth_position(draft, candidates, velocity)
-
-
-def _is_of_simulator(draft: _Draft, topic: TopicInfo) -> bool:
-    """Return whether a topic is a simulator's odometry with a lateral velocity, which wheels do not give."""
-    if _type(topic) not in BODY_TWIST_TYPES or not _words(topic.name) & _TOPICS["simulators"]:
-        return False
-    return _span(draft.values(topic.name, _twist(topic, "linear", "y"))) > 0.0
 
 
 def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo | None:
@@ -670,25 +659,21 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
         return None
     forward = draft.values(chosen.name, _twist(chosen, "linear", "x"))
     left = draft.values(chosen.name, _twist(chosen, "linear", "y"))
-    if _is_over_ground(draft, chosen, forward, left):
-        draft.doubt(
-            "ground-truth velocity frame", (chosen.name,), chosen.name, "its twist has the direction of its path"
-        )
-        paths = tuple(_twist(chosen, "linear", a) for a in "xyz")
-        draft.take(draft.truth, "enu_velocity_m_s", chosen.name, paths)
-        draft.take(draft.truth, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
-        return chosen
-    body = _looks_like_body_frame(forward, left)
-    if _type(chosen) not in BODY_TWIST_TYPES and _words(chosen.name) & NAVIGATION_WORDS and body is not True:
-        # Receivers publish their velocity in east, north, up under the same type.
+    body, over_ground = _looks_like_body_frame(forward, left), _is_over_ground(draft, chosen, forward, left)
+    receives = _type(chosen) not in BODY_TWIST_TYPES and bool(_words(chosen.name) & NAVIGATION_WORDS)
+    if over_ground or (receives and body is not True):
+        # Receivers, and some simulators, publish their velocity in east, north, up under the same type.
         up = draft.values(chosen.name, _twist(chosen, "linear", "z"))
         readings = (f"{chosen.name} as body velocity", f"{chosen.name} as east, north, up")
-        if body is None or not np.isfinite(up).any():
+        if not over_ground and (body is None or not np.isfinite(up).any()):
             draft.doubt("ground-truth velocity frame", readings, None, "too little motion to identify the frame")
             return None
-        draft.doubt("ground-truth velocity frame", readings, readings[1], "x is not the direction of travel")
+        why = "it has the direction of its path" if over_ground else "x is not the direction of travel"
+        draft.doubt("ground-truth velocity frame", readings, readings[1], why)
         paths = tuple(_twist(chosen, "linear", a) for a in "xyz")
         draft.take(draft.truth, "enu_velocity_m_s", chosen.name, paths)
+        if over_ground:
+            draft.take(draft.truth, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
         return chosen
     if body is False:
         draft.doubt(

@@ -46,8 +46,6 @@ COPY = 0.98
 ITSELF = 0.999
 #: A steering angle follows the path's curvature so well.
 STEERS = 0.9
-#: Strength of a name that values give without deciding.
-WEAK = 0.3
 _UNITS = HYPOTHESES | {"acceleration": (("m/s²", 1.0), ("g", G_M_S2))}
 
 
@@ -264,8 +262,7 @@ def _speed_is_sure(fields: Fields, speed: Field, unit: tuple[str, float]) -> boo
 
 
 def _named(item: Field, meaning: Meaning, sign: float, *, sure: bool) -> Field:
-    """Return a column with its quantity; with a weak name where it is not sure."""
-    meaning = replace(meaning, strength=1.0 if sure else WEAK)
+    """Return a column with its quantity; a weak one where it is not sure."""
     factors = ((meaning.unit, meaning.scale or 1.0),)
     named = replace(item, meaning=meaning, factors=factors, sign=sign, unit_known=sure, reasons=[], doubts=[])
     if not sure:
@@ -289,7 +286,7 @@ def _steering(fields: Fields, columns: Sequence[Field], speed: FloatArray, rate:
     first, best = ranked[0]
     rivals = [o for c, o in ranked[1:] if c > first - CLEARER and not _is_copy(best, o)]
     why = f"it follows the path's curvature (correlation {first:.2f})"
-    meaning = Meaning("steering", "", WEAK if rivals else 1.0, "", None, why)
+    meaning = Meaning("steering", "", 1.0, "", None, why)
     doubts = [f"its name gives no quantity, and {f.path} follows the path's curvature equally well" for f in rivals[:1]]
     return [replace(best, meaning=meaning, factors=ANGLES, reasons=[], doubts=doubts, is_weak=bool(doubts))]
 

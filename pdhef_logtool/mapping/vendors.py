@@ -110,42 +110,38 @@ def names_of(quantity: str, part: str, among: Iterable[str] = SIGNAL_UNITS) -> t
 
 
 @dataclass(frozen=True, slots=True)
-class Vendors:
-    """Documented types by name, as ROS 2 spells it without ``/msg``, and why some are left out.
+class VendorType:
+    """A documented type: its fields by path, ground truth quantities that several fields make, with an empty topic.
 
-    ``vectors`` are ground truth quantities that several fields make, with an empty topic. ``exports`` are the fields
-    that count a recorder's export, which has no type of its own, by the name that it has here; other channels are next
-    to them.
+    Attributes
+    ----------
+    left_out : why nothing of it can be taken; empty where something can.
+    has : fields that count a recorder's export, which has no type of its own; other channels are next to them.
     """
 
-    types: Mapping[str, Mapping[str, VendorField]] = field(default_factory=dict)
-    vectors: Mapping[str, tuple[SignalSource, ...]] = field(default_factory=dict)
-    reasons: Mapping[str, str] = field(default_factory=dict)
-    exports: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    fields: Mapping[str, VendorField] = field(default_factory=dict)
+    vectors: tuple[SignalSource, ...] = ()
+    left_out: str = ""
+    has: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Vendors:
+    """Documented types by name, as ROS 2 spells it without ``/msg``."""
+
+    types: Mapping[str, VendorType] = field(default_factory=dict)
 
     def typed(self, topic: TopicInfo, fields: Iterable[FieldInfo]) -> TopicInfo:
         """Return a topic with the name of the export that its fields are, if it has no type and they are one."""
         if topic.encoding != "json" or _plain(topic.type_name) in self.types:
             return topic
         there = {f.path for f in fields}
-        names = (name for name, needed in self.exports.items() if needed <= there)
+        names = (name for name, kind in self.types.items() if kind.has and kind.has <= there)
         return next((replace(topic, type_name=name) for name in names), topic)
 
-    def is_export(self, type_name: str) -> bool:
-        """Return whether a type is an export, whose other fields may be anything."""
-        return _plain(type_name) in self.exports
-
-    def fields_of(self, type_name: str) -> Mapping[str, VendorField]:
-        """Return the documented fields of a type by path; empty for a type that is not documented here."""
-        return self.types.get(_plain(type_name), {})
-
-    def vectors_of(self, type_name: str) -> tuple[SignalSource, ...]:
-        """Return the vectors of a type, with an empty topic."""
-        return self.vectors.get(_plain(type_name), ())
-
-    def why_left_out(self, type_name: str) -> str:
-        """Return why nothing of a documented type can be taken; empty where something can."""
-        return self.reasons.get(_plain(type_name), "")
+    def of(self, type_name: str) -> VendorType:
+        """Return a type, without anything where it is not documented here."""
+        return self.types.get(_plain(type_name), VendorType())
 
 
 def _plain(type_name: str) -> str:
@@ -162,14 +158,7 @@ def load_vendors(path: Path | None = None) -> Vendors:
     given = path or (Path(os.environ[USERS_FILE]) if os.environ.get(USERS_FILE) else None)
     if given is None:
         return _shipped()
-    users = _read(given)
-    kept = {name: why for name, why in _shipped().reasons.items() if name not in users.types}
-    return Vendors(
-        {**_shipped().types, **users.types},
-        {**{n: v for n, v in _shipped().vectors.items() if n not in users.types}, **users.vectors},
-        {**kept, **users.reasons},
-        {**_shipped().exports, **users.exports},
-    )
+    return Vendors({**_shipped().types, **_read(given).types})
 
 
 @cache
@@ -180,26 +169,18 @@ def _shipped() -> Vendors:
 def _read(path: Path) -> Vendors:
     raw = read_toml(path, "a TOML file of vendors' types", MappingFileError)
     problems = [f"{key}: not known, expected [[types]]" for key in raw if key != "types"]
-    by_name: dict[str, dict[str, VendorField]] = {}
-    reasons: dict[str, str] = {}
-    vectors: dict[str, tuple[SignalSource, ...]] = {}
-    exports: dict[str, frozenset[str]] = {}
+    types: dict[str, VendorType] = {}
     entries = raw.get("types", [])
     for number, table in enumerate(entries if isinstance(entries, list) else [], 1):
         model = checked(_TypeTable, table, f"types[{number}]", problems)
         if model is None:
             continue
-        exports.update({_plain(name): frozenset(model.has) for name in model.type if model.has})
         page = f"{model.page}, read {model.read}"
-        fields = {
-            f.field: _field(f, f.scale, page)
-            for f in model.fields
-            if isinstance(f.field, str) and isinstance(f.scale, float)
-        }
-        by_name.update({_plain(name): fields for name in model.type})
+        single = [(f.field, f.scale, f) for f in model.fields]
+        fields = {p: _field(f, x, page) for p, x, f in single if isinstance(p, str) and isinstance(x, float)}
         several = tuple(_vector(f) for f in model.fields if isinstance(f.field, list))
-        vectors.update({_plain(name): several for name in model.type if several})
-        reasons.update({_plain(name): model.leave_out for name in model.type if model.leave_out})
+        kind = VendorType(fields, several, model.leave_out, frozenset(model.has))
+        types |= {_plain(name): kind for name in model.type}
     if problems:
         raise MappingFileError(
             expected="entries as in docs/formats.md",
@@ -207,7 +188,7 @@ def _read(path: Path) -> Vendors:
             where=str(path),
             remedy="see docs/formats.md for every entry",
         )
-    return Vendors(by_name, vectors, reasons, exports)
+    return Vendors(types)
 
 
 def _field(table: _FieldTable, scale: float, page: str) -> VendorField:

@@ -160,12 +160,7 @@ class _Weighing:
     def choose_signals(self, have: set[str]) -> None:
         """Take the best candidate of each signal that is missing."""
         self._drop_vectors_over_ground()
-        usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation", "device")]
-        usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
-        elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
-        for item in usable:
-            # Sensors of the message with ground truth are taken only if no other message has them.
-            item.bonus -= 0.2 * (item.topic.name == self.truth_from and item.meaning.quantity in elsewhere)
+        usable = self._usable()
         wheels = any(n.startswith("wheel_speed") for n in have)
         for name, quantity, part in _SENSORS:
             if name not in have and not (wheels and quantity == "speed"):
@@ -179,24 +174,36 @@ class _Weighing:
         for name, item in self.taken.items():
             self._tell(name, item)
 
+    def _usable(self) -> list[Field]:
+        """Return candidates for signals; sensors beside ground truth come behind those of other messages."""
+        usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation", "device")]
+        usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
+        elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
+        for item in usable:
+            item.bonus -= 0.2 * (item.topic.name == self.truth_from and item.meaning.quantity in elsewhere)
+        return usable
+
     def _drop_vectors_over_ground(self) -> None:
-        """Leave out velocities x, y that are not the body's: x is not where the car goes, or they turn with it."""
-        pieces, rate = self.fields.pieces, next(iter(self.fields.open("rate", "z")), None)
+        """Leave out velocities x, y that are not the body's."""
         for y in [f for f in self.fields.candidates if f.meaning.quantity == "velocity" and f.is_axis and not f.fixed]:
             beside = (f for f in self.fields.candidates if f.meaning.quantity == "speed" and triad_of(f) == triad_of(y))
-            x = next((f for f in beside if f.meaning.part == "x"), None)
-            if x is None or not (x.seen.changes and y.seen.changes):
-                continue
-            moving = np.hypot(x.si, y.si) > SLOW_M_S
-            ahead = np.mean((x.si > np.abs(y.si))[moving]) if moving.any() else 1.0
-            angle = np.where(moving, np.arctan2(y.si, x.si), np.nan)
-            relation = None if rate is None else fit(np.sin(pieces.rate_of(angle)), pieces.smooth(rate.si))
-            turns = relation is not None and abs(relation.correlation) > CLEAR
-            speeds = [f.si for f in self.fields.open("speed") if f is not x]
-            is_length = any(agree(v, np.hypot(x.si, y.si)) and not agree(v, x.si) for v in speeds)
-            if ahead < 0.6 or turns or is_length:
+            x = next((f for f in beside if f.meaning.part == "x" and f.seen.changes), None)
+            if x is not None and y.seen.changes and self._is_over_ground(x, y):
                 self.fields.candidates = [f for f in self.fields.candidates if f is not x and f is not y]
                 self.notes.append(f"{x.topic.name}.{x.path} is not used: its vector is not in the car's axes")
+
+    def _is_over_ground(self, x: Field, y: Field) -> bool:
+        """Return whether x is not where the car goes, or not the speed, as its length is, or it turns with the car."""
+        length, rates = np.hypot(x.si, y.si), self.fields.open("rate", "z")[:1]
+        speeds = (f.si for f in self.fields.open("speed") if f is not x)
+        moving = length > SLOW_M_S
+        if moving.any() and np.mean((x.si > np.abs(y.si))[moving]) < 0.6:
+            return True
+        turning = self.fields.pieces.rate_of(np.where(moving, np.arctan2(y.si, x.si), np.nan))
+        fits = [fit(np.sin(turning), self.fields.pieces.smooth(rate.si)) for rate in rates]
+        if any(f is not None and abs(f.correlation) > CLEAR for f in fits):
+            return True
+        return any(agree(v, length) and not agree(v, x.si) for v in speeds)
 
     def note_unlabelled(self, topic: str, evidence: str) -> None:
         """Note that the fields of a topic are identified by values alone."""
