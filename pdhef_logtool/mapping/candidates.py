@@ -265,8 +265,7 @@ def look(
             signs[topic.name, info.path] = sign
     for source in sources:
         if source.can_signal is None:
-            paths = requests.setdefault(source.topic, [])
-            paths += [p for p in source.paths if p not in paths]
+            requests.setdefault(source.topic, []).extend(source.paths)
     pieces = Pieces(log)
     samples = pieces.read(requests)
     for (topic, path), sign in signs.items():

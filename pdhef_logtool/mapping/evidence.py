@@ -79,6 +79,7 @@ class Pieces:
         What cannot be read is left out.
         """
         parts: dict[tuple[str, str], list[tuple[int, IntArray, FloatArray]]] = {}
+        requests = {topic: [*dict.fromkeys(paths)] for topic, paths in requests.items()}
         for number, start in enumerate(self.starts):
             for topic, columns in self._columns(requests, start).items():
                 cell = (columns.log_time_ns - start) // CELL_NS

@@ -53,8 +53,7 @@ def speed_over_ground(
     pieces = Pieces(log)
     requests: dict[str, list[str]] = {}
     for source in (*vectors, *references):
-        paths = requests.setdefault(source.topic, [])
-        paths += [p for p in source.paths if p not in paths]
+        requests.setdefault(source.topic, []).extend(source.paths)
     read = pieces.read(requests)
     anchors = anchors_of(log, references, read)
     fields = Fields(pieces, {}, [], [f for f in anchors if f.meaning.quantity != "acceleration"])

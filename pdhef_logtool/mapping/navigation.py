@@ -92,17 +92,15 @@ def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
     truth = {s.name: s for s in (*_enu_velocities(topic, fields, stamp), *_ecef_vectors(topic, fields, stamp))}
     named = ((f.path, meaning_of(topic.name, topic.type_name, f.path)) for f in fields if f.kind == "number")
     meanings = {path: meaning for path, meaning in named if meaning is not None}
-    for quantity, name in (("latitude", "lat_deg"), ("longitude", "lon_deg")):
-        path = next((p for p, m in meanings.items() if m.quantity == quantity), "")
-        if path:
-            truth[name] = SignalSource(name, topic.name, path, stamp)
+    first = {m.quantity: path for path, m in reversed(meanings.items())}
+    places = {n: SignalSource(n, topic.name, first[q], stamp) for n, q in _PLACES.items() if q in first}
     headings = {p: m.scale for p, m in meanings.items() if m.quantity == "heading"}
     pieces = Pieces(log)
-    paths = [p for s in truth.values() for p in s.paths if "ecef" not in p.lower()]
+    paths = [p for s in (*truth.values(), *places.values()) for p in s.paths if "ecef" not in p.lower()]
     samples = pieces.read({topic.name: [*dict.fromkeys([*paths, *headings])]}) if paths or headings else {}
-    for name, most in (("lat_deg", 90.0), ("lon_deg", 180.0)):
-        if name not in truth or not _is_place(samples.get((topic.name, truth[name].paths[0])), most):
-            truth = {n: s for n, s in truth.items() if n not in ("lat_deg", "lon_deg")}
+    seen = [samples.get((topic.name, source.paths[0])) for source in places.values()]
+    if len(seen) == 2 and all(map(_is_place, seen, (90.0, 180.0))):
+        truth |= places
     note = f"ground truth is taken from {topic.name}, by the names of its fields"
     course = _course(truth, samples, topic.name, pieces)
     conventions = {p: _convention(samples.get((topic.name, p)), course, unit) for p, unit in headings.items()}

@@ -249,10 +249,11 @@ def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
 
 def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Weighed:
     """Take candidates for what no well-known type gives."""
-    for topic in topics:
-        reason = vendors.of(topic.type_name).left_out
-        if reason:
-            draft.notes.append(f"{topic.name} ({topic.type_name.replace('/msg/', '/')}) is left out: {reason}")
+    draft.notes += [
+        f"{t.name} ({t.type_name.replace('/msg/', '/')}) is left out: {reason}"
+        for t in topics
+        if (reason := vendors.of(t.type_name).left_out)
+    ]
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
     # A measured steering angle goes before a command, regardless of its type.
     command = draft.signals.pop("steer_rad", None) if any(n.startswith(FROM_COMMAND) for n in draft.notes) else None
@@ -269,20 +270,14 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
     if both is not None:
         draft.signals["steer_rad"] = both
         draft.notes.append(f"steer_rad is the mean of the two steered wheels in {both.topic}")
-    draft.notes += _why_not_weighed(draft.log, rest)
+    joints = (t for t, role in rest if is_joints(t) and role != "command" and not joint_names(draft.log, t))
+    draft.notes += [f"{t.name} is not used: the joints or their order differ between messages" for t in joints]
     if weighed.truth:
         draft.replace_truth(weighed.truth)
     draft.notes += weighed.notes
     for name, fields in weighed.rivals:
         draft.doubt(name, fields, fields[0], "the best score, then most messages")
     return weighed
-
-
-def _why_not_weighed(log: DriveLog, topics: list[tuple[TopicInfo, Role]]) -> Iterator[str]:
-    """Yield why names of fields are not enough: joints of changing order."""
-    for topic, role in topics:
-        if is_joints(topic) and role != "command" and not joint_names(log, topic):
-            yield f"{topic.name} is not used: the joints or their order differ between messages"
 
 
 def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
