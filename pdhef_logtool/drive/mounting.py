@@ -434,14 +434,18 @@ class Survey:
         passed = {c.name for c in drive_checks if c.verdict == "passed"} - {
             f"{c.subject}.sign" for c in drive_checks if c.verdict != "passed"
         }
-        doubted = {c.name.removesuffix(".candidate") for c in self.mapping.checks if "unit" in c.evidence}
+        doubted = {
+            c.name.removesuffix(".candidate")
+            for c in self.mapping.checks
+            if "unit" in c.evidence or "share" in c.evidence
+        }
         for check in self.mapping.checks:
             signal = check.name.removesuffix(".candidate")
             if check.name == "imu.mounting" and self.mounting is not None and self.mounting.confident:
                 continue
             # Rim speed in m/s and in rad/s look alike where the radius is not known. v_y has the unit of its v_x.
             unit = f"{signal.replace('truth.vy', 'truth.vx')}.unit"
-            is_resolved = unit in passed and not signal.startswith("wheel")
+            is_resolved = unit in passed and not signal.startswith("wheel") and "a share" not in check.evidence
             if f"{signal}.sign" not in passed or (signal in doubted and not is_resolved):
                 yield check
 

@@ -306,21 +306,25 @@ def _weighable(
         elif its.scale is not None:
             item.unit_known = True
             item.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
-        if _is_share(item, fields):
-            item.is_weak = True
-            item.doubts.append("a share of the largest angle, as throttle and brake beside it: it needs a scale")
+        if _may_be_share(item):
+            item.is_weak = _has_pedals_beside(item, fields)
+            item.doubts.append("it may be a share of the largest angle, which needs a scale")
         if item.is_downward and not documented:
             item.sign = -1.0
             item.reasons.append("positive downward by its name")
         yield item
 
 
-def _is_share(item: Field, fields: tuple[FieldInfo, ...]) -> bool:
-    """Return whether a steering in [-1, 1] is a control without a unit, as the pedals beside it."""
+def _may_be_share(item: Field) -> bool:
+    """Return whether a steering in [-1, 1] has neither a unit nor the name of an angle."""
     is_open = item.meaning.quantity == "steering" and not item.unit_known and item.seen.largest <= 1.0
-    struct = item.path.rpartition(".")[0]
-    beside = {w for f in fields if f.path.rpartition(".")[0] == struct for w in words_of(f.path.rpartition(".")[2])}
-    return is_open and bool(_PEDALS & beside) and not {"angle", "ang"} & set(words_of(item.path))
+    return is_open and not {"angle", "ang", "delta"} & set(words_of(item.path))
+
+
+def _has_pedals_beside(item: Field, fields: tuple[FieldInfo, ...]) -> bool:
+    """Return whether pedals are in the same struct, of which it is a control like them."""
+    places = (f.path.rpartition(".") for f in fields)
+    return any(struct == item.path.rpartition(".")[0] and _PEDALS & set(words_of(leaf)) for struct, _, leaf in places)
 
 
 def _is_nested_imu(topic: TopicInfo, fields: tuple[FieldInfo, ...], path: str) -> bool:

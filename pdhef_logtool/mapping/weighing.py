@@ -56,9 +56,10 @@ FOLLOWS = 0.5
 WHEEL_UNIT = 0.04
 #: Metres by which curvature becomes an angle: wheelbases of model cars to lorries, and those times a steering ratio.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
-#: Signals to both sides, whose sign may be open; speeds below give no information.
+#: Signals to both sides, whose sign may be open; speeds below give no information; how far the length that a steering
+#: angle gives may be from cars' (logarithm) where it may be a share of the largest angle as well.
 _SIGNED = ("steer_rad", "steering_wheel_rad", "yaw_rate_rad_s", "ay_m_s2")
-SLOW_M_S = 1.0
+SLOW_M_S, USUAL = 1.0, 0.6
 #: Units of rotational speeds, and the usual radius of a wheel.
 TURNING = (("rad/s", 1.0), ("rpm", 2.0 * math.pi / 60.0))
 USUAL_RADIUS_M = 0.3
@@ -173,6 +174,17 @@ class _Weighing:
         self._follow()
         for name, item in self.taken.items():
             self._tell(name, item)
+        self._tell_mirrored()
+
+    def _tell_mirrored(self) -> None:
+        """Report where steering and yaw rate alone, both by their names, show left and right: both may be turned."""
+        turning = [n for n in _SIGNED if self._chosen(n) is not None]
+        is_open = {*turning} <= {n for group in self._open_signs() for n in group}
+        others = [n for n in (*self.taken, *self.fields.anchors) if n == "ay_m_s2" or n.startswith("wheel_speed")]
+        if len(turning) > 1 and is_open and not others and not self.fields.positions:
+            evidence = f"left and right may be exchanged in {' and '.join(turning)}: nothing shows which is positive"
+            remedy = 'name them in a mapping file, or --waive "mapping.names"'
+            self.checks += [Check("mapping.names", name, "undecided", evidence, remedy) for name in turning]
 
     def _usable(self) -> list[Field]:
         """Return candidates for signals; sensors beside ground truth come behind those of other messages."""
@@ -367,6 +379,8 @@ class _Weighing:
         name, (unit, factor) = min(fits, key=lambda f: _unlikely(f[0], length * f[1][1]))
         item.use(unit)
         item.reasons.append(f"ratio to the path's curvature {length * factor:.3g} m: {name} in {unit}")
+        if _unlikely(name, length * factor) < USUAL:
+            item.doubts = [d for d in item.doubts if "a share" not in d]
         rest = [f for f in fits if f != (name, (unit, factor)) and _unlikely(f[0], length * f[1][1]) < 1.0]
         if rest and not item.fixed:
             item.doubts.append(f"it could be {rest[0][0]} in {rest[0][1][0]} as well")

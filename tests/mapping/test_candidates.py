@@ -313,7 +313,7 @@ def test_a_magnitude_takes_its_sign_from_another_field() -> None:
 def test_a_steering_beside_pedals_is_a_share() -> None:
     auto = found(controls=topic(steer=STEER / 0.5, throttle=0.3 + 0.0 * S), imu__data=topic(**imu_fields()), **SPEED)
     assert not {"steer_rad", "steering_wheel_rad"} & set(auto.mapping.signals)
-    assert any(note.startswith("/controls.steer is not used: a share") for note in auto.mapping.notes)
+    assert any(note.startswith("/controls.steer is not used: it may be a share") for note in auto.mapping.notes)
 
 
 def test_a_velocity_in_the_axes_of_the_world_is_no_speed() -> None:
