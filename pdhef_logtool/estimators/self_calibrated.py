@@ -147,16 +147,17 @@ def widened(
     slow_m_s : a velocity shows of sideslip no more below this speed than there.
     own_share : of the track's own 1-sigma that counts.
     """
-    added = np.where(np.isfinite(seen_m_s), seen_m_s, 0.0) ** 2
+    added = np.where(np.isfinite(seen_m_s), seen_m_s, 0.0)
     for vy in compared[1:]:
         away = vy - compared[0]
-        added += np.where(np.isfinite(away), away**2, 0.0)
+        added = np.hypot(added, np.where(np.isfinite(away), away, 0.0))
     speed = np.abs(track.vx_m_s)
-    added = added / np.maximum(speed, slow_m_s) ** 2
-    std = np.minimum(np.sqrt((own_share * track.sideslip_std_rad) ** 2 + added), MAX_SIDESLIP_STD_RAD)
+    added = np.minimum(added / np.maximum(speed, slow_m_s), MAX_SIDESLIP_STD_RAD)
+    std = np.minimum(np.hypot(own_share * track.sideslip_std_rad, added), MAX_SIDESLIP_STD_RAD)
     covariance = track.covariance
     if covariance.shape[0]:
         variance = covariance[:, 1, 1]
-        more = np.divide(added * speed**2, variance, out=np.full(len(track), 1.0 - own_share**2), where=variance > 0.0)
+        own = np.full(len(track), 1.0 - own_share**2)
+        more = np.divide((added * speed) ** 2, variance, out=own, where=variance > 0.0)
         covariance = scaled_covariance(covariance, np.sqrt(own_share**2 + more))
     return replace(track, sideslip_std_rad=std, covariance=covariance)
