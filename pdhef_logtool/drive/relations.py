@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -348,12 +347,13 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
 
 
 def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
-    """Relate the ground-truth v_y and sideslip to what positions and heading of the same device give.
+    """Relate the mapped ground-truth sideslip, or v_y, to what positions and heading of one device give.
 
     The frame of a pose may be mirrored: heading and course then turn against the yaw rates, and if only some do, the
     sign is not known.
     """
-    if not {"truth.pose_vx_m_s", "truth.pose_vy_m_s"} <= columns.keys():
+    subject = next((n for n, of in (("truth.sideslip_rad",) * 2, ("truth.vy_m_s", CG_VY)) if of in columns), "")
+    if not {subject, "truth.pose_vy_m_s"} <= columns.keys():
         return []
     ahead, left, turning = (columns[f"truth.{n}"] for n in ("pose_vx_m_s", "pose_vy_m_s", "heading_rate_rad_s"))
     moving = moving_at(ahead)
@@ -361,20 +361,15 @@ def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
     if median_known(ahead / speed) < AHEAD_SHARE:
         return []  # the heading is not that of the car
     yaws = [columns[n] for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
-    turns = [r for yaw in yaws for r in compare("", {}, turning, yaw, moving, GAIN_RANGE) if r.tells]
-    signs = {math.copysign(1.0, r.gain) for r in turns}
-    sign, is_known = min(signs, default=1.0), len(signs) == 1 and len(turns) == 2
-    relations = []
-    for name, expected, powers in (
-        ("truth.vy_m_s", left, {"truth.vy_m_s": 1, "truth.position_speed_m_s": -1}),
-        ("truth.sideslip_rad", left / speed, {"truth.sideslip_rad": 1}),
-    ):
-        if name in columns:
-            sides = (f"{name} against ground-truth positions and heading", powers, sign * expected, columns[name])
-            # Velocity and position may be of two places of the car, which turn about one another.
-            apart = _partial(*sides, [turning, np.ones_like(turning)], moving, SAME_RANGE)
-            relations += _best([*compare(*sides, moving, SAME_RANGE), *apart])
-    return [replace(r, signless=not is_known) for r in relations]
+    signs = [np.sign(r.gain) for yaw in yaws for r in compare("", {}, turning, yaw, moving, GAIN_RANGE) if r.tells]
+    is_vy = subject == "truth.vy_m_s"
+    powers = {subject: 1} | ({"truth.position_speed_m_s": -1} if is_vy else {})
+    expected = min(signs, default=1.0) * (left if is_vy else left / speed)
+    sides = (f"{subject} against ground-truth positions and heading", powers, expected, columns[subject])
+    # Velocity and position may be of two places of the car, which turn about one another.
+    apart = _partial(*sides, [turning, np.ones_like(turning)], moving, SAME_RANGE)
+    best = _best([*compare(*sides, moving, SAME_RANGE), *apart])
+    return [replace(r, signless=len(signs) < 2 or len(set(signs)) > 1) for r in best]
 
 
 def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
