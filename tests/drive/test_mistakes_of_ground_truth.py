@@ -95,6 +95,16 @@ def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
     assert factor == 1.0 or f"by {1.0 / factor:.6g}" in checks[failed[0]].remedy
 
 
+def test_exchanged_velocities_of_ground_truth_are_named() -> None:
+    signals, truth = with_truth(VEHICLE, 1.0)
+    ahead, across = truth["vx_m_s"], truth["vy_m_s"]
+    truth |= {"vx_m_s": replace(ahead, values=across.values), "vy_m_s": replace(across, values=ahead.values)}
+    found = check_drive(signals, truth, derive_truth(truth), VEHICLE)
+    named = {c.subject for c in found if c.name.endswith(".axis") and c.remedy.startswith("exchange the fields")}
+    assert named == {"truth.vx_m_s", "truth.vy_m_s"}
+    assert {c.subject for c in found if c.verdict == "failed"} <= {*named, "truth.sideslip_rad"}
+
+
 def test_an_impossible_yaw_rate_of_ground_truth_does_not_blame_the_gyro() -> None:
     signals, truth = with_truth(VEHICLE, 1.0)
     rate = truth["yaw_rate_rad_s"]
