@@ -213,7 +213,8 @@ def posterior(
         looked_up.append((table, index))
 
     def energies(first: IntArray, second: IntArray) -> FloatArray:
-        return priors[first] + priors[second] + sum(table[i[first], i[second]] for table, i in looked_up)
+        of_relations = sum(table[i[first], i[second]] for table, i in looked_up)
+        return np.asarray(priors[first] + priors[second] + of_relations)
 
     none, every = len(useful), np.arange(len(useful) + 1)
     alone = energies(every, np.full_like(every, none))
@@ -239,7 +240,7 @@ def _compatible(mistakes: Sequence[Hypothesis]) -> BoolArray:
     names = sorted({n for h in mistakes for n in h.factors})
     about = np.array([[n in h.factors for n in names] for h in mistakes], dtype=bool).reshape(len(mistakes), len(names))
     common = np.array([h.kind != "foreign" for h in mistakes], dtype=bool)
-    return np.outer(common, common) & ~(about @ about.T)
+    return np.asarray(np.outer(common, common) & ~(about @ about.T))
 
 
 def known_hypotheses(
@@ -294,7 +295,8 @@ _NEVER_TURNED = frozenset({"speed_m_s", "steer_rad", "steering_wheel_rad"})
 def _together(names: Sequence[str]) -> str:
     """Return signals in words; the wheel speeds and their mean as one."""
     wheels = [n for n in names if n.startswith("wheel_speed")]
-    return "wheel speeds" if len(wheels) == len(names) > 2 else " and ".join(names)
+    shown = ["truth.x_m or truth.y_m" if n == "truth.y_m" else n for n in names]  # which one, the path does not show
+    return "wheel speeds" if len(wheels) == len(names) > 2 else " and ".join(shown)
 
 
 def units_of(name: str) -> list[tuple[float, str]]:

@@ -10,7 +10,14 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.columns import columns_on_grid, derivative, halves, median_known, moving_at
 from pdhef_logtool.drive.hypotheses import Posterior, Relation, known_hypotheses, posterior
-from pdhef_logtool.drive.relations import CG_VY, direction_rate, measured_relations
+from pdhef_logtool.drive.relations import (
+    CG_VY,
+    COURSE_RATE,
+    POSITION_VX,
+    POSITION_VY,
+    direction_rate,
+    measured_relations,
+)
 from pdhef_logtool.drive.truth import TruthTrack, channel_of
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
@@ -135,8 +142,8 @@ def drive_columns(
     columns = columns_on_grid(channels)
     if "truth.x_m" in columns and "truth.y_m" in columns:
         vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))
-        columns["truth.position_speed_m_s"] = np.hypot(vx, vy)
-        columns["truth.course_rate_rad_s"] = direction_rate(vx, vy)
+        columns |= {POSITION_VX: vx, POSITION_VY: vy, "truth.position_speed_m_s": np.hypot(vx, vy)}
+        columns[COURSE_RATE] = direction_rate(vx, vy)
     return columns, _speed_of(columns)
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.columns import derivative, independent_samples, median_known, moving_at
+from pdhef_logtool.drive.columns import derivative, fit, independent_samples, median_known, moving_at
 from pdhef_logtool.drive.hypotheses import BLOCKS, MIN_CORRELATION, MIN_SAMPLES, Relation, block_gains
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
@@ -17,6 +18,10 @@ MIN_PARTIAL_CORRELATION = 0.8
 #: Column of the ground-truth v_y at the CG, where v_y itself is mapped and is a column as mapped: the lever's part of a
 #: v_y at the CG would hide its unit.
 CG_VY = "truth.vy_m_s at the CG"
+#: Column of the turning of the ground-truth path, under the name of the position whose sign it has.
+COURSE_RATE = "truth.y_m"
+#: Columns of the velocity along the axes of the ground-truth positions.
+POSITION_VX, POSITION_VY = "truth.position_vx_m_s", "truth.position_vy_m_s"
 #: One of two sides that moves by more must move the other. Crossfall and grade alone move an accelerometer by less (5 %
 #: are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
 MOVES_M_S2 = 1.0
@@ -272,7 +277,7 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
 
 def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
     """Return other measurements of the yaw rate than the gyro's, to any factor; steering has no certain sign."""
-    references = [(n, columns[n]) for n in ("truth.course_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
+    references = [(n, columns[n]) for n in (COURSE_RATE, "truth.yaw_rate_rad_s") if n in columns]
     return references + ([] if speed_name is None else _axle_differences(columns, columns[speed_name]))
 
 
@@ -325,8 +330,8 @@ def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> Float
 
 def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relation]:
     """Relate the yaw rates to the rate of the ground-truth course over ground."""
-    course = columns.get("truth.course_rate_rad_s")
-    if course is None:
+    course = columns.get(COURSE_RATE)
+    if course is None or any(map(is_misscaled, position_factors(columns))):
         return []
     turnings = [course]
     if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # in a spin the sideslip turns as well
@@ -340,10 +345,33 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
             either = [
                 r
                 for turning in turnings
-                for r in compare(text, {name: 1}, turning, yaw, moving, GAIN_RANGE, moves=MOVES_RAD_S, gentle=gentle)
+                for r in compare(
+                    text, {name: 1, COURSE_RATE: -1}, turning, yaw, moving, GAIN_RANGE, moves=MOVES_RAD_S, gentle=gentle
+                )
             ]
             relations += _best(either)
     return relations
+
+
+def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
+    """Return what the scales of the ground-truth x and y are to be multiplied with; NaN where the drive shows none.
+
+    v_x² = a² ẋ² + b² ẏ², less v_y², whose unit may be wrong: of a car that drifts at 45 degrees 0.7 are left. A car
+    that drives along one axis shows only its scale.
+    """
+    vx = columns.get("truth.vx_m_s")
+    if vx is None or POSITION_VX not in columns:
+        return math.nan, math.nan
+    result = fit(vx**2, [columns[n] ** 2 for n in (POSITION_VX, POSITION_VY)], moving_at(vx))
+    if result is None:
+        return math.nan, math.nan
+    x, y = (math.sqrt(s) if s > 4.0 * e else math.nan for s, e in zip(*result[:2], strict=True))
+    return x, y
+
+
+def is_misscaled(factor: float) -> bool:
+    """Return whether a factor of a position is another unit: feet are 3.3 times off."""
+    return factor < 0.6 or factor > 1.7
 
 
 def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
@@ -353,7 +381,7 @@ def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
     sign is not known.
     """
     subject = next((n for n, of in (("truth.sideslip_rad",) * 2, ("truth.vy_m_s", CG_VY)) if of in columns), "")
-    if not {subject, "truth.pose_vy_m_s"} <= columns.keys():
+    if not {subject, "truth.pose_vy_m_s"} <= columns.keys() or any(map(is_misscaled, position_factors(columns))):
         return []
     ahead, left, turning = (columns[f"truth.{n}"] for n in ("pose_vx_m_s", "pose_vy_m_s", "heading_rate_rad_s"))
     moving = moving_at(ahead)

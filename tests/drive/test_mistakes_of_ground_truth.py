@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks import check_drive
 from pdhef_logtool.drive.checks.by_relations import SUSPICIONS
+from pdhef_logtool.drive.checks.running import misread_channels
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.other_fields import with_other_fields
 from pdhef_logtool.drive.truth import derive_truth
@@ -188,3 +189,25 @@ def test_suspicions_ask_for_another_field_and_weak_ones_do_not() -> None:
         checks = [Check("steer_rad.unit", "steer_rad", "undecided", "a gain", remedy)]
         found = with_other_fields(checks, mapping, lambda _: (), lambda: other)
         assert [c.name for c in found if c.verdict == "failed"] == (["steer_rad.axis"] if is_named else [])
+
+
+@pytest.mark.parametrize(("name", "factor"), [("x_m", 1e-3), ("y_m", 3.2808), ("x_m", -1.0), ("y_m", -1.0), ("", 1.0)])
+def test_a_wrong_scale_or_sign_of_a_position_is_named_and_the_position_not_used(name: str, factor: float) -> None:
+    signals, truth = with_truth(VEHICLE, 1.0)
+    vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
+    yaw = np.cumsum(rate) * 0.01
+    pose = {
+        "x_m": np.cumsum(vx * np.cos(yaw) - vy * np.sin(yaw)),
+        "y_m": np.cumsum(vx * np.sin(yaw) + vy * np.cos(yaw)),
+    }
+    scales = {n: factor if n == name else 1.0 for n in pose}
+    truth |= {n: replace(truth["vx_m_s"], name=n, values=0.01 * scales[n] * v) for n, v in pose.items()}
+    checks = check_drive(signals, truth, derive_truth(truth), VEHICLE)
+    failed = {c.name: c.remedy for c in checks if c.verdict == "failed" and c.subject.startswith("truth.")}
+    expected = "" if not name else "truth.y_m.sign" if factor < 0.0 else f"truth.{name}.scale"
+    assert list(failed) == [n for n in [expected] if n]
+    if expected:
+        named = float(failed[expected].partition(" by ")[2].partition(",")[0])
+        assert named == pytest.approx(1.0 / factor, rel=0.05)
+        assert factor > 0.0 or "truth.x_m or truth.y_m" in failed[expected]
+        assert set(misread_channels(checks)) == {expected.rpartition(".")[0]}

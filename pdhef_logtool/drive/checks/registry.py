@@ -16,6 +16,7 @@ MODULES = (
     "magnitude",
     "level",
     "truth_sideslip",
+    "truth_position",
     "sensor_errors",
     "late_sensors",
     "vehicle_file",

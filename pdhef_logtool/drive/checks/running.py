@@ -18,7 +18,7 @@ from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import Channel
 
 #: Aspects whose failure means that a channel is not the signal that it is mapped to.
-_MISREAD = frozenset({"sign", "unit", "axis", "mounting", "magnitude"})
+_MISREAD = frozenset({"sign", "unit", "scale", "axis", "mounting", "magnitude"})
 _BADNESS = {"passed": 0, "undecided": 1, "failed": 2}
 
 
