@@ -141,7 +141,7 @@ def outcomes(path: Path, vehicle: VehicleParameters, mapping: Mapping | None = N
     log = open_log(path)
     try:
         right = auto_map(log).mapping if mapping is None else mapping
-        sound = {c.name: c.verdict for c in _checks(log, replace(right, origin="file"), vehicle)}
+        sound = {c.name: str(c.verdict) for c in _checks(log, replace(right, origin="file"), vehicle)}
         for subject in subjects(right):
             for kind in KINDS:
                 yield from _outcome(log, right, subject, kind, vehicle, sound)

@@ -151,7 +151,7 @@ def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack) -> dict[str,
     """Return the velocities ahead and to the left that positions and heading of one topic have; empty without them."""
     pose = [truth[n] for n in ("x_m", "y_m", "yaw_rad", "quat_wxyz") if n in truth]
     finite = np.isfinite(track.yaw_rad)
-    stamps = pose[0].stamps_ns if pose else np.empty(0)
+    stamps = pose[0].stamps_ns if pose else np.empty(0, np.int64)
     topics = {c.source.split(".")[0] for c in pose}
     if not {"x_m", "y_m"} <= truth.keys() or len(topics) > 1 or not finite.any() or stamps.size < 3:
         return {}

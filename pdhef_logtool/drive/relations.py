@@ -356,13 +356,13 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
 def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
     """Return what the scales of the ground-truth x and y are to be multiplied with; NaN where the drive shows none.
 
-    v_x² + v_y² = a² ẋ² + b² ẏ². A car that drives along one axis shows only its scale.
+    v_x² = a² ẋ² + b² ẏ², less v_y², whose unit may be wrong: of a car that drifts at 45 degrees 0.7 are left. A car
+    that drives along one axis shows only its scale.
     """
-    vx, vy = columns.get("truth.vx_m_s"), columns.get(CG_VY, columns.get("truth.vy_m_s"))
+    vx = columns.get("truth.vx_m_s")
     if vx is None or POSITION_VX not in columns:
         return math.nan, math.nan
-    squares = [columns[n] ** 2 for n in (POSITION_VX, POSITION_VY)]
-    result = fit(vx**2 if vy is None else vx**2 + vy**2, squares, moving_at(vx))
+    result = fit(vx**2, [columns[n] ** 2 for n in (POSITION_VX, POSITION_VY)], moving_at(vx))
     if result is None:
         return math.nan, math.nan
     x, y = (math.sqrt(s) if s > 4.0 * e else math.nan for s, e in zip(*result[:2], strict=True))
@@ -381,8 +381,7 @@ def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
     sign is not known.
     """
     subject = next((n for n, of in (("truth.sideslip_rad",) * 2, ("truth.vy_m_s", CG_VY)) if of in columns), "")
-    known = {subject, "truth.pose_vy_m_s"} <= columns.keys()
-    if not known or any(map(is_misscaled, position_factors(columns))):
+    if not {subject, "truth.pose_vy_m_s"} <= columns.keys() or any(map(is_misscaled, position_factors(columns))):
         return []
     ahead, left, turning = (columns[f"truth.{n}"] for n in ("pose_vx_m_s", "pose_vy_m_s", "heading_rate_rad_s"))
     moving = moving_at(ahead)
