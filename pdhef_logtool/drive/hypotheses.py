@@ -295,7 +295,9 @@ _NEVER_TURNED = frozenset({"speed_m_s", "steer_rad", "steering_wheel_rad"})
 def _together(names: Sequence[str]) -> str:
     """Return signals in words; the wheel speeds and their mean as one."""
     wheels = [n for n in names if n.startswith("wheel_speed")]
-    shown = ["truth.x_m or truth.y_m" if n == "truth.y_m" else n for n in names]  # which one, the path does not show
+    shown = [
+        "truth.x_m or truth.y_m (which may be exchanged)" if n == "truth.y_m" else n for n in names
+    ]  # which one, the path does not show
     return "wheel speeds" if len(wheels) == len(names) > 2 else " and ".join(shown)
 
 

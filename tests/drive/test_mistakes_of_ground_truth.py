@@ -212,3 +212,17 @@ def test_a_wrong_scale_or_sign_of_a_position_is_named_and_the_position_not_used(
         assert named == pytest.approx(1.0 / factor, rel=0.05)
         assert factor > 0.0 or "truth.x_m or truth.y_m" in failed[expected]
         assert set(misread_channels(checks)) == {expected.rpartition(".")[0]}
+
+
+def test_exchanged_degrees_of_a_place_are_named_as_such() -> None:
+    signals, truth = with_truth(VEHICLE, 1.0)
+    yaw = np.cumsum(truth["yaw_rate_rad_s"].values) * 0.01
+    north, east = (np.cumsum(truth["vx_m_s"].values * way) * 0.01 / 111_320.0 for way in (np.sin(yaw), np.cos(yaw)))
+    degrees = {"lat_deg": east, "lon_deg": north}
+    truth |= {n: replace(truth["vx_m_s"], name=n, values=v) for n, v in degrees.items()}
+    mapping = Mapping({}, {n: SignalSource(n, "/fix", n) for n in degrees})
+    derived = derive_truth(truth)
+    measured = measure(signals, truth, derived, VEHICLE, mapping)
+    checks = check_drive(signals, truth, derived, VEHICLE, measured=measured)
+    (sign,) = (c for c in checks if c.subject == "truth.lat_deg" and c.verdict == "failed")
+    assert sign.name == "truth.lat_deg.sign" and "exchanged" in sign.remedy and "lon_deg" in sign.remedy
