@@ -156,9 +156,8 @@ def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack) -> dict[str,
     if not {"x_m", "y_m"} <= truth.keys() or len(topics) > 1 or not finite.any() or stamps.size < 3:
         return {}
     yaw = np.interp(stamps, track.stamps_ns[finite], np.unwrap(track.yaw_rad[finite]))
-    vx, vy, rate = (
-        np.gradient(c, (stamps - stamps[0]) * 1e-9) for c in (truth["x_m"].values, truth["y_m"].values, yaw)
-    )
+    y_m = np.interp(stamps, truth["y_m"].stamps_ns, truth["y_m"].values)  # a sample of it may be missing
+    vx, vy, rate = (np.gradient(c, (stamps - stamps[0]) * 1e-9) for c in (truth["x_m"].values, y_m, yaw))
     ahead, left = np.cos(yaw) * vx + np.sin(yaw) * vy, np.cos(yaw) * vy - np.sin(yaw) * vx
     columns = {"truth.pose_vx_m_s": ahead, "truth.pose_vy_m_s": left, "truth.heading_rate_rad_s": rate}
     return {n: Channel(n, "", "pose", stamps, stamps, v) for n, v in columns.items()}

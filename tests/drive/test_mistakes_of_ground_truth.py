@@ -88,6 +88,7 @@ def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
     pose["x_m"] += antenna_m * np.cos(yaw)
     truth |= {n: replace(truth["vx_m_s"], name=n, source=f"/ins.{n}", values=v) for n, v in pose.items()}
     truth["vy_m_s"] = replace(truth["vy_m_s"], values=factor * vy)
+    truth["y_m"] = truth["y_m"].take(np.arange(vy.size) % 1000 != 500)  # a sample of one axis is missing
     derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
     checks = {c.name: c for c in check_drive(signals, truth, derived, vehicle) if c.subject == "truth.vy_m_s"}
     failed = [n for n, c in checks.items() if c.verdict == "failed"]
