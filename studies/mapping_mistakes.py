@@ -141,7 +141,7 @@ def outcomes(path: Path, vehicle: VehicleParameters, mapping: Mapping | None = N
     log = open_log(path)
     try:
         right = auto_map(log).mapping if mapping is None else mapping
-        sound = {c.name: c.verdict for c in _checks(log, replace(right, origin="file"), vehicle)}
+        sound = {c.name: str(c.verdict) for c in _checks(log, replace(right, origin="file"), vehicle)}
         for subject in subjects(right):
             for kind in KINDS:
                 yield from _outcome(log, right, subject, kind, vehicle, sound)
@@ -180,50 +180,73 @@ CLASSES = ("sedan", "suv", "hatchback")
 SPEED_FACTORS, FRICTIONS, LONGEST_S = (0.7, 1.1), (0.4, 1.0), 60.0
 
 
-def drawn_drives(count: int, seed: int, limit_s: float, path: Path, longest_s: float) -> Iterator[tuple[str, str]]:
-    """Simulate drives, write each to ``path`` and yield it in words and its car.
+def drawn_drives(count: int, seed: int, limit_s: float, longest_s: float) -> Iterator[tuple[str, str, Path]]:
+    """Simulate drives and yield each in words, with its car and the log.
 
     Parameters
     ----------
     limit_s : of processor time. longest_s : of a drive, s.
     """
     rng, drives = np.random.default_rng(seed), 0
-    for i in itertools.count():
-        if drives >= count or time.process_time() > limit_s:
-            return
-        name = sorted(MANOEUVRES)[i % len(MANOEUVRES)]
-        manoeuvre, drawn = MANOEUVRES[name], int(rng.integers(1, 2**31))
-        car = f"{CLASSES[(i + i // len(MANOEUVRES)) % len(CLASSES)]}~{drawn}"
-        speed, friction = manoeuvre.speed_km_h * rng.uniform(*SPEED_FACTORS), float(rng.uniform(*FRICTIONS))
-        shorter_s = longest_s if (manoeuvre.duration_s or 0.0) > longest_s else None
-        try:
-            drive = simulate_drive(
-                name, speed_km_h=speed, friction=friction, seed=drawn, duration_s=shorter_s,
-                vehicle=choose_vehicle(car), vehicle_name=car,
-            )  # fmt: skip
-        except PdhefError:  # it would spin, or the course is too fast for this car
-            continue
-        path.unlink(missing_ok=True)
-        write_drive(drive, path, steering_wheel=drives % 4 > 1)
-        drives += 1
-        yield f"{name} {car} {speed:.1f} km/h, friction {friction:.2f}", car
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "drive.mcap"
+        for i in itertools.count():
+            if drives >= count or time.process_time() > limit_s:
+                return
+            name = sorted(MANOEUVRES)[i % len(MANOEUVRES)]
+            manoeuvre, drawn = MANOEUVRES[name], int(rng.integers(1, 2**31))
+            car = f"{CLASSES[(i + i // len(MANOEUVRES)) % len(CLASSES)]}~{drawn}"
+            speed, friction = manoeuvre.speed_km_h * rng.uniform(*SPEED_FACTORS), float(rng.uniform(*FRICTIONS))
+            shorter_s = longest_s if (manoeuvre.duration_s or 0.0) > longest_s else None
+            try:
+                drive = simulate_drive(
+                    name, speed_km_h=speed, friction=friction, seed=drawn, duration_s=shorter_s,
+                    vehicle=choose_vehicle(car), vehicle_name=car,
+                )  # fmt: skip
+            except PdhefError:  # it would spin, or the course is too fast for this car
+                continue
+            path.unlink(missing_ok=True)
+            write_drive(drive, path, steering_wheel=drives % 4 > 1)
+            drives += 1
+            yield f"{name} {car} {speed:.1f} km/h, friction {friction:.2f}", car, path
 
 
 def sound_drives(count: int, seed: int, limit_s: float) -> Counter[str]:
     """Count simulated drives, those with a failed check and those with a correction; print the checks of both."""
     counts: Counter[str] = Counter()
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "drive.mcap"
-        for words, _ in drawn_drives(count, seed, limit_s, path, LONGEST_S):
-            log = open_log(path)
-            checks = _checks(log, auto_map(log).mapping, default_vehicle())
-            log.close()
-            failed = [c for c in checks if c.verdict == "failed"]
-            counts += Counter({"drives": 1, "with a failed check": bool(failed)})
-            counts["corrected"] += any(c.name.endswith(".corrected") for c in failed)
-            for check in failed:
-                print(f"{words}: {check.name}: {check.evidence}")
+    for words, _, path in drawn_drives(count, seed, limit_s, LONGEST_S):
+        log = open_log(path)
+        failed = [c for c in _checks(log, auto_map(log).mapping, default_vehicle()) if c.verdict == "failed"]
+        log.close()
+        counts += Counter({"drives": 1, "with a failed check": bool(failed)})
+        counts["corrected"] += any(c.name.endswith(".corrected") for c in failed)
+        for check in failed:
+            print(f"{words}: {check.name}: {check.evidence}")
     return counts
+
+
+def simulated_mistakes(count: int, seed: int, limit_s: float, *, verbose: bool) -> Counter[str]:
+    """Count the outcomes over simulated drives."""
+    counts: Counter[str] = Counter()
+    for i, (words, car, path) in enumerate(drawn_drives(count, seed, limit_s, 1.5 * LONGEST_S)):
+        vehicle = fit_vehicle(choose_vehicle(car), FIT_FRICTION, default_vehicle()) if i % 2 else default_vehicle()
+        of_drive = count_outcomes(outcomes(path, vehicle), verbose=verbose)
+        print(f"{words}, {'with' if i % 2 else 'without'} a vehicle file: {dict(of_drive)}", flush=True)
+        counts += of_drive
+    return counts
+
+
+def recorded_mistakes(path: Path, *, verbose: bool) -> Counter[str]:
+    """Count the outcomes over a log: of a peer with its vehicle and mapping, else with the vehicle file beside it."""
+    peer = next((d for d in PEER_DRIVES if d.log == path.name), None)
+    if peer is not None:
+        return count_outcomes(
+            outcomes(path, vehicle_of(peer, path.parent), mapping_of(peer, path.parent)), verbose=verbose
+        )
+    vehicle = path.parent / ("vehicle_mu03.toml" if path.stem == "sweep" else "vehicle.toml")
+    return count_outcomes(
+        outcomes(path, Car.load(vehicle).vehicle if vehicle.exists() else default_vehicle()), verbose=verbose
+    )
 
 
 def count_outcomes(found: Iterable[Outcome], *, verbose: bool) -> Counter[str]:
@@ -238,19 +261,6 @@ def count_outcomes(found: Iterable[Outcome], *, verbose: bool) -> Counter[str]:
     return counts
 
 
-def simulated_mistakes(count: int, seed: int, limit_s: float, *, verbose: bool) -> Counter[str]:
-    """Count the outcomes over simulated drives."""
-    counts: Counter[str] = Counter()
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "drive.mcap"
-        for i, (words, car) in enumerate(drawn_drives(count, seed, limit_s, path, 1.5 * LONGEST_S)):
-            vehicle = fit_vehicle(choose_vehicle(car), FIT_FRICTION, default_vehicle()) if i % 2 else default_vehicle()
-            of_drive = count_outcomes(outcomes(path, vehicle), verbose=verbose)
-            print(f"{words}, {'with' if i % 2 else 'without'} a vehicle file: {dict(of_drive)}", flush=True)
-            counts += of_drive
-    return counts
-
-
 def main(arguments: Sequence[str]) -> int:
     """Count the outcomes over logs and print those that are not named."""
     warnings.simplefilter("error", RuntimeWarning)
@@ -259,19 +269,12 @@ def main(arguments: Sequence[str]) -> int:
         of_sound = sound_drives(int(words[1]), int(words[2]), float(words[3]))
         print(", ".join(f"{n} {what}" for what, n in of_sound.items()))
         return 0
-    counts: Counter[str] = Counter()
     if words[:1] == ["--simulated"]:
-        counts, words = simulated_mistakes(int(words[1]), int(words[2]), float(words[3]), verbose=verbose), []
+        counts = simulated_mistakes(int(words[1]), int(words[2]), float(words[3]), verbose=verbose)
     else:
-        samples = Path(__file__).parents[1] / "sample_logs"
-        words = words or [str(samples / f"{name}.mcap") for name in SAMPLES]
-    for path in map(Path, words):
-        peer = next((d for d in PEER_DRIVES if d.log == path.name), None)
-        vehicle = path.parent / ("vehicle_mu03.toml" if path.stem == "sweep" else "vehicle.toml")
-        car = Car.load(vehicle).vehicle if vehicle.exists() else default_vehicle()
-        car = car if peer is None else vehicle_of(peer, path.parent)
-        mapping = None if peer is None else mapping_of(peer, path.parent)
-        counts += count_outcomes(outcomes(path, car, mapping), verbose=verbose)
+        samples = [Path(__file__).parents[1] / "sample_logs" / f"{name}.mcap" for name in SAMPLES]
+        paths = [Path(w) for w in words] or samples
+        counts = sum((recorded_mistakes(p, verbose=verbose) for p in paths), Counter())
     total = counts.total()
     print(f"{total} mistakes: " + ", ".join(f"{n} {v} ({n / total:.1%})" for v, n in counts.most_common()))
     return 0

@@ -295,7 +295,9 @@ _NEVER_TURNED = frozenset({"speed_m_s", "steer_rad", "steering_wheel_rad"})
 def _together(names: Sequence[str]) -> str:
     """Return signals in words; the wheel speeds and their mean as one."""
     wheels = [n for n in names if n.startswith("wheel_speed")]
-    shown = ["truth.x_m or truth.y_m" if n == "truth.y_m" else n for n in names]  # which one, the path does not show
+    shown = [
+        "truth.x_m or truth.y_m (which may be exchanged)" if n == "truth.y_m" else n for n in names
+    ]  # which one, the path does not show
     return "wheel speeds" if len(wheels) == len(names) > 2 else " and ".join(shown)
 
 
@@ -304,7 +306,7 @@ def units_of(name: str) -> list[tuple[float, str]]:
     to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
     of_speeds = [(1.0 / 3.6, "is in km/h"), (3.6, "was converted from km/h twice")]
     of_speeds += [(0.44704, "is in mph"), (1.0 / 0.44704, "was converted from mph twice")]
-    if name in ("yaw_rate_rad_s", "sideslip_rad"):
+    if name in ("yaw_rate_rad_s", "roll_rate_rad_s", "pitch_rate_rad_s", "sideslip_rad"):
         return to_radians
     if name == "steer_rad":
         return [*to_radians, (1.0 / TYPICAL_STEERING_RATIO, "is the steering-wheel angle")]

@@ -31,9 +31,6 @@ WHEEL_SPEEDS = "wheel_speeds"
 SPIN_SHARE = 0.2
 
 _EAST_NORTH = ("gnss_velocity_east_m_s", "gnss_velocity_north_m_s")
-#: A car with a shorter wheelbase has no driver, and no steering wheel.
-SEATED_WHEELBASE_M = 1.0
-
 _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 
 
@@ -45,7 +42,6 @@ class Measured:
     ----------
     speed_name : the column used as the speed. topics : of the signals, by name.
     scales : by name, those of ground truth with ``truth.``, what the mapping multiplies the raw values with.
-    is_geared : whether the car may have a steering wheel.
     """
 
     columns: Mapping[str, FloatArray]
@@ -53,7 +49,6 @@ class Measured:
     relations: tuple[Relation, ...]
     topics: Mapping[str, str]
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
-    is_geared: bool = True
 
     def without_truth(self) -> Measured:
         """Return what the signals alone state."""
@@ -79,10 +74,7 @@ class Measured:
     def posterior(self, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> Posterior:
         """Return the probabilities of the mistakes that mappings make with these signals."""
         groups = self.groups(mounting_is_known=mounting_is_known)
-        mistakes = known_hypotheses(list(self.columns), groups, open_signs)
-        if not self.is_geared:
-            mistakes = [h for h in mistakes if h.is_exact or h.kind == "field" or "steer" not in "".join(h.factors)]
-        return posterior(self.relations, mistakes, self.scales)
+        return posterior(self.relations, known_hypotheses(list(self.columns), groups, open_signs), self.scales)
 
     def agrees(self, name: str, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> bool:
         """Return whether a signal is wrong by these relations too, if one of them counts."""
@@ -122,8 +114,7 @@ def measure(
     ----------
     derived : ground truth at the CG. vehicle : the default car states nothing. mapping : of the channels, if known.
     """
-    place = 0.0 if vehicle is None else vehicle.truth_position_m[0]
-    columns, speed_name = drive_columns(signals, truth or {}, derived, place)
+    columns, speed_name = drive_columns(signals, truth or {}, derived)
     topics = {n: c.source.split(".")[0] for n, c in signals.items()}
     scales: dict[str, float | tuple[float, ...]] = {}
     if mapping is not None:
@@ -134,17 +125,13 @@ def measure(
     # Two quantities of ground truth that are read from one field agree by themselves.
     read = [[sources[n] for n in r.powers if n in sources] for r in related]
     related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
-    is_geared = vehicle is None or vehicle.wheelbase_m > SEATED_WHEELBASE_M
-    return Measured(columns, speed_name, tuple(related), topics, scales, is_geared)
+    return Measured(columns, speed_name, tuple(related), topics, scales)
 
 
 def drive_columns(
-    signals: Mapping[str, Channel], truth: Mapping[str, Channel], derived: TruthTrack | None, truth_x_m: float = 0.0
+    signals: Mapping[str, Channel], truth: Mapping[str, Channel], derived: TruthTrack | None
 ) -> tuple[dict[str, FloatArray], str | None]:
-    """Return signals and ground truth on one grid, and the name of the column used as the speed.
-
-    ``truth_x_m``: how far ahead of the CG ground truth is measured.
-    """
+    """Return signals and ground truth on one grid, and the name of the column used as the speed."""
     channels = {n: c for n, c in signals.items() if c.values.ndim == 1}
     if derived is not None:
         for name in _TRUTH:
@@ -153,7 +140,7 @@ def drive_columns(
         if "vy_m_s" in truth and "truth.vy_m_s" in channels:
             channels[CG_VY] = channels["truth.vy_m_s"]
         channels |= {f"truth.{n}": truth[n] for n in ("vy_m_s", "sideslip_rad", "ay_m_s2") if n in truth}
-        channels |= _pose_velocity(truth, derived.track, truth_x_m)
+        channels |= _pose_velocity(truth, derived.track)
     channels |= _over_ground(channels)
     columns = columns_on_grid(channels)
     if set(_EAST_NORTH) <= set(columns):
@@ -174,18 +161,20 @@ def _over_ground(channels: Mapping[str, Channel]) -> dict[str, Channel]:
     return {n: replace(speed, name=n, values=speed.values * s) for n, s in zip(_EAST_NORTH, sides, strict=True)}
 
 
-def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack, x_m: float) -> dict[str, Channel]:
+def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack) -> dict[str, Channel]:
     """Return the velocities ahead and to the left that positions and heading of one topic have; empty without them."""
-    topics = {truth[n].source.split(".")[0] for n in ("x_m", "y_m", "yaw_rad", "quat_wxyz") if n in truth}
-    usable = np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
-    if len(topics) != 1 or not {"x_m", "y_m"} <= truth.keys() or np.count_nonzero(usable) < 3:
+    pose = [truth[n] for n in ("x_m", "y_m", "yaw_rad", "quat_wxyz") if n in truth]
+    finite = np.isfinite(track.yaw_rad)
+    stamps = pose[0].stamps_ns if pose else np.empty(0, np.int64)
+    topics = {c.source.split(".")[0] for c in pose}
+    if not {"x_m", "y_m"} <= truth.keys() or len(topics) > 1 or not finite.any() or stamps.size < 3:
         return {}
-    stamps, yaw = track.stamps_ns[usable], np.unwrap(track.yaw_rad[usable])
-    times = (stamps - stamps[0]) * 1e-9
-    vx, vy, rate = (np.gradient(c, times) for c in (track.x_m[usable], track.y_m[usable], yaw))
-    ahead, left = np.cos(yaw) * vx + np.sin(yaw) * vy, np.cos(yaw) * vy - np.sin(yaw) * vx + x_m * rate
-    pairs = {"truth.pose_vx_m_s": ahead, "truth.pose_vy_m_s": left, "truth.heading_rate_rad_s": rate}
-    return {n: Channel(n, "", "pose", stamps, stamps, v) for n, v in pairs.items()}
+    yaw = np.interp(stamps, track.stamps_ns[finite], np.unwrap(track.yaw_rad[finite]))
+    y_m = np.interp(stamps, truth["y_m"].stamps_ns, truth["y_m"].values)  # a sample of it may be missing
+    vx, vy, rate = (np.gradient(c, (stamps - stamps[0]) * 1e-9) for c in (truth["x_m"].values, y_m, yaw))
+    ahead, left = np.cos(yaw) * vx + np.sin(yaw) * vy, np.cos(yaw) * vy - np.sin(yaw) * vx
+    columns = {"truth.pose_vx_m_s": ahead, "truth.pose_vy_m_s": left, "truth.heading_rate_rad_s": rate}
+    return {n: Channel(n, "", "pose", stamps, stamps, v) for n, v in columns.items()}
 
 
 def _speed_of(columns: dict[str, FloatArray]) -> str | None:

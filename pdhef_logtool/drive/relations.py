@@ -15,8 +15,6 @@ from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
 #: What is left of two columns by regression is small, and a car that slides leaves it related otherwise.
 MIN_PARTIAL_CORRELATION = 0.8
-#: Share of the curvature that a_y must leave: at one speed they are one regressor.
-SEPARABLE = 0.15
 #: Column of the ground-truth v_y at the CG, where v_y itself is mapped and is a column as mapped: the lever's part of a
 #: v_y at the CG would hide its unit.
 CG_VY = "truth.vy_m_s at the CG"
@@ -39,9 +37,6 @@ SIDESLIP_RANGE = (0.5, 2.0)
 #: Slip of a rear axle at 1 m/s^2: cornering stiffness over load is 4 to 40 per rad, and much less where a model car
 #: drifts. It gives a sign, no unit.
 COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
-#: Of ground truth ahead of the rear axle. Ground truth that is near that axle gives no information: its lever may
-#: be of any sign.
-REAR_LEVER_M, REAR_LEVER_TYPICAL_M = (1.0, 12.0), 1.6
 #: Beyond, sideslip times lateral acceleration is no longer small beside the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
 #: Share of its speed that a car drives ahead, if its heading is right.
@@ -364,13 +359,13 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
 def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
     """Return what the scales of the ground-truth x and y are to be multiplied with; NaN where the drive shows none.
 
-    v_x² + v_y² = a² ẋ² + b² ẏ². A car that drives along one axis shows only its scale.
+    v_x² = a² ẋ² + b² ẏ², less v_y², whose unit may be wrong: of a car that drifts at 45 degrees 0.7 are left. A car
+    that drives along one axis shows only its scale.
     """
-    vx, vy = columns.get("truth.vx_m_s"), columns.get(CG_VY, columns.get("truth.vy_m_s"))
+    vx = columns.get("truth.vx_m_s")
     if vx is None or POSITION_VX not in columns:
         return math.nan, math.nan
-    squares = [columns[n] ** 2 for n in (POSITION_VX, POSITION_VY)]
-    result = fit(vx**2 if vy is None else vx**2 + vy**2, squares, moving_at(vx))
+    result = fit(vx**2, [columns[n] ** 2 for n in (POSITION_VX, POSITION_VY)], moving_at(vx))
     if result is None:
         return math.nan, math.nan
     x, y = (math.sqrt(s) if s > 4.0 * e else math.nan for s, e in zip(*result[:2], strict=True))
@@ -383,12 +378,13 @@ def is_misscaled(factor: float) -> bool:
 
 
 def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
-    """Relate the ground-truth v_y and sideslip to what positions and heading of the same device give.
+    """Relate the mapped ground-truth sideslip, or v_y, to what positions and heading of one device give.
 
     The frame of a pose may be mirrored: heading and course then turn against the yaw rates, and if only some do, the
     sign is not known.
     """
-    if "truth.pose_vx_m_s" not in columns or any(map(is_misscaled, position_factors(columns))):
+    subject = next((n for n, of in (("truth.sideslip_rad",) * 2, ("truth.vy_m_s", CG_VY)) if of in columns), "")
+    if not {subject, "truth.pose_vy_m_s"} <= columns.keys() or any(map(is_misscaled, position_factors(columns))):
         return []
     ahead, left, turning = (columns[f"truth.{n}"] for n in ("pose_vx_m_s", "pose_vy_m_s", "heading_rate_rad_s"))
     moving = moving_at(ahead)
@@ -396,20 +392,15 @@ def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
     if median_known(ahead / speed) < AHEAD_SHARE:
         return []  # the heading is not that of the car
     yaws = [columns[n] for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
-    turns = [r for yaw in yaws for r in compare("", {}, turning, yaw, moving, GAIN_RANGE) if r.tells]
-    signs = {math.copysign(1.0, r.gain) for r in turns}
-    sign, is_known = min(signs, default=1.0), len(signs) == 1 and len(turns) == 2
-    relations = []
-    for name, expected, powers in (
-        ("truth.vy_m_s", left, {"truth.vy_m_s": 1, "truth.position_speed_m_s": -1}),
-        ("truth.sideslip_rad", left / speed, {"truth.sideslip_rad": 1}),
-    ):
-        if name in columns:
-            sides = (f"{name} against ground-truth positions and heading", powers, sign * expected, columns[name])
-            # Velocity and position may be of two places of the car, which turn about one another.
-            apart = _partial(*sides, [turning, np.ones_like(turning)], moving, SAME_RANGE)
-            relations += _best([*compare(*sides, moving, SAME_RANGE), *apart])
-    return [replace(r, signless=not is_known) for r in relations]
+    signs = [np.sign(r.gain) for yaw in yaws for r in compare("", {}, turning, yaw, moving, GAIN_RANGE) if r.tells]
+    is_vy = subject == "truth.vy_m_s"
+    powers = {subject: 1} | ({"truth.position_speed_m_s": -1} if is_vy else {})
+    expected = min(signs, default=1.0) * (left if is_vy else left / speed)
+    sides = (f"{subject} against ground-truth positions and heading", powers, expected, columns[subject])
+    # Velocity and position may be of two places of the car, which turn about one another.
+    apart = _partial(*sides, [turning, np.ones_like(turning)], moving, SAME_RANGE)
+    best = _best([*compare(*sides, moving, SAME_RANGE), *apart])
+    return [replace(r, signless=len(signs) < 2 or len(set(signs)) > 1) for r in best]
 
 
 def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
@@ -421,7 +412,7 @@ def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
 
 
 def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Relation]:
-    """Relate the ground-truth sideslip to a_y and curvature: by kinematics where it moves fast, by the rear axle else.
+    """Relate the ground-truth sideslip to a_y: by kinematics where it moves fast, by the rear axle else.
 
     a_y - v_x r is the derivative of v_y; the lever of an accelerometer, the roll of the body and a bias are next to
     it and go with the derivative of the yaw rate, with v_x r and with nothing. In gentle driving sideslip is the
@@ -446,11 +437,7 @@ def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Rel
     text = f"{subject} against -ay_m_s2, apart from curvature"
     gentle = gentle_at(vx * rate, moving)
     powers = {subject: 1, "ay_m_s2": -1} | ({"truth.vx_m_s": -1} if of_vx else {})
-    relations += _partial(text, powers, -ay, sideslip, [curvature, ones], gentle, COMPLIANCE_RAD_PER_M_S2)
-    text = f"{subject} against curvature, apart from a_y"
-    powers = {subject: 1, turning: -1} | ({} if of_vx else {"truth.vx_m_s": 1})
-    rolling = _partial(text, powers, curvature, sideslip, [ay, ones], gentle, REAR_LEVER_M, SEPARABLE)
-    return relations + [replace(r, typical=REAR_LEVER_TYPICAL_M) for r in rolling if abs(r.gain) > REAR_LEVER_M[0]]
+    return relations + _partial(text, powers, -ay, sideslip, [curvature, ones], gentle, COMPLIANCE_RAD_PER_M_S2)
 
 
 def _axle_sideslips(
@@ -487,7 +474,6 @@ def _partial(
     others: list[FloatArray],
     use: BoolArray,
     expected: tuple[float, float],
-    separable: float = 0.0,
 ) -> list[Relation]:  # positional: both sides of a relation and what is wanted of them
     """Return the relation between what regression on other columns leaves of two columns; none if that is little."""
     finite = use & np.isfinite(np.stack([reference, measured, *others])).all(axis=0)
@@ -499,8 +485,6 @@ def _partial(
         out = np.full(column.shape[0], np.nan)
         out[finite] = column[finite] - aside @ np.linalg.lstsq(aside, column[finite], rcond=None)[0]
         left.append(out)
-    if np.nanstd(left[0]) < separable * np.std(reference[finite]):
-        return []
     relations = compare(text, powers, left[0], left[1], finite, expected)
     # That so many blocks of the drive agree on the sign is no chance.
     is_steady = [len(r.blocks) > BLOCKS // 2 and len(set(np.sign(r.blocks))) == 1 for r in relations]

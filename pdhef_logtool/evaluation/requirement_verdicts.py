@@ -416,11 +416,9 @@ def _decisive(requirement: Requirement, bounded: Bounded, exposure: Exposure, wh
     if not math.isfinite(width) or (times := (width / distance) ** 2 if distance else math.inf) > _MOST_TIMES:
         far = "the value is close to the limit for the spread of the drives"
         return f"{far}: more than {_MOST_TIMES:g} times as much driving would be needed"
-    times = math.ceil(10.0 * times) / 10.0 if times < 10.0 else math.ceil(times)
-    more = f"about {times:g} times as much driving{where} would decide, if value and spread stay the same"
-    if exposure.minutes:
-        more += f" ({exposure.minutes * (times - 1.0):.2g} min more)"
-    return more
+    times = math.ceil(10.0 * times) / 10.0
+    minutes = f" ({exposure.minutes * (times - 1.0):.2g} min more)" if exposure.minutes else ""
+    return f"about {times:g} times as much driving{where} would decide, if value and spread stay the same{minutes}"
 
 
 def _notes(

@@ -13,13 +13,11 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.hypotheses import Relation, block_gains, known_hypotheses, posterior
-from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.mounting import scaled_source
 from pdhef_logtool.drive.windows import plan_drive
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map
 from pdhef_logtool.runs.inspection import inspect_drive_log
-from tests.drive.test_checks import drive
 
 NAMES = ["ay_m_s2", "yaw_rate_rad_s", "speed_m_s"]
 TURN = {"ay_m_s2": 1, "yaw_rate_rad_s": -1, "speed_m_s": -1}
@@ -61,17 +59,6 @@ def test_scales_of_right_mappings_are_those_of_units() -> None:
     assert all(p > 0.75 for p, _ in likeliest.values())
     counts = posterior([between], known_hypotheses(["speed_m_s"]), {"speed_m_s": 0.0123})
     assert counts == posterior([between], known_hypotheses(["speed_m_s"]))
-
-
-def test_a_model_car_has_no_steering_wheel() -> None:
-    signals = drive(3)
-    signals["steer_rad"] = replace(signals["steer_rad"], values=signals["steer_rad"].values * 16.0)
-    model = default_vehicle().model_copy(update={"cg_to_front_axle_m": 0.2, "cg_to_rear_axle_m": 0.13})
-    for vehicle, is_named in ((default_vehicle(), True), (model, False)):
-        words = {
-            h.words for p, h in measure(signals, vehicle=vehicle).posterior(mounting_is_known=True).of("steer_rad")
-        }
-        assert ("steer_rad is the steering-wheel angle" in words) is is_named
 
 
 def test_signals_without_a_relation_take_no_probability_from_a_mistake() -> None:

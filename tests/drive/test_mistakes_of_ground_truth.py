@@ -88,11 +88,22 @@ def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
     pose["x_m"] += antenna_m * np.cos(yaw)
     truth |= {n: replace(truth["vx_m_s"], name=n, source=f"/ins.{n}", values=v) for n, v in pose.items()}
     truth["vy_m_s"] = replace(truth["vy_m_s"], values=factor * vy)
+    truth["y_m"] = truth["y_m"].take(np.arange(vy.size) % 1000 != 500)  # a sample of one axis is missing
     derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
     checks = {c.name: c for c in check_drive(signals, truth, derived, vehicle) if c.subject == "truth.vy_m_s"}
     failed = [n for n, c in checks.items() if c.verdict == "failed"]
     assert failed == ([] if factor == 1.0 else ["truth.vy_m_s.sign" if factor < 0.0 else "truth.vy_m_s.unit"])
     assert factor == 1.0 or f"by {1.0 / factor:.6g}" in checks[failed[0]].remedy
+
+
+def test_exchanged_velocities_of_ground_truth_are_named() -> None:
+    signals, truth = with_truth(VEHICLE, 1.0)
+    ahead, across = truth["vx_m_s"], truth["vy_m_s"]
+    truth |= {"vx_m_s": replace(ahead, values=across.values), "vy_m_s": replace(across, values=ahead.values)}
+    found = check_drive(signals, truth, derive_truth(truth), VEHICLE)
+    named = {c.subject for c in found if c.name.endswith(".axis") and c.remedy.startswith("exchange the fields")}
+    assert named == {"truth.vx_m_s", "truth.vy_m_s"}
+    assert {c.subject for c in found if c.verdict == "failed"} <= {*named, "truth.sideslip_rad"}
 
 
 def test_an_impossible_yaw_rate_of_ground_truth_does_not_blame_the_gyro() -> None:
@@ -201,3 +212,17 @@ def test_a_wrong_scale_or_sign_of_a_position_is_named_and_the_position_not_used(
         assert named == pytest.approx(1.0 / factor, rel=0.05)
         assert factor > 0.0 or "truth.x_m or truth.y_m" in failed[expected]
         assert set(misread_channels(checks)) == {expected.rpartition(".")[0]}
+
+
+def test_exchanged_degrees_of_a_place_are_named_as_such() -> None:
+    signals, truth = with_truth(VEHICLE, 1.0)
+    yaw = np.cumsum(truth["yaw_rate_rad_s"].values) * 0.01
+    north, east = (np.cumsum(truth["vx_m_s"].values * way) * 0.01 / 111_320.0 for way in (np.sin(yaw), np.cos(yaw)))
+    degrees = {"lat_deg": east, "lon_deg": north}
+    truth |= {n: replace(truth["vx_m_s"], name=n, values=v) for n, v in degrees.items()}
+    mapping = Mapping({}, {n: SignalSource(n, "/fix", n) for n in degrees})
+    derived = derive_truth(truth)
+    measured = measure(signals, truth, derived, VEHICLE, mapping)
+    checks = check_drive(signals, truth, derived, VEHICLE, measured=measured)
+    (sign,) = (c for c in checks if c.subject == "truth.lat_deg" and c.verdict == "failed")
+    assert sign.name == "truth.lat_deg.sign" and "exchanged" in sign.remedy and "lon_deg" in sign.remedy

@@ -316,6 +316,21 @@ def test_a_steering_beside_pedals_is_a_share() -> None:
     assert any(note.startswith("/controls.steer is not used: it may be a share") for note in auto.mapping.notes)
 
 
+@pytest.mark.parametrize("share", [1.0, 3.0])
+def test_a_steering_without_a_unit_may_be_a_share(share: float) -> None:
+    auto = found(controls=topic(steer=STEER * share), imu__data=topic(**imu_fields()), **SPEED)
+    doubts = [c.evidence for c in auto.mapping.checks if c.name == "steer_rad.candidate"]
+    assert any("a share of the largest angle" in doubt for doubt in doubts) is (share > 1.0)
+
+
+def test_steering_and_yaw_rate_alone_may_both_be_mirrored() -> None:
+    bus = topic(steering_wheel_angle_deg=-STEER * 16.0 / DEG, yaw_rate_dps=-RATE / DEG)
+    told = {c.subject for c in found(bus=bus, **SPEED).mapping.checks if c.name == "mapping.names"}
+    assert told == {"steering_wheel_rad", "yaw_rate_rad_s"}
+    bus.fields |= {"lat_accel_mps2": AY}
+    assert "mapping.names" not in undecided(found(bus=bus, **SPEED))
+
+
 def test_a_velocity_in_the_axes_of_the_world_is_no_speed() -> None:
     course = np.cumsum(RATE) * 0.01 + 0.3
     world = {"velocity__linear__x": V * np.cos(course), "velocity__linear__y": V * np.sin(course)}

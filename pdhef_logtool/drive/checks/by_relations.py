@@ -72,7 +72,15 @@ def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Che
             evidence = f"{r.text}: one moves and the other does not with it, correlation {r.correlation:.2f}"
             checks.append(AXIS.failed(evidence, name, signal_name=name))
         checks += judged or ([] if unrelated else [_not_excited(name, mine)])
-    return tuple(checks)
+    # Of latitude and longitude the positions are made.
+    return tuple(map(_of_place, checks)) if "truth.lat_deg" in measured.scales else tuple(checks)
+
+
+def _of_place(check: Check) -> Check:
+    if check.subject != "truth.y_m":
+        return check
+    name, remedy = (t.replace("truth.y_m", "truth.lat_deg") for t in (check.name, check.remedy))
+    return replace(check, name=name, subject="truth.lat_deg", remedy=remedy.replace("truth.x_m", "truth.lon_deg"))
 
 
 def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measured: Measured) -> list[Check]:

@@ -75,10 +75,7 @@ def _level(name: str, rest: float, error: float, mean: float) -> Check:
     size = min(abs(rest), abs(mean))
     evidence = f"mean {mean:.2f} m/s^2, after removal of the driving {rest:.2f} +- {error:.2f}"
     if size > OTHER_AXIS_M_S2:
-        words, remedy = "that is gravity", "map a level axis of the sensor"
-        if size > IS_GRAVITY_M_S2[1]:
-            words, remedy = "gravity is less", f"look at the unit of {name}, or map another field"
-        return Check(f"{name}.axis", name, "failed", f"{evidence}: {words}", remedy)
+        return Check(f"{name}.axis", name, "failed", f"{evidence}: that is gravity", "map a level axis of the sensor")
     if is_beyond(size, error, (0.0, LEVEL_M_S2)):
         return LEVEL.failed(evidence, name, tilt=math.degrees(math.asin(size / GRAVITY_M_S2)))
     return LEVEL.passed(evidence, name) if size <= LEVEL_M_S2 else LEVEL.undecided(evidence, name)

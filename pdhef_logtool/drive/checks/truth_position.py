@@ -17,15 +17,17 @@ def _checks(drive: CheckedDrive) -> Iterator[Check]:
     for names, factor in zip(axes, position_factors(drive.measured.columns), strict=True):
         name = next((f"truth.{n}" for n in names if f"truth.{n}" in drive.measured.scales), f"truth.{names[0]}")
         evidence = f"the ground-truth velocity is {factor:.3g} times what its positions change by along this axis"
+        scale = drive.measured.scales.get(name)
+        line = f", scale = {scale * factor:.3g}" if isinstance(scale, float | int) else ""
         if not math.isnan(factor):
-            yield SCALE.judged(not is_misscaled(factor), evidence, name, factor=factor)
+            yield SCALE.judged(not is_misscaled(factor), evidence, name, factor=factor, line=line)
 
 
 SCALE = CheckKind(
     "SIGNAL.scale",
     compares="the speed of the ground-truth positions along each axis with the ground-truth velocity",
     fails="they are 1.7 times apart",
-    remedy="multiply its scale in the mapping by {factor:.3g}",
+    remedy="multiply its scale in the mapping by {factor:.3g}{line}",
     function=_checks,
 )
 CHECKS = (SCALE,)

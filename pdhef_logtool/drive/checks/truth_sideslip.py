@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from pdhef_logtool.drive.checks.kind import CheckedDrive, CheckKind
-from pdhef_logtool.drive.columns import fit, halves, moving_at
-from pdhef_logtool.drive.relations import gentle_at
+from pdhef_logtool.drive.columns import fit, halves, median_known, moving_at
+from pdhef_logtool.drive.relations import SAME_RANGE, gentle_at
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
@@ -34,8 +34,21 @@ def _checks(drive: CheckedDrive) -> list[Check]:
     typical = float(np.quantile(np.abs(sideslip[finite]), 1.0 - SIDEWAYS_SHARE))
     evidence = f"its size is above {math.degrees(typical):.1f} deg for {SIDEWAYS_SHARE:.0%} of the moving time"
     frame = FRAME.judged(typical <= SIDEWAYS_RAD, evidence)
+    if frame.verdict == "failed" and _is_speed(drive, vy):
+        remedy = "exchange the fields of v_x and v_y in the mapping"
+        names = ("truth.vx_m_s", "truth.vy_m_s")
+        return [Check(f"{n}.axis", n, "failed", f"{evidence}, and v_y is the speed", remedy) for n in names]
     offset = _offset_check(columns) if frame.verdict == "passed" else None
     return [frame] if offset is None else [frame, offset]
+
+
+def _is_speed(drive: CheckedDrive, column: FloatArray) -> bool:
+    """Return whether a column is the speed that the sensors show."""
+    if drive.speed is None or str(drive.measured.speed_name).startswith("truth."):
+        return False
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = median_known(np.where(moving_at(drive.speed), np.abs(column / drive.speed), np.nan))
+    return SAME_RANGE[0] < share < SAME_RANGE[1]
 
 
 def sideslip_offset(columns: Mapping[str, FloatArray]) -> tuple[float, float] | None:
