@@ -157,8 +157,8 @@ def _over_ground(channels: Mapping[str, Channel]) -> dict[str, Channel]:
     speed, course = (channels.get(n) for n in ("gnss_speed_m_s", "gnss_course_rad"))
     if speed is None or course is None or not np.array_equal(speed.stamps_ns, course.stamps_ns):
         return {}
-    sides = (np.cos(course.values), np.sin(course.values))
-    return {n: replace(speed, name=n, values=speed.values * s) for n, s in zip(_EAST_NORTH, sides, strict=True)}
+    sides = zip(_EAST_NORTH, (np.cos, np.sin), strict=True)
+    return {n: replace(speed, name=n, values=speed.values * side(course.values)) for n, side in sides}
 
 
 def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack) -> dict[str, Channel]:

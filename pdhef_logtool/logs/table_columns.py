@@ -222,9 +222,8 @@ def _clocks(sheet: Sheet, names: Mapping[str, str]) -> list[str]:
     clocks = [name for n, name in names.items() if _TIME.fullmatch(n)]
     clocks = [n for n in reversed(clocks) if _is_clock(sheet.columns[n])]
     ascending = [(n, name) for n, name in reversed(names.items()) if not clocks and _ascends(sheet.columns[name])]
-    clocks = clocks or sorted(
-        (name for n, name in ascending if _TIME_LIKE.search(n)), key=lambda n: not _dates(sheet, n)
-    )
+    like = [name for n, name in ascending if _TIME_LIKE.search(n)]
+    clocks = clocks or sorted(like, key=lambda n: not _dates(sheet, n))
     dates = [name for _, name in ascending if sheet.columns[name].dtype.kind == "M"]  # type: ignore[union-attr]
     return clocks or dates or [name for _, name in ascending if sheet.units.get(name, "").lower() in _FACTORS_NS]
 

@@ -243,11 +243,6 @@ def _signs_of(paths: Collection[str]) -> dict[str, str]:
     return {m: path for path in paths if (m := _SIGN.sub("", path)) != path and m in paths}
 
 
-def _with_sign(magnitude: Seen, sign: Seen) -> Seen:
-    values, cells = signed(magnitude.values, sign.values), signed(magnitude.cells, sign.cells)
-    return replace(magnitude, values=values, cells=cells)
-
-
 def look(
     log: DriveLog, named: Sequence[Named], vendors: Vendors, sources: Sequence[SignalSource]
 ) -> tuple[Pieces, list[Field]]:
@@ -270,7 +265,9 @@ def look(
     samples = pieces.read(requests)
     for (topic, path), sign in signs.items():
         if (topic, path) in samples:
-            samples[topic, path] = _with_sign(samples[topic, path], samples[topic, sign])
+            size, its = samples[topic, path], samples[topic, sign]
+            values, cells = signed(size.values, its.values), signed(size.cells, its.cells)
+            samples[topic, path] = replace(size, values=values, cells=cells)
     weighable = [item for entry in named for item in _weighable(log, entry, samples, vendors) if item.factors]
     for item in weighable:
         item.sign_path = signs.get((item.topic.name, item.path), "")

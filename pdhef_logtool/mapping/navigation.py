@@ -74,16 +74,11 @@ def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
     direction, seen = _course(places, samples, topic.name, pieces), samples.get((topic.name, course))
     # A course over ground counts clockwise from north by definition; the path shows that it is one, and its unit.
     clockwise = (c[1:] for c in _CONVENTIONS[:2] if unit is None or math.isclose(-c[1], unit))
-    convention = next(
-        (c for c in clockwise if seen is not None and direction is not None and _off(seen, direction, *c) < NEAR_RAD),
-        None,
-    )
-    if convention is None or scale is None:
+    if seen is None or direction is None or scale is None:
         return {}
-    return {
-        "gnss_speed_m_s": SignalSource("gnss_speed_m_s", topic.name, speed, stamp, scale),
-        "gnss_course_rad": SignalSource("gnss_course_rad", topic.name, course, stamp, *convention),
-    }
+    fitting = [c for c in clockwise if _off(seen, direction, *c) < NEAR_RAD]
+    sources = [SignalSource("gnss_course_rad", topic.name, course, stamp, *c) for c in fitting[:1]]
+    return {s.name: s for s in (*sources, SignalSource("gnss_speed_m_s", topic.name, speed, stamp, scale)) if sources}
 
 
 def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:

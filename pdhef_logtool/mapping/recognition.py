@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -51,6 +51,10 @@ FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove.LocationFix"})
 _IMU_PATHS = ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
 _GRAVITY_PATHS = (*_IMU_PATHS[:2], "linear_acceleration.z")
 _TILT_RATE_PATHS = ("angular_velocity.x", "angular_velocity.y")
+
+
+#: Sources by signal.
+_Sources: TypeAlias = dict[str, SignalSource]
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +127,7 @@ class _Draft:
 
     def take(
         self,
-        into: dict[str, SignalSource],
+        into: _Sources,
         name: str,
         topic: str,
         path: str | tuple[str, ...],
@@ -187,15 +191,8 @@ def auto_map(
     _map_navigation(draft, topics, vendors)
     _fall_back(draft, topics)
     _map_gnss(draft, topics)
-    mapping = Mapping(
-        signals=draft.signals,
-        truth=draft.truth,
-        quality=draft.quality,
-        origin="auto",
-        notes=tuple(draft.notes),
-        checks=weighed.checks,
-        open_signs=weighed.open_signs,
-    )
+    mapping = Mapping(draft.signals, draft.truth, draft.quality, "auto", tuple(draft.notes))
+    mapping = replace(mapping, checks=weighed.checks, open_signs=weighed.open_signs)
     candidates = weighed.candidates
     if decoded is not None:
         mapping = decoded.as_mapped(mapping)
@@ -249,11 +246,8 @@ def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
 
 def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Weighed:
     """Take candidates for what no well-known type gives."""
-    draft.notes += [
-        f"{t.name} ({t.type_name.replace('/msg/', '/')}) is left out: {reason}"
-        for t in topics
-        if (reason := vendors.of(t.type_name).left_out)
-    ]
+    unusable = ((t, vendors.of(t.type_name).left_out) for t in topics)
+    draft.notes += [f"{t.name} ({t.type_name.replace('/msg/', '/')}) is left out: {why}" for t, why in unusable if why]
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
     # A measured steering angle goes before a command, regardless of its type.
     command = draft.signals.pop("steer_rad", None) if any(n.startswith(FROM_COMMAND) for n in draft.notes) else None
@@ -355,11 +349,8 @@ def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
                 draft.take(draft.signals, name, topic.name, path)
             return
     for topic in topics:
-        if (
-            _role(topic) in ("navigation", "sensor")
-            and not _is_well_known(topic)
-            and (named := named_gnss(draft.log, topic))
-        ):
+        of_others = _is_well_known(topic) or _role(topic) not in ("navigation", "sensor")
+        if named := {} if of_others else named_gnss(draft.log, topic):
             draft.signals |= named
             return
 
@@ -506,13 +497,8 @@ def _probed_paths(topic: TopicInfo) -> list[str]:
     kind = _type(topic)
     paths: list[str] = []
     if kind in IMU_TYPES:
-        paths += [
-            *_IMU_PATHS,
-            *_TILT_RATE_PATHS,
-            _GRAVITY_PATHS[2],
-            "linear_acceleration_covariance[0]",
-            "angular_velocity_covariance[0]",
-        ]
+        paths += [*_IMU_PATHS, *_TILT_RATE_PATHS, _GRAVITY_PATHS[2]]
+        paths += [f"{name}_covariance[0]" for name in ("linear_acceleration", "angular_velocity")]
     if kind in TWIST_FIELDS:
         paths += [*(_twist(topic, "linear", axis) for axis in "xyz"), _twist(topic, "angular", "z")]
     if kind in _FIELDS["pose"]:
@@ -644,11 +630,9 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
 
 def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo | None:
     twists = [t for t in candidates if _type(t) in TWIST_FIELDS and _has_twist(draft, t)]
+    why = "topics named as ground truth first, then topics with a pose"
     chosen = draft.choose(
-        "ground-truth velocity",
-        twists,
-        lambda t: (not _words(t.name) & TRUTH_WORDS, not _has_pose(draft, t)),
-        "topics named as ground truth first, then topics with a pose",
+        "ground-truth velocity", twists, lambda t: (not _words(t.name) & TRUTH_WORDS, not _has_pose(draft, t)), why
     )
     if chosen is None:
         return None
@@ -763,11 +747,9 @@ def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: To
         chosen: TopicInfo | None = velocity
     else:
         positions = [t for t in candidates if _has_pose(draft, t) or _has_fix(draft, t)]
+        why = "topics named as ground truth first, then poses before satellite fixes"
         chosen = draft.choose(
-            "ground-truth position",
-            positions,
-            lambda t: (not _words(t.name) & TRUTH_WORDS, _type(t) in FIX_TYPES),
-            "topics named as ground truth first, then poses before satellite fixes",
+            "ground-truth position", positions, lambda t: (not _words(t.name) & TRUTH_WORDS, _type(t) in FIX_TYPES), why
         )
     if chosen is None:
         return
