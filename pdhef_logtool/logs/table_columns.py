@@ -221,7 +221,7 @@ def _clocks(sheet: Sheet, names: Mapping[str, str]) -> list[str]:
     """Return the columns with times, the best first; ``names`` are all columns by their names in lower case."""
     clocks = [name for n, name in names.items() if _TIME.fullmatch(n)]
     clocks = [n for n in reversed(clocks) if _is_clock(sheet.columns[n])]
-    ascending = [(n, name) for n, name in reversed(names.items()) if not clocks and _ascends(sheet.columns[name])]
+    ascending = [(n, name) for n, name in reversed([*names.items()]) if not clocks and _ascends(sheet.columns[name])]
     like = [name for n, name in ascending if _TIME_LIKE.search(n)]
     clocks = clocks or sorted(like, key=lambda n: not _dates(sheet, n))
     dates = [name for _, name in ascending if sheet.columns[name].dtype.kind == "M"]  # type: ignore[union-attr]

@@ -263,11 +263,11 @@ def look(
             requests.setdefault(source.topic, []).extend(source.paths)
     pieces = Pieces(log)
     samples = pieces.read(requests)
-    for (topic, path), sign in signs.items():
-        if (topic, path) in samples:
-            size, its = samples[topic, path], samples[topic, sign]
+    for key, sign in signs.items():
+        if key in samples:
+            size, its = samples[key], samples[key[0], sign]
             values, cells = signed(size.values, its.values), signed(size.cells, its.cells)
-            samples[topic, path] = replace(size, values=values, cells=cells)
+            samples[key] = replace(size, values=values, cells=cells)
     weighable = [item for entry in named for item in _weighable(log, entry, samples, vendors) if item.factors]
     for item in weighable:
         item.sign_path = signs.get((item.topic.name, item.path), "")
@@ -319,7 +319,7 @@ def _may_be_share(item: Field) -> bool:
 
 
 def _has_pedals_beside(item: Field, fields: tuple[FieldInfo, ...]) -> bool:
-    """Return whether pedals are in the same struct, of which it is a control like them."""
+    """Return whether pedals are in the same struct: it is a control as they are."""
     places = (f.path.rpartition(".") for f in fields)
     return any(struct == item.path.rpartition(".")[0] and _PEDALS & set(words_of(leaf)) for struct, _, leaf in places)
 

@@ -523,7 +523,7 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
         draft.notes.append(f"{imu.name} provides no acceleration (covariance -1)")
     else:
         means = [_mean(draft.values(imu.name, path)) for path in _GRAVITY_PATHS]
-        in_g = abs(abs(means[2]) - 1.0) < NEAR_1_G and np.hypot(*means[:2]) < 0.5 * abs(means[2])
+        in_g = abs(abs(means[2]) - 1.0) < NEAR_1_G and np.hypot(means[0], means[1]) < 0.5 * abs(means[2])
         if in_g:
             fast = np.abs(draft.values(imu.name, "angular_velocity.z"))
             in_deg = bool(np.isfinite(fast).any()) and float(np.nanquantile(fast, 0.995)) > MOST["rate"]
