@@ -12,11 +12,13 @@ from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS
 
 #: Above what a road car, a race car or a model car reaches for longer than a second: model cars spin at 5 rad/s and
-#: corner at 15 m/s²; a wheel of 5 cm at 30 m/s turns with 600 rad/s; trucks have five turns of the steering wheel.
+#: corner at 15 m/s²; a body that keeps rolling at 4 rad/s overturns; a wheel of 5 cm at 30 m/s turns with 600 rad/s;
+#: trucks have five turns of the steering wheel.
 MOST = {
     "ax_m_s2": 30.0,
     "ay_m_s2": 30.0,
     "yaw_rate_rad_s": 10.0,
+    **dict.fromkeys(("roll_rate_rad_s", "pitch_rate_rad_s"), 4.0),
     "steer_rad": 1.3,
     "steering_wheel_rad": 20.0,
     "speed_m_s": 120.0,
