@@ -223,7 +223,7 @@ def test_a_sound_road_passes_everything(road: MappedChannels, saloon: VehiclePar
     assert {c.verdict for c in checks if c.subject not in alone and c.name not in place} == {"passed"}
     assert {c.verdict for c in checks if c.subject in alone} == {"undecided"}
     subjects = {c.subject for c in checks}
-    truth = {"truth.vx_m_s", "truth.vy_m_s", "truth.yaw_rate_rad_s", "truth.sideslip_rad"}
+    truth = {f"truth.{n}" for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "x_m", "y_m")}
     assert subjects == set(road.signals) | truth | {"vehicle"}
 
 
