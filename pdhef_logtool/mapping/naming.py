@@ -150,8 +150,8 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
     if not leaf_words or _WORDS["other_devices"] & set(outer):
         return None
     # A current before other words is the present one, a state before them the topic of an export.
-    words = {w for w in leaf_words[:-1] if w not in ("current", "state", "states", "status")} | {*leaf_words[-1:]}
-    if _WORDS["not_values"] & words or _WORDS["not_values"] & set(inner) - {"state", "status", "orientation"}:
+    kept = {w for w in leaf_words[:-1] if w not in ("current", "state", "states", "status")} | {*leaf_words[-1:]}
+    if _WORDS["not_values"] & kept or _WORDS["not_values"] & set(inner) - {"state", "status", "orientation"}:
         return None
     index = re.search(r"\[(\d+)\]$", leaf)
     column = None if index is None else int(index[1])
