@@ -64,7 +64,7 @@ causal estimates.
 
 {plus_cars} simulated cars of all kinds, seed {plus_seed}, with wrong vehicle files (stiffness, inertia, roll gradient,
 IMU position) on five manoeuvres; command: `python -m studies.plus_minus`. A row shows how many true values are within
-1.96 standard deviations. Model errors were chosen on 44 other cars. The rotation of an IMU and the bank of a road have
+1.96 standard deviations. Model errors were chosen on 74 other cars. The rotation of an IMU and the bank of a road have
 no printed ±.
 
 <!-- begin plus-minus -->
