@@ -187,6 +187,8 @@ def auto_map(
     _map_wheel_speeds(draft, topics)
     _map_truth(draft, topics, prefer_truth)
     _map_documented_truth(draft, topics, vendors)
+    unusable = ((t, vendors.of(t.type_name).left_out) for t in topics)
+    draft.notes += [f"{t.name} ({t.type_name.replace('/msg/', '/')}) is left out: {why}" for t, why in unusable if why]
     weighed = _weigh_the_rest(draft, topics, vendors)
     _map_navigation(draft, topics, vendors)
     _fall_back(draft, topics)
@@ -246,8 +248,6 @@ def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
 
 def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Weighed:
     """Take candidates for what no well-known type gives."""
-    unusable = ((t, vendors.of(t.type_name).left_out) for t in topics)
-    draft.notes += [f"{t.name} ({t.type_name.replace('/msg/', '/')}) is left out: {why}" for t, why in unusable if why]
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
     # A measured steering angle goes before a command, regardless of its type.
     command = draft.signals.pop("steer_rad", None) if any(n.startswith(FROM_COMMAND) for n in draft.notes) else None
