@@ -157,7 +157,7 @@ def widened(
     covariance = track.covariance
     if covariance.shape[0]:
         variance = covariance[:, 1, 1]
-        own = np.full(len(track), 1.0 - own_share**2)
-        more = np.divide((added * speed) ** 2, variance, out=own, where=variance > 0.0)
+        rest = np.full(len(track), 1.0 - own_share**2)
+        more = np.divide((added * speed) ** 2, variance, out=rest, where=variance > 0.0)
         covariance = scaled_covariance(covariance, np.sqrt(own_share**2 + more))
     return replace(track, sideslip_std_rad=std, covariance=covariance)
