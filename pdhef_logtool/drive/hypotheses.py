@@ -48,8 +48,8 @@ PRIORS |= {"odd scale": math.log(10.0)}
 #: angle counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
 _OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 _SELDOM, _SELDOM_STEP = 1.0, 0.3
-#: Likeliest mistakes that are combined with another one; blocks of a drive whose gains are compared.
-BEAM, BLOCKS = 12, 8
+#: Blocks of a drive whose gains are compared.
+BLOCKS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,12 +218,7 @@ def posterior(
 
     none, every = len(useful), np.arange(len(useful) + 1)
     alone = energies(every, np.full_like(every, none))
-    compatible, pairs = _compatible(useful), [np.empty((0, 2), dtype=np.int64)]
-    for i in np.argsort(alone[:none], kind="stable")[:BEAM]:
-        others = np.flatnonzero(compatible[i])
-        compatible[:, i] = False
-        pairs.append(np.stack([np.minimum(others, i), np.maximum(others, i)], axis=1))
-    paired = np.concatenate(pairs)
+    paired = np.argwhere(np.triu(_compatible(useful)))
     scored = np.concatenate([alone, energies(*paired.T)])
     least = float(scored.min())
     weights = {

@@ -21,7 +21,7 @@ from pdhef_logtool.drive.relations import (
 )
 from pdhef_logtool.drive.truth import TruthTrack, channel_of
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
-from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
+from pdhef_logtool.records.signals import GNSS, WHEELS, Channel, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Name of the column that is the mean of the wheel speeds.
@@ -86,7 +86,7 @@ class Measured:
         columns = self.columns
         topics: dict[str, list[str]] = {}
         for name, topic in () if mounting_is_known else self.topics.items():
-            if name in columns and not name.startswith("wheel_speed_"):
+            if name in columns and not name.startswith(("wheel_speed_", GNSS)):
                 topics.setdefault(topic, []).append(name)
         wheels = [n for n in columns if n.startswith("wheel_speed")]
         truth = [

@@ -13,6 +13,7 @@ from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.evidence import Pieces, fit, ratio
 from pdhef_logtool.mapping.fields import CLEAR, Fields
 from pdhef_logtool.mapping.naming import is_command, words_of
+from pdhef_logtool.mapping.navigation import side_of
 from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.signals import FloatArray
@@ -71,9 +72,12 @@ def speed_over_ground(
 
 
 def _vectors(log: DriveLog, topic: TopicInfo, base: str) -> Iterator[SignalSource]:
-    """Yield the x and y of the velocities of a topic."""
+    """Yield the x and y of the velocities of a topic, or their names' north and east."""
     fields = log.fields(topic.name, quiet=True)
-    bases = [base] if base else []
+    bases, stamp = [base] if base else [], stamp_path_of(fields)
+    sides = {side_of(*i.path.rpartition(".")[::2]): i.path for i in fields if i.kind == "number" and not base}
+    if {"n", "e"} <= sides.keys():
+        yield SignalSource("speed_m_s", topic.name, (sides["n"], sides["e"]), stamp, (1.0, 1.0), combine="norm")
     for info in () if base else fields:
         struct, _, leaf = info.path.rpartition(".")
         said = {*words_of(struct), *words_of(topic.name)}
@@ -82,7 +86,7 @@ def _vectors(log: DriveLog, topic: TopicInfo, base: str) -> Iterator[SignalSourc
     for struct in bases:
         paths = (f"{struct}.x", f"{struct}.y") if struct else ("x", "y")
         if all(has_path(fields, p) for p in paths) and not is_command(topic.name, struct):
-            yield SignalSource("speed_m_s", topic.name, paths, stamp_path_of(fields), (1.0, 1.0), combine="norm")
+            yield SignalSource("speed_m_s", topic.name, paths, stamp, (1.0, 1.0), combine="norm")
 
 
 def _evidence(pieces: Pieces, speed: FloatArray, path: FloatArray | None, ax: FloatArray | None) -> str:

@@ -114,7 +114,7 @@ def _enu_velocities(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str)
     structs: dict[str, dict[str, str]] = {}
     for info in fields:
         prefix, _, leaf = info.path.rpartition(".")
-        if info.kind == "number" and "ecef" not in info.path.lower() and (side := _side_of(prefix, leaf)):
+        if info.kind == "number" and "ecef" not in info.path.lower() and (side := side_of(prefix, leaf)):
             structs.setdefault(prefix, {}).setdefault(side, info.path)
     for paths_of in structs.values():
         vertical = next((s for s in "ud" if s in paths_of), "")
@@ -126,7 +126,7 @@ def _enu_velocities(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str)
             return
 
 
-def _side_of(struct: str, leaf: str) -> str:
+def side_of(struct: str, leaf: str) -> str:
     """Return the direction (n, e, u, d) of a field's velocity; empty where its name is none of one."""
     words = words_of(leaf)
     short = "".join(words)

@@ -19,7 +19,7 @@ from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, length_of, speed_
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command
-from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth
+from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth, side_of
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighed, weigh
@@ -404,6 +404,9 @@ def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
         speed = speed_over_ground(draft.log, vectors, draft.signals, draft.truth)
         if speed is not None:
             draft.signals["speed_m_s"], evidence = speed
+            if [side_of(*path.rpartition(".")[::2]) for path in speed[0].paths] == ["n", "e"]:
+                for name, path in zip(("north", "east"), speed[0].paths, strict=True):
+                    draft.take(draft.signals, f"gnss_velocity_{name}_m_s", speed[0].topic, path)
             draft.notes.append(f"speed_m_s comes from {speed[0].topic}, {evidence}: it is {NEVER_NEGATIVE}")
             draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
 

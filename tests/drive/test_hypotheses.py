@@ -48,6 +48,21 @@ def test_a_unit_is_wrong_in_every_block_and_a_slide_in_some() -> None:
     assert max(probabilities(sound, relation(1.0, 0.6, 0.35, 0.2)).values()) < 0.05
 
 
+def test_two_mistakes_are_found_that_are_worse_than_none_alone() -> None:
+    """All that turns counts to the right, and only the path over ground shows it: IMU and steering are two mistakes."""
+    steady, steer = (1.0, 1.1, 0.9, 1.0), {"steer_rad": 1}
+    relations = [
+        relation(*steady),
+        relation(*steady, powers=steer | {"yaw_rate_rad_s": -1}, text="steering"),
+        relation(*steady, powers=steer | {"ay_m_s2": -1}, text="steering and a_y"),
+        relation(*(-g for g in steady), powers={"yaw_rate_rad_s": 1}, text="path"),
+    ]
+    imu = ("ay_m_s2", "yaw_rate_rad_s")
+    found = posterior(relations, known_hypotheses([*NAMES, "steer_rad"], [imu], [("steer_rad",)]))
+    probability, chosen = found.sets[0]
+    assert probability > 0.97 and {n for h in chosen for n in h.factors} == {*imu, "steer_rad"}
+
+
 def test_scales_of_right_mappings_are_those_of_units() -> None:
     """What a gain leaves open between km/h and mph, a scale that would be no unit's decides; sums of both do not."""
     between = relation(2.8, 2.9, 2.85, powers={"speed_m_s": 1}, text="another speed")

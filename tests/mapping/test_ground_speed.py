@@ -52,6 +52,15 @@ def test_a_velocity_east_and_north_gives_the_speed(witness: dict[str, FakeTopic]
     assert not auto.ambiguities
 
 
+@pytest.mark.parametrize("names", [("VelN", "VelE"), ("v_n", "v_e"), ("north_speed", "east_speed")])
+def test_north_and_east_in_a_table_of_everything_are_speed_and_receiver(names: tuple[str, str]) -> None:
+    table = {"AccX": IMU["linear_acceleration.x"], "AccY": IMU["linear_acceleration.y"], "GyroZ": RATE}
+    table |= dict(zip(names, (NORTH, EAST), strict=True))
+    signals = auto_map(FakeLog({"csv": FakeTopic("table", T, table)})).mapping.signals
+    assert signals["speed_m_s"].paths == names
+    assert signals["gnss_velocity_north_m_s"].paths + signals["gnss_velocity_east_m_s"].paths == names
+
+
 def test_a_velocity_in_another_unit_is_not_taken() -> None:
     auto = found(vel=twist(3.6), fix=topic("sensor_msgs/msg/NavSatFix", FIX))
     assert "speed_m_s" not in auto.mapping.signals
