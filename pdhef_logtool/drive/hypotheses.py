@@ -16,7 +16,7 @@ from itertools import combinations
 import numpy as np
 
 from pdhef_logtool.mapping.naming import G_M_S2
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray
 
 DEGREE = float(np.pi / 180.0)
 #: Below this correlation a gain gives no information, and above it, it is between the two regressions. It must be so
@@ -212,19 +212,13 @@ def posterior(
         table = relation.energies(np.outer(single, single).ravel()).reshape(len(single), len(single))
         looked_up.append((table, index))
 
-    def energies(first: IntArray, second: IntArray) -> FloatArray:
-        of_relations = sum(table[i[first], i[second]] for table, i in looked_up)
-        return np.asarray(priors[first] + priors[second] + of_relations)
-
-    none, every = len(useful), np.arange(len(useful) + 1)
-    alone = energies(every, np.full_like(every, none))
-    paired = np.argwhere(np.triu(_compatible(useful)))
-    scored = np.concatenate([alone, energies(*paired.T)])
-    least = float(scored.min())
-    weights = {
-        () if k == none else (k,) if k < none else tuple(paired[k - none - 1].tolist()): math.exp(least - scored[k])
-        for k in np.flatnonzero(scored < least + 25.0).tolist()
-    }
+    none = len(useful)
+    sets = np.concatenate([[(k, none) for k in range(none + 1)], np.argwhere(np.triu(_compatible(useful)))])
+    first, second = sets.T
+    energy = priors[first] + priors[second] + sum(table[index[first], index[second]] for table, index in looked_up)
+    least = float(energy.min())
+    likely = np.flatnonzero(energy < least + 25.0)  # the others have less than 1e-10 of the likeliest's probability
+    weights = {tuple(k for k in sets[i].tolist() if k != none): math.exp(least - energy[i]) for i in likely}
     total = sum(weights.values())
     ordered = sorted(weights.items(), key=lambda x: (-x[1], x[0]))
     return Posterior(tuple((w / total, tuple(useful[i] for i in k)) for k, w in ordered))

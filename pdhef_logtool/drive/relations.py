@@ -363,10 +363,8 @@ def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
     that drives along one axis shows only its scale.
     """
     vx = columns.get("truth.vx_m_s")
-    if vx is None or POSITION_VX not in columns:
-        return math.nan, math.nan
-    result = fit(vx**2, [columns[n] ** 2 for n in (POSITION_VX, POSITION_VY)], moving_at(vx))
-    if result is None:
+    squares = [columns[n] ** 2 for n in (POSITION_VX, POSITION_VY) if n in columns]
+    if vx is None or not squares or (result := fit(vx**2, squares, moving_at(vx))) is None:
         return math.nan, math.nan
     x, y = (math.sqrt(s) if s > 4.0 * e else math.nan for s, e in zip(*result[:2], strict=True))
     return x, y

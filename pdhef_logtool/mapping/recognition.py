@@ -397,18 +397,25 @@ def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
         return
     _speed_of_navigation(draft, topics)
     if "speed_m_s" not in draft.signals:
-        unsaid = (t for t in twists if not _words(t.name) & _TOPICS["vehicle"])
-        other = (t for t in topics if _role(t) in ("sensor", "navigation") and not _is_well_known(t))
-        vectors = [(t, TWIST_FIELDS[_type(t)].format("linear")) for t in unsaid]
-        vectors += ((t, "") for t in other if not _type(t).startswith(NO_SENSORS))
-        speed = speed_over_ground(draft.log, vectors, draft.signals, draft.truth)
-        if speed is not None:
-            draft.signals["speed_m_s"], evidence = speed
-            if [side_of(*path.rpartition(".")[::2]) for path in speed[0].paths] == ["n", "e"]:
-                for name, path in zip(("north", "east"), speed[0].paths, strict=True):
-                    draft.take(draft.signals, f"gnss_velocity_{name}_m_s", speed[0].topic, path)
-            draft.notes.append(f"speed_m_s comes from {speed[0].topic}, {evidence}: it is {NEVER_NEGATIVE}")
-            draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
+        _speed_over_ground(draft, topics, twists)
+
+
+def _speed_over_ground(draft: _Draft, topics: list[TopicInfo], twists: list[TopicInfo]) -> None:
+    """Take the speed as the length of a velocity; by north and east it is a receiver's, which is a signal too."""
+    unsaid = (t for t in twists if not _words(t.name) & _TOPICS["vehicle"])
+    other = (t for t in topics if _role(t) in ("sensor", "navigation") and not _is_well_known(t))
+    vectors = [(t, TWIST_FIELDS[_type(t)].format("linear")) for t in unsaid]
+    vectors += ((t, "") for t in other if not _type(t).startswith(NO_SENSORS))
+    speed = speed_over_ground(draft.log, vectors, draft.signals, draft.truth)
+    if speed is None:
+        return
+    source, evidence = speed
+    draft.signals["speed_m_s"] = source
+    if [side_of(*path.rpartition(".")[::2]) for path in source.paths] == ["n", "e"]:
+        for name, path in zip(("north", "east"), source.paths, strict=True):
+            draft.take(draft.signals, f"gnss_velocity_{name}_m_s", source.topic, path)
+    draft.notes.append(f"speed_m_s comes from {source.topic}, {evidence}: it is {NEVER_NEGATIVE}")
+    draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
 
 
 def _speed_of_navigation(draft: _Draft, topics: list[TopicInfo]) -> None:
