@@ -295,7 +295,7 @@ def units_of(name: str) -> list[tuple[float, str]]:
     to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
     of_speeds = [(1.0 / 3.6, "is in km/h"), (3.6, "was converted from km/h twice")]
     of_speeds += [(0.44704, "is in mph"), (1.0 / 0.44704, "was converted from mph twice")]
-    if name in ("yaw_rate_rad_s", "roll_rate_rad_s", "pitch_rate_rad_s", "sideslip_rad"):
+    if name in ("yaw_rate_rad_s", "roll_rate_rad_s", "pitch_rate_rad_s", "sideslip_rad", "yaw_rad"):
         return to_radians
     if name == "steer_rad":
         return [*to_radians, (1.0 / TYPICAL_STEERING_RATIO, "is the steering-wheel angle")]

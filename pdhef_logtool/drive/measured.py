@@ -14,8 +14,8 @@ from pdhef_logtool.drive.relations import (
     CG_VY,
     COURSE_RATE,
     GNSS_COURSE_RATE,
-    POSITION_VX,
-    POSITION_VY,
+    POSITION,
+    TURNING,
     direction_rate,
     measured_relations,
 )
@@ -116,16 +116,13 @@ def measure(
     """
     columns, speed_name = drive_columns(signals, truth or {}, derived)
     topics = {n: c.source.split(".")[0] for n, c in signals.items()}
-    scales: dict[str, float | tuple[float, ...]] = {}
-    if mapping is not None:
-        scales |= {n: s.scale for n, s in mapping.signals.items()}
-        scales |= {f"truth.{n}": s.scale for n, s in mapping.truth.items()}
-    sources = {} if mapping is None else {f"truth.{n}": (s.topic, s.paths) for n, s in mapping.truth.items()}
+    of_truth = {} if mapping is None else {f"truth.{n}": s for n, s in mapping.truth.items()}
+    sources = {**({} if mapping is None else mapping.signals), **of_truth}
     related = measured_relations(columns, speed_name, _known(vehicle))
     # Two quantities of ground truth that are read from one field agree by themselves.
-    read = [[sources[n] for n in r.powers if n in sources] for r in related]
+    read = [[(of_truth[n].topic, of_truth[n].paths) for n in r.powers if n in of_truth] for r in related]
     related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
-    return Measured(columns, speed_name, tuple(related), topics, scales)
+    return Measured(columns, speed_name, tuple(related), topics, {n: s.scale for n, s in sources.items()})
 
 
 def drive_columns(
@@ -141,13 +138,17 @@ def drive_columns(
             channels[CG_VY] = channels["truth.vy_m_s"]
         channels |= {f"truth.{n}": truth[n] for n in ("vy_m_s", "sideslip_rad", "ay_m_s2") if n in truth}
         channels |= _pose_velocity(truth, derived.track)
+        if "yaw_rad" in truth:
+            heading = truth["yaw_rad"].take(np.isfinite(truth["yaw_rad"].values))
+            channels[TURNING] = replace(heading, values=np.unwrap(heading.values))
     channels |= _over_ground(channels)
     columns = columns_on_grid(channels)
+    columns |= {n: derivative(c) for n, c in columns.items() if n == TURNING}
     if set(_EAST_NORTH) <= set(columns):
         columns[GNSS_COURSE_RATE] = direction_rate(*(columns[n] for n in _EAST_NORTH))
     if "truth.x_m" in columns and "truth.y_m" in columns:
         vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))
-        columns |= {POSITION_VX: vx, POSITION_VY: vy, "truth.position_speed_m_s": np.hypot(vx, vy)}
+        columns |= {POSITION[0]: vx, POSITION[1]: vy, "truth.position_speed_m_s": np.hypot(vx, vy)}
         columns[COURSE_RATE] = direction_rate(vx, vy)
     return columns, _speed_of(columns)
 

@@ -434,11 +434,8 @@ class Survey:
         passed = {c.name for c in drive_checks if c.verdict == "passed"} - {
             f"{c.subject}.sign" for c in drive_checks if c.verdict != "passed"
         }
-        doubted = {
-            c.name.removesuffix(".candidate")
-            for c in self.mapping.checks
-            if "unit" in c.evidence or "share" in c.evidence
-        }
+        doubts = [c for c in self.mapping.checks if "unit" in c.evidence or "share" in c.evidence]
+        doubted = {c.name.removesuffix(".candidate") for c in doubts}
         for check in self.mapping.checks:
             signal = check.name.removesuffix(".candidate")
             if check.name == "imu.mounting" and self.mounting is not None and self.mounting.confident:

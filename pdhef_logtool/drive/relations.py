@@ -20,10 +20,12 @@ MIN_PARTIAL_CORRELATION = 0.8
 CG_VY = "truth.vy_m_s at the CG"
 #: Column of the turning of the ground-truth path, under the name of the position whose sign it has.
 COURSE_RATE = "truth.y_m"
+#: Column of the turning of the mapped ground-truth heading, under its name.
+TURNING = "truth.yaw_rad"
 #: Column of the turning of a receiver's velocity over ground.
 GNSS_COURSE_RATE = "gnss_course_rate_rad_s"
 #: Columns of the velocity along the axes of the ground-truth positions.
-POSITION_VX, POSITION_VY = "truth.position_vx_m_s", "truth.position_vy_m_s"
+POSITION = "truth.position_vx_m_s", "truth.position_vy_m_s"
 #: One of two sides that moves by more must move the other. Crossfall and grade alone move an accelerometer by less (5 %
 #: are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
 MOVES_M_S2 = 1.0
@@ -84,10 +86,11 @@ def measured_relations(
         relations += _wheel_differences(columns, speed_name, speed)
         relations += _courses(columns, speed)
     relations += _poses(columns)
-    twice = (("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S), ("ay_m_s2", GAIN_RANGE, MOVES_M_S2))
-    for name, expected, moves in twice:
-        other, text = f"truth.{name}", f"truth.{name} against {name}"
+    rate = ("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S)
+    twice = (("truth.yaw_rate_rad_s", *rate), (TURNING, *rate), ("truth.ay_m_s2", "ay_m_s2", GAIN_RANGE, MOVES_M_S2))
+    for other, name, expected, moves in twice:
         if name in columns and other in columns:
+            text = f"{other} against {name}"
             sides, everywhere = (columns[name], columns[other]), np.ones(columns[name].shape[0], np.bool_)
             relations += compare(text, {other: 1, name: -1}, *sides, everywhere, expected, moves=moves)
     bends = {"ay_m_s2", "yaw_rate_rad_s"}
@@ -363,7 +366,7 @@ def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
     that drives along one axis shows only its scale.
     """
     vx = columns.get("truth.vx_m_s")
-    squares = [columns[n] ** 2 for n in (POSITION_VX, POSITION_VY) if n in columns]
+    squares = [columns[n] ** 2 for n in POSITION if n in columns]
     if vx is None or not squares or (result := fit(vx**2, squares, moving_at(vx))) is None:
         return math.nan, math.nan
     x, y = (math.sqrt(s) if s > 4.0 * e else math.nan for s, e in zip(*result[:2], strict=True))

@@ -226,3 +226,15 @@ def test_exchanged_degrees_of_a_place_are_named_as_such() -> None:
     checks = check_drive(signals, truth, derived, VEHICLE, measured=measured)
     (sign,) = (c for c in checks if c.subject == "truth.lat_deg" and c.verdict == "failed")
     assert sign.name == "truth.lat_deg.sign" and "exchanged" in sign.remedy and "lon_deg" in sign.remedy
+
+
+@pytest.mark.parametrize("factor", [1.0, np.pi / 180.0, 180.0 / np.pi, -1.0])
+def test_a_heading_turns_as_the_gyro_does(factor: float) -> None:
+    signals, truth = with_truth(VEHICLE, 1.0)
+    yaw = 1.0 + np.cumsum(truth["yaw_rate_rad_s"].values) * 0.01
+    truth["yaw_rad"] = replace(truth["vx_m_s"], name="yaw_rad", values=factor * np.angle(np.exp(1j * yaw)))
+    checks = check_drive(signals, truth, derive_truth(truth), VEHICLE)
+    failed = {c.name: c.remedy for c in checks if c.verdict == "failed" and c.subject == "truth.yaw_rad"}
+    kind = {1.0: [], -1.0: ["truth.yaw_rad.sign"]}.get(factor, ["truth.yaw_rad.unit"])
+    assert list(failed) == kind
+    assert all(f"by {1.0 / factor:.6g}" in remedy for remedy in failed.values())

@@ -121,7 +121,8 @@ def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float]) ->
     return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
 
 
-_JUDGED_TRUTH = (*(f"truth.{n}" for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2", "y_m")),)
+_JUDGED = "vx_m_s vy_m_s yaw_rate_rad_s yaw_rad sideslip_rad ay_m_s2 y_m"
+_JUDGED_TRUTH = (*(f"truth.{n}" for n in _JUDGED.split()),)
 
 
 def _is_cleared(name: str, unrelated: Relation, relations: Sequence[Relation]) -> bool:
