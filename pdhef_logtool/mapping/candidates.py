@@ -202,23 +202,21 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
             joints = () if role == "command" else joint_meanings(log, topic)
             results += [(topic, role, FieldInfo(path, "number"), meaning, False) for path, meaning in joints]
             continue
-        documented_fields = vendors.of(topic.type_name).fields
-        signs = _signs_of({f.path for f in fields})
-        no_values = {*signs.values(), *(signs if topic.encoding == "can" else ())}
-        for info in fields:
+        documented = vendors.of(topic.type_name)
+        there = {f.path for f in fields}
+        no_values = _no_values(topic, fields)
+        for info in (f for f in fields if f.path not in no_values):
             if info.kind != "number" or info.path.count("[]") > info.path.endswith("[]") or _is_setpoint(topic, info):
                 continue
-            if info.path in no_values:
-                continue
-            if info.path in documented_fields:
-                results.append((topic, role, info, documented_fields[info.path].meaning, True))
-            elif not documented_fields or info.path.count(".") or bool(vendors.of(topic.type_name).has):
-                meaning = _meaning_by_names(topic, info, {f.path for f in fields})
+            if info.path in documented.fields:
+                results.append((topic, role, info, documented.fields[info.path].meaning, True))
+            elif not documented.fields or info.path.count(".") or documented.has:
+                meaning = _meaning_by_names(topic, info, there)
                 results += [] if meaning is None else [(topic, role, info, meaning, False)]
     return results
 
 
-def _meaning_by_names(topic: TopicInfo, info: FieldInfo, there: Collection[str]) -> Meaning | None:
+def _meaning_by_names(topic: TopicInfo, info: FieldInfo, there: set[str]) -> Meaning | None:
     """Return what names give, short ones beside others: g_x beside a_x is a gyro, r beside v_x and v_y a yaw rate.
 
     The third element shows whether an array without a length has axes.
@@ -226,7 +224,7 @@ def _meaning_by_names(topic: TopicInfo, info: FieldInfo, there: Collection[str])
     path = info.path
     if (gyro := re.fullmatch(r"(.*(?:^|[._]))g([xyz])", path)) and f"{gyro[1]}a{gyro[2]}" in there:
         path = f"{gyro[1]}gyro_{gyro[2]}"
-    if (rate := re.fullmatch(r"((?:.*\.)?)r", path)) and {f"{rate[1]}vx", f"{rate[1]}vy"} <= set(there):
+    if (rate := re.fullmatch(r"((?:.*\.)?)r", path)) and {f"{rate[1]}vx", f"{rate[1]}vy"} <= there:
         path = f"{rate[1]}yaw_rate"
     paths = dict.fromkeys((path, path.replace("[]", "[2]")))
     meanings = (meaning_of(topic.name, topic.type_name, path, info.unit) for path in paths)
@@ -243,6 +241,12 @@ def _signs_of(paths: Collection[str]) -> dict[str, str]:
     return {m: path for path in paths if (m := _SIGN.sub("", path)) != path and m in paths}
 
 
+def _no_values(topic: TopicInfo, fields: Sequence[FieldInfo]) -> set[str]:
+    """Return the paths of signs, and of magnitudes whose sign cannot be read: a text, or a signal of a bus."""
+    signs, texts = _signs_of({f.path for f in fields}), {f.path for f in fields if f.kind == "string"}
+    return {*signs.values(), *(m for m, sign in signs.items() if topic.encoding == "can" or sign in texts)}
+
+
 def look(
     log: DriveLog, named: Sequence[Named], vendors: Vendors, sources: Sequence[SignalSource]
 ) -> tuple[Pieces, list[Field]]:
@@ -252,12 +256,12 @@ def look(
     """
     named = sorted(named, key=lambda n: (not n[4], -n[3].strength))[:MOST_READ]
     requests: dict[str, list[str]] = {}
-    signs: dict[tuple[str, str], str] = {}
     for topic, _, info, _, _ in named:
         requests.setdefault(topic.name, []).append(info.path.removesuffix("[]"))
-        if sign := _signs_of({f.path for f in log.fields(topic.name, quiet=True)}).get(info.path):
-            requests[topic.name].append(sign)
-            signs[topic.name, info.path] = sign
+    of_topics = {t: _signs_of({f.path for f in log.fields(t, quiet=True)}) for t in requests}
+    signs = {(t, p): of_topics[t][p] for t, paths in requests.items() for p in paths if p in of_topics[t]}
+    for (of_topic, _), sign in signs.items():
+        requests[of_topic].append(sign)
     for source in sources:
         if source.can_signal is None:
             requests.setdefault(source.topic, []).extend(source.paths)

@@ -298,6 +298,13 @@ def test_a_magnitude_without_its_sign_is_said() -> None:
     assert "never negative" in checks["yaw_rate_rad_s.candidate"]
 
 
+def test_a_magnitude_whose_sign_is_a_text_is_no_signal_and_the_others_are() -> None:
+    bus = topic(steering_angle_deg=np.abs(STEER) / DEG, yaw_rate_dps=RATE / DEG)
+    bus.fields["steering_angle_deg_sign"] = np.where(STEER < 0.0, "right", "left").astype(object)
+    signals = found(bus=bus, **SPEED).mapping.signals
+    assert "yaw_rate_rad_s" in signals and not {"steer_rad", "steering_wheel_rad"} & set(signals)
+
+
 def test_a_magnitude_takes_its_sign_from_another_field() -> None:
     bus = topic(steering_angle_deg=np.abs(STEER) / DEG, steering_angle_deg_sign=1.0 * (STEER < 0.0))
     source = found(bus=bus, imu__data=topic(**imu_fields()), **SPEED).mapping.signals["steer_rad"]
@@ -325,8 +332,8 @@ def test_a_steering_without_a_unit_may_be_a_share(share: float) -> None:
 
 def test_steering_and_yaw_rate_alone_may_both_be_mirrored() -> None:
     bus = topic(steering_wheel_angle_deg=-STEER * 16.0 / DEG, yaw_rate_dps=-RATE / DEG)
-    told = {c.subject for c in found(bus=bus, **SPEED).mapping.checks if c.name == "mapping.names"}
-    assert told == {"steering_wheel_rad", "yaw_rate_rad_s"}
+    doubted = {c.subject for c in found(bus=bus, **SPEED).mapping.checks if c.name == "mapping.names"}
+    assert doubted == {"steering_wheel_rad", "yaw_rate_rad_s"}
     bus.fields |= {"lat_accel_mps2": AY}
     assert "mapping.names" not in undecided(found(bus=bus, **SPEED))
 
