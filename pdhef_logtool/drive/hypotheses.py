@@ -114,11 +114,8 @@ class Relation:
         room = -math.log(max(abs(self.correlation), 1e-3))  # between the two regressions
         # Blocks that differ show what changes: sliding, a frequency that tyres do not follow; a unit does not change.
         # A drive without blocks slides for all of it: they would differ by half of what the relation leaves.
-        apart = (
-            float(np.std(np.log(np.abs(self.blocks))))
-            if self.blocks and all(self.blocks)
-            else (0.5 * math.sqrt(max(0.0, 1.0 - self.correlation**2)))
-        )
+        unknown = 0.5 * math.sqrt(max(0.0, 1.0 - self.correlation**2))
+        apart = float(np.std(np.log(np.abs(self.blocks)))) if self.blocks and all(self.blocks) else unknown
         beyond = np.maximum(np.maximum(low - room - size, size - high - room), 0.0)
         energy = 0.5 * (beyond / math.hypot(EDGE if self.decides_unit else WIDE_EDGE, apart)) ** 2
         if self.decides_unit:
@@ -284,9 +281,8 @@ _NEVER_TURNED = frozenset({"speed_m_s", "steer_rad", "steering_wheel_rad"})
 def _together(names: Sequence[str]) -> str:
     """Return signals in words; the wheel speeds and their mean as one."""
     wheels = [n for n in names if n.startswith("wheel_speed")]
-    shown = [
-        "truth.x_m or truth.y_m (which may be exchanged)" if n == "truth.y_m" else n for n in names
-    ]  # which one, the path does not show
+    # The path does not show which of the two is wrong.
+    shown = ["truth.x_m or truth.y_m (which may be exchanged)" if n == "truth.y_m" else n for n in names]
     return "wheel speeds" if len(wheels) == len(names) > 2 else " and ".join(shown)
 
 

@@ -50,6 +50,12 @@ class Measured:
     topics: Mapping[str, str]
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
 
+    @property
+    def positions(self) -> tuple[str, str]:
+        """Names of the ground-truth positions east and north as mapped."""
+        is_place = "truth.lat_deg" in self.scales and "truth.y_m" not in self.scales
+        return ("truth.lon_deg", "truth.lat_deg") if is_place else ("truth.x_m", "truth.y_m")
+
     def without_truth(self) -> Measured:
         """Return what the signals alone state."""
         columns = {n: c for n, c in self.columns.items() if not n.startswith("truth.")}
@@ -143,7 +149,8 @@ def drive_columns(
             channels[TURNING] = replace(heading, values=np.unwrap(heading.values))
     channels |= _over_ground(channels)
     columns = columns_on_grid(channels)
-    columns |= {n: derivative(c) for n, c in columns.items() if n == TURNING}
+    if TURNING in columns:
+        columns[TURNING] = derivative(columns[TURNING])
     if set(_EAST_NORTH) <= set(columns):
         columns[GNSS_COURSE_RATE] = direction_rate(*(columns[n] for n in _EAST_NORTH))
     if "truth.x_m" in columns and "truth.y_m" in columns:

@@ -75,6 +75,7 @@ def measured_relations(
     """
     relations: list[Relation] = []
     speed = None if speed_name is None else columns[speed_name]
+    of_path = {} if any(map(is_misscaled, position_factors(columns))) else columns
     for prefix in ("", "truth."):
         pace_name = f"{prefix}vx_m_s" if f"{prefix}vx_m_s" in columns else speed_name
         pace = None if pace_name is None else columns[pace_name]
@@ -84,8 +85,8 @@ def measured_relations(
         relations += _steering(columns, speed_name, speed, vehicle)
         relations += _speeds(columns, speed_name, speed)
         relations += _wheel_differences(columns, speed_name, speed)
-        relations += _courses(columns, speed)
-    relations += _poses(columns)
+        relations += _courses(of_path, speed)
+    relations += _poses(of_path)
     rate = ("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S)
     twice = (("truth.yaw_rate_rad_s", *rate), (TURNING, *rate), ("truth.ay_m_s2", "ay_m_s2", GAIN_RANGE, MOVES_M_S2))
     for other, name, expected, moves in twice:
@@ -336,7 +337,7 @@ def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> Float
 def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relation]:
     """Relate the yaw rates to the rate of the course over ground, of the ground truth or else of a receiver."""
     path = next((n for n in (COURSE_RATE, GNSS_COURSE_RATE) if n in columns), "")
-    if not path or any(map(is_misscaled, position_factors(columns))):
+    if not path:
         return []
     course, signs = columns[path], {COURSE_RATE: -1} if path == COURSE_RATE else {}
     turnings = [course]
@@ -385,7 +386,7 @@ def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
     sign is not known.
     """
     subject = next((n for n, of in (("truth.sideslip_rad",) * 2, ("truth.vy_m_s", CG_VY)) if of in columns), "")
-    if not {subject, "truth.pose_vy_m_s"} <= columns.keys() or any(map(is_misscaled, position_factors(columns))):
+    if not {subject, "truth.pose_vy_m_s"} <= columns.keys():
         return []
     ahead, left, turning = (columns[f"truth.{n}"] for n in ("pose_vx_m_s", "pose_vy_m_s", "heading_rate_rad_s"))
     moving = moving_at(ahead)

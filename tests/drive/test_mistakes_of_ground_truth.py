@@ -226,6 +226,9 @@ def test_exchanged_degrees_of_a_place_are_named_as_such() -> None:
     checks = check_drive(signals, truth, derived, VEHICLE, measured=measured)
     (sign,) = (c for c in checks if c.subject == "truth.lat_deg" and c.verdict == "failed")
     assert sign.name == "truth.lat_deg.sign" and "exchanged" in sign.remedy and "lon_deg" in sign.remedy
+    both = replace(measured, scales=measured.scales | {"truth.x_m": 1.0, "truth.y_m": 1.0})
+    found = check_drive(signals, truth, derived, VEHICLE, measured=both)  # positions in metres go before degrees
+    assert {c.subject for c in found if c.verdict == "failed" and c.subject != "ay_m_s2"} == {"truth.y_m"}
 
 
 @pytest.mark.parametrize("factor", [1.0, np.pi / 180.0, 180.0 / np.pi, -1.0])

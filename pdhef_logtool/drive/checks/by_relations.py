@@ -12,6 +12,7 @@ from dataclasses import replace
 from pdhef_logtool.drive.checks.kind import CheckKind
 from pdhef_logtool.drive.hypotheses import FOREIGN, Hypothesis, Posterior, Relation, units_of
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured
+from pdhef_logtool.drive.relations import COURSE_RATE
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import GNSS
 
@@ -72,15 +73,13 @@ def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Che
             evidence = f"{r.text}: one moves and the other does not with it, correlation {r.correlation:.2f}"
             checks.append(AXIS.failed(evidence, name, signal_name=name))
         checks += judged or ([] if unrelated else [_not_excited(name, mine)])
-    # Of latitude and longitude the positions are made.
-    return tuple(map(_of_place, checks)) if "truth.lat_deg" in measured.scales else tuple(checks)
+    return tuple(_of_place(c, *measured.positions) if c.subject == COURSE_RATE else c for c in checks)
 
 
-def _of_place(check: Check) -> Check:
-    if check.subject != "truth.y_m":
-        return check
-    name, remedy = (t.replace("truth.y_m", "truth.lat_deg") for t in (check.name, check.remedy))
-    return replace(check, name=name, subject="truth.lat_deg", remedy=remedy.replace("truth.x_m", "truth.lon_deg"))
+def _of_place(check: Check, east: str, north: str) -> Check:
+    """Return the check of the path's turning with the names of the mapped positions."""
+    remedy = check.remedy.replace("truth.x_m", east).replace(COURSE_RATE, north)
+    return replace(check, name=check.name.replace(COURSE_RATE, north), subject=north, remedy=remedy)
 
 
 def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measured: Measured) -> list[Check]:

@@ -13,9 +13,7 @@ from pdhef_logtool.records.checks import Check
 def _checks(drive: CheckedDrive) -> Iterator[Check]:
     if drive.wrong & {"truth.vx_m_s", "truth.vy_m_s"}:
         return
-    axes = ("x_m", "lon_deg"), ("y_m", "lat_deg")
-    for names, factor in zip(axes, position_factors(drive.measured.columns), strict=True):
-        name = next((f"truth.{n}" for n in names if f"truth.{n}" in drive.measured.scales), f"truth.{names[0]}")
+    for name, factor in zip(drive.measured.positions, position_factors(drive.measured.columns), strict=True):
         evidence = f"the ground-truth velocity is {factor:.3g} times what its positions change by along this axis"
         scale = drive.measured.scales.get(name)
         line = f", scale = {scale * factor:.3g}" if isinstance(scale, float | int) else ""
