@@ -11,17 +11,16 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import describe_damage
-from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.resource_limits import ResourceLimits
 from pdhef_logtool.logs.table_columns import Sheet, field_name, read_head, stamps_of, tables_of, unique
-from pdhef_logtool.logs.table_log import Table, TableLog
+from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.extras import required
 from pdhef_logtool.records.signals import IntArray, Loss
@@ -37,34 +36,32 @@ _DEEPEST = 8
 _SLASH = "/"
 
 
-def open_parquet(file: LogFile) -> TableLog:
-    """Open a Parquet file; a row group that cannot be read is a loss."""
+def open_parquet(file: TableFile) -> Tables:
+    """Read a Parquet file; a row group that cannot be read is a loss."""
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     losses: list[Loss] = []
-    with file.meter.running(file.path.stat().st_size), pq.ParquetFile(file.path) as source:
+    with pq.ParquetFile(file.stream) as source:
         groups = [source.metadata.row_group(i) for i in range(source.num_row_groups)]
-        ratio = sum(g.total_byte_size for g in groups) / max(1, file.path.stat().st_size)
-        file.meter.limits.check("chunk_ratio", ratio, str(file.place))
+        ratio = sum(g.total_byte_size for g in groups) / max(1, file.size)
+        file.limits.check("chunk_ratio", ratio, file.name)
         parts = []
         for number, group in enumerate(groups):
             try:
                 parts.append(source.read_row_group(number))
             except Exception as error:  # noqa: BLE001  any error of a damaged page
                 what = f"row group {number} cannot be read: {describe_damage(error)[1]}"
-                losses.append(Loss("bad-rows", what, str(file.place), count=group.num_rows))
-        if not parts:
-            raise LogError(expected="a row group that can be read", got="none", where=str(file.place))
-        import pyarrow as pa
-
-        table = pa.concat_tables(parts)
-        while any(pa.types.is_struct(column.type) for column in table.columns):
-            table = table.flatten()
-        fields, units = read_head(table.column_names)
-        units |= {n: unit for n, f in zip(fields, table.schema, strict=True) if (unit := _unit_of(f.metadata))}
-        columns = {name: _arrow_column(column) for name, column in zip(fields, table.columns, strict=True)}
-        sheet = Sheet("parquet", columns, units)
-        return TableLog(file, "parquet", list(tables_of(sheet, str(file.place), losses)), losses)
+                losses.append(Loss("bad-rows", what, file.name, count=group.num_rows))
+    if not parts:
+        raise LogError(expected="a row group that can be read", got="none", where=file.name)
+    table = pa.concat_tables(parts)
+    while any(pa.types.is_struct(column.type) for column in table.columns):
+        table = table.flatten()
+    fields, units = read_head(table.column_names)
+    units |= {n: unit for n, f in zip(fields, table.schema, strict=True) if (unit := _unit_of(f.metadata))}
+    columns = {name: _arrow_column(column) for name, column in zip(fields, table.columns, strict=True)}
+    return Tables("parquet", list(tables_of(Sheet("parquet", columns, units), file.name, losses)), losses)
 
 
 def _unit_of(metadata: Mapping[bytes, bytes] | None) -> str:
@@ -91,29 +88,28 @@ def _arrow_column(column: Any) -> Any:
     return column.to_numpy()
 
 
-def open_mat(file: LogFile) -> TableLog:
-    """Open a MAT file; a variable that cannot be read is a loss."""
+def open_mat(file: TableFile) -> Tables:
+    """Read a MAT file; a variable that cannot be read is a loss."""
     losses: list[Loss] = []
-    size = file.path.stat().st_size
-    with file.meter.running(size), file.path.open("rb") as head:
-        hdf5 = head.read(len(_HDF5_MAT)) == _HDF5_MAT
-        read = _hdf5_variables if hdf5 else _variables
-        arrays: dict[str, dict[str, NDArray[Any]]] = {}
-        units: dict[str, dict[str, str]] = {}
-        for path, array, unit in read(file, losses):
-            struct_, _, name = path.rpartition(_SLASH)
-            vectors = _vectors(name, array)
-            arrays.setdefault(struct_, {}).update(vectors)
-            units.setdefault(struct_, {}).update(dict.fromkeys(vectors, unit))
-        tables = list(_mat_tables(arrays, units, str(file.place), losses))
+    hdf5 = file.stream.read(len(_HDF5_MAT)) == _HDF5_MAT
+    file.stream.seek(0)
+    read = _hdf5_variables if hdf5 else _variables
+    arrays: dict[str, dict[str, NDArray[Any]]] = {}
+    units: dict[str, dict[str, str]] = {}
+    for path, array, unit in read(file, losses):
+        struct_, _, name = path.rpartition(_SLASH)
+        vectors = _vectors(name, array)
+        arrays.setdefault(struct_, {}).update(vectors)
+        units.setdefault(struct_, {}).update(dict.fromkeys(vectors, unit))
+    tables = list(_mat_tables(arrays, units, file.name, losses))
     if not tables:
         raise LogError(
             expected="a vector of times (t, time, ...) as long as the signals beside it",
             got=", ".join(name for columns in arrays.values() for name in columns) or "no numeric variables",
-            where=str(file.place),
+            where=file.name,
             remedy="name the vector of times so",
         )
-    return TableLog(file, "mat-7.3" if hdf5 else "mat", tables, losses)
+    return Tables("mat-7.3" if hdf5 else "mat", tables, losses)
 
 
 def _mat_tables(
@@ -173,11 +169,11 @@ def _vectors(name: str, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
     return {f"{field_name(name)}_{i}": array[:, i] for i in columns}
 
 
-def _variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray[Any], str]]:
+def _variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray[Any], str]]:
     """Yield the arrays of a MAT file of version 5 by path and their units, by element: a damaged one is a loss."""
     from scipy.io import loadmat
 
-    data = file.path.read_bytes()
+    data = file.stream.read()
     order = ">" if data[126:128] == b"MI" else "<"
     offset = _MAT_HEAD
     while offset + 8 <= len(data):
@@ -188,12 +184,12 @@ def _variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray
             if len(element) < 8 + size:
                 raise ValueError("the file ends inside of it")
             if kind == _COMPRESSED:
-                element = _inflated(element[8:], file.meter.limits)
+                element = _inflated(element[8:], file.limits)
             _check_tags(element, 0, len(element), order)
             values = loadmat(io.BytesIO(data[:_MAT_HEAD] + element), simplify_cells=True)
         except Exception as error:  # noqa: BLE001  any error of a damaged element
             what = f"a variable cannot be read: {describe_damage(error)[1]}"
-            losses.append(Loss("bad-variable", what, str(file.place)))
+            losses.append(Loss("bad-variable", what, file.name))
             continue
         for name, value in values.items():
             if not name.startswith("__"):
@@ -241,21 +237,19 @@ def _text_of(struct_: Mapping[str, Any], *names: str) -> str:
     return next((lower[n] for n in names if isinstance(lower.get(n), str)), "")
 
 
-def _hdf5_variables(file: LogFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray[Any], str]]:
+def _hdf5_variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, NDArray[Any], str]]:
     """Yield the arrays of a MAT file of version 7.3 by path; a dataset that cannot be read is a loss."""
-    h5py = required("h5py", "formats", "reads MAT files of version 7.3", file.place)
+    h5py = required("h5py", "formats", "reads MAT files of version 7.3", file.name)
     datasets: list[tuple[str, Callable[[], NDArray[Any]]]] = []
 
     def visit(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and not name.startswith("#") and item.dtype.kind in "iufb":
             datasets.append((name, lambda: item[()]))
 
-    with h5py.File(Path(file.path), "r") as source:
+    with h5py.File(file.stream, "r") as source:
         source.visititems(visit)
         for name, load in datasets:
             try:
                 yield name, np.asarray(load()), ""
             except Exception as error:  # noqa: BLE001  any error of a damaged chunk
-                losses.append(
-                    Loss("bad-variable", f"{name} cannot be read: {describe_damage(error)[1]}", str(file.place))
-                )
+                losses.append(Loss("bad-variable", f"{name} cannot be read: {describe_damage(error)[1]}", file.name))

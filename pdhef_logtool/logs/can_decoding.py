@@ -50,6 +50,14 @@ class Frames:
     parts: Mapping[str, NDArray[Any]]
     data: NDArray[np.uint8]
 
+    @classmethod
+    def of_table(cls, table: Table) -> Frames:
+        """Return the frames of a table that :meth:`table` made."""
+        rows = slice(0, len(table.stamps_ns))
+        names = [f.path for f in table.fields if not f.path.startswith("data[")]
+        parts = {name: np.asarray(table.load(name, rows)).astype(np.int64) for name in names}
+        return cls(table.stamps_ns, parts, np.nan_to_num(table.load("data", rows)).astype(np.uint8))
+
     def table(self, name: str) -> Table:
         """Return the frames as they are, with NaN behind the length."""
         names = [f"data[{i}]" for i in range(self.data.shape[1])]

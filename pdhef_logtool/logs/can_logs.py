@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from io import TextIOWrapper
 from itertools import islice
 from typing import Any
 
@@ -11,9 +12,8 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.can_decoding import Frames
 from pdhef_logtool.logs.container import describe_damage
-from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.table_columns import number_stamps
-from pdhef_logtool.logs.table_log import TableLog
+from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.extras import required
 from pdhef_logtool.records.signals import FloatArray, Loss
@@ -25,47 +25,45 @@ _BLOCK_FRAMES = 65_536
 _PARTS = ("id", "length", "is_extended", "bus", "is_error", "is_remote")
 
 
-def open_blf(file: LogFile) -> TableLog:
-    """Open a BLF file; raises LogError where it has no frames."""
-    return _open(file, "BLFReader", "blf")
+def open_blf(file: TableFile) -> Tables:
+    """Read a BLF file; raises LogError where it has no frames."""
+    can = required("can.io", "formats", "reads BLF files", file.name)
+    return _open(file, lambda: can.BLFReader(file.stream), "blf")
 
 
-def open_asc(file: LogFile) -> TableLog:
-    """Open an ASC file; raises LogError where it has no frames."""
-    return _open(file, "ASCReader", "asc")
+def open_asc(file: TableFile) -> Tables:
+    """Read an ASC file; raises LogError where it has no frames."""
+    can = required("can.io", "formats", "reads ASC files", file.name)
+    return _open(file, lambda: can.ASCReader(TextIOWrapper(file.stream)), "asc")
 
 
-def _open(file: LogFile, reader: str, kind: str) -> TableLog:
-    io = required("can.io", "formats", f"reads {kind.upper()} files", file.place)
-    size = file.path.stat().st_size
+def _open(file: TableFile, reader: Callable[[], Any], kind: str) -> Tables:
     losses: list[Loss] = []
     blocks: list[_Block] = []
-    with file.meter.running(size):
-        try:
-            with getattr(io, reader)(str(file.path)) as source:
-                if size < getattr(source, "file_size", 0):
-                    what = f"the file ends after {size} of {source.file_size} bytes"
-                    losses.append(Loss("truncated", what, str(file.place)))
-                messages = iter(source)
-                while not blocks or len(blocks[-1].stamps) == _BLOCK_FRAMES:
-                    file.meter.check()
-                    blocks.append(_Block())
-                    blocks[-1].read(messages)
-        except LogError:
-            raise
-        except Exception as error:  # noqa: BLE001  any error of a damaged file
-            what = f"frames behind the damage cannot be read: {describe_damage(error)[1]}"
-            losses.append(Loss("truncated", what, str(file.place)))
-        parts = [block.arrays() for block in blocks if block.stamps]
-        if not parts:
-            raise LogError(expected="CAN frames", got="none that can be read", where=str(file.place))
-        clock = number_stamps(np.concatenate([stamps for stamps, _, _ in parts]), "s")
-        order = np.argsort(clock, kind="stable")
-        numbers = np.concatenate([rows for _, rows, _ in parts])[order].T
-        widest = max(data.shape[1] for _, _, data in parts)
-        data = np.concatenate([np.pad(d, ((0, 0), (0, widest - d.shape[1]))) for _, _, d in parts])[order]
-        frames = Frames(clock[order], dict(zip(_PARTS, numbers, strict=True)), data)
-        return TableLog(file, kind, [frames.table("can")], losses, [frames])
+    try:
+        with reader() as source:
+            if file.size < getattr(source, "file_size", 0):
+                what = f"the file ends after {file.size} of {source.file_size} bytes"
+                losses.append(Loss("truncated", what, file.name))
+            messages = iter(source)
+            while not blocks or len(blocks[-1].stamps) == _BLOCK_FRAMES:
+                blocks.append(_Block())
+                blocks[-1].read(messages)
+    except LogError:
+        raise
+    except Exception as error:  # noqa: BLE001  any error of a damaged file
+        what = f"frames behind the damage cannot be read: {describe_damage(error)[1]}"
+        losses.append(Loss("truncated", what, file.name))
+    parts = [block.arrays() for block in blocks if block.stamps]
+    if not parts:
+        raise LogError(expected="CAN frames", got="none that can be read", where=file.name)
+    clock = number_stamps(np.concatenate([stamps for stamps, _, _ in parts]), "s")
+    order = np.argsort(clock, kind="stable")
+    numbers = np.concatenate([rows for _, rows, _ in parts])[order].T
+    widest = max(data.shape[1] for _, _, data in parts)
+    data = np.concatenate([np.pad(d, ((0, 0), (0, widest - d.shape[1]))) for _, _, d in parts])[order]
+    frames = Frames(clock[order], dict(zip(_PARTS, numbers, strict=True)), data)
+    return Tables(kind, [frames.table("can")], losses)
 
 
 class _Block:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.logs.container import MCAP_MAGIC, ROSBAG1_MAGIC, SQLITE_MAGIC, Container
 from pdhef_logtool.logs.log_file import LogFile
+from pdhef_logtool.logs.reader_process import open_tables
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.drive_log import DriveLog
@@ -35,7 +36,8 @@ class LogFormat:
     ----------
     title : for messages: ``an MCAP file``.
     opener : ``package.module:function``, which opens a :class:`LogFile` as a log, or as a container of messages, and
-        raises LogError for a file that is none of this format.
+        raises LogError for a file that is none of this format. With ``isolated`` it is a reader of tables, which
+        receives a :class:`~pdhef_logtool.logs.table_file.TableFile` and returns ``Tables``.
     suffixes : by which a search through folders takes files for logs. named : also, if it is named outright.
     magic : first bytes of every file, or several possible ones; empty: a file is recognised by its suffix.
     needs_suffix : whether files of other formats begin with the same bytes, so that the suffix must match too.
@@ -50,6 +52,7 @@ class LogFormat:
     needs_suffix: bool = False
     is_general: bool = False
     named: tuple[str, ...] = ()
+    isolated: bool = False
 
     def recognises(self, head: bytes, name: str) -> bool:
         """Return, by the first bytes and the name, whether a file is of this format."""
@@ -59,6 +62,8 @@ class LogFormat:
 
     def open(self, file: LogFile) -> DriveLog | Container:
         """Open a file."""
+        if self.isolated:
+            return open_tables(file, self.opener)
         opener: Callable[[LogFile], Any] = pkgutil.resolve_name(self.opener)
         return opener(file)  # type: ignore[no-any-return]
 
@@ -67,13 +72,31 @@ FORMATS = (
     LogFormat("an MCAP file", f"{__package__}.mcap_log:McapContainer.open", (".mcap",), MCAP_MAGIC),
     LogFormat("a ROS 1 bag", f"{__package__}.rosbag1_log:Rosbag1Container.open", (".bag",), ROSBAG1_MAGIC),
     LogFormat("a rosbag2 database", f"{__package__}.rosbag2_sqlite_log:SqliteContainer.open", (".db3",), SQLITE_MAGIC),
-    LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",)),
-    LogFormat("a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"), is_general=True, named=(".txt",)),
-    LogFormat("a Parquet file", f"{__package__}.array_logs:open_parquet", (".parquet",), b"PAR1", is_general=True),
-    LogFormat("a MAT file", f"{__package__}.array_logs:open_mat", (".mat",), b"MATLAB ", is_general=True),
-    LogFormat("an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF ")),
-    LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG"),
-    LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",)),
+    LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",), isolated=True),
+    LogFormat(
+        "a CSV file",
+        f"{__package__}.text_logs:open_csv",
+        (".csv", ".tsv"),
+        is_general=True,
+        named=(".txt",),
+        isolated=True,
+    ),
+    LogFormat(
+        "a Parquet file",
+        f"{__package__}.array_logs:open_parquet",
+        (".parquet",),
+        b"PAR1",
+        is_general=True,
+        isolated=True,
+    ),
+    LogFormat(
+        "a MAT file", f"{__package__}.array_logs:open_mat", (".mat",), b"MATLAB ", is_general=True, isolated=True
+    ),
+    LogFormat(
+        "an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF "), isolated=True
+    ),
+    LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG", isolated=True),
+    LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",), isolated=True),
 )
 
 

@@ -7,30 +7,26 @@ from __future__ import annotations
 
 import gc
 import logging
-import mmap
 import re
-import shutil
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, redirect_stdout, suppress
+from contextlib import redirect_stdout, suppress
 from functools import partial
-from io import StringIO
-from pathlib import Path
-from typing import Any
+from io import BytesIO, StringIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.can_decoding import Frames
 from pdhef_logtool.logs.container import describe_damage
-from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.table_columns import NO_TIME, field_name, placed, unique
-from pdhef_logtool.logs.table_log import Table, TableLog
+from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.extras import required
 from pdhef_logtool.records.signals import IntArray, Loss
-from pdhef_logtool.storage.files import scratch_folder
 
 _FRAMES = "CAN_DataFrame"
 #: Parts of a frame by the names of the standard for bus logging.
@@ -41,69 +37,51 @@ _LONGEST_NAME = 40
 _LONGEST_S = 4e9
 
 
-def open_mdf(file: LogFile) -> TableLog:
-    """Open an MDF file; groups and channels that cannot be read are losses."""
-    asammdf = required("asammdf", "formats", "reads MDF files", file.place)
+def open_mdf(file: TableFile) -> Tables:
+    """Read an MDF file; groups and channels that cannot be read are losses."""
+    asammdf = required("asammdf", "formats", "reads MDF files", file.name)
     logging.getLogger("asammdf").setLevel(logging.CRITICAL)
     losses: list[Loss] = []
-    with file.meter.running(file.path.stat().st_size):
-        source, got = _opened(asammdf, file.path)
-        copies = ExitStack()
-        if source is None and (copy := _repaired(file.path, Path(copies.enter_context(scratch_folder())))):
-            source, got = _opened(asammdf, copy)
-            losses.append(Loss("truncated", "the last block of data is incomplete", str(file.place)))
-        if source is None:
-            copies.close()
-            raise LogError(expected="an MDF file with readable channels", got=got, where=str(file.place))
-        groups = [Group(source, number) for number in range(len(source.groups))]
-        names = unique(group.name for group in groups)
-        tables: list[Table] = []
-        frames: list[Frames] = []
-        for name, group in zip(names, groups, strict=True):
-            try:
-                with redirect_stdout(StringIO()):
-                    tables += group.tables(name, frames)
-            except Exception as error:  # noqa: BLE001  any error of a damaged block
-                what = f"the channel group cannot be read: {describe_damage(error)[1]}"
-                losses.append(Loss("bad-group", what, name))
+    source, got = _opened(asammdf, file.stream)
+    if source is None and (copy := _repaired(file)):
+        source, got = _opened(asammdf, copy)
+        losses.append(Loss("truncated", "the last block of data is incomplete", file.name))
+    if source is None:
+        raise LogError(expected="an MDF file with readable channels", got=got, where=file.name)
+    groups = [Group(source, number) for number in range(len(source.groups))]
+    names = unique(group.name for group in groups)
+    tables: list[Table] = []
+    for name, group in zip(names, groups, strict=True):
+        try:
+            with redirect_stdout(StringIO()):
+                tables += group.tables(name)
+        except Exception as error:  # noqa: BLE001  any error of a damaged block
+            what = f"the channel group cannot be read: {describe_damage(error)[1]}"
+            losses.append(Loss("bad-group", what, name))
     if not tables:
-        source.close()
-        copies.close()
-        raise LogError(expected="a channel group with times", got="none that can be read", where=str(file.place))
-    release = file.release
-
-    def close() -> None:
-        source.close()
-        copies.close()
-        release()
-
-    opened = LogFile(file.path, file.place, file.meter, close, file.cut)
-    return TableLog(opened, f"mdf-{str(source.version)[:1]}", tables, losses, frames)
+        raise LogError(expected="a channel group with times", got="none that can be read", where=file.name)
+    return Tables(f"mdf-{str(source.version)[:1]}", tables, losses)
 
 
-def _repaired(path: Path, folder: Path) -> Path | None:
-    """Return a copy of a version 4 file whose last block of data has the length that is left; None if none is cut."""
-    size = path.stat().st_size
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        starts = [m.start() for m in _DATA_BLOCK.finditer(data) if m.start() + 16 <= size]
-        cut = [start for start in starts if start + int.from_bytes(data[start + 8 : start + 16], "little") > size]
+def _repaired(file: TableFile) -> BytesIO | None:
+    """Return a version 4 file whose last block of data has the length that is left; None if none is cut."""
+    file.stream.seek(0)
+    data = bytearray(file.stream.read())
+    starts = [m.start() for m in _DATA_BLOCK.finditer(data) if m.start() + 16 <= len(data)]
+    cut = [start for start in starts if start + int.from_bytes(data[start + 8 : start + 16], "little") > len(data)]
     if not cut:
         return None
-    copy = folder / path.name
-    shutil.copyfile(path, copy)
-    with copy.open("r+b") as repaired:
-        repaired.seek(cut[-1] + 8)
-        repaired.write((size - cut[-1]).to_bytes(8, "little"))
-    return copy
+    data[cut[-1] + 8 : cut[-1] + 16] = (len(data) - cut[-1]).to_bytes(8, "little")
+    return BytesIO(data)
 
 
-def _opened(asammdf: Any, path: Path) -> tuple[Any, str]:
+def _opened(asammdf: Any, stream: BinaryIO) -> tuple[Any, str]:
     """Return the file, or None and why it cannot be opened."""
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None  # the end of a half-opened object is an error there
     source, got = None, ""
     try:
         try:
-            source = asammdf.MDF(str(path), use_display_names=False)
+            source = asammdf.MDF(stream, use_display_names=False)
         except Exception as error:  # noqa: BLE001  any error of a damaged file
             got = describe_damage(error)[1]
         if source is None:
@@ -137,8 +115,8 @@ class Group:
         """Return whether it contains raw CAN frames."""
         return any(channel.name == _FRAMES for channel in self._group.channels)
 
-    def tables(self, name: str, frames: list[Frames]) -> Iterator[Table]:
-        """Yield the table of the group, none without samples or times; raw CAN frames are added to ``frames``."""
+    def tables(self, name: str) -> Iterator[Table]:
+        """Yield the table of the group, none without samples or times."""
         master = self._source.masters_db.get(self._number)
         if master is None or not self._group.channel_group.cycles_nr:
             return
@@ -148,8 +126,7 @@ class Group:
             parts = {part: self._frames(end)[order].astype(np.int64) for part, end in _PARTS.items() if self._has(end)}
             data = np.atleast_2d(self._frames("DataBytes"))[order].astype(np.uint8)
             parts.setdefault("length", np.full(len(stamps), data.shape[1]))
-            frames.append(Frames(stamps, parts, data))
-            yield frames[-1].table(name)
+            yield Frames(stamps, parts, data).table(name)
             return
         indices = [i for i in range(len(self._group.channels)) if i != master]
         titles = unique(field_name(self._group.channels[i].name) for i in indices)

@@ -22,8 +22,6 @@ from pdhef_logtool.records.signals import IntArray, Loss
 if TYPE_CHECKING:
     from cantools.database.can import Database
 
-    from pdhef_logtool.logs.can_decoding import Frames
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
@@ -67,7 +65,6 @@ class TableLog(DriveLog):
     file : that the tables come from; it is released when the log is closed.
     kind : name of the format, for reports.
     tables : one a topic. lost : what of the file could not be read.
-    frames : raw CAN frames among them, for :meth:`decode_frames`.
 
     Raises
     ------
@@ -80,10 +77,8 @@ class TableLog(DriveLog):
         kind: str,
         tables: Sequence[Table],
         lost: Sequence[Loss] = (),
-        frames: Sequence[Frames] = (),
     ) -> None:
         self.path, self.kind = file.place, kind
-        self._frames = frames
         self._file = file
         self._tables = {table.name: table for table in sorted(tables, key=lambda table: table.name)}
         names = Counter(table.name for table in tables)
@@ -99,7 +94,10 @@ class TableLog(DriveLog):
 
     def decode_frames(self, databases: Sequence[Database]) -> None:
         """Add a table for each message of DBC files that raw CAN frames of the log contain."""
-        tables = [table for frames in self._frames for table in frames.decoded(databases)]
+        from pdhef_logtool.logs.can_decoding import CAN_TYPE, Frames
+
+        frames = [Frames.of_table(table) for table in self._tables.values() if table.type_name == CAN_TYPE]
+        tables = [table for part in frames for table in part.decoded(databases)]
         for table in tables:
             number = 1 + sum(name.partition("#")[0] == table.name for name in self._tables)
             name = table.name if number == 1 else f"{table.name}#{number}"

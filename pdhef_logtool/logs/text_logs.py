@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.table_columns import (
     NO_TIME,
     Sheet,
@@ -30,7 +29,7 @@ from pdhef_logtool.logs.table_columns import (
     unwrapped,
     whole_days,
 )
-from pdhef_logtool.logs.table_log import TableLog
+from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
 
@@ -54,39 +53,34 @@ _RECEIVER = re.compile(
 _CREATED = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})")
 
 
-def open_csv(file: LogFile) -> TableLog:
-    """Open a CSV file; raises LogError where it has no header or no column of times."""
-    with file.meter.running(file.path.stat().st_size):
-        lines = _decoded(file.path.read_bytes()).split("\n")
-        separator, header, units, first = _layout(lines, str(file.place))
-        fields, given = read_head(header)
-        given |= {name: unit.strip("[](){} ") for name, unit in zip(fields, units, strict=False) if unit.strip()}
-        losses: list[Loss] = []
-        columns = _columns(lines[first:], separator, fields, str(file.place), losses)
-        sheet = Sheet("csv", columns, given)
-        return TableLog(file, "csv", list(tables_of(sheet, str(file.place), losses)), losses)
+def open_csv(file: TableFile) -> Tables:
+    """Read a CSV file; raises LogError where it has no header or no column of times."""
+    lines = _decoded(file.stream.read()).split("\n")
+    separator, header, units, first = _layout(lines, file.name)
+    fields, given = read_head(header)
+    given |= {name: unit.strip("[](){} ") for name, unit in zip(fields, units, strict=False) if unit.strip()}
+    losses: list[Loss] = []
+    columns = _columns(lines[first:], separator, fields, file.name, losses)
+    return Tables("csv", list(tables_of(Sheet("csv", columns, given), file.name, losses)), losses)
 
 
-def open_vbo(file: LogFile) -> TableLog:
-    """Open a VBO file; raises LogError where a section is missing."""
-    with file.meter.running(file.path.stat().st_size):
-        text = file.path.read_bytes().decode("latin-1").replace("\r\n", "\n")
-        head, mark, data = text.partition("[data]\n")
-        sections = {
-            n.lower(): b.strip("\n").split("\n") for n, b in re.findall(r"^\[([^\]\n]*)\]\n([^\[]*)", head, re.M)
-        }
-        titles = [t.strip() for t in sections.get("header", ()) if t.strip()]
-        if not mark or not titles:
-            raise LogError(expected="a VBO file with [header] and [data]", got="none of them", where=str(file.place))
-        fields = unique(field_name(title) for title in titles)
-        losses: list[Loss] = []
-        columns = _columns(data.split("\n"), " ", fields, str(file.place), losses)
-        units = _vbo_units(titles, fields, sections.get("channel units", []))
-        sheet = Sheet("vbox", {n: c for n, c in columns.items() if n != "time"}, units, VBO_TYPE)
-        if not isinstance(columns.get("time"), np.ndarray):
-            raise LogError(expected="a channel time in hhmmss.sss", got=", ".join(fields[:8]), where=str(file.place))
-        stamps = _vbo_stamps(columns, _CREATED.search(head.partition("\n")[0]))
-        return TableLog(file, "vbo", list(tables_of(sheet, str(file.place), losses, stamps)), losses)
+def open_vbo(file: TableFile) -> Tables:
+    """Read a VBO file; raises LogError where a section is missing."""
+    text = file.stream.read().decode("latin-1").replace("\r\n", "\n")
+    head, mark, data = text.partition("[data]\n")
+    sections = {n.lower(): b.strip("\n").split("\n") for n, b in re.findall(r"^\[([^\]\n]*)\]\n([^\[]*)", head, re.M)}
+    titles = [t.strip() for t in sections.get("header", ()) if t.strip()]
+    if not mark or not titles:
+        raise LogError(expected="a VBO file with [header] and [data]", got="none of them", where=file.name)
+    fields = unique(field_name(title) for title in titles)
+    losses: list[Loss] = []
+    columns = _columns(data.split("\n"), " ", fields, file.name, losses)
+    units = _vbo_units(titles, fields, sections.get("channel units", []))
+    sheet = Sheet("vbox", {n: c for n, c in columns.items() if n != "time"}, units, VBO_TYPE)
+    if not isinstance(columns.get("time"), np.ndarray):
+        raise LogError(expected="a channel time in hhmmss.sss", got=", ".join(fields[:8]), where=file.name)
+    stamps = _vbo_stamps(columns, _CREATED.search(head.partition("\n")[0]))
+    return Tables("vbo", list(tables_of(sheet, file.name, losses, stamps)), losses)
 
 
 def _decoded(data: bytes) -> str:
