@@ -13,6 +13,7 @@ import contextlib
 import gc
 import os
 import signal
+import sys
 from collections.abc import Generator, Iterator
 from pathlib import Path
 
@@ -45,7 +46,12 @@ def pytest_configure() -> None:
 
 
 def _process_state() -> set[str]:
-    """Return what all tests of this process share, and its child processes where the system lists them."""
+    """Return what all tests of this process share, and its child processes where the system lists them.
+
+    The servers that fork readers of tables are kept on purpose, as their start takes a second.
+    """
+    readers = sys.modules.get("pdhef_logtool.logs.reader_process")
+    kept = {str(server.pid) for server in readers.SERVERS.values()} if readers else set()
     processes: list[str] = []
     for children in Path("/proc/self/task").glob("*/children"):
         with contextlib.suppress(OSError):  # of a thread that has just ended
@@ -54,7 +60,7 @@ def _process_state() -> set[str]:
         f"working directory {Path.cwd()}",
         *(f"signal {n}: {signal.getsignal(n)}" for n in signal.valid_signals()),
         *(f"{name}={value}" for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"),
-        *(f"process {pid}" for pid in processes),
+        *(f"process {pid}" for pid in processes if pid not in kept),
     }
 
 

@@ -197,27 +197,27 @@ class _Order:
     seconds: float
 
 
-#: Fork servers, which have imported the libraries of a reader, by process and reader.
-_servers: dict[tuple[int, str], ForkServer] = {}
+#: Fork servers, which have imported the libraries of a reader, by process and reader; kept until this process ends.
+SERVERS: dict[tuple[int, str], ForkServer] = {}
 _numbers = itertools.count(1)
 
 
 def _server(reader: str, *libraries: str) -> ForkServer:
     key = os.getpid(), reader
-    if key not in _servers or _servers[key].is_dead():
+    if key not in SERVERS or SERVERS[key].is_dead():
         here = [name for name in libraries if importlib.util.find_spec(name.partition(".")[0])]
         server = ForkServer([reader.partition(":")[0], *here])
         server.start()
-        _servers[key] = server
-    return _servers[key]
+        SERVERS[key] = server
+    return SERVERS[key]
 
 
 @atexit.register
 def _end_servers() -> None:
-    for (pid, _), server in _servers.items():
+    for (pid, _), server in SERVERS.items():
         if pid == os.getpid():
             server.end()
-    _servers.clear()
+    SERVERS.clear()
 
 
 def serve_tables(channel: socket.socket) -> None:

@@ -210,6 +210,11 @@ class ForkServer:
             )
         self._preload = list(preload)
 
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
     def start(self) -> bool | None:
         """Wait until it has loaded its modules; return False if workers have code to compile.
 
