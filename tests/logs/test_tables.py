@@ -19,7 +19,8 @@ from pdhef_logtool import inspect_log
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.table_columns import RELATIVE_NS, field_name, gps_stamps, number_stamps, split_unit
+from pdhef_logtool.logs.table_clocks import RELATIVE_NS
+from pdhef_logtool.logs.table_columns import field_name, split_unit
 from pdhef_logtool.records.errors import PdhefError
 from tests.command_line import called
 
@@ -186,14 +187,6 @@ def test_names_and_units_of_titles() -> None:
     assert field_name("Lat._Vel.") == "Lat_Vel"
     assert field_name("Längsbeschl.\\CCP:1") == "Laengsbeschl"
     assert field_name("2nd gear") == "n_2nd_gear"
-
-
-def test_stamps_of_numbers() -> None:
-    week, second = np.array([1773.0, 2312.0]), np.array([0.0, 302_418_000.0])
-    # 2014-01-01 was 16 s, 2024-05-01 is 18 s behind GPS time; 1773 began on 2013-12-29.
-    assert gps_stamps(week, second / 1e3).tolist() == [1_388_275_184 * 10**9, 1_714_564_800 * 10**9]
-    assert gps_stamps(week[1:], second[1:]).tolist() == [1_714_564_800 * 10**9]
-    assert number_stamps(np.array([0.0, 20.0, np.nan]), "us").tolist()[:2] == [RELATIVE_NS, RELATIVE_NS + 20_000]
 
 
 # ------------------------------------------------------------------------------------------------ VBO
