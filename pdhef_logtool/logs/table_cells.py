@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pdhef_logtool.records.signals import FloatArray, Loss
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Loss
 
 if TYPE_CHECKING:
-    from polars import DataFrame, Expr, Series
+    from polars import Series
 
 #: Spellings of a missing value, in lower case.
 EMPTY = r"^([-+]?(nan|1\.#(qnan|snan|ind))(\(\w*\))?0*|#?n/?a|#n/a!|<na>|nat|null|none|-*)$"
@@ -72,51 +72,51 @@ def read_cells(texts: Series, decimal: str = "") -> Cells:
         marked = texts.filter(texts.str.contains(".", literal=True))
         open_ = len(marked) > 0 and marked.str.contains(_POINTS).all()
         return Cells(values, decimal="" if open_ or not len(marked) else ".", ambiguous=marked[0] if open_ else "")
-    frame = _readings(texts)
-    point, comma = frame["point"], frame["comma"]
-    needs = {".": (point.is_not_null() & comma.is_null()).sum(), ",": (comma.is_not_null() & point.is_null()).sum()}
-    undecided = needs["."] == needs[","]
-    ambiguous = texts.filter(point != comma) if undecided else texts.clear()
-    mark = decimal or ("," if ambiguous.str.contains(",", literal=True).all() else ".")
-    mark = mark if undecided else max(needs, key=lambda m: needs[m])
-    first, second = (comma, point) if mark == "," else (point, comma)
-    numbers = frame.select(pl.coalesce(first, second, "other")).to_series()
-    unreadable = (numbers.is_null() & ~frame["empty"]).to_numpy()
+    point, comma, other, empty = _readings(texts)
+    more = np.count_nonzero(np.isfinite(point)) - np.count_nonzero(np.isfinite(comma))
+    needed = "." if more > 0 else "," if more < 0 else ""
+    double = texts.filter(np.abs(point - comma) > 0.0)
+    mark = needed or decimal or ("," if double.str.contains(",", literal=True).all() else ".")
+    values = comma if mark == "," else point
+    for numbers in (point, comma, other):
+        values = np.where(np.isnan(values), numbers, values)
+    unreadable = np.isnan(values) & ~empty
     row = int(unreadable.argmax())
     return Cells(
-        numbers.fill_null(float("nan")).to_numpy(),
-        int((numbers.is_null() & frame["empty"]).sum()),
-        int(unreadable.sum()),
+        values,
+        int(np.count_nonzero(empty)),
+        int(np.count_nonzero(unreadable)),
         texts[row][:40] if unreadable.any() else "",
         row,
-        "" if undecided else mark,
-        ambiguous[0] if len(ambiguous) else "",
+        needed,
+        double[0] if len(double) and not needed else "",
     )
 
 
-def _readings(texts: Series) -> DataFrame:
-    """Return the numbers of texts by their decimal mark, in ``other`` spellings, and which texts are ``empty``."""
+def _readings(texts: Series) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Return the numbers [N] by decimal point, by decimal comma and of other spellings, and which cells are empty."""
     import polars as pl
 
-    text = pl.col("text")
-    plain = texts.str.to_lowercase().str.replace_all("[−–]", "-").to_frame("text")
-    spaces = pl.when(text.str.contains(_SPACED)).then(text.str.replace_all(r"[\s'’]", "")).otherwise(text)
-    hexadecimal = pl.when(text.str.contains("^0x[0-9a-f]+$")).then(text.str.slice(2))
-    hexadecimal = hexadecimal.str.to_integer(base=16, strict=False).cast(pl.Float64)
-    return plain.with_columns(spaces).select(
-        point=_numbers(".", ","),
-        comma=_numbers(",", "."),
-        other=hexadecimal.fill_null(text.replace_strict(_TRUTHS, default=None, return_dtype=pl.Float64)),
-        empty=text.str.contains(EMPTY),
-    )
+    point, comma = _numbers(texts, ".", ","), _numbers(texts, ",", ".")
+    other, rest = np.full(len(texts), np.nan), np.isnan(point) & np.isnan(comma)
+    empty = np.zeros(len(texts), np.bool_)
+    if rest.any():
+        text = texts.filter(rest).str.to_lowercase().str.replace_all("[−–]", "-")
+        spaced = pl.when(text.str.contains(_SPACED)).then(text.str.replace_all(r"[\s'’]", "")).otherwise(text)
+        text = pl.select(spaced).to_series()
+        point[rest], comma[rest] = _numbers(text, ".", ","), _numbers(text, ",", ".")
+        hexadecimal = text.str.extract("^0x([0-9a-f]+)$").str.to_integer(base=16, strict=False).cast(pl.Float64)
+        truths = text.replace_strict(_TRUTHS, default=None, return_dtype=pl.Float64)
+        other[rest] = hexadecimal.fill_null(truths).fill_null(float("nan")).to_numpy()
+        empty[rest] = text.str.contains(EMPTY).to_numpy()
+    return point, comma, other, empty
 
 
-def _numbers(decimal: str, group: str) -> Expr:
-    """Return the finite numbers of a column ``text`` with these marks, null where a cell has another spelling."""
+def _numbers(texts: Series, decimal: str, group: str) -> FloatArray:
+    """Return the finite numbers [N] of texts with these marks, NaN where a text has another spelling."""
     import polars as pl
 
-    text = pl.col("text")
-    spelling = rf"^[-+]?(\d+|[1-9]\d{{0,2}}([{group}]\d{{3}})+)?([{decimal}]\d*)?(e[-+]?\d+)?$"
-    plain = text.str.replace_all(group, "", literal=True).str.replace(decimal, ".", literal=True)
-    number = pl.when(text.str.contains(spelling)).then(plain).cast(pl.Float64, strict=False)
-    return pl.when(number.is_finite()).then(number)
+    spelling = rf"^[-+]?(\d+|[1-9]\d{{0,2}}([{group}]\d{{3}})+)?([{decimal}]\d*)?([eE][-+]?\d+)?$"
+    plain = texts.str.replace_all(group, "", literal=True).str.replace(decimal, ".", literal=True)
+    numbers = plain.cast(pl.Float64, strict=False).fill_null(float("nan")).to_numpy()
+    return np.where(texts.str.contains(spelling).to_numpy() & np.isfinite(numbers), numbers, np.nan)
