@@ -109,8 +109,8 @@ class Clock:
     @property
     def length_s(self) -> float:
         """Duration in s by the usual step; 0 without times."""
-        stamps = self.stamps_ns[self.stamps_ns != NO_TIME]
-        return _step(stamps) * 1e-9 * (len(stamps) - 1)
+        step, count = _steps(self.stamps_ns[self.stamps_ns != NO_TIME])
+        return step * 1e-9 * count
 
     @property
     def is_dated(self) -> bool:
@@ -147,7 +147,8 @@ def number_stamps(values: FloatArray, unit: str = "") -> IntArray:
 
 def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock]) -> tuple[int, int, str]:
     """Return ns of a unit, the units from an epoch to 1970, and what is assumed, from finite values and the unit."""
-    middle, step = (float(np.median(values)), _step(values)) if len(values) else (0.0, 0.0)
+    middle = float(np.median(values)) if len(values) else 0.0
+    step, count = _steps(values)
     lengths = [length for clock in others if (length := clock.length_s) > 0.0]
 
     def fits(factor: int) -> bool:
@@ -155,7 +156,7 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock]) -> tupl
 
     def decades_off(reading: tuple[int, int]) -> float:
         step_s = step * reading[0] / _SECONDS
-        length_s = step_s * (len(values) - 1)
+        length_s = step_s * count
         if length_s <= 0.0:
             return 0.0
         apart = min((abs(math.log10(length_s / length)) for length in lengths), default=0.0)
@@ -211,10 +212,11 @@ def _outside(value: float, usual: tuple[float, float]) -> float:
     return max(0.0, math.log10(usual[0] / value), math.log10(value / usual[1]))
 
 
-def _step(values: NDArray[Any]) -> float:
-    """Return the usual step of finite values; 0 if none is positive."""
-    steps = np.diff(values.astype(np.float64) if values.dtype.kind != "i" else values)
-    return float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+def _steps(values: NDArray[Any]) -> tuple[float, int]:
+    """Return the usual step of finite values, 0 if none is positive, and the number of positive ones."""
+    steps = np.diff(values if values.dtype.kind == "i" else values.astype(np.float64))
+    steps = steps[steps > 0]
+    return (float(np.median(steps)), len(steps)) if len(steps) else (0.0, 0)
 
 
 def _scaled(values: NDArray[Any], factor: int, epoch: int, has_time: BoolArray) -> IntArray:

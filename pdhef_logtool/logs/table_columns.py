@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 _REGULAR = 1.5
 #: A second clock is used if it has times in fewer rows than this share of another one.
 _ENOUGH_ROWS = 0.9
+#: Two clocks of a table whose lengths differ by more than this share contradict each other.
+_ALIKE = 0.01
 #: Share of steps that are not negative, of a column that may contain times.
 _ASCENDING_SHARE = 0.99
 
@@ -145,7 +147,11 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = ()) -> Clock:
             remedy="name the column of times so",
         )
     certain = [clock for name, clock in clocks.items() if name != chosen and clock.is_certain]
-    return _read_clock(sheet, chosen, (*others, *certain)) if certain else clocks[chosen]
+    clock = _read_clock(sheet, chosen, (*others, *certain)) if certain else clocks[chosen]
+    length = clock.length_s
+    apart = [n for _, n in best if abs(clocks[n].length_s - length) > _ALIKE * length and rows[n] >= enough]
+    note = f"{chosen} is the clock; the times of {', '.join(apart)} have another length"
+    return replace(clock, notes=(*clock.notes, note)) if apart else clock
 
 
 def _grade(sheet: Sheet, name: str) -> int | None:
@@ -164,7 +170,7 @@ def _grade(sheet: Sheet, name: str) -> int | None:
         return 0
     if (given[1:] >= given[:-1]).sum() < _ASCENDING_SHARE * (len(given) - 1) or len(column) == 1:
         return 2 if column.dtype.kind == "M" else None
-    is_unit_of_time = sheet.units.get(name, "").lower() in TIME_UNITS_NS
+    is_unit_of_time = sheet.units.get(name, "").lower() in TIME_UNITS_NS or text.startswith("t_")
     return 1 if _TIME_LIKE.search(text) else 2 if column.dtype.kind == "M" else 3 if is_unit_of_time else None
 
 
@@ -208,8 +214,10 @@ def tables_of(sheet: Sheet, where: str, losses: list[Loss], stamps: IntArray | N
     for name, column in sheet.columns.items():
         if name in used:
             continue
-        if not isinstance(column, np.ndarray) or column.dtype.kind not in "iufb" or not np.isfinite(column).any():
+        if not isinstance(column, np.ndarray) or column.dtype.kind not in "iufb":
             unusable.append(name)
+            continue
+        if not np.isfinite(column).any():  # its cells are empty
             continue
         if len(column) != len(stamps):
             losses.append(Loss("bad-column", f"{name}: {len(column)} values for {len(stamps)} times", where))
