@@ -64,7 +64,7 @@ class _Matrices:
 
     def __init__(self, file: TableFile, order: str, losses: list[Loss]) -> None:
         self._file, self._order, self._losses = file, order, losses
-        self._bytes = self._matrices = 0
+        self._claimed = self._matrices = 0
 
     def inflated(self, stored: memoryview) -> memoryview:
         """Return the contents of a compressed element."""
@@ -114,8 +114,7 @@ class _Matrices:
         values = self._numbers((element, contents))
         if min(shape, default=0) < 0 or math.prod(shape) != len(values):
             raise ValueError(f"{path} has {len(values)} values for the dimensions {shape}")
-        self._bytes += 8 * len(values)
-        self._file.limits.check_table(self._bytes, self._file.size, self._file.name)
+        self._claimed = _claim(self._file, self._claimed, len(values))
         values = values.astype(np.bool_ if flags & _LOGICAL else _NUMBERS[kind])
         return name, values.item() if len(values) == 1 else values.reshape(shape, order="F").squeeze()
 
@@ -135,6 +134,12 @@ class _Matrices:
         if element[0] not in _ELEMENTS:
             raise ValueError("an element of it has no valid type or size")
         return np.frombuffer(element[1], f"{self._order}{_ELEMENTS[element[0]]}")
+
+
+def _claim(file: TableFile, claimed: int, count: int) -> int:
+    """Return the bytes that are claimed, with those of an array; raises LimitError above the limit."""
+    file.limits.check_table(claimed + 8 * count, file.size, file.name)
+    return claimed + 8 * count
 
 
 def hdf5_variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, Any]]:
@@ -180,8 +185,7 @@ def hdf5_variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, A
             what = f"{dataset.name} is not used: texts, cells or complex numbers ({dataset.dtype})"
             losses.append(Loss("bad-variable", what, file.name, severity="note"))
             return None
-        claimed += 8 * math.prod(dataset.shape)
-        file.limits.check_table(claimed, file.size, file.name)
+        claimed = _claim(file, claimed, math.prod(dataset.shape))
         file.limits.check_unpacked(dataset.dtype.itemsize * math.prod(dataset.chunks or ()), file.size, file.name)
         if dataset.size and not dataset.id.get_storage_size():
             raise ValueError("none of its values are stored")
