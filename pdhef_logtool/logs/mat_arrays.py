@@ -36,10 +36,14 @@ _ENCODINGS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16"
 _FILTERS = frozenset({1, 2, 3})
 
 
+class _UnusableError(Exception):
+    """A variable contains no numbers; nothing is damaged."""
+
+
 def mat5_variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, Any]]:
     """Yield name and value of the variables of a MAT file of version 5; a damaged one is a loss."""
     data = memoryview(file.stream.read())
-    order = ">" if data[126:128] == b"MI" else "<"
+    order = ">" if bytes(data[126:128]) == b"MI" else "<"
     reader = _Matrices(file, order, losses)
     offset = _MAT_HEAD
     while offset + 8 <= len(data):
@@ -64,7 +68,7 @@ class _Matrices:
 
     def __init__(self, file: TableFile, order: str, losses: list[Loss]) -> None:
         self._file, self._order, self._losses = file, order, losses
-        self._claimed = self._matrices = 0
+        self._budget, self._matrices = _Budget(file), 0
 
     def inflated(self, stored: memoryview) -> memoryview:
         """Return the contents of a compressed element."""
@@ -114,7 +118,7 @@ class _Matrices:
         values = self._numbers((element, contents))
         if min(shape, default=0) < 0 or math.prod(shape) != len(values):
             raise ValueError(f"{path} has {len(values)} values for the dimensions {shape}")
-        self._claimed = _claim(self._file, self._claimed, len(values))
+        self._budget.claim(len(values))
         values = values.astype(np.bool_ if flags & _LOGICAL else _NUMBERS[kind])
         return name, values.item() if len(values) == 1 else values.reshape(shape, order="F").squeeze()
 
@@ -136,17 +140,23 @@ class _Matrices:
         return np.frombuffer(element[1], f"{self._order}{_ELEMENTS[element[0]]}")
 
 
-def _claim(file: TableFile, claimed: int, count: int) -> int:
-    """Return the bytes that are claimed, with those of an array; raises LimitError above the limit."""
-    file.limits.check_table(claimed + 8 * count, file.size, file.name)
-    return claimed + 8 * count
+class _Budget:
+    """Bytes that the arrays of a file claim."""
+
+    def __init__(self, file: TableFile) -> None:
+        self._file, self._claimed = file, 0
+
+    def claim(self, count: int) -> None:
+        """Raise LimitError if an array of so many numbers exceeds the limit."""
+        self._file.limits.check_table(self._claimed + 8 * count, self._file.size, self._file.name)
+        self._claimed += 8 * count
 
 
 def hdf5_variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, Any]]:
     """Yield name and value of the variables of a MAT file of version 7.3; a dataset that cannot be read is a loss."""
     h5py = required("h5py", "formats", "reads MAT files of version 7.3", file.name)
     seen: set[Any] = set()
-    claimed = 0
+    budget = _Budget(file)
 
     def children(group: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
         for name in group:
@@ -162,37 +172,42 @@ def hdf5_variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, A
                     continue
                 seen.add(address)
                 file.limits.check("channels", len(seen), file.name)
-                value = values(item) if isinstance(item, h5py.Dataset) else None
                 if isinstance(item, h5py.Group):
-                    value = dict(children(item, f"{place}/", depth + 1))
-                if value is not None:
+                    yield name, dict(children(item, f"{place}/", depth + 1))
+                elif (value := _dataset(h5py, item, file, budget)) is not None:
                     yield name, value
+            except _UnusableError as error:
+                losses.append(Loss("bad-variable", f"{place} is not used: {error}", file.name, severity="note"))
             except Exception as error:  # noqa: BLE001  any error of a damaged object
                 what = f"{place} cannot be read: {describe_damage(error)[1]}"
                 losses.append(Loss("bad-variable", what, file.name))
 
-    def values(dataset: Any) -> Any:
-        nonlocal claimed
-        plan = dataset.id.get_create_plist()
-        if plan.get_layout() == h5py.h5d.VIRTUAL or plan.get_external_count():
-            raise ValueError("its values are in other files")
-        if not {plan.get_filter(i)[0] for i in range(plan.get_nfilters())} <= _FILTERS:
-            raise ValueError("it has a filter that MATLAB does not use")
-        attributes = {n: dataset.attrs[n] for n in ("MATLAB_class", "MATLAB_empty") if n in dataset.attrs}
-        if attributes.get("MATLAB_empty"):
-            return None
-        if dataset.dtype.kind not in "iufb":
-            what = f"{dataset.name} is not used: texts, cells or complex numbers ({dataset.dtype})"
-            losses.append(Loss("bad-variable", what, file.name, severity="note"))
-            return None
-        claimed = _claim(file, claimed, math.prod(dataset.shape))
-        file.limits.check_unpacked(dataset.dtype.itemsize * math.prod(dataset.chunks or ()), file.size, file.name)
-        if dataset.size and not dataset.id.get_storage_size():
-            raise ValueError("none of its values are stored")
-        array = dataset[()]
-        if attributes.get("MATLAB_class") == b"char":
-            return np.ravel(array).astype("<u2").tobytes().decode("utf-16-le", errors="replace")
-        return np.asarray(array)
-
     with h5py.File(file.stream, "r") as source:
         yield from children(source, "", 0)
+
+
+def _dataset(h5py: Any, dataset: Any, file: TableFile, budget: _Budget) -> Any:
+    """Return an array or a text, None for an empty array.
+
+    Raises
+    ------
+    _UnusableError : it contains no numbers. ValueError : it cannot be read, or is not in the file.
+    """
+    plan = dataset.id.get_create_plist()
+    if plan.get_layout() == h5py.h5d.VIRTUAL or plan.get_external_count():
+        raise ValueError("its values are in other files")
+    if not {plan.get_filter(i)[0] for i in range(plan.get_nfilters())} <= _FILTERS:
+        raise ValueError("it has a filter that MATLAB does not use")
+    attributes = {n: dataset.attrs[n] for n in ("MATLAB_class", "MATLAB_empty") if n in dataset.attrs}
+    if attributes.get("MATLAB_empty"):
+        return None
+    if dataset.dtype.kind not in "iufb":
+        raise _UnusableError(f"texts, cells or complex numbers ({dataset.dtype})")
+    budget.claim(math.prod(dataset.shape))
+    file.limits.check_unpacked(dataset.dtype.itemsize * math.prod(dataset.chunks or ()), file.size, file.name)
+    if dataset.size and not dataset.id.get_storage_size():
+        raise ValueError("none of its values are stored")
+    array = np.asarray(dataset[()])
+    if attributes.get("MATLAB_class") == b"char":
+        return array.ravel().astype("<u2").tobytes().decode("utf-16-le", errors="replace")
+    return array

@@ -9,7 +9,6 @@ from __future__ import annotations
 import datetime as dt
 import math
 import re
-from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -166,9 +165,10 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock]) -> tupl
     days = [(_DAY_NS, epoch) for epoch in _DAYS_TO_1970 if _is_date((middle - epoch) * 86_400.0)]
     if stated:
         as_stated = next((r for r in (*dates, *days) if r[0] == stated), (stated, 0))
-        better = next((r for r in (*dates, *days) if fits(r[0])), as_stated) if not fits(stated) else as_stated
+        is_sound = fits(stated) and abs(middle) * stated < _LAST_NS
+        better = as_stated if is_sound else next((r for r in (*dates, *days) if fits(r[0])), as_stated)
         changed = better[0] != stated
-        return *better, f"the unit makes no plausible rate, read as {_named(*better)}" if changed else ""
+        return *better, f"the unit makes no plausible times, read as {_named(*better)}" if changed else ""
     dates = [reading for reading in dates if fits(reading[0])]
     factor, epoch = dates[0] if dates else min((*((f, 0) for f in _SUBUNITS), *days), key=decades_off)
     assumed = "" if dates or factor == _SECONDS else f"no unit, read as {_named(factor, epoch)}"
@@ -189,9 +189,8 @@ def _of_gps(clock: Clock, name: str, others: Sequence[Clock]) -> Clock:
     if dated is not None:
         return clock
     year = dt.datetime.fromtimestamp(unix_s, dt.UTC).year
-    return replace(
-        clock, notes=(*clock.notes, f"{name}: read as Unix time, {year}; as GPS time it would be {year + 10}")
-    )
+    note = f"{name}: read as Unix time, {year}; as GPS time it would be {year + 10}"
+    return replace(clock, notes=(*clock.notes, note))
 
 
 def _named(factor: int, epoch: int) -> str:
@@ -243,7 +242,7 @@ def week_clock(week: FloatArray, seconds: FloatArray) -> Clock:
     """Return the clock of GPS weeks [N] and their seconds (or milliseconds) [N]; 10-bit weeks are of 2015 to 2034."""
     has_time = np.isfinite(week) & np.isfinite(seconds)
     has_time &= (np.abs(np.where(has_time, week, -1.0) - 5000.0) <= 5000.0) & (np.abs(seconds) <= 2e3 * _WEEK_S)
-    given, within = week[has_time], seconds[has_time]
+    given, within = week[has_time].astype(np.int64), seconds[has_time]
     notes: tuple[str, ...] = ()
     if given.size and given.max() < _WEEKS_OF_10_BITS:
         added = _WEEKS_OF_10_BITS * math.ceil((_FIRST_WEEK - float(np.median(given))) / _WEEKS_OF_10_BITS)
@@ -251,9 +250,7 @@ def week_clock(week: FloatArray, seconds: FloatArray) -> Clock:
         given = given + added
     within = within / 1e3 if within.max(initial=0.0) > _WEEK_S else within
     stamps = np.full(week.shape, NO_TIME, np.int64)
-    stamps[has_time] = (
-        _GPS_EPOCH_NS + given.astype(np.int64) * (_WEEK_S * _SECONDS) + np.round(within * 1e9).astype(np.int64)
-    )
+    stamps[has_time] = _GPS_EPOCH_NS + given * (_WEEK_S * _SECONDS) + np.round(within * 1e9).astype(np.int64)
     return Clock(_to_utc(stamps, has_time), notes)
 
 
@@ -350,8 +347,8 @@ def ascending_rows(stamps: IntArray, where: str) -> tuple[IntArray, list[Loss]]:
     """Return the rows that are kept of stamps [N], in file order, and losses.
 
     As in logs of messages, rows of another time (:mod:`~pdhef_logtool.logs.recording_span`) are left out where they
-    disturb the order. Where the clock steps back, the first pass is kept, and rows more than ``BREAK_NS`` behind its
-    end. Single rows out of order are left out. No row is moved.
+    disturb the order. If the clock steps back, the first pass is kept, and rows more than ``BREAK_NS`` after its end.
+    Single rows out of order are left out. No row is moved.
     """
     rows: IntArray = np.flatnonzero(stamps != NO_TIME)
     losses: list[Loss] = []
@@ -361,8 +358,8 @@ def ascending_rows(stamps: IntArray, where: str) -> tuple[IntArray, list[Loss]]:
         if not kept.all():
             out, n = stamps[rows[~kept]], int((~kept).sum())
             severity: Literal["lost", "note"] = "lost" if n > NOTED_SHARE * len(stamps) else "note"
-            inside = (int(out.min()), int(out.max())) if reason == TIME_JUMP else (None, None)
-            losses.append(Loss(reason, f"{n} rows are left out: {what}", where, *inside, n, severity))
+            first, last = (int(out.min()), int(out.max())) if reason == TIME_JUMP else (None, None)
+            losses.append(Loss(reason, f"{n} rows are left out: {what}", where, first, last, n, severity))
             rows = rows[kept]
 
     if len(rows) < len(stamps):
@@ -380,34 +377,15 @@ def ascending_rows(stamps: IntArray, where: str) -> tuple[IntArray, list[Loss]]:
         kept[begin:end] = times > end_ns
         end_ns = max(end_ns, int(times.max()) + BREAK_NS)
     leave_out(kept, TIME_JUMP, f"the clock steps back at row {rows[begins[0]] + 1}" if begins else "")
-    leave_out(_ascending(stamps[rows]), "out-of-order", "their times step back")
+    times = stamps[rows]
+    behind, ahead = times >= np.maximum.accumulate(times), times <= np.minimum.accumulate(times[::-1])[::-1]
+    leave_out(max(behind, ahead, key=np.count_nonzero), "out-of-order", "their times are not in order")
     return rows, losses
-
-
-def _ascending(times: IntArray) -> BoolArray:
-    """Return which of times [N] are in the longest sequence that never steps back."""
-    ends: list[int] = []  # the lowest last time of sequences of each length
-    end_rows: list[int] = []
-    before = []
-    for row, time in enumerate(times.tolist()):
-        length = bisect_right(ends, time)
-        ends[length : length + 1], end_rows[length : length + 1] = [time], [row]
-        before.append(end_rows[length - 1] if length else -1)
-    kept = np.zeros(len(times), np.bool_)
-    row = end_rows[-1] if end_rows else -1
-    while row >= 0:
-        kept[row] = True
-        row = before[row]
-    return kept
 
 
 def unlike_lengths(stamps: Mapping[str, IntArray], where: str) -> list[Loss]:
     """Return a loss if the clocks [N] of a file, by table, have lengths that are not those of one recording."""
-    lengths = {name: int(s[-1] - s[0]) * 1e-9 for name, s in stamps.items() if len(s) >= _FEW_ROWS and s[-1] > s[0]}
-    if not lengths:
-        return []
-    short, long = (extreme(lengths, key=lengths.__getitem__) for extreme in (min, max))
-    if lengths[long] < _UNLIKE * lengths[short]:
-        return []
-    what = f"clocks of one recording differ: {short} lasts {lengths[short]:.4g} s, {long} {lengths[long]:.4g} s"
-    return [Loss("clock-lengths", what, where)]
+    compared = [(int(s[-1] - s[0]) * 1e-9, n) for n, s in stamps.items() if len(s) >= _FEW_ROWS and s[-1] > s[0]]
+    (short_s, short), (long_s, long) = (min(compared), max(compared)) if compared else ((1.0, ""), (1.0, ""))
+    what = f"clocks of one recording differ: {short} lasts {short_s:.4g} s, {long} {long_s:.4g} s"
+    return [Loss("clock-lengths", what, where)] if long_s >= _UNLIKE * short_s else []

@@ -51,9 +51,7 @@ _LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "O
 
 _TIME = re.compile(
     r"(?:(?:time|t|timestamp|time_?stamps?|stamp|utc|utc_time|gps_time|date_?time|datetime|zeit|log_time|rel(?:ative)?_time|"
-    r"elapsed(?:_time)?|time_of_day)(?:_(?:"
-    + "|".join(TIME_UNITS_NS)
-    + r"))?|seconds|milli(?:s|seconds)|micros|time_utc|epoch)"
+    rf"elapsed(?:_time)?|time_of_day)(?:_(?:{'|'.join(TIME_UNITS_NS)}))?|seconds|milli(?:s|seconds)|micros|time_utc|epoch)"
 )
 _TIME_LIKE = re.compile(r"time|zeit|clock|stamp")
 _WEEK = re.compile(r"(?:gps|gnss)?_?week(?:_?(?:number|no|nr))?")
@@ -131,15 +129,10 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = ()) -> Clock:
     if week is not None and seconds is not None:
         clock = week_clock(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds]))
         return replace(clock, columns=frozenset({week, seconds}))
-    graded = sorted(
-        (grade, i, name) for i, name in enumerate(sheet.columns) if (grade := _grade(sheet, name)) is not None
-    )
-    clocks = {name: _read_clock(sheet, name, others) for _, _, name in graded}
-    rows = {name: np.count_nonzero(clock.stamps_ns != NO_TIME) for name, clock in clocks.items()}
-    best = [(not (grade and clocks[n].is_dated), n) for grade, _, n in graded if grade == graded[0][0]]
-    enough = _ENOUGH_ROWS * max((rows[name] for _, name in best), default=0)
-    chosen = next((name for _, name in sorted(best, key=lambda b: b[0]) if rows[name] >= enough > 0.0), None)
-    if chosen is None:
+    grades = {name: grade for name in sheet.columns if (grade := _grade(sheet, name)) is not None}
+    clocks = {name: _read_clock(sheet, name, others) for name in grades}
+    chosen, *rivals = _best_clocks(clocks, grades)
+    if not chosen:
         raise LogError(
             expected="a column of times (time, t, timestamp; s, ms, ISO 8601, or GPS week and seconds)",
             got=", ".join([*sheet.columns][:8]) or "no columns",
@@ -148,10 +141,16 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = ()) -> Clock:
         )
     certain = [clock for name, clock in clocks.items() if name != chosen and clock.is_certain]
     clock = _read_clock(sheet, chosen, (*others, *certain)) if certain else clocks[chosen]
-    length = clock.length_s
-    apart = [n for _, n in best if abs(clocks[n].length_s - length) > _ALIKE * length and rows[n] >= enough]
+    apart = [n for n in rivals if abs(clocks[n].length_s - clock.length_s) > _ALIKE * clock.length_s]
     note = f"{chosen} is the clock; the times of {', '.join(apart)} have another length"
     return replace(clock, notes=(*clock.notes, note)) if apart else clock
+
+
+def _best_clocks(clocks: Mapping[str, Clock], grades: Mapping[str, int]) -> list[str]:
+    """Return the columns of the best grade with enough times, dates first unless their names decide; "" if none."""
+    rows = {n: np.count_nonzero(clocks[n].stamps_ns != NO_TIME) for n in grades if grades[n] == min(grades.values())}
+    enough = [n for n in rows if rows[n] >= _ENOUGH_ROWS * max(rows.values()) > 0.0]
+    return sorted(enough, key=lambda n: not (grades[n] and clocks[n].is_dated)) or [""]
 
 
 def _grade(sheet: Sheet, name: str) -> int | None:
@@ -159,8 +158,10 @@ def _grade(sheet: Sheet, name: str) -> int | None:
     column, text = sheet.columns[name], snake(name)
     is_time = _TIME.fullmatch(text) is not None
     if not isinstance(column, np.ndarray):
-        stamps = text_clock(column.drop_nulls().head(20)).stamps_ns if is_time or _DATE.fullmatch(text) else []
-        return (not is_time) * 1 if len({*stamps} - {NO_TIME}) > (not is_time) else None
+        if not is_time and not _DATE.fullmatch(text):
+            return None
+        times = {*text_clock(column.drop_nulls().head(20)).stamps_ns.tolist()} - {NO_TIME}
+        return (0 if is_time else 1) if len(times) > (not is_time) else None
     if column.dtype.kind not in "iufM":
         return None
     given = column[~np.isnat(column)].view(np.int64) if column.dtype.kind == "M" else column[np.isfinite(column)]

@@ -286,4 +286,4 @@ def test_structs_texts_units_and_cells_of_version_7_3(tmp_path: Path) -> None:
     assert {(t.name, f.path, f.unit) for t in tables.tables for f in t.fields} == {
         ("mat", "ay", ""), ("loop", "data", "m/s^2"),
     }  # fmt: skip
-    assert [(severity, what.partition(" is")[0]) for severity, what in _losses(tables)] == [("note", "/cell")]
+    assert [(severity, what.partition(" is")[0]) for severity, what in _losses(tables)] == [("note", "cell")]

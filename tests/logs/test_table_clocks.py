@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -250,7 +251,7 @@ def test_a_column_has_its_own_table_if_its_clock_is_slower(missing: str, own_row
         "every tenth": row % 10 > 0, "each second": row % 2 == 0, "1 Hz": row % 50 == 0,
         "1 Hz from the middle": (row % 50 == 0) & (row >= 500), "20 Hz": np.isin(row % 5, (0, 2)),
     }[missing]  # fmt: skip
-    columns = {
+    columns: dict[str, Any] = {
         "t": row * 0.02,
         "ay": row * 1.0,
         "gnss": np.where(there, row, np.nan),
