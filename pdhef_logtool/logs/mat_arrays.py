@@ -1,6 +1,6 @@
 """Variables of MAT files, of version 5 and (extra ``formats``) 7.3, as arrays, texts, and structs of these.
 
-Both readers refuse what no recording needs: sparse matrices, objects, and, of HDF5, values in other files. Dimensions
+Both readers refuse sparse matrices, objects and, in HDF5, values in other files. Dimensions
 are compared with the stored bytes and the limits before anything is allocated.
 """
 
@@ -37,7 +37,7 @@ _FILTERS = frozenset({1, 2, 3})
 
 
 class _UnusableError(Exception):
-    """A variable contains no numbers; nothing is damaged."""
+    """A variable contains no numbers; the file is not damaged."""
 
 
 def mat5_variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, Any]]:
@@ -147,7 +147,7 @@ class _Budget:
         self._file, self._claimed = file, 0
 
     def claim(self, count: int) -> None:
-        """Raise LimitError if an array of so many numbers exceeds the limit."""
+        """Raise LimitError if an array of ``count`` numbers exceeds the limit."""
         self._file.limits.check_table(self._claimed + 8 * count, self._file.size, self._file.name)
         self._claimed += 8 * count
 

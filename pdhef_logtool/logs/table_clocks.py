@@ -66,14 +66,14 @@ _DATE_STEPS_S = (1e-5, 60.0)
 #: Usual recordings: steps and durations in s. A reading is rated by the decades outside of these ranges.
 _USUAL_STEP_S = (0.5e-3, 1.0)
 _USUAL_LENGTH_S = (10.0, 14_400.0)
-#: Clocks of one file whose lengths have this ratio, or a higher one, are not of one recording.
+#: Clocks of one recording have lengths below this ratio.
 _UNLIKE = 1000.0
 #: Clocks with fewer rows are not compared.
 _FEW_ROWS = 10
 
 _GPS_EPOCH_NS = 315_964_800 * 10**9
 _WEEK_S = 604_800
-#: Weeks of 10 bits are those of 2015 to 2034.
+#: 10-bit weeks are read as dates from 2015 to 2034.
 _FIRST_WEEK, _WEEKS_OF_10_BITS = 1826, 1024
 #: A clock of GPS time that is read as Unix time is before 2018, in s since 1970; logs of cars are younger.
 _GPS_AS_UNIX_S = (1_104_537_600, 1_514_764_800)
@@ -96,7 +96,7 @@ class Clock:
     ----------
     stamps_ns : int64 [N], since 1970, or after :data:`RELATIVE_NS` if they count from the start of a recording;
         :data:`NO_TIME` in rows without a time.
-    notes : what was assumed. is_certain : the file states the unit, or the times are dates.
+    notes : assumptions. is_certain : the file states the unit, or the times are dates.
     columns : names of the columns that the times come from.
     """
 
@@ -145,7 +145,7 @@ def number_stamps(values: FloatArray, unit: str = "") -> IntArray:
 
 
 def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock]) -> tuple[int, int, str]:
-    """Return ns of a unit, the units from an epoch to 1970, and what is assumed, from finite values and the unit."""
+    """Return ns of a unit, the units from an epoch to 1970, and the assumption, from finite values and the unit."""
     middle = float(np.median(values)) if len(values) else 0.0
     step, count = _steps(values)
     lengths = [length for clock in others if (length := clock.length_s) > 0.0]
@@ -231,7 +231,7 @@ def _scaled(values: NDArray[Any], factor: int, epoch: int, has_time: BoolArray) 
 
 
 def placed(stamps: IntArray) -> IntArray:
-    """Return stamps [N], moved to :data:`RELATIVE_NS` where they are no dates."""
+    """Return stamps [N], moved to :data:`RELATIVE_NS` unless they are dates."""
     return stamps if _is_dated(stamps) else np.where(stamps != NO_TIME, stamps + RELATIVE_NS, NO_TIME)
 
 
@@ -267,8 +267,8 @@ def _to_utc(stamps: IntArray, has_time: BoolArray) -> IntArray:
 def text_clock(texts: Series, dates: Series | None = None) -> Clock:
     """Return the clock of texts [N]: ISO 8601, other dates with a time, or times of day; ``dates``: of their days.
 
-    Day and month have one order in the whole column: that of the numbers above 12, otherwise that of the shorter
-    recording, otherwise month first, with a note.
+    Day and month have one order in the whole column. Numbers above 12 decide it; then the shorter recording; otherwise
+    the month is first, with a note.
     """
     parts = texts.str.strip_chars().str.extract_groups(_TIME_TEXT).struct.unnest()
     if dates is not None and parts["a"].null_count() == len(parts):
@@ -302,7 +302,7 @@ _WORDS = frozenset({"mark", "half", "sign", "fraction"})
 
 
 def _days(a: IntArray, b: IntArray, c: IntArray, mark: NDArray[Any]) -> tuple[IntArray, BoolArray, str]:
-    """Return days since 1970 of dates a-b-c [N], where they are days, and what is assumed."""
+    """Return days since 1970 of dates a-b-c [N], a mask of valid days, and the assumption."""
     year_first = a > 31
     is_short = (c < 100) & (mark != "-")
     year = np.where(year_first, a, np.where(is_short, c + 2000, c))
@@ -384,7 +384,7 @@ def ascending_rows(stamps: IntArray, where: str) -> tuple[IntArray, list[Loss]]:
 
 
 def unlike_lengths(stamps: Mapping[str, IntArray], where: str) -> list[Loss]:
-    """Return a loss if the clocks [N] of a file, by table, have lengths that are not those of one recording."""
+    """Return a loss if the lengths of the clocks [N] of a file, by table, contradict each other."""
     compared = [(int(s[-1] - s[0]) * 1e-9, n) for n, s in stamps.items() if len(s) >= _FEW_ROWS and s[-1] > s[0]]
     (short_s, short), (long_s, long) = (min(compared), max(compared)) if compared else ((1.0, ""), (1.0, ""))
     what = f"clocks of one recording differ: {short} lasts {short_s:.4g} s, {long} {long_s:.4g} s"

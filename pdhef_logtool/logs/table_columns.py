@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _REGULAR = 1.5
 #: A second clock is used if it has times in fewer rows than this share of another one.
 _ENOUGH_ROWS = 0.9
-#: Two clocks of a table whose lengths differ by more than this share contradict each other.
+#: Lengths of two clocks of a table differ by less than this share.
 _ALIKE = 0.01
 #: Share of steps that are not negative, of a column that may contain times.
 _ASCENDING_SHARE = 0.99
@@ -89,7 +89,7 @@ def is_unit(text: str) -> bool:
 
 
 def split_unit(text: str) -> tuple[str, str]:
-    """Return name and unit of a title (``Speed (km/h)``, ``"Speed"|"km/h"|0|250``); empty where it has none."""
+    """Return name and unit of a title (``Speed (km/h)``, ``"Speed"|"km/h"|0|250``); an empty unit if the title contains no unit."""
     if "|" in text:
         text, unit, *_ = (part.strip('" ') for part in text.split("|"))
         return text, unit if is_unit(unit) else ""
@@ -236,7 +236,7 @@ def tables_of(sheet: Sheet, where: str, losses: list[Loss], stamps: IntArray | N
 
 
 def clock_notes(clock: Clock, where: str) -> list[Loss]:
-    """Return what was assumed of a clock."""
+    """Return the assumptions of a clock as notes."""
     return [Loss("clock", note, where, severity="note") for note in clock.notes]
 
 
@@ -255,7 +255,7 @@ def _own_rows(there: BoolArray, stamps: IntArray) -> BoolArray:
 
 
 def _of_long_form(sheet: Sheet, stamps: IntArray) -> Iterator[tuple[Sheet, IntArray]]:
-    """Yield the signals of a table with a row for each value, those with the same times together; of others nothing."""
+    """Yield the signals of a table with a row for each value; signals with equal times are one sheet."""
     named = {snake(name): column for name, column in sheet.columns.items()}
     signal, value = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in (_SIGNAL, _VALUE))
     if signal is None or isinstance(signal, np.ndarray) or not isinstance(value, np.ndarray):
