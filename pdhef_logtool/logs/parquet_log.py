@@ -96,7 +96,7 @@ def _groups(source: Any, paths: Sequence[str], file: TableFile, losses: list[Los
         where, rows = f"{file.name}, row group {number}", group.num_rows
         part: dict[str, Any] = {}
         try:
-            claimed += rows * max(1, len(paths)) * 8
+            claimed += max(8 * rows * max(1, len(paths)), group.total_byte_size)
             file.limits.check_table(claimed, file.size, where)
             errors = dict(_read(source, number, rows, paths, part))
         except LogError as error:

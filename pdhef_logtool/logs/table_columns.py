@@ -89,7 +89,7 @@ def is_unit(text: str) -> bool:
 
 
 def split_unit(text: str) -> tuple[str, str]:
-    """Return name and unit of a title (``Speed (km/h)``, ``"Speed"|"km/h"|0|250``); an empty unit if the title contains no unit."""
+    """Return name and unit of a title (``Speed (km/h)``, ``"Speed"|"km/h"|0|250``); without a unit, it is empty."""
     if "|" in text:
         text, unit, *_ = (part.strip('" ') for part in text.split("|"))
         return text, unit if is_unit(unit) else ""
