@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 GROUP = "pdhef.log_formats"
 #: Bytes of a file's start by which its format is recognised.
 HEAD_BYTES = 16
-#: Suffixes of a file that is compressed as a whole, and what it begins with.
+#: Suffixes of a file that is compressed as a whole, and its first bytes.
 COMPRESSED_SUFFIXES = (".zstd", ".zst")
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 ROSBAG2_METADATA = "metadata.yaml"
@@ -36,8 +36,8 @@ class LogFormat:
     ----------
     title : for messages: ``an MCAP file``.
     opener : ``package.module:function``, which opens a :class:`LogFile` as a log, or as a container of messages, and
-        raises LogError for a file that is none of this format.
-    libraries : None; or the opener is a reader of tables, which runs in a process of its own
+        raises LogError for a file of another format.
+    libraries : None; or the opener is a reader of tables, which runs in a separate process
         (:mod:`~pdhef_logtool.logs.reader_process`), with the modules that it imports.
     suffixes : by which a search through folders takes files for logs. named : also, if it is named outright.
     magic : first bytes of every file, or several possible ones; empty: a file is recognised by its suffix.
@@ -102,18 +102,18 @@ def _of_other_packages() -> tuple[LogFormat, ...]:
 
 
 def _every_format() -> Iterator[LogFormat]:
-    """Yield all formats, those of other packages last, so that these are looked for only where they are needed."""
+    """Yield all formats. Those of other packages are last, so that they are searched for only if necessary."""
     yield from FORMATS
     yield from _of_other_packages()
 
 
 def recognised_format(head: bytes, name: str) -> LogFormat | None:
-    """Return the format of a file by its first :data:`HEAD_BYTES` and its name; None where it is no log."""
+    """Return the format of a file by its first :data:`HEAD_BYTES` and its name; None if it is not a log."""
     return next((f for f in _every_format() if f.recognises(head, name)), None)
 
 
 def log_suffixes() -> tuple[str, ...]:
-    """Return the suffixes by which files are taken for logs in a search through folders."""
+    """Return the suffixes of logs in a search through folders."""
     return tuple(suffix for f in _every_format() for suffix in f.suffixes)
 
 

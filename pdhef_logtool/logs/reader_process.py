@@ -1,4 +1,4 @@
-"""The boundary of foreign readers: each file of tables is read by a process of its own (Linux).
+"""The boundary of foreign readers: each file of tables is read by a separate process (Linux).
 
 A library for MDF, MAT or Parquet files is a large parser of third-party bytes. It runs in a process that has the open
 file, limits of memory and processor time, an empty folder, and no other file
@@ -46,9 +46,9 @@ from pdhef_logtool.workers.supervisor import ForkServer, can_fork
 _SERVE = f"{__name__}:serve_tables"
 _HEAD = struct.Struct("<q")
 _ERRORS: Mapping[str, type[PdhefError]] = {e.__name__: e for e in (LogError, LimitError, UsageError)}
-#: A process that answers nothing is ended after its processor time by this factor, and a constant part.
+#: Timeout of a request: the allowed processor time by this factor, and a constant part.
 _PATIENCE, _PATIENCE_S = 10.0, 60.0
-#: Readers that are started again after one died: the other columns of its file are still wanted.
+#: Restarts of a reader that died while it loaded a column: the other columns can still be read.
 _RESTARTS = 1
 _REMEDY = "give the recording itself"
 
@@ -186,7 +186,7 @@ class _Session:
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """What a reader process receives beside the open file."""
+    """Settings of a reader process."""
 
     reader: str
     name: str
@@ -197,27 +197,27 @@ class _Order:
     seconds: float
 
 
-#: Fork servers by process and by the reader whose libraries they have imported.
-_servers: dict[tuple[int, str], ForkServer] = {}
+#: Fork servers, which have imported the libraries of a reader, by process and reader; kept until this process ends.
+SERVERS: dict[tuple[int, str], ForkServer] = {}
 _numbers = itertools.count(1)
 
 
 def _server(reader: str, *libraries: str) -> ForkServer:
     key = os.getpid(), reader
-    if key not in _servers or _servers[key].is_dead():
+    if key not in SERVERS or SERVERS[key].is_dead():
         here = [name for name in libraries if importlib.util.find_spec(name.partition(".")[0])]
         server = ForkServer([reader.partition(":")[0], *here])
         server.start()
-        _servers[key] = server
-    return _servers[key]
+        SERVERS[key] = server
+    return SERVERS[key]
 
 
 @atexit.register
 def _end_servers() -> None:
-    for (pid, _), server in _servers.items():
+    for (pid, _), server in SERVERS.items():
         if pid == os.getpid():
             server.end()
-    _servers.clear()
+    SERVERS.clear()
 
 
 def serve_tables(channel: socket.socket) -> None:

@@ -15,11 +15,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import pdhef_logtool
-
 #: System calls of Landlock, the same on every architecture, and the option of prctl that they need.
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF, _NO_NEW_PRIVILEGES = 444, 445, 446, 38
-#: Rights over files that each version of Landlock knows, as a number of bits; version 4 adds the network.
+#: Rights over files by version of Landlock, as a number of bits; version 4 adds the network.
 _RIGHTS_BY_VERSION = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
 _READ_FILES_AND_FOLDERS, _TCP, _ALL_SCOPES, _BELOW_A_PATH = 0b1100, 0b11, 0b11, 1
 
@@ -31,7 +29,7 @@ def confine(folder: Path, more_bytes: int) -> None:
     ----------
     folder : private and empty; becomes the working folder, the folder of temporary files, and takes the standard
         output and error as file ``output``. It is the only place that can be written.
-    more_bytes : limit of the memory that the process takes in addition to what it has.
+    more_bytes : limit of further memory.
     """
     os.chdir(folder)
     os.environ["TMPDIR"] = tempfile.tempdir = str(folder)
@@ -76,7 +74,7 @@ def _refuse_other_files(folder: Path) -> None:
             rule = struct.pack("=Qi", _READ_FILES_AND_FOLDERS, place)
             system.syscall(_ADD_RULE, rules, _BELOW_A_PATH, rule, 0)
     with _opened(folder) as place:
-        system.syscall(_ADD_RULE, rules, _BELOW_A_PATH, struct.pack("=Qi", rights & ~1, place), 0)  # runs nothing
+        system.syscall(_ADD_RULE, rules, _BELOW_A_PATH, struct.pack("=Qi", rights & ~1, place), 0)  # all but to execute
     system.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)
     if system.syscall(_RESTRICT_SELF, rules, 0):
         raise OSError(ctypes.get_errno(), "Landlock refuses to confine the reader")
@@ -88,7 +86,7 @@ def _code() -> Iterator[Path]:
     packages = (Path(p) for p in sys.path if Path(p).name in ("site-packages", "dist-packages"))
     system = (Path(p) for p in ("/lib", "/lib64", "/usr/lib", "/usr/share/zoneinfo"))
     library = Path(os.__file__).parent
-    yield from (p for p in (library, Path(pdhef_logtool.__file__).parent, *packages, *system) if p.is_dir())
+    yield from (p for p in (library, Path(__file__).parents[1], *packages, *system) if p.is_dir())
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """The fork server, from which workers are forked, and the loop of a worker: the counterpart of ``supervisor.py``.
 
-The server imports what the workers need and stays otherwise as it is: it has one thread and no open query, so that
-every fork of it is a whole process at the price of a fork.
+The server imports the modules of the workers and does no other work: it has one thread and no open query, so that each
+fork is a complete process.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def ask(control: socket.socket, what: bytes, number: int, descriptors: Sequence[
 
 def serve(descriptor: int) -> None:
     """Run the server on the socket of this descriptor until the other side closes; no worker outlives it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     control = socket.socket(fileno=descriptor)
     workers: set[int] = set()
     try:
@@ -108,13 +108,13 @@ def serve(descriptor: int) -> None:
         for pid in workers:
             os.kill(pid, signal.SIGKILL)  # not yet waited for: no other process can have its number
         for pid in workers:
-            os.waitpid(pid, 0)  # so that what they took counts as the command's
+            os.waitpid(pid, 0)  # so that their processor time counts as the command's
 
 
 def _prepare(preload: Sequence[str]) -> tuple[str, bool]:
     """Import modules, with ``.*`` all of a package, and call the function after a colon.
 
-    Returns what went wrong, and whether all is warm: nothing that was called has returned False.
+    Returns an error message, and whether all is warm: no function has returned False.
     """
     warm = True
     for name in preload:
@@ -129,7 +129,7 @@ def _prepare(preload: Sequence[str]) -> tuple[str, bool]:
         except Exception as error:  # noqa: BLE001 (the parent reports any error)
             return f"{name}: {describe_error(error)}", warm
     gc.collect()
-    gc.freeze()  # so that collecting in a worker does not copy what all share
+    gc.freeze()  # so that garbage collection in a worker copies no shared memory
     return "", warm
 
 

@@ -210,8 +210,13 @@ class ForkServer:
             )
         self._preload = list(preload)
 
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
     def start(self) -> bool | None:
-        """Wait until it has loaded what it is to load; return False if workers have something to compile.
+        """Wait until it has loaded its modules; return False if workers have code to compile.
 
         Returns None if it died.
 
@@ -262,7 +267,7 @@ class ForkServer:
 
 
 class Crew(Generic[T, R]):
-    """Workers for several lists of items; arguments and errors as those of :func:`supervise`."""
+    """Workers for several lists of items; arguments and errors as for :func:`supervise`."""
 
     def __init__(
         self,
@@ -385,7 +390,7 @@ class Crew(Generic[T, R]):
         self._selector.register(ours, selectors.EVENT_READ, worker)
 
     def _live_server(self) -> ForkServer:
-        """Return the fork server, started or restarted where it is necessary.
+        """Return the fork server; start or restart it if necessary.
 
         Raises
         ------
@@ -407,7 +412,7 @@ class Crew(Generic[T, R]):
                 expected="a fork server that keeps running",
                 got=f"{self._deaths} that died, the last one by {how}",
                 where="worker processes",
-                remedy="find what kills them, for example the system for lack of memory",
+                remedy="find the process that kills them, for example the system for lack of memory",
             )
         self._warn(f"the fork server died ({how}): restart {self._deaths} of {_RESTARTS}, no item is lost")
 
