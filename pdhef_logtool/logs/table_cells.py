@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from polars import Series
 
 #: Spellings of a missing value, in lower case.
-EMPTY = r"^([-+]?(nan|1\.#(qnan|snan|ind))(\(\w*\))?0*|#?n/?a|#n/a!|<na>|nat|null|none|-*)$"
+EMPTY = r"([-+]?(nan|1\.#(qnan|snan|ind))(\(\w*\))?0*|#?n/?a|#n/a!|<na>|nat|null|none|-*)"
 _TRUTHS = {"true": 1.0, "false": 0.0}
 #: Groups of three digits with spaces or apostrophes between them, and with points.
 _SPACED, _POINTS = r"^[-+]?[1-9]\d{0,2}([\s'’]\d{3})+([.,]\d*)?$", r"^[-+]?[1-9]\d{0,2}(\.\d{3})+$"
@@ -28,8 +28,8 @@ class Cells:
     ----------
     values : float64 [N], NaN where a cell contains no number; all numbers are finite.
     empty, unreadable : cells without a number. example, row : first unreadable cell and its row, from 0.
-    decimal : decimal mark that the cells need, ``.`` or ``,``; empty if they fit both.
-    ambiguous : first cell with two readings, such as ``1,234``, if no other cell of the column decides.
+    decimal : decimal mark that the cells need, ``.`` or ``,``; empty if they fit both. mark : the one that was used.
+    ambiguous : first cell with two readings, such as ``1,234``, if nothing decides between them.
     """
 
     values: FloatArray
@@ -38,6 +38,7 @@ class Cells:
     example: str = ""
     row: int = 0
     decimal: str = ""
+    mark: str = "."
     ambiguous: str = ""
 
     @property
@@ -56,6 +57,9 @@ class Cells:
         if self.unreadable:
             what = f"{column} has cells that are not numbers, the first in {place}: {self.example!r}"
             yield Loss("bad-cell", what, where, count=self.unreadable)
+        if "," in self.ambiguous + self.mark and self.ambiguous:
+            what = f"{column}: {self.ambiguous} has two readings; {self.mark!r} is taken as the decimal mark"
+            yield Loss("ambiguous-number", what, where, severity="note")
 
 
 def read_cells(texts: Series, decimal: str = "") -> Cells:
@@ -82,6 +86,7 @@ def read_cells(texts: Series, decimal: str = "") -> Cells:
         values = np.where(np.isnan(values), numbers, values)
     unreadable = np.isnan(values) & ~empty
     row = int(unreadable.argmax())
+    ambiguous = "" if needed or double.is_empty() or (decimal == mark and mark in double[0]) else double[0]
     return Cells(
         values,
         int(np.count_nonzero(empty)),
@@ -89,7 +94,8 @@ def read_cells(texts: Series, decimal: str = "") -> Cells:
         texts[row][:40] if unreadable.any() else "",
         row,
         needed,
-        double[0] if len(double) and not needed else "",
+        mark,
+        ambiguous,
     )
 
 
@@ -108,7 +114,7 @@ def _readings(texts: Series) -> tuple[FloatArray, FloatArray, FloatArray, BoolAr
         hexadecimal = text.str.extract("^0x([0-9a-f]+)$").str.to_integer(base=16, strict=False).cast(pl.Float64)
         truths = text.replace_strict(_TRUTHS, default=None, return_dtype=pl.Float64)
         other[rest] = hexadecimal.fill_null(truths).fill_null(float("nan")).to_numpy()
-        empty[rest] = text.str.contains(EMPTY).to_numpy()
+        empty[rest] = text.str.contains(f"^{EMPTY}$").to_numpy()
     return point, comma, other, empty
 
 
