@@ -29,7 +29,7 @@ class Cells:
     ----------
     values : float64 [N], NaN where a cell contains no number; all numbers are finite.
     empty, unreadable : cells without a number. example, row : first unreadable cell and its row, from 0.
-    decimal : decimal mark that the cells need, ``.`` or ``,``; empty if they fit both or were not examined.
+    decimal : decimal mark that the cells need, ``.`` or ``,``; empty if they fit both.
     ambiguous : first cell with two readings, such as ``1,234``, and its value, if no evidence decides between them.
     """
 
@@ -67,12 +67,7 @@ def read_cells(texts: Series, decimal: str = "") -> Cells:
     One decimal mark applies to the whole column: the one that more of its cells need; if no cell decides, ``decimal``,
     or else the only mark that the cells contain. A cell that fits only the other mark is read with that one.
     """
-    import polars as pl
-
     texts = texts.fill_null("").str.strip_chars()
-    values = texts.cast(pl.Float64, strict=False).fill_null(float("nan")).to_numpy()
-    if decimal == "." and np.isfinite(values).all():
-        return Cells(values)
     point, comma = _numbers(texts, "."), _numbers(texts, ",")
     rest = np.isnan(point) & np.isnan(comma)
     cleaned = _cleaned(texts.filter(rest))

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.table_cells import EMPTY, read_cells
+from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
 from pdhef_logtool.logs.table_columns import (
     NO_TIME,
     Sheet,
@@ -42,8 +42,10 @@ if TYPE_CHECKING:
 
 #: Lines at the start of a CSV file in which its header must be.
 _HEAD_LINES = 200
+#: Cells below the header that show the decimal mark of the file.
+_CELLS_OF_HEAD = 10_000
 #: Cells that are in memory as texts at the same time.
-_CELLS_AT_ONCE = 1 << 24
+_CELLS_AT_ONCE = 1 << 23
 _CELL_END = "\x1f"
 #: Numbers, in any spelling, and times.
 _VALUE = re.compile(
@@ -68,15 +70,17 @@ def open_csv(file: TableFile) -> Tables:
     import polars as pl
 
     text = _text(file)
-    separator = _separator([line for line in islice(text, _HEAD_LINES) if line.strip()][-20:])
+    lines = [line for line in islice(text, _HEAD_LINES) if line.strip()]
+    separator = _separator(lines[-20:])
+    file.limits.check("array_width", max((line.count(separator) for line in lines), default=0), file.name)
     text.seek(0)
     rows = _rows(text, separator)
     head = [*islice(rows, _HEAD_LINES)]
     titles, units, first = _layout([row for _, row in head], file.name)
     fields, given = read_head(titles)
     given |= {name: unit.strip("[](){} ") for name, unit in zip(fields, units, strict=False) if unit.strip()}
-    cells = pl.Series([cell for _, row in head[first:] for cell in row], dtype=pl.String)
-    decimal = read_cells(cells).decimal or ("." if separator == "," else "")
+    cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
+    decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
     losses: list[Loss] = []
     columns = _columns(chain(head[first:], rows), fields, file, losses, decimal)
     return Tables("csv", list(tables_of(Sheet("csv", columns, given), file.name, losses)), losses)
@@ -181,8 +185,12 @@ def _columns(
         part = pl.read_csv(
             data, has_header=False, separator=_CELL_END, quote_char=None, infer_schema=False, columns=places
         )
-        for name, column in zip(names[start:], part.iter_columns(), strict=False):
-            cells = read_cells(column, decimal)
+        plain = part.select(pl.all().str.strip_chars().cast(pl.Float64, strict=False))
+        for name, column, numbers in zip(names[start:], part.iter_columns(), plain.iter_columns(), strict=False):
+            values = numbers.to_numpy()
+            empty = column.null_count()
+            is_plain = decimal == "." and np.count_nonzero(np.isfinite(values)) == len(values) - empty
+            cells = Cells(values, empty) if is_plain else read_cells(column, decimal)
             columns[name] = column.str.strip_chars() if cells.is_text else cells.values
             losses += cells.losses(name, file.name, lines)
     return columns

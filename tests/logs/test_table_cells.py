@@ -132,5 +132,5 @@ def test_cells_are_numbers_empty_and_unreadable(
     assert cells.numbers == np.isfinite(cells.values).sum()
     assert cells.numbers >= len(numbers)
     if cells.unreadable:
-        assert cells.example == mixed[cells.row].strip()
+        assert cells.example in mixed[cells.row]
         assert np.isnan(cells.values[cells.row])
