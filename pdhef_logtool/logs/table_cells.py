@@ -85,7 +85,7 @@ def read_cells(texts: Series, decimal: str = "") -> Cells:
     reading = ""
     if double.any() and not needed and "," in ambiguous[0] + mark and not (mark == decimal and mark in ambiguous[0]):
         reading = f"{ambiguous[0]} is read as {values[double][0]:.12g}"
-    return Cells(values, np.count_nonzero(empty), len(bad), example, row, needed, reading)
+    return Cells(values, int(empty.sum()), len(bad), example, row, needed, reading)
 
 
 def _cleaned(texts: Series) -> Series:

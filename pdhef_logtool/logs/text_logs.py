@@ -2,7 +2,8 @@
 
 CSV: the delimiter, the decimal comma, the header, a row of units and the encoding are found in the file. Columns with
 values in other rows than the rest become a topic of their own. VBO: columns are named as in ``[header]``; latitude and
-longitude stay in arc minutes, longitude positive to the west, as documented (``mapping/vendors.toml``).
+longitude stay in arc minutes, longitude positive to the west, as documented (``mapping/vendors.toml``); a file with the
+other sign, which the heading shows, is mirrored.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from itertools import chain, islice
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
 from pdhef_logtool.logs.table_columns import (
@@ -38,7 +38,7 @@ from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
 
 if TYPE_CHECKING:
-    from polars import Series
+    pass
 
 #: Lines at the start of a CSV file in which its header must be.
 _HEAD_LINES = 200
@@ -62,6 +62,8 @@ _RECEIVER = re.compile(
     r"glonass.*|gps.*|beidou.*|solution type.*|long accel.*|lat accel.*|.*distance m|date|avi.*)",
     re.IGNORECASE,
 )
+#: Share of the path that is along the heading if the signs of the positions are right.
+_ALONG_HEADING = 0.95
 _CREATED = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})")
 
 
@@ -69,27 +71,27 @@ def open_csv(file: TableFile) -> Tables:
     """Read a CSV file; raises LogError where it has no header or no column of times."""
     import polars as pl
 
-    text = _text(file)
-    lines = [line for line in islice(text, _HEAD_LINES) if line.strip()]
-    separator = _separator(lines[-20:])
-    file.limits.check("array_width", max((line.count(separator) for line in lines), default=0), file.name)
-    text.seek(0)
-    rows = _rows(text, separator)
-    head = [*islice(rows, _HEAD_LINES)]
-    titles, units, first = _layout([row for _, row in head], file.name)
-    fields, given = read_head(titles)
-    given |= {name: unit.strip("[](){} ") for name, unit in zip(fields, units, strict=False) if unit.strip()}
-    cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
-    decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
     losses: list[Loss] = []
-    columns = _columns(chain(head[first:], rows), fields, file, losses, decimal)
+    with _text(file) as text:
+        lines = [line for line in islice(text, _HEAD_LINES) if line.strip()]
+        separator = _separator(lines[-20:])
+        file.limits.check("array_width", max((line.count(separator) for line in lines), default=0), file.name)
+        text.seek(0)
+        rows = _rows(text, separator)
+        head = [*islice(rows, _HEAD_LINES)]
+        titles, units, first = _layout([row for _, row in head], file.name)
+        fields, given = read_head(titles)
+        given |= {name: unit.strip("[](){} ") for name, unit in zip(fields, units, strict=False) if unit.strip()}
+        cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
+        decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
+        columns = _columns(chain(head[first:], rows), fields, file, losses, decimal)
     return Tables("csv", list(tables_of(Sheet("csv", columns, given), file.name, losses)), losses)
 
 
 def open_vbo(file: TableFile) -> Tables:
     """Read a VBO file; raises LogError where a section is missing."""
-    text = _text(file)
-    head, mark, data = text.read().partition("[data]\n")
+    with _text(file) as text:
+        head, mark, data = text.read().partition("[data]\n")
     parts = re.split(r"^\[([^\]\n]*)\]\n", head, flags=re.MULTILINE)
     sections = {n.lower(): b.strip("\n").split("\n") for n, b in zip(parts[1::2], parts[2::2], strict=True)}
     titles = [t.strip() for t in sections.get("header", ()) if t.strip()]
@@ -99,6 +101,10 @@ def open_vbo(file: TableFile) -> Tables:
     losses: list[Loss] = []
     above = [""] * (head.count("\n") + 1)
     columns = _columns(_rows(chain(above, data.split("\n")), " "), fields, file, losses, ".")
+    if _is_mirrored(columns):
+        what = "longitude is positive to the east, against the format, as the heading shows: its sign is changed"
+        losses.append(Loss("mirrored", what, file.name, severity="note"))
+        columns["longitude"] = -columns["longitude"]
     units = _vbo_units(titles, fields, sections.get("channel units", [])) | given
     sheet = Sheet("vbox", {n: c for n, c in columns.items() if n != "time"}, units, VBO_TYPE)
     if not isinstance(columns.get("time"), np.ndarray):
@@ -170,7 +176,7 @@ def _share(cells: Sequence[str], matches: Callable[[str], object]) -> float:
 
 def _columns(
     rows: Iterable[tuple[int, list[str]]], names: Sequence[str], file: TableFile, losses: list[Loss], decimal: str
-) -> Mapping[str, NDArray[Any] | Series]:
+) -> dict[str, Any]:
     """Return the columns of numbered rows: numbers float64 [N] with NaN, or texts [N].
 
     ``decimal`` is the decimal mark of columns that do not show theirs.
@@ -178,7 +184,7 @@ def _columns(
     import polars as pl
 
     lines, data = _fitting(rows, len(names), file, losses)
-    columns: dict[str, NDArray[Any] | Series] = {}
+    columns = {}
     step = max(1, _CELLS_AT_ONCE // len(lines))
     for start in range(0, len(names), step):
         places = [*range(len(names))[start : start + step]]
@@ -226,6 +232,17 @@ def _fitting(
         raise LogError(expected=f"rows of {width} cells", got="none", where=file.name)
     file.limits.check_table(8 * width * len(lines), file.size, file.name)
     return lines, data.getvalue()
+
+
+def _is_mirrored(columns: Mapping[str, Any]) -> bool:
+    """Return whether the path agrees with the heading only if longitude (arc minutes) is positive to the east."""
+    latitude, longitude, heading = (columns.get(n) for n in ("latitude", "longitude", "heading"))
+    if not all(isinstance(column, np.ndarray) for column in (latitude, longitude, heading)):
+        return False
+    path = np.diff(latitude) + 1j * np.diff(longitude) * np.cos(np.radians(latitude[1:] / 60.0))
+    direction = np.exp(-1j * np.radians(heading[1:]))
+    east, west = (np.nansum((p * direction).real) / np.nansum(np.abs(path)) for p in (path, path.conj()))
+    return bool(east > max(_ALONG_HEADING, west + 1.0 - _ALONG_HEADING))
 
 
 def _vbo_units(titles: Sequence[str], fields: Sequence[str], units: Sequence[str]) -> dict[str, str]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from random import Random
+
 import numpy as np
 import polars as pl
 import pytest
@@ -100,7 +103,7 @@ def test_a_column_of_texts_is_no_column_of_numbers() -> None:
     assert not read_cells(pl.Series(["", ""], dtype=pl.String)).is_text
 
 
-_SPELLINGS = {
+_SPELLINGS: dict[str, Callable[[float], str]] = {
     "point": str,
     "comma": lambda v: str(v).replace(".", ","),
     "grouped": lambda v: f"{v:,.2f}",
@@ -119,14 +122,14 @@ _SPELLINGS = {
     order=st.randoms(use_true_random=False),
 )
 def test_cells_are_numbers_empty_and_unreadable(
-    numbers: list[float], spelling: str, others: list[str], order: object
+    numbers: list[float], spelling: str, others: list[str], order: Random
 ) -> None:
     texts = [_SPELLINGS[spelling](v) for v in numbers]
     cells = read_cells(pl.Series(texts))
     if not cells.ambiguous:
         np.testing.assert_allclose(cells.values, numbers, rtol=1e-12)
     mixed = [*texts, *others]
-    order.shuffle(mixed)  # type: ignore[attr-defined]
+    order.shuffle(mixed)
     cells = read_cells(pl.Series(mixed))
     assert cells.numbers + cells.empty + cells.unreadable == len(mixed)
     assert cells.numbers == np.isfinite(cells.values).sum()

@@ -341,6 +341,21 @@ def test_titles_of_a_vbo_file_may_contain_units(tmp_path: Path) -> None:
         assert log.lost == ()
 
 
+@pytest.mark.parametrize(("east", "turn"), [(1, 90), (-1, 90), (1, 1), (-1, 1)])
+def test_the_heading_shows_which_longitude_is_positive(east: int, turn: int, tmp_path: Path) -> None:
+    head = "File created on 01/05/2024\n\n[header]\ntime\nlatitude\nlongitude\nheading\n\n[data]\n"
+    heading = np.linspace(0.0, turn, N)
+    north, to_east = (np.cumsum(1e-3 * f(np.radians(heading))) for f in (np.cos, np.sin))
+    rows = [
+        f"1000{i // 100:02d}.{i % 100:02d} {3420 + n:+.6f} {east * (720 + 1.84 * e):+.6f} {h:.3f}"
+        for i, (n, e, h) in enumerate(zip(north, to_east, heading, strict=True))
+    ]
+    columns, lost = _read(tmp_path / "a.vbo", head + "\n".join([*rows, ""]))
+    is_clear = turn == 90  # a drive to the north shows nothing
+    assert lost == ([("mirrored", None)] if is_clear and east > 0 else [])
+    assert (columns["longitude"][0] < 0.0) == (is_clear or east < 0)
+
+
 def test_a_cut_vbo_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     data = vbo([f"1000{i // 100:02d}.{i % 100:02d}" for i in range(N)])
     with closing(_log(tmp_path / "a.vbo", data[:-40])) as log:
