@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.can_decoding import Frames
 from pdhef_logtool.logs.container import describe_damage
-from pdhef_logtool.logs.table_columns import number_stamps
+from pdhef_logtool.logs.table_clocks import number_stamps
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.extras import required

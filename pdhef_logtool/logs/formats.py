@@ -36,8 +36,9 @@ class LogFormat:
     ----------
     title : for messages: ``an MCAP file``.
     opener : ``package.module:function``, which opens a :class:`LogFile` as a log, or as a container of messages, and
-        raises LogError for a file that is none of this format. With ``isolated`` it is a reader of tables, which
-        receives a :class:`~pdhef_logtool.logs.table_file.TableFile` and returns ``Tables``.
+        raises LogError for a file that is none of this format.
+    libraries : None; or the opener is a reader of tables, which runs in a process of its own
+        (:mod:`~pdhef_logtool.logs.reader_process`), with the modules that it imports.
     suffixes : by which a search through folders takes files for logs. named : also, if it is named outright.
     magic : first bytes of every file, or several possible ones; empty: a file is recognised by its suffix.
     needs_suffix : whether files of other formats begin with the same bytes, so that the suffix must match too.
@@ -52,7 +53,7 @@ class LogFormat:
     needs_suffix: bool = False
     is_general: bool = False
     named: tuple[str, ...] = ()
-    isolated: bool = False
+    libraries: tuple[str, ...] | None = None
 
     def recognises(self, head: bytes, name: str) -> bool:
         """Return, by the first bytes and the name, whether a file is of this format."""
@@ -62,8 +63,8 @@ class LogFormat:
 
     def open(self, file: LogFile) -> DriveLog | Container:
         """Open a file."""
-        if self.isolated:
-            return open_tables(file, self.opener)
+        if self.libraries is not None:
+            return open_tables(file, self.opener, self.libraries)
         opener: Callable[[LogFile], Any] = pkgutil.resolve_name(self.opener)
         return opener(file)  # type: ignore[no-any-return]
 
@@ -72,32 +73,26 @@ FORMATS = (
     LogFormat("an MCAP file", f"{__package__}.mcap_log:McapContainer.open", (".mcap",), MCAP_MAGIC),
     LogFormat("a ROS 1 bag", f"{__package__}.rosbag1_log:Rosbag1Container.open", (".bag",), ROSBAG1_MAGIC),
     LogFormat("a rosbag2 database", f"{__package__}.rosbag2_sqlite_log:SqliteContainer.open", (".db3",), SQLITE_MAGIC),
-    LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",), isolated=True),
+    LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",), libraries=("polars",)),
     LogFormat(
-        "a CSV file",
-        f"{__package__}.text_logs:open_csv",
-        (".csv", ".tsv"),
-        is_general=True,
-        named=(".txt",),
-        isolated=True,
+        "a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"),
+        is_general=True, named=(".txt",), libraries=("polars",),
     ),
     LogFormat(
-        "a Parquet file",
-        f"{__package__}.array_logs:open_parquet",
-        (".parquet",),
-        b"PAR1",
-        is_general=True,
-        isolated=True,
+        "a Parquet file", f"{__package__}.parquet_log:open_parquet", (".parquet",), b"PAR1",
+        is_general=True, libraries=("polars", "pyarrow.parquet"),
     ),
     LogFormat(
-        "a MAT file", f"{__package__}.array_logs:open_mat", (".mat",), b"MATLAB ", is_general=True, isolated=True
+        "a MAT file", f"{__package__}.mat_log:open_mat", (".mat",), b"MATLAB ",
+        is_general=True, libraries=("h5py",),
     ),
     LogFormat(
-        "an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF "), isolated=True
+        "an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF "),
+        libraries=("asammdf",),
     ),
-    LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG", isolated=True),
-    LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",), isolated=True),
-)
+    LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG", libraries=("can.io",)),
+    LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",), libraries=("can.io",)),
+)  # fmt: skip
 
 
 @cache

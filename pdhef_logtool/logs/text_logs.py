@@ -18,27 +18,16 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
-from pdhef_logtool.logs.table_columns import (
-    NO_TIME,
-    Sheet,
-    is_unit,
-    placed,
-    read_head,
-    tables_of,
-    unwrapped,
-    whole_days,
-)
+from pdhef_logtool.logs.table_clocks import NO_TIME, placed, unwrapped, whole_days
+from pdhef_logtool.logs.table_columns import Sheet, is_unit, read_head, tables_of
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
-
-if TYPE_CHECKING:
-    pass
 
 #: Lines at the start of a CSV file in which its header must be.
 _HEAD_LINES = 200

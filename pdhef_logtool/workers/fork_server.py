@@ -24,9 +24,11 @@ from typing import Any
 
 from pdhef_logtool.records import processes
 from pdhef_logtool.records.printable import printable
+from pdhef_logtool.workers.confinement import bound_memory
 
-#: One thread a worker: what libraries read when they are loaded.
-ONE_THREAD = dict.fromkeys(
+#: Environment of a server, read by libraries when they are loaded: one thread per worker, and no arena of Arrow, which
+#: reserves a GiB that would count as memory of the worker.
+ENVIRONMENT = {"ARROW_DEFAULT_MEMORY_POOL": "system"} | dict.fromkeys(
     (
         "OMP_NUM_THREADS",
         "OPENBLAS_NUM_THREADS",
@@ -39,6 +41,8 @@ ONE_THREAD = dict.fromkeys(
     ),
     "1",
 )
+#: First message to a worker: the function that it calls with its channel.
+WORK = f"{__name__}:work_on_items"
 #: Requests to the server: fork a worker (with its socket), or return the exit status of a worker.
 FORK, STATUS = b"fork", b"stat"
 _REQUEST = struct.Struct("<4sq")
@@ -61,7 +65,7 @@ def receive(channel: socket.socket) -> Any:
     ------
     EOFError : the other side is gone.
     """
-    return pickle.loads(_exactly(channel, _HEAD.unpack(_exactly(channel, _HEAD.size))[0]))  # noqa: S301 (from our own process)
+    return pickle.loads(exactly(channel, _HEAD.unpack(exactly(channel, _HEAD.size))[0]))  # noqa: S301 (from our own process)
 
 
 def split(buffer: bytearray) -> Iterator[Any]:
@@ -141,7 +145,7 @@ def _fork(control: socket.socket, channel: socket.socket, number: int) -> set[in
         try:
             processes.worker_number = number
             control.close()
-            _work(channel)
+            pkgutil.resolve_name(receive(channel))(channel)
         finally:
             with contextlib.suppress(OSError, ValueError):
                 sys.stdout.flush()
@@ -160,7 +164,7 @@ def _say(channel: socket.socket, *message: Any) -> None:
         raise _Gone from None
 
 
-def _work(channel: socket.socket) -> None:
+def work_on_items(channel: socket.socket) -> None:
     """Run a worker: receive the function and its memory limit, then items; reply to each with its result or error."""
     with contextlib.suppress(OSError):
         # If the machine runs out of memory, the system must end a worker and not its supervisor.
@@ -168,7 +172,8 @@ def _work(channel: socket.socket) -> None:
     with contextlib.suppress(_Gone, EOFError, OSError):
         _say(channel, "ready", os.getpid())
         work, more_bytes = receive(channel)
-        _bound(more_bytes)
+        if more_bytes is not None:
+            bound_memory(more_bytes)
         while True:
             _say(channel, *_answer(channel, work, receive(channel)))
 
@@ -202,20 +207,6 @@ def _function(packed: bytes) -> Callable[..., Any]:
     return pickle.loads(packed)  # type: ignore[no-any-return]  # noqa: S301 (from our own process)
 
 
-def _bound(more_bytes: int | None) -> None:
-    """Limit the memory of this process to this much more than it has now (Linux)."""
-    if more_bytes is None:
-        return
-    with contextlib.suppress(ImportError, OSError, ValueError, IndexError):
-        import resource
-
-        # All that is writable and private, whether touched or not: the sixth number, in pages.
-        now = int(Path("/proc/self/statm").read_bytes().split()[5]) * resource.getpagesize()
-        _, most = resource.getrlimit(resource.RLIMIT_DATA)
-        bound = now + more_bytes if most == resource.RLIM_INFINITY else min(now + more_bytes, most)
-        resource.setrlimit(resource.RLIMIT_DATA, (bound, bound))
-
-
 def describe_error(error: BaseException) -> str:
     """Return an exception as one line."""
     try:
@@ -225,7 +216,8 @@ def describe_error(error: BaseException) -> str:
     return printable(f"{type(error).__name__}: {text}", _LONGEST) if text else type(error).__name__
 
 
-def _exactly(channel: socket.socket, count: int) -> bytes:
+def exactly(channel: socket.socket, count: int) -> bytes:
+    """Wait for a number of bytes; raises EOFError where the other side is gone."""
     parts = bytearray()
     while len(parts) < count:
         part = channel.recv(min(count - len(parts), 1 << 20))
