@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 #: Spellings of a missing value.
 EMPTY = re.compile(r"(?i)\s*([-+]?(nan|1\.#(qnan|snan|ind))(\(\w*\))?0*|#?n/?a|#n/a!|<na>|nat|null|none|-*)\s*")
-_TRUTHS = {"true": "1", "false": "0"}
+_BOOLEANS = {"true": "1", "false": "0"}
 #: Groups of three digits with spaces or apostrophes between them.
 _SPACED = r"^[-+]?[1-9]\d{0,2}([\s'’]\d{3})+([.,]\d*)?$"
 
@@ -42,14 +42,9 @@ class Cells:
     ambiguous: str = ""
 
     @property
-    def numbers(self) -> int:
-        """Number of cells that contain a number."""
-        return len(self.values) - self.empty - self.unreadable
-
-    @property
     def is_text(self) -> bool:
-        """Whether most of the cells that are not empty contain no number: texts, dates or times of day."""
-        return self.unreadable > self.numbers
+        """Whether most cells that are not empty contain no number: texts, dates or times of day."""
+        return 2 * self.unreadable > len(self.values) - self.empty
 
     def losses(self, column: str, where: str, lines: Sequence[int] | None = None) -> Iterator[Loss]:
         """Yield the losses of a column of numbers; ``lines`` [N] are the lines of the rows in a file of text."""
@@ -89,10 +84,10 @@ def read_cells(texts: Series, decimal: str = "") -> Cells:
 
 
 def _cleaned(texts: Series) -> Series:
-    """Return texts with hexadecimal numbers, truth values, minus signs and groups of digits in plain spelling."""
+    """Return texts with hexadecimal numbers, booleans, minus signs and groups of digits in plain spelling."""
     import polars as pl
 
-    texts = texts.str.to_lowercase().str.replace_all("[−–]", "-").replace(_TRUTHS)
+    texts = texts.str.to_lowercase().str.replace_all("[−–]", "-").replace(_BOOLEANS)
     hexadecimal = texts.str.extract("^0x([0-9a-f]+)$").str.to_integer(base=16, strict=False).cast(pl.String)
     spaced = pl.when(texts.str.contains(_SPACED)).then(texts.str.replace_all(r"[\s'’]", ""))
     return pl.select(pl.coalesce(hexadecimal, spaced, texts)).to_series()

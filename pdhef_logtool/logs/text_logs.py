@@ -1,7 +1,7 @@
 """Logs of text: CSV files of any dialect, and Racelogic's VBO files.
 
-CSV: the delimiter, the decimal comma, the header, a row of units and the encoding are found in the file. Columns with
-values in other rows than the rest become a topic of their own. VBO: columns are named as in ``[header]``; latitude and
+CSV: the delimiter, the decimal mark, the header, a row of units and the encoding are detected. Each row is read, or it is
+a loss with its line; cells are counted by :mod:`~pdhef_logtool.logs.table_cells`. VBO: columns are named as in ``[header]``; latitude and
 longitude stay in arc minutes, longitude positive to the west, as documented (``mapping/vendors.toml``); a file with the
 other sign, which the heading shows, is mirrored.
 """
@@ -42,7 +42,7 @@ _VALUE = re.compile(
     r"\d{1,4}[./-]\d\d?[./-]\d{2,4}([T ].*)?|(\d\d?:)?\d\d?:\d\d([.,]\d+)?Z?(\s?[AP]M)?)\s*",
     re.IGNORECASE,
 )
-codecs.register_error("latin-1", lambda e: (e.object[e.start : e.end].decode("latin-1"), e.end))  # type: ignore[attr-defined]
+codecs.register_error("as-latin-1", lambda e: (e.object[e.start : e.end].decode("latin-1"), e.end))  # type: ignore[attr-defined]
 
 VBO_TYPE = "vbox/msg/Vbo"
 #: Channels of the receiver itself, which ``[channel units]`` leaves out.
@@ -57,7 +57,7 @@ _CREATED = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})")
 
 
 def open_csv(file: TableFile) -> Tables:
-    """Read a CSV file; raises LogError where it has no header or no column of times."""
+    """Read a CSV file; raises LogError if the file has no header or no column of times."""
     import polars as pl
 
     losses: list[Loss] = []
@@ -78,7 +78,7 @@ def open_csv(file: TableFile) -> Tables:
 
 
 def open_vbo(file: TableFile) -> Tables:
-    """Read a VBO file; raises LogError where a section is missing."""
+    """Read a VBO file; raises LogError if a section is missing."""
     with _text(file) as text:
         head, mark, data = text.read().partition("[data]\n")
     parts = re.split(r"^\[([^\]\n]*)\]\n", head, flags=re.MULTILINE)
@@ -106,7 +106,7 @@ def _text(file: TableFile) -> io.TextIOWrapper:
     """Return the text of a file: UTF-16 with a byte order mark, otherwise UTF-8; other bytes are read as Latin-1."""
     mark = file.stream.read(2)
     file.stream.seek(0)
-    encoding, errors = ("utf-16", "replace") if mark in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig", "latin-1")
+    encoding, errors = ("utf-16", "replace") if mark in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig", "as-latin-1")
     return io.TextIOWrapper(file.stream, encoding, errors)
 
 
@@ -205,7 +205,7 @@ def _fitting(
         if len(row) == width and text.count(_CELL_END) == width - 1:
             lines.append(line)
             data.write((text.replace("\n", " ") + "\n").encode())
-        elif text.strip(_CELL_END + " "):
+        elif text.replace(_CELL_END, " ").strip():
             (comments if text.startswith("#") else wrong).append(line)
     cut = [wrong.pop()] if wrong[-1:] == array("q", [line]) and len(row) < width else []
     for kind, what, numbers in (
@@ -225,13 +225,15 @@ def _fitting(
 
 def _is_mirrored(columns: Mapping[str, Any]) -> bool:
     """Return whether the path agrees with the heading only if longitude (arc minutes) is positive to the east."""
-    latitude, longitude, heading = (columns.get(n) for n in ("latitude", "longitude", "heading"))
-    if not all(isinstance(column, np.ndarray) for column in (latitude, longitude, heading)):
+    names = ("latitude", "longitude", "heading")
+    if not all(isinstance(columns.get(name), np.ndarray) for name in names):
         return False
+    latitude, longitude, heading = (columns[name] for name in names)
     path = np.diff(latitude) + 1j * np.diff(longitude) * np.cos(np.radians(latitude[1:] / 60.0))
     direction = np.exp(-1j * np.radians(heading[1:]))
-    east, west = (np.nansum((p * direction).real) / np.nansum(np.abs(path)) for p in (path, path.conj()))
-    return bool(east > max(_ALONG_HEADING, west + 1.0 - _ALONG_HEADING))
+    east, west = (np.nansum((p * direction).real) for p in (path, path.conj()))
+    length = np.nansum(np.abs(path))
+    return bool(east > max(_ALONG_HEADING * length, west + (1.0 - _ALONG_HEADING) * length))
 
 
 def _vbo_units(titles: Sequence[str], fields: Sequence[str], units: Sequence[str]) -> dict[str, str]:

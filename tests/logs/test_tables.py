@@ -223,7 +223,7 @@ def test_a_decimal_comma_counts_in_whichever_row_it_is(tmp_path: Path) -> None:
         (",", "0.5", "1.234", 1.234, False),
         (",", "0.5", '"8,734.5"', 8734.5, False),
         (";", "7", "1.234", 1.234, False),
-        (";", "7", "1,234", 1.234, True),  # nothing decides
+        (";", "7", "1,234", 1.234, True),  # no other column decides
     ],
 )
 def test_other_columns_decide_what_a_mark_between_digits_is(
@@ -348,7 +348,7 @@ def test_the_heading_shows_which_longitude_is_positive(east: int, turn: int, tmp
         for i, (n, e, h) in enumerate(zip(north, to_east, heading, strict=True))
     ]
     columns, lost = _read(tmp_path / "a.vbo", head + "\n".join([*rows, ""]))
-    is_clear = turn == 90  # a drive to the north shows nothing
+    is_clear = turn == 90  # a drive to the north does not show the sign
     assert lost == ([("mirrored", None)] if is_clear and east > 0 else [])
     assert (columns["longitude"][0] < 0.0) == (is_clear or east < 0)
 
