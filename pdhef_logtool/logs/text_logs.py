@@ -1,9 +1,9 @@
 """Logs of text: CSV files of any dialect, and Racelogic's VBO files.
 
-CSV: the delimiter, the decimal mark, the header, a row of units and the encoding are detected. Each row is read, or it is
-a loss with its line; cells are counted by :mod:`~pdhef_logtool.logs.table_cells`. VBO: columns are named as in ``[header]``; latitude and
-longitude stay in arc minutes, longitude positive to the west, as documented (``mapping/vendors.toml``); a file with the
-other sign, which the heading shows, is mirrored.
+CSV: the delimiter, the decimal mark, the header, a row of units and the encoding are detected. Each row is read, or it
+is a loss with its line. VBO: columns are named as in ``[header]``; latitude and longitude stay in arc minutes with
+longitude positive to the west, as documented (``mapping/vendors.toml``). A file with the other sign, which the heading
+shows, is mirrored.
 """
 
 from __future__ import annotations
