@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from random import Random
+
 import numpy as np
 import polars as pl
 import pytest
@@ -71,14 +74,15 @@ def test_a_number_in_any_spelling(texts: list[str], numbers: list[float]) -> Non
     [
         (["1,234", "5"], "", [1.234, 5.0]),
         (["1,234", "5"], ".", [1234.0, 5.0]),
-        (["1.234", "5"], "", [1.234, 5.0]),
         (["1.234", "5"], ",", [1234.0, 5.0]),
-        (["1.234", "5,678"], "", [1.234, 5678.0]),
+        (["5,678", "1.234"], "", [5678.0, 1.234]),
     ],
 )
 def test_a_group_of_three_digits_alone_is_ambiguous(texts: list[str], decimal: str, numbers: list[float]) -> None:
     cells = read_cells(pl.Series(texts), decimal)
-    assert (cells.values.tolist(), cells.ambiguous, cells.decimal) == (numbers, texts[0], "")
+    assert (cells.values.tolist(), cells.decimal) == (numbers, "")
+    assert [(x.kind, x.severity) for x in cells.losses("a", "a.csv")] == [("ambiguous-number", "note")]
+    assert cells.ambiguous == f"{texts[0]} is read as {numbers[0]:g}"
 
 
 def test_cells_without_a_number_leave_the_others_in_place() -> None:
@@ -90,7 +94,7 @@ def test_cells_without_a_number_leave_the_others_in_place() -> None:
     (loss,) = cells.losses("yaw", "a.csv")
     assert (loss.kind, loss.count, loss.severity) == ("bad-cell", len(UNREADABLE), "lost")
     assert "'ERR'" in loss.what
-    assert f"row {2 + len(EMPTY)}" in loss.what
+    assert f"row {2 + len(EMPTY)}" in loss.where
 
 
 def test_a_column_of_texts_is_no_column_of_numbers() -> None:
@@ -99,7 +103,7 @@ def test_a_column_of_texts_is_no_column_of_numbers() -> None:
     assert not read_cells(pl.Series(["", ""], dtype=pl.String)).is_text
 
 
-_SPELLINGS = {
+_SPELLINGS: dict[str, Callable[[float], str]] = {
     "point": str,
     "comma": lambda v: str(v).replace(".", ","),
     "grouped": lambda v: f"{v:,.2f}",
@@ -118,18 +122,17 @@ _SPELLINGS = {
     order=st.randoms(use_true_random=False),
 )
 def test_cells_are_numbers_empty_and_unreadable(
-    numbers: list[float], spelling: str, others: list[str], order: object
+    numbers: list[float], spelling: str, others: list[str], order: Random
 ) -> None:
     texts = [_SPELLINGS[spelling](v) for v in numbers]
     cells = read_cells(pl.Series(texts))
-    if spelling == "minus" or not cells.ambiguous:
+    if not cells.ambiguous:
         np.testing.assert_allclose(cells.values, numbers, rtol=1e-12)
     mixed = [*texts, *others]
-    order.shuffle(mixed)  # type: ignore[attr-defined]
+    order.shuffle(mixed)
     cells = read_cells(pl.Series(mixed))
-    assert cells.numbers + cells.empty + cells.unreadable == len(mixed)
-    assert cells.numbers == np.isfinite(cells.values).sum()
-    assert cells.numbers >= len(numbers)
+    assert np.isfinite(cells.values).sum() + cells.empty + cells.unreadable == len(mixed)
+    assert np.isfinite(cells.values).sum() >= len(numbers)
     if cells.unreadable:
-        assert cells.example == mixed[cells.row].strip()
+        assert cells.example in mixed[cells.row]
         assert np.isnan(cells.values[cells.row])
