@@ -40,7 +40,10 @@ def conversion_rule(block: Any, version: int) -> Rule:
     rules = _RULES_4 if version >= 4 else _RULES_3
     if block.conversion_type not in rules:
         raise ValueError(f"its conversion is of type {block.conversion_type}, which is not supported")
-    return rules[block.conversion_type](block)
+    try:
+        return rules[block.conversion_type](block)
+    except AttributeError:  # what asammdf has not found in a damaged block
+        raise ValueError("its conversion is incomplete") from None
 
 
 def formula_rule(text: str) -> Rule:
@@ -50,11 +53,12 @@ def formula_rule(text: str) -> Rule:
     ------
     ValueError : the formula contains anything else.
     """
+    text = text.partition("\0")[0].strip()
     shown = text if len(text) <= 40 else f"{text[:40]}..."
     if len(text) > _LONGEST_FORMULA:
         raise ValueError(f"its formula {shown!r} is longer than {_LONGEST_FORMULA} characters")
     try:
-        tree = ast.parse(text.lower().replace("^", "**").strip(" \0"), mode="eval").body
+        tree = ast.parse(text.lower().replace("^", "**"), mode="eval").body
         _evaluated(tree, np.empty(0), 0)
     except (SyntaxError, ValueError, TypeError, OverflowError, RecursionError, MemoryError):
         raise ValueError(f"its formula {shown!r} is no arithmetic of X") from None
