@@ -18,7 +18,8 @@ _FOLLOWED: Mapping[bytes, tuple[int, ...]] = {
 _FOLLOWED_3: Mapping[bytes, tuple[int, ...]] = {b"HD": (0,), b"DG": (0, 1), b"CG": (0, 1), b"CN": (0,)}
 #: Links that lead to blocks of one kind only.
 _CHAINS: Mapping[tuple[bytes, int], bytes] = {
-    (b"", 0): b"HD", (b"HD", 0): b"DG", (b"DG", 0): b"DG", (b"DG", 1): b"CG", (b"CG", 0): b"CG", (b"CG", 1): b"CN", (b"CN", 0): b"CN",
+    (b"", 0): b"HD", (b"HD", 0): b"DG", (b"DG", 0): b"DG", (b"DG", 1): b"CG", (b"CG", 0): b"CG", (b"CG", 1): b"CN",
+    (b"CN", 0): b"CN",
 }  # fmt: skip
 _LISTS = frozenset({b"DL", b"LD", b"HL"})
 
