@@ -1,49 +1,80 @@
 """Conversions of MDF channels from raw to physical values; a formula of a file is parsed, never run as code.
 
-A conversion is given as the block that ``asammdf`` has parsed. Source: ASAM MDF 4.2, CCBLOCK; MDF 3.3, CCBLOCK.
+A conversion is given as the block that ``asammdf`` has parsed. Source: ASAM MDF 4.2 and MDF 3.3, CCBLOCK.
 """
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.records.signals import FloatArray
 
-Values: TypeAlias = NDArray[Any]
 #: Returns physical values [N] of raw numbers [N].
-Rule: TypeAlias = Callable[[Values], FloatArray]
+Rule: TypeAlias = Callable[[NDArray[Any]], FloatArray]
 
-_LONGEST_FORMULA = 500
-_DEEPEST_FORMULA = 40
-_OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
+_LONGEST_FORMULA, _DEEPEST_FORMULA = 500, 40
+_OPERATORS: dict[type[ast.AST], np.ufunc] = {
     ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide, ast.Pow: np.power,
     ast.USub: np.negative, ast.UAdd: np.positive,
 }  # fmt: skip
-_FUNCTIONS: Mapping[str, np.ufunc] = {
-    "abs": np.abs, "sqrt": np.sqrt, "exp": np.exp, "ln": np.log, "log": np.log, "log10": np.log10, "pow": np.power,
-    "sin": np.sin, "cos": np.cos, "tan": np.tan, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan,
-    "arcsin": np.arcsin, "arccos": np.arccos, "arctan": np.arctan, "atan2": np.arctan2,
-    "sinh": np.sinh, "cosh": np.cosh, "tanh": np.tanh,
+_NAMES = "abs sqrt exp log log10 sin cos tan arcsin arccos arctan arctan2 sinh cosh tanh"
+_FUNCTIONS: dict[str, np.ufunc] = {name: getattr(np, name) for name in _NAMES.split()} | {
+    "ln": np.log, "pow": np.power, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "atan2": np.arctan2,
 }  # fmt: skip
+
+_LINEAR = "{0.a}*x+{0.b}"
+_RATIONAL = "({0.P1}*x*x+{0.P2}*x+{0.P3})/({0.P4}*x*x+{0.P5}*x+{0.P6})"
+#: Conversions that are formulas of their parameters, by version and type.
+_FORMULAS = {
+    (4, 0): "x", (4, 1): _LINEAR, (4, 2): _RATIONAL, (4, 3): "{0.formula}", (4, 11): "x",
+    (3, 0): _LINEAR, (3, 9): _RATIONAL, (3, 10): "{0.formula}", (3, 11): "x", (3, 65535): "x",
+    (3, 6): "({0.P2}-{0.P4}*(x-{0.P5}-{0.P6}))/({0.P3}*(x-{0.P5}-{0.P6})-{0.P1})",
+}  # fmt: skip
+#: Exponential and logarithmic conversions without P4, and without P1.
+_WITHOUT_P4 = "{1}(((x-{0.P7})*{0.P6}-{0.P3})/{0.P1})/{0.P2}"
+_WITHOUT_P1 = "{1}(({0.P3}/(x-{0.P7})-{0.P6})/{0.P4})/{0.P5}"
 
 
 def conversion_rule(block: Any, version: int) -> Rule:
     """Return the rule of a conversion block of MDF 3 or 4; ValueError if it is not supported."""
     if block is None:
         return _floats
-    rules = _RULES_4 if version >= 4 else _RULES_3
-    if block.conversion_type not in rules:
-        raise ValueError(f"its conversion is of type {block.conversion_type}, which is not supported")
+    kind = (4 if version >= 4 else 3), block.conversion_type
     try:
-        return rules[block.conversion_type](block)
-    except AttributeError:  # what asammdf has not found in a damaged block
+        if kind in _FORMULAS:
+            return formula_rule(_FORMULAS[kind].format(block))
+        match kind:
+            case (3, 7 | 8) if (block.P1 == 0.0) != (block.P4 == 0.0):
+                formula = _WITHOUT_P4 if block.P4 == 0.0 else _WITHOUT_P1
+                return formula_rule(formula.format(block, "exp" if kind[1] == 7 else "log"))
+            case (4, 4 | 5):
+                return _table(block, block.val_param_nr // 2, interpolates=kind[1] == 4)
+            case (3, 1 | 2):
+                return _table(block, block.ref_param_nr, interpolates=kind[1] == 1)
+            case (4, 6):
+                count = (block.val_param_nr - 1) // 3
+                values = [formula_rule(str(value)) for value in _column(block, "phys", count).tolist()]
+                return _pieces(block, "lower", "upper", values, formula_rule(str(block.default)))
+            case (4, 7 | 8):
+                count = block.val_param_nr // (kind[1] - 6)
+                nested = [
+                    block.referenced_blocks.get(k) for k in (*(f"text_{i}" for i in range(count)), "default_addr")
+                ]
+                *rules, default = (None if isinstance(b, bytes | None) else conversion_rule(b, 4) for b in nested)
+                return _pieces(block, *(("val", "val") if kind[1] == 7 else ("lower", "upper")), rules, default)
+            case (3, 12):  # the text of all other numbers may contain a formula of {X}
+                text = (block.referenced_blocks.get("default_addr") or b"").decode("latin-1")
+                default = formula_rule(text.replace("{X}", "x").strip('\0 "')) if "{X}" in text else None
+                return _pieces(block, "lower", "upper", [None] * (block.ref_param_nr - 1), default)
+    except AttributeError:  # of a block that asammdf has not read to its end
         raise ValueError("its conversion is incomplete") from None
+    raise ValueError(f"its conversion is of type {kind[1]}, which is not supported")
 
 
 def formula_rule(text: str) -> Rule:
@@ -56,7 +87,7 @@ def formula_rule(text: str) -> Rule:
     text = text.partition("\0")[0].strip()
     shown = text if len(text) <= 40 else f"{text[:40]}..."
     if len(text) > _LONGEST_FORMULA:
-        raise ValueError(f"its formula {shown!r} is longer than {_LONGEST_FORMULA} characters")
+        raise ValueError(f"its formula {shown!r} has more than {_LONGEST_FORMULA} characters")
     try:
         tree = ast.parse(text.lower().replace("^", "**"), mode="eval").body
         _evaluated(tree, np.empty(0), 0)
@@ -74,6 +105,8 @@ def _evaluated(node: ast.AST, x: FloatArray, depth: int) -> Any:
         match node:
             case ast.Name(id="x" | "x1"):
                 return x
+            case ast.Name(id="nan" | "inf" as name):
+                return np.float64(name)
             case ast.Constant(value=int() | float() as number):
                 return np.float64(number)
             case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
@@ -83,65 +116,19 @@ def _evaluated(node: ast.AST, x: FloatArray, depth: int) -> Any:
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if name in _FUNCTIONS:
                 if len(arguments) == _FUNCTIONS[name].nin:
                     return _FUNCTIONS[name](*map(value, arguments))
-    raise ValueError(ast.dump(node)[:80])
+    raise ValueError(node)
 
 
-def _floats(raw: Values) -> FloatArray:
+def _floats(raw: NDArray[Any]) -> FloatArray:
     return raw.astype(np.float64)
-
-
-def _parameters(block: Any, count: int) -> list[np.float64]:
-    return [np.float64(getattr(block, f"P{i}")) for i in range(1, count + 1)]
 
 
 def _column(block: Any, name: str, count: int) -> FloatArray:
     return np.asarray([getattr(block, f"{name}_{i}") for i in range(count)], np.float64)
 
 
-def _linear(block: Any) -> Rule:
-    return lambda raw: _floats(raw) * block.a + block.b
-
-
-def _rational(block: Any) -> Rule:
-    p1, p2, p3, p4, p5, p6 = _parameters(block, 6)
-
-    def convert(raw: Values) -> FloatArray:
-        x = _floats(raw)
-        with np.errstate(all="ignore"):
-            return np.asarray(((p1 * x + p2) * x + p3) / ((p4 * x + p5) * x + p6))
-
-    return convert
-
-
-def _polynomial(block: Any) -> Rule:
-    p1, p2, p3, p4, p5, p6 = _parameters(block, 6)
-
-    def convert(raw: Values) -> FloatArray:
-        x = _floats(raw) - p5 - p6
-        with np.errstate(all="ignore"):
-            return np.asarray((p2 - p4 * x) / (p3 * x - p1))
-
-    return convert
-
-
-def _transcendental(function: np.ufunc, block: Any) -> Rule:
-    """Return the rule of an exponential (``exp``) or logarithmic (``log``) conversion."""
-    p1, p2, p3, p4, p5, p6, p7 = _parameters(block, 7)
-    if (p1 == 0.0) == (p4 == 0.0):
-        raise ValueError("its exponential or logarithmic conversion needs either P1 or P4")
-
-    def convert(raw: Values) -> FloatArray:
-        x = _floats(raw) - p7
-        with np.errstate(all="ignore"):
-            values = function((p3 / x - p6) / p4) / p5 if p1 == 0.0 else function((x * p6 - p3) / p1) / p2
-        return np.asarray(values)
-
-    return convert
-
-
-def _table(interpolates: bool, values_of_a_pair: int, block: Any) -> Rule:
+def _table(block: Any, count: int, *, interpolates: bool) -> Rule:
     """Return the rule of a table: interpolated, or the value of the nearest key, of two equally near the lower."""
-    count = (block.val_param_nr if values_of_a_pair == 2 else block.ref_param_nr) // values_of_a_pair
     keys, values = _column(block, "raw", count), _column(block, "phys", count)
     if not count or np.isnan(keys).any():
         raise ValueError("its conversion table has no keys")
@@ -153,74 +140,21 @@ def _table(interpolates: bool, values_of_a_pair: int, block: Any) -> Rule:
     return lambda raw: np.where(np.isnan(_floats(raw)), np.nan, values[np.searchsorted(borders, _floats(raw))])
 
 
-def _inside(raw: Values, low: float, high: float) -> BoolArray:
-    """Return which raw values [N] are in a range; its end belongs to a range of integers."""
-    is_end = (raw == high) & (raw.dtype.kind != "f" or low == high)
-    return np.asarray((raw >= low) & (raw < high) | is_end)
+def _pieces(block: Any, low: str, high: str, rules: Sequence[Rule | None], default: Rule | None) -> Rule:
+    """Return the rule of ranges with a rule each and of a default for all other numbers; None is a text.
 
+    The end of a range belongs to a range of integers. Texts are NaN if other numbers have a rule; otherwise all numbers
+    stay as they are.
+    """
+    if default is None and not any(rules):
+        return _floats
+    lows, highs = (_column(block, name, len(rules)).tolist() for name in (low, high))
 
-def _ranges(block: Any) -> Rule:
-    count = (block.val_param_nr - 1) // 3
-    lows, highs, values = (_column(block, name, count).tolist() for name in ("lower", "upper", "phys"))
-
-    def convert(raw: Values) -> FloatArray:
-        result = np.where(np.isnan(_floats(raw)), np.nan, np.float64(block.default))
-        for low, high, value in zip(lows, highs, values, strict=True):
-            result[_inside(raw, low, high)] = value
-        return result
+    def convert(raw: NDArray[Any]) -> FloatArray:
+        values = default(raw) if default else np.full(raw.shape, np.nan)
+        for first, last, rule in reversed([*zip(lows, highs, rules, strict=True)]):
+            its = (raw >= first) & (raw < last) | (raw == last) & (raw.dtype.kind != "f" or first == last)
+            values[its] = rule(raw[its]) if rule else np.nan
+        return values
 
     return convert
-
-
-def _texts_4(is_range: bool, block: Any) -> Rule:
-    count = block.val_param_nr // (2 if is_range else 1)
-    names = ("lower", "upper") if is_range else ("val", "val")
-    lows, highs = (_column(block, name, count).tolist() for name in names)
-    blocks = [block.referenced_blocks.get(key) for key in (*(f"text_{i}" for i in range(count)), "default_addr")]
-    *rules, default = (None if isinstance(b, bytes | None) else conversion_rule(b, 4) for b in blocks)
-    return _texts(list(zip(lows, highs, rules, strict=True)), default)
-
-
-def _text_ranges_3(block: Any) -> Rule:
-    """Return the rule of a table of texts, whose default text may contain a formula of ``{X}``."""
-    default = block.referenced_blocks.get("default_addr") or b""
-    if b"{X}" not in default:
-        return _floats
-    count = block.ref_param_nr - 1
-    lows, highs = (_column(block, name, count).tolist() for name in ("lower", "upper"))
-    formula = default.decode("latin-1").replace("{X}", "X").strip('\0 "')
-    return _texts([(low, high, None) for low, high in zip(lows, highs, strict=True)], formula_rule(formula))
-
-
-def _texts(entries: list[tuple[float, float, Rule | None]], default: Rule | None) -> Rule:
-    """Return the rule of a table of texts: raw numbers, or NaN for texts that replace some of the numbers."""
-    if default is None and not any(rule for _, _, rule in entries):
-        return _floats
-
-    def convert(raw: Values) -> FloatArray:
-        result = default(raw) if default else np.full(raw.shape, np.nan)
-        for low, high, rule in reversed(entries):
-            its = _inside(raw, low, high)
-            result[its] = rule(raw[its]) if rule else np.nan
-        return result
-
-    return convert
-
-
-def _as_is(_: Any) -> Rule:
-    return _floats
-
-
-def _formula(block: Any) -> Rule:
-    return formula_rule(str(block.formula))
-
-
-_RULES_4: Mapping[int, Callable[[Any], Rule]] = {
-    0: _as_is, 1: _linear, 2: _rational, 3: _formula, 4: partial(_table, True, 2), 5: partial(_table, False, 2),
-    6: _ranges, 7: partial(_texts_4, False), 8: partial(_texts_4, True), 11: _as_is,
-}  # fmt: skip
-_RULES_3: Mapping[int, Callable[[Any], Rule]] = {
-    0: _linear, 1: partial(_table, True, 1), 2: partial(_table, False, 1), 6: _polynomial,
-    7: partial(_transcendental, np.exp), 8: partial(_transcendental, np.log), 9: _rational, 10: _formula,
-    11: _as_is, 12: _text_ranges_3, 65535: _as_is,
-}  # fmt: skip

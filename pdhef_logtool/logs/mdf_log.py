@@ -7,51 +7,43 @@ conversions are those of :mod:`~pdhef_logtool.logs.mdf_conversions`.
 from __future__ import annotations
 
 import datetime as dt
-import gc
 import logging
 import re
-import shutil
-import sys
-import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import redirect_stdout
-from dataclasses import dataclass, field
 from functools import partial
-from io import StringIO
-from typing import Any, BinaryIO
+from io import BytesIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.can_decoding import Frames
-from pdhef_logtool.logs.container import describe_damage
+from pdhef_logtool.logs.container import SpanDamageError, describe_damage
 from pdhef_logtool.logs.mdf_blocks import survey_blocks
-from pdhef_logtool.logs.mdf_conversions import Rule, conversion_rule
+from pdhef_logtool.logs.mdf_conversions import conversion_rule
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.table_columns import NO_TIME, field_name, placed, unique
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.extras import required
-from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 
 _FRAMES = "CAN_DataFrame"
-#: Bytes of a CAN FD frame by its data length code, and the numbers that are such codes and no lengths.
+#: Bytes of a frame by its data length code, and the codes that are no lengths.
 _LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
 _ONLY_CODES = (9, 10, 11, 13, 14, 15)
 _DATA_BLOCK = re.compile(rb"##(?:DT|SD|DV)\0{4}")
 _LONGEST_NAME = 40
-#: Times from the start of a recording beyond this are damaged.
-_LONGEST_S = 4e9
-#: Dates of a header beyond this, in 2100, are damaged.
-_LAST_DATE_NS = 4_102_444_800 * 10**9
-#: Types of channels of MDF 4: values of variable length, masters, and those whose raw values are the row numbers.
-_VARIABLE, _MASTERS, _VIRTUAL = 1, (2, 3), (3, 6)
-#: Data types that are numbers, of MDF 4 and 3.
-_NUMBERS, _NUMBERS_3 = frozenset(range(6)), frozenset({0, 1, 2, 3, *range(9, 17)})
-#: Flags of a channel: all values are invalid, some are.
+#: Times from the start of a recording beyond this are damaged, as are starts after this date, in 2100.
+_LONGEST_S, _LAST_DATE_NS = 4e9, 4_102_444_800 * 10**9
+#: Types of channels of MDF 4: values of variable length, and those whose raw values are the row numbers.
+_VARIABLE, _VIRTUAL = (1, 5, 7), (3, 6)
+#: Types of masters, and of data that are numbers, by version.
+_MASTERS = {4: (2, 3), 3: (1,)}
+_NUMBERS = {4: range(6), 3: (0, 1, 2, 3, *range(9, 17))}
 _ALL_INVALID, _SOME_INVALID = 1, 2
-#: What a master other than time is, by its type of synchronisation.
+#: What a master that is no time contains, by its type of synchronisation.
 _NO_TIMES = {2: "an angle", 3: "a distance", 4: "an index"}
 
 
@@ -68,290 +60,243 @@ def open_mdf(file: TableFile) -> Tables:
     if missing := survey_blocks(file):
         losses.append(Loss("truncated", f"{missing} blocks are beyond the end of the file", file.name))
     file.stream.seek(0)
-    is_open = file.stream.read(7) == b"UnFinMF"
-    if is_open:
+    stream: Any = file.stream
+    if file.stream.read(7) == b"UnFinMF":  # asammdf completes it in place
         losses.append(Loss("truncated", "the recorder has not finished the file", file.name, severity="note"))
-    source, got = _opened(asammdf, _copy(file) if is_open else file.stream)
-    if source is None and (copy := _repaired(file)):
-        source, got = _opened(asammdf, copy)
-        losses.append(Loss("truncated", "the last block of data is incomplete", file.name))
-    if source is None:
-        raise LogError(expected="an MDF file with readable channels", got=got, where=file.name)
-    start_ns, is_local = _start(source.header)
-    if is_local:
-        what = "the start is a local time without a time zone, read as UTC"
-        losses.append(Loss("no-clock", what, file.name, severity="note"))
-    recording = _Recording(file, source, start_ns)
-    recording.groups.extend(Group(recording, number) for number in range(len(source.groups)))
+        stream = BytesIO(b"UnFinMF" + file.stream.read())
+    source = _opened(asammdf, stream)
+    if isinstance(source, str) and (repaired := _repaired(file)):
+        source = _opened(asammdf, repaired)
+    if isinstance(source, str):
+        raise LogError(expected="an MDF file with readable channels", got=source, where=file.name)
+    groups = Groups(file, source)
     tables: list[Table] = []
-    for name, group in zip(unique(group.name for group in recording.groups), recording.groups, strict=True):
+    names = [groups.name(number) for number in range(len(source.groups))]
+    for number, name in enumerate(unique(names)):
         try:
-            tables += group.tables(name, losses)
+            tables += groups.tables(number, name, losses)
         except Exception as error:  # noqa: BLE001  any error of a damaged block
             what = f"the channel group cannot be read: {describe_damage(error)[1]}"
             losses.append(Loss("bad-group", what, name))
     if not tables:
         got = next((f"{loss.where}: {loss.what}" for loss in losses if loss.kind == "bad-group"), "none with samples")
         raise LogError(expected="a channel group with times", got=got, where=file.name)
+    if groups.is_local:
+        what = "the start is a local time without a time zone, read as UTC"
+        losses.append(Loss("no-clock", what, file.name, severity="note"))
     return Tables(f"mdf-{str(source.version)[:1]}", tables, losses)
 
 
-def _copy(file: TableFile) -> BinaryIO:
-    """Return a copy that may be written, without a name."""
-    copy = tempfile.TemporaryFile()  # noqa: SIM115  asammdf reads it as long as the log is open
-    file.stream.seek(0)
-    shutil.copyfileobj(file.stream, copy)
-    return copy  # type: ignore[return-value]
-
-
-def _repaired(file: TableFile) -> BinaryIO | None:
+def _repaired(file: TableFile) -> BytesIO | None:
     """Return a version 4 file whose last block of data has the length that is left; None if none is cut."""
-    copy = _copy(file)
-    copy.seek(0)
-    data = copy.read()
+    file.stream.seek(0)
+    data = bytearray(file.stream.read())
     starts = [m.start() for m in _DATA_BLOCK.finditer(data) if m.start() + 16 <= len(data)]
     cut = [start for start in starts if start + int.from_bytes(data[start + 8 : start + 16], "little") > len(data)]
     if not cut:
         return None
-    copy.seek(cut[-1] + 8)
-    copy.write((len(data) - cut[-1]).to_bytes(8, "little"))
-    return copy
+    data[cut[-1] + 8 : cut[-1] + 16] = (len(data) - cut[-1]).to_bytes(8, "little")
+    return BytesIO(data)
 
 
-def _opened(asammdf: Any, stream: BinaryIO) -> tuple[Any, str]:
-    """Return the file, or None and why it cannot be opened."""
-    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None  # the end of a half-opened object is an error there
-    source, got = None, ""
+def _opened(asammdf: Any, stream: Any) -> Any:
+    """Return the file, or why it cannot be opened. Bus logging is not processed: asammdf would convert it."""
     try:
-        try:
-            with redirect_stdout(StringIO()):
-                # Bus logging would be converted by asammdf at once.
-                source = asammdf.MDF(stream, use_display_names=False, process_bus_logging=False)
-        except Exception as error:  # noqa: BLE001  any error of a damaged file
-            got = describe_damage(error)[1]
-        if source is None:
-            gc.collect()
-    finally:
-        sys.unraisablehook = hook
-    return source, got
+        return asammdf.MDF(stream, use_display_names=False, process_bus_logging=False)
+    except Exception as error:  # noqa: BLE001  any error of a damaged file
+        return describe_damage(error)[1]
 
 
 def _start(header: Any) -> tuple[int, bool]:
-    """Return the start of a recording in ns since 1970, 0 without a date, and whether it is a local time.
-
-    The machine's time zone does not matter.
-    """
-    flags = getattr(header, "time_flags", 0)
+    """Return the start of a recording in ns since 1970, 0 without a date, and whether it is a local time."""
+    flags = getattr(header, "time_flags", 0)  # 1: a local time, 2: with offsets from UTC
     start, is_local = int(getattr(header, "abs_time", 0)), flags == 1
     if flags == 3:
         start -= (header.tz_offset + header.daylight_save_time) * 60 * 10**9
     if not start and hasattr(header, "date"):
         text = b" ".join((header.date, header.time)).decode("latin-1").strip(" \0")
         try:
-            date = dt.datetime.strptime(text, "%d:%m:%Y %H:%M:%S").replace(tzinfo=dt.UTC)
+            start = round(dt.datetime.strptime(f"{text} +0000", "%d:%m:%Y %H:%M:%S %z").timestamp()) * 10**9
         except ValueError:
             return 0, False
-        start, is_local = int(date.timestamp()) * 10**9, True
+        is_local = True
     return (start, is_local) if 0 < start < _LAST_DATE_NS else (0, False)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Recording:
-    """An opened file: asammdf's object, and its groups by number."""
+class Groups:
+    """The channel groups of an opened file, by number, and their channels, by number within the group.
 
-    file: TableFile
-    source: Any
-    start_ns: int
-    groups: list[Group] = field(default_factory=list)
+    Conversions are taken from asammdf, which would run their formulas.
+    """
 
-
-class Group:
-    """A channel group of a file. It takes the conversions from asammdf, which would run their formulas."""
-
-    def __init__(self, recording: _Recording, number: int) -> None:
-        self._recording, self._number = recording, number
-        self._group = recording.source.groups[number]
-        self._channels = self._group.channels
-        self._version = int(str(recording.source.version)[:1])
-        self._conversions = [channel.conversion for channel in self._channels]
-        for channel in self._channels:
+    def __init__(self, file: TableFile, source: Any) -> None:
+        self._file, self._source, self._groups = file, source, source.groups
+        self._version = 4 if str(source.version) >= "4" else 3
+        self._start_ns, self.is_local = _start(source.header)
+        channels = [(g, i, c) for g, group in enumerate(source.groups) for i, c in enumerate(group.channels)]
+        self._conversions = {(g, i): channel.conversion for g, i, channel in channels}
+        for _, _, channel in channels:
             channel.conversion = None
-        self._last: tuple[str, NDArray[Any]] = "", np.empty(0)
+        self._last: tuple[tuple[int, int] | None, FloatArray] = None, np.empty(0)
 
-    @property
-    def name(self) -> str:
-        """Name by its acquisition, comment or source."""
-        group = self._group.channel_group
+    def name(self, number: int) -> str:
+        """Return the name of a group by its acquisition, comment or source."""
+        group = self._groups[number].channel_group
         source = getattr(group, "acq_source", None)
         texts = (getattr(group, "acq_name", ""), getattr(group, "comment", ""), getattr(source, "name", ""))
         plain = (re.sub(r"<[^>]*>|\s+", " ", text or "").strip() for text in texts)
-        if self.is_frames:
+        if self._contains_frames(number):
             return "can"
-        return field_name(next((t for t in plain if t and len(t) <= _LONGEST_NAME), f"group {self._number + 1}"))
+        return field_name(next((t for t in plain if t and len(t) <= _LONGEST_NAME), f"group {number + 1}"))
 
-    @property
-    def is_frames(self) -> bool:
-        """Return whether it contains raw CAN frames."""
-        return any(channel.name == _FRAMES for channel in self._channels)
+    def _contains_frames(self, number: int) -> bool:
+        return any(channel.name == _FRAMES for channel in self._groups[number].channels)
 
-    def tables(self, name: str, losses: list[Loss]) -> Iterator[Table]:
-        """Yield the table of the group, none without samples; channels that cannot be read become losses.
+    def tables(self, number: int, name: str, losses: list[Loss]) -> Iterator[Table]:
+        """Yield the table of a group, none without samples; channels that cannot be read become losses.
 
         Raises
         ------
-        ValueError : the group has no times, or its layout is damaged.
+        SpanDamageError : the group has no times, or its layout is damaged.
         """
-        group, file = self._group.channel_group, self._recording.file
-        if not self._channels or not group.cycles_nr:
+        group, channels, file = self._groups[number].channel_group, self._groups[number].channels, self._file
+        if not channels or not group.cycles_nr:
             return
-        row_bytes = group.samples_byte_nr + getattr(group, "invalidation_bytes_nr", 0)
-        file.limits.check_table(group.cycles_nr * (row_bytes + 8), file.size, f"{file.name}, {name}")
-        self._check_layout()
-        stamps, order = self._stamps(name, losses)
-        if self.is_frames:
-            yield self._frames(stamps, order).table(name)
+        row_bytes = group.samples_byte_nr + getattr(group, "invalidation_bytes_nr", 0) + 8
+        file.limits.check_table(group.cycles_nr * row_bytes, file.size, f"{file.name}, {name}")
+        self._check_layout(number)
+        stamps, rows = self._stamps(number, name, losses)
+        if self._contains_frames(number):
+            yield self._frames(number, stamps, rows).table(name)
             return
-        rules: dict[int, Rule] = {}
-        texts: list[str] = []
-        for i, channel in enumerate(self._channels):
-            if channel.data_type not in (_NUMBERS if self._version >= 4 else _NUMBERS_3) or self._is_compound(i):
+        indices, texts = [], []
+        for i, channel in enumerate(channels):
+            is_compound = self._groups[number].channel_dependencies[i] or self._is(number, i, _VARIABLE)
+            if is_compound or channel.data_type not in _NUMBERS[self._version]:
                 texts.append(channel.name)
-            elif not self._is_master(i):
+            elif channel.channel_type not in _MASTERS[self._version]:
                 try:
-                    rules[i] = conversion_rule(self._conversions[i], self._version)
+                    conversion_rule(self._conversions[number, i], self._version)
+                    indices.append(i)
                 except ValueError as error:
                     losses.append(Loss("bad-column", f"{channel.name} cannot be read: {error}", name))
         if texts:
             what = f"no columns of numbers: {', '.join(texts)}"
             losses.append(Loss("bad-column", what, name, count=len(texts), severity="note"))
-        titles = unique(field_name(self._channels[i].name) for i in rules)
-        fields = tuple(FieldInfo(t, "number", unit=self._unit(i)) for t, i in zip(titles, rules, strict=True))
-        yield Table(name, stamps, fields, partial(self._load, dict(zip(titles, rules, strict=True)), order))
+        titles = unique(field_name(channels[i].name) for i in indices)
+        units = [getattr(o, "unit", "") for i in indices for o in (self._conversions[number, i], channels[i])]
+        fields = tuple(
+            FieldInfo(t, "number", unit=a or b) for t, a, b in zip(titles, units[::2], units[1::2], strict=True)
+        )
+        yield Table(name, stamps, fields, partial(self._load, number, dict(zip(titles, indices, strict=True)), rows))
 
-    def _check_layout(self) -> None:
-        """Raise ValueError for a channel outside of its record: asammdf would read and write memory of others."""
-        group = self._group.channel_group
-        for channel in self._channels:
-            if hasattr(channel, "start_offset"):  # version 3
-                start = channel.start_offset + 8 * getattr(channel, "additional_byte_offset", 0)
+    def _is(self, number: int, index: int, types: tuple[int, ...]) -> bool:
+        """Return whether a channel is of one of these types of MDF 4."""
+        return self._version == 4 and self._groups[number].channels[index].channel_type in types
+
+    def _check_layout(self, number: int) -> None:
+        """Raise SpanDamageError for a channel outside of its record: asammdf would read and write memory of others."""
+        group = self._groups[number].channel_group
+        for channel in self._groups[number].channels:
+            if self._version == 3:
+                start, invalid = channel.start_offset + 8 * getattr(channel, "additional_byte_offset", 0), False
             else:
-                start = 8 * channel.byte_offset + channel.bit_offset
-                if channel.flags & _SOME_INVALID and channel.pos_invalidation_bit >= 8 * group.invalidation_bytes_nr:
-                    raise ValueError(f"the invalidation bit of channel {channel.name} is outside of its record")
-            if start + channel.bit_count > 8 * group.samples_byte_nr:
-                raise ValueError(f"channel {channel.name} is outside of its record")
+                start, place = 8 * channel.byte_offset + channel.bit_offset, channel.pos_invalidation_bit
+                invalid = channel.flags & _SOME_INVALID and place >= 8 * group.invalidation_bytes_nr
+            if invalid or start + channel.bit_count > 8 * group.samples_byte_nr:
+                raise SpanDamageError(f"channel {channel.name} is outside of its record")
 
-    def _is_compound(self, index: int) -> bool:
-        """Return whether a channel is an array, a structure or of variable length."""
-        is_variable = self._version >= 4 and self._channels[index].channel_type in (_VARIABLE, 5, 7)
-        return is_variable or bool(self._group.channel_dependencies[index])
+    def _seconds(self, number: int) -> FloatArray:
+        """Return the times of a group from the start of the recording in s [N]; SpanDamageError if it has none."""
+        remote = getattr(self._groups[number].channel_group, "cg_master_index", None)
+        number = number if remote is None else remote
+        masters = [
+            (getattr(channel, "sync_type", 1), i)
+            for i, channel in enumerate(self._groups[number].channels)
+            if channel.channel_type in _MASTERS[self._version]
+        ]
+        kind, index = min(masters, default=(0, None))
+        if index is None or kind in _NO_TIMES:
+            raise SpanDamageError(f"its master is {_NO_TIMES[kind]}, no time" if masters else "it has no time channel")
+        return self._values(number, index)
 
-    def _is_master(self, index: int) -> bool:
-        return self._channels[index].channel_type in (_MASTERS if self._version >= 4 else (1,))
-
-    def _is_virtual(self, index: int) -> bool:
-        """Return whether the raw values of a channel are the row numbers."""
-        channel = self._channels[index]
-        return channel.channel_type in _VIRTUAL if self._version >= 4 else channel.bit_count == 0
-
-    def _clock(self) -> int:
-        """Return the channel with the times; ValueError if there is none."""
-        masters = [i for i in range(len(self._channels)) if self._is_master(i)]
-        kinds = [getattr(self._channels[i], "sync_type", 1) for i in masters]
-        if (i := next((i for i, kind in zip(masters, kinds, strict=True) if kind not in _NO_TIMES), None)) is not None:
-            return i
-        raise ValueError(f"its master is {_NO_TIMES[kinds[0]]}, no time" if kinds else "it has no time channel")
-
-    def _seconds(self) -> NDArray[Any]:
-        """Return the times from the start of the recording in s [N], which may be those of another group."""
-        remote = getattr(self._group.channel_group, "cg_master_index", None)
-        if remote is not None and remote != self._number:
-            return self._recording.groups[remote]._seconds()
-        return self._values(self._clock())
-
-    def _stamps(self, name: str, losses: list[Loss]) -> tuple[IntArray, NDArray[Any] | slice]:
-        """Return the times in ascending order, and the rows that they are of; rows without a time are losses."""
-        seconds = self._seconds()
-        if missing := self._group.channel_group.cycles_nr - len(seconds):
-            losses.append(Loss("truncated", f"the file contains {len(seconds)} rows", name, count=missing))
-        finite = np.isfinite(seconds) & (np.abs(np.nan_to_num(seconds)) < _LONGEST_S)
+    def _stamps(self, number: int, name: str, losses: list[Loss]) -> tuple[IntArray, NDArray[Any] | slice]:
+        """Return the times of a group in ascending order, and their rows; rows without a time are losses."""
+        seconds = self._seconds(number)
+        if missing := self._groups[number].channel_group.cycles_nr - len(seconds):
+            losses.append(Loss("truncated", f"the file ends after {len(seconds)} rows", name, count=missing))
+        finite = np.abs(seconds) < _LONGEST_S
         if not finite.all():
             losses.append(Loss("bad-stamp", "row without a time", name, count=int((~finite).sum())))
-        stamps = np.round(np.where(finite, seconds, 0.0) * 1e9).astype(np.int64) + self._recording.start_ns
-        stamps = np.where(finite, stamps, NO_TIME)
+        stamps = np.round(np.where(finite, seconds, 0.0) * 1e9).astype(np.int64) + self._start_ns
+        stamps = placed(np.where(finite, stamps, NO_TIME))
         rows = np.flatnonzero(finite)
-        order = rows[np.argsort(stamps[rows], kind="stable")]
-        in_order = slice(None) if np.array_equal(order, np.arange(len(stamps))) else order
-        return placed(stamps)[in_order], in_order
+        rows = rows[np.argsort(stamps[rows], kind="stable")]
+        return stamps[rows], slice(None) if np.array_equal(rows, np.arange(len(stamps))) else rows
 
-    def _raw(self, index: int) -> tuple[NDArray[Any], BoolArray | None]:
+    def _raw(self, number: int, index: int) -> tuple[NDArray[Any], BoolArray | None]:
         """Return raw values [N] or [N, k] of a channel, and which rows are invalid [N]."""
-        group, channel = self._group.channel_group, self._channels[index]
-        values: NDArray[Any] = np.arange(group.cycles_nr)
-        invalid = None
-        if not self._is_virtual(index) or getattr(channel, "flags", 0) & _SOME_INVALID:
-            with redirect_stdout(StringIO()):  # what asammdf prints of a channel that it cannot read
-                read, invalid = self._recording.source.get(
-                    group=self._number, index=index, raw=True, samples_only=True, ignore_invalidation_bits=True
-                )
-            values = values if self._is_virtual(index) else np.asarray(read)
-        elif self._version < 4:
-            values = values * (channel.sampling_rate or 1.0)
-        return values, invalid
+        channel, rows = self._groups[number].channels[index], self._groups[number].channel_group.cycles_nr
+        is_virtual = self._is(number, index, _VIRTUAL)
+        if not channel.bit_count and self._version == 3:
+            return np.arange(rows) * (channel.sampling_rate or 1.0), None
+        if is_virtual and not channel.flags & _SOME_INVALID:
+            return np.arange(rows), None
+        values, invalid = self._source.get(
+            group=number, index=index, raw=True, samples_only=True, ignore_invalidation_bits=True
+        )
+        return np.arange(rows) if is_virtual else np.asarray(values), invalid
 
-    def _values(self, index: int) -> NDArray[Any]:
+    def _values(self, number: int, index: int) -> FloatArray:
         """Return physical values [N] of a channel, NaN where they are invalid."""
-        raw, invalid = self._raw(index)
+        raw, invalid = self._raw(number, index)
         if raw.ndim != 1 or raw.dtype.kind not in "biuf":
-            raise ValueError("it contains no numbers")
-        values = conversion_rule(self._conversions[index], self._version)(raw)
-        if getattr(self._channels[index], "flags", 0) & _ALL_INVALID:
-            return np.full(values.shape, np.nan)
-        return values if invalid is None else np.where(np.asarray(invalid, np.bool_), np.nan, values)
+            raise SpanDamageError("it contains no numbers")
+        values = conversion_rule(self._conversions[number, index], self._version)(raw)
+        if getattr(self._groups[number].channels[index], "flags", 0) & _ALL_INVALID:
+            values[:] = np.nan
+        elif invalid is not None:
+            values[np.asarray(invalid, np.bool_)] = np.nan
+        return values
 
-    def _load(self, indices: Mapping[str, int], order: Any, path: str, rows: slice) -> NDArray[Any]:
-        if self._last[0] != path:
-            self._last = path, self._values(indices[path])[order]
+    def _load(self, number: int, indices: Mapping[str, int], order: Any, path: str, rows: slice) -> FloatArray:
+        if self._last[0] != (number, indices[path]):
+            self._last = (number, indices[path]), self._values(number, indices[path])[order]
         return self._last[1][rows]
 
-    def _unit(self, index: int) -> str:
-        conversion, channel = self._conversions[index], self._channels[index]
-        return str(getattr(conversion, "unit", "") or getattr(channel, "unit", "") or "")
-
-    def _frames(self, stamps: IntArray, order: Any) -> Frames:
-        """Return the CAN frames. A virtual channel is used if its conversion makes a constant of the row numbers."""
-        ends = {c.name.rpartition(".")[2]: i for i, c in enumerate(self._channels) if c.name.startswith(f"{_FRAMES}.")}
-        named = ("ID", "IDE", "BusChannel", "DataLength", "DLC")
-        used = {
-            n: ends[n] for n in named if n in ends and (not self._is_virtual(ends[n]) or self._conversions[ends[n]])
+    def _frames(self, number: int, stamps: IntArray, rows: Any) -> Frames:
+        """Return the CAN frames of a group. Row numbers, of a virtual channel without a conversion, are no part."""
+        names = [channel.name.removeprefix(f"{_FRAMES}.") for channel in self._groups[number].channels]
+        parts = {
+            name: np.nan_to_num(self._values(number, i), nan=-1.0)[rows].astype(np.int64)
+            for i, name in enumerate(names)
+            if name in ("ID", "IDE", "BusChannel", "DataLength", "DLC")
+            and (self._conversions[number, i] or not self._is(number, i, _VIRTUAL))
         }
-        parts = {n: np.nan_to_num(self._values(i), nan=-1.0)[order].astype(np.int64) for n, i in used.items()}
-        data = self._bytes(ends["DataBytes"])[order]
-        number = parts["ID"]
+        data = self._bytes(number, names.index("DataBytes"))[rows]
+        identifier, has_length = parts["ID"] & 0x1FFF_FFFF, "DataLength" in parts
         length = parts.get("DataLength", parts.get("DLC", np.full(len(stamps), data.shape[1])))
-        if np.isin(length, _ONLY_CODES).any() or ("DLC" in parts and "DataLength" not in parts):
+        if np.isin(length, _ONLY_CODES).any() or (not has_length and "DLC" in parts):
             length = _LENGTHS[length.clip(0, 15)]
-        extended = (number >> 31 & 1 > 0) | ((number & 0x1FFF_FFFF) > 0x7FF) | (parts.get("IDE", number * 0) > 0)
-        frames = {"id": number & 0x1FFF_FFFF, "length": length.clip(0, data.shape[1])}
-        frames["is_extended"] = extended.astype(np.int64)
-        if "BusChannel" in parts:
-            frames["bus"] = parts["BusChannel"]
-        return Frames(stamps, frames, data)
+        extended = (parts["ID"] >> 31 & 1) | (identifier > 0x7FF) | (parts.get("IDE", np.zeros(1)) > 0)
+        bus = {"bus": parts["BusChannel"]} if "BusChannel" in parts else {}
+        length = length.clip(0, data.shape[1])
+        return Frames(stamps, {"id": identifier, "length": length, "is_extended": extended, **bus}, data)
 
-    def _bytes(self, index: int) -> NDArray[np.uint8]:
+    def _bytes(self, number: int, index: int) -> NDArray[np.uint8]:
         """Return the data of frames [N, k], zero behind the length."""
-        channel = self._channels[index]
-        is_variable = channel.channel_type == _VARIABLE
+        group = self._groups[number]
+        is_variable = self._is(number, index, _VARIABLE[:1])
         if is_variable:
-            channel.channel_type = 0  # its raw values are the places of the data
-        raw, _ = self._raw(index)
+            group.channels[index].channel_type = 0  # its raw values are the places of the data
+        raw, _ = self._raw(number, index)
         if not is_variable:
             return np.asarray(raw, np.uint8).reshape(len(raw), -1)
-        stored = np.frombuffer(self._recording.source._mdf._load_signal_data(self._group, index), np.uint8)
-        begins = raw.astype(np.int64)
+        stored = np.frombuffer(self._source._mdf._load_signal_data(group, index), np.uint8)
+        begins = raw.astype(np.int64)[:, np.newaxis]
         if begins.min(initial=0) < 0 or begins.max(initial=0) > len(stored) - 4:
-            raise ValueError("data of a frame are missing")
-        stored = np.pad(stored, (0, int(_LENGTHS[-1])))
-        lengths = np.ascontiguousarray(stored[begins[:, np.newaxis] + np.arange(4)]).view("<u4")
-        places = np.arange(min(int(lengths.max(initial=0)), int(_LENGTHS[-1])))
-        return np.where(places < lengths, stored[begins[:, np.newaxis] + 4 + places], 0).astype(np.uint8)
+            raise SpanDamageError("data of a frame are missing")
+        stored = np.pad(stored, (0, _LENGTHS[-1]))
+        lengths = stored[begins + np.arange(4)].view("<u4")
+        places = np.arange(min(lengths.max(initial=0), _LENGTHS[-1]))
+        return np.where(places < lengths, stored[begins + 4 + places], np.uint8(0))
