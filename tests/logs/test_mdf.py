@@ -319,8 +319,8 @@ def test_a_conversion_of_an_unknown_type_is_refused() -> None:
 @pytest.mark.parametrize("version", ["4.10", "3.30"])
 def test_a_formula_of_a_file_runs_nothing(version: str, tmp_path: Path) -> None:
     canary = tmp_path / "canary"
-    hostile = {"formula": f"__import__('pathlib').Path('{canary}').touch() or X1"}
-    ours = [signal("bad", AY, conversion=hostile), signal("good", AY, conversion={"formula": "2*X1+1"})]
+    hostile = {"formula": f"__import__('pathlib').Path('{canary}').touch() or X"}
+    ours = [signal("bad", AY, conversion=hostile), signal("good", AY, conversion={"formula": "2*X+1"})]
     path = written(tmp_path / "a.mf4", ours, version)
     read = contents(path)
     np.testing.assert_allclose(read.columns["car.good"], 2.0 * AY + 1.0)
