@@ -39,9 +39,8 @@ _LONGEST_NAME = 40
 _LONGEST_S, _LAST_DATE_NS = 4e9, 4_102_444_800 * 10**9
 #: Types of channels of MDF 4: values of variable length, and those whose raw values are the row numbers.
 _VARIABLE, _VIRTUAL = (1, 5, 7), (3, 6)
-#: Types of masters, and of data that are numbers, by version.
+#: Types of masters by version.
 _MASTERS = {4: (2, 3), 3: (1,)}
-_NUMBERS = {4: range(6), 3: (0, 1, 2, 3, *range(9, 17))}
 _ALL_INVALID, _SOME_INVALID = 1, 2
 #: What a master that is no time contains, by its type of synchronisation.
 _NO_TIMES = {2: "an angle", 3: "a distance", 4: "an index"}
@@ -133,10 +132,10 @@ class Groups:
         self._file, self._source, self._groups = file, source, source.groups
         self._version = 4 if str(source.version) >= "4" else 3
         self._start_ns, self.is_local = _start(source.header)
-        channels = [(g, i, c) for g, group in enumerate(source.groups) for i, c in enumerate(group.channels)]
-        self._conversions = {(g, i): channel.conversion for g, i, channel in channels}
-        for _, _, channel in channels:
-            channel.conversion = None
+        self._conversions: dict[tuple[int, int], Any] = {}
+        for place, channel in (((g, i), c) for g, of in enumerate(source.groups) for i, c in enumerate(of.channels)):
+            self._conversions[place], channel.conversion = channel.conversion, None
+        self._rows: dict[int, int] = {}
         self._last: tuple[tuple[int, int] | None, FloatArray] = None, np.empty(0)
 
     def name(self, number: int) -> str:
@@ -172,7 +171,7 @@ class Groups:
         indices, texts = [], []
         for i, channel in enumerate(channels):
             is_compound = self._groups[number].channel_dependencies[i] or self._is(number, i, _VARIABLE)
-            if is_compound or channel.data_type not in _NUMBERS[self._version]:
+            if is_compound or channel.dtype_fmt.kind not in "iuf":
                 texts.append(channel.name)
             elif channel.channel_type not in _MASTERS[self._version]:
                 try:
@@ -183,12 +182,13 @@ class Groups:
         if texts:
             what = f"no columns of numbers: {', '.join(texts)}"
             losses.append(Loss("bad-column", what, name, count=len(texts), severity="note"))
-        titles = unique(field_name(channels[i].name) for i in indices)
-        units = [getattr(o, "unit", "") for i in indices for o in (self._conversions[number, i], channels[i])]
-        fields = tuple(
-            FieldInfo(t, "number", unit=a or b) for t, a, b in zip(titles, units[::2], units[1::2], strict=True)
-        )
-        yield Table(name, stamps, fields, partial(self._load, number, dict(zip(titles, indices, strict=True)), rows))
+        titles = dict(zip(unique(field_name(channels[i].name) for i in indices), indices, strict=True))
+        fields = tuple(FieldInfo(title, "number", unit=self._unit(number, i)) for title, i in titles.items())
+        yield Table(name, stamps, fields, partial(self._load, number, titles, rows))
+
+    def _unit(self, number: int, index: int) -> str:
+        of_conversion = getattr(self._conversions[number, index], "unit", "")
+        return of_conversion or getattr(self._groups[number].channels[index], "unit", "")
 
     def _is(self, number: int, index: int, types: tuple[int, ...]) -> bool:
         """Return whether a channel is of one of these types of MDF 4."""
@@ -197,13 +197,14 @@ class Groups:
     def _check_layout(self, number: int) -> None:
         """Raise SpanDamageError for a channel outside of its record: asammdf would read and write memory of others."""
         group = self._groups[number].channel_group
-        for channel in self._groups[number].channels:
+        for i, channel in enumerate(self._groups[number].channels):
+            end, last_bit = channel.bit_count, -1
             if self._version == 3:
-                start, invalid = channel.start_offset + 8 * getattr(channel, "additional_byte_offset", 0), False
+                end += channel.start_offset + 8 * getattr(channel, "additional_byte_offset", 0)
             else:
-                start, place = 8 * channel.byte_offset + channel.bit_offset, channel.pos_invalidation_bit
-                invalid = channel.flags & _SOME_INVALID and place >= 8 * group.invalidation_bytes_nr
-            if invalid or start + channel.bit_count > 8 * group.samples_byte_nr:
+                end += 8 * channel.byte_offset + channel.bit_offset if not self._is(number, i, _VIRTUAL) else -end
+                last_bit = channel.pos_invalidation_bit if channel.flags & _SOME_INVALID else -1
+            if end > 8 * group.samples_byte_nr or last_bit >= 8 * getattr(group, "invalidation_bytes_nr", 0):
                 raise SpanDamageError(f"channel {channel.name} is outside of its record")
 
     def _seconds(self, number: int) -> FloatArray:
@@ -223,6 +224,7 @@ class Groups:
     def _stamps(self, number: int, name: str, losses: list[Loss]) -> tuple[IntArray, NDArray[Any] | slice]:
         """Return the times of a group in ascending order, and their rows; rows without a time are losses."""
         seconds = self._seconds(number)
+        self._rows[number] = len(seconds)
         if missing := self._groups[number].channel_group.cycles_nr - len(seconds):
             losses.append(Loss("truncated", f"the file ends after {len(seconds)} rows", name, count=missing))
         finite = np.abs(seconds) < _LONGEST_S
@@ -261,7 +263,10 @@ class Groups:
 
     def _load(self, number: int, indices: Mapping[str, int], order: Any, path: str, rows: slice) -> FloatArray:
         if self._last[0] != (number, indices[path]):
-            self._last = (number, indices[path]), self._values(number, indices[path])[order]
+            values = self._values(number, indices[path])
+            if len(values) != self._rows[number]:
+                raise SpanDamageError(f"{len(values)} values for {self._rows[number]} times")
+            self._last = (number, indices[path]), values[order]
         return self._last[1][rows]
 
     def _frames(self, number: int, stamps: IntArray, rows: Any) -> Frames:
@@ -293,10 +298,10 @@ class Groups:
         if not is_variable:
             return np.asarray(raw, np.uint8).reshape(len(raw), -1)
         stored = np.frombuffer(self._source._mdf._load_signal_data(group, index), np.uint8)
-        begins = raw.astype(np.int64)[:, np.newaxis]
+        begins = raw.astype(np.int64)
         if begins.min(initial=0) < 0 or begins.max(initial=0) > len(stored) - 4:
             raise SpanDamageError("data of a frame are missing")
-        stored = np.pad(stored, (0, _LENGTHS[-1]))
-        lengths = stored[begins + np.arange(4)].view("<u4")
-        places = np.arange(min(lengths.max(initial=0), _LENGTHS[-1]))
-        return np.where(places < lengths, stored[begins + 4 + places], np.uint8(0))
+        frames = np.lib.stride_tricks.sliding_window_view(np.pad(stored, (0, _LENGTHS[-1])), 4 + _LENGTHS[-1])[begins]
+        lengths = frames[:, :4].copy().view("<u4")
+        data = frames[:, 4 : 4 + min(lengths.max(initial=0), _LENGTHS[-1])]
+        return np.where(np.arange(data.shape[1]) < lengths, data, np.uint8(0))

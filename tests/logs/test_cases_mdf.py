@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from contextlib import closing
 from pathlib import Path
 
@@ -39,7 +40,7 @@ def test_a_hostile_file_is_one_line(
     scratch = tmp_path / "t"
     scratch.mkdir()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("TMPDIR", str(scratch))
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     done = called("inspect", cases / "hostile" / name)
     assert done.returncode == code
     assert re.search(line, " ".join((done.stdout + done.stderr).split()))
