@@ -1,4 +1,4 @@
-"""The blocks of an MDF file, followed before a library opens it: their number, unpacked size and links in a circle."""
+"""Survey of the blocks of an MDF file before a library opens it: number, unpacked size and circular links."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pdhef_logtool.logs.table_file import TableFile
 from pdhef_logtool.records.errors import LogError
 
 _FIRST = 64
-#: Links of a block that are followed, by their place; those of lists of data all.
+#: Places of the links that are followed, by kind of block; empty: all links of a list of data.
 _FOLLOWED: Mapping[bytes, tuple[int, ...]] = {
     b"HD": (0, 1, 3, 4), b"DG": (0, 1, 2), b"CG": (0, 1), b"CN": (0, 1, 5), b"CA": (0,), b"HL": (0,),
     b"FH": (0,), b"AT": (0,), b"EV": (0,), b"DL": (), b"LD": (),
@@ -24,15 +24,24 @@ _CHAINS: Mapping[tuple[bytes, int], bytes] = {
 _LISTS = frozenset({b"DL", b"LD", b"HL"})
 
 
+def is_unfinished(file: TableFile) -> bool:
+    """Return whether the recorder did not complete lengths and links, and leave the stream at its start."""
+    file.stream.seek(0)
+    head = file.stream.read(_FIRST).ljust(_FIRST)
+    file.stream.seek(0)
+    return head[8:9] == b"4" and (head[:7] == b"UnFinMF" or any(head[60:62]))
+
+
 def survey_blocks(file: TableFile) -> int:
     """Follow the links of an MDF file and return how many lead beyond its end.
 
     Raises
     ------
-    LogError : links form a circle, or lead to a block of another kind.
+    LogError : links form a circle, or lead to a block of another kind; the file is unfinished and has several lists of
+        data, which asammdf does not complete.
     LimitError : more groups, channels or unpacked data than a file of this size may contain.
     """
-    stream, limits = file.stream, file.limits
+    stream, limits, unfinished = file.stream, file.limits, is_unfinished(file)
     stream.seek(_FIRST)
     is_old = stream.read(2) == b"HD"
     base, link, followed = (4, struct.Struct("<I"), _FOLLOWED_3) if is_old else (24, struct.Struct("<Q"), _FOLLOWED)
@@ -63,6 +72,8 @@ def survey_blocks(file: TableFile) -> int:
         data = stream.read(count * link.size)
         links = [target for (target,) in link.iter_unpack(data[: len(data) // link.size * link.size])]
         missing += len(links) < count
+        if kind == b"DL" and links[:1] > [0] and unfinished:
+            raise _damage("a finished recording", "an unfinished one with several lists of data", file)
         pending += [(links[i], kind, i) for i in followed[kind] or range(len(links)) if i < len(links) and links[i]]
     limits.check("channels", kinds[b"CG"], file.name)
     limits.check("schema_leaves", kinds[b"CN"] / max(1, kinds[b"CG"]), f"{file.name}, channels of a group")

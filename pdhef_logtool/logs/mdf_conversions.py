@@ -1,6 +1,6 @@
 """Conversions of MDF channels from raw to physical values; a formula of a file is parsed, never run as code.
 
-A conversion is given as the block that ``asammdf`` has parsed. Source: ASAM MDF 4.2 and MDF 3.3, CCBLOCK.
+``block`` is a conversion block as ``asammdf`` has parsed it. Source: ASAM MDF 4.2 and MDF 3.3, CCBLOCK.
 """
 
 from __future__ import annotations

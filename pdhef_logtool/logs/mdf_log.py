@@ -1,7 +1,7 @@
 """MDF 3 and 4 (extra ``formats``): each channel group is a topic with its own clock; columns are read when needed.
 
-A group of bus logging becomes a topic ``can`` of raw frames. ``asammdf`` opens the file and returns raw values; their
-conversions are those of :mod:`~pdhef_logtool.logs.mdf_conversions`.
+A group of bus logging becomes a topic ``can`` of raw frames. ``asammdf`` opens the file and returns raw values.
+:mod:`~pdhef_logtool.logs.mdf_conversions` converts them.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import datetime as dt
 import logging
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 from io import BytesIO
 from typing import Any
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.can_decoding import Frames
 from pdhef_logtool.logs.container import SpanDamageError, describe_damage
-from pdhef_logtool.logs.mdf_blocks import survey_blocks
+from pdhef_logtool.logs.mdf_blocks import is_unfinished, survey_blocks
 from pdhef_logtool.logs.mdf_conversions import conversion_rule
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.table_columns import NO_TIME, field_name, placed, unique
@@ -37,12 +38,14 @@ _DATA_BLOCK = re.compile(rb"##(?:DT|SD|DV)\0{4}")
 _LONGEST_NAME = 40
 #: Times from the start of a recording beyond this are damaged, as are starts after this date, in 2100.
 _LONGEST_S, _LAST_DATE_NS = 4e9, 4_102_444_800 * 10**9
-#: Types of channels of MDF 4: values of variable length, and those whose raw values are the row numbers.
+#: Types of channels of MDF 4: values of variable length, and virtual channels (raw values are row numbers).
 _VARIABLE, _VIRTUAL = (1, 5, 7), (3, 6)
 #: Types of masters by version.
 _MASTERS = {4: (2, 3), 3: (1,)}
+#: Flags of channels and of the start.
 _ALL_INVALID, _SOME_INVALID = 1, 2
-#: What a master that is no time contains, by its type of synchronisation.
+_LOCAL, _WITH_OFFSETS = 1, 2
+#: Quantities of masters other than time, by type of synchronisation.
 _NO_TIMES = {2: "an angle", 3: "a distance", 4: "an index"}
 
 
@@ -58,11 +61,10 @@ def open_mdf(file: TableFile) -> Tables:
     losses: list[Loss] = []
     if missing := survey_blocks(file):
         losses.append(Loss("truncated", f"{missing} blocks are beyond the end of the file", file.name))
-    file.stream.seek(0)
     stream: Any = file.stream
-    if file.stream.read(7) == b"UnFinMF":  # asammdf completes it in place
+    if is_unfinished(file):  # asammdf completes it in place
         losses.append(Loss("truncated", "the recorder has not finished the file", file.name, severity="note"))
-        stream = BytesIO(b"UnFinMF" + file.stream.read())
+        stream = BytesIO(file.stream.read())
     source = _opened(asammdf, stream)
     if isinstance(source, str) and (repaired := _repaired(file)):
         source = _opened(asammdf, repaired)
@@ -87,7 +89,7 @@ def open_mdf(file: TableFile) -> Tables:
 
 
 def _repaired(file: TableFile) -> BytesIO | None:
-    """Return a version 4 file whose last block of data has the length that is left; None if none is cut."""
+    """Return a copy of a version 4 file with the length of its cut last data block corrected; None without a cut."""
     file.stream.seek(0)
     data = bytearray(file.stream.read())
     starts = [m.start() for m in _DATA_BLOCK.finditer(data) if m.start() + 16 <= len(data)]
@@ -108,24 +110,21 @@ def _opened(asammdf: Any, stream: Any) -> Any:
 
 def _start(header: Any) -> tuple[int, bool]:
     """Return the start of a recording in ns since 1970, 0 without a date, and whether it is a local time."""
-    flags = getattr(header, "time_flags", 0)  # 1: a local time, 2: with offsets from UTC
-    start, is_local = int(getattr(header, "abs_time", 0)), flags == 1
-    if flags == 3:
+    start, flags = int(getattr(header, "abs_time", 0)), getattr(header, "time_flags", 0)
+    if flags == _LOCAL | _WITH_OFFSETS:
         start -= (header.tz_offset + header.daylight_save_time) * 60 * 10**9
-    if not start and hasattr(header, "date"):
+    elif not start and hasattr(header, "date"):
         text = b" ".join((header.date, header.time)).decode("latin-1").strip(" \0")
-        try:
-            start = round(dt.datetime.strptime(f"{text} +0000", "%d:%m:%Y %H:%M:%S %z").timestamp()) * 10**9
-        except ValueError:
-            return 0, False
-        is_local = True
-    return (start, is_local) if 0 < start < _LAST_DATE_NS else (0, False)
+        with suppress(ValueError):
+            date = dt.datetime.strptime(f"{text} +0000", "%d:%m:%Y %H:%M:%S %z")
+            start, flags = round(date.timestamp()) * 10**9, _LOCAL
+    return (start, flags == _LOCAL) if 0 < start < _LAST_DATE_NS else (0, False)
 
 
 class Groups:
     """The channel groups of an opened file, by number, and their channels, by number within the group.
 
-    Conversions are taken from asammdf, which would run their formulas.
+    This class removes the conversions from asammdf's channels, because asammdf would run their formulas.
     """
 
     def __init__(self, file: TableFile, source: Any) -> None:
@@ -208,7 +207,7 @@ class Groups:
                 raise SpanDamageError(f"channel {channel.name} is outside of its record")
 
     def _seconds(self, number: int) -> FloatArray:
-        """Return the times of a group from the start of the recording in s [N]; SpanDamageError if it has none."""
+        """Return the times of a group from the start of the recording in s [N]; SpanDamageError without times."""
         remote = getattr(self._groups[number].channel_group, "cg_master_index", None)
         number = number if remote is None else remote
         masters = [
@@ -250,7 +249,7 @@ class Groups:
         return np.arange(rows) if is_virtual else np.asarray(values), invalid
 
     def _values(self, number: int, index: int) -> FloatArray:
-        """Return physical values [N] of a channel, NaN where they are invalid."""
+        """Return physical values [N] of a channel, NaN for invalid samples."""
         raw, invalid = self._raw(number, index)
         if raw.ndim != 1 or raw.dtype.kind not in "biuf":
             raise SpanDamageError("it contains no numbers")

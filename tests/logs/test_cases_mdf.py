@@ -1,4 +1,4 @@
-"""MDF files of ../shared/cases that failed once: each gives what its README states."""
+"""MDF files of ../shared/cases, which failed once, and their right results by its README."""
 
 from __future__ import annotations
 

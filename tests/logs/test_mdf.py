@@ -94,8 +94,10 @@ class Ch:
 def mdf4(
     channels: Sequence[Ch], records: bytes, rows: int, size: int, invalid_bytes: int = 0, packed: tuple[int, ...] = ()
 ) -> bytes:
-    """An MDF 4.10 as recorders write it: one group IMU whose data are the last block; ``packed``: sizes that a
-    compressed block claims."""
+    """Return an MDF 4.10 as recorders write it: one group IMU, data in the last block.
+
+    ``packed`` : size that a compressed block claims.
+    """
     about = b"<FHcomment><TX>x</TX><tool_id>x</tool_id><tool_vendor>x</tool_vendor></FHcomment>\0"
     blocks: dict[str, tuple[list[str], bytes]] = {
         "HD": (["DG", "FH", "", "", "", ""], struct.pack("<QhhB", START_NS, 0, 0, 0) + bytes(19)),
@@ -152,7 +154,7 @@ def patched(data: bytes, at: int, value: int) -> bytes:
 
 
 def mdf(path: Path, version: str = "4.10") -> Path:
-    """Two channel groups with clocks of their own."""
+    """Write two channel groups with separate clocks."""
     with asammdf.MDF(version=version) as file:
         file.start_time = START
         file.append(
@@ -537,7 +539,7 @@ def test_groups_of_version_3_in_a_circle_are_one_line(tmp_path: Path) -> None:
         contents(path)
 
 
-def test_what_a_file_claims_is_asked_of_the_limits_first(tmp_path: Path) -> None:
+def test_claimed_sizes_are_compared_with_the_limits_first(tmp_path: Path) -> None:
     (tmp_path / "a.mf4").write_bytes(imu(packed=(2**40,)))
     with pytest.raises(LogError, match="table bytes"):
         contents(tmp_path / "a.mf4")
@@ -549,6 +551,18 @@ def test_what_a_file_claims_is_asked_of_the_limits_first(tmp_path: Path) -> None
     (tmp_path / "c.mf4").write_bytes(mdf4(channels, bytes(16), 1, 16))
     with pytest.raises(LogError, match="schema leaves"):
         contents(tmp_path / "c.mf4")
+
+
+def test_an_unfinished_file_with_several_lists_of_data_is_one_line(tmp_path: Path) -> None:
+    data = bytearray(written(tmp_path / "a.mf4", [signal("ay", AY)]).read_bytes())
+    group = block(bytes(data), b"DG")
+    lists = [len(data), len(data) + 48]
+    for following in (lists[1], 0):
+        data += struct.pack("<4s4xQQQIIQ", b"##DL", 48, 1, following, 0, 0, 0)[:48]
+    data[:8], data[60:62] = b"UnFinMF ", struct.pack("<H", 0b10000)
+    (tmp_path / "a.mf4").write_bytes(patched(bytes(data), group + 24 + 16, lists[0]))
+    with pytest.raises(LogError, match="several lists of data"):
+        contents(tmp_path / "a.mf4")
 
 
 def test_packed_data_are_read(tmp_path: Path) -> None:
