@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import count, takewhile
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -53,25 +54,20 @@ def conversion_rule(block: Any, version: int) -> Rule:
             case (3, 7 | 8) if (block.P1 == 0.0) != (block.P4 == 0.0):
                 formula = _WITHOUT_P4 if block.P4 == 0.0 else _WITHOUT_P1
                 return formula_rule(formula.format(block, "exp" if kind[1] == 7 else "log"))
-            case (4, 4 | 5):
-                return _table(block, block.val_param_nr // 2, interpolates=kind[1] == 4)
-            case (3, 1 | 2):
-                return _table(block, block.ref_param_nr, interpolates=kind[1] == 1)
+            case (4, 4 | 5) | (3, 1 | 2):
+                return _table(block, interpolates=kind[1] in (1, 4))
             case (4, 6):
-                count = (block.val_param_nr - 1) // 3
-                values = [formula_rule(str(value)) for value in _column(block, "phys", count).tolist()]
-                return _pieces(block, "lower", "upper", values, formula_rule(str(block.default)))
+                values = [formula_rule(str(value)) for value in _column(block, "phys")]
+                return _pieces(block, values, formula_rule(str(block.default)))
             case (4, 7 | 8):
-                count = block.val_param_nr // (kind[1] - 6)
-                nested = [
-                    block.referenced_blocks.get(k) for k in (*(f"text_{i}" for i in range(count)), "default_addr")
-                ]
-                *rules, default = (None if isinstance(b, bytes | None) else conversion_rule(b, 4) for b in nested)
-                return _pieces(block, *(("val", "val") if kind[1] == 7 else ("lower", "upper")), rules, default)
+                blocks = block.referenced_blocks.items()
+                rules = {key: None if isinstance(b, bytes | None) else conversion_rule(b, 4) for key, b in blocks}
+                default = rules.pop("default_addr", None)
+                return _pieces(block, [*rules.values()], default)
             case (3, 12):  # the text of all other numbers may contain a formula of {X}
                 text = (block.referenced_blocks.get("default_addr") or b"").decode("latin-1")
                 default = formula_rule(text.replace("{X}", "x").strip('\0 "')) if "{X}" in text else None
-                return _pieces(block, "lower", "upper", [None] * (block.ref_param_nr - 1), default)
+                return _pieces(block, [None] * len(_column(block, "lower")), default)
     except AttributeError:  # of a block that asammdf has not read to its end
         raise ValueError("its conversion is incomplete") from None
     raise ValueError(f"its conversion is of type {kind[1]}, which is not supported")
@@ -123,14 +119,16 @@ def _floats(raw: NDArray[Any]) -> FloatArray:
     return raw.astype(np.float64)
 
 
-def _column(block: Any, name: str, count: int) -> FloatArray:
-    return np.asarray([getattr(block, f"{name}_{i}") for i in range(count)], np.float64)
+def _column(block: Any, name: str) -> list[float]:
+    """Return the numbers of a table: attributes ``name_0``, ``name_1``, ..."""
+    places = takewhile(lambda i: hasattr(block, f"{name}_{i}"), count())
+    return [float(getattr(block, f"{name}_{i}")) for i in places]
 
 
-def _table(block: Any, count: int, *, interpolates: bool) -> Rule:
+def _table(block: Any, *, interpolates: bool) -> Rule:
     """Return the rule of a table: interpolated, or the value of the nearest key, of two equally near the lower."""
-    keys, values = _column(block, "raw", count), _column(block, "phys", count)
-    if not count or np.isnan(keys).any():
+    keys, values = np.asarray(_column(block, "raw")), np.asarray(_column(block, "phys"))
+    if not len(keys) or np.isnan(keys).any():
         raise ValueError("its conversion table has no keys")
     order = np.argsort(keys, kind="stable")
     keys, values = keys[order], values[order]
@@ -140,15 +138,15 @@ def _table(block: Any, count: int, *, interpolates: bool) -> Rule:
     return lambda raw: np.where(np.isnan(_floats(raw)), np.nan, values[np.searchsorted(borders, _floats(raw))])
 
 
-def _pieces(block: Any, low: str, high: str, rules: Sequence[Rule | None], default: Rule | None) -> Rule:
-    """Return the rule of ranges with a rule each and of a default for all other numbers; None is a text.
+def _pieces(block: Any, rules: Sequence[Rule | None], default: Rule | None) -> Rule:
+    """Return the rule of values or ranges with a rule each, and of a default for all other numbers; None is a text.
 
     The end of a range belongs to a range of integers. Texts are NaN if other numbers have a rule; otherwise all numbers
     stay as they are.
     """
     if default is None and not any(rules):
         return _floats
-    lows, highs = (_column(block, name, len(rules)).tolist() for name in (low, high))
+    lows, highs = (_column(block, "val") or _column(block, name) for name in ("lower", "upper"))
 
     def convert(raw: NDArray[Any]) -> FloatArray:
         values = default(raw) if default else np.full(raw.shape, np.nan)
