@@ -121,9 +121,16 @@ def mdf4(
         blocks["DZ"] = [], struct.pack("<2sBBIQQ", b"DT", 0, 0, 0, packed[0], len(data)) + data
     else:
         blocks["DT"] = [], records
+    return assembled(blocks)
+
+
+def assembled(blocks: Mapping[str, tuple[list[str], bytes]], version: int = 410) -> bytes:
+    """Return a file of blocks: their links, by name, and data; a name begins with the identifier of its block."""
     at: dict[str, int] = {}
     for _ in range(2):  # the first pass finds the addresses
-        out = bytearray(b"MDF     4.10    test".ljust(28, b"\0") + struct.pack("<H", 410)).ljust(64, b"\0")
+        out = bytearray(
+            f"MDF     {version / 100:.2f}    test".encode().ljust(28, b"\0") + struct.pack("<H", version)
+        ).ljust(64, b"\0")
         for name, (links, data) in blocks.items():
             at[name] = len(out)
             head = struct.pack("<4s4xQQ", f"##{name[:2]}".encode(), 24 + 8 * len(links) + len(data), len(links))
@@ -436,6 +443,32 @@ def test_a_virtual_master_counts_the_rows(tmp_path: Path) -> None:
     read = contents(tmp_path / "a.mf4")
     expected = START_NS + np.round((0.5 + np.arange(N) * 0.02) * 1e9)
     np.testing.assert_array_equal(read.stamps_ns["IMU"], expected.astype(np.int64))
+
+
+def test_a_group_may_have_the_times_of_another_group(tmp_path: Path) -> None:
+    def channel(name: str, kind: int) -> tuple[list[str], bytes]:
+        numbers = struct.pack("<BBBBIIIIBxHdddddd", kind, kind // 2, 4, 0, 0, 64, 0, 0, 0, 0, *[0.0] * 6)
+        return ["", "", name, "", "", "", "", ""], numbers
+
+    def group(flags: int) -> bytes:
+        return struct.pack("<QQHHIII", 0, N, flags, 0, 0, 8, 0)
+
+    date = struct.pack("<QhhB", START_NS, 0, 0, 0)
+    blocks = {
+        "HD": (["DG", "FH", "", "", "", ""], date + bytes(19)),
+        "FH": (["", "MD"], date + bytes(3)),
+        "MD": ([], b"<FHcomment><TX>x</TX></FHcomment>\0"),
+        "DG": (["DG2", "CG", "DT", ""], bytes(8)),
+        "CG": (["", "CN", "", "", "", ""], group(0)),
+        "DG2": (["", "CG2", "DT2", ""], bytes(8)),
+        "CG2": (["", "CN2", "TX3", "", "", "", "CG"], group(8)),
+        "CN": channel("TX1", 2), "CN2": channel("TX2", 0), "TX1": ([], b"time\0"), "TX2": ([], b"AccY\0"),
+        "TX3": ([], b"IMU\0"), "DT": ([], TIME_S.tobytes()), "DT2": ([], AY.tobytes()),
+    }  # fmt: skip
+    (tmp_path / "a.mf4").write_bytes(assembled(blocks, 420))
+    read = contents(tmp_path / "a.mf4")
+    np.testing.assert_array_equal(read.columns["IMU.AccY"], AY)
+    np.testing.assert_array_equal(read.stamps_ns["IMU"], START_NS + np.round(TIME_S * 1e9).astype(np.int64))
 
 
 # ---- bus logging of newer loggers ----
