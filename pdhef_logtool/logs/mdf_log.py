@@ -72,8 +72,7 @@ def open_mdf(file: TableFile) -> Tables:
         raise LogError(expected="an MDF file with readable channels", got=source, where=file.name)
     groups = Groups(file, source)
     tables: list[Table] = []
-    names = [groups.name(number) for number in range(len(source.groups))]
-    for number, name in enumerate(unique(names)):
+    for number, name in enumerate(unique(map(groups.name, range(len(source.groups))))):
         try:
             tables += groups.tables(number, name, losses)
         except Exception as error:  # noqa: BLE001  any error of a damaged block
@@ -237,16 +236,16 @@ class Groups:
 
     def _raw(self, number: int, index: int) -> tuple[NDArray[Any], BoolArray | None]:
         """Return raw values [N] or [N, k] of a channel, and which rows are invalid [N]."""
-        channel, rows = self._groups[number].channels[index], self._groups[number].channel_group.cycles_nr
+        channel, rows = self._groups[number].channels[index], np.arange(self._groups[number].channel_group.cycles_nr)
         is_virtual = self._is(number, index, _VIRTUAL)
         if not channel.bit_count and self._version == 3:
-            return np.arange(rows) * (channel.sampling_rate or 1.0), None
+            return rows * (channel.sampling_rate or 1.0), None
         if is_virtual and not channel.flags & _SOME_INVALID:
-            return np.arange(rows), None
+            return rows, None
         values, invalid = self._source.get(
             group=number, index=index, raw=True, samples_only=True, ignore_invalidation_bits=True
         )
-        return np.arange(rows) if is_virtual else np.asarray(values), invalid
+        return rows if is_virtual else np.asarray(values), invalid
 
     def _values(self, number: int, index: int) -> FloatArray:
         """Return physical values [N] of a channel, NaN for invalid samples."""
@@ -278,14 +277,13 @@ class Groups:
             and (self._conversions[number, i] or not self._is(number, i, _VIRTUAL))
         }
         data = self._bytes(number, names.index("DataBytes"))[rows]
-        identifier, has_length = parts["ID"] & 0x1FFF_FFFF, "DataLength" in parts
+        identifier = parts["ID"] & 0x1FFF_FFFF
         length = parts.get("DataLength", parts.get("DLC", np.full(len(stamps), data.shape[1])))
-        if np.isin(length, _ONLY_CODES).any() or (not has_length and "DLC" in parts):
+        if np.isin(length, _ONLY_CODES).any() or ("DLC" in parts and "DataLength" not in parts):
             length = _LENGTHS[length.clip(0, 15)]
         extended = (parts["ID"] >> 31 & 1) | (identifier > 0x7FF) | (parts.get("IDE", np.zeros(1)) > 0)
-        bus = {"bus": parts["BusChannel"]} if "BusChannel" in parts else {}
-        length = length.clip(0, data.shape[1])
-        return Frames(stamps, {"id": identifier, "length": length, "is_extended": extended, **bus}, data)
+        frames = {"id": identifier, "length": length.clip(0, data.shape[1]), "is_extended": extended}
+        return Frames(stamps, frames | ({"bus": parts["BusChannel"]} if "BusChannel" in parts else {}), data)
 
     def _bytes(self, number: int, index: int) -> NDArray[np.uint8]:
         """Return the data of frames [N, k], zero behind the length."""
