@@ -1,18 +1,18 @@
 """Signals of a DBC from raw CAN frames, column by column.
 
 A signal's bits are gathered from the few bytes that contain it, for all frames at once. Bit numbers follow the DBC: bit
-b is bit b mod 8 of byte b div 8; a little-endian signal starts at its least significant bit, a big-endian one at its
-most significant bit.
+b is bit b mod 8 of byte b div 8. A message is identified by bus and identifier, in J1939 by its parameter group (PGN).
 """
 
 from __future__ import annotations
 
+import re
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import MappingFileError
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
@@ -29,6 +29,27 @@ CAN_TYPE = "can/msg/Frame"
 _MAX_DBC_BYTES = 32 << 20
 #: Bits of a signal that become a number.
 _MOST_BITS = 64
+ID_BITS = (1 << 29) - 1
+_STANDARD_BITS = (1 << 11) - 1
+_BYTE = 0xFF
+#: J1939: source address in identifiers of a DBC that stand for any, and first PDU format without a destination.
+_NULL_ADDRESS, _BROADCAST = 0xFE, 0xF0
+#: Most significant byte of raw values that state an error or no value.
+_NO_J1939_VALUE = 0xFE
+#: Names of such raw values in a DBC. Shorter signals are states, with an error as one of them.
+_NO_VALUE = re.compile(r"(?<![a-z])(?<!no[ _-])(?:sna|invalid|error|fehler|(?:not|un|n)[ _-]?available)", re.I)
+_BITS_OF_A_MEASUREMENT = 8
+#: Different values outside of a signal's range, and their share of all, that are errors of the signal.
+_FEW_VALUES, _FEW_SHARE = 16, 0.1
+_MOST_NAMED = 5
+
+
+class Source(NamedTuple):
+    """What identifies frames with the same contents."""
+
+    bus: int
+    is_extended: bool
+    identifier: int
 
 
 #: Multiplexers with the values under which something is sent.
@@ -72,99 +93,220 @@ class Frames:
         fields = tuple(FieldInfo(path, "number") for path in (*self.parts, *names))
         return Table(name, self.stamps_ns, fields, load, CAN_TYPE)
 
-    def decoded(self, databases: Sequence[Database]) -> Iterator[Table]:
-        """Yield a table for each message of the databases that the frames contain, with its signals and units.
+    def decoded(self, databases: Sequence[tuple[str, Database]], lose: Callable[[Loss], None]) -> Iterator[Table]:
+        """Yield a table for each message, bus and source address of the frames, with signals and units.
 
         An identifier that several databases define is that of the one with the largest share of its messages on a bus.
+        The best bus and the most frequent address have the name of the message; the others add theirs (``#bus1``).
         Signals that are sent under some values of a multiplexer only have a table for each of these conditions.
+
+        Parameters
+        ----------
+        databases : with their names. lose : receives what cannot be decoded, of a signal when it is read.
         """
-        owner = self._owners(databases)
-        for message, number in ((m, n) for n, database in enumerate(databases) for m in database.messages):
-            rows = np.flatnonzero(self._are(message) & (owner == number))
-            if not rows.size or message.length > self.data.shape[1]:
+        rows = self._by_source()
+        described = [described_sources(database, rows) for _, database in databases]
+        fits = {
+            (number, bus): fit_of(database, frozenset(m.frame_id for s, m in described[number].items() if s.bus == bus))
+            for bus in {source.bus for source in rows}
+            for number, (_, database) in enumerate(databases)
+        }
+        senders: dict[int, list[Source]] = {}
+        unknown: dict[Source, int] = {}
+        for source in rows:
+            able = [number for number, messages in enumerate(described) if source in messages]
+            if able:
+                owner = max(able, key=lambda number: fits[number, source.bus])
+                senders.setdefault(id(described[owner][source]), []).append(source)
+            else:
+                unknown[source] = len(rows[source])
+        for number, message in ((n, m) for n, (_, database) in enumerate(databases) for m in database.messages):
+            sources = senders.get(id(message), [])
+            sources.sort(key=lambda s: (-fits[number, s.bus], s.bus, -len(rows[s]), s.identifier))
+            for source in sources:
+                ending = f"bus{source.bus}" * (source.bus != sources[0].bus)
+                ending += f"sa{source.identifier & _BYTE:02X}" * (source.identifier != sources[0].identifier)
+                is_j1939 = has_j1939_identifier(message) or source.identifier != message.frame_id
+                yield from self._messages(message, rows[source], f"#{ending}" * bool(ending), is_j1939, lose)
+        if unknown:
+            names, count = ", ".join(name for name, _ in databases), sum(unknown.values())
+            shown = ", ".join(f"0x{source.identifier:X}" for source in [*unknown][:_MOST_NAMED])
+            what = f"{count} frames, no identifier of {names}: {shown}{', ...' * (len(unknown) > _MOST_NAMED)}"
+            lose(Loss("unknown-frame", what, names, count=count, severity="note"))
+
+    def _by_source(self) -> dict[Source, IntArray]:
+        """Return the rows of data frames by their source."""
+        ids = self.parts["id"].astype(np.int64)
+        zero = np.zeros(len(ids), np.int64)
+        bus, extended = self.parts.get("bus", zero), self.parts.get("is_extended", ids > _STANDARD_BITS)
+        rows = np.flatnonzero((self.parts.get("is_error", zero) == 0) & (self.parts.get("is_remote", zero) == 0))
+        keys = (2 * bus.astype(np.int64) + (extended > 0) << 32) + (ids & ID_BITS)
+        keys, inverse, counts = np.unique(keys[rows], return_inverse=True, return_counts=True)
+        parts = np.split(rows[np.argsort(inverse, kind="stable")], np.cumsum(counts)[:-1])
+        return {
+            Source(key >> 33, bool(key >> 32 & 1), key & ID_BITS): part
+            for key, part in zip(keys.tolist(), parts, strict=bool(len(keys)))
+        }
+
+    def _messages(
+        self, message: Message, rows: IntArray, ending: str, is_j1939: bool, lose: Callable[[Loss], None]
+    ) -> Iterator[Table]:
+        """Yield the tables of a message from one source. Signals behind the end of all its frames are left out."""
+        lengths = np.minimum(self.parts["length"], self.data.shape[1])
+        for condition, signals, selectors in signal_groups(message):
+            its = rows
+            for selector, values in selectors:
+                its = its[lengths[its] >= bytes_of(selector)]
+                its = its[np.isin(raw_bits(self.data[its], selector), np.asarray(values, np.uint64))]
+            if not its.size:
                 continue
-            for ending, signals, selectors in signal_groups(message):
-                its = rows
-                for selector, values in selectors:
-                    raw = raw_bits(self.data[its], selector.start, selector.length, selector.byte_order)
-                    its = its[np.isin(raw, np.asarray(values, np.uint64))]
-                if its.size:
-                    yield self._message(f"{message.name}{ending}", signals, its)
+            name, length = f"{message.name}{condition}{ending}", lengths[its]
+            beyond = {s.name: bytes_of(s) for s in signals if bytes_of(s) > length.min()}
+            if beyond:
+                count = int((length < max(beyond.values())).sum())
+                what = f"frames of {length.min()} bytes, {message.length} in the DBC: without {', '.join(beyond)}"
+                lose(Loss("undecodable", what, name, count=count))
+            there = [s for s in signals if bytes_of(s) <= length.max()]
+            if there:
+                yield self._table(name, message.name, there, its, is_j1939, lose)
 
-    def _owners(self, databases: Sequence[Database]) -> IntArray:
-        """Return the number of the database that describes each frame [N]; -1 without one."""
-        ids, buses = self.parts["id"], self.parts.get("bus", np.zeros(len(self.stamps_ns)))
-        owner, most = np.full(len(ids), -1), np.zeros(len(ids))
-        for number, database in enumerate(databases):
-            described = np.isin(ids, [m.frame_id for m in database.messages])
-            for bus in np.unique(buses[described]):
-                its = described & (buses == bus)
-                weight = fit_of(database, frozenset(ids[its].tolist()))
-                its &= weight > most
-                owner[its], most[its] = number, weight
-        return owner
-
-    def _are(self, message: Message) -> NDArray[np.bool_]:
-        ids = self.parts["id"]
-        fits = (ids == message.frame_id) & (self.parts["length"] >= message.length)
-        if "is_extended" in self.parts:
-            fits &= (self.parts["is_extended"] > 0) == message.is_extended_frame
-        for flag in ("is_error", "is_remote"):
-            fits &= self.parts.get(flag, np.zeros(len(ids))) == 0
-        return np.asarray(fits, np.bool_)
-
-    def _message(self, name: str, signals: Sequence[Signal], its: IntArray) -> Table:
+    def _table(
+        self,
+        name: str,
+        message_name: str,
+        signals: Sequence[Signal],
+        its: IntArray,
+        is_j1939: bool,
+        lose: Callable[[Loss], None],
+    ) -> Table:
         by_name = {s.name: s for s in signals}
+        data, lengths = self.data[its], self.parts["length"][its]
+        columns: dict[str, FloatArray] = {}
+
+        def load(path: str, rows: slice) -> FloatArray:
+            if path not in columns:
+                signal = by_name[path]
+                values = np.full(len(its), np.nan)
+                there = np.flatnonzero(lengths >= bytes_of(signal))
+                values[there] = signal_values(data[there], signal, is_j1939=is_j1939)
+                none = int(np.isnan(values[there]).sum())
+                if none:
+                    what = f"{path} is not available, by its raw value"
+                    lose(Loss("not-available", what, name, count=none, severity="note"))
+                columns[path] = within_range(values, signal, name, lose)
+            return columns[path][rows]
+
         fields = tuple(FieldInfo(s.name, "number", unit=s.unit or "") for s in signals)
-        data = self.data[its]
-        return Table(
-            name,
-            self.stamps_ns[its],
-            fields,
-            lambda path, rows: signal_values(data[rows], by_name[path]),
-            f"can/msg/{name}",
-        )
+        return Table(name, self.stamps_ns[its], fields, load, f"can/msg/{message_name}")
 
 
-def raw_bits(data: NDArray[np.uint8], start: int, length: int, byte_order: str) -> NDArray[np.uint64]:
-    """Gather an unsigned integer of at most 64 bits from frames.
+def has_j1939_identifier(message: Message) -> bool:
+    """Return whether the DBC states J1939 for a message, by its frame format or the null address in its identifier."""
+    return message.is_extended_frame and (message.protocol == "j1939" or message.frame_id & _BYTE == _NULL_ADDRESS)
 
-    Parameters
-    ----------
-    data : uint8 [N, k]; all bytes of the signal must be there.
-    start : of the signal's least (little-endian) or most (big-endian) significant bit, in the DBC's numbering.
-    byte_order : ``little_endian`` or ``big_endian``.
+
+def parameter_group(identifier: int) -> int:
+    """Return the PGN of a 29-bit identifier, without the destination address where it contains one."""
+    group = identifier >> 8 & 0x3FFFF
+    return group if group >> 8 & _BYTE >= _BROADCAST else group & ~_BYTE
+
+
+def described_sources(database: Database, sources: Iterable[Source]) -> dict[Source, Message]:
+    """Return the messages of a database by the sources that send them.
+
+    An identifier of 29 bits that the database does not contain is compared by its PGN with the messages of J1939, and
+    with those that no frame has the identifier of, if the PGN is a broadcast.
     """
-    if byte_order == "little_endian":
-        first, skipped = divmod(start, 8)
-        last = (start + length - 1) // 8
-        columns = range(first, last + 1)
-    else:
-        top = 8 * (start // 8) + 7 - start % 8
-        first, last = top // 8, (top + length - 1) // 8
-        skipped = 8 * (last + 1) - (top + length)
-        columns = range(last, first - 1, -1)
+    exact = {(m.is_extended_frame, m.frame_id): m for m in reversed(database.messages)}
+    sent = {source.identifier for source in sources if source.is_extended}
+    groups = {
+        parameter_group(m.frame_id): m
+        for m in reversed(database.messages)
+        if has_j1939_identifier(m)
+        or (m.is_extended_frame and m.frame_id not in sent and m.frame_id >> 16 & _BYTE >= _BROADCAST)
+    }
+    by_group = {s: groups.get(parameter_group(s.identifier)) if s.is_extended else None for s in sources}
+    matches = {s: exact.get((s.is_extended, s.identifier), by_group[s]) for s in sources}
+    return {source: message for source, message in matches.items() if message is not None}
+
+
+def _bytes_of(signal: Signal) -> tuple[int, int, int]:
+    """Return first and last byte of a signal, and the bits of the least significant one that are not part of it.
+
+    Its start is the least significant bit of a little-endian signal, the most significant one of a big-endian signal.
+    """
+    if signal.byte_order == "little_endian":
+        first, skipped = divmod(signal.start, 8)
+        return first, (signal.start + signal.length - 1) // 8, skipped
+    top = 8 * (signal.start // 8) + 7 - signal.start % 8
+    last = (top + signal.length - 1) // 8
+    return top // 8, last, 8 * (last + 1) - (top + signal.length)
+
+
+def bytes_of(signal: Signal) -> int:
+    """Return how many bytes a frame needs to contain a signal."""
+    return _bytes_of(signal)[1] + 1
+
+
+def raw_bits(data: NDArray[np.uint8], signal: Signal) -> NDArray[np.uint64]:
+    """Gather the unsigned integer of a signal of at most 64 bits from frames uint8 [N, k] that contain it."""
+    first, last, skipped = _bytes_of(signal)
     value = np.zeros(data.shape[0], np.uint64)
-    for i, column in enumerate(columns):
+    for i, column in enumerate(
+        range(first, last + 1) if signal.byte_order == "little_endian" else range(last, first - 1, -1)
+    ):
         byte = data[:, column].astype(np.uint64)
         shift = 8 * i - skipped
         value |= byte << np.uint64(shift) if shift >= 0 else byte >> np.uint64(-shift)
-    return value & np.uint64((1 << length) - 1)
+    return value & np.uint64((1 << signal.length) - 1)
 
 
-def signal_values(data: NDArray[np.uint8], signal: Signal) -> FloatArray:
-    """Decode one signal of frames uint8 [N, k] to ``scale * raw + offset``, float64 [N]."""
-    raw = raw_bits(data, signal.start, signal.length, signal.byte_order)
-    number: NDArray[Any]
+def signal_values(data: NDArray[np.uint8], signal: Signal, *, is_j1939: bool = False) -> FloatArray:
+    """Decode one signal of frames uint8 [N, k] to ``scale * raw + offset``, float64 [N].
+
+    NaN where the raw value states that there is none: by its name in the DBC, or by SAE J1939-71 (all ones, or a most
+    significant byte of 0xFE and above).
+    """
+    raw = raw_bits(data, signal)
+    number: NDArray[Any] = raw
     if signal.is_float:
         width = signal.length // 8
         number = raw.astype(f"<u{width}").view(f"<f{width}").astype(np.float64)
     elif signal.is_signed:
         sign = np.uint64(1 << (signal.length - 1))
         number = ((raw ^ sign) - sign).view(np.int64)
-    else:
-        number = raw
-    return np.asarray(number.astype(np.float64) * float(signal.scale) + float(signal.offset), dtype=np.float64)
+    values = np.asarray(number.astype(np.float64) * float(signal.scale) + float(signal.offset), dtype=np.float64)
+    for code, text in (signal.choices or {}).items() if signal.length >= _BITS_OF_A_MEASUREMENT else ():
+        if _NO_VALUE.search(str(text)):
+            values[number == code] = np.nan
+    if is_j1939 and not signal.is_float and not signal.is_signed and signal.length > 1:
+        top = max(0, signal.length - 8)
+        values[raw >> np.uint64(top) >= (_NO_J1939_VALUE if signal.length >= 8 else (1 << signal.length) - 1)] = np.nan
+    return values
+
+
+def within_range(values: FloatArray, signal: Signal, where: str, lose: Callable[[Loss], None]) -> FloatArray:
+    """Return values [N] with NaN outside of the range that the DBC states.
+
+    A range that a signal leaves with many different values does not describe it: the values stay, with a note.
+    """
+    low, high = signal.minimum, signal.maximum
+    if low is None or high is None or not low < high:
+        return values
+    margin = abs(float(signal.scale)) / 2
+    outside = (values < float(low) - margin) | (values > float(high) + margin)
+    if not outside.any():
+        return values
+    first = values[int(np.argmax(outside))]
+    what = (
+        f"{signal.name} is outside of [{low}|{high}] of the DBC, first with {first:.10g} {signal.unit or ''}".rstrip()
+    )
+    is_wrong = len(np.unique(values[outside])) > max(_FEW_VALUES, _FEW_SHARE * len(np.unique(values)))
+    if is_wrong:
+        lose(Loss("out-of-range", f"{what}; the range is ignored", where, count=int(outside.sum()), severity="note"))
+        return values
+    lose(Loss("out-of-range", what, where, count=int(outside.sum())))
+    return np.where(outside, np.nan, values)
 
 
 def fit_of(database: Database, sent: frozenset[int]) -> float:

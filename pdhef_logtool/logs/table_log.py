@@ -92,12 +92,12 @@ class TableLog(DriveLog):
         self._unreadable: set[tuple[str, str]] = set()
         self._size = file.path.stat().st_size
 
-    def decode_frames(self, databases: Sequence[Database]) -> None:
-        """Add a table for each message of DBC files that raw CAN frames of the log contain."""
+    def decode_frames(self, databases: Sequence[tuple[str, Database]]) -> None:
+        """Add a table for each message of DBC files, given with their names, that raw CAN frames of the log contain."""
         from pdhef_logtool.logs.can_decoding import CAN_TYPE, Frames
 
         frames = [Frames.of_table(table) for table in self._tables.values() if table.type_name == CAN_TYPE]
-        tables = [table for part in frames for table in part.decoded(databases)]
+        tables = [table for part in frames for table in part.decoded(databases, self._lost.append)]
         for table in tables:
             number = 1 + sum(name.partition("#")[0] == table.name for name in self._tables)
             name = table.name if number == 1 else f"{table.name}#{number}"

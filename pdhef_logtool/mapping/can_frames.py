@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.can_decoding import (
+    ID_BITS,
     Selectors,
     fit_of,
     load_dbc,
@@ -49,7 +50,6 @@ REMOTE_NAMES = ("isrtr", "isremote", "isremoteframe", "remoteframe", "rtr", "rem
 #: Flags that SocketCAN and DBC files keep above the 29 bits of an identifier.
 EXTENDED_FLAG = 1 << 31
 NO_DATA_FLAGS = (1 << 30) | (1 << 29)
-ID_BITS = (1 << 29) - 1
 STANDARD_ID_BITS = (1 << 11) - 1
 
 #: Parts of a log in which identifiers are looked for.
@@ -288,7 +288,7 @@ class CanSignalLog(DriveLog):
         use = long_enough
         if data.shape[1] >= view.message.length:  # otherwise no frame is long enough
             for selector, sent_under in view.selectors:
-                raw = raw_bits(data, selector.start, selector.length, selector.byte_order)
+                raw = raw_bits(data, selector)
                 use = use & np.isin(raw, np.asarray(sent_under, np.uint64))
         rows, data = rows[use], data[use]
         given = {p: frames.fields[p][rows] for p in paths if p not in view.signals}
