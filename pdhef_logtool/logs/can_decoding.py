@@ -52,6 +52,7 @@ class Source(NamedTuple):
     identifier: int
 
 
+_Lose: TypeAlias = Callable[[Loss], None]
 #: Multiplexers with the values under which something is sent.
 Selectors: TypeAlias = "tuple[tuple[Signal, tuple[int, ...]], ...]"
 
@@ -93,7 +94,7 @@ class Frames:
         fields = tuple(FieldInfo(path, "number") for path in (*self.parts, *names))
         return Table(name, self.stamps_ns, fields, load, CAN_TYPE)
 
-    def decoded(self, databases: Sequence[tuple[str, Database]], lose: Callable[[Loss], None]) -> Iterator[Table]:
+    def decoded(self, databases: Sequence[tuple[str, Database]], lose: _Lose) -> Iterator[Table]:
         """Yield a table for each message, bus and source address of the frames, with signals and units.
 
         An identifier that several databases define is that of the one with the largest share of its messages on a bus.
@@ -148,9 +149,7 @@ class Frames:
             for key, part in zip(keys.tolist(), parts, strict=bool(len(keys)))
         }
 
-    def _messages(
-        self, message: Message, rows: IntArray, ending: str, is_j1939: bool, lose: Callable[[Loss], None]
-    ) -> Iterator[Table]:
+    def _messages(self, message: Message, rows: IntArray, ending: str, is_j1939: bool, lose: _Lose) -> Iterator[Table]:
         """Yield the tables of a message from one source. Signals behind the end of all its frames are left out."""
         lengths = np.minimum(self.parts["length"], self.data.shape[1])
         for condition, signals, selectors in signal_groups(message):
@@ -168,16 +167,10 @@ class Frames:
                 lose(Loss("undecodable", what, name, count=count))
             there = [s for s in signals if bytes_of(s) <= length.max()]
             if there:
-                yield self._table(name, message.name, there, its, is_j1939, lose)
+                yield self._table(name, message, there, its, is_j1939, lose)
 
     def _table(
-        self,
-        name: str,
-        message_name: str,
-        signals: Sequence[Signal],
-        its: IntArray,
-        is_j1939: bool,
-        lose: Callable[[Loss], None],
+        self, name: str, message: Message, signals: Sequence[Signal], its: IntArray, is_j1939: bool, lose: _Lose
     ) -> Table:
         by_name = {s.name: s for s in signals}
         data, lengths = self.data[its], self.parts["length"][its]
@@ -197,7 +190,7 @@ class Frames:
             return columns[path][rows]
 
         fields = tuple(FieldInfo(s.name, "number", unit=s.unit or "") for s in signals)
-        return Table(name, self.stamps_ns[its], fields, load, f"can/msg/{message_name}")
+        return Table(name, self.stamps_ns[its], fields, load, f"can/msg/{message.name}")
 
 
 def has_j1939_identifier(message: Message) -> bool:
@@ -285,7 +278,7 @@ def signal_values(data: NDArray[np.uint8], signal: Signal, *, is_j1939: bool = F
     return values
 
 
-def within_range(values: FloatArray, signal: Signal, where: str, lose: Callable[[Loss], None]) -> FloatArray:
+def within_range(values: FloatArray, signal: Signal, where: str, lose: _Lose) -> FloatArray:
     """Return values [N] with NaN outside of the range that the DBC states.
 
     A range that a signal leaves with many different values does not describe it: the values stay, with a note.

@@ -11,7 +11,6 @@ import struct
 import zlib
 from array import array
 from mmap import ACCESS_READ, mmap
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +51,7 @@ def _start_ns(year: int, month: int, day: int, *time: int) -> int:
         moment = dt.datetime(year, month, day, *time, tzinfo=dt.UTC)
     except ValueError:
         return 0
-    since = moment - dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
-    return since // dt.timedelta(microseconds=1) * 1000 if _YEARS[0] <= year < _YEARS[1] else 0
+    return round(moment.timestamp() * 1e6) * 1000 if _YEARS[0] <= year < _YEARS[1] else 0
 
 
 # BLF: objects "LOBJ", most of them in compressed containers. An object may continue in the next container.
@@ -69,11 +67,8 @@ _TIME = np.dtype({"names": ["unit", "time"], "formats": ["<u4", "<i8"], "offsets
 _TEN_MICROSECONDS = 1
 #: Longest time from the start of a measurement, so that no sum overflows.
 _MOST_NS = 1 << 61
-_NOT_COMPRESSED, _ZLIB = 0, 2
 #: Damaged places that are named one by one.
 _MOST_NAMED = 20
-#: Start, bytes of header, bytes and kind of an object.
-_Object: TypeAlias = tuple[int, int, int, int]
 
 
 def _layout(**parts: tuple[str, int]) -> np.dtype[np.void]:
@@ -112,7 +107,9 @@ class _Blf:
         self._losses: list[Loss] = []
         self._more = 0
         self._blocks: list[tuple[IntArray, NDArray[np.int32], NDArray[np.uint8]]] = []
-        self._tail, self._follows_loss, self._unpacked = b"", False, 0
+        #: Bytes of an object that continues in the next container; None behind a container that is lost.
+        self._tail: bytes | None = b""
+        self._unpacked = 0
 
     def tables(self) -> Tables:
         """Read the file."""
@@ -126,10 +123,10 @@ class _Blf:
             objects.append((rest, _HEAD, size - rest, _CONTAINER))
         self._decode(data, objects)
         for start, _, length, kind in objects:
-            if kind == _CONTAINER and not self._read_container(start, start + length, f"the container at byte {start}"):
-                break
+            if kind == _CONTAINER:
+                self._read_container(start, start + length, f"the container at byte {start}")
         self._feed(b"", "the last container", final=True)
-        if len(self._tail) > _PADDING and not is_cut:
+        if len(self._tail or b"") > _PADDING and not is_cut:
             self._lose("truncated", "the last object is incomplete")
         if self._more:
             self._losses.append(Loss("bad-chunk", "more damaged places", self._file.name, count=self._more))
@@ -143,43 +140,39 @@ class _Blf:
         else:
             self._more += 1
 
-    def _read_container(self, start: int, end: int, place: str) -> bool:
-        """Read a container; return whether the limits allow more."""
+    def _read_container(self, start: int, end: int, place: str) -> None:
+        """Read a container. Each that is beyond the limits is a loss."""
         method, size = struct.unpack_from("<H6xI", self._data, start + _HEAD)
         stored = self._data[start + _CONTAINER_HEAD : end]
-        size = size if method else len(stored)
-        within = True
         try:
             self._file.limits.check_unpacked(size, len(stored), place)
-            within = False
             self._file.limits.check_table(self._unpacked + size, self._file.size, f"{place} and those before it")
-            within = True
-            block = _unpacked(method, stored, size, is_cut=end == self._file.size)
+            block = _unpacked(stored, size, is_cut=end == self._file.size) if method else stored
         except (ValueError, LogError, zlib.error) as error:
             kind, text = describe_damage(error)
             self._feed(b"", place, final=True)
-            self._tail, self._follows_loss = b"", True
-            self._lose(kind, f"{place} is lost{'' if within else ' with all that follows'}: {text}")
-            return within
-        self._unpacked += len(block)
-        self._feed(block, place)
-        return True
+            self._tail = None
+            self._lose(kind, f"{place} is lost: {text}")
+        else:
+            self._unpacked += len(block)
+            self._feed(block, place)
 
     def _feed(self, block: bytes, place: str, *, final: bool = False) -> None:
         """Read the objects of a container; what is incomplete waits for the next."""
-        data = self._tail + block
-        first = data.find(_SIGNATURE) if self._follows_loss else 0
-        objects, rest = self._objects(data, max(first, 0), place, final=final)
-        self._follows_loss = self._follows_loss and not objects
+        data = (self._tail or b"") + block
+        first = max(0, data.find(_SIGNATURE)) if self._tail is None else 0
+        objects, rest = self._objects(data, first, place, final=final)
         self._decode(data, objects)
         self._tail = data[rest:]
 
-    def _objects(self, data: bytes | mmap, position: int, place: str, *, final: bool) -> tuple[list[_Object], int]:
+    def _objects(
+        self, data: bytes | mmap, position: int, place: str, *, final: bool
+    ) -> tuple[list[tuple[int, int, int, int]], int]:
         """Return the sound objects from a position, and where the first incomplete one begins.
 
         With ``final`` no data follow: an object that is incomplete is damaged if another begins behind it.
         """
-        objects: list[_Object] = []
+        objects: list[tuple[int, int, int, int]] = []
         size, search = len(data), position
         while (start := data.find(_SIGNATURE, search)) >= 0 and start + _HEAD <= size:
             head, version, length, kind = _OBJECT_HEAD.unpack_from(data, start)
@@ -198,7 +191,7 @@ class _Blf:
             self._lose("bad-chunk", f"{rest - position} bytes of {place} are damaged, from byte {position}")
         return objects, rest
 
-    def _decode(self, data: bytes | mmap, objects: list[_Object]) -> None:
+    def _decode(self, data: bytes | mmap, objects: list[tuple[int, int, int, int]]) -> None:
         """Add the frames among objects."""
         for kind, (layout, _, _, remote) in _FRAMES.items():
             chosen = np.array([o[:3] for o in objects if o[3] == kind], np.int64)
@@ -231,12 +224,8 @@ def _is_sound(head: int, version: int, length: int, kind: int) -> bool:
     return version in (1, 2) and _TIME.itemsize <= head and fewest <= length - head < most
 
 
-def _unpacked(method: int, stored: bytes, size: int, *, is_cut: bool) -> bytes:
-    """Return the contents of a container; of one that is cut, those that are there."""
-    if method == _NOT_COMPRESSED:
-        return stored
-    if method != _ZLIB:
-        raise ValueError(f"compression {method} is unknown")
+def _unpacked(stored: bytes, size: int, *, is_cut: bool) -> bytes:
+    """Return the contents of a compressed container; of one that is cut, those that are there."""
     inflater = zlib.decompressobj()
     block = inflater.decompress(stored, size + 1)
     if len(block) > size or not (inflater.eof or is_cut):
@@ -330,22 +319,20 @@ class _Asc:
             return _FRAME_SHAPE.match(text) is None
         bus, is_error, identifier, extended, remote, length, content = match.groups()
         try:
-            count = int(length or b"0", self._base if match.re is _CLASSIC else 10)
-            count = min(count, _CLASSIC_BYTES if match.re is _CLASSIC else _MOST_BYTES)
+            base, most = (self._base, _CLASSIC_BYTES) if match.re is _CLASSIC else (10, _MOST_BYTES)
+            count = min(int(length or b"0", base), most)
             data = bytes([int(byte, self._base) for byte in (content or b"").split(None, count)[:count]])
             number = int(identifier or b"0", self._base)
             row = array("i", (number, count, bool(extended), int(bus) - 1, bool(is_error), bool(remote)))
         except (ValueError, OverflowError):
             return False
-        if len(data) < count or number > ID_BITS:
-            return False
         if self._is_overlapping:
             self._overlapping += 1
-            return True
-        self._stamps.append(self._start_ns + self._now_ns)
-        self._numbers.extend(row)
-        self._data.extend(data)
-        return True
+        elif len(data) == count and number <= ID_BITS:
+            self._stamps.append(self._start_ns + self._now_ns)
+            self._numbers.extend(row)
+            self._data.extend(data)
+        return len(data) == count and number <= ID_BITS
 
     def _begin(self, begins_ns: int, time_ns: int) -> None:
         """Begin a measurement with its first event; times that go on count from the same start as before."""
