@@ -50,7 +50,7 @@ class ResourceLimits:
     schema_leaves: int = 20_000
     schema_depth: int = 32
     array_width: int = 65_536
-    table_bytes: int = 512 << 20
+    table_bytes: int = 256 << 20
     table_ratio: int = 32
     seconds: float = 5.0
     seconds_per_mib: float = 20.0

@@ -1,7 +1,7 @@
-"""What a reader of tables receives and returns.
+"""Argument and result of a reader of tables.
 
 A reader of a table format (CSV, Parquet, MAT, MDF, BLF, ...) is a function ``TableFile -> Tables``. It runs in a
-process of its own (:mod:`~pdhef_logtool.logs.reader_process`): it has an open file and its limits, and no path.
+separate process (:mod:`~pdhef_logtool.logs.reader_process`), which has an open file and limits, and no path.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A log of columns without messages: what a format of tables (CSV, MDF, MAT, ...) gives its columns to."""
+"""A log of columns without messages, for formats of tables (CSV, MDF, MAT, ...)."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class TableLog(DriveLog):
     ----------
     file : that the tables come from; it is released when the log is closed.
     kind : name of the format, for reports.
-    tables : one a topic. lost : what of the file could not be read.
+    tables : one per topic. lost : unreadable parts of the file.
 
     Raises
     ------

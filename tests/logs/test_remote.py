@@ -40,7 +40,7 @@ def saloon() -> Car:
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    quick = remote_objects.Patience(connect_s=2.0, silence_s=0.2, tries=3, first_wait_s=0.01, most_wait_s=0.02)
+    quick = remote_objects.Patience(tries=3, first_wait_s=0.01, most_wait_s=0.02)
     monkeypatch.setattr(remote_objects, "PATIENCE", quick)
     yield
     for spool in list(remote_source._spools.values()):
@@ -282,7 +282,7 @@ def test_other_formats_are_fetched_once_as_a_whole(tmp_path: Path, sample_logs_d
 def test_several_ranges_at_once_but_not_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote_source, "MOST_RANGE_BYTES", 10_000)
     with serving(x=bytes(200_000)) as server:
-        server.fault = slow(0.1)
+        server.fault = slow(0.5)
         source = RemoteSource(_place(server, "x"))
         source.fetch_whole()
         source.close()
@@ -337,8 +337,12 @@ def served(sample_logs_dir: Path) -> Iterator[CountingServer]:
     ],
     ids=["429", "503", "503 later", "404", "403", "round and round", "cuts", "stalls"],
 )
-def test_faults_end_in_one_line(served: CountingServer, fault, words: str, requests: int | None) -> None:
+def test_faults_end_in_one_line(
+    served: CountingServer, monkeypatch: pytest.MonkeyPatch, fault, words: str, requests: int | None
+) -> None:
     served.fault = fault
+    if words.startswith("silence"):
+        monkeypatch.setattr(remote_objects, "PATIENCE", dataclasses.replace(remote_objects.PATIENCE, silence_s=0.2))
     assert words in str(_error(served))
     assert requests is None or len(served.requests) == requests
 

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[S3Store]:
-    monkeypatch.setattr(remote_objects, "PATIENCE", remote_objects.Patience(2.0, 2.0, 2, 0.01, 0.02))
+    monkeypatch.setattr(remote_objects, "PATIENCE", remote_objects.Patience(30.0, 30.0, 2, 0.01, 0.02))
     with s3_store() as empty:
         yield empty
         for spool in list(remote_source._spools.values()):

@@ -48,7 +48,7 @@ def serving(*folders: Path) -> Iterator[int]:
         yield listener.getsockname()[1]
     finally:
         server.should_exit = True
-        thread.join(10)
+        thread.join()
         listener.close()
 
 
@@ -57,7 +57,7 @@ Get = Callable[..., tuple[int, dict[str, str], str]]
 
 def getter(port: int) -> Get:
     def get(path: str, host: str = "", method: str = "GET") -> tuple[int, dict[str, str], str]:
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=300)
         connection.request(method, path, headers={"Host": host or f"127.0.0.1:{port}"})
         answer = connection.getresponse()
         text = answer.read().decode()
