@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import re
 import stat
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +52,6 @@ class Source(NamedTuple):
     identifier: int
 
 
-_Lose: TypeAlias = Callable[[Loss], None]
 #: Multiplexers with the values under which something is sent.
 Selectors: TypeAlias = "tuple[tuple[Signal, tuple[int, ...]], ...]"
 
@@ -94,48 +93,7 @@ class Frames:
         fields = tuple(FieldInfo(path, "number") for path in (*self.parts, *names))
         return Table(name, self.stamps_ns, fields, load, CAN_TYPE)
 
-    def decoded(self, databases: Sequence[tuple[str, Database]], lose: _Lose) -> Iterator[Table]:
-        """Yield a table for each message, bus and source address of the frames, with signals and units.
-
-        An identifier that several databases define is that of the one with the largest share of its messages on a bus.
-        The best bus and the most frequent address have the name of the message; the others add theirs (``#bus1``).
-        Signals that are sent under some values of a multiplexer only have a table for each of these conditions.
-
-        Parameters
-        ----------
-        databases : with their names. lose : receives what cannot be decoded, of a signal when it is read.
-        """
-        rows = self._by_source()
-        described = [described_sources(database, rows) for _, database in databases]
-        fits = {
-            (number, bus): fit_of(database, frozenset(m.frame_id for s, m in described[number].items() if s.bus == bus))
-            for bus in {source.bus for source in rows}
-            for number, (_, database) in enumerate(databases)
-        }
-        senders: dict[int, list[Source]] = {}
-        unknown: dict[Source, int] = {}
-        for source in rows:
-            able = [number for number, messages in enumerate(described) if source in messages]
-            if able:
-                owner = max(able, key=lambda number: fits[number, source.bus])
-                senders.setdefault(id(described[owner][source]), []).append(source)
-            else:
-                unknown[source] = len(rows[source])
-        for number, message in ((n, m) for n, (_, database) in enumerate(databases) for m in database.messages):
-            sources = senders.get(id(message), [])
-            sources.sort(key=lambda s: (-fits[number, s.bus], s.bus, -len(rows[s]), s.identifier))
-            for source in sources:
-                ending = f"bus{source.bus}" * (source.bus != sources[0].bus)
-                ending += f"sa{source.identifier & _BYTE:02X}" * (source.identifier != sources[0].identifier)
-                is_j1939 = has_j1939_identifier(message) or source.identifier != message.frame_id
-                yield from self._messages(message, rows[source], f"#{ending}" * bool(ending), is_j1939, lose)
-        if unknown:
-            names, count = ", ".join(name for name, _ in databases), sum(unknown.values())
-            shown = ", ".join(f"0x{source.identifier:X}" for source in [*unknown][:_MOST_NAMED])
-            what = f"{count} frames, no identifier of {names}: {shown}{', ...' * (len(unknown) > _MOST_NAMED)}"
-            lose(Loss("unknown-frame", what, names, count=count, severity="note"))
-
-    def _by_source(self) -> dict[Source, IntArray]:
+    def by_source(self) -> dict[Source, IntArray]:
         """Return the rows of data frames by their source."""
         ids = self.parts["id"].astype(np.int64)
         zero = np.zeros(len(ids), np.int64)
@@ -144,53 +102,121 @@ class Frames:
         keys = (2 * bus.astype(np.int64) + (extended > 0) << 32) + (ids & ID_BITS)
         keys, inverse, counts = np.unique(keys[rows], return_inverse=True, return_counts=True)
         parts = np.split(rows[np.argsort(inverse, kind="stable")], np.cumsum(counts)[:-1])
-        return {
-            Source(key >> 33, bool(key >> 32 & 1), key & ID_BITS): part
-            for key, part in zip(keys.tolist(), parts, strict=bool(len(keys)))
-        }
+        sources = (Source(key >> 33, bool(key >> 32 & 1), key & ID_BITS) for key in keys.tolist())
+        return dict(zip(sources, parts, strict=False))
 
-    def _messages(self, message: Message, rows: IntArray, ending: str, is_j1939: bool, lose: _Lose) -> Iterator[Table]:
-        """Yield the tables of a message from one source. Signals behind the end of all its frames are left out."""
-        lengths = np.minimum(self.parts["length"], self.data.shape[1])
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decoder:
+    """Tables of signals from raw frames.
+
+    Attributes
+    ----------
+    frames : of a log. databases : with their names. names : of tables that exist.
+    lost : receives the frames that cannot be decoded.
+    column_losses : receives, when a column is loaded for the first time, losses by table and column.
+    """
+
+    frames: Frames
+    databases: Sequence[tuple[str, Database]]
+    names: Collection[str]
+    lost: list[Loss]
+    column_losses: dict[tuple[str, str], list[Loss]]
+
+    def tables(self) -> Iterator[Table]:
+        """Yield a table for each message, bus and source address of the frames, with signals and units.
+
+        An identifier that several databases define is that of the one with the largest share of its messages on a bus.
+        The best bus and the most frequent address have the name of the message; the others add theirs (``#bus1``).
+        Signals that are sent under some values of a multiplexer only have a table for each of these conditions.
+        """
+        rows = self.frames.by_source()
+        described = [described_sources(database, rows) for _, database in self.databases]
+        fits = {
+            (number, bus): fit_of(database, frozenset(m.frame_id for s, m in described[number].items() if s.bus == bus))
+            for bus in {source.bus for source in rows}
+            for number, (_, database) in enumerate(self.databases)
+        }
+        senders: dict[int, dict[tuple[int, int], list[IntArray]]] = {}
+        addressed: set[int] = set()
+        unknown: dict[int, int] = {}
+        for source, its in rows.items():
+            able = [number for number, messages in enumerate(described) if source in messages]
+            if not able:
+                unknown[source.identifier] = unknown.get(source.identifier, 0) + len(its)
+                continue
+            message = described[max(able, key=lambda number: fits[number, source.bus])][source]
+            if has_j1939_identifier(message) or source.identifier != message.frame_id:
+                addressed.add(id(message))
+            sender = source.bus, source.identifier & _BYTE
+            senders.setdefault(id(message), {}).setdefault(sender, []).append(its)
+        for number, message in ((n, m) for n, (_, database) in enumerate(self.databases) for m in database.messages):
+            parts = {sender: np.sort(np.concatenate(its)) for sender, its in senders.get(id(message), {}).items()}
+            ranked = sorted(
+                parts, key=lambda sender: (-fits[number, sender[0]], sender[0], -len(parts[sender]), sender)
+            )
+            for bus, address in ranked:
+                ending = f"bus{bus}" * (bus != ranked[0][0]) + f"sa{address:02X}" * (address != ranked[0][1])
+                ending = f"#{ending}" * bool(ending)
+                yield from self._messages(message, ending, parts[bus, address], is_j1939=id(message) in addressed)
+        if unknown:
+            names, count = ", ".join(name for name, _ in self.databases), sum(unknown.values())
+            shown = ", ".join(f"0x{identifier:X}" for identifier in [*unknown][:_MOST_NAMED])
+            what = f"{count} frames, no identifier of {names}: {shown}{', ...' * (len(unknown) > _MOST_NAMED)}"
+            self.lost.append(Loss("unknown-frame", what, names, count=count, severity="note"))
+
+    def _messages(self, message: Message, ending: str, rows: IntArray, *, is_j1939: bool) -> Iterator[Table]:
+        """Yield the tables of a message from one sender. Signals behind the end of all its frames are left out."""
+        data = self.frames.data
+        lengths = np.minimum(self.frames.parts["length"], data.shape[1])
         for condition, signals, selectors in signal_groups(message):
             its = rows
             for selector, values in selectors:
                 its = its[lengths[its] >= bytes_of(selector)]
-                its = its[np.isin(raw_bits(self.data[its], selector), np.asarray(values, np.uint64))]
+                its = its[np.isin(raw_bits(data[its], selector), np.asarray(values, np.uint64))]
             if not its.size:
                 continue
-            name, length = f"{message.name}{condition}{ending}", lengths[its]
-            beyond = {s.name: bytes_of(s) for s in signals if bytes_of(s) > length.min()}
+            name = f"{message.name}{condition}{ending}"
+            name = next(
+                n for n in (name, *(f"{name}#{i}" for i in range(2, 2 + len(self.names)))) if n not in self.names
+            )
+            beyond = {s.name: bytes_of(s) for s in signals if bytes_of(s) > lengths[its].min()}
             if beyond:
-                count = int((length < max(beyond.values())).sum())
-                what = f"frames of {length.min()} bytes, {message.length} in the DBC: without {', '.join(beyond)}"
-                lose(Loss("undecodable", what, name, count=count))
-            there = [s for s in signals if bytes_of(s) <= length.max()]
+                short = lengths[its] < max(beyond.values())
+                what = f"frames of {lengths[its].min()} bytes, {message.length} in the DBC: without {', '.join(beyond)}"
+                self.lost.append(Loss("undecodable", what, name, count=int(short.sum())))
+            there = [s for s in signals if bytes_of(s) <= lengths[its].max()]
             if there:
-                yield self._table(name, message, there, its, is_j1939, lose)
+                load = self._loader(name, {s.name: s for s in there}, data[its], lengths[its], is_j1939=is_j1939)
+                fields = tuple(FieldInfo(s.name, "number", unit=s.unit or "") for s in there)
+                yield Table(name, self.frames.stamps_ns[its], fields, load, f"can/msg/{message.name}")
 
-    def _table(
-        self, name: str, message: Message, signals: Sequence[Signal], its: IntArray, is_j1939: bool, lose: _Lose
-    ) -> Table:
-        by_name = {s.name: s for s in signals}
-        data, lengths = self.data[its], self.parts["length"][its]
+    def _loader(
+        self, name: str, signals: Mapping[str, Signal], data: NDArray[np.uint8], lengths: IntArray, *, is_j1939: bool
+    ) -> Callable[[str, slice], FloatArray]:
+        """Return what loads rows of a signal: decoded as a whole once, NaN where a frame has no value of it."""
         columns: dict[str, FloatArray] = {}
 
         def load(path: str, rows: slice) -> FloatArray:
             if path not in columns:
-                signal = by_name[path]
-                values = np.full(len(its), np.nan)
-                there = np.flatnonzero(lengths >= bytes_of(signal))
+                signal = signals[path]
+                there = lengths >= bytes_of(signal)
+                values = np.full(len(there), np.nan)
                 values[there] = signal_values(data[there], signal, is_j1939=is_j1939)
-                none = int(np.isnan(values[there]).sum())
-                if none:
+                losses = self.column_losses.setdefault((name, path), [])
+                if none := int(np.isnan(values[there]).sum()):
                     what = f"{path} is not available, by its raw value"
-                    lose(Loss("not-available", what, name, count=none, severity="note"))
-                columns[path] = within_range(values, signal, name, lose)
+                    losses.append(Loss("not-available", what, name, count=none, severity="note"))
+                outside, is_error = leaves_range(values, signal)
+                if outside.any():
+                    what = f"{path} is outside of [{signal.minimum}|{signal.maximum}] of the DBC"
+                    what += f", first with {values[outside][0]:.10g}{'' if is_error else '; this range is ignored'}"
+                    severity: Literal["lost", "note"] = "lost" if is_error else "note"
+                    losses.append(Loss("out-of-range", what, name, count=int(outside.sum()), severity=severity))
+                columns[path] = np.where(outside & is_error, np.nan, values)
             return columns[path][rows]
 
-        fields = tuple(FieldInfo(s.name, "number", unit=s.unit or "") for s in signals)
-        return Table(name, self.stamps_ns[its], fields, load, f"can/msg/{message.name}")
+        return load
 
 
 def has_j1939_identifier(message: Message) -> bool:
@@ -245,9 +271,8 @@ def raw_bits(data: NDArray[np.uint8], signal: Signal) -> NDArray[np.uint64]:
     """Gather the unsigned integer of a signal of at most 64 bits from frames uint8 [N, k] that contain it."""
     first, last, skipped = _bytes_of(signal)
     value = np.zeros(data.shape[0], np.uint64)
-    for i, column in enumerate(
-        range(first, last + 1) if signal.byte_order == "little_endian" else range(last, first - 1, -1)
-    ):
+    columns = range(first, last + 1) if signal.byte_order == "little_endian" else range(last, first - 1, -1)
+    for i, column in enumerate(columns):
         byte = data[:, column].astype(np.uint64)
         shift = 8 * i - skipped
         value |= byte << np.uint64(shift) if shift >= 0 else byte >> np.uint64(-shift)
@@ -278,28 +303,17 @@ def signal_values(data: NDArray[np.uint8], signal: Signal, *, is_j1939: bool = F
     return values
 
 
-def within_range(values: FloatArray, signal: Signal, where: str, lose: _Lose) -> FloatArray:
-    """Return values [N] with NaN outside of the range that the DBC states.
+def leaves_range(values: FloatArray, signal: Signal) -> tuple[NDArray[np.bool_], bool]:
+    """Return which values [N] are outside of the range in the DBC, and whether this range describes the signal.
 
-    A range that a signal leaves with many different values does not describe it: the values stay, with a note.
+    A range that a signal leaves with many different values does not.
     """
-    low, high = signal.minimum, signal.maximum
+    margin, (low, high) = abs(float(signal.scale)) / 2, (signal.minimum, signal.maximum)
     if low is None or high is None or not low < high:
-        return values
-    margin = abs(float(signal.scale)) / 2
+        return np.zeros(len(values), np.bool_), True
     outside = (values < float(low) - margin) | (values > float(high) + margin)
-    if not outside.any():
-        return values
-    first = values[int(np.argmax(outside))]
-    what = (
-        f"{signal.name} is outside of [{low}|{high}] of the DBC, first with {first:.10g} {signal.unit or ''}".rstrip()
-    )
-    is_wrong = len(np.unique(values[outside])) > max(_FEW_VALUES, _FEW_SHARE * len(np.unique(values)))
-    if is_wrong:
-        lose(Loss("out-of-range", f"{what}; the range is ignored", where, count=int(outside.sum()), severity="note"))
-        return values
-    lose(Loss("out-of-range", what, where, count=int(outside.sum())))
-    return np.where(outside, np.nan, values)
+    allowed = max(_FEW_VALUES, _FEW_SHARE * len(np.unique(values))) if outside.any() else 0
+    return outside, len(np.unique(values[outside])) <= allowed
 
 
 def fit_of(database: Database, sent: frozenset[int]) -> float:
