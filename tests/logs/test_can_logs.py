@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pdhef_logtool import inspect_log
 from pdhef_logtool.logs.can_decoding import Decoder, Frames
 from pdhef_logtool.logs.can_logs import open_asc, open_blf
 from pdhef_logtool.logs.open_log import open_log
@@ -122,8 +123,8 @@ def test_asc_is_read_as_python_can_reads_it(written: list[Any], tmp_path_factory
     assert tables.losses == []
     expected = [row_of(m) for m in can.ASCReader(str(path), relative_timestamp=False)]
     remote = PARTS.index("is_remote")  # python-can takes a frame of CAN FD without data for a remote frame
-    fd = {row for row, message in zip(expected, written, strict=True) if message.is_fd}
-    expected = [(*r[:remote], False, *r[remote + 1 :]) if r in fd else r for r in expected]
+    pairs = zip(expected, written, strict=True)
+    expected = [(*r[:remote], r[remote] and not message.is_fd, *r[remote + 1 :]) for r, message in pairs]
     bus = PARTS.index("bus")  # and does not read the bus of an error frame
     assert [r for r in rows_of(tables) if not r[3]] == [r for r in expected if not r[3]]
     assert [r[bus] for r in rows_of(tables)] == [m.channel for m in written]
@@ -631,6 +632,33 @@ def test_a_log_is_decoded_by_its_mapping_or_by_a_given_dbc(drive: Path, tmp_path
     np.testing.assert_allclose(values.fields["AccelY"], np.arange(300) / 1000, atol=1e-12)
     np.testing.assert_allclose(values.log_time_ns, START_NS + np.arange(300) * 10**7, atol=1000)
     np.testing.assert_allclose(found.signals["ay_m_s2"].values, np.arange(300) * 9.80665e-3, atol=1e-9)
+
+
+def test_a_mapping_of_frames_names_the_bus_where_several_send_a_message(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.blf", [sent(i / 100, 291, bytes([i % 2] * 3), channel=i % 2) for i in range(100)])
+    (tmp_path / "car.dbc").write_text(HEAD + MOTION)
+    signal = '[signals.ay_m_s2]\ntopic = "can"\nfield = "can:Motion.AccelY"\n'
+    read = {}
+    for bus in (None, 0, 1):
+        which = "" if bus is None else f'bus_field = "bus"\nbus = {bus}\n'
+        (tmp_path / "m.toml").write_text(f'[can]\ndbc = "car.dbc"\n{which}{signal}')
+        with closing(open_log(path)) as log:
+            if bus is None:
+                with pytest.raises(PdhefError, match=r"Motion is on buses \[0, 1\]"):
+                    read_signals(log, load_mapping(tmp_path / "m.toml"), {}, log.start_ns, log.end_ns)
+            else:
+                found = read_signals(log, load_mapping(tmp_path / "m.toml"), {}, log.start_ns, log.end_ns)
+                read[bus] = set(found.signals["ay_m_s2"].values.tolist())
+                assert len(found.signals["ay_m_s2"].values) == 50  # the frames are shorter than the message
+    assert {bus: round(max(values), 9) for bus, values in read.items()} == {0: 0.0, 1: 0.257}
+
+
+def test_a_dbc_that_matches_nothing_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.blf", [sent(i / 100, 300, bytes(8)) for i in range(100)])
+    (tmp_path / "car.dbc").write_text(HEAD + MOTION)
+    notes = " ".join(map(str, inspect_log(path, msgs=tmp_path / "car.dbc").to_dict()["notes"]))
+    assert "car.dbc contains none of their identifiers" in notes
+    assert "--set msgs" not in notes
 
 
 def test_losses_of_a_column_are_those_of_a_log_that_reads_it(drive: Path, tmp_path: Path) -> None:
