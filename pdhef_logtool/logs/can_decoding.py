@@ -26,26 +26,20 @@ if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
 
 CAN_TYPE = "can/msg/Frame"
-_MAX_DBC_BYTES = 32 << 20
+_MAX_DBC0xFFS = 32 << 20
 #: Bits of a signal that become a number.
 _MOST_BITS = 64
 ID_BITS = (1 << 29) - 1
-_STANDARD_BITS = (1 << 11) - 1
-_BYTE = 0xFF
-#: J1939: source address in identifiers of a DBC that stand for any, and first PDU format without a destination.
+#: J1939: source address of any sender in a DBC, and first PDU format without a destination address.
 _NULL_ADDRESS, _BROADCAST = 0xFE, 0xF0
-#: Most significant byte of raw values that state an error or no value.
-_NO_J1939_VALUE = 0xFE
-#: Names of such raw values in a DBC. Shorter signals are states, with an error as one of them.
+#: Names of raw values without a measurement, in signals of at least 8 bits; shorter ones are states.
 _NO_VALUE = re.compile(r"(?<![a-z])(?<!no[ _-])(?:sna|invalid|error|fehler|(?:not|un|n)[ _-]?available)", re.I)
-_BITS_OF_A_MEASUREMENT = 8
-#: Different values outside of a signal's range, and their share of all, that are errors of the signal.
+#: Maximum number of distinct values outside of a correct range, and their share of all distinct values.
 _FEW_VALUES, _FEW_SHARE = 16, 0.1
-_MOST_NAMED = 5
 
 
 class Source(NamedTuple):
-    """What identifies frames with the same contents."""
+    """Bus and identifier of a frame."""
 
     bus: int
     is_extended: bool
@@ -97,7 +91,7 @@ class Frames:
         """Return the rows of data frames by their source."""
         ids = self.parts["id"].astype(np.int64)
         zero = np.zeros(len(ids), np.int64)
-        bus, extended = self.parts.get("bus", zero), self.parts.get("is_extended", ids > _STANDARD_BITS)
+        bus, extended = self.parts.get("bus", zero), self.parts.get("is_extended", ids >= 1 << 11)
         rows = np.flatnonzero((self.parts.get("is_error", zero) == 0) & (self.parts.get("is_remote", zero) == 0))
         keys = (2 * bus.astype(np.int64) + (extended > 0) << 32) + (ids & ID_BITS)
         keys, inverse, counts = np.unique(keys[rows], return_inverse=True, return_counts=True)
@@ -112,9 +106,9 @@ class Decoder:
 
     Attributes
     ----------
-    frames : of a log. databases : with their names. names : of tables that exist.
-    lost : receives the frames that cannot be decoded.
-    column_losses : receives, when a column is loaded for the first time, losses by table and column.
+    frames : raw frames. databases : DBC files and their names. names : names of existing tables.
+    lost : list to which losses of frames are appended.
+    column_losses : losses by table and column, added when a column is first loaded.
     """
 
     frames: Frames
@@ -126,9 +120,9 @@ class Decoder:
     def tables(self) -> Iterator[Table]:
         """Yield a table for each message, bus and source address of the frames, with signals and units.
 
-        An identifier that several databases define is that of the one with the largest share of its messages on a bus.
-        The best bus and the most frequent address have the name of the message; the others add theirs (``#bus1``).
-        Signals that are sent under some values of a multiplexer only have a table for each of these conditions.
+        If several databases define an identifier, the database with the most of its messages on the bus is used. The
+        table of the best bus and the most frequent address has the name of the message; the names of the others end
+        with bus or address (``#bus1``). Multiplexed signals have a table for each value of their multiplexer.
         """
         rows = self.frames.by_source()
         described = [described_sources(database, rows) for _, database in self.databases]
@@ -148,7 +142,7 @@ class Decoder:
             message = described[max(able, key=lambda number: fits[number, source.bus])][source]
             if has_j1939_identifier(message) or source.identifier != message.frame_id:
                 addressed.add(id(message))
-            sender = source.bus, source.identifier & _BYTE
+            sender = source.bus, source.identifier & 0xFF
             senders.setdefault(id(message), {}).setdefault(sender, []).append(its)
         for number, message in ((n, m) for n, (_, database) in enumerate(self.databases) for m in database.messages):
             parts = {sender: np.sort(np.concatenate(its)) for sender, its in senders.get(id(message), {}).items()}
@@ -161,12 +155,12 @@ class Decoder:
                 yield from self._messages(message, ending, parts[bus, address], is_j1939=id(message) in addressed)
         if unknown:
             names, count = ", ".join(name for name, _ in self.databases), sum(unknown.values())
-            shown = ", ".join(f"0x{identifier:X}" for identifier in [*unknown][:_MOST_NAMED])
-            what = f"{count} frames, no identifier of {names}: {shown}{', ...' * (len(unknown) > _MOST_NAMED)}"
+            shown = ", ".join(f"0x{identifier:X}" for identifier in [*unknown][:5])
+            what = f"{count} frames, no identifier of {names}: {shown}{', ...' * (len(unknown) > 5)}"
             self.lost.append(Loss("unknown-frame", what, names, count=count, severity="note"))
 
     def _messages(self, message: Message, ending: str, rows: IntArray, *, is_j1939: bool) -> Iterator[Table]:
-        """Yield the tables of a message from one sender. Signals behind the end of all its frames are left out."""
+        """Yield the tables of a message from one sender, without the signals that no frame contains."""
         data = self.frames.data
         lengths = np.minimum(self.frames.parts["length"], data.shape[1])
         for condition, signals, selectors in signal_groups(message):
@@ -183,7 +177,7 @@ class Decoder:
             beyond = {s.name: bytes_of(s) for s in signals if bytes_of(s) > lengths[its].min()}
             if beyond:
                 short = lengths[its] < max(beyond.values())
-                what = f"frames of {lengths[its].min()} bytes, {message.length} in the DBC: without {', '.join(beyond)}"
+                what = f"frames of {lengths[its].min()} bytes, {message.length} in the DBC, lack {', '.join(beyond)}"
                 self.lost.append(Loss("undecodable", what, name, count=int(short.sum())))
             there = [s for s in signals if bytes_of(s) <= lengths[its].max()]
             if there:
@@ -194,7 +188,7 @@ class Decoder:
     def _loader(
         self, name: str, signals: Mapping[str, Signal], data: NDArray[np.uint8], lengths: IntArray, *, is_j1939: bool
     ) -> Callable[[str, slice], FloatArray]:
-        """Return what loads rows of a signal: decoded as a whole once, NaN where a frame has no value of it."""
+        """Return the loader of columns. A column is decoded once, for all frames; missing values are NaN."""
         columns: dict[str, FloatArray] = {}
 
         def load(path: str, rows: slice) -> FloatArray:
@@ -205,7 +199,7 @@ class Decoder:
                 values[there] = signal_values(data[there], signal, is_j1939=is_j1939)
                 losses = self.column_losses.setdefault((name, path), [])
                 if none := int(np.isnan(values[there]).sum()):
-                    what = f"{path} is not available, by its raw value"
+                    what = f"the raw value of {path} means 'not available' or 'error'"
                     losses.append(Loss("not-available", what, name, count=none, severity="note"))
                 outside, is_error = leaves_range(values, signal)
                 if outside.any():
@@ -221,20 +215,20 @@ class Decoder:
 
 def has_j1939_identifier(message: Message) -> bool:
     """Return whether the DBC states J1939 for a message, by its frame format or the null address in its identifier."""
-    return message.is_extended_frame and (message.protocol == "j1939" or message.frame_id & _BYTE == _NULL_ADDRESS)
+    return message.is_extended_frame and (message.protocol == "j1939" or message.frame_id & 0xFF == _NULL_ADDRESS)
 
 
 def parameter_group(identifier: int) -> int:
     """Return the PGN of a 29-bit identifier, without the destination address where it contains one."""
     group = identifier >> 8 & 0x3FFFF
-    return group if group >> 8 & _BYTE >= _BROADCAST else group & ~_BYTE
+    return group if group >> 8 & 0xFF >= _BROADCAST else group & ~0xFF
 
 
 def described_sources(database: Database, sources: Iterable[Source]) -> dict[Source, Message]:
-    """Return the messages of a database by the sources that send them.
+    """Return the messages of a database by source.
 
-    An identifier of 29 bits that the database does not contain is compared by its PGN with the messages of J1939, and
-    with those that no frame has the identifier of, if the PGN is a broadcast.
+    A 29-bit identifier that is not in the database is compared by PGN: with J1939 messages, and with messages with a
+    broadcast PGN whose identifier no frame has.
     """
     exact = {(m.is_extended_frame, m.frame_id): m for m in reversed(database.messages)}
     sent = {source.identifier for source in sources if source.is_extended}
@@ -242,7 +236,7 @@ def described_sources(database: Database, sources: Iterable[Source]) -> dict[Sou
         parameter_group(m.frame_id): m
         for m in reversed(database.messages)
         if has_j1939_identifier(m)
-        or (m.is_extended_frame and m.frame_id not in sent and m.frame_id >> 16 & _BYTE >= _BROADCAST)
+        or (m.is_extended_frame and m.frame_id not in sent and m.frame_id >> 16 & 0xFF >= _BROADCAST)
     }
     by_group = {s: groups.get(parameter_group(s.identifier)) if s.is_extended else None for s in sources}
     matches = {s: exact.get((s.is_extended, s.identifier), by_group[s]) for s in sources}
@@ -250,7 +244,7 @@ def described_sources(database: Database, sources: Iterable[Source]) -> dict[Sou
 
 
 def _bytes_of(signal: Signal) -> tuple[int, int, int]:
-    """Return first and last byte of a signal, and the bits of the least significant one that are not part of it.
+    """Return first and last byte of a signal, and the number of unused low bits in its least significant byte.
 
     Its start is the least significant bit of a little-endian signal, the most significant one of a big-endian signal.
     """
@@ -282,8 +276,8 @@ def raw_bits(data: NDArray[np.uint8], signal: Signal) -> NDArray[np.uint64]:
 def signal_values(data: NDArray[np.uint8], signal: Signal, *, is_j1939: bool = False) -> FloatArray:
     """Decode one signal of frames uint8 [N, k] to ``scale * raw + offset``, float64 [N].
 
-    NaN where the raw value states that there is none: by its name in the DBC, or by SAE J1939-71 (all ones, or a most
-    significant byte of 0xFE and above).
+    The result is NaN for raw values that mean "not available" or "error": by their name in the DBC, or by SAE J1939-71
+    (all bits set, or a most significant byte of 0xFE or 0xFF).
     """
     raw = raw_bits(data, signal)
     number: NDArray[Any] = raw
@@ -294,19 +288,19 @@ def signal_values(data: NDArray[np.uint8], signal: Signal, *, is_j1939: bool = F
         sign = np.uint64(1 << (signal.length - 1))
         number = ((raw ^ sign) - sign).view(np.int64)
     values = np.asarray(number.astype(np.float64) * float(signal.scale) + float(signal.offset), dtype=np.float64)
-    for code, text in (signal.choices or {}).items() if signal.length >= _BITS_OF_A_MEASUREMENT else ():
+    for code, text in (signal.choices or {}).items() if signal.length >= 8 else ():
         if _NO_VALUE.search(str(text)):
             values[number == code] = np.nan
     if is_j1939 and not signal.is_float and not signal.is_signed and signal.length > 1:
         top = max(0, signal.length - 8)
-        values[raw >> np.uint64(top) >= (_NO_J1939_VALUE if signal.length >= 8 else (1 << signal.length) - 1)] = np.nan
+        values[raw >> np.uint64(top) >= (0xFE if signal.length >= 8 else (1 << signal.length) - 1)] = np.nan
     return values
 
 
 def leaves_range(values: FloatArray, signal: Signal) -> tuple[NDArray[np.bool_], bool]:
-    """Return which values [N] are outside of the range in the DBC, and whether this range describes the signal.
+    """Return which values [N] are outside of the range in the DBC, and whether this range is plausible.
 
-    A range that a signal leaves with many different values does not.
+    A range is implausible if many distinct values are outside.
     """
     margin, (low, high) = abs(float(signal.scale)) / 2, (signal.minimum, signal.maximum)
     if low is None or high is None or not low < high:
@@ -355,9 +349,9 @@ def load_dbc(path: Path) -> Database:
         raise MappingFileError(
             expected="a DBC file", got=error.strerror or str(error), where=str(path), remedy="correct [can] dbc"
         ) from None
-    if not stat.S_ISREG(state.st_mode) or state.st_size > _MAX_DBC_BYTES:
+    if not stat.S_ISREG(state.st_mode) or state.st_size > _MAX_DBC0xFFS:
         raise MappingFileError(
-            expected=f"a DBC file of at most {_MAX_DBC_BYTES >> 20} MiB",
+            expected=f"a DBC file of at most {_MAX_DBC0xFFS >> 20} MiB",
             got=f"{state.st_size} bytes" if stat.S_ISREG(state.st_mode) else "no file",
             where=str(path),
             remedy="correct [can] dbc",

@@ -23,16 +23,14 @@ from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray, Loss
 
 _PARTS = ("id", "length", "is_extended", "bus", "is_error", "is_remote")
-#: Of CAN FD.
+#: Maximum data length of CAN FD.
 _MOST_BYTES = 64
-#: First and last year of a plausible start of a measurement.
-_YEARS = 1990, 2200
 
 
 def _tables(
     kind: str, file: TableFile, stamps: IntArray, numbers: NDArray[np.int32], data: NDArray[np.uint8], lost: list[Loss]
 ) -> Tables:
-    """Return the topic of frames with their times [N], numbers [N, 6], and bytes one frame after the other."""
+    """Build the topic ``can`` from times [N], numbers [N, 6] and the concatenated data of the frames."""
     if not len(stamps):
         got = f"none that can be read{''.join(f'; {loss.what}' for loss in lost[:1])}"
         raise LogError(expected="CAN frames", got=got, where=file.name)
@@ -45,13 +43,13 @@ def _tables(
     return Tables(kind, [Frames(placed(stamps)[order], parts, rows[order]).table("can")], lost)
 
 
-def _start_ns(year: int, month: int, day: int, *time: int) -> int:
-    """Return a date and time (h, min, s, µs) in ns since 1970, 0 for an impossible one."""
+def _start_ns(year: int, month: int, day: int, hour: int, minute: int, second: int, micro: int) -> int:
+    """Return a date and time in ns since 1970; 0 for an invalid date or one of another century."""
     try:
-        moment = dt.datetime(year, month, day, *time, tzinfo=dt.UTC)
+        seconds = dt.datetime(year, month, day, hour, minute, second, micro, dt.UTC).timestamp()
     except ValueError:
         return 0
-    return round(moment.timestamp() * 1e6) * 1000 if _YEARS[0] <= year < _YEARS[1] else 0
+    return round(seconds * 1e6) * 1000 if 0.0 < seconds < 4e9 else 0
 
 
 # BLF: objects "LOBJ", most of them in compressed containers. An object may continue in the next container.
@@ -59,15 +57,12 @@ _SIGNATURE = b"LOBJ"
 _CONTAINER, _CONTAINER_HEAD = 10, 32
 #: Bytes of an object's header without its time.
 _HEAD = 16
-#: Bytes behind an object without a meaning, and those of the longest object that is no frame.
+#: Maximum bytes of padding behind an object, and of an object of another kind.
 _PADDING, _LONGEST = 8, 16 << 20
 _FILE_HEAD = struct.Struct("<4xI8xQ16x8H")
 _OBJECT_HEAD = struct.Struct("<4xHHII")
 _TIME = np.dtype({"names": ["unit", "time"], "formats": ["<u4", "<i8"], "offsets": [16, 24], "itemsize": 32})
-_TEN_MICROSECONDS = 1
-#: Longest time from the start of a measurement, so that no sum overflows.
-_MOST_NS = 1 << 61
-#: Damaged places that are named one by one.
+#: Maximum number of losses; further ones are counted.
 _MOST_NAMED = 20
 
 
@@ -82,12 +77,11 @@ _FD = _layout(bus=("<u2", 0), flags=("u1", 2), length=("u1", 14), id=("<u4", 4),
 _FD_64 = _layout(
     bus=("u1", 0), length=("u1", 2), id=("<u4", 4), flags=("<u4", 12), extension=("u1", 35), data=("(64,)u1", 40)
 )
-#: Frames by their kind: layout behind the header, fewest and most bytes of it, flag of a remote frame.
+#: Kinds of frames: layout behind the header, minimum and maximum bytes of it, flag of a remote frame.
 _FRAMES = {
     1: (_CAN, 16, 40, 0x80), 86: (_CAN, 16, 40, 0x80), 73: (_ERROR, 32, 56, 0), 100: (_FD, 84, 108, 0x80),
     101: (_FD_64, 40, 168, 0x10),
 }  # fmt: skip
-_ERROR_KIND = 73
 
 
 def open_blf(file: TableFile) -> Tables:
@@ -98,7 +92,7 @@ def open_blf(file: TableFile) -> Tables:
 
 
 class _Blf:
-    """A BLF file as it is read. Damage costs what it covers: reading goes on at the next signature."""
+    """Reader of a BLF file. Behind damage, it continues at the next signature."""
 
     def __init__(self, file: TableFile, data: mmap) -> None:
         self._file, self._data = file, data
@@ -107,7 +101,7 @@ class _Blf:
         self._losses: list[Loss] = []
         self._more = 0
         self._blocks: list[tuple[IntArray, NDArray[np.int32], NDArray[np.uint8]]] = []
-        #: Bytes of an object that continues in the next container; None behind a container that is lost.
+        # Bytes of an object that continues in the next container; None behind a lost container.
         self._tail: bytes | None = b""
         self._unpacked = 0
 
@@ -141,7 +135,7 @@ class _Blf:
             self._more += 1
 
     def _read_container(self, start: int, end: int, place: str) -> None:
-        """Read a container. Each that is beyond the limits is a loss."""
+        """Read a container. A damaged one, or one beyond the limits, is a loss."""
         method, size = struct.unpack_from("<H6xI", self._data, start + _HEAD)
         stored = self._data[start + _CONTAINER_HEAD : end]
         try:
@@ -158,7 +152,7 @@ class _Blf:
             self._feed(block, place)
 
     def _feed(self, block: bytes, place: str, *, final: bool = False) -> None:
-        """Read the objects of a container; what is incomplete waits for the next."""
+        """Read the objects of a container. An incomplete object is kept for the next container."""
         data = (self._tail or b"") + block
         first = max(0, data.find(_SIGNATURE)) if self._tail is None else 0
         objects, rest = self._objects(data, first, place, final=final)
@@ -168,9 +162,9 @@ class _Blf:
     def _objects(
         self, data: bytes | mmap, position: int, place: str, *, final: bool
     ) -> tuple[list[tuple[int, int, int, int]], int]:
-        """Return the sound objects from a position, and where the first incomplete one begins.
+        """Return the valid objects from a position on, and the position of an incomplete object at the end.
 
-        With ``final`` no data follow: an object that is incomplete is damaged if another begins behind it.
+        With ``final`` no data follow: an incomplete object is damaged if another signature follows it.
         """
         objects: list[tuple[int, int, int, int]] = []
         size, search = len(data), position
@@ -193,7 +187,7 @@ class _Blf:
 
     def _decode(self, data: bytes | mmap, objects: list[tuple[int, int, int, int]]) -> None:
         """Add the frames among objects."""
-        for kind, (layout, _, _, remote) in _FRAMES.items():
+        for kind, (layout, fewest, _, remote) in _FRAMES.items():
             chosen = np.array([o[:3] for o in objects if o[3] == kind], np.int64)
             if not len(chosen):
                 continue
@@ -202,16 +196,17 @@ class _Blf:
             places = np.minimum(start + head + np.arange(layout.itemsize), len(raw) - 1)
             part = raw[places].view(layout)[:, 0]
             content = part["data"]
-            if "extension" in part.dtype.names:  # data of varying length, with others behind it
+            if "extension" in part.dtype.names:  # variable length; other data can follow
                 end = np.where(part["extension"] > 0, part["extension"], length[:, 0])[:, np.newaxis]
-                content = np.where(np.arange(_MOST_BYTES) < end - head - layout.fields["data"][1], content, 0)
+                content = np.where(np.arange(_MOST_BYTES) < end - head - fewest, content, 0)
             is_remote = (part["flags"] & remote) > 0
             count = np.where(is_remote, 0, np.minimum(part["length"], content.shape[1]))
             number, bus = part["id"].astype(np.int64), part["bus"].astype(np.int64) - 1
-            is_error = np.full(len(number), kind == _ERROR_KIND)
+            is_error = np.full(len(number), layout is _ERROR)
             numbers = np.stack((number & ID_BITS, count, number >> 31, bus, is_error, is_remote), axis=1)
-            unit = np.where(times["unit"] == _TEN_MICROSECONDS, 10_000, 1)
-            stamps = self._start_ns + np.clip(times["time"], -_MOST_NS // unit, _MOST_NS // unit) * unit
+            unit = np.where(times["unit"] == 1, 10_000, 1)
+            most = 2**61 // unit  # no sum overflows
+            stamps = self._start_ns + np.clip(times["time"], -most, most) * unit
             there = np.arange(content.shape[1]) < count[:, np.newaxis]
             self._blocks.append((stamps, numbers.astype(np.int32), content[there].astype(np.uint8)))
 
@@ -225,11 +220,11 @@ def _is_sound(head: int, version: int, length: int, kind: int) -> bool:
 
 
 def _unpacked(stored: bytes, size: int, *, is_cut: bool) -> bytes:
-    """Return the contents of a compressed container; of one that is cut, those that are there."""
+    """Decompress a container; of a truncated one (``is_cut``), its beginning."""
     inflater = zlib.decompressobj()
     block = inflater.decompress(stored, size + 1)
     if len(block) > size or not (inflater.eof or is_cut):
-        raise ValueError(f"it does not have the {size} bytes that it states")
+        raise ValueError(f"its contents are not the stated {size} bytes")
     return block
 
 
@@ -252,10 +247,8 @@ _FD_FRAME = re.compile(
     re.I | re.S,
 )
 _FRAME_SHAPE = re.compile(rb"\d+\s+(?:\S+\s+[rt]x\s|errorframe)|canfd\s", re.I)
-_CLASSIC_BYTES = 8
 #: A step back in time by more begins a measurement.
 _STEP_NS = 10**9
-_SHOWN = 60
 
 
 def open_asc(file: TableFile) -> Tables:
@@ -264,7 +257,7 @@ def open_asc(file: TableFile) -> Tables:
 
 
 class _Asc:
-    """An ASC file as its lines are read."""
+    """Reader of an ASC file."""
 
     def __init__(self, file: TableFile) -> None:
         self._file = file
@@ -282,7 +275,7 @@ class _Asc:
             if event is None:
                 self._read_head(line.decode("ascii", "ignore"))
             elif not self._read_event(round(float(event[1]) * 1e9), event[2].rstrip()):
-                first = first or f"line {number}, {line[:_SHOWN].decode('ascii', 'replace').strip()!r}"
+                first = first or f"line {number}, {line[:60].decode('ascii', 'replace').strip()!r}"
                 unreadable += 1
         if unreadable:
             what = f"{unreadable} lines of frames cannot be read, the first: {first}"
@@ -319,7 +312,7 @@ class _Asc:
             return _FRAME_SHAPE.match(text) is None
         bus, is_error, identifier, extended, remote, length, content = match.groups()
         try:
-            base, most = (self._base, _CLASSIC_BYTES) if match.re is _CLASSIC else (10, _MOST_BYTES)
+            base, most = (self._base, 8) if match.re is _CLASSIC else (10, _MOST_BYTES)
             count = min(int(length or b"0", base), most)
             data = bytes([int(byte, self._base) for byte in (content or b"").split(None, count)[:count]])
             number = int(identifier or b"0", self._base)
@@ -335,7 +328,7 @@ class _Asc:
         return len(data) == count and number <= ID_BITS
 
     def _begin(self, begins_ns: int, time_ns: int) -> None:
-        """Begin a measurement with its first event; times that go on count from the same start as before."""
+        """Begin a measurement with its first event. If the times continue, they have the same origin as before."""
         self._begins_ns = None
         goes_on = not begins_ns if self._is_relative else time_ns >= self._now_ns
         if not self._stamps or self._is_overlapping or not goes_on:
