@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
 
 CAN_TYPE = "can/msg/Frame"
-_MAX_DBC0xFFS = 32 << 20
+_MAX_DBC_BYTES = 32 << 20
 #: Bits of a signal that become a number.
 _MOST_BITS = 64
 ID_BITS = (1 << 29) - 1
@@ -342,21 +342,19 @@ def selectors_of(signal: Signal, by_name: Mapping[str, Signal]) -> Iterator[tupl
 
 
 def load_dbc(path: Path) -> Database:
-    """Read a DBC file; raises MappingFileError where it is none."""
+    """Read a DBC file; raises MappingFileError for any other file."""
     try:
         state = path.stat()
     except OSError as error:
-        raise MappingFileError(
-            expected="a DBC file", got=error.strerror or str(error), where=str(path), remedy="correct [can] dbc"
-        ) from None
-    if not stat.S_ISREG(state.st_mode) or state.st_size > _MAX_DBC0xFFS:
-        raise MappingFileError(
-            expected=f"a DBC file of at most {_MAX_DBC0xFFS >> 20} MiB",
-            got=f"{state.st_size} bytes" if stat.S_ISREG(state.st_mode) else "no file",
-            where=str(path),
-            remedy="correct [can] dbc",
-        )
+        raise _no_dbc(path, error.strerror or str(error)) from None
+    if not stat.S_ISREG(state.st_mode) or state.st_size > _MAX_DBC_BYTES:
+        raise _no_dbc(path, f"{state.st_size} bytes" if stat.S_ISREG(state.st_mode) else "no file")
     return _load_cached(path, state.st_mtime_ns, state.st_size)
+
+
+def _no_dbc(path: Path, got: str) -> MappingFileError:
+    expected = f"a DBC file of at most {_MAX_DBC_BYTES >> 20} MiB"
+    return MappingFileError(expected=expected, got=got, where=str(path), remedy="correct [can] dbc")
 
 
 @lru_cache(maxsize=16)
@@ -364,15 +362,11 @@ def _load_cached(path: Path, _modified_ns: int, _size: int) -> Database:
     import cantools
     from cantools.database.can import Database
 
-    expected = "a DBC file"
     try:
         # Overlapping signals are an error of the file, not of the signals that are asked for.
         matches = cantools.database.load_file(path, strict=False)
     except Exception as error:  # noqa: BLE001  cantools' parsers raise any exception for a malformed file.
-        reason = (str(error).splitlines() or [""])[0] or type(error).__name__
-        raise MappingFileError(expected=expected, got=reason, where=str(path), remedy="correct [can] dbc") from None
+        raise _no_dbc(path, (str(error).splitlines() or [""])[0] or type(error).__name__) from None
     if not isinstance(matches, Database):
-        raise MappingFileError(
-            expected=expected, got="a file of another kind", where=str(path), remedy="correct [can] dbc"
-        )
+        raise _no_dbc(path, "a file of another kind")
     return matches

@@ -99,7 +99,6 @@ class _Blf:
         self._head, self._stated, year, month, _, day, hour, minute, second, ms = _FILE_HEAD.unpack_from(data)
         self._start_ns = _start_ns(year, month, day, hour, minute, second, 1000 * ms)
         self._losses: list[Loss] = []
-        self._more = 0
         self._blocks: list[tuple[IntArray, NDArray[np.int32], NDArray[np.uint8]]] = []
         # Bytes of an object that continues in the next container; None behind a lost container.
         self._tail: bytes | None = b""
@@ -122,17 +121,14 @@ class _Blf:
         self._feed(b"", "the last container", final=True)
         if len(self._tail or b"") > _PADDING and not is_cut:
             self._lose("truncated", "the last object is incomplete")
-        if self._more:
-            self._losses.append(Loss("bad-chunk", "more damaged places", self._file.name, count=self._more))
         self._blocks.append((np.empty(0, np.int64), np.empty((0, len(_PARTS)), np.int32), np.empty(0, np.uint8)))
         stamps, numbers, content = (np.concatenate(parts) for parts in zip(*self._blocks, strict=True))
         return _tables("blf", self._file, stamps, numbers, content, self._losses)
 
     def _lose(self, kind: str, what: str) -> None:
-        if len(self._losses) < _MOST_NAMED:
-            self._losses.append(Loss(kind, what, self._file.name))
-        else:
-            self._more += 1
+        """Add a loss; the last one counts those beyond the limit."""
+        count = (self._losses.pop().count or 1) + 1 if len(self._losses) > _MOST_NAMED else None
+        self._losses.append(Loss(kind, what, self._file.name, count=count))
 
     def _read_container(self, start: int, end: int, place: str) -> None:
         """Read a container. A damaged one, or one beyond the limits, is a loss."""
@@ -167,7 +163,7 @@ class _Blf:
         With ``final`` no data follow: an incomplete object is damaged if another signature follows it.
         """
         objects: list[tuple[int, int, int, int]] = []
-        size, search = len(data), position
+        size, search, checked = len(data), position, -1
         while (start := data.find(_SIGNATURE, search)) >= 0 and start + _HEAD <= size:
             head, version, length, kind = _OBJECT_HEAD.unpack_from(data, start)
             sound = _is_sound(head, version, length, kind)
@@ -177,6 +173,11 @@ class _Blf:
                 search = start + len(_SIGNATURE)
                 continue
             if start - position > _PADDING:
+                last, *_, other = objects[-1] if objects else (-1, _CONTAINER)
+                if last > checked and other not in _FRAMES and data.find(_SIGNATURE, last + _HEAD, position) >= 0:
+                    position = checked = last  # its length is wrong: it covers others
+                    search = objects.pop()[0] + _HEAD
+                    continue
                 self._lose("bad-chunk", f"{start - position} bytes of {place} are damaged, from byte {position}")
             objects.append((start, head, length, kind))
             position = search = start + length

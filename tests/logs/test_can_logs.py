@@ -99,8 +99,8 @@ def messages(draw: st.DrawFn) -> list[Any]:
     return results
 
 
-@settings(max_examples=30, deadline=None)
-@given(written=messages(), container=st.sampled_from([100, 1000, 100_000]), level=st.sampled_from([0, 6]))
+@settings(max_examples=25, deadline=None)
+@given(written=messages(), container=st.sampled_from([200, 1000, 100_000]), level=st.sampled_from([0, 6]))
 def test_blf_is_read_as_python_can_reads_it(
     written: list[Any], container: int, level: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -114,7 +114,7 @@ def test_blf_is_read_as_python_can_reads_it(
     np.testing.assert_allclose(frames_of(tables).stamps_ns - START_NS, np.array(times) - START_NS, atol=1000)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(written=messages())
 def test_asc_is_read_as_python_can_reads_it(written: list[Any], tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.mktemp("asc") / "a.asc"
@@ -240,6 +240,17 @@ def test_a_damaged_object_costs_itself(offset: int, value: bytes, tmp_path: Path
     assert [loss.kind for loss in tables.losses] == ["bad-chunk"]
 
 
+def test_an_object_that_covers_others_costs_itself(tmp_path: Path) -> None:
+    marker = bytearray(blf_object(96, bytes(48), 0))
+    marker[8:12] = struct.pack("<I", 1001)
+    parts = [bytearray(container(numbered(5, first=i))) for i in range(40, 60, 5)]
+    parts[1][8:12] = struct.pack("<I", len(parts[1]) + 50)
+    objects = numbered(5) + bytes(marker) + numbered(35, first=5)
+    tables = read(blf(tmp_path / "a.blf", container(objects), *map(bytes, parts)))
+    assert set(range(60)) - set(numbers_of(tables)) <= set(range(45, 50))
+    assert {loss.kind for loss in tables.losses} == {"bad-chunk"}
+
+
 def test_a_cut_blf_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     path = write(
         tmp_path / "a.blf", [sent(i / 100, 256, struct.pack("<I", i)) for i in range(600)], max_container_size=2000
@@ -259,6 +270,15 @@ def test_a_container_beyond_the_limits_is_a_loss_of_itself(tmp_path: Path) -> No
     assert numbers_of(tables) == list(range(10))
     assert [loss.kind for loss in tables.losses] == ["over-budget"]
     assert "budget=" in tables.losses[0].what
+
+
+def test_many_damaged_places_are_counted(tmp_path: Path) -> None:
+    bad = container(numbered(1))[:32] + b"no zlib!"
+    parts = [bad[:8] + struct.pack("<I", len(bad)) + bad[12:]] * 50
+    tables = read(blf(tmp_path / "a.blf", container(numbered(5)), *parts))
+    assert numbers_of(tables) == list(range(5))
+    assert len(tables.losses) < 30
+    assert sum(loss.count or 1 for loss in tables.losses) == 50
 
 
 def test_all_containers_together_have_a_limit(tmp_path: Path) -> None:
