@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.can_decoding import ID_BITS, Frames
 from pdhef_logtool.logs.container import describe_damage
-from pdhef_logtool.logs.table_columns import placed
+from pdhef_logtool.logs.table_clocks import placed
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray, Loss

@@ -79,12 +79,12 @@ FORMATS = (
         is_general=True, named=(".txt",), libraries=("polars",),
     ),
     LogFormat(
-        "a Parquet file", f"{__package__}.array_logs:open_parquet", (".parquet",), b"PAR1",
+        "a Parquet file", f"{__package__}.parquet_log:open_parquet", (".parquet",), b"PAR1",
         is_general=True, libraries=("polars", "pyarrow.parquet"),
     ),
     LogFormat(
-        "a MAT file", f"{__package__}.array_logs:open_mat", (".mat",), b"MATLAB ",
-        is_general=True, libraries=("scipy.io", "h5py"),
+        "a MAT file", f"{__package__}.mat_log:open_mat", (".mat",), b"MATLAB ",
+        is_general=True, libraries=("h5py",),
     ),
     LogFormat(
         "an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF "),

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.can_decoding import Frames
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.table_columns import NO_TIME, field_name, placed, unique
+from pdhef_logtool.logs.table_clocks import NO_TIME, placed
+from pdhef_logtool.logs.table_columns import field_name, unique
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError

@@ -17,18 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.table_columns import (
-    NO_TIME,
-    Sheet,
-    field_name,
-    is_unit,
-    placed,
-    read_head,
-    tables_of,
-    unique,
-    unwrapped,
-    whole_days,
-)
+from pdhef_logtool.logs.table_clocks import NO_TIME, placed, unwrapped, whole_days
+from pdhef_logtool.logs.table_columns import Sheet, field_name, is_unit, read_head, tables_of, unique
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss

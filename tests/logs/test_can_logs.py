@@ -21,7 +21,7 @@ from pdhef_logtool.logs.can_decoding import Decoder, Frames
 from pdhef_logtool.logs.can_logs import open_asc, open_blf
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
-from pdhef_logtool.logs.table_columns import RELATIVE_NS
+from pdhef_logtool.logs.table_clocks import RELATIVE_NS
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.mapping.channels import read_signals
 from pdhef_logtool.mapping.mapping_file import load_mapping

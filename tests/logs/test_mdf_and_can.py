@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.table_columns import RELATIVE_NS
+from pdhef_logtool.logs.table_clocks import RELATIVE_NS
 from pdhef_logtool.mapping.channels import read_signals
 from pdhef_logtool.mapping.mapping_file import load_mapping
 from pdhef_logtool.records.errors import PdhefError
