@@ -90,8 +90,8 @@ FORMATS = (
         "an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF "),
         libraries=("asammdf",),
     ),
-    LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG", libraries=("can.io",)),
-    LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",), libraries=("can.io",)),
+    LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG", libraries=()),
+    LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",), libraries=()),
 )  # fmt: skip
 
 

@@ -23,7 +23,7 @@ from pdhef_logtool.logs.container import SpanDamageError, describe_damage
 from pdhef_logtool.logs.mdf_blocks import is_unfinished, survey_blocks
 from pdhef_logtool.logs.mdf_conversions import conversion_rule
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.table_clocks import NO_TIME, placed
+from pdhef_logtool.logs.table_clocks import NO_TIME, ascending_rows, placed
 from pdhef_logtool.logs.table_columns import field_name, unique
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.logs.table_log import Table
@@ -220,20 +220,20 @@ class Groups:
             raise SpanDamageError(f"its master is {_NO_TIMES[kind]}, no time" if masters else "it has no time channel")
         return self._values(number, index)
 
-    def _stamps(self, number: int, name: str, losses: list[Loss]) -> tuple[IntArray, NDArray[Any] | slice]:
-        """Return the times of a group in ascending order, and their rows; rows without a time are losses."""
+    def _stamps(self, number: int, name: str, losses: list[Loss]) -> tuple[IntArray, NDArray[Any]]:
+        """Return the ascending times of a group, and their rows; other rows are losses."""
         seconds = self._seconds(number)
         self._rows[number] = len(seconds)
         if missing := self._groups[number].channel_group.cycles_nr - len(seconds):
             losses.append(Loss("truncated", f"the file ends after {len(seconds)} rows", name, count=missing))
         finite = np.abs(seconds) < _LONGEST_S
-        if not finite.all():
-            losses.append(Loss("bad-stamp", "row without a time", name, count=int((~finite).sum())))
         stamps = np.round(np.where(finite, seconds, 0.0) * 1e9).astype(np.int64) + self._start_ns
         stamps = placed(np.where(finite, stamps, NO_TIME))
-        rows = np.flatnonzero(finite)
-        rows = rows[np.argsort(stamps[rows], kind="stable")]
-        return stamps[rows], slice(None) if np.array_equal(rows, np.arange(len(stamps))) else rows
+        # Frames of several buses are buffered before they are written; rows of channels are in order.
+        order = np.argsort(stamps, kind="stable") if self._contains_frames(number) else np.arange(len(stamps))
+        rows, left_out = ascending_rows(stamps[order], name)
+        losses += left_out
+        return stamps[order[rows]], order[rows]
 
     def _raw(self, number: int, index: int) -> tuple[NDArray[Any], BoolArray | None]:
         """Return raw values [N] or [N, k] of a channel, and which rows are invalid [N]."""

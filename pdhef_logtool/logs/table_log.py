@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -90,18 +90,17 @@ class TableLog(DriveLog):
         cut = [Loss("truncated", file.cut, str(self.path))] if file.cut else []
         self._lost = [*lost, *cut, *self._recording_span.losses]
         self._unreadable: set[tuple[str, str]] = set()
+        self._column_losses: dict[tuple[str, str], list[Loss]] = {}
         self._size = file.path.stat().st_size
 
-    def decode_frames(self, databases: Sequence[Database]) -> None:
-        """Add a table for each message of DBC files that raw CAN frames of the log contain."""
-        from pdhef_logtool.logs.can_decoding import CAN_TYPE, Frames
+    def decode_frames(self, databases: Sequence[tuple[str, Database]]) -> None:
+        """Add a table for each message of DBC files, given with their names, that raw CAN frames of the log contain."""
+        from pdhef_logtool.logs.can_decoding import CAN_TYPE, Decoder, Frames
 
-        frames = [Frames.of_table(table) for table in self._tables.values() if table.type_name == CAN_TYPE]
-        tables = [table for part in frames for table in part.decoded(databases)]
-        for table in tables:
-            number = 1 + sum(name.partition("#")[0] == table.name for name in self._tables)
-            name = table.name if number == 1 else f"{table.name}#{number}"
-            self._tables[name] = replace(table, name=name)
+        for frames in [Frames.of_table(table) for table in self._tables.values() if table.type_name == CAN_TYPE]:
+            decoder = Decoder(frames, databases, self._tables, self._lost, self._column_losses)
+            for table in decoder.tables():
+                self._tables[table.name] = table
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
@@ -179,4 +178,6 @@ class TableLog(DriveLog):
                 self._unreadable.add((table.name, path))
                 self._lost.append(Loss("bad-column", f"{path} cannot be read: {describe_damage(error)[1]}", table.name))
             return np.zeros(n, kind) if is_time else np.full(n, np.nan)
+        if not quiet:
+            self._lost += self._column_losses.pop((table.name, path), ())
         return values
