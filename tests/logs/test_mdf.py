@@ -25,7 +25,7 @@ from pdhef_logtool.logs.mdf_conversions import conversion_rule, formula_rule
 from pdhef_logtool.logs.mdf_log import open_mdf
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
-from pdhef_logtool.logs.table_columns import RELATIVE_NS
+from pdhef_logtool.logs.table_clocks import RELATIVE_NS
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError, PdhefError
 from tests.command_line import called
