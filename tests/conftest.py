@@ -21,6 +21,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
+#: Environment variables that pytest sets for each test, and Polars when it is imported.
+OF_LIBRARIES = {"PYTEST_CURRENT_TEST", "_RJEM_MALLOC_CONF"}
 
 hypothesis.settings.register_profile("any load", deadline=None)
 hypothesis.settings.load_profile("any load")
@@ -53,7 +55,7 @@ def _process_state() -> set[str]:
     return {
         f"working directory {Path.cwd()}",
         *(f"signal {n}: {signal.getsignal(n)}" for n in signal.valid_signals()),
-        *(f"{name}={value}" for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"),
+        *(f"{name}={value}" for name, value in os.environ.items() if name not in OF_LIBRARIES),
         *(f"process {pid}" for pid in processes),
     }
 

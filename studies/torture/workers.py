@@ -108,11 +108,12 @@ def run_cases(
     *,
     jobs: int = 2,
     tell: Callable[[str], None] = print,
+    limits: Limits | None = None,
 ) -> list[Case]:
     """Judge the cases 0 to ``count`` - 1 in supervised processes; none that is in the journal already."""
     done = {case.number: case for case in read_journal(journal)}
     left = [n for n in range(count) if n not in done]
-    limits = Limits(silence_s=LIMIT_S, memory_bytes=LIMIT_BYTES)
+    limits = limits or Limits(silence_s=LIMIT_S, memory_bytes=LIMIT_BYTES)
     journal.parent.mkdir(parents=True, exist_ok=True)
     with journal.open("a") as file:
         for ended in supervise(partial(_case, judge_case), left, jobs=jobs, limits=limits, preload=_PRELOAD):
@@ -131,8 +132,8 @@ def _case(judge_case: Callable[[int], Verdict], number: int, tell: Tell) -> Case
     del tell
     begin = time.monotonic()
     verdict = judge_case(number)
-    peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
-    return Case(number, verdict.end, verdict.problem, time.monotonic() - begin, peak_bytes)
+    peak_bytes = verdict.costs.get("bytes", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10)
+    return Case(number, verdict.end, verdict.problem, verdict.costs.get("s", time.monotonic() - begin), int(peak_bytes))
 
 
 def read_journal(journal: Path) -> Iterator[Case]:
