@@ -30,7 +30,7 @@ from studies.torture.logs import log_judge
 from studies.torture.numerics import odd_drives, write_hours
 from studies.torture.outside import measured
 from studies.torture.places import PLACES
-from studies.torture.table_damage import DAMAGE
+from studies.torture.table_seeds import FORMATS
 from studies.torture.workers import LIMIT_BYTES, LIMIT_S, NO_VERDICT, Verdict, run_cases
 
 _SHARED = ROOT.parent / "shared" / "torture"
@@ -217,7 +217,7 @@ def main() -> int:
     parser.add_argument("--hours", type=float, default=10.0)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--count", type=int, default=500, help="mutants of each table and CAN format")
-    parser.add_argument("--format", action="append", choices=DAMAGE, help="a table or CAN format; may be given again")
+    parser.add_argument("--format", action="append", choices=FORMATS, help="a table or CAN format; may be given again")
     parser.add_argument("--only", action="append", help="a part; may be given again")
     parser.add_argument("--out", type=Path, default=DOCS / "reliability.md")
     given = parser.parse_args()
@@ -229,7 +229,7 @@ def main() -> int:
         "places": lambda: one_by_one("places", work, PLACES),
         "numerics": lambda: one_by_one("numerics", work, odd_drives()),
         "mutations": lambda: mutations(work, given.seed, given.jobs, given.logs, given.configs),
-        "formats": lambda: formats(work, given.seed, given.jobs, given.count, given.format or DAMAGE),
+        "formats": lambda: formats(work, given.seed, given.jobs, given.count, given.format or FORMATS),
         "kills": lambda: kills(work, given.seed, given.kills),
         "hours": lambda: hours(work, given.hours),
     }

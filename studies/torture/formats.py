@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import shutil
 import struct
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from studies.torture.outside import measured
-from studies.torture.table_damage import DAMAGE, table_mutant
-from studies.torture.table_seeds import TABLE_SEEDS
+from studies.torture.table_damage import table_mutant
+from studies.torture.table_seeds import FORMATS, table_seeds
 from studies.torture.workers import LIMIT_BYTES, Verdict, judge
 
 #: A command that runs for longer hangs; the machine may do other work beside it.
@@ -31,18 +32,18 @@ def format_judge(work: Path, name: str, seed: int) -> Any:
     canary.write_bytes(_CANARY * 150)
     with h5py.File(f"{canary}.h5", "w") as file:
         file["x"] = [[424_242.125] * 150]
-    return partial(judge_mutant, work, name, TABLE_SEEDS[name](folder), seed, canary)
+    return partial(judge_mutant, work, name, table_seeds(name, folder), seed, canary)
 
 
-def judge_mutant(work: Path, name: str, content: bytes, seed: int, canary: Path, number: int) -> Verdict:
+def judge_mutant(work: Path, name: str, seeds: Sequence[bytes], seed: int, canary: Path, number: int) -> Verdict:
     """Write a mutant into a folder of its own, read it in a process of its own, and look at what that left."""
     folder = work / "cases" / f"{name}-{number}"
     places = [folder / "cwd", folder / "tmp"]
     for place in places:
         place.mkdir(parents=True, exist_ok=True)
-    log, out = folder / f"drive.{DAMAGE[name][0]}", folder / "out.mcap"
+    log, out = folder / f"drive.{FORMATS[name][0]}", folder / "out.mcap"
     try:
-        log.write_bytes(table_mutant(name, content, seed, number, canary))
+        log.write_bytes(table_mutant(name, seeds, seed, number, canary))
         arguments = ["inspect"] if number % CONVERT_EVERY else ["convert", "-o", str(out)]
         env = {**os.environ, "TMPDIR": str(places[1])}
         process = measured(arguments[0], str(log), *arguments[1:], limit_s=HANG_S, cwd=places[0], env=env)

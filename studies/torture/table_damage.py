@@ -12,13 +12,14 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from studies.torture.mutating import EDGES, TEXTS, damage_bytes
-from studies.torture.table_seeds import COLUMNS
+from studies.torture.table_seeds import TOPICS
 
 #: Writes this file where a reader evaluates it.
 CALL = b"__import__('os').system('echo x > formula_was_run')"
@@ -58,11 +59,13 @@ def _number(data: bytes, offset: int, width: int) -> int:
     return int.from_bytes(data[offset : offset + width], "little")
 
 
-def _field(data: bytearray, offset: int, width: int, rng: random.Random, blocks: Sequence[int] = ()) -> None:
-    """Write an edge, a small or negative step, or (a link) the address of a block."""
-    value = _number(data, offset, width)
-    near = (value - 1, value + 1, 8 * value, -value, 0, 0, len(data), len(data) - 8)
-    _put(data, offset, width, rng.choice(blocks if blocks and rng.random() < 0.6 else (*EDGES, *near)))
+def _fields(data: bytearray, places: Sequence[tuple[int, int]], rng: random.Random, blocks: Sequence[int] = ()) -> None:
+    """Change up to four of the numbers at these places of so many bytes: an edge, a step, the address of a block."""
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        offset, width = rng.choice(places)
+        value = _number(data, offset, width)
+        near = (value - 1, value + 1, 8 * value, -value, 0, 0, len(data), len(data) - 8)
+        _put(data, offset, width, rng.choice(blocks if blocks and rng.random() < 0.4 else (*EDGES, *near)))
 
 
 def damage_text(content: bytes, rng: random.Random) -> bytes:
@@ -101,26 +104,17 @@ def damage_mdf4(content: bytes, rng: random.Random) -> bytes:
     """Change sizes, links and fields of blocks; add formulas and blocks of data that unfold."""
     data = bytearray(content)
     blocks = [m.start() for m in re.finditer(rb"##[A-Z]{2}\0{4}", content) if not m.start() % 8]
-    for _ in range(rng.choice((1, 1, 2, 4))):
-        at = rng.choice(blocks)
-        kind, count = bytes(data[at + 2 : at + 4]), min(_number(data, at + 16, 8), 12)
-        match rng.randrange(8):
-            case 0:
-                _field(data, at + rng.choice((8, 16)), 8, rng)
-            case 1 | 2 if count:
-                _field(data, at + 24 + 8 * rng.randrange(count), 8, rng, blocks)
-            case 3 | 4:
-                width = rng.choice((1, 2, 4, 8))
-                _field(data, at + 24 + 8 * count + width * rng.randrange(64 // width), width, rng)
-            case 5:
-                data[:8] = rng.choice((b"UnFinMF ", b"MDF     "))
-                _put(data, 60, 2, rng.choice((1, 2, 3, 4, 0xFFFF, 0)))
-            case _:
-                data += bytes(-len(data) % 8)
-                new = len(data)
-                data += _formula4(new, rng) if kind == b"CN" else _data4(rng)
-                link = {b"CN": 4, b"DG": 2}.get(kind, rng.randrange(max(count, 1)))
-                _put(data, at + 24 + 8 * link, 8, new)
+    block = rng.choice(blocks)
+    first = [(block + 8 * i, 8) for i in (1, 2, 3, 3, 4, 4, 5, 6, 7)]
+    _fields(data, [*first, *((block + rng.randrange(24, 160), rng.choice((1, 2, 4))) for _ in first)], rng, blocks)
+    if rng.random() < 0.1:
+        data[:8] = b"UnFinMF "
+        _put(data, 60, 2, rng.choice((1, 2, 3, 4, 0xFFFF, 0)))
+    kind, link, make = rng.choice(((b"CN", 4, _formula4), (b"DG", 2, _data4)))
+    if (holders := [b for b in blocks if content[b + 2 : b + 4] == kind]) and rng.random() < 0.4:
+        data += bytes(-len(data) % 8)
+        _put(data, rng.choice(holders) + 24 + 8 * link, 8, len(data))
+        data += make(len(data), rng)
     return bytes(data)
 
 
@@ -138,7 +132,7 @@ def _formula4(new: int, rng: random.Random) -> bytes:
     return bytes(head) + _block4(b"TX", (), rng.choice(_FORMULAS) + b"\0")
 
 
-def _data4(rng: random.Random) -> bytes:
+def _data4(_: int, rng: random.Random) -> bytes:
     size, packed = _bomb(rng)
     head = struct.pack("<2sBxIQQ", b"DT", rng.choice((0, 0, 1)), rng.choice((0, 1, 48, 2**32 - 1)), size, len(packed))
     return _block4(b"DZ", (), head + packed)
@@ -157,24 +151,19 @@ def damage_mdf3(content: bytes, rng: random.Random) -> bytes:
             continue
         blocks.append(at)
         waiting += [_number(content, at + 4 + 4 * i, 4) for i in range(_LINKS3.get(content[at : at + 2], 0))]
-    for _ in range(rng.choice((1, 1, 2, 4))):
-        at = rng.choice(blocks)
-        links = _LINKS3.get(bytes(data[at : at + 2]), 0)
-        match rng.randrange(6):
-            case 0:
-                _field(data, at + 2, 2, rng)
-            case 1 | 2 if links:
-                _field(data, at + 4 + 4 * rng.randrange(links), 4, rng, blocks)
-            case 3 if data[at : at + 2] == b"CN":
-                _put(data, at + 8, 4, len(data))
-                kind, text = rng.choice((10, 10, 10, 11, 12, 65_535)), rng.choice(_FORMULAS)[:4000]
-                head = struct.pack(
-                    "<2sHHdd20sHH", b"CC", 46 + 256, 0, 0.0, 0.0, b"m/s", kind, rng.choice((256, 65535, 0))
-                )
-                data += head + text.ljust(256, b"\0")
-            case _:
-                width = rng.choice((1, 2, 4))
-                _field(data, at + 4 + 4 * links + width * rng.randrange(64 // width), width, rng)
+    block = rng.choice(blocks)
+    links = [(block + 4 + 4 * i, 4) for i in range(6)]
+    _fields(
+        data,
+        [(block + 2, 2), *links, *((block + rng.randrange(2, 120), rng.choice((1, 2, 4))) for _ in links)],
+        rng,
+        blocks,
+    )
+    if rng.random() < 0.3:
+        _put(data, rng.choice([b for b in blocks if content[b : b + 2] == b"CN"]) + 8, 4, len(data))
+        kind, text = rng.choice((10, 10, 10, 11, 12, 65_535)), rng.choice(_FORMULAS)[:4000]
+        head = struct.pack("<2sHHdd20sHH", b"CC", 46 + 256, 0, 0.0, 0.0, b"m/s", kind, rng.choice((256, 65535, 0)))
+        data += head + text.ljust(256, b"\0")
     return bytes(data)
 
 
@@ -187,18 +176,18 @@ def damage_blf(content: bytes, rng: random.Random) -> bytes:
         parts.append(bytearray(zlib.decompress(content[at + 32 : at + size])))
         at += size + size % 4
     for part in parts:
-        objects = [m.start() for m in re.finditer(b"LOBJ", part)]
-        for _ in range(rng.choice((0, 1, 1, 3))):
-            offset, width = rng.choice(((4, 2), (8, 4), (8, 4), (12, 4), (4 * rng.randrange(4, 16), 4)))
-            _field(part, rng.choice(objects) + offset, width, rng)
+        at = rng.choice([m.start() for m in re.finditer(b"LOBJ", part)])
+        _fields(
+            part, [(at + 4, 2), (at + 8, 4), (at + 8, 4), (at + 12, 4), *((at + 4 * i, 4) for i in range(4, 16))], rng
+        )
     if rng.random() < 0.3:
-        _field(head, 4 * rng.randrange(1, 18), 4, rng)
+        _fields(head, [(4 * i, 4) for i in range(1, 18)], rng)
     body = b""
     for part in parts * rng.choice((1, 1, 1, 3)):
         size, packed = (len(part), zlib.compress(part)) if rng.random() < 0.9 else _bomb(rng)
         container = bytearray(struct.pack("<4sHHIIH6xI4x", b"LOBJ", 16, 1, 32 + len(packed), 10, 2, size % 2**32))
         if rng.random() < 0.3:
-            _field(container, *rng.choice(((4, 2), (8, 4), (12, 4), (16, 2), (24, 4))), rng)
+            _fields(container, ((4, 2), (8, 4), (12, 4), (16, 2), (24, 4)), rng)
         body += container + packed + bytes(len(packed) % 4)
     return bytes(head) + body
 
@@ -208,10 +197,9 @@ def damage_mat(content: bytes, rng: random.Random) -> bytes:
     out, at = bytearray(content[:128]), 128
     while at + 8 <= len(content):
         size = _number(content, at + 4, 4)
-        element = bytearray(zlib.decompress(content[at + 8 : at + 8 + size]))
+        element = bytearray(content[at : at + 8 + size])
         at += 8 + size
-        for _ in range(rng.choice((0, 1, 1, 3))):
-            _field(element, 4 * rng.randrange(min(len(element), rng.choice((24, 64, 400))) // 4), 4, rng)
+        _fields(element, [(4 * i, 4) for i in range(rng.choice((6, 16, 100)))], rng)
         if rng.random() < 0.1:
             element = bytearray(_nested(bytes(element), rng.choice((2, 40, 1000, 5000))))
         packed = zlib.compress(element) if rng.random() < 0.9 else _bomb(rng)[1]
@@ -238,20 +226,13 @@ def damage_hdf5(content: bytes, rng: random.Random, canary: Path) -> bytes:
     if rng.random() < 0.3:
         data = bytearray(content)
         blocks = [m.start() for m in re.finditer(rb"TREE|SNOD|HEAP|OHDR|\x89HDF|\x08\0\x17\0|\x01\0\x01\0", content)]
-        for _ in range(rng.choice((1, 2, 4))):
-            width = rng.choice((1, 2, 4, 8))
-            relative = [b - 512 for b in blocks]
-            _field(
-                data,
-                rng.choice(blocks) + width * rng.randrange(96 // width),
-                width,
-                rng,
-                relative if width == 8 else (),
-            )
+        block = rng.choice(blocks)
+        places = [(block + width * rng.randrange(96 // width), width) for width in (1, 2, 4, 8, 8)]
+        _fields(data, places, rng, [b - 512 for b in blocks])
         return bytes(data)
     file = io.BytesIO(content)
     with h5py.File(file, "r+") as target:
-        car = target["car"]
+        car = rng.choice((target, target["car"]))
         for _ in range(rng.choice((1, 1, 3))):
             name = rng.choice(list(car))
             if rng.random() < 0.5:
@@ -304,7 +285,12 @@ def _odd(car: Any, name: str, rng: random.Random, _: Path) -> None:
 def _link(car: Any, name: str, rng: random.Random, canary: Path) -> None:
     import h5py
 
-    links = (h5py.SoftLink(f"/car/{name}"), h5py.ExternalLink(f"{canary}.h5", "/x"), h5py.ExternalLink(".", "/"), car)
+    links = (
+        h5py.SoftLink(f"{car.name}/{name}"),
+        h5py.ExternalLink(f"{canary}.h5", "/x"),
+        h5py.ExternalLink(".", "/"),
+        car,
+    )
     car[name] = rng.choice((*links, h5py.SoftLink("/car"), h5py.ExternalLink("/dev/zero", "/"), car.parent))
 
 
@@ -338,11 +324,8 @@ def damage_parquet(content: bytes, rng: random.Random) -> bytes:
     import pyarrow.parquet as pq
 
     rows = rng.choice((150, 150, 300_000))
-    times = np.resize(COLUMNS["time [s]"], rows)
-    columns: dict[str, Any] = dict(
-        rng.sample([(k, np.resize(v, rows)) for k, v in COLUMNS.items()], rng.randrange(1, 6))
-    )
-    columns |= {"time": times} if rng.random() < 0.7 else {}
+    columns: dict[str, Any] = {k: np.resize(v, rows) for topic in TOPICS for k, v in topic.fields.items()}
+    columns |= {"time": np.resize(TOPICS[0].stamps_ns, rows)} if rng.random() < 0.7 else {}
     for k in range(rng.choice((1, 1, 20 if rows > 150 else 400))):
         columns[rng.choice(TEXTS).decode(errors="replace") + str(k)] = _arrow_values(rows, rng)
     kinds = ("none", "gzip", "zstd", "snappy", "brotli")
@@ -367,26 +350,17 @@ def _arrow_values(rows: int, rng: random.Random) -> Any:
     return column.dictionary_encode() if rng.random() < 0.2 and kind == pa.string() else column
 
 
-#: Suffix and damage of each format.
-DAMAGE: dict[str, tuple[str, Callable[..., bytes]]] = {
-    "csv": ("csv", damage_text),
-    "vbo": ("vbo", damage_text),
-    "parquet": ("parquet", damage_parquet),
-    "mat": ("mat", damage_mat),
-    "mat73": ("mat", damage_hdf5),
-    "mdf": ("mdf", damage_mdf3),
-    "mf4": ("mf4", damage_mdf4),
-    "mf4dz": ("mf4", damage_mdf4),
-    "blf": ("blf", damage_blf),
-    "asc": ("asc", damage_text),
-}
+_DAMAGE: dict[str, Callable[..., bytes]] = {
+    "parquet": damage_parquet, "mat5": damage_mat, "mdf3": damage_mdf3, "mdf4": damage_mdf4, "blf": damage_blf,
+}  # fmt: skip
 
 
-def table_mutant(name: str, content: bytes, seed: int, number: int, canary: Path) -> bytes:
+def table_mutant(name: str, seeds: Sequence[bytes], seed: int, number: int, canary: Path) -> bytes:
     """Return the damaged file of a format, the same for the same numbers."""
     rng = random.Random(f"{seed} {name} {number}")
+    content = seeds[number % len(seeds)]
     if rng.random() < 0.2:
         return damage_bytes(content, rng)
-    damage = DAMAGE[name][1]
-    changed = damage(content, rng, canary) if damage is damage_hdf5 else damage(content, rng)
-    return changed if rng.random() < 0.9 else damage_bytes(changed, rng)
+    damage = partial(damage_hdf5, canary=canary) if name == "mat73" else _DAMAGE.get(name, damage_text)
+    changed = damage(content, rng)
+    return damage_bytes(changed, rng) if rng.random() < 0.1 else changed
