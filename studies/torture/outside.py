@@ -21,7 +21,7 @@ from studies.torture.workers import Ended
 _HARD_LIMIT_BYTES = 8 << 30
 _SAMPLE_S = 0.01
 #: What a child of a command that has ended may take to end.
-_END_S = 10.0
+END_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ def _peak_bytes(pid: int) -> int:
 def _outlived(group: int) -> bool:
     """Return whether a process of an ended group goes on for seconds, and end it."""
     with contextlib.suppress(ProcessLookupError):
-        for _ in range(round(_END_S / _SAMPLE_S)):
+        for _ in range(round(END_S / _SAMPLE_S)):
             os.killpg(group, 0)
             time.sleep(_SAMPLE_S)
         os.killpg(group, signal.SIGKILL)
