@@ -22,7 +22,7 @@ from typing import Any
 
 from pdhef_logtool.workers.supervisor import Limits
 from studies.pages import DOCS, ROOT, fill, options, table, write
-from studies.torture.bombs import BOMBS, judge_bomb
+from studies.torture.bombs import BOMBS, Bomb, judge_bomb
 from studies.torture.configs import config_judge
 from studies.torture.formats import HANG_S, format_judge
 from studies.torture.killing import contents, faults, kill_many, kill_run, leftovers
@@ -31,7 +31,7 @@ from studies.torture.numerics import odd_drives, write_hours
 from studies.torture.outside import measured
 from studies.torture.places import PLACES
 from studies.torture.table_seeds import FORMATS
-from studies.torture.workers import LIMIT_BYTES, LIMIT_S, NO_VERDICT, Verdict, run_cases
+from studies.torture.workers import NO_VERDICT, Verdict, run_cases
 
 _SHARED = ROOT.parent / "shared" / "torture"
 _THREE = ("--estimators", "zero,kinematic,phy-ukf")
@@ -137,18 +137,6 @@ def hours(work: Path, most: float) -> list[dict[str, Any]]:
     return collected
 
 
-def shared_cases() -> list[dict[str, Any]]:
-    """Inspect the cases that others keep, where they are at hand."""
-    collected = []
-    for path in sorted(_SHARED.glob("*.mcap")) + sorted(_SHARED.glob("*.bag")):
-        process = measured("inspect", str(path))
-        late = process.wall_s > LIMIT_S or process.peak_bytes > LIMIT_BYTES or process.code not in (0, 1, 3)
-        collected.append(
-            {"name": path.name, "end": f"exit {process.code}", "s": process.wall_s, "problem": "wrong" if late else ""}
-        )
-    return collected
-
-
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
@@ -223,9 +211,12 @@ def main() -> int:
     given = parser.parse_args()
     work: Path = given.work
     work.mkdir(parents=True, exist_ok=True)
+    shared = sorted([*_SHARED.glob("*.mcap"), *_SHARED.glob("*.bag")])
     todo: dict[str, Callable[[], Any]] = {
         "bombs": lambda: one_by_one("bombs", work, {b.name: partial(judge_bomb, b) for b in BOMBS}),
-        "shared": shared_cases,
+        "shared": lambda: one_by_one(
+            "shared", work, {p.name: partial(judge_bomb, Bomb(p.name, lambda _, p=p: p, (0, 1, 3))) for p in shared}
+        ),
         "places": lambda: one_by_one("places", work, PLACES),
         "numerics": lambda: one_by_one("numerics", work, odd_drives()),
         "mutations": lambda: mutations(work, given.seed, given.jobs, given.logs, given.configs),

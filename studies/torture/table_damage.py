@@ -36,12 +36,10 @@ _CELLS = (
 
 
 def zeros(size: int) -> bytes:
-    """Return a zlib stream of so many zeros, in MiB, at once: blocks that end with a full flush are equal."""
+    """Return a zlib stream of zeros (a multiple of 1 MiB), quickly: blocks that end with a full flush are equal."""
     compressor = zlib.compressobj(9)
-    first = compressor.compress(bytes(1 << 20)) + compressor.flush(zlib.Z_FULL_FLUSH)
-    block = compressor.compress(bytes(1 << 20)) + compressor.flush(zlib.Z_FULL_FLUSH)
-    total = size >> 20
-    return first + block * (total - 1) + b"\3\0" + struct.pack(">HH", total * (1 << 20) % 65_521, 1)
+    first, block = (compressor.compress(bytes(1 << 20)) + compressor.flush(zlib.Z_FULL_FLUSH) for _ in range(2))
+    return first + block * ((size >> 20) - 1) + b"\3\0" + struct.pack(">HH", size % 65_521, 1)
 
 
 def _bomb(rng: random.Random) -> tuple[int, bytes]:
@@ -119,10 +117,9 @@ def damage_mdf4(content: bytes, rng: random.Random) -> bytes:
 
 
 def _block4(kind: bytes, links: Sequence[int], body: bytes) -> bytes:
-    block = (
-        struct.pack(f"<4s4xQQ{len(links)}Q", b"##" + kind, 24 + 8 * len(links) + len(body), len(links), *links) + body
-    )
-    return block + bytes(-len(block) % 8)
+    size = 24 + 8 * len(links) + len(body)
+    block = struct.pack(f"<2s2s4xQQ{len(links)}Q", b"##", kind, size, len(links), *links) + body
+    return block + bytes(-size % 8)
 
 
 def _formula4(new: int, rng: random.Random) -> bytes:
@@ -152,13 +149,8 @@ def damage_mdf3(content: bytes, rng: random.Random) -> bytes:
         blocks.append(at)
         waiting += [_number(content, at + 4 + 4 * i, 4) for i in range(_LINKS3.get(content[at : at + 2], 0))]
     block = rng.choice(blocks)
-    links = [(block + 4 + 4 * i, 4) for i in range(6)]
-    _fields(
-        data,
-        [(block + 2, 2), *links, *((block + rng.randrange(2, 120), rng.choice((1, 2, 4))) for _ in links)],
-        rng,
-        blocks,
-    )
+    places = [(block + 2, 2), *((block + 4 + 4 * i, 4) for i in range(6))]
+    _fields(data, [*places, *((block + rng.randrange(2, 120), rng.choice((1, 2, 4))) for _ in places)], rng, blocks)
     if rng.random() < 0.3:
         _put(data, rng.choice([b for b in blocks if content[b : b + 2] == b"CN"]) + 8, 4, len(data))
         kind, text = rng.choice((10, 10, 10, 11, 12, 65_535)), rng.choice(_FORMULAS)[:4000]
@@ -177,9 +169,7 @@ def damage_blf(content: bytes, rng: random.Random) -> bytes:
         at += size + size % 4
     for part in parts:
         at = rng.choice([m.start() for m in re.finditer(b"LOBJ", part)])
-        _fields(
-            part, [(at + 4, 2), (at + 8, 4), (at + 8, 4), (at + 12, 4), *((at + 4 * i, 4) for i in range(4, 16))], rng
-        )
+        _fields(part, [(at + 4, 2), *((at + 4 * i, 4) for i in (2, 2, *range(2, 16)))], rng)
     if rng.random() < 0.3:
         _fields(head, [(4 * i, 4) for i in range(1, 18)], rng)
     body = b""
@@ -234,11 +224,9 @@ def damage_hdf5(content: bytes, rng: random.Random, canary: Path) -> bytes:
     with h5py.File(file, "r+") as target:
         car = rng.choice((target, target["car"]))
         for _ in range(rng.choice((1, 1, 3))):
-            name = rng.choice(list(car))
-            if rng.random() < 0.5:
+            name = rng.choice((rng.choice(list(car)), f"more {rng.random()}"))
+            if name in car:
                 del car[name]
-            else:
-                name = f"more {rng.random()}"
             rng.choice(_HDF5)(car, name, rng, canary)
     return content[:512] + file.getvalue()[512:]
 
@@ -275,23 +263,16 @@ def _odd(car: Any, name: str, rng: random.Random, _: Path) -> None:
         np.full((1, 150), np.nan), np.array([car.ref] * 150, h5py.ref_dtype),
     )  # fmt: skip
     car[name] = rng.choice(odd)
-    attributes = rng.choice(
-        ({}, {"MATLAB_class": b"cell"}, {"MATLAB_class": 3.0}, {"MATLAB_empty": 1}, {"unit": "x" * 60_000})
-    )
-    for key, value in attributes.items():
-        car[name].attrs[key] = value
+    about = (("MATLAB_class", b"cell"), ("MATLAB_class", 3.0), ("MATLAB_empty", 1), ("unit", "x" * 60_000))
+    car[name].attrs.update([rng.choice(about)])
 
 
 def _link(car: Any, name: str, rng: random.Random, canary: Path) -> None:
     import h5py
 
-    links = (
-        h5py.SoftLink(f"{car.name}/{name}"),
-        h5py.ExternalLink(f"{canary}.h5", "/x"),
-        h5py.ExternalLink(".", "/"),
-        car,
-    )
-    car[name] = rng.choice((*links, h5py.SoftLink("/car"), h5py.ExternalLink("/dev/zero", "/"), car.parent))
+    soft = [h5py.SoftLink(path) for path in (f"{car.name}/{name}", "/car")]
+    files = [h5py.ExternalLink(*target) for target in ((f"{canary}.h5", "/x"), (".", "/"), ("/dev/zero", "/"))]
+    car[name] = rng.choice((*soft, *files, car, car.parent))
 
 
 def _external(car: Any, name: str, rng: random.Random, canary: Path) -> None:
@@ -299,14 +280,7 @@ def _external(car: Any, name: str, rng: random.Random, canary: Path) -> None:
     car.create_dataset(name, (1, 150), "f8", external=[rng.choice(files)])
 
 
-_HDF5: tuple[Callable[[Any, str, random.Random, Path], None], ...] = (
-    _many_groups,
-    _virtual,
-    _huge,
-    _odd,
-    _link,
-    _external,
-)
+_HDF5: tuple[Callable[..., None], ...] = (_many_groups, _virtual, _huge, _odd, _link, _external)
 
 
 def damage_parquet(content: bytes, rng: random.Random) -> bytes:
@@ -328,11 +302,8 @@ def damage_parquet(content: bytes, rng: random.Random) -> bytes:
     columns |= {"time": np.resize(TOPICS[0].stamps_ns, rows)} if rng.random() < 0.7 else {}
     for k in range(rng.choice((1, 1, 20 if rows > 150 else 400))):
         columns[rng.choice(TEXTS).decode(errors="replace") + str(k)] = _arrow_values(rows, rng)
-    kinds = ("none", "gzip", "zstd", "snappy", "brotli")
-    file = io.BytesIO()
-    with pq.ParquetWriter(file, (table := pa.table(columns)).schema, compression=rng.choice(kinds)) as writer:
-        for _ in range(rng.choice((1, 1, 3, 10))):
-            writer.write_table(table)
+    table = pa.concat_tables([pa.table(columns)] * rng.choice((1, 1, 3, 10)))
+    pq.write_table(table, file := io.BytesIO(), compression=rng.choice(("none", "gzip", "zstd", "snappy", "brotli")))
     return file.getvalue()
 
 
