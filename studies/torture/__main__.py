@@ -22,7 +22,7 @@ from typing import Any
 
 from pdhef_logtool.workers.supervisor import Limits
 from studies.pages import DOCS, ROOT, fill, options, table, write
-from studies.torture.bombs import BOMBS, Bomb, judge_bomb
+from studies.torture.bombs import BOMBS, former_cases, judge_bomb
 from studies.torture.configs import config_judge
 from studies.torture.formats import HANG_S, format_judge
 from studies.torture.killing import contents, faults, kill_many, kill_run, leftovers
@@ -33,7 +33,6 @@ from studies.torture.places import PLACES
 from studies.torture.table_seeds import FORMATS
 from studies.torture.workers import NO_VERDICT, Verdict, run_cases
 
-_SHARED = ROOT.parent / "shared" / "torture"
 _THREE = ("--estimators", "zero,kinematic,phy-ukf")
 
 
@@ -211,12 +210,9 @@ def main() -> int:
     given = parser.parse_args()
     work: Path = given.work
     work.mkdir(parents=True, exist_ok=True)
-    shared = sorted([*_SHARED.glob("*.mcap"), *_SHARED.glob("*.bag")])
     todo: dict[str, Callable[[], Any]] = {
         "bombs": lambda: one_by_one("bombs", work, {b.name: partial(judge_bomb, b) for b in BOMBS}),
-        "shared": lambda: one_by_one(
-            "shared", work, {p.name: partial(judge_bomb, Bomb(p.name, lambda _, p=p: p, (0, 1, 3))) for p in shared}
-        ),
+        "shared": lambda: one_by_one("shared", work, {bomb.name: partial(judge_bomb, bomb) for bomb in former_cases()}),
         "places": lambda: one_by_one("places", work, PLACES),
         "numerics": lambda: one_by_one("numerics", work, odd_drives()),
         "mutations": lambda: mutations(work, given.seed, given.jobs, given.logs, given.configs),

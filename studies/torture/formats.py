@@ -23,7 +23,7 @@ _CANARY = struct.pack("<d", 424_242.125)
 
 
 def format_judge(work: Path, name: str, seed: int) -> Any:
-    """Return what judges one mutant of a format by its number; seed and canary files are written first."""
+    """Return a function that judges a mutant of a format by its number. Writes the seeds and the canary files."""
     import h5py
 
     folder = work / "seeds" / name
@@ -36,7 +36,7 @@ def format_judge(work: Path, name: str, seed: int) -> Any:
 
 
 def judge_mutant(work: Path, name: str, seeds: Sequence[bytes], seed: int, canary: Path, number: int) -> Verdict:
-    """Write a mutant into a folder of its own, read it in a process of its own, and look at what that left."""
+    """Read a mutant in a separate process with an empty working folder and TMPDIR, and judge its end and its traces."""
     folder = work / "cases" / f"{name}-{number}"
     places = [folder / "cwd", folder / "tmp"]
     for place in places:

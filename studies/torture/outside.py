@@ -1,4 +1,4 @@
-"""``pdhef`` as a process of its own, under limits: how it ended, how long it took, how much memory it had."""
+"""``pdhef`` in a separate process under limits: exit code, duration, memory."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from pathlib import Path
 from studies.pages import ROOT
 from studies.torture.workers import Ended
 
-#: Protects the machine from any case; what a case may take is checked against what it took.
+#: Protects the machine; the limits of a case are checked when it has ended.
 _HARD_LIMIT_BYTES = 8 << 30
 _SAMPLE_S = 0.01
-#: What a child of a command that has ended may take to end.
+#: Time in which the children of an ended command must end.
 END_S = 10.0
 
 
@@ -41,7 +41,7 @@ class Process(Ended):
 def start(
     *arguments: str, prefix: Sequence[str] = (), env: Mapping[str, str] | None = None, **options: object
 ) -> subprocess.Popen[bytes]:
-    """Start ``pdhef`` from this tree in a session of its own; ``prefix`` is put before the interpreter."""
+    """Start ``pdhef`` from this tree in a new session; ``prefix`` is put before the interpreter."""
     environment = dict(os.environ) if env is None else dict(env)
     environment |= {"PYTHONPATH": environment.get("PYTHONPATH", str(ROOT)), "OMP_NUM_THREADS": "1"}
     code = "from pdhef_logtool.cli.app import main; main()"
@@ -80,14 +80,14 @@ def _family(pid: int) -> Iterator[int]:
 
 
 def _peak_bytes(pid: int) -> int:
-    """Return the peak of a process since it was loaded: that of the process which started it is not in it."""
+    """Return the peak memory of a process since its program was loaded, without that of its parent."""
     with contextlib.suppress(OSError, IndexError, ValueError):
         return int(Path(f"/proc/{pid}/status").read_text().split("VmHWM:")[1].split()[0]) << 10
     return 0
 
 
 def _outlived(group: int) -> bool:
-    """Return whether a process of an ended group goes on for seconds, and end it."""
+    """Return whether a process of the group still runs after :data:`END_S`, and end it."""
     with contextlib.suppress(ProcessLookupError):
         for _ in range(round(END_S / _SAMPLE_S)):
             os.killpg(group, 0)

@@ -53,12 +53,12 @@ def _put(data: bytearray, offset: int, width: int, value: int) -> None:
         data[offset : offset + width] = (value % (1 << (8 * width))).to_bytes(width, "little")
 
 
-def _number(data: bytes, offset: int, width: int) -> int:
+def _number(data: bytes | bytearray, offset: int, width: int) -> int:
     return int.from_bytes(data[offset : offset + width], "little")
 
 
 def _fields(data: bytearray, places: Sequence[tuple[int, int]], rng: random.Random, blocks: Sequence[int] = ()) -> None:
-    """Change up to four of the numbers at these places of so many bytes: an edge, a step, the address of a block."""
+    """Change up to four numbers, given as offset and width in bytes, to an edge, a step or the address of a block."""
     for _ in range(rng.choice((1, 1, 2, 4))):
         offset, width = rng.choice(places)
         value = _number(data, offset, width)
@@ -160,7 +160,7 @@ def damage_mdf3(content: bytes, rng: random.Random) -> bytes:
 
 
 def damage_blf(content: bytes, rng: random.Random) -> bytes:
-    """Change objects inside of compressed containers, the containers, or what they claim to contain."""
+    """Change objects inside compressed containers, and sizes and data of the containers."""
     head = bytearray(content[: _number(content, 4, 4)])
     parts, at = [], len(head)
     while content[at : at + 4] == b"LOBJ":
@@ -210,7 +210,7 @@ def _nested(element: bytes, levels: int) -> bytes:
 
 
 def damage_hdf5(content: bytes, rng: random.Random, canary: Path) -> bytes:
-    """Change signed blocks and addresses, or add what reads other files, goes in circles, or has no end."""
+    """Change signed blocks and addresses, or add external, cyclic, huge and unusual objects."""
     import h5py
 
     if rng.random() < 0.3:

@@ -1,4 +1,4 @@
-"""The default limits: far above what recorders write, far below what harms a machine."""
+"""The default limits: amounts that recorders write pass, amounts that harm a machine do not."""
 
 from __future__ import annotations
 
