@@ -189,7 +189,8 @@ def damage_mat(content: bytes, rng: random.Random) -> bytes:
         size = _number(content, at + 4, 4)
         element = bytearray(content[at : at + 8 + size])
         at += 8 + size
-        _fields(element, [(4 * i, 4) for i in range(rng.choice((6, 16, 100)))], rng)
+        if rng.random() < 0.5:
+            _fields(element, [(4 * i, 4) for i in range(rng.choice((16, 100, len(element) // 4)))], rng)
         if rng.random() < 0.1:
             element = bytearray(_nested(bytes(element), rng.choice((2, 40, 1000, 5000))))
         packed = zlib.compress(element) if rng.random() < 0.9 else _bomb(rng)[1]
@@ -285,7 +286,7 @@ _HDF5: tuple[Callable[..., None], ...] = (_many_groups, _virtual, _huge, _odd, _
 
 def damage_parquet(content: bytes, rng: random.Random) -> bytes:
     """Change the metadata at the end and heads of pages, or write columns of few bytes and many rows."""
-    if rng.random() < 0.5:
+    if rng.random() < 0.4:
         data = bytearray(content)
         size = _number(content, len(content) - 8, 4)
         for _ in range(rng.choice((1, 1, 3))):
@@ -297,17 +298,19 @@ def damage_parquet(content: bytes, rng: random.Random) -> bytes:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    rows = rng.choice((150, 150, 300_000))
+    rows = rng.choice((150, 150, 150, 300_000))
     columns: dict[str, Any] = {k: np.resize(v, rows) for topic in TOPICS for k, v in topic.fields.items()}
-    columns |= {"time": np.resize(TOPICS[0].stamps_ns, rows)} if rng.random() < 0.7 else {}
-    for k in range(rng.choice((1, 1, 20 if rows > 150 else 400))):
-        columns[rng.choice(TEXTS).decode(errors="replace") + str(k)] = _arrow_values(rows, rng)
-    table = pa.concat_tables([pa.table(columns)] * rng.choice((1, 1, 3, 10)))
-    pq.write_table(table, file := io.BytesIO(), compression=rng.choice(("none", "gzip", "zstd", "snappy", "brotli")))
+    columns |= {"time": TOPICS[0].stamps_ns[0] + 20_000_000 * np.arange(rows)} if rng.random() < 0.8 else {}
+    for k in range(rng.choice((1, 1, 30))):
+        columns[rng.choice(TEXTS).decode(errors="replace") + str(k)] = (
+            _arrow_values(rng) if rows == 150 else pa.repeat(1.0, rows)
+        )
+    table = pa.concat_tables([pa.table(columns)] * rng.choice((1, 1, 3)))
+    pq.write_table(table, file := io.BytesIO(), compression=rng.choice(("none", "gzip", "zstd", "snappy")))
     return file.getvalue()
 
 
-def _arrow_values(rows: int, rng: random.Random) -> Any:
+def _arrow_values(rng: random.Random) -> Any:
     import pyarrow as pa
 
     text = rng.choice(_CELLS).decode(errors="replace")
@@ -317,7 +320,7 @@ def _arrow_values(rows: int, rng: random.Random) -> Any:
         (2**62, pa.timestamp("ns")), (5, pa.decimal128(38, 9)), ([("k", 1.0)], pa.map_(pa.string(), pa.float64())),
         (2**62, pa.duration("ms")), (True, pa.bool_()), (1, pa.date32()),
     ))  # fmt: skip
-    column = pa.repeat(pa.scalar(value, kind), rows)
+    column = pa.repeat(pa.scalar(value, kind), 150)
     return column.dictionary_encode() if rng.random() < 0.2 and kind == pa.string() else column
 
 
