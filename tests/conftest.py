@@ -1,9 +1,9 @@
 """Fixtures shared by all tests.
 
 Tests run in random order in several processes, and a process can get any part of a file. A test therefore changes
-what others see (environment, working directory, module attributes, signal handlers) by fixtures only, writes to
-``tmp_path``, lets the system choose ports and takes an S3 bucket of its own (``tests/s3_store.py``). It calls the
-command line in its own process (``called`` in ``tests/command_line.py``) unless it is about processes: a start takes
+shared state (environment, working directory, module attributes, signal handlers) by fixtures only, writes to
+``tmp_path``, lets the system choose ports and takes a separate S3 bucket (``tests/s3_store.py``). It calls the
+command line in the test process (``called`` in ``tests/command_line.py``) unless it is about processes: a start takes
 two seconds. Limits in seconds only end a hang (minutes): another load of the machine must not reach them.
 """
 
@@ -22,6 +22,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
+#: Environment variables that pytest sets for each test, and Polars when it is imported.
+OF_LIBRARIES = {"PYTEST_CURRENT_TEST", "_RJEM_MALLOC_CONF"}
 
 hypothesis.settings.register_profile("any load", deadline=None)
 hypothesis.settings.load_profile("any load")
@@ -46,7 +48,7 @@ def pytest_configure() -> None:
 
 
 def _process_state() -> set[str]:
-    """Return what all tests of this process share, and its child processes where the system lists them.
+    """Return the state that all tests of this process share, and its child processes where the system lists them.
 
     The servers that fork readers of tables are kept on purpose, as their start takes a second.
     """
@@ -59,7 +61,7 @@ def _process_state() -> set[str]:
     return {
         f"working directory {Path.cwd()}",
         *(f"signal {n}: {signal.getsignal(n)}" for n in signal.valid_signals()),
-        *(f"{name}={value}" for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"),
+        *(f"{name}={value}" for name, value in os.environ.items() if name not in OF_LIBRARIES),
         *(f"process {pid}" for pid in processes if pid not in kept),
     }
 
@@ -89,7 +91,7 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Leave what takes long or needs extras to ``make fleet``."""
+    """Leave long tests and tests with extras to ``make fleet``."""
     if item.get_closest_marker("fleet") is not None and not os.environ.get("PDHEF_FLEET"):
         pytest.skip("make fleet runs it")
 

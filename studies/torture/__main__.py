@@ -1,7 +1,8 @@
 """Fuzz and fault-injection tests, counted: ``docs/reliability.md``.
 
     python -m studies.torture [--work out/torture] [--seed 1] [--logs 200000] [--configs 20000] [--kills 200]
-                              [--hours 10] [--jobs 2] [--only mutations ...] [--out docs/reliability.md]
+                              [--count 500] [--format blf ...] [--hours 10] [--jobs 2] [--only mutations ...]
+                              [--out docs/reliability.md]
 
 Resumable: results in the work folder are not computed again; remove it after a change of the code. Exit code 1:
 something ended as it should not.
@@ -14,41 +15,59 @@ import shutil
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from pdhef_logtool.workers.supervisor import Limits
 from studies.pages import DOCS, ROOT, fill, options, table, write
-from studies.torture.bombs import BOMBS, judge_bomb
+from studies.torture.bombs import BOMBS, former_cases, judge_bomb
 from studies.torture.configs import config_judge
+from studies.torture.formats import HANG_S, format_judge
 from studies.torture.killing import contents, faults, kill_many, kill_run, leftovers
 from studies.torture.logs import log_judge
 from studies.torture.numerics import odd_drives, write_hours
 from studies.torture.outside import measured
 from studies.torture.places import PLACES
-from studies.torture.workers import LIMIT_BYTES, LIMIT_S, NO_VERDICT, Verdict, run_cases
+from studies.torture.table_seeds import FORMATS
+from studies.torture.workers import NO_VERDICT, Verdict, run_cases
 
-_SHARED = ROOT.parent / "shared" / "torture"
 _THREE = ("--estimators", "zero,kinematic,phy-ukf")
 
 
 def mutations(work: Path, seed: int, jobs: int, logs: int, configs: int) -> dict[str, Any]:
     """Judge mutated logs and configurations."""
-    collected = {}
-    for name, make, count in (("logs", log_judge, logs), ("configurations", config_judge, configs)):
-        begin = time.monotonic()
-        cases = run_cases(make(work, seed), count, work / f"{name}-{seed}.jsonl", jobs=jobs, tell=_say)
-        collected[name] = {
-            "seed": seed,
-            "wall_s": time.monotonic() - begin,
-            "count": count,
-            "ends": dict(sorted(Counter(case.end for case in cases).items())),
-            "problems": [(case.number, case.problem[-800:]) for case in cases if case.problem],
-            "slowest_s": max((case.wall_s for case in cases), default=0.0),
-            "peak_bytes": max((case.peak_bytes for case in cases), default=0),
-        }
-    return collected
+    counts = (("logs", log_judge, logs), ("configurations", config_judge, configs))
+    return {name: _judged(work, name, make(work, seed), seed, count, jobs) for name, make, count in counts}
+
+
+def formats(work: Path, seed: int, jobs: int, count: int, names: Iterable[str]) -> dict[str, Any]:
+    """Judge mutated files of table and CAN formats, each by a command of its own."""
+    limits = Limits(silence_s=3 * HANG_S)
+    return {name: _judged(work, name, format_judge(work, name, seed), seed, count, jobs, limits) for name in names}
+
+
+def _judged(
+    work: Path,
+    name: str,
+    judge: Callable[[int], Verdict],
+    seed: int,
+    count: int,
+    jobs: int,
+    limits: Limits | None = None,
+) -> dict[str, Any]:
+    begin = time.monotonic()
+    cases = run_cases(judge, count, work / f"{name}-{seed}.jsonl", jobs=jobs, tell=_say, limits=limits)
+    return {
+        "seed": seed,
+        "wall_s": time.monotonic() - begin,
+        "count": count,
+        "ends": dict(sorted(Counter(case.end for case in cases).items())),
+        "problems": [(case.number, case.problem[-800:]) for case in cases if case.problem],
+        "slowest_s": max((case.wall_s for case in cases), default=0.0),
+        "peak_bytes": max((case.peak_bytes for case in cases), default=0),
+    }
 
 
 def one_by_one(part: str, work: Path, cases: Mapping[str, Callable[[Path], Verdict]]) -> list[dict[str, Any]]:
@@ -117,18 +136,6 @@ def hours(work: Path, most: float) -> list[dict[str, Any]]:
     return collected
 
 
-def shared_cases() -> list[dict[str, Any]]:
-    """Inspect the cases that others keep, where they are at hand."""
-    collected = []
-    for path in sorted(_SHARED.glob("*.mcap")) + sorted(_SHARED.glob("*.bag")):
-        process = measured("inspect", str(path))
-        late = process.wall_s > LIMIT_S or process.peak_bytes > LIMIT_BYTES or process.code not in (0, 1, 3)
-        collected.append(
-            {"name": path.name, "end": f"exit {process.code}", "s": process.wall_s, "problem": "wrong" if late else ""}
-        )
-    return collected
-
-
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
@@ -140,8 +147,7 @@ def blocks(results: dict[str, Any]) -> dict[str, str]:
     """Return the tables of the page by name."""
     lists = [name for name in ("bombs", "numerics", "places", "shared") if results.get(name)]
     texts: dict[str, str] = {name: _list(results[name]) for name in lists}
-    if done := results.get("mutations"):
-        texts["mutations"] = _mutations(done)
+    texts |= {name: _mutations(results[name]) for name in ("mutations", "formats") if results.get(name)}
     if done := results.get("kills"):
         rows = [[end, str(n)] for end, n in done["ends"].items()]
         wrong = "; ".join(sorted(set(done["problems"]))) or "none"
@@ -197,6 +203,8 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--hours", type=float, default=10.0)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--count", type=int, default=500, help="mutants of each table and CAN format")
+    parser.add_argument("--format", action="append", choices=FORMATS, help="a table or CAN format; may be given again")
     parser.add_argument("--only", action="append", help="a part; may be given again")
     parser.add_argument("--out", type=Path, default=DOCS / "reliability.md")
     given = parser.parse_args()
@@ -204,10 +212,11 @@ def main() -> int:
     work.mkdir(parents=True, exist_ok=True)
     todo: dict[str, Callable[[], Any]] = {
         "bombs": lambda: one_by_one("bombs", work, {b.name: partial(judge_bomb, b) for b in BOMBS}),
-        "shared": shared_cases,
+        "shared": lambda: one_by_one("shared", work, {bomb.name: partial(judge_bomb, bomb) for bomb in former_cases()}),
         "places": lambda: one_by_one("places", work, PLACES),
         "numerics": lambda: one_by_one("numerics", work, odd_drives()),
         "mutations": lambda: mutations(work, given.seed, given.jobs, given.logs, given.configs),
+        "formats": lambda: formats(work, given.seed, given.jobs, given.count, given.format or FORMATS),
         "kills": lambda: kills(work, given.seed, given.kills),
         "hours": lambda: hours(work, given.hours),
     }
@@ -216,13 +225,17 @@ def main() -> int:
     results: dict[str, Any] = {}
     for name, do in todo.items():
         kept = work / f"{name}.json"
-        if not kept.is_file() and (given.only is None or name in given.only):
+        again = name == "formats" and given.format
+        if (again or not kept.is_file()) and (given.only is None or name in given.only):
             done = do()
+            if again and kept.is_file():
+                done = json.loads(kept.read_text()) | done
             kept.write_text(json.dumps(done, indent=1))
         if kept.is_file():
             results[name] = json.loads(kept.read_text())
     if given.out.is_file():
-        counts = f"--logs {given.logs} --configs {given.configs} --kills {given.kills} --hours {given.hours:g}"
+        counts = f"--logs {given.logs} --configs {given.configs} --count {given.count} --kills {given.kills}"
+        counts += f" --hours {given.hours:g}"
         asked = {"command": f"The figures below: `python -m studies.torture --seed {given.seed} {counts}`."}
         write(given.out, fill(given.out.read_text(), blocks(results) | asked, str(given.out)))
     return int(any(_wrong(r) for r in results.values()))

@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from studies.pages import ROOT
 from studies.torture.outside import measured
 from studies.torture.seeds import SEEDS, START_NS
 from studies.torture.workers import LIMIT_BYTES, LIMIT_S, Verdict, judge
@@ -324,6 +325,12 @@ BOMBS = (
     Bomb("database whose messages are an endless view", partial(_database, _ENDLESS), _EITHER),
     Bomb("database whose rows are 900 MB of nothing each", partial(_database, _HUGE_ROW), _EITHER),
 )
+
+
+def former_cases() -> list[Bomb]:
+    """Return the files beside the repository that caused failures of earlier versions, where they are present."""
+    folder = ROOT.parent / "shared" / "torture"
+    return [Bomb(p.name, lambda _, p=p: p, _ANY) for p in sorted([*folder.glob("*.mcap"), *folder.glob("*.bag")])]  # type: ignore[misc]
 
 
 def judge_bomb(bomb: Bomb, folder: Path) -> Verdict:

@@ -1,37 +1,47 @@
-"""``pdhef`` as a process of its own, under limits: how it ended, how long it took, how much memory it had."""
+"""``pdhef`` in a separate process under limits: exit code, duration, memory."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
 import signal
 import subprocess
 import sys
 import tempfile
-import threading
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from studies.pages import ROOT
-from studies.torture.workers import LIMIT_BYTES, Ended
+from studies.torture.workers import Ended
 
-#: Protects the machine from any case; what a case may take is checked against what it took.
+#: Protects the machine; the limits of a case are checked when it has ended.
 _HARD_LIMIT_BYTES = 8 << 30
+_SAMPLE_S = 0.01
+#: Time in which the children of an ended command must end.
+END_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Process(Ended):
-    """An ended process; ``code`` is negative for a signal, ``late`` if it had to be killed."""
+    """An ended process and its children.
+
+    ``code`` is negative for a signal, ``late`` if it had to be killed, ``left`` if a child outlived it. ``peak_bytes``
+    is the highest sum of the peaks of the processes that ran at the same time.
+    """
 
     wall_s: float
     peak_bytes: int
     late: bool = False
+    left: bool = False
 
 
 def start(
     *arguments: str, prefix: Sequence[str] = (), env: Mapping[str, str] | None = None, **options: object
 ) -> subprocess.Popen[bytes]:
-    """Start ``pdhef`` from this tree in a session of its own; ``prefix`` is put before the interpreter."""
+    """Start ``pdhef`` from this tree in a new session; ``prefix`` is put before the interpreter."""
     environment = dict(os.environ) if env is None else dict(env)
     environment |= {"PYTHONPATH": environment.get("PYTHONPATH", str(ROOT)), "OMP_NUM_THREADS": "1"}
     code = "from pdhef_logtool.cli.app import main; main()"
@@ -42,32 +52,49 @@ def start(
 
 def measured(*arguments: str, limit_s: float = 60.0, **options: object) -> Process:
     """Run ``pdhef`` to its end, or kill it and all its children at the limit."""
-    import time
-
-    begin = time.monotonic()
+    begin, peak, late = time.monotonic(), 0, False
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         process = start(*arguments, stdout=out, stderr=err, preexec_fn=_limit, **options)  # type: ignore[arg-type]
-        late = threading.Event()
-
-        def kill() -> None:
-            late.set()
-            os.killpg(process.pid, signal.SIGKILL)
-
-        timer = threading.Timer(limit_s, kill)
-        timer.start()
-        _, status, usage = os.wait4(process.pid, 0)
-        timer.cancel()
-        process.returncode = os.waitstatus_to_exitcode(status)
+        while process.poll() is None:
+            peak = max(peak, sum(map(_peak_bytes, _family(process.pid))))
+            if not late and time.monotonic() - begin > limit_s:
+                late = True
+                os.killpg(process.pid, signal.SIGKILL)
+            time.sleep(_SAMPLE_S)
+        wall_s = time.monotonic() - begin
+        left = _outlived(process.pid)
         texts = []
         for file in (out, err):
             file.seek(0)
             texts.append(file.read().decode("utf-8", errors="replace"))
-    wall_s = time.monotonic() - begin
-    # A child's peak begins with that of the process which starts it: one above the limit would put it on the child.
-    inherited = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
-    peak = usage.ru_maxrss << 10
-    is_known = peak > inherited or inherited < LIMIT_BYTES
-    return Process(process.returncode, texts[0], texts[1], wall_s, peak if is_known else 0, late.is_set())
+    return Process(process.returncode, texts[0], texts[1], wall_s, peak, late, left)
+
+
+def _family(pid: int) -> Iterator[int]:
+    """Yield a process and all that descend from it."""
+    yield pid
+    with contextlib.suppress(OSError):
+        for children in list(Path(f"/proc/{pid}/task").glob("*/children")):
+            for child in children.read_text().split():
+                yield from _family(int(child))
+
+
+def _peak_bytes(pid: int) -> int:
+    """Return the peak memory of a process since its program was loaded, without that of its parent."""
+    with contextlib.suppress(OSError, IndexError, ValueError):
+        return int(Path(f"/proc/{pid}/status").read_text().split("VmHWM:")[1].split()[0]) << 10
+    return 0
+
+
+def _outlived(group: int) -> bool:
+    """Return whether a process of the group still runs after :data:`END_S`, and end it."""
+    with contextlib.suppress(ProcessLookupError):
+        for _ in range(round(END_S / _SAMPLE_S)):
+            os.killpg(group, 0)
+            time.sleep(_SAMPLE_S)
+        os.killpg(group, signal.SIGKILL)
+        return True
+    return False
 
 
 def _limit() -> None:

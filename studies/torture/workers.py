@@ -1,4 +1,4 @@
-"""Cases in supervised processes: what hangs or grows is killed and reported."""
+"""Cases in supervised processes; a case that hangs or grows is killed and reported."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from unittest.mock import patch
 from pdhef_logtool.estimators.table import FILTERS
 from pdhef_logtool.workers.supervisor import Limits, Tell, supervise
 
-#: What no case may take.
+#: Limits of a case.
 LIMIT_S = 10.0
 LIMIT_BYTES = 1 << 30
-#: End of a case whose process died, hung or grew too large, or which the judge could not judge.
+#: End of a case without a judgement: its process died, hung or grew too large, or the judge failed.
 NO_VERDICT = "no verdict"
 _TOLD_EVERY = 500
 _PRELOAD = ("pdhef_logtool.runs.*", "pdhef_logtool.logs.*", "pdhef_logtool.cli.*", *FILTERS)
@@ -42,7 +42,7 @@ class Ended:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """How a case ended: a word such as ``exit 3``, what is wrong with it, empty if nothing, and what it cost."""
+    """How a case ended: a word such as ``exit 3``, the problem (empty if none), and the costs."""
 
     end: str
     problem: str = ""
@@ -77,7 +77,7 @@ def command(*arguments: str) -> Ended:
             main()
     except SystemExit as exit_:
         code = exit_.code
-    except Exception:  # noqa: BLE001 (this is what is looked for)
+    except Exception:  # noqa: BLE001 (any exception is a finding)
         return Ended(1, out.getvalue(), f"internal error\n{traceback.format_exc()}")
     finally:
         for number, handler in handlers.items():
@@ -86,7 +86,7 @@ def command(*arguments: str) -> Ended:
 
 
 def judge(ended: Ended, allowed: Sequence[int] = (0, 1, 2, 3)) -> Verdict:
-    """Return what every end must be: a documented code, one line for an error, nothing that steers a terminal."""
+    """Check the end of a command: a documented code, one line for an error, no terminal control characters."""
     end = f"exit {ended.code}"
     last = ended.err.rstrip("\n").rpartition("\n")[2]
     if "internal error" in ended.err:
@@ -108,11 +108,12 @@ def run_cases(
     *,
     jobs: int = 2,
     tell: Callable[[str], None] = print,
+    limits: Limits | None = None,
 ) -> list[Case]:
     """Judge the cases 0 to ``count`` - 1 in supervised processes; none that is in the journal already."""
     done = {case.number: case for case in read_journal(journal)}
     left = [n for n in range(count) if n not in done]
-    limits = Limits(silence_s=LIMIT_S, memory_bytes=LIMIT_BYTES)
+    limits = limits or Limits(silence_s=LIMIT_S, memory_bytes=LIMIT_BYTES)
     journal.parent.mkdir(parents=True, exist_ok=True)
     with journal.open("a") as file:
         for ended in supervise(partial(_case, judge_case), left, jobs=jobs, limits=limits, preload=_PRELOAD):
@@ -131,8 +132,8 @@ def _case(judge_case: Callable[[int], Verdict], number: int, tell: Tell) -> Case
     del tell
     begin = time.monotonic()
     verdict = judge_case(number)
-    peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
-    return Case(number, verdict.end, verdict.problem, time.monotonic() - begin, peak_bytes)
+    peak_bytes = verdict.costs.get("bytes", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10)
+    return Case(number, verdict.end, verdict.problem, verdict.costs.get("s", time.monotonic() - begin), int(peak_bytes))
 
 
 def read_journal(journal: Path) -> Iterator[Case]:

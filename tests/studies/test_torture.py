@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
+import zlib
 from functools import partial
 from pathlib import Path
 
@@ -15,10 +17,14 @@ import pytest
 from studies.pages import ROOT
 from studies.torture import outside
 from studies.torture.bombs import BOMBS, Bomb, judge_bomb
+from studies.torture.formats import format_judge
 from studies.torture.logs import log_judge
 from studies.torture.mutating import mutant
 from studies.torture.seeds import SEEDS, write_seeds
+from studies.torture.table_damage import table_mutant, zeros
+from studies.torture.table_seeds import FORMATS, table_seeds
 from studies.torture.workers import Ended, Verdict, judge, read_journal, run_cases
+from tests.command_line import called
 
 LOGS, CONFIGS = 40, 12
 
@@ -79,6 +85,59 @@ def test_the_same_number_gives_the_same_mutant_and_most_differ_from_the_seed(tmp
         assert sum(content != seeds[name] for _, content in made) > 15
 
 
+@pytest.mark.fleet
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMATS)
+def test_mutants_of_tables_do_no_harm(name: str, tmp_path: Path) -> None:
+    judge_number = format_judge(tmp_path, name, 2)
+    assert {n: problem for n in range(12) if (problem := judge_number(n).problem)} == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORMATS)
+def test_seeds_of_tables_are_sound_and_their_mutants_the_same_each_time(name: str, tmp_path: Path) -> None:
+    seeds = table_seeds(name, tmp_path)
+    for content in seeds:
+        path = tmp_path / f"drive.{FORMATS[name][0]}"
+        path.write_bytes(content)
+        assert called("inspect", path).returncode == 0
+    made = [table_mutant(name, seeds, 3, n, tmp_path / "canary") for n in range(20)]
+    assert sum(content not in seeds for content in made) > 15
+    if name != "mat73":  # HDF5 stores times of writing
+        assert made == [table_mutant(name, seeds, 3, n, tmp_path / "canary") for n in range(20)]
+
+
+def test_a_bomb_of_zeros_is_a_sound_stream() -> None:
+    assert zlib.decompress(zeros(3 << 20)) == bytes(3 << 20)
+
+
+def test_what_a_command_leaves_or_takes_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def harmful(command: str, log: str, *_: str, cwd: Path, env: dict[str, str], limit_s: float) -> outside.Process:
+        assert (command, Path(log).name, limit_s) == ("inspect", "drive.csv", 60.0)
+        (cwd / "formula_was_run").touch()
+        Path(env["TMPDIR"], "copy").touch()
+        return outside.Process(0, "Traceback", "Traceback", 61.0, 2 << 30, late=True, left=True)
+
+    monkeypatch.setattr("studies.torture.formats.measured", harmful)
+    problem = format_judge(tmp_path, "csv", 1)(1).problem
+    assert problem == "a traceback; more than 60 s; 2048 MiB; left a process; left formula_was_run; left copy"
+    assert not list((tmp_path / "cases").iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("script", "late", "left"), [("sleep 600 & exit 3", False, True), ("sleep 600", True, False)])
+def test_what_outlives_a_command_or_its_limit_is_ended(
+    script: str, late: bool, left: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def shell(*_: str, **options: object) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(["sh", "-c", script], start_new_session=True, **options)  # type: ignore[call-overload,no-any-return]
+
+    monkeypatch.setattr(outside, "start", shell)
+    monkeypatch.setattr(outside, "END_S", 0.5)
+    process = outside.measured(limit_s=1.0 if late else 600.0)
+    assert (process.late, process.left, process.code) == (late, left, -signal.SIGKILL if late else 3)
+
+
 def _case(folder: Path, number: int) -> Verdict:
     with (folder / "done").open("a") as file:
         file.write(f"{number}\n")
@@ -130,8 +189,8 @@ def test_what_counts_as_wrong(ended: Ended, wrong: bool) -> None:
 
 
 @pytest.mark.slow
-def test_a_large_process_does_not_put_its_memory_on_what_it_starts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outside, "LIMIT_BYTES", 1 << 40)
-    assert outside.measured("--version").peak_bytes > 0
-    monkeypatch.setattr(outside, "LIMIT_BYTES", 1)
-    assert outside.measured("--version").peak_bytes == 0  # this process is larger: nothing is known
+def test_the_memory_of_a_command_is_its_own() -> None:
+    kept = bytearray(b"x") * (1 << 30)
+    process = outside.measured("--version")
+    assert 10 << 20 < process.peak_bytes < len(kept)
+    assert not process.late and not process.left

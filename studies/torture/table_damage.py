@@ -1,0 +1,340 @@
+"""Damage for tables and CAN logs that knows their structure: links in circles, sizes, bombs, formulas, other files.
+
+A block that is new is put behind the others, and a link to another block is directed to it. HDF5 and Parquet files are
+changed by their own libraries.
+"""
+
+from __future__ import annotations
+
+import io
+import random
+import re
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from studies.torture.mutating import EDGES, TEXTS, damage_bytes
+from studies.torture.table_seeds import TOPICS
+
+#: Writes this file where a reader evaluates it.
+CALL = b"__import__('os').system('echo x > formula_was_run')"
+_FORMULAS = (
+    CALL + b"+X*1.0", b"X1*(" + CALL + b")", b"9**9**9**9", b"(" * 5000 + b"X" + b")" * 5000, b"X/0", b"X[10**9]",
+    b"sin(X)+Y", b"X.__class__.__mro__[1].__subclasses__()", b"(lambda: X)()",
+    b"X if X else open('formula_was_run', 'w')",
+)  # fmt: skip
+_CELLS = (
+    *TEXTS, b"nan", b"-nan(ind)", b"1e999", b"-1e308", b"5e-324", b"0x4f", b"1,5", b'"', b'"a\nb', b"\xe2\x88\x921",
+    b"9" * 400, b"1_000", b"inf", b"=" + CALL, b"2024-05-01T12:00:00+99:99", b"24:60:61", b"-",
+    b"9223372036854775808", b"#", b";", b"\t",
+)  # fmt: skip
+
+
+def zeros(size: int) -> bytes:
+    """Return a zlib stream of zeros (a multiple of 1 MiB), quickly: blocks that end with a full flush are equal."""
+    compressor = zlib.compressobj(9)
+    first, block = (compressor.compress(bytes(1 << 20)) + compressor.flush(zlib.Z_FULL_FLUSH) for _ in range(2))
+    return first + block * ((size >> 20) - 1) + b"\3\0" + struct.pack(">HH", size % 65_521, 1)
+
+
+def _bomb(rng: random.Random) -> tuple[int, bytes]:
+    size = 1 << rng.choice((20, 26, 30, 32))
+    return rng.choice((size, size, 1000, *EDGES)), zeros(size)
+
+
+def _put(data: bytearray, offset: int, width: int, value: int) -> None:
+    """Write a number where the file has room for it."""
+    if 0 <= offset <= len(data) - width:
+        data[offset : offset + width] = (value % (1 << (8 * width))).to_bytes(width, "little")
+
+
+def _number(data: bytes | bytearray, offset: int, width: int) -> int:
+    return int.from_bytes(data[offset : offset + width], "little")
+
+
+def _fields(data: bytearray, places: Sequence[tuple[int, int]], rng: random.Random, blocks: Sequence[int] = ()) -> None:
+    """Change up to four numbers, given as offset and width in bytes, to an edge, a step or the address of a block."""
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        offset, width = rng.choice(places)
+        value = _number(data, offset, width)
+        near = (value - 1, value + 1, 8 * value, -value, 0, 0, len(data), len(data) - 8)
+        _put(data, offset, width, rng.choice(blocks if blocks and rng.random() < 0.4 else (*EDGES, *near)))
+
+
+def damage_text(content: bytes, rng: random.Random) -> bytes:
+    """Change cells and lines, also to millions of delimiters or characters."""
+    lines = content.split(b"\n")
+    for _ in range(rng.choice((1, 1, 2, 5))):
+        i = rng.choice((rng.randrange(len(lines)), rng.randrange(min(len(lines), 20))))
+        cells = re.split(rb"([,; \t]+)", lines[i])
+        match rng.randrange(9):
+            case 0 | 1 | 2:
+                cells[rng.randrange(len(cells))] = rng.choice(_CELLS)
+                lines[i] = b"".join(cells)
+            case 3:
+                del lines[i : i + rng.choice((1, 1, 40))]
+                lines.append(b"")
+            case 4:
+                lines[i:i] = [lines[i]] * rng.choice((1, 100, 200_000))
+            case 5:
+                lines.insert(i, lines.pop(rng.randrange(len(lines))))
+            case 6:
+                lines[i] = rng.choice((b",", b";", b" ", b"\t", b'"', b"9", b"\0", b"a,")) * 10 ** rng.randrange(3, 8)
+            case 7:
+                lines[i] = b"".join(cells[: rng.randrange(len(cells))])
+            case _:
+                lines[i:i] = [rng.choice((b",", b";", b"")) * 5000] * rng.choice((10, 2000))
+    changed = b"\n".join(lines)
+    match rng.randrange(20):
+        case 0:
+            return changed.decode("latin-1").encode(rng.choice(("utf-16", "utf-32", "utf-8-sig", "utf-7")))
+        case 1:
+            return changed.replace(b"\n", rng.choice((b"\r", b"\r\n", b"\n\n", b"\0\n")))
+    return changed
+
+
+def damage_mdf4(content: bytes, rng: random.Random) -> bytes:
+    """Change sizes, links and fields of blocks; add formulas and blocks of data that unfold."""
+    data = bytearray(content)
+    blocks = [m.start() for m in re.finditer(rb"##[A-Z]{2}\0{4}", content) if not m.start() % 8]
+    block = rng.choice(blocks)
+    first = [(block + 8 * i, 8) for i in (1, 2, 3, 3, 4, 4, 5, 6, 7)]
+    _fields(data, [*first, *((block + rng.randrange(24, 160), rng.choice((1, 2, 4))) for _ in first)], rng, blocks)
+    if rng.random() < 0.1:
+        data[:8] = b"UnFinMF "
+        _put(data, 60, 2, rng.choice((1, 2, 3, 4, 0xFFFF, 0)))
+    kind, link, make = rng.choice(((b"CN", 4, _formula4), (b"DG", 2, _data4)))
+    if (holders := [b for b in blocks if content[b + 2 : b + 4] == kind]) and rng.random() < 0.4:
+        data += bytes(-len(data) % 8)
+        _put(data, rng.choice(holders) + 24 + 8 * link, 8, len(data))
+        data += make(len(data), rng)
+    return bytes(data)
+
+
+def _block4(kind: bytes, links: Sequence[int], body: bytes) -> bytes:
+    size = 24 + 8 * len(links) + len(body)
+    block = struct.pack(f"<2s2s4xQQ{len(links)}Q", b"##", kind, size, len(links), *links) + body
+    return block + bytes(-size % 8)
+
+
+def _formula4(new: int, rng: random.Random) -> bytes:
+    body = struct.pack("<BBHHHdd", rng.choice((3, 3, 3, 4, 7, 11)), 0, 0, 0, rng.choice((0, 0, 7, 65535)), 0.0, 1.0)
+    conversion = _block4(b"CC", (0, 0, 0, 0, new + 24 + 40 + len(body)), body)
+    _put(head := bytearray(conversion), 24 + 32, 8, new + len(conversion))
+    return bytes(head) + _block4(b"TX", (), rng.choice(_FORMULAS) + b"\0")
+
+
+def _data4(_: int, rng: random.Random) -> bytes:
+    size, packed = _bomb(rng)
+    head = struct.pack("<2sBxIQQ", b"DT", rng.choice((0, 0, 1)), rng.choice((0, 1, 48, 2**32 - 1)), size, len(packed))
+    return _block4(b"DZ", (), head + packed)
+
+
+#: Links at the begin of the blocks of MDF 3.
+_LINKS3 = {b"HD": 3, b"DG": 4, b"CG": 3, b"CN": 5}
+
+
+def damage_mdf3(content: bytes, rng: random.Random) -> bytes:
+    """Change sizes, links and fields of blocks; add formulas."""
+    data, blocks, waiting = bytearray(content), [], [64]
+    while waiting:
+        at = waiting.pop()
+        if at in blocks or not content[at : at + 2].isalpha():
+            continue
+        blocks.append(at)
+        waiting += [_number(content, at + 4 + 4 * i, 4) for i in range(_LINKS3.get(content[at : at + 2], 0))]
+    block = rng.choice(blocks)
+    places = [(block + 2, 2), *((block + 4 + 4 * i, 4) for i in range(6))]
+    _fields(data, [*places, *((block + rng.randrange(2, 120), rng.choice((1, 2, 4))) for _ in places)], rng, blocks)
+    if rng.random() < 0.3:
+        _put(data, rng.choice([b for b in blocks if content[b : b + 2] == b"CN"]) + 8, 4, len(data))
+        kind, text = rng.choice((10, 10, 10, 11, 12, 65_535)), rng.choice(_FORMULAS)[:4000]
+        head = struct.pack("<2sHHdd20sHH", b"CC", 46 + 256, 0, 0.0, 0.0, b"m/s", kind, rng.choice((256, 65535, 0)))
+        data += head + text.ljust(256, b"\0")
+    return bytes(data)
+
+
+def damage_blf(content: bytes, rng: random.Random) -> bytes:
+    """Change objects inside compressed containers, and sizes and data of the containers."""
+    head = bytearray(content[: _number(content, 4, 4)])
+    parts, at = [], len(head)
+    while content[at : at + 4] == b"LOBJ":
+        size = _number(content, at + 8, 4)
+        parts.append(bytearray(zlib.decompress(content[at + 32 : at + size])))
+        at += size + size % 4
+    for part in parts:
+        at = rng.choice([m.start() for m in re.finditer(b"LOBJ", part)])
+        _fields(part, [(at + 4, 2), *((at + 4 * i, 4) for i in (2, 2, *range(2, 16)))], rng)
+    if rng.random() < 0.3:
+        _fields(head, [(4 * i, 4) for i in range(1, 18)], rng)
+    body = b""
+    for part in parts * rng.choice((1, 1, 1, 3)):
+        size, packed = (len(part), zlib.compress(part)) if rng.random() < 0.9 else _bomb(rng)
+        container = bytearray(struct.pack("<4sHHIIH6xI4x", b"LOBJ", 16, 1, 32 + len(packed), 10, 2, size % 2**32))
+        if rng.random() < 0.3:
+            _fields(container, ((4, 2), (8, 4), (12, 4), (16, 2), (24, 4)), rng)
+        body += container + packed + bytes(len(packed) % 4)
+    return bytes(head) + body
+
+
+def damage_mat(content: bytes, rng: random.Random) -> bytes:
+    """Change tags and sizes inside of compressed elements, nest them, or let them unfold."""
+    out, at = bytearray(content[:128]), 128
+    while at + 8 <= len(content):
+        size = _number(content, at + 4, 4)
+        element = bytearray(content[at : at + 8 + size])
+        at += 8 + size
+        if rng.random() < 0.5:
+            _fields(element, [(4 * i, 4) for i in range(rng.choice((16, 100, len(element) // 4)))], rng)
+        if rng.random() < 0.1:
+            element = bytearray(_nested(bytes(element), rng.choice((2, 40, 1000, 5000))))
+        packed = zlib.compress(element) if rng.random() < 0.9 else _bomb(rng)[1]
+        if rng.random() < 0.1:
+            element[16:32] = struct.pack("<IIII", 6, 8, rng.choice((1, 6, 9, 13, 255)), 0)
+        if rng.random() < 0.1:
+            out += element
+        else:
+            claimed = len(packed) if rng.random() < 0.9 else rng.choice(EDGES) % 2**32
+            out += struct.pack("<II", 15, claimed) + packed
+    return bytes(out)
+
+
+def _nested(element: bytes, levels: int) -> bytes:
+    head = struct.pack("<IIIIIIiiII", 6, 8, 1, 0, 5, 8, 1, 1, 1, 0)
+    heads = [struct.pack("<II", 14, len(element) + 48 * k - 8 + len(head)) + head for k in range(levels, 0, -1)]
+    return b"".join(heads) + element
+
+
+def damage_hdf5(content: bytes, rng: random.Random, canary: Path) -> bytes:
+    """Change signed blocks and addresses, or add external, cyclic, huge and unusual objects."""
+    import h5py
+
+    if rng.random() < 0.3:
+        data = bytearray(content)
+        blocks = [m.start() for m in re.finditer(rb"TREE|SNOD|HEAP|OHDR|\x89HDF|\x08\0\x17\0|\x01\0\x01\0", content)]
+        block = rng.choice(blocks)
+        places = [(block + width * rng.randrange(96 // width), width) for width in (1, 2, 4, 8, 8)]
+        _fields(data, places, rng, [b - 512 for b in blocks])
+        return bytes(data)
+    file = io.BytesIO(content)
+    with h5py.File(file, "r+") as target:
+        car = rng.choice((target, target["car"]))
+        for _ in range(rng.choice((1, 1, 3))):
+            name = rng.choice((rng.choice(list(car)), f"more {rng.random()}"))
+            if name in car:
+                del car[name]
+            rng.choice(_HDF5)(car, name, rng, canary)
+    return content[:512] + file.getvalue()[512:]
+
+
+def _many_groups(car: Any, name: str, rng: random.Random, _: Path) -> None:
+    car["/".join([name] * rng.choice((20, 2000)))] = np.arange(3.0)
+
+
+def _virtual(car: Any, name: str, rng: random.Random, canary: Path) -> None:
+    import h5py
+
+    layout = h5py.VirtualLayout((1, rng.choice((150, 1 << 40))), "f8")
+    layout[:, :150] = h5py.VirtualSource(rng.choice((f"{canary}.h5", ".")), rng.choice(("x", f"car/{name}")), (1, 150))
+    car.create_virtual_dataset(name, layout)
+
+
+def _huge(car: Any, name: str, rng: random.Random, _: Path) -> None:
+    size = 1 << rng.choice((20, 25, 31, 33, 40, 60))
+    filters = rng.choice(({}, {"compression": "gzip"}, {"compression": "lzf"}, {"shuffle": True}))
+    shape = rng.choice(((1, size), (size, 1), (size,), (size // 64, 64), (16, 16, size // 256)))
+    chunks = tuple(min(n, 1 << rng.choice((8, 9))) for n in shape)
+    values = car.create_dataset(name, shape, rng.choice(("f8", "f4", "i8")), chunks=chunks, **filters)
+    if size == 1 << 20:
+        values[:] = np.zeros(shape, values.dtype)
+
+
+def _odd(car: Any, name: str, rng: random.Random, _: Path) -> None:
+    import h5py
+
+    odd: tuple[Any, ...] = (
+        h5py.Empty("f8"), np.array("x" * 100_000, dtype=h5py.string_dtype()), np.zeros((1, 150), "c16"),
+        np.float16(1.0), np.zeros((1, 150), [("a", "f8"), ("b", "S9")]),
+        np.array([["a"] * 150], dtype=h5py.string_dtype()), np.zeros((0, 150)), np.zeros((1,) * 30 + (150,)),
+        np.full((1, 150), np.nan), np.array([car.ref] * 150, h5py.ref_dtype),
+    )  # fmt: skip
+    car[name] = rng.choice(odd)
+    about = (("MATLAB_class", b"cell"), ("MATLAB_class", 3.0), ("MATLAB_empty", 1), ("unit", "x" * 60_000))
+    car[name].attrs.update([rng.choice(about)])
+
+
+def _link(car: Any, name: str, rng: random.Random, canary: Path) -> None:
+    import h5py
+
+    soft = [h5py.SoftLink(path) for path in (f"{car.name}/{name}", "/car")]
+    files = [h5py.ExternalLink(*target) for target in ((f"{canary}.h5", "/x"), (".", "/"), ("/dev/zero", "/"))]
+    car[name] = rng.choice((*soft, *files, car, car.parent))
+
+
+def _external(car: Any, name: str, rng: random.Random, canary: Path) -> None:
+    files = ((str(canary), 0, 1200), ("../canary", 0, 1200), ("/dev/zero", 0, 1 << 40), ("formula_was_run", 0, 1200))
+    car.create_dataset(name, (1, 150), "f8", external=[rng.choice(files)])
+
+
+_HDF5: tuple[Callable[..., None], ...] = (_many_groups, _virtual, _huge, _odd, _link, _external)
+
+
+def damage_parquet(content: bytes, rng: random.Random) -> bytes:
+    """Change the metadata at the end and heads of pages, or write columns of few bytes and many rows."""
+    if rng.random() < 0.4:
+        data = bytearray(content)
+        size = _number(content, len(content) - 8, 4)
+        for _ in range(rng.choice((1, 1, 3))):
+            offset = rng.choice((4, len(data) - 8 - size, len(data) - 8 - size)) + rng.randrange(min(size, 200))
+            data[offset : offset + 1] = rng.choice((b"\xff\xff\xff\xff\x07", b"\0", b"\x80\x80\x01", rng.randbytes(1)))
+        footer = len(data) - len(content) + size
+        _put(data, len(data) - 8, 4, footer if rng.random() < 0.9 else rng.choice(EDGES))
+        return bytes(data)
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows = rng.choice((150, 150, 150, 300_000))
+    columns: dict[str, Any] = {k: np.resize(v, rows) for topic in TOPICS for k, v in topic.fields.items()}
+    columns |= {"time": TOPICS[0].stamps_ns[0] + 20_000_000 * np.arange(rows)} if rng.random() < 0.8 else {}
+    for k in range(rng.choice((1, 1, 30))):
+        columns[rng.choice(TEXTS).decode(errors="replace") + str(k)] = (
+            _arrow_values(rng) if rows == 150 else pa.repeat(1.0, rows)
+        )
+    table = pa.concat_tables([pa.table(columns)] * rng.choice((1, 1, 3)))
+    pq.write_table(table, file := io.BytesIO(), compression=rng.choice(("none", "gzip", "zstd", "snappy")))
+    return file.getvalue()
+
+
+def _arrow_values(rng: random.Random) -> Any:
+    import pyarrow as pa
+
+    text = rng.choice(_CELLS).decode(errors="replace")
+    value, kind = rng.choice((
+        (0.0, pa.float64()), (text, pa.string()), ([1.0, None], pa.list_(pa.float64())), (None, pa.null()),
+        (b"x" * 99, pa.binary()), ({"a": {"b": 1.0}}, pa.struct([("a", pa.struct([("b", pa.float64())]))])),
+        (2**62, pa.timestamp("ns")), (5, pa.decimal128(38, 9)), ([("k", 1.0)], pa.map_(pa.string(), pa.float64())),
+        (2**62, pa.duration("ms")), (True, pa.bool_()), (1, pa.date32()),
+    ))  # fmt: skip
+    column = pa.repeat(pa.scalar(value, kind), 150)
+    return column.dictionary_encode() if rng.random() < 0.2 and kind == pa.string() else column
+
+
+_DAMAGE: dict[str, Callable[..., bytes]] = {
+    "parquet": damage_parquet, "mat5": damage_mat, "mdf3": damage_mdf3, "mdf4": damage_mdf4, "blf": damage_blf,
+}  # fmt: skip
+
+
+def table_mutant(name: str, seeds: Sequence[bytes], seed: int, number: int, canary: Path) -> bytes:
+    """Return the damaged file of a format, the same for the same numbers."""
+    rng = random.Random(f"{seed} {name} {number}")
+    content = seeds[number % len(seeds)]
+    if rng.random() < 0.2:
+        return damage_bytes(content, rng)
+    damage = partial(damage_hdf5, canary=canary) if name == "mat73" else _DAMAGE.get(name, damage_text)
+    changed = damage(content, rng)
+    return damage_bytes(changed, rng) if rng.random() < 0.1 else changed
