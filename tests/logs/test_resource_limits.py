@@ -22,6 +22,8 @@ MIB = 1 << 20
         ("schema_leaves", 5000, 1_000_000),
         ("schema_depth", 16, 200),
         ("array_width", 40_000, 10_000_000),
+        ("table_bytes", 100 * MIB, 2048 * MIB),
+        ("table_ratio", 16, 1000),
         ("seconds", 3.0, 60.0),
         ("seconds_per_mib", 10.0, 200.0),
     ],
@@ -54,6 +56,15 @@ def test_small_parts_may_unfold_as_they_like(size: int, stored: int, limit: str 
     else:
         with pytest.raises(LimitError, match=limit):
             DEFAULT_LIMITS.check_unpacked(size, stored, "a chunk")
+
+
+@pytest.mark.parametrize(("size", "stored", "is_sound"), [(100, 1, True), (600, 1, False), (600, 20, True)])
+def test_tables_may_be_as_large_as_their_file_gives_reason_for(size: int, stored: int, is_sound: bool) -> None:
+    if is_sound:
+        DEFAULT_LIMITS.check_table(size * MIB, stored * MIB, "a file")
+    else:
+        with pytest.raises(LimitError, match="table bytes"):
+            DEFAULT_LIMITS.check_table(size * MIB, stored * MIB, "a file")
 
 
 @pytest.mark.parametrize(
