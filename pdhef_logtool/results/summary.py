@@ -11,7 +11,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pdhef_logtool.results.drive_rows import independent_figures
 from pdhef_logtool.results.fleet import ANSWER, JUDGED, Failures, grouped
 from pdhef_logtool.results.opened_run import OpenedRun
 
@@ -76,7 +75,7 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
     """Return the summary of a run; raises OutputError where metrics.parquet is damaged."""
     import polars as pl
 
-    errors = independent_figures(run, JUDGED, "rmse")
+    errors = _independent_figures(run, JUDGED, "rmse")
     answers = errors.filter(pl.col("estimator") == pl.col("main"))
     error_rows = [ErrorsOf(ANSWER, *_spread(answers))] if answers.height else []
     for name in _RIVALS:
@@ -98,6 +97,24 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
         checks_failed=tuple(checks_failed),
         plan=run.document.get("plan"),
     )
+
+
+def _independent_figures(run: OpenedRun, signal: str, metric: str) -> pl.DataFrame:
+    """Return log, estimator, value, unit and main (selected estimator) of a figure with independent ground truth.
+
+    Raises
+    ------
+    OutputError : metrics.parquet of the run is damaged.
+    """
+    import polars as pl
+
+    texts = {"log": pl.String, "main": pl.String}
+    mains = pl.DataFrame([(log.label, log.main()) for log in run.logs], schema=texts, orient="row")
+    rows = run.metrics().filter(pl.col("signal") == signal)
+    dependent = rows.filter(pl.col("metric") == "not_independent").select("log", "estimator")
+    scored = rows.filter(pl.col("metric") == metric, pl.col("segment") == "all", pl.col("value").is_finite())
+    scored = scored.select("log", "estimator", "value", "unit").join(dependent, on=["log", "estimator"], how="anti")
+    return scored.collect().join(mains, on="log").sort("log", "estimator")
 
 
 def _spread(errors: pl.DataFrame) -> tuple[int, float, float, float]:
