@@ -89,7 +89,7 @@ async def guarded_client(*, origin: str, **options: Any) -> Any:
     guard = RedirectGuard(origin)
     trace = aiohttp.TraceConfig()
     trace.on_request_redirect.append(guard.check_redirect)
-    connector = aiohttp.TCPConnector(resolver=guard)
+    connector = aiohttp.TCPConnector(resolver=guard)  # type: ignore[arg-type]  # its base would need aiohttp
     return aiohttp.ClientSession(connector=connector, trace_configs=[trace], **options)
 
 

@@ -14,8 +14,9 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iter
 from concurrent.futures import Future
 from contextlib import asynccontextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Lock
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 from pdhef_logtool.logs.byte_source import ByteSource, ChangedError, SourceError, read_at
 from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, guarded_client
@@ -39,17 +40,8 @@ _TEMPORARY = frozenset({408, 425, 429, 500, 502, 503, 504, 520, 521, 522, 523, 5
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(\d+)")
 
 
-class TemporaryError(Exception):
+class _TemporaryError(Exception):
     """The answer is incomplete; a new request may help."""
-
-
-class _Answer(NamedTuple):
-    """A response in transfer; ``size`` of the object (None: unknown), ``version``: its ETag or time of modification."""
-
-    size: int | None
-    version: str
-    start: int
-    blocks: AsyncIterator[bytes]
 
 
 class RemoteSource(ByteSource):
@@ -101,7 +93,8 @@ class _Copy:
 
     Attributes
     ----------
-    blocks : by number, the request that brings a block. users : sources that read it. failed : a request failed.
+    size, version : bytes of the object (None: not known yet), and its ETag or time of modification.
+    blocks : by number, the request that brings a block. users : sources that read it.
     """
 
     def __init__(self, place: RemotePlace, head_bytes: int) -> None:
@@ -109,16 +102,16 @@ class _Copy:
         self.size: int | None = None
         self.version = ""
         self.blocks: dict[int, Future[None]] = {}
-        self.users, self.failed = 0, False
+        self.users = 0
         self._lock = Lock()
         self._at_once = asyncio.Semaphore(AT_ONCE)
         folder = scratch_folder()
         self.path = Path(folder.name) / (place.name.replace("/", "_")[-80:] or "log")
         self._file = self.path.open("x+b", buffering=0)
-        weakref.finalize(self, lambda file: (file.close(), folder.cleanup()), self._file)
-        first = self._start(lambda: self._get(0, head_bytes))
+        weakref.finalize(self, _remove, self._file, folder)
+        first = self._start(self._get, 0, head_bytes)
         first.result()
-        if head_bytes >= BLOCK_BYTES or self.size == 0:
+        if head_bytes >= BLOCK_BYTES:
             self.blocks.setdefault(0, first)
 
     @property
@@ -129,18 +122,18 @@ class _Copy:
     def order(self, extents: Iterable[tuple[int, int]]) -> Collection[Future[None]]:
         """Start to fetch the missing blocks of some extents; return the requests that bring all blocks of them."""
         blocks = (range(start // BLOCK_BYTES, -(-end // BLOCK_BYTES)) for start, end in extents if end > start)
-        numbers = sorted({n for numbers in blocks for n in numbers})
+        wanted = sorted({n for numbers in blocks for n in numbers})
         with self._lock:
             runs: list[range] = []
-            for n in (n for n in numbers if n not in self.blocks):
+            for n in (n for n in wanted if n not in self.blocks):
                 if runs and n == runs[-1].stop and len(runs[-1]) * BLOCK_BYTES < MOST_RANGE_BYTES:
                     runs[-1] = range(runs[-1].start, n + 1)
                 else:
                     runs.append(range(n, n + 1))
             for run in runs:
-                start, end = run.start * BLOCK_BYTES, min(run.stop * BLOCK_BYTES, self.size or 0)
-                self.blocks |= dict.fromkeys(run, self._start(lambda start=start, end=end: self._get(start, end)))
-            return dict.fromkeys(self.blocks[n] for n in numbers)
+                request = self._start(self._get, run.start * BLOCK_BYTES, min(run.stop * BLOCK_BYTES, self.size or 0))
+                self.blocks |= dict.fromkeys(run, request)
+            return dict.fromkeys(self.blocks[n] for n in wanted)
 
     def wait(self, start: int, end: int) -> None:
         """Return when bytes [start, end) are in the file; raises SourceError if they cannot be fetched."""
@@ -163,7 +156,9 @@ class _Copy:
         return min(reached, end)
 
     def is_current(self) -> bool:
-        """Return whether the object is the one that was copied."""
+        """Return whether the object is the one that was copied, and no request for it has failed."""
+        if any(request.done() and request.exception() for request in set(self.blocks.values())):
+            return False
         try:
             self._start(self._compare).result()
         except ChangedError:
@@ -175,28 +170,25 @@ class _Copy:
         with self._lock:
             self.blocks = {n: request for n, request in self.blocks.items() if not request.cancel()}
 
-    def _start(self, request: Callable[[], Awaitable[None]]) -> Future[None]:
-        return asyncio.run_coroutine_threadsafe(_repeated(self.place, request, self._fail), self._system.loop)
-
-    def _fail(self) -> None:
-        self.failed = True
+    def _start(self, request: Callable[..., Awaitable[None]], *arguments: int) -> Future[None]:
+        return asyncio.run_coroutine_threadsafe(_repeated(self.place, request, *arguments), self._system.loop)
 
     async def _compare(self) -> None:
         async with self._ask(0, 1):
             pass
 
     async def _get(self, start: int, end: int) -> None:
-        async with self._at_once, self._ask(start, end) as answer:
-            position = answer.start
-            async for block in answer.blocks:
+        async with self._at_once, self._ask(start, end) as (size, first, blocks):
+            position = first
+            async for block in blocks:
                 self._write(position, block)
                 position += len(block)
-        size = position if answer.size is None else answer.size
+        size = position if size is None else size
         if position < min(end, size):
-            raise TemporaryError("an answer that is cut")
+            raise _TemporaryError("an answer that is cut")
         if self.size is None:
-            self.size, self.version = size, answer.version
-        if answer.start == 0 and position >= size > end:  # the server gives no ranges
+            self.size = size
+        if first == 0 and position >= size > end:  # the server gives no ranges
             done: Future[None] = Future()
             done.set_result(None)
             with self._lock:
@@ -211,42 +203,49 @@ class _Copy:
             raise _error(self.place, "no room for its bytes on this disk", "set TMPDIR to another") from None
 
     @asynccontextmanager
-    async def _ask(self, start: int, end: int) -> AsyncIterator[_Answer]:
-        """Request bytes [start, end) and compare the answer with the object's state; a server may send all bytes."""
-        place = self.place
+    async def _ask(self, start: int, end: int) -> AsyncIterator[tuple[int | None, int, AsyncIterator[bytes]]]:
+        """Request bytes [start, end); yield the object's size, the offset of the answer (0 for all bytes), and it."""
+        place, part = self.place, f"bytes={start}-{end - 1}"
         if place.scheme == "s3":
-            if self.size is None and (info := await self._system._info(f"{place.host}/{place.key}"))["size"] == 0:
-                yield _Answer(0, info["ETag"], 0, _nothing())
-                return
-            asked = {"Bucket": place.host, "Key": place.key, "Range": f"bytes={start}-{end - 1}"}
+            asked = {"Bucket": place.host, "Key": place.key, "Range": part}
+            if self.size is None and (await self._system._info(f"{place.host}/{place.key}"))["size"] == 0:
+                del asked["Range"]  # an empty object has none
             response = await self._system._call_s3("get_object", **asked)
             async with response["Body"] as body:
-                head = {"Content-Range": response.get("ContentRange", ""), "ETag": response["ETag"]}
-                head["Content-Length"] = response["ContentLength"]
-                yield self._compared(head, body.iter_chunks(1 << 20))
+                head = {"Content-Length": response["ContentLength"], "ETag": response["ETag"]}
+                head["Content-Range"] = response.get("ContentRange", "")
+                yield *self._compared(head), body.iter_chunks(1 << 20)
             return
-        headers = {"Range": f"bytes={start}-{end - 1}", "Accept-Encoding": "identity"}
+        headers = {"Range": part, "Accept-Encoding": "identity"}
         session = await self._system.set_session()
         async with session.get(self._system.encode_url(place.url), headers=headers) as response:
-            if self.size is None and response.status == 416:  # an empty object has no range
-                yield _Answer(0, response.headers.get("ETag", ""), 0, _nothing())
+            if response.status == 416 and response.headers.get("Content-Range") == "bytes */0":
+                async with session.get(self._system.encode_url(place.url)) as empty:
+                    yield *self._compared(empty.headers), empty.content.iter_chunked(1 << 20)
                 return
             _check_status(response.status)
-            yield self._compared(response.headers, response.content.iter_chunked(1 << 20))
+            yield *self._compared(response.headers), response.content.iter_chunked(1 << 20)
 
-    def _compared(self, head: Mapping[str, Any], blocks: AsyncIterator[bytes]) -> _Answer:
+    def _compared(self, head: Mapping[str, Any]) -> tuple[int | None, int]:
+        """Return size and offset of an answer; raises ChangedError if the object is not the one that was opened."""
         part = _CONTENT_RANGE.match(str(head.get("Content-Range", "")))
         length = part[2] if part else head.get("Content-Length")
         size, version = None if length is None else int(length), head.get("ETag") or head.get("Last-Modified") or ""
-        known = self.version if version else version  # an answer without both does not differ
-        if self.size is not None and (version != known or size not in (None, self.size)):
+        if self.size is None:
+            self.version = version
+        elif version not in ("", self.version) or size not in (None, self.size):
             raise ChangedError(
                 expected="the object that was opened",
                 got="another one (its size, ETag or time of modification differs)",
                 where=str(self.place),
                 remedy="run again when nothing writes to it any more",
             )
-        return _Answer(size, version, int(part[1]) if part else 0, blocks)
+        return size, int(part[1]) if part else 0
+
+
+def _remove(file: BinaryIO, folder: TemporaryDirectory[str]) -> None:
+    file.close()
+    folder.cleanup()
 
 
 def identity_of_object(place: RemotePlace) -> str:
@@ -257,26 +256,21 @@ def identity_of_object(place: RemotePlace) -> str:
 def keys_below(prefix: RemotePlace) -> list[str]:
     """Return the keys of all objects of a store that begin with a prefix; raises SourceError."""
     system = _file_system(prefix)
-
-    async def listed() -> list[str]:
-        paths = await system._find(f"{prefix.host}/{prefix.key}".rstrip("/"))
-        return [path.removeprefix(f"{prefix.host}/") for path in paths]
-
-    return asyncio.run_coroutine_threadsafe(_repeated(prefix, listed), system.loop).result()
+    listed = _repeated(prefix, system._find, f"{prefix.host}/{prefix.key}".rstrip("/"))
+    paths: list[str] = asyncio.run_coroutine_threadsafe(listed, system.loop).result()
+    return [path.removeprefix(f"{prefix.host}/") for path in paths]
 
 
-async def _repeated(place: RemotePlace, once: Callable[[], Awaitable[T]], fail: Callable[[], None] = lambda: None) -> T:
+async def _repeated(place: RemotePlace, request: Callable[..., Awaitable[T]], *arguments: object) -> T:
     """Return the result of a request, which is repeated after a temporary failure; raises SourceError."""
     for wait_s in (*WAITS_S, None):
         try:
-            return await once()
+            return await request(*arguments)
         except SourceError:
-            fail()
             raise
         except Exception as error:  # noqa: BLE001 (of any library; it becomes one line)
             got, remedy, temporary = _words_of(error)
             if wait_s is None or not temporary:
-                fail()
                 tries = f", {len(WAITS_S) + 1} times in turn" if temporary else ""
                 expected = "a server that answers" if temporary else "an object that can be read"
                 raise _error(place, f"{got}{tries}", remedy, expected) from None
@@ -299,7 +293,7 @@ def _words_of(error: Exception) -> tuple[str, str, bool]:
         return "a server without a valid certificate", "check the URL", False
     if isinstance(error, aiohttp.InvalidURL | aiohttp.NonHttpUrlClientError | aiohttp.TooManyRedirects | ValueError):
         return "a URL that cannot be requested", "check the URL", False
-    if isinstance(error, TemporaryError):
+    if isinstance(error, _TemporaryError):
         return str(error), "try again later", True
     if isinstance(error, aiohttp.ClientPayloadError):
         return "an answer that is cut", "try again later", True
@@ -314,18 +308,13 @@ def _words_of(error: Exception) -> tuple[str, str, bool]:
 def _check_status(status: int) -> None:
     """Raise the error of a status without content."""
     if status in _TEMPORARY:
-        raise TemporaryError(f"status {status}")
+        raise _TemporaryError(f"status {status}")
     if status in (401, 403, 407):
         raise PermissionError(f"status {status}")
     if status in (404, 410):
         raise FileNotFoundError(f"status {status}")
     if status not in (200, 206):
         raise OSError(f"status {status}")
-
-
-async def _nothing() -> AsyncIterator[bytes]:
-    for block in ():
-        yield block
 
 
 def _file_system(place: RemotePlace) -> Any:
@@ -370,8 +359,6 @@ def _release(copy: _Copy) -> None:
         if copy.users:
             return
         copy.cancel()
-        if copy.failed and _copies.get(copy.place) is copy:
-            del _copies[copy.place]
         idle = [c for c in _copies.values() if not c.users]
         while len(idle) > KEPT_COPIES or sum(len(c.blocks) for c in idle) * BLOCK_BYTES > KEPT_BYTES:
             del _copies[idle.pop(0).place]
