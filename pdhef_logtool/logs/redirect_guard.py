@@ -83,7 +83,7 @@ class RedirectGuard:
 
 
 async def guarded_client(*, origin: str, **options: Any) -> Any:
-    """Return a session for a server whose redirects are checked; ``options`` are those of aiohttp."""
+    """Return a session of aiohttp that checks redirects of a server."""
     import aiohttp
 
     guard = RedirectGuard(origin)

@@ -41,7 +41,7 @@ _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(\d+)")
 
 
 class _TemporaryError(Exception):
-    """The answer is incomplete; a new request may help."""
+    """The response is incomplete; a new request may help."""
 
 
 class RemoteSource(ByteSource):
@@ -116,7 +116,7 @@ class _Copy:
 
     @property
     def identity(self) -> str:
-        """Hash of the URL without what gives access to it, of the size, and of ETag or time of modification."""
+        """Hash of the URL without access tokens, of the size, and of ETag or time of modification."""
         return hashlib.sha256("\0".join((self.place.identity, str(self.size), self.version)).encode()).hexdigest()
 
     def order(self, extents: Iterable[tuple[int, int]]) -> Collection[Future[None]]:
@@ -204,12 +204,12 @@ class _Copy:
 
     @asynccontextmanager
     async def _ask(self, start: int, end: int) -> AsyncIterator[tuple[int | None, int, AsyncIterator[bytes]]]:
-        """Request bytes [start, end); yield the object's size, the offset of the answer (0 for all bytes), and it."""
+        """Request bytes [start, end); yield object size, offset of the response (0: all bytes) and its blocks."""
         place, part = self.place, f"bytes={start}-{end - 1}"
         if place.scheme == "s3":
             asked = {"Bucket": place.host, "Key": place.key, "Range": part}
             if self.size is None and (await self._system._info(f"{place.host}/{place.key}"))["size"] == 0:
-                del asked["Range"]  # an empty object has none
+                del asked["Range"]  # an empty object has no range
             response = await self._system._call_s3("get_object", **asked)
             async with response["Body"] as body:
                 head = {"Content-Length": response["ContentLength"], "ETag": response["ETag"]}
@@ -238,7 +238,7 @@ class _Copy:
                 expected="the object that was opened",
                 got="another one (its size, ETag or time of modification differs)",
                 where=str(self.place),
-                remedy="run again when nothing writes to it any more",
+                remedy="run again when the object no longer changes",
             )
         return size, int(part[1]) if part else 0
 
@@ -283,7 +283,7 @@ def _error(place: RemotePlace, got: str, remedy: str, expected: str = "an object
 
 
 def _words_of(error: Exception) -> tuple[str, str, bool]:
-    """Return what went wrong, a remedy, and whether a new request may help; texts of aiohttp can contain the URL."""
+    """Return cause, remedy, and whether a new request may help. The texts of aiohttp can contain the URL."""
     import aiohttp
 
     if isinstance(error, PrivateRedirectError):

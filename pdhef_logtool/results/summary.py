@@ -1,6 +1,6 @@
-"""A run of many logs in a few lines: how large the errors are, which drives are worst, and what failed.
+"""Summary of a run of many logs: distribution of errors, drives with the largest errors, and failures.
 
-Only the figures of sideslip are read, as columns: what a drive costs here is some bytes.
+Only the figures of sideslip are read, as columns, so that a drive takes some bytes of memory.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from pdhef_logtool.results.opened_run import OpenedRun
 if TYPE_CHECKING:
     import polars as pl
 
-#: Drives that are named as the worst, and estimators that are given beside the selected estimate.
+#: Number of drives with the largest errors, and estimators that are listed beside the selected estimate.
 WORST = 10
 _RIVALS = ("physics", "zero")
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorsOf:
-    """RMSE of sideslip in rad of one estimator over drives whose ground truth is independent of it."""
+    """RMSE of sideslip in rad of one estimator over drives with independent ground truth."""
 
     estimator: str
     drives: int
@@ -35,7 +35,7 @@ class ErrorsOf:
 
 @dataclass(frozen=True, slots=True)
 class WorstDrive:
-    """A drive with a large error: RMSE of sideslip in rad by estimator, that of the selected estimate first."""
+    """A drive with a large error: RMSE of sideslip in rad by estimator, the selected estimate first."""
 
     log: str
     main: str
@@ -44,12 +44,12 @@ class WorstDrive:
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """What a run of many logs is given as.
+    """Summary of a run of many logs.
 
     Attributes
     ----------
     output : folder or URL. exit_code : of the run. logs, done, lost : logs, those with figures, those with input lost.
-    scored : drives whose answer is scored. remaining : logs that are not done. checks_failed : logs with failed checks
+    scored : drives with a scored selected estimate. remaining : logs that are not done. checks_failed : logs with failed checks
         that count.
     """
 

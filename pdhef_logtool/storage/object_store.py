@@ -22,13 +22,12 @@ from pdhef_logtool.storage.files import scratch_folder
 from pdhef_logtool.storage.outputs import LOCK_FILE
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://.")
-#: Stores whose objects appear when they are complete.
+#: Schemes of object stores: their objects appear when they are complete.
 _STORES = frozenset({"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "memory"})
 #: A lock that was not renewed for this time is left over. Stores refuse clocks that differ by more than 15 minutes.
 LEFT_OVER_S = 1800.0
 #: Timeouts and retries of S3, by botocore with growing waits.
-_RETRIES = {"mode": "standard", "total_max_attempts": 5}
-_S3_CLIENT: dict[str, Any] = {"connect_timeout": 15.0, "read_timeout": 60.0, "retries": _RETRIES}
+_S3_CLIENT = {"connect_timeout": 15, "read_timeout": 60, "retries": {"mode": "standard", "total_max_attempts": 5}}
 _AT_ONCE = 16
 _CREDENTIALS = "give credentials that permit this, by the environment: docs/remote.md"
 
@@ -44,7 +43,7 @@ def is_url(place: Path | str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class ObjectFolder:
-    """The objects below a URL of what fsspec can write to, by their names there: ``logs/drive/report.json``."""
+    """The objects below a URL of an object store, by their relative names: ``logs/drive/report.json``."""
 
     url: str
 
@@ -69,7 +68,7 @@ class ObjectFolder:
         return sorted(path.lstrip("/").removeprefix(f"{root.lstrip('/')}/") for path in paths)
 
     def get(self, name: str, to: Path) -> bool:
-        """Copy an object to a file; False where there is none."""
+        """Copy an object to a file; False if it does not exist."""
         with self._asking(name):
             store, root = self._store()
             try:
@@ -92,7 +91,7 @@ class ObjectFolder:
                 store.get([f"{root}/{name}" for name in names], [str(folder / name) for name in names])
 
     def put(self, name: str, path: Path) -> None:
-        """Copy a file to an object, in place of what it was."""
+        """Copy a file to an object, which is replaced."""
         with self._asking(name):
             store, root = self._store()
             store.put_file(str(path), f"{root}/{name}")
@@ -110,9 +109,9 @@ class ObjectFolder:
                 list(several.map(remove_one, gone))
 
     def acquire(self) -> None:
-        """Lock the folder by an object that is created only if there is none; raises OutputError if it is locked.
+        """Create the lock object of the folder; raises OutputError if another command has locked it.
 
-        That of a command that has ended here, or has not renewed it for long, is replaced.
+        The lock of a command that has ended on this machine, or has not renewed it for long, is replaced.
         """
         with self._asking():
             store, root = self._store()
@@ -140,7 +139,7 @@ class ObjectFolder:
             store.pipe_file(f"{root}/{LOCK_FILE}", process_name().encode())
 
     def release(self) -> None:
-        """Release the lock; harmless if there is none."""
+        """Release the lock if this process has it."""
         with suppress(OutputError), self._asking():
             if self._holder() == process_name():
                 self.remove([LOCK_FILE])
@@ -191,7 +190,7 @@ class ObjectFolder:
 
     @contextmanager
     def _asking(self, name: str = "") -> Iterator[None]:
-        """Turn what goes wrong with the store into one line."""
+        """Convert the errors of a store to OutputError."""
         try:
             yield
         except (OutputError, UsageError):
@@ -204,7 +203,7 @@ class ObjectFolder:
 
 
 def words_of(error: Exception) -> tuple[str, str]:
-    """Return what went wrong with a store in one line without credentials, and a remedy."""
+    """Return the cause of an error in one line without credentials, and a remedy."""
     kind = type(error).__name__
     text = getattr(error, "strerror", None) or (error.args[0] if error.args else "") or kind
     line = str(text).partition("\n")[0].partition("?")[0][:200]
@@ -238,7 +237,7 @@ class Mirror:
         self.folder.mkdir()
 
     def fetch(self, name: str) -> Path | None:
-        """Return the local file of an object, fetched once; None if there is none."""
+        """Return the local file of an object, fetched once; None if it does not exist."""
         path = self.folder / name
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)
