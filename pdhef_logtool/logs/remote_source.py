@@ -16,7 +16,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO
 
 from pdhef_logtool.logs.byte_source import ByteSource, ChangedError, SourceError, read_at
 from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, guarded_client
@@ -24,8 +24,6 @@ from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.extras import required
 from pdhef_logtool.storage.files import scratch_folder
 from pdhef_logtool.storage.object_store import s3_system, words_of
-
-T = TypeVar("T")
 
 BLOCK_BYTES = 64 << 10
 MOST_RANGE_BYTES = 8 << 20
@@ -35,13 +33,7 @@ WAITS_S = (0.5, 1.0, 2.0, 4.0)
 CONNECT_S, SILENCE_S = 15.0, 30.0
 #: Copies of closed objects that are kept for the next opening, so that no pass over the same log fetches it again.
 KEPT_BYTES, KEPT_COPIES = 4 << 30, 100
-#: Temporary status codes: timeouts, too many requests, restarts.
-_TEMPORARY = frozenset({408, 425, 429, 500, 502, 503, 504, 520, 521, 522, 523, 524})
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(\d+)")
-
-
-class _TemporaryError(Exception):
-    """The response is incomplete; a new request may help."""
 
 
 class RemoteSource(ByteSource):
@@ -185,7 +177,7 @@ class _Copy:
                 position += len(block)
         size = position if size is None else size
         if position < min(end, size):
-            raise _TemporaryError("an answer that is cut")
+            raise ConnectionError("an answer that is cut")
         if self.size is None:
             self.size = size
         if first == 0 and position >= size > end:  # the server gives no ranges
@@ -261,7 +253,7 @@ def keys_below(prefix: RemotePlace) -> list[str]:
     return [path.removeprefix(f"{prefix.host}/") for path in paths]
 
 
-async def _repeated(place: RemotePlace, request: Callable[..., Awaitable[T]], *arguments: object) -> T:
+async def _repeated(place: RemotePlace, request: Callable[..., Awaitable[Any]], *arguments: object) -> Any:
     """Return the result of a request, which is repeated after a temporary failure; raises SourceError."""
     for wait_s in (*WAITS_S, None):
         try:
@@ -293,7 +285,7 @@ def _words_of(error: Exception) -> tuple[str, str, bool]:
         return "a server without a valid certificate", "check the URL", False
     if isinstance(error, aiohttp.InvalidURL | aiohttp.NonHttpUrlClientError | aiohttp.TooManyRedirects | ValueError):
         return "a URL that cannot be requested", "check the URL", False
-    if isinstance(error, _TemporaryError):
+    if isinstance(error, ConnectionError):
         return str(error), "try again later", True
     if isinstance(error, aiohttp.ClientPayloadError):
         return "an answer that is cut", "try again later", True
@@ -306,9 +298,9 @@ def _words_of(error: Exception) -> tuple[str, str, bool]:
 
 
 def _check_status(status: int) -> None:
-    """Raise the error of a status without content."""
-    if status in _TEMPORARY:
-        raise _TemporaryError(f"status {status}")
+    """Raise the error of a status without content; timeouts, too many requests and restarts are temporary."""
+    if status in (408, 425, 429) or status >= 500:
+        raise ConnectionError(f"status {status}")
     if status in (401, 403, 407):
         raise PermissionError(f"status {status}")
     if status in (404, 410):

@@ -49,8 +49,8 @@ class RunSummary:
     Attributes
     ----------
     output : folder or URL. exit_code : of the run. logs, done, lost : logs, those with figures, those with input lost.
-    scored : drives with a scored selected estimate. remaining : logs that are not done. checks_failed : logs with failed checks
-        that count.
+    scored : drives with a scored selected estimate. remaining : logs that are not done. checks_failed : logs with
+        failed checks that count.
     """
 
     output: Path | str
@@ -75,7 +75,7 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
     """Return the summary of a run; raises OutputError where metrics.parquet is damaged."""
     import polars as pl
 
-    errors = _independent_figures(run, JUDGED, "rmse")
+    errors = _independent_errors(run)
     answers = errors.filter(pl.col("estimator") == pl.col("main"))
     error_rows = [ErrorsOf(ANSWER, *_spread(answers))] if answers.height else []
     for name in _RIVALS:
@@ -99,8 +99,8 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
     )
 
 
-def _independent_figures(run: OpenedRun, signal: str, metric: str) -> pl.DataFrame:
-    """Return log, estimator, value, unit and main (selected estimator) of a figure with independent ground truth.
+def _independent_errors(run: OpenedRun) -> pl.DataFrame:
+    """Return log, estimator, RMSE (value) and main (selected estimator) of tracks with independent ground truth.
 
     Raises
     ------
@@ -110,10 +110,10 @@ def _independent_figures(run: OpenedRun, signal: str, metric: str) -> pl.DataFra
 
     texts = {"log": pl.String, "main": pl.String}
     mains = pl.DataFrame([(log.label, log.main()) for log in run.logs], schema=texts, orient="row")
-    rows = run.metrics().filter(pl.col("signal") == signal)
+    rows = run.metrics().filter(pl.col("signal") == JUDGED)
     dependent = rows.filter(pl.col("metric") == "not_independent").select("log", "estimator")
-    scored = rows.filter(pl.col("metric") == metric, pl.col("segment") == "all", pl.col("value").is_finite())
-    scored = scored.select("log", "estimator", "value", "unit").join(dependent, on=["log", "estimator"], how="anti")
+    scored = rows.filter(pl.col("metric") == "rmse", pl.col("segment") == "all", pl.col("value").is_finite())
+    scored = scored.select("log", "estimator", "value").join(dependent, on=["log", "estimator"], how="anti")
     return scored.collect().join(mains, on="log").sort("log", "estimator")
 
 

@@ -44,8 +44,9 @@ def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell)
         folder = Path(scratch) / task.output.name
         folder.mkdir()
         end = work(replace(task, output=folder), tell)
-        files = (p for p in folder.rglob("*") if p.is_file() and not _is_hidden(p.relative_to(folder)))
-        names = sorted((p.relative_to(folder).as_posix() for p in files), key=_order)
+        files = (p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+        # The report is last: it states that the drive is done.
+        names = sorted((n for n in files if "/." not in f"/{n}"), key=lambda n: (n.endswith(f"/{REPORT_FILE}"), n))
         here, report = f"{LOGS}/{task.log.stem}", f"{LOGS}/{task.log.stem}/{REPORT_FILE}"
         try:
             if report in names:
@@ -58,15 +59,6 @@ def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell)
             return error
         needed = [name for name in names if name == report or name.startswith(f"{PARTS}/")]
         return StoredEnd(end, tuple(names), {name: (folder / name).read_bytes() for name in needed})
-
-
-def _is_hidden(path: Path) -> bool:
-    return any(part.startswith(".") for part in path.parts)
-
-
-def _order(name: str) -> tuple[bool, str]:
-    """Sort the report last: it states that the drive is done."""
-    return name.endswith(f"/{REPORT_FILE}"), name
 
 
 class StoredOutput(Mirror):
@@ -162,7 +154,9 @@ class StoredOutput(Mirror):
     def begin(self) -> None:
         """Upload the journal of the start of the run; remove figures that it does not list."""
         self._put_journal()
-        self._remove_gone()
+        gone = sorted(name for name in self._own if not (self.folder / name).is_file())
+        self.objects.remove(gone)
+        self._own.difference_update(gone)
 
     def publish(self) -> None:
         """Upload figures, pages and run.json, and the journal last."""
@@ -174,13 +168,7 @@ class StoredOutput(Mirror):
                 name = path.relative_to(self.folder).as_posix()
                 self.objects.put(name, path)
                 self._see(name)
-        self._put_journal()
-        self._remove_gone()
-
-    def _remove_gone(self) -> None:
-        gone = sorted(name for name in self._own if not (self.folder / name).is_file())
-        self.objects.remove(gone)
-        self._own.difference_update(gone)
+        self.begin()
 
     def _put_journal(self) -> None:
         path = self.folder / JOURNAL_FILE

@@ -62,8 +62,7 @@ class ObjectFolder:
         """Return the names of all objects, ascending."""
         with self._asking():
             store, root = self._store()
-            store.invalidate_cache()
-            paths = store.find(root)
+                paths = store.find(root)
         # Some stores give paths a slash more than they take.
         return sorted(path.lstrip("/").removeprefix(f"{root.lstrip('/')}/") for path in paths)
 
@@ -71,14 +70,12 @@ class ObjectFolder:
         """Copy an object to a file; False if it does not exist."""
         with self._asking(name):
             store, root = self._store()
+            partial = to.with_name(f".{to.name}.partial")
             try:
-                store.get_file(f"{root}/{name}", str(to))
-            except BaseException as error:
-                with suppress(OSError):
-                    to.unlink(missing_ok=True)  # a part of it must not be taken for the object
-                if isinstance(error, FileNotFoundError):
-                    return False
-                raise
+                store.get_file(f"{root}/{name}", str(partial))
+            except FileNotFoundError:
+                return False
+            partial.replace(to)
         return True
 
     def get_all(self, names: Sequence[str], folder: Path) -> None:
@@ -156,7 +153,6 @@ class ObjectFolder:
             if is_alive(holder) is not None:
                 return not is_alive(holder)
         store, root = self._store()
-        store.invalidate_cache()
         renewed = store.modified(f"{root}/{LOCK_FILE}")
         return bool((datetime.now(UTC) - renewed.astimezone(UTC)).total_seconds() > LEFT_OVER_S)
 

@@ -100,7 +100,7 @@ def main() -> None:
         compiled = Path("pdhef_logtool/__pycache__/compiled")  # code of the same sources, which saves a minute
         if (ROOT / compiled).is_dir():
             (installed,) = (folder / "venv").glob("[Ll]ib/**/site-packages/pdhef_logtool")
-            shutil.copytree(ROOT / compiled, installed.parent / compiled)
+            shutil.copytree(ROOT / compiled, installed.parent / compiled, dirs_exist_ok=True)
         _do("logs", python, "-c", COPIES, ROOT / "sample_logs" / "step.mcap", logs, str(MANY), cwd=folder)
         pdhef = (python, "-m", "pdhef_logtool", "run")
         two = [logs / f"drive{n:02}.mcap" for n in range(2)]
