@@ -62,7 +62,7 @@ class ObjectFolder:
         """Return the names of all objects, ascending."""
         with self._asking():
             store, root = self._store()
-                paths = store.find(root)
+            paths = store.find(root)
         # Some stores give paths a slash more than they take.
         return sorted(path.lstrip("/").removeprefix(f"{root.lstrip('/')}/") for path in paths)
 
