@@ -12,6 +12,7 @@ import pytest
 OPTIONAL = ("aiobotocore", "aiohttp", "asammdf", "botocore", "h5py", "ray", "s3fs", "torch", "yarl")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("extras", "code"), [((), 0), (("train",), 1)])
 def test_every_module_imports_without_extras(extras: tuple[str, ...], code: int) -> None:
     without = f"import sys; sys.modules.update(dict.fromkeys({OPTIONAL!r}))"
