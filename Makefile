@@ -16,7 +16,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randomly-seed=$(ORDER_SEED))
 
 .PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions peers torture \
-  recalibrate retrain docs docs-truthsim paper strangers wheel release lock clean
+  recalibrate docs docs-truthsim paper strangers wheel release lock clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
@@ -32,7 +32,6 @@ help:
 	@echo "make bench    speed against peers"
 	@echo "make recalibrate  regenerate all that is derived: shipped cars and networks, evidence pages (hours; resumable)"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
-	@echo "make retrain LOGS=drives/ CAR=mycar OUT=folder  train the network of a car again, behind a gate (docs/retrain.md)"
 	@echo "make samples  write sample_logs/ anew with the simulator"
 	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
 	@echo "make peers    docs/peers.md: published sideslip estimators on the recorded drives in ../shared (three minutes)"
@@ -131,9 +130,6 @@ recalibrate: $(VENV)/installed-dev $(VENV)/compiled
 train-default: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.defaults.train_default
 	$(BIN)/python -m studies.model_card
-
-retrain: $(VENV)/installed-dev $(VENV)/compiled
-	$(BIN)/pdhef retrain $(LOGS) -o $(if $(filter out/demo,$(OUT)),out/retrain,$(OUT)) --car $(CAR) --jobs $(JOBS)
 
 # Without --quiet, which would hide the warnings that make it fail.
 docs: $(VENV)/installed-docs

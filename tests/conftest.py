@@ -4,20 +4,27 @@ Tests run in random order in several processes, and a process can get any part o
 what others see (environment, working directory, module attributes, signal handlers) by fixtures only, writes to
 ``tmp_path``, lets the system choose ports and takes an S3 bucket of its own (``tests/s3_store.py``). It calls the
 command line in its own process (``called`` in ``tests/command_line.py``) unless it is about processes: a start takes
-two seconds.
+two seconds. Limits in seconds only end a hang (minutes): another load of the machine must not reach them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
-from collections.abc import Generator
+import signal
+import sys
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
+
+hypothesis.settings.register_profile("any load", deadline=None)
+hypothesis.settings.load_profile("any load")
 
 
 @pytest.fixture(scope="session")
@@ -30,6 +37,41 @@ def shared_dir() -> Path:
 @pytest.fixture(scope="session")
 def sample_logs_dir() -> Path:
     return ROOT / "sample_logs"
+
+
+def pytest_configure() -> None:
+    """Restore SIGINT, which a shell without job control ignores in background commands and all their children."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _process_state() -> set[str]:
+    """Return what all tests of this process share, and its child processes where the system lists them.
+
+    The servers that fork readers of tables are kept on purpose, as their start takes a second.
+    """
+    readers = sys.modules.get("pdhef_logtool.logs.reader_process")
+    kept = {str(server.pid) for server in readers.SERVERS.values()} if readers else set()
+    processes: list[str] = []
+    for children in Path("/proc/self/task").glob("*/children"):
+        with contextlib.suppress(OSError):  # of a thread that has just ended
+            processes += children.read_text().split()
+    return {
+        f"working directory {Path.cwd()}",
+        *(f"signal {n}: {signal.getsignal(n)}" for n in signal.valid_signals()),
+        *(f"{name}={value}" for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"),
+        *(f"process {pid}" for pid in processes if pid not in kept),
+    }
+
+
+@pytest.fixture(autouse=True)
+def _unchanged_process() -> Iterator[None]:
+    """Fail a test that leaves a process behind, or another signal handler, environment variable or folder."""
+    before = _process_state()
+    yield
+    after = _process_state()
+    ended = {state for state in before - after if state.startswith("process ")}
+    assert after == before - ended, "the test leaves its process as it was"
 
 
 @pytest.hookimpl(wrapper=True)
@@ -60,7 +102,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     ``-m`` takes any test away.
     """
     tests = ROOT / "tests"
-    collected = {item.path.relative_to(tests).parts[0] for item in items}
+    collected = {item.path.relative_to(tests).parts[0] for item in items if tests in item.path.parents}
     if not {p.parent.name for p in tests.glob("*/test_*.py")} <= collected:
         return
     quick = {item.path.relative_to(tests).parts[0] for item in items if item.get_closest_marker("slow") is None}

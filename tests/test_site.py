@@ -25,7 +25,7 @@ def test_the_site_search_works_from_disk(tmp_path: Path) -> None:
     options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
     page = (tmp_path / "site" / "index.html").as_uri() + "?q=sideslip"
     command = [CHROMIUM, *options, "--virtual-time-budget=20000", "--dump-dom", page]
-    dom = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+    dom = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True).stdout
     assert not re.search(r'<(script|link)[^>]*(src|href)="https?://', dom)
     count = re.search(r"(\d+) matching documents", dom)
     assert count is not None and int(count[1]) > 5

@@ -59,6 +59,8 @@ def descend(
         normal = jac.T @ jac + np.eye(theta.size)
         gradient = jac.T @ residuals + theta
         gain = 0.0
+        if not gradient.any():  # the residuals contain nothing about θ, or this is the minimum
+            break
         for _ in range(_TRIES):
             step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
             step *= min(1.0, max_step / float(np.max(np.abs(step))))

@@ -1,4 +1,4 @@
-"""``pdhef learn``, ``extract``, ``train``, ``retrain``."""
+"""``pdhef learn``, ``extract``, ``train``."""
 
 from __future__ import annotations
 
@@ -193,40 +193,3 @@ def train(
             dataset, output, init=init, paper=paper, seed=seed, epochs=epochs, device=device, progress=reporter.progress
         )
     console.finish(result, learning_tables.render_training, as_json)
-
-
-@options.command(
-    commands,
-    "pdhef retrain logs/ -o retrained --car mycar --jobs 2",
-    "pdhef retrain logs/ -o retrained --car mycar --strict",
-    "pdhef run new/ -o out --car retrained/accepted/0123456789ab/car",
-    panel=panels.LEARN,
-    notes="Each drive is assigned to one split: training, validation, residual gain, intervals, or the final "
-    "comparison. If its error on the last split is significantly higher than that of the car, it is written to "
-    "rejected/ with the reason, otherwise to accepted/ (docs/retrain.md). Repeating the command processes new drives "
-    "only. Exit codes: 0 accepted, 3 accepted with drives left out, 4 rejected.",
-    shared="cache sensors friction",
-    car="Car whose network is trained further",
-)
-def retrain(
-    *,
-    logs: options.TruthLogs,
-    output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Folder for stages and candidates.")],
-    config: RunConfig,
-    strict: Annotated[bool, Option("--strict", help="Reject unless the lower error is significant.")] = False,
-    init: Annotated[
-        Path | None, Option(help="Model bundle to start from, or none. Default: the car's, else a new one.")
-    ] = None,
-    epochs: Annotated[int | None, Option(help="Number of epochs. Default: 15; 30 without --init.")] = None,
-    seed: Annotated[int, Option(help="Seed of the split, of training and of bootstraps.")] = 0,
-    jobs: options.Jobs = 1,
-    as_json: options.JsonFlag = False,
-) -> None:
-    """Train a car's network further; accept it only if it is not worse on held-out drives."""
-    from pdhef_logtool.learning.retrain.retrain_command import RetrainSettings
-    from pdhef_logtool.learning.retrain.retrain_command import retrain as train_again
-
-    settings = RetrainSettings(config=config, seed=seed, init=init, epochs=epochs, strict=strict)
-    with console.reporter() as reporter:
-        result = train_again(logs, output, settings, jobs=jobs, reporter=reporter)
-    console.finish(result, learning_tables.render_retraining, as_json)

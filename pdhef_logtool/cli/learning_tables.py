@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.learning.network.baselines import BaselinesResult
     from pdhef_logtool.learning.network.extract_command import ExtractResult
     from pdhef_logtool.learning.network.train_command import TrainResult
-    from pdhef_logtool.learning.retrain.retrain_command import RetrainResult
 
 
 #: Of more drives than these only those that gave nothing are listed.
@@ -227,18 +226,3 @@ def render_baselines(result: BaselinesResult, console: Console) -> None:
     shown = ", ".join(f"{split} {value:.3f}" for split, value in errors.items() if value is not None)
     console.print(f"linear regression, sideslip RMSE in degrees: {shown}")
     console.print(f"coefficients in {result.regression_file}", soft_wrap=True)
-
-
-def render_retraining(result: RetrainResult, console: Console) -> None:
-    """Print what the candidate identified on, how it compares on the drives of the gate, and the verdict."""
-    document = result.document
-    _print_cells(document["cells"], None, console)
-    console.print(", ".join(f"{role}: {count}" for role, count in document["drives_by_role"].items()) + " drives")
-    console.print(f"the candidate against the car as it is: {document['gate']['text']}")
-    if document["judged"] > 1:
-        console.print(
-            f"{document['judged']} candidates were judged on these drives: the more there are, the less it shows"
-        )
-    for reason in document["reasons"]:
-        console.print(f"rejected: {reason}")
-    console.print(f"{'accepted' if result.accepted else 'rejected'}: {result.folder}", soft_wrap=True)

@@ -1,18 +1,18 @@
 """Signals of a DBC from raw CAN frames, column by column.
 
 A signal's bits are gathered from the few bytes that contain it, for all frames at once. Bit numbers follow the DBC: bit
-b is bit b mod 8 of byte b div 8; a little-endian signal starts at its least significant bit, a big-endian one at its
-most significant bit.
+b is bit b mod 8 of byte b div 8. A message is identified by bus and identifier, in J1939 by its parameter group (PGN).
 """
 
 from __future__ import annotations
 
+import re
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import MappingFileError
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
@@ -29,6 +29,21 @@ CAN_TYPE = "can/msg/Frame"
 _MAX_DBC_BYTES = 32 << 20
 #: Bits of a signal that become a number.
 _MOST_BITS = 64
+ID_BITS = (1 << 29) - 1
+#: J1939: source address of any sender in a DBC, and first PDU format without a destination address.
+_NULL_ADDRESS, _BROADCAST = 0xFE, 0xF0
+#: Names of raw values without a measurement, in signals of at least 8 bits; shorter ones are states.
+_NO_VALUE = re.compile(r"(?<![a-z])(?<!no[ _-])(?:sna|invalid|error|fehler|(?:not|un|n)[ _-]?available)", re.I)
+#: Maximum number of distinct values outside of a correct range, and their share of all distinct values.
+_FEW_VALUES, _FEW_SHARE = 16, 0.1
+
+
+class Source(NamedTuple):
+    """Bus and identifier of a frame."""
+
+    bus: int
+    is_extended: bool
+    identifier: int
 
 
 #: Multiplexers with the values under which something is sent.
@@ -50,6 +65,14 @@ class Frames:
     parts: Mapping[str, NDArray[Any]]
     data: NDArray[np.uint8]
 
+    @classmethod
+    def of_table(cls, table: Table) -> Frames:
+        """Return the frames of a table that :meth:`table` made."""
+        rows = slice(0, len(table.stamps_ns))
+        names = [f.path for f in table.fields if not f.path.startswith("data[")]
+        parts = {name: np.asarray(table.load(name, rows)).astype(np.int64) for name in names}
+        return cls(table.stamps_ns, parts, np.nan_to_num(table.load("data", rows)).astype(np.uint8))
+
     def table(self, name: str) -> Table:
         """Return the frames as they are, with NaN behind the length."""
         names = [f"data[{i}]" for i in range(self.data.shape[1])]
@@ -64,99 +87,227 @@ class Frames:
         fields = tuple(FieldInfo(path, "number") for path in (*self.parts, *names))
         return Table(name, self.stamps_ns, fields, load, CAN_TYPE)
 
-    def decoded(self, databases: Sequence[Database]) -> Iterator[Table]:
-        """Yield a table for each message of the databases that the frames contain, with its signals and units.
-
-        An identifier that several databases define is that of the one with the largest share of its messages on a bus.
-        Signals that are sent under some values of a multiplexer only have a table for each of these conditions.
-        """
-        owner = self._owners(databases)
-        for message, number in ((m, n) for n, database in enumerate(databases) for m in database.messages):
-            rows = np.flatnonzero(self._are(message) & (owner == number))
-            if not rows.size or message.length > self.data.shape[1]:
-                continue
-            for ending, signals, selectors in signal_groups(message):
-                its = rows
-                for selector, values in selectors:
-                    raw = raw_bits(self.data[its], selector.start, selector.length, selector.byte_order)
-                    its = its[np.isin(raw, np.asarray(values, np.uint64))]
-                if its.size:
-                    yield self._message(f"{message.name}{ending}", signals, its)
-
-    def _owners(self, databases: Sequence[Database]) -> IntArray:
-        """Return the number of the database that describes each frame [N]; -1 without one."""
-        ids, buses = self.parts["id"], self.parts.get("bus", np.zeros(len(self.stamps_ns)))
-        owner, most = np.full(len(ids), -1), np.zeros(len(ids))
-        for number, database in enumerate(databases):
-            described = np.isin(ids, [m.frame_id for m in database.messages])
-            for bus in np.unique(buses[described]):
-                its = described & (buses == bus)
-                weight = fit_of(database, frozenset(ids[its].tolist()))
-                its &= weight > most
-                owner[its], most[its] = number, weight
-        return owner
-
-    def _are(self, message: Message) -> NDArray[np.bool_]:
-        ids = self.parts["id"]
-        fits = (ids == message.frame_id) & (self.parts["length"] >= message.length)
-        if "is_extended" in self.parts:
-            fits &= (self.parts["is_extended"] > 0) == message.is_extended_frame
-        for flag in ("is_error", "is_remote"):
-            fits &= self.parts.get(flag, np.zeros(len(ids))) == 0
-        return np.asarray(fits, np.bool_)
-
-    def _message(self, name: str, signals: Sequence[Signal], its: IntArray) -> Table:
-        by_name = {s.name: s for s in signals}
-        fields = tuple(FieldInfo(s.name, "number", unit=s.unit or "") for s in signals)
-        data = self.data[its]
-        return Table(
-            name,
-            self.stamps_ns[its],
-            fields,
-            lambda path, rows: signal_values(data[rows], by_name[path]),
-            f"can/msg/{name}",
-        )
+    def by_source(self) -> dict[Source, IntArray]:
+        """Return the rows of data frames by their source."""
+        ids = self.parts["id"].astype(np.int64)
+        zero = np.zeros(len(ids), np.int64)
+        bus, extended = self.parts.get("bus", zero), self.parts.get("is_extended", ids >= 1 << 11)
+        rows = np.flatnonzero((self.parts.get("is_error", zero) == 0) & (self.parts.get("is_remote", zero) == 0))
+        keys = (2 * bus.astype(np.int64) + (extended > 0) << 32) + (ids & ID_BITS)
+        keys, inverse, counts = np.unique(keys[rows], return_inverse=True, return_counts=True)
+        parts = np.split(rows[np.argsort(inverse, kind="stable")], np.cumsum(counts)[:-1])
+        sources = (Source(key >> 33, bool(key >> 32 & 1), key & ID_BITS) for key in keys.tolist())
+        return dict(zip(sources, parts, strict=False))
 
 
-def raw_bits(data: NDArray[np.uint8], start: int, length: int, byte_order: str) -> NDArray[np.uint64]:
-    """Gather an unsigned integer of at most 64 bits from frames.
+@dataclass(frozen=True, slots=True, eq=False)
+class Decoder:
+    """Tables of signals from raw frames.
 
-    Parameters
+    Attributes
     ----------
-    data : uint8 [N, k]; all bytes of the signal must be there.
-    start : of the signal's least (little-endian) or most (big-endian) significant bit, in the DBC's numbering.
-    byte_order : ``little_endian`` or ``big_endian``.
+    frames : raw frames. databases : DBC files and their names. names : names of existing tables.
+    lost : list to which losses of frames are appended.
+    column_losses : losses by table and column, added when a column is first loaded.
     """
-    if byte_order == "little_endian":
-        first, skipped = divmod(start, 8)
-        last = (start + length - 1) // 8
-        columns = range(first, last + 1)
-    else:
-        top = 8 * (start // 8) + 7 - start % 8
-        first, last = top // 8, (top + length - 1) // 8
-        skipped = 8 * (last + 1) - (top + length)
-        columns = range(last, first - 1, -1)
+
+    frames: Frames
+    databases: Sequence[tuple[str, Database]]
+    names: Collection[str]
+    lost: list[Loss]
+    column_losses: dict[tuple[str, str], list[Loss]]
+
+    def tables(self) -> Iterator[Table]:
+        """Yield a table for each message, bus and source address of the frames, with signals and units.
+
+        If several databases define an identifier, the database with the most of its messages on the bus is used. The
+        table of the best bus and the most frequent address has the name of the message; the names of the others end
+        with bus or address (``#bus1``). Multiplexed signals have a table for each value of their multiplexer.
+        """
+        rows = self.frames.by_source()
+        described = [described_sources(database, rows) for _, database in self.databases]
+        fits = {
+            (number, bus): fit_of(database, frozenset(m.frame_id for s, m in described[number].items() if s.bus == bus))
+            for bus in {source.bus for source in rows}
+            for number, (_, database) in enumerate(self.databases)
+        }
+        senders: dict[int, dict[tuple[int, int], list[IntArray]]] = {}
+        addressed: set[int] = set()
+        unknown: dict[int, int] = {}
+        for source, its in rows.items():
+            able = [number for number, messages in enumerate(described) if source in messages]
+            if not able:
+                unknown[source.identifier] = unknown.get(source.identifier, 0) + len(its)
+                continue
+            message = described[max(able, key=lambda number: fits[number, source.bus])][source]
+            if has_j1939_identifier(message) or source.identifier != message.frame_id:
+                addressed.add(id(message))
+            sender = source.bus, source.identifier & 0xFF
+            senders.setdefault(id(message), {}).setdefault(sender, []).append(its)
+        for number, message in ((n, m) for n, (_, database) in enumerate(self.databases) for m in database.messages):
+            parts = {sender: np.sort(np.concatenate(its)) for sender, its in senders.get(id(message), {}).items()}
+            ranked = sorted(
+                parts, key=lambda sender: (-fits[number, sender[0]], sender[0], -len(parts[sender]), sender)
+            )
+            for bus, address in ranked:
+                ending = f"bus{bus}" * (bus != ranked[0][0]) + f"sa{address:02X}" * (address != ranked[0][1])
+                ending = f"#{ending}" * bool(ending)
+                yield from self._messages(message, ending, parts[bus, address], is_j1939=id(message) in addressed)
+        if unknown:
+            names, count = ", ".join(name for name, _ in self.databases), sum(unknown.values())
+            shown = ", ".join(f"0x{identifier:X}" for identifier in [*unknown][:5])
+            what = f"{count} frames, no identifier of {names}: {shown}{', ...' * (len(unknown) > 5)}"
+            self.lost.append(Loss("unknown-frame", what, names, count=count, severity="note"))
+
+    def _messages(self, message: Message, ending: str, rows: IntArray, *, is_j1939: bool) -> Iterator[Table]:
+        """Yield the tables of a message from one sender, without the signals that no frame contains."""
+        data = self.frames.data
+        lengths = np.minimum(self.frames.parts["length"], data.shape[1])
+        for condition, signals, selectors in signal_groups(message):
+            its = rows
+            for selector, values in selectors:
+                its = its[lengths[its] >= bytes_of(selector)]
+                its = its[np.isin(raw_bits(data[its], selector), np.asarray(values, np.uint64))]
+            if not its.size:
+                continue
+            name = f"{message.name}{condition}{ending}"
+            name = next(
+                n for n in (name, *(f"{name}#{i}" for i in range(2, 2 + len(self.names)))) if n not in self.names
+            )
+            beyond = {s.name: bytes_of(s) for s in signals if bytes_of(s) > lengths[its].min()}
+            if beyond:
+                short = lengths[its] < max(beyond.values())
+                what = f"frames of {lengths[its].min()} bytes, {message.length} in the DBC, lack {', '.join(beyond)}"
+                self.lost.append(Loss("undecodable", what, name, count=int(short.sum())))
+            there = [s for s in signals if bytes_of(s) <= lengths[its].max()]
+            if there:
+                load = self._loader(name, {s.name: s for s in there}, data[its], lengths[its], is_j1939=is_j1939)
+                fields = tuple(FieldInfo(s.name, "number", unit=s.unit or "") for s in there)
+                yield Table(name, self.frames.stamps_ns[its], fields, load, f"can/msg/{message.name}")
+
+    def _loader(
+        self, name: str, signals: Mapping[str, Signal], data: NDArray[np.uint8], lengths: IntArray, *, is_j1939: bool
+    ) -> Callable[[str, slice], FloatArray]:
+        """Return the loader of columns. A column is decoded once, for all frames; missing values are NaN."""
+        columns: dict[str, FloatArray] = {}
+
+        def load(path: str, rows: slice) -> FloatArray:
+            if path not in columns:
+                signal = signals[path]
+                there = lengths >= bytes_of(signal)
+                values = np.full(len(there), np.nan)
+                values[there] = signal_values(data[there], signal, is_j1939=is_j1939)
+                losses = self.column_losses.setdefault((name, path), [])
+                if none := int(np.isnan(values[there]).sum()):
+                    what = f"the raw value of {path} means 'not available' or 'error'"
+                    losses.append(Loss("not-available", what, name, count=none, severity="note"))
+                outside, is_error = leaves_range(values, signal)
+                if outside.any():
+                    what = f"{path} is outside of [{signal.minimum}|{signal.maximum}] of the DBC"
+                    what += f", first with {values[outside][0]:.10g}{'' if is_error else '; this range is ignored'}"
+                    severity: Literal["lost", "note"] = "lost" if is_error else "note"
+                    losses.append(Loss("out-of-range", what, name, count=int(outside.sum()), severity=severity))
+                columns[path] = np.where(outside & is_error, np.nan, values)
+            return columns[path][rows]
+
+        return load
+
+
+def has_j1939_identifier(message: Message) -> bool:
+    """Return whether the DBC states J1939 for a message, by its frame format or the null address in its identifier."""
+    return message.is_extended_frame and (message.protocol == "j1939" or message.frame_id & 0xFF == _NULL_ADDRESS)
+
+
+def parameter_group(identifier: int) -> int:
+    """Return the PGN of a 29-bit identifier, without the destination address where it contains one."""
+    group = identifier >> 8 & 0x3FFFF
+    return group if group >> 8 & 0xFF >= _BROADCAST else group & ~0xFF
+
+
+def described_sources(database: Database, sources: Iterable[Source]) -> dict[Source, Message]:
+    """Return the messages of a database by source.
+
+    A 29-bit identifier that is not in the database is compared by PGN: with J1939 messages, and with messages with a
+    broadcast PGN whose identifier no frame has.
+    """
+    exact = {(m.is_extended_frame, m.frame_id): m for m in reversed(database.messages)}
+    sent = {source.identifier for source in sources if source.is_extended}
+    groups = {
+        parameter_group(m.frame_id): m
+        for m in reversed(database.messages)
+        if has_j1939_identifier(m)
+        or (m.is_extended_frame and m.frame_id not in sent and m.frame_id >> 16 & 0xFF >= _BROADCAST)
+    }
+    by_group = {s: groups.get(parameter_group(s.identifier)) if s.is_extended else None for s in sources}
+    matches = {s: exact.get((s.is_extended, s.identifier), by_group[s]) for s in sources}
+    return {source: message for source, message in matches.items() if message is not None}
+
+
+def _bytes_of(signal: Signal) -> tuple[int, int, int]:
+    """Return first and last byte of a signal, and the number of unused low bits in its least significant byte.
+
+    Its start is the least significant bit of a little-endian signal, the most significant one of a big-endian signal.
+    """
+    if signal.byte_order == "little_endian":
+        first, skipped = divmod(signal.start, 8)
+        return first, (signal.start + signal.length - 1) // 8, skipped
+    top = 8 * (signal.start // 8) + 7 - signal.start % 8
+    last = (top + signal.length - 1) // 8
+    return top // 8, last, 8 * (last + 1) - (top + signal.length)
+
+
+def bytes_of(signal: Signal) -> int:
+    """Return how many bytes a frame needs to contain a signal."""
+    return _bytes_of(signal)[1] + 1
+
+
+def raw_bits(data: NDArray[np.uint8], signal: Signal) -> NDArray[np.uint64]:
+    """Gather the unsigned integer of a signal of at most 64 bits from frames uint8 [N, k] that contain it."""
+    first, last, skipped = _bytes_of(signal)
     value = np.zeros(data.shape[0], np.uint64)
+    columns = range(first, last + 1) if signal.byte_order == "little_endian" else range(last, first - 1, -1)
     for i, column in enumerate(columns):
         byte = data[:, column].astype(np.uint64)
         shift = 8 * i - skipped
         value |= byte << np.uint64(shift) if shift >= 0 else byte >> np.uint64(-shift)
-    return value & np.uint64((1 << length) - 1)
+    return value & np.uint64((1 << signal.length) - 1)
 
 
-def signal_values(data: NDArray[np.uint8], signal: Signal) -> FloatArray:
-    """Decode one signal of frames uint8 [N, k] to ``scale * raw + offset``, float64 [N]."""
-    raw = raw_bits(data, signal.start, signal.length, signal.byte_order)
-    number: NDArray[Any]
+def signal_values(data: NDArray[np.uint8], signal: Signal, *, is_j1939: bool = False) -> FloatArray:
+    """Decode one signal of frames uint8 [N, k] to ``scale * raw + offset``, float64 [N].
+
+    The result is NaN for raw values that mean "not available" or "error": by their name in the DBC, or by SAE J1939-71
+    (all bits set, or a most significant byte of 0xFE or 0xFF).
+    """
+    raw = raw_bits(data, signal)
+    number: NDArray[Any] = raw
     if signal.is_float:
         width = signal.length // 8
         number = raw.astype(f"<u{width}").view(f"<f{width}").astype(np.float64)
     elif signal.is_signed:
         sign = np.uint64(1 << (signal.length - 1))
         number = ((raw ^ sign) - sign).view(np.int64)
-    else:
-        number = raw
-    return np.asarray(number.astype(np.float64) * float(signal.scale) + float(signal.offset), dtype=np.float64)
+    values = np.asarray(number.astype(np.float64) * float(signal.scale) + float(signal.offset), dtype=np.float64)
+    for code, text in (signal.choices or {}).items() if signal.length >= 8 else ():
+        if _NO_VALUE.search(str(text)):
+            values[number == code] = np.nan
+    if is_j1939 and not signal.is_float and not signal.is_signed and signal.length > 1:
+        top = max(0, signal.length - 8)
+        values[raw >> np.uint64(top) >= (0xFE if signal.length >= 8 else (1 << signal.length) - 1)] = np.nan
+    return values
+
+
+def leaves_range(values: FloatArray, signal: Signal) -> tuple[NDArray[np.bool_], bool]:
+    """Return which values [N] are outside of the range in the DBC, and whether this range is plausible.
+
+    A range is implausible if many distinct values are outside.
+    """
+    margin, (low, high) = abs(float(signal.scale)) / 2, (signal.minimum, signal.maximum)
+    if low is None or high is None or not low < high:
+        return np.zeros(len(values), np.bool_), True
+    outside = (values < float(low) - margin) | (values > float(high) + margin)
+    allowed = max(_FEW_VALUES, _FEW_SHARE * len(np.unique(values))) if outside.any() else 0
+    return outside, len(np.unique(values[outside])) <= allowed
 
 
 def fit_of(database: Database, sent: frozenset[int]) -> float:
@@ -191,21 +342,19 @@ def selectors_of(signal: Signal, by_name: Mapping[str, Signal]) -> Iterator[tupl
 
 
 def load_dbc(path: Path) -> Database:
-    """Read a DBC file; raises MappingFileError where it is none."""
+    """Read a DBC file; raises MappingFileError for any other file."""
     try:
         state = path.stat()
     except OSError as error:
-        raise MappingFileError(
-            expected="a DBC file", got=error.strerror or str(error), where=str(path), remedy="correct [can] dbc"
-        ) from None
+        raise _no_dbc(path, error.strerror or str(error)) from None
     if not stat.S_ISREG(state.st_mode) or state.st_size > _MAX_DBC_BYTES:
-        raise MappingFileError(
-            expected=f"a DBC file of at most {_MAX_DBC_BYTES >> 20} MiB",
-            got=f"{state.st_size} bytes" if stat.S_ISREG(state.st_mode) else "no file",
-            where=str(path),
-            remedy="correct [can] dbc",
-        )
+        raise _no_dbc(path, f"{state.st_size} bytes" if stat.S_ISREG(state.st_mode) else "no file")
     return _load_cached(path, state.st_mtime_ns, state.st_size)
+
+
+def _no_dbc(path: Path, got: str) -> MappingFileError:
+    expected = f"a DBC file of at most {_MAX_DBC_BYTES >> 20} MiB"
+    return MappingFileError(expected=expected, got=got, where=str(path), remedy="correct [can] dbc")
 
 
 @lru_cache(maxsize=16)
@@ -213,15 +362,11 @@ def _load_cached(path: Path, _modified_ns: int, _size: int) -> Database:
     import cantools
     from cantools.database.can import Database
 
-    expected = "a DBC file"
     try:
         # Overlapping signals are an error of the file, not of the signals that are asked for.
         matches = cantools.database.load_file(path, strict=False)
     except Exception as error:  # noqa: BLE001  cantools' parsers raise any exception for a malformed file.
-        reason = (str(error).splitlines() or [""])[0] or type(error).__name__
-        raise MappingFileError(expected=expected, got=reason, where=str(path), remedy="correct [can] dbc") from None
+        raise _no_dbc(path, (str(error).splitlines() or [""])[0] or type(error).__name__) from None
     if not isinstance(matches, Database):
-        raise MappingFileError(
-            expected=expected, got="a file of another kind", where=str(path), remedy="correct [can] dbc"
-        )
+        raise _no_dbc(path, "a file of another kind")
     return matches

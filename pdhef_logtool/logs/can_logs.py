@@ -1,94 +1,337 @@
-"""Logs of raw CAN frames, BLF and ASC (extra ``formats``): a topic ``can`` that a DBC in the mapping file decodes."""
+"""Logs of raw CAN frames, BLF and ASC: a topic ``can`` that a DBC decodes.
+
+Both formats state the local time of the recorder without its zone; it is read as UTC.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import islice
-from typing import Any
+import datetime as dt
+import re
+import struct
+import zlib
+from array import array
+from mmap import ACCESS_READ, mmap
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.can_decoding import Frames
+from pdhef_logtool.logs.can_decoding import ID_BITS, Frames
 from pdhef_logtool.logs.container import describe_damage
-from pdhef_logtool.logs.log_file import LogFile
-from pdhef_logtool.logs.table_columns import number_stamps
-from pdhef_logtool.logs.table_log import TableLog
+from pdhef_logtool.logs.table_clocks import placed
+from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.extras import required
-from pdhef_logtool.records.signals import FloatArray, Loss
+from pdhef_logtool.records.signals import IntArray, Loss
 
-#: Of CAN FD.
-_MOST_BYTES = 64
-#: Frames that become an array at once.
-_BLOCK_FRAMES = 65_536
 _PARTS = ("id", "length", "is_extended", "bus", "is_error", "is_remote")
+#: Maximum data length of CAN FD.
+_MOST_BYTES = 64
 
 
-def open_blf(file: LogFile) -> TableLog:
-    """Open a BLF file; raises LogError where it has no frames."""
-    return _open(file, "BLFReader", "blf")
+def _tables(
+    kind: str, file: TableFile, stamps: IntArray, numbers: NDArray[np.int32], data: NDArray[np.uint8], lost: list[Loss]
+) -> Tables:
+    """Build the topic ``can`` from times [N], numbers [N, 6] and the concatenated data of the frames."""
+    if not len(stamps):
+        got = f"none that can be read{''.join(f'; {loss.what}' for loss in lost[:1])}"
+        raise LogError(expected="CAN frames", got=got, where=file.name)
+    widest = max(1, int(numbers[:, 1].max()))
+    file.limits.check_table(len(stamps) * (8 + 4 * len(_PARTS) + widest), file.size, f"{len(stamps)} frames")
+    rows = np.zeros((len(stamps), widest), np.uint8)
+    rows[np.arange(widest) < numbers[:, 1:2]] = data
+    order = np.argsort(stamps, kind="stable")
+    parts = dict(zip(_PARTS, numbers[order].T, strict=True))
+    return Tables(kind, [Frames(placed(stamps)[order], parts, rows[order]).table("can")], lost)
 
 
-def open_asc(file: LogFile) -> TableLog:
-    """Open an ASC file; raises LogError where it has no frames."""
-    return _open(file, "ASCReader", "asc")
+def _start_ns(year: int, month: int, day: int, hour: int, minute: int, second: int, micro: int) -> int:
+    """Return a date and time in ns since 1970; 0 for an invalid date or one of another century."""
+    try:
+        seconds = dt.datetime(year, month, day, hour, minute, second, micro, dt.UTC).timestamp()
+    except ValueError:
+        return 0
+    return round(seconds * 1e6) * 1000 if 0.0 < seconds < 4e9 else 0
 
 
-def _open(file: LogFile, reader: str, kind: str) -> TableLog:
-    io = required("can.io", "formats", f"reads {kind.upper()} files", file.place)
-    size = file.path.stat().st_size
-    losses: list[Loss] = []
-    blocks: list[_Block] = []
-    with file.meter.running(size):
+# BLF: objects "LOBJ", most of them in compressed containers. An object may continue in the next container.
+_SIGNATURE = b"LOBJ"
+_CONTAINER, _CONTAINER_HEAD = 10, 32
+#: Bytes of an object's header without its time.
+_HEAD = 16
+#: Maximum bytes of padding behind an object, and of an object of another kind.
+_PADDING, _LONGEST = 8, 16 << 20
+_FILE_HEAD = struct.Struct("<4xI8xQ16x8H")
+_OBJECT_HEAD = struct.Struct("<4xHHII")
+_TIME = np.dtype({"names": ["unit", "time"], "formats": ["<u4", "<i8"], "offsets": [16, 24], "itemsize": 32})
+#: Maximum number of losses; further ones are counted.
+_MOST_NAMED = 20
+
+
+def _layout(**parts: tuple[str, int]) -> np.dtype[np.void]:
+    formats, offsets = zip(*parts.values(), strict=True)
+    return np.dtype({"names": [*parts], "formats": [*formats], "offsets": [*offsets]})
+
+
+_CAN = _layout(bus=("<u2", 0), flags=("u1", 2), length=("u1", 3), id=("<u4", 4), data=("(8,)u1", 8))
+_ERROR = _layout(bus=("<u2", 0), flags=("<u4", 4), length=("u1", 10), id=("<u4", 16), data=("(8,)u1", 24))
+_FD = _layout(bus=("<u2", 0), flags=("u1", 2), length=("u1", 14), id=("<u4", 4), data=("(64,)u1", 20))
+_FD_64 = _layout(
+    bus=("u1", 0), length=("u1", 2), id=("<u4", 4), flags=("<u4", 12), extension=("u1", 35), data=("(64,)u1", 40)
+)
+#: Kinds of frames: layout behind the header, minimum and maximum bytes of it, flag of a remote frame.
+_FRAMES = {
+    1: (_CAN, 16, 40, 0x80), 86: (_CAN, 16, 40, 0x80), 73: (_ERROR, 32, 56, 0), 100: (_FD, 84, 108, 0x80),
+    101: (_FD_64, 40, 168, 0x10),
+}  # fmt: skip
+
+
+def open_blf(file: TableFile) -> Tables:
+    """Read a BLF file; raises LogError where it has no frames."""
+    if file.size < _FILE_HEAD.size:
+        raise LogError(expected="a BLF file", got=f"{file.size} bytes", where=file.name)
+    return _Blf(file, mmap(file.stream.fileno(), 0, access=ACCESS_READ)).tables()
+
+
+class _Blf:
+    """Reader of a BLF file. Behind damage, it continues at the next signature."""
+
+    def __init__(self, file: TableFile, data: mmap) -> None:
+        self._file, self._data = file, data
+        self._head, self._stated, year, month, _, day, hour, minute, second, ms = _FILE_HEAD.unpack_from(data)
+        self._start_ns = _start_ns(year, month, day, hour, minute, second, 1000 * ms)
+        self._losses: list[Loss] = []
+        self._blocks: list[tuple[IntArray, NDArray[np.int32], NDArray[np.uint8]]] = []
+        # Bytes of an object that continues in the next container; None behind a lost container.
+        self._tail: bytes | None = b""
+        self._unpacked = 0
+
+    def tables(self) -> Tables:
+        """Read the file."""
+        data, size = self._data, self._file.size
+        objects, rest = self._objects(data, min(self._head, max(data.find(_SIGNATURE), 0)), "the file", final=True)
+        is_cut = self._stated > size or size - rest > _PADDING
+        if is_cut:
+            what = f"the file ends after {size} of {max(self._stated, size + 1)} bytes"
+            self._losses.append(Loss("truncated", what, self._file.name))
+        if size - rest > _CONTAINER_HEAD and _OBJECT_HEAD.unpack_from(data, rest)[3] == _CONTAINER:
+            objects.append((rest, _HEAD, size - rest, _CONTAINER))
+        self._decode(data, objects)
+        for start, _, length, kind in objects:
+            if kind == _CONTAINER:
+                self._read_container(start, start + length, f"the container at byte {start}")
+        self._feed(b"", "the last container", final=True)
+        if len(self._tail or b"") > _PADDING and not is_cut:
+            self._lose("truncated", "the last object is incomplete")
+        self._blocks.append((np.empty(0, np.int64), np.empty((0, len(_PARTS)), np.int32), np.empty(0, np.uint8)))
+        stamps, numbers, content = (np.concatenate(parts) for parts in zip(*self._blocks, strict=True))
+        return _tables("blf", self._file, stamps, numbers, content, self._losses)
+
+    def _lose(self, kind: str, what: str) -> None:
+        """Add a loss; the last one counts those beyond the limit."""
+        count = (self._losses.pop().count or 1) + 1 if len(self._losses) > _MOST_NAMED else None
+        self._losses.append(Loss(kind, what, self._file.name, count=count))
+
+    def _read_container(self, start: int, end: int, place: str) -> None:
+        """Read a container. A damaged one, or one beyond the limits, is a loss."""
+        method, size = struct.unpack_from("<H6xI", self._data, start + _HEAD)
+        stored = self._data[start + _CONTAINER_HEAD : end]
         try:
-            with getattr(io, reader)(str(file.path)) as source:
-                if size < getattr(source, "file_size", 0):
-                    what = f"the file ends after {size} of {source.file_size} bytes"
-                    losses.append(Loss("truncated", what, str(file.place)))
-                messages = iter(source)
-                while not blocks or len(blocks[-1].stamps) == _BLOCK_FRAMES:
-                    file.meter.check()
-                    blocks.append(_Block())
-                    blocks[-1].read(messages)
-        except LogError:
-            raise
-        except Exception as error:  # noqa: BLE001  any error of a damaged file
-            what = f"frames behind the damage cannot be read: {describe_damage(error)[1]}"
-            losses.append(Loss("truncated", what, str(file.place)))
-        parts = [block.arrays() for block in blocks if block.stamps]
-        if not parts:
-            raise LogError(expected="CAN frames", got="none that can be read", where=str(file.place))
-        clock = number_stamps(np.concatenate([stamps for stamps, _, _ in parts]), "s")
-        order = np.argsort(clock, kind="stable")
-        numbers = np.concatenate([rows for _, rows, _ in parts])[order].T
-        widest = max(data.shape[1] for _, _, data in parts)
-        data = np.concatenate([np.pad(d, ((0, 0), (0, widest - d.shape[1]))) for _, _, d in parts])[order]
-        frames = Frames(clock[order], dict(zip(_PARTS, numbers, strict=True)), data)
-        return TableLog(file, kind, [frames.table("can")], losses, [frames])
+            self._file.limits.check_unpacked(size, len(stored), place)
+            self._file.limits.check_table(self._unpacked + size, self._file.size, f"{place} and those before it")
+            block = _unpacked(stored, size, is_cut=end == self._file.size) if method else stored
+        except (ValueError, LogError, zlib.error) as error:
+            kind, text = describe_damage(error)
+            self._feed(b"", place, final=True)
+            self._tail = None
+            self._lose(kind, f"{place} is lost: {text}")
+        else:
+            self._unpacked += len(block)
+            self._feed(block, place)
+
+    def _feed(self, block: bytes, place: str, *, final: bool = False) -> None:
+        """Read the objects of a container. An incomplete object is kept for the next container."""
+        data = (self._tail or b"") + block
+        first = max(0, data.find(_SIGNATURE)) if self._tail is None else 0
+        objects, rest = self._objects(data, first, place, final=final)
+        self._decode(data, objects)
+        self._tail = data[rest:]
+
+    def _objects(
+        self, data: bytes | mmap, position: int, place: str, *, final: bool
+    ) -> tuple[list[tuple[int, int, int, int]], int]:
+        """Return the valid objects from a position on, and the position of an incomplete object at the end.
+
+        With ``final`` no data follow: an incomplete object is damaged if another signature follows it.
+        """
+        objects: list[tuple[int, int, int, int]] = []
+        size, search, checked = len(data), position, -1
+        while (start := data.find(_SIGNATURE, search)) >= 0 and start + _HEAD <= size:
+            head, version, length, kind = _OBJECT_HEAD.unpack_from(data, start)
+            sound = _is_sound(head, version, length, kind)
+            if sound and start + length > size and (not final or data.find(_SIGNATURE, start + _HEAD) < 0):
+                break
+            if not sound or start + length > size:
+                search = start + len(_SIGNATURE)
+                continue
+            if start - position > _PADDING:
+                last, *_, other = objects[-1] if objects else (-1, _CONTAINER)
+                if last > checked and other not in _FRAMES and data.find(_SIGNATURE, last + _HEAD, position) >= 0:
+                    position = checked = last  # its length is wrong: it covers others
+                    search = objects.pop()[0] + _HEAD
+                    continue
+                self._lose("bad-chunk", f"{start - position} bytes of {place} are damaged, from byte {position}")
+            objects.append((start, head, length, kind))
+            position = search = start + length
+        rest = start if start >= 0 else max(position, size - len(_SIGNATURE) + 1)
+        if rest - position > _PADDING:
+            self._lose("bad-chunk", f"{rest - position} bytes of {place} are damaged, from byte {position}")
+        return objects, rest
+
+    def _decode(self, data: bytes | mmap, objects: list[tuple[int, int, int, int]]) -> None:
+        """Add the frames among objects."""
+        for kind, (layout, fewest, _, remote) in _FRAMES.items():
+            chosen = np.array([o[:3] for o in objects if o[3] == kind], np.int64)
+            if not len(chosen):
+                continue
+            raw, (start, head, length) = np.frombuffer(data, np.uint8), chosen.T[:, :, np.newaxis]
+            times = raw[start + np.arange(_TIME.itemsize)].view(_TIME)[:, 0]
+            places = np.minimum(start + head + np.arange(layout.itemsize), len(raw) - 1)
+            part = raw[places].view(layout)[:, 0]
+            content = part["data"]
+            if "extension" in part.dtype.names:  # variable length; other data can follow
+                end = np.where(part["extension"] > 0, part["extension"], length[:, 0])[:, np.newaxis]
+                content = np.where(np.arange(_MOST_BYTES) < end - head - fewest, content, 0)
+            is_remote = (part["flags"] & remote) > 0
+            count = np.where(is_remote, 0, np.minimum(part["length"], content.shape[1]))
+            number, bus = part["id"].astype(np.int64), part["bus"].astype(np.int64) - 1
+            is_error = np.full(len(number), layout is _ERROR)
+            numbers = np.stack((number & ID_BITS, count, number >> 31, bus, is_error, is_remote), axis=1)
+            unit = np.where(times["unit"] == 1, 10_000, 1)
+            most = 2**61 // unit  # no sum overflows
+            stamps = self._start_ns + np.clip(times["time"], -most, most) * unit
+            there = np.arange(content.shape[1]) < count[:, np.newaxis]
+            self._blocks.append((stamps, numbers.astype(np.int32), content[there].astype(np.uint8)))
 
 
-class _Block:
-    """Frames as they are read; what is read before an error stays."""
+def _is_sound(head: int, version: int, length: int, kind: int) -> bool:
+    """Return whether an object may have this header, length and kind."""
+    if kind not in _FRAMES:
+        return length >= _CONTAINER_HEAD if kind == _CONTAINER else _HEAD <= length <= _LONGEST
+    _, fewest, most, _ = _FRAMES[kind]
+    return version in (1, 2) and _TIME.itemsize <= head and fewest <= length - head < most
 
-    def __init__(self) -> None:
-        self.stamps: list[float] = []
-        self._numbers: list[tuple[int, ...]] = []
-        self._data: list[bytes] = []
 
-    def read(self, messages: Iterator[Any]) -> None:
-        """Read up to a number of frames."""
-        for message in islice(messages, _BLOCK_FRAMES):
-            data = bytes(message.data[:_MOST_BYTES])
-            bus = message.channel if isinstance(message.channel, int) else -1
-            flags = message.is_extended_id, bus, message.is_error_frame, message.is_remote_frame
-            self._numbers.append((message.arbitration_id, len(data), *flags))
-            self._data.append(data)
-            self.stamps.append(message.timestamp)
+def _unpacked(stored: bytes, size: int, *, is_cut: bool) -> bytes:
+    """Decompress a container; of a truncated one (``is_cut``), its beginning."""
+    inflater = zlib.decompressobj()
+    block = inflater.decompress(stored, size + 1)
+    if len(block) > size or not (inflater.eof or is_cut):
+        raise ValueError(f"its contents are not the stated {size} bytes")
+    return block
 
-    def arrays(self) -> tuple[FloatArray, NDArray[np.int32], NDArray[np.uint8]]:
-        """Return times in s [N], the numbers of a frame [N, 6], and bytes [N, k]."""
-        widest = max(1, *map(len, self._data))
-        data = b"".join(d.ljust(widest, b"\0") for d in self._data)
-        rows = np.frombuffer(data, np.uint8).reshape(-1, widest)
-        return np.asarray(self.stamps), np.asarray(self._numbers, np.int32), rows
+
+# ASC: a line for each event, with its time in s.
+_BASE = re.compile(r"\s*base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?", re.I)
+_BEGIN = re.compile(r"\s*(?:date|begin\s+triggerblock)\b\s*(.*)", re.I)
+_DATE = re.compile(r"\S+\s+(\S+)\s+(\d+)\.?\s+(\d+):(\d+):(\d+)(?:\.(\d+))?\s*([ap]m)?\s+(\d{4})", re.I)
+#: English and German months, without the letters that are not ASCII.
+_MONTHS = {
+    "jan": 1, "feb": 2, "mar": 3, "mr": 3, "mrz": 3, "apr": 4, "may": 5, "mai": 5, "jun": 6, "jul": 7, "aug": 8,
+    "sep": 9, "oct": 10, "okt": 10, "nov": 11, "dec": 12, "dez": 12,
+}  # fmt: skip
+_EVENT = re.compile(rb"\s*(\d{1,9}(?:\.\d{1,12})?)\s+(.*)", re.S)
+#: Bus, then an error frame, or identifier, remote frame, length and data.
+_CLASSIC = re.compile(
+    rb"(\d+)\s+(?:(errorframe)|([\da-f]+)(x?)\s+[rt]x\s+(?:(r)\b|d\s+([\da-f]+)(?:\s+(.*)|$)))", re.I | re.S
+)
+_FD_FRAME = re.compile(
+    rb"canfd\s+(\d+)\s+[rt]x\s+(?:(errorframe)|([\da-f]+)(x?)\s+(?:\S+\s+)??[01]\s+[01]\s+[\da-f]+()\s+(\d+)(?:\s+(.*)|$))",
+    re.I | re.S,
+)
+_FRAME_SHAPE = re.compile(rb"\d+\s+(?:\S+\s+[rt]x\s|errorframe)|canfd\s", re.I)
+#: A step back in time by more begins a measurement.
+_STEP_NS = 10**9
+
+
+def open_asc(file: TableFile) -> Tables:
+    """Read an ASC file; raises LogError where it has no frames."""
+    return _Asc(file).tables()
+
+
+class _Asc:
+    """Reader of an ASC file."""
+
+    def __init__(self, file: TableFile) -> None:
+        self._file = file
+        self._stamps, self._numbers, self._data = array("q"), array("i"), bytearray()
+        self._base, self._is_relative = 16, False
+        self._begins_ns: int | None = None
+        self._start_ns = self._now_ns = self._overlapping = 0
+        self._is_overlapping = False
+
+    def tables(self) -> Tables:
+        """Read the file."""
+        unreadable, first, losses = 0, "", []
+        for number, line in enumerate(self._file.stream, 1):
+            event = _EVENT.match(line)
+            if event is None:
+                self._read_head(line.decode("ascii", "ignore"))
+            elif not self._read_event(round(float(event[1]) * 1e9), event[2].rstrip()):
+                first = first or f"line {number}, {line[:60].decode('ascii', 'replace').strip()!r}"
+                unreadable += 1
+        if unreadable:
+            what = f"{unreadable} lines of frames cannot be read, the first: {first}"
+            losses.append(Loss("bad-row", what, self._file.name, count=unreadable))
+        if self._overlapping:
+            what = "frames of a measurement that begins before the end of the one above it"
+            losses.append(Loss("out-of-order", what, self._file.name, count=self._overlapping))
+        numbers = np.frombuffer(self._numbers, np.int32).reshape(-1, len(_PARTS))
+        stamps, data = np.frombuffer(self._stamps, np.int64), np.frombuffer(self._data, np.uint8)
+        return _tables("asc", self._file, stamps, numbers, data, losses)
+
+    def _read_head(self, line: str) -> None:
+        """Read a line without a time. A date begins a measurement."""
+        if match := _BASE.match(line):
+            self._base = 16 if match[1].lower() == "hex" else 10
+            self._is_relative = (match[2] or "").lower() == "relative"
+        elif begin := _BEGIN.match(line):
+            if date := _DATE.match(begin[1]):
+                month, day, hour, minute, second, fraction, half, year = date.groups()
+                hours = int(hour) % 12 + 12 * (half.lower() == "pm") if half else int(hour)
+                time = hours, int(minute), int(second), int((fraction or "0").ljust(6, "0")[:6])
+                self._begins_ns = _start_ns(int(year), _MONTHS.get(month.lower()[:3], 0), int(day), *time)
+            self._begins_ns = self._begins_ns or 0
+
+    def _read_event(self, time_ns: int, text: bytes) -> bool:
+        """Read a line with a time; return False for a frame that cannot be read."""
+        if self._begins_ns is None and not self._is_relative and time_ns < self._now_ns - _STEP_NS:
+            self._begins_ns = 0
+        if self._begins_ns is not None:
+            self._begin(self._begins_ns, time_ns)
+        self._now_ns = self._now_ns + time_ns if self._is_relative else time_ns
+        match = _CLASSIC.match(text) or _FD_FRAME.match(text)
+        if match is None:
+            return _FRAME_SHAPE.match(text) is None
+        bus, is_error, identifier, extended, remote, length, content = match.groups()
+        try:
+            base, most = (self._base, 8) if match.re is _CLASSIC else (10, _MOST_BYTES)
+            count = min(int(length or b"0", base), most)
+            data = bytes([int(byte, self._base) for byte in (content or b"").split(None, count)[:count]])
+            number = int(identifier or b"0", self._base)
+            row = array("i", (number, count, bool(extended), int(bus) - 1, bool(is_error), bool(remote)))
+        except (ValueError, OverflowError):
+            return False
+        if self._is_overlapping:
+            self._overlapping += 1
+        elif len(data) == count and number <= ID_BITS:
+            self._stamps.append(self._start_ns + self._now_ns)
+            self._numbers.extend(row)
+            self._data.extend(data)
+        return len(data) == count and number <= ID_BITS
+
+    def _begin(self, begins_ns: int, time_ns: int) -> None:
+        """Begin a measurement with its first event. If the times continue, they have the same origin as before."""
+        self._begins_ns = None
+        goes_on = not begins_ns if self._is_relative else time_ns >= self._now_ns
+        if not self._stamps or self._is_overlapping or not goes_on:
+            self._is_overlapping = bool(self._stamps) and begins_ns + time_ns < self._stamps[-1]
+            self._start_ns, self._now_ns = begins_ns, 0

@@ -207,6 +207,8 @@ def describe_damage(error: Exception) -> tuple[str, str]:
         raise error
     if isinstance(error, LimitError):
         return "over-budget", f"expected {error.expected}, got {error.got} ({error.where}); {error.remedy}"
+    if isinstance(error, LogError):
+        return "bad-chunk", f"expected {error.expected}, got {error.got}"
     text = str(error) if isinstance(error, SpanDamageError | CutError) else f"{type(error).__name__}: {error}"
     return "bad-chunk", " ".join(text.split())[:_TOLD_CHARACTERS]
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.logs.container import MCAP_MAGIC, ROSBAG1_MAGIC, SQLITE_MAGIC, Container
 from pdhef_logtool.logs.log_file import LogFile
+from pdhef_logtool.logs.reader_process import open_tables
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.drive_log import DriveLog
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 GROUP = "pdhef.log_formats"
 #: Bytes of a file's start by which its format is recognised.
 HEAD_BYTES = 16
-#: Suffixes of a file that is compressed as a whole, and what it begins with.
+#: Suffixes of a file that is compressed as a whole, and its first bytes.
 COMPRESSED_SUFFIXES = (".zstd", ".zst")
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 ROSBAG2_METADATA = "metadata.yaml"
@@ -35,7 +36,9 @@ class LogFormat:
     ----------
     title : for messages: ``an MCAP file``.
     opener : ``package.module:function``, which opens a :class:`LogFile` as a log, or as a container of messages, and
-        raises LogError for a file that is none of this format.
+        raises LogError for a file of another format.
+    libraries : None; or the opener is a reader of tables, which runs in a separate process
+        (:mod:`~pdhef_logtool.logs.reader_process`), with the modules that it imports.
     suffixes : by which a search through folders takes files for logs. named : also, if it is named outright.
     magic : first bytes of every file, or several possible ones; empty: a file is recognised by its suffix.
     needs_suffix : whether files of other formats begin with the same bytes, so that the suffix must match too.
@@ -50,6 +53,7 @@ class LogFormat:
     needs_suffix: bool = False
     is_general: bool = False
     named: tuple[str, ...] = ()
+    libraries: tuple[str, ...] | None = None
 
     def recognises(self, head: bytes, name: str) -> bool:
         """Return, by the first bytes and the name, whether a file is of this format."""
@@ -59,6 +63,8 @@ class LogFormat:
 
     def open(self, file: LogFile) -> DriveLog | Container:
         """Open a file."""
+        if self.libraries is not None:
+            return open_tables(file, self.opener, self.libraries)
         opener: Callable[[LogFile], Any] = pkgutil.resolve_name(self.opener)
         return opener(file)  # type: ignore[no-any-return]
 
@@ -67,14 +73,26 @@ FORMATS = (
     LogFormat("an MCAP file", f"{__package__}.mcap_log:McapContainer.open", (".mcap",), MCAP_MAGIC),
     LogFormat("a ROS 1 bag", f"{__package__}.rosbag1_log:Rosbag1Container.open", (".bag",), ROSBAG1_MAGIC),
     LogFormat("a rosbag2 database", f"{__package__}.rosbag2_sqlite_log:SqliteContainer.open", (".db3",), SQLITE_MAGIC),
-    LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",)),
-    LogFormat("a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"), is_general=True, named=(".txt",)),
-    LogFormat("a Parquet file", f"{__package__}.array_logs:open_parquet", (".parquet",), b"PAR1", is_general=True),
-    LogFormat("a MAT file", f"{__package__}.array_logs:open_mat", (".mat",), b"MATLAB ", is_general=True),
-    LogFormat("an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF ")),
-    LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG"),
-    LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",)),
-)
+    LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",), libraries=("polars",)),
+    LogFormat(
+        "a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"),
+        is_general=True, named=(".txt",), libraries=("polars",),
+    ),
+    LogFormat(
+        "a Parquet file", f"{__package__}.parquet_log:open_parquet", (".parquet",), b"PAR1",
+        is_general=True, libraries=("polars", "pyarrow.parquet"),
+    ),
+    LogFormat(
+        "a MAT file", f"{__package__}.mat_log:open_mat", (".mat",), b"MATLAB ",
+        is_general=True, libraries=("h5py",),
+    ),
+    LogFormat(
+        "an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF "),
+        libraries=("asammdf",),
+    ),
+    LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG", libraries=()),
+    LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",), libraries=()),
+)  # fmt: skip
 
 
 @cache
@@ -84,18 +102,18 @@ def _of_other_packages() -> tuple[LogFormat, ...]:
 
 
 def _every_format() -> Iterator[LogFormat]:
-    """Yield all formats, those of other packages last, so that these are looked for only where they are needed."""
+    """Yield all formats. Those of other packages are last, so that they are searched for only if necessary."""
     yield from FORMATS
     yield from _of_other_packages()
 
 
 def recognised_format(head: bytes, name: str) -> LogFormat | None:
-    """Return the format of a file by its first :data:`HEAD_BYTES` and its name; None where it is no log."""
+    """Return the format of a file by its first :data:`HEAD_BYTES` and its name; None if it is not a log."""
     return next((f for f in _every_format() if f.recognises(head, name)), None)
 
 
 def log_suffixes() -> tuple[str, ...]:
-    """Return the suffixes by which files are taken for logs in a search through folders."""
+    """Return the suffixes of logs in a search through folders."""
     return tuple(suffix for f in _every_format() for suffix in f.suffixes)
 
 

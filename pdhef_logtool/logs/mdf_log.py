@@ -1,202 +1,305 @@
 """MDF 3 and 4 (extra ``formats``): each channel group is a topic with its own clock; columns are read when needed.
 
-A group of bus logging becomes a topic ``can`` of raw frames.
+A group of bus logging becomes a topic ``can`` of raw frames. ``asammdf`` opens the file and returns raw values.
+:mod:`~pdhef_logtool.logs.mdf_conversions` converts them.
 """
 
 from __future__ import annotations
 
-import gc
+import datetime as dt
 import logging
-import mmap
 import re
-import shutil
-import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, redirect_stdout, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import partial
-from io import StringIO
-from pathlib import Path
+from io import BytesIO
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.can_decoding import Frames
-from pdhef_logtool.logs.container import describe_damage
-from pdhef_logtool.logs.log_file import LogFile
+from pdhef_logtool.logs.container import SpanDamageError, describe_damage
+from pdhef_logtool.logs.mdf_blocks import is_unfinished, survey_blocks
+from pdhef_logtool.logs.mdf_conversions import conversion_rule
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.table_columns import NO_TIME, field_name, placed, unique
-from pdhef_logtool.logs.table_log import Table, TableLog
+from pdhef_logtool.logs.table_clocks import NO_TIME, ascending_rows, placed
+from pdhef_logtool.logs.table_columns import field_name, unique
+from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.extras import required
-from pdhef_logtool.records.signals import IntArray, Loss
-from pdhef_logtool.storage.files import scratch_folder
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 
 _FRAMES = "CAN_DataFrame"
-#: Parts of a frame by the names of the standard for bus logging.
-_PARTS = {"id": "ID", "length": "DataLength", "is_extended": "IDE", "bus": "BusChannel"}
+#: Bytes of a frame by its data length code, and the codes that are no lengths.
+_LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
+_ONLY_CODES = (9, 10, 11, 13, 14, 15)
 _DATA_BLOCK = re.compile(rb"##(?:DT|SD|DV)\0{4}")
 _LONGEST_NAME = 40
-#: Times from the start of a recording beyond this are damaged.
-_LONGEST_S = 4e9
+#: Times from the start of a recording beyond this are damaged, as are starts after this date, in 2100.
+_LONGEST_S, _LAST_DATE_NS = 4e9, 4_102_444_800 * 10**9
+#: Types of channels of MDF 4: values of variable length, and virtual channels (raw values are row numbers).
+_VARIABLE, _VIRTUAL = (1, 5, 7), (3, 6)
+#: Types of masters by version.
+_MASTERS = {4: (2, 3), 3: (1,)}
+#: Flags of channels and of the start.
+_ALL_INVALID, _SOME_INVALID = 1, 2
+_LOCAL, _WITH_OFFSETS = 1, 2
+#: Quantities of masters other than time, by type of synchronisation.
+_NO_TIMES = {2: "an angle", 3: "a distance", 4: "an index"}
 
 
-def open_mdf(file: LogFile) -> TableLog:
-    """Open an MDF file; groups and channels that cannot be read are losses."""
-    asammdf = required("asammdf", "formats", "reads MDF files", file.place)
+def open_mdf(file: TableFile) -> Tables:
+    """Read an MDF file; groups and channels that cannot be read are losses.
+
+    Raises
+    ------
+    LogError : no group of it can be read. LimitError : it claims more than the limits allow.
+    """
+    asammdf = required("asammdf", "formats", "reads MDF files", file.name)
     logging.getLogger("asammdf").setLevel(logging.CRITICAL)
     losses: list[Loss] = []
-    with file.meter.running(file.path.stat().st_size):
-        source, got = _opened(asammdf, file.path)
-        copies = ExitStack()
-        if source is None and (copy := _repaired(file.path, Path(copies.enter_context(scratch_folder())))):
-            source, got = _opened(asammdf, copy)
-            losses.append(Loss("truncated", "the last block of data is incomplete", str(file.place)))
-        if source is None:
-            copies.close()
-            raise LogError(expected="an MDF file with readable channels", got=got, where=str(file.place))
-        groups = [Group(source, number) for number in range(len(source.groups))]
-        names = unique(group.name for group in groups)
-        tables: list[Table] = []
-        frames: list[Frames] = []
-        for name, group in zip(names, groups, strict=True):
-            try:
-                with redirect_stdout(StringIO()):
-                    tables += group.tables(name, frames)
-            except Exception as error:  # noqa: BLE001  any error of a damaged block
-                what = f"the channel group cannot be read: {describe_damage(error)[1]}"
-                losses.append(Loss("bad-group", what, name))
+    if missing := survey_blocks(file):
+        losses.append(Loss("truncated", f"{missing} blocks are beyond the end of the file", file.name))
+    stream: Any = file.stream
+    if is_unfinished(file):  # asammdf completes it in place
+        losses.append(Loss("truncated", "the recorder has not finished the file", file.name, severity="note"))
+        stream = BytesIO(file.stream.read())
+    source = _opened(asammdf, stream)
+    if isinstance(source, str) and (repaired := _repaired(file)):
+        source = _opened(asammdf, repaired)
+    if isinstance(source, str):
+        raise LogError(expected="an MDF file with readable channels", got=source, where=file.name)
+    groups = Groups(file, source)
+    tables: list[Table] = []
+    for number, name in enumerate(unique(map(groups.name, range(len(source.groups))))):
+        try:
+            tables += groups.tables(number, name, losses)
+        except Exception as error:  # noqa: BLE001  any error of a damaged block
+            what = f"the channel group cannot be read: {describe_damage(error)[1]}"
+            losses.append(Loss("bad-group", what, name))
     if not tables:
-        source.close()
-        copies.close()
-        raise LogError(expected="a channel group with times", got="none that can be read", where=str(file.place))
-    release = file.release
-
-    def close() -> None:
-        source.close()
-        copies.close()
-        release()
-
-    opened = LogFile(file.path, file.place, file.meter, close, file.cut)
-    return TableLog(opened, f"mdf-{str(source.version)[:1]}", tables, losses, frames)
+        got = next((f"{loss.where}: {loss.what}" for loss in losses if loss.kind == "bad-group"), "none with samples")
+        raise LogError(expected="a channel group with times", got=got, where=file.name)
+    if groups.is_local:
+        what = "the start is a local time without a time zone, read as UTC"
+        losses.append(Loss("no-clock", what, file.name, severity="note"))
+    return Tables(f"mdf-{str(source.version)[:1]}", tables, losses)
 
 
-def _repaired(path: Path, folder: Path) -> Path | None:
-    """Return a copy of a version 4 file whose last block of data has the length that is left; None if none is cut."""
-    size = path.stat().st_size
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        starts = [m.start() for m in _DATA_BLOCK.finditer(data) if m.start() + 16 <= size]
-        cut = [start for start in starts if start + int.from_bytes(data[start + 8 : start + 16], "little") > size]
+def _repaired(file: TableFile) -> BytesIO | None:
+    """Return a copy of a version 4 file with the length of its cut last data block corrected; None without a cut."""
+    file.stream.seek(0)
+    data = bytearray(file.stream.read())
+    starts = [m.start() for m in _DATA_BLOCK.finditer(data) if m.start() + 16 <= len(data)]
+    cut = [start for start in starts if start + int.from_bytes(data[start + 8 : start + 16], "little") > len(data)]
     if not cut:
         return None
-    copy = folder / path.name
-    shutil.copyfile(path, copy)
-    with copy.open("r+b") as repaired:
-        repaired.seek(cut[-1] + 8)
-        repaired.write((size - cut[-1]).to_bytes(8, "little"))
-    return copy
+    data[cut[-1] + 8 : cut[-1] + 16] = (len(data) - cut[-1]).to_bytes(8, "little")
+    return BytesIO(data)
 
 
-def _opened(asammdf: Any, path: Path) -> tuple[Any, str]:
-    """Return the file, or None and why it cannot be opened."""
-    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None  # the end of a half-opened object is an error there
-    source, got = None, ""
+def _opened(asammdf: Any, stream: Any) -> Any:
+    """Return the file, or why it cannot be opened. Bus logging is not processed: asammdf would convert it."""
     try:
-        try:
-            source = asammdf.MDF(str(path), use_display_names=False)
-        except Exception as error:  # noqa: BLE001  any error of a damaged file
-            got = describe_damage(error)[1]
-        if source is None:
-            gc.collect()
-    finally:
-        sys.unraisablehook = hook
-    return source, got
+        return asammdf.MDF(stream, use_display_names=False, process_bus_logging=False)
+    except Exception as error:  # noqa: BLE001  any error of a damaged file
+        return describe_damage(error)[1]
 
 
-class Group:
-    """A channel group of a file."""
+def _start(header: Any) -> tuple[int, bool]:
+    """Return the start of a recording in ns since 1970, 0 without a date, and whether it is a local time."""
+    start, flags = int(getattr(header, "abs_time", 0)), getattr(header, "time_flags", 0)
+    if flags == _LOCAL | _WITH_OFFSETS:
+        start -= (header.tz_offset + header.daylight_save_time) * 60 * 10**9
+    elif not start and hasattr(header, "date"):
+        text = b" ".join((header.date, header.time)).decode("latin-1").strip(" \0")
+        with suppress(ValueError):
+            date = dt.datetime.strptime(f"{text} +0000", "%d:%m:%Y %H:%M:%S %z")
+            start, flags = round(date.timestamp()) * 10**9, _LOCAL
+    return (start, flags == _LOCAL) if 0 < start < _LAST_DATE_NS else (0, False)
 
-    def __init__(self, source: Any, number: int) -> None:
-        self._source, self._number = source, number
-        self._group = source.groups[number]
-        self._columns: dict[str, NDArray[Any]] = {}
 
-    @property
-    def name(self) -> str:
-        """Name by its acquisition, comment or source."""
-        group = self._group.channel_group
+class Groups:
+    """The channel groups of an opened file, by number, and their channels, by number within the group.
+
+    This class removes the conversions from asammdf's channels, because asammdf would run their formulas.
+    """
+
+    def __init__(self, file: TableFile, source: Any) -> None:
+        self._file, self._source, self._groups = file, source, source.groups
+        self._version = 4 if str(source.version) >= "4" else 3
+        self._start_ns, self.is_local = _start(source.header)
+        self._conversions: dict[tuple[int, int], Any] = {}
+        for place, channel in (((g, i), c) for g, of in enumerate(source.groups) for i, c in enumerate(of.channels)):
+            self._conversions[place], channel.conversion = channel.conversion, None
+        self._rows: dict[int, int] = {}
+        self._last: tuple[tuple[int, int] | None, FloatArray] = None, np.empty(0)
+
+    def name(self, number: int) -> str:
+        """Return the name of a group by its acquisition, comment or source."""
+        group = self._groups[number].channel_group
         source = getattr(group, "acq_source", None)
         texts = (getattr(group, "acq_name", ""), getattr(group, "comment", ""), getattr(source, "name", ""))
         plain = (re.sub(r"<[^>]*>|\s+", " ", text or "").strip() for text in texts)
-        if self.is_frames:
+        if self._contains_frames(number):
             return "can"
-        return field_name(next((t for t in plain if t and len(t) <= _LONGEST_NAME), f"group {self._number + 1}"))
+        return field_name(next((t for t in plain if t and len(t) <= _LONGEST_NAME), f"group {number + 1}"))
 
-    @property
-    def is_frames(self) -> bool:
-        """Return whether it contains raw CAN frames."""
-        return any(channel.name == _FRAMES for channel in self._group.channels)
+    def _contains_frames(self, number: int) -> bool:
+        return any(channel.name == _FRAMES for channel in self._groups[number].channels)
 
-    def tables(self, name: str, frames: list[Frames]) -> Iterator[Table]:
-        """Yield the table of the group, none without samples or times; raw CAN frames are added to ``frames``."""
-        master = self._source.masters_db.get(self._number)
-        if master is None or not self._group.channel_group.cycles_nr:
+    def tables(self, number: int, name: str, losses: list[Loss]) -> Iterator[Table]:
+        """Yield the table of a group, none without samples; channels that cannot be read become losses.
+
+        Raises
+        ------
+        SpanDamageError : the group has no times, or its layout is damaged.
+        """
+        group, channels, file = self._groups[number].channel_group, self._groups[number].channels, self._file
+        if not channels or not group.cycles_nr:
             return
-        self._check_layout()
-        stamps, order = self._stamps()
-        if self.is_frames:
-            parts = {part: self._frames(end)[order].astype(np.int64) for part, end in _PARTS.items() if self._has(end)}
-            data = np.atleast_2d(self._frames("DataBytes"))[order].astype(np.uint8)
-            parts.setdefault("length", np.full(len(stamps), data.shape[1]))
-            frames.append(Frames(stamps, parts, data))
-            yield frames[-1].table(name)
+        row_bytes = group.samples_byte_nr + getattr(group, "invalidation_bytes_nr", 0) + 8
+        file.limits.check_table(group.cycles_nr * row_bytes, file.size, f"{file.name}, {name}")
+        self._check_layout(number)
+        stamps, rows = self._stamps(number, name, losses)
+        if self._contains_frames(number):
+            yield self._frames(number, stamps, rows).table(name)
             return
-        indices = [i for i in range(len(self._group.channels)) if i != master]
-        titles = unique(field_name(self._group.channels[i].name) for i in indices)
-        fields = tuple(FieldInfo(t, "number", unit=self._unit(i)) for t, i in zip(titles, indices, strict=True))
-        yield Table(name, stamps, fields, partial(self._load, dict(zip(titles, indices, strict=True)), order))
+        indices, texts = [], []
+        for i, channel in enumerate(channels):
+            is_compound = self._groups[number].channel_dependencies[i] or self._is(number, i, _VARIABLE)
+            if is_compound or channel.dtype_fmt.kind not in "iuf":
+                texts.append(channel.name)
+            elif channel.channel_type not in _MASTERS[self._version]:
+                try:
+                    conversion_rule(self._conversions[number, i], self._version)
+                    indices.append(i)
+                except ValueError as error:
+                    losses.append(Loss("bad-column", f"{channel.name} cannot be read: {error}", name))
+        if texts:
+            what = f"no columns of numbers: {', '.join(texts)}"
+            losses.append(Loss("bad-column", what, name, count=len(texts), severity="note"))
+        titles = dict(zip(unique(field_name(channels[i].name) for i in indices), indices, strict=True))
+        fields = tuple(FieldInfo(title, "number", unit=self._unit(number, i)) for title, i in titles.items())
+        yield Table(name, stamps, fields, partial(self._load, number, titles, rows))
 
-    def _check_layout(self) -> None:
-        """Raise ValueError for a channel outside of its record: asammdf would read and write memory of others."""
-        for channel in self._group.channels:
-            if hasattr(channel, "start_offset"):  # version 3
-                start = channel.start_offset + 8 * getattr(channel, "additional_byte_offset", 0)
+    def _unit(self, number: int, index: int) -> str:
+        of_conversion = getattr(self._conversions[number, index], "unit", "")
+        return of_conversion or getattr(self._groups[number].channels[index], "unit", "")
+
+    def _is(self, number: int, index: int, types: tuple[int, ...]) -> bool:
+        """Return whether a channel is of one of these types of MDF 4."""
+        return self._version == 4 and self._groups[number].channels[index].channel_type in types
+
+    def _check_layout(self, number: int) -> None:
+        """Raise SpanDamageError for a channel outside of its record: asammdf would read and write memory of others."""
+        group = self._groups[number].channel_group
+        for i, channel in enumerate(self._groups[number].channels):
+            end, last_bit = channel.bit_count, -1
+            if self._version == 3:
+                end += channel.start_offset + 8 * getattr(channel, "additional_byte_offset", 0)
             else:
-                start = 8 * channel.byte_offset + channel.bit_offset
-            if start + channel.bit_count > 8 * self._group.channel_group.samples_byte_nr:
-                raise ValueError(f"channel {channel.name} is outside of its record")
+                end += 8 * channel.byte_offset + channel.bit_offset if not self._is(number, i, _VIRTUAL) else -end
+                last_bit = channel.pos_invalidation_bit if channel.flags & _SOME_INVALID else -1
+            if end > 8 * group.samples_byte_nr or last_bit >= 8 * getattr(group, "invalidation_bytes_nr", 0):
+                raise SpanDamageError(f"channel {channel.name} is outside of its record")
 
-    def _stamps(self) -> tuple[IntArray, NDArray[Any]]:
-        """Return the times in ascending order, and the rows that they are of; rows without a time are left out."""
-        seconds = np.asarray(self._source.get_master(self._number), np.float64)
-        start_ns = round(self._source.start_time.timestamp() * 1e6) * 1000
-        finite = np.isfinite(seconds) & (np.abs(np.nan_to_num(seconds)) < _LONGEST_S)
-        stamps = np.where(finite, np.round(np.where(finite, seconds, 0.0) * 1e9).astype(np.int64) + start_ns, NO_TIME)
-        rows = np.flatnonzero(finite)
-        order = rows[np.argsort(stamps[rows], kind="stable")]
-        in_order: slice | NDArray[Any] = slice(None) if np.array_equal(order, np.arange(len(stamps))) else order
-        return placed(stamps)[in_order], in_order  # type: ignore[return-value]
+    def _seconds(self, number: int) -> FloatArray:
+        """Return the times of a group from the start of the recording in s [N]; SpanDamageError without times."""
+        remote = getattr(self._groups[number].channel_group, "cg_master_index", None)
+        number = number if remote is None else remote
+        masters = [
+            (getattr(channel, "sync_type", 1), i)
+            for i, channel in enumerate(self._groups[number].channels)
+            if channel.channel_type in _MASTERS[self._version]
+        ]
+        kind, index = min(masters, default=(0, None))
+        if index is None or kind in _NO_TIMES:
+            raise SpanDamageError(f"its master is {_NO_TIMES[kind]}, no time" if masters else "it has no time channel")
+        return self._values(number, index)
 
-    def _load(self, indices: dict[str, int], order: Any, path: str, rows: slice) -> NDArray[Any]:
-        if path not in self._columns:
-            with redirect_stdout(StringIO()):  # what asammdf prints of a channel that it cannot read
-                signal = self._source.get(group=self._number, index=indices[path])
-                samples = np.asarray(signal.samples)
-                if samples.dtype.kind in "SUO":  # a conversion to texts: its numbers
-                    samples = np.asarray(self._source.get(group=self._number, index=indices[path], raw=True).samples)
-            invalid = getattr(signal, "invalidation_bits", None)
-            if invalid is not None and np.any(invalid):
-                samples = np.where(np.asarray(invalid, np.bool_), np.nan, samples)
-            self._columns[path] = samples[order]
-        return self._columns[path][rows]
+    def _stamps(self, number: int, name: str, losses: list[Loss]) -> tuple[IntArray, NDArray[Any]]:
+        """Return the ascending times of a group, and their rows; other rows are losses."""
+        seconds = self._seconds(number)
+        self._rows[number] = len(seconds)
+        if missing := self._groups[number].channel_group.cycles_nr - len(seconds):
+            losses.append(Loss("truncated", f"the file ends after {len(seconds)} rows", name, count=missing))
+        finite = np.abs(seconds) < _LONGEST_S
+        stamps = np.round(np.where(finite, seconds, 0.0) * 1e9).astype(np.int64) + self._start_ns
+        stamps = placed(np.where(finite, stamps, NO_TIME))
+        # Frames of several buses are buffered before they are written; rows of channels are in order.
+        order = np.argsort(stamps, kind="stable") if self._contains_frames(number) else np.arange(len(stamps))
+        rows, left_out = ascending_rows(stamps[order], name)
+        losses += left_out
+        return stamps[order[rows]], order[rows]
 
-    def _unit(self, index: int) -> str:
-        with suppress(Exception):  # a damaged block of a unit is no reason to lose the channel
-            return str(self._source.get_channel_unit(group=self._number, index=index) or "")
-        return ""
+    def _raw(self, number: int, index: int) -> tuple[NDArray[Any], BoolArray | None]:
+        """Return raw values [N] or [N, k] of a channel, and which rows are invalid [N]."""
+        channel, rows = self._groups[number].channels[index], np.arange(self._groups[number].channel_group.cycles_nr)
+        is_virtual = self._is(number, index, _VIRTUAL)
+        if not channel.bit_count and self._version == 3:
+            return rows * (channel.sampling_rate or 1.0), None
+        if is_virtual and not channel.flags & _SOME_INVALID:
+            return rows, None
+        values, invalid = self._source.get(
+            group=number, index=index, raw=True, samples_only=True, ignore_invalidation_bits=True
+        )
+        return rows if is_virtual else np.asarray(values), invalid
 
-    def _has(self, end: str) -> bool:
-        return any(channel.name == f"{_FRAMES}.{end}" for channel in self._group.channels)
+    def _values(self, number: int, index: int) -> FloatArray:
+        """Return physical values [N] of a channel, NaN for invalid samples."""
+        raw, invalid = self._raw(number, index)
+        if raw.ndim != 1 or raw.dtype.kind not in "biuf":
+            raise SpanDamageError("it contains no numbers")
+        values = conversion_rule(self._conversions[number, index], self._version)(raw)
+        if getattr(self._groups[number].channels[index], "flags", 0) & _ALL_INVALID:
+            values[:] = np.nan
+        elif invalid is not None:
+            values[np.asarray(invalid, np.bool_)] = np.nan
+        return values
 
-    def _frames(self, end: str) -> NDArray[Any]:
-        return np.asarray(self._source.get(f"{_FRAMES}.{end}", group=self._number, raw=True, samples_only=True)[0])
+    def _load(self, number: int, indices: Mapping[str, int], order: Any, path: str, rows: slice) -> FloatArray:
+        if self._last[0] != (number, indices[path]):
+            values = self._values(number, indices[path])
+            if len(values) != self._rows[number]:
+                raise SpanDamageError(f"{len(values)} values for {self._rows[number]} times")
+            self._last = (number, indices[path]), values[order]
+        return self._last[1][rows]
+
+    def _frames(self, number: int, stamps: IntArray, rows: Any) -> Frames:
+        """Return the CAN frames of a group. Row numbers, of a virtual channel without a conversion, are no part."""
+        names = [channel.name.removeprefix(f"{_FRAMES}.") for channel in self._groups[number].channels]
+        parts = {
+            name: np.nan_to_num(self._values(number, i), nan=-1.0)[rows].astype(np.int64)
+            for i, name in enumerate(names)
+            if name in ("ID", "IDE", "BusChannel", "DataLength", "DLC")
+            and (self._conversions[number, i] or not self._is(number, i, _VIRTUAL))
+        }
+        data = self._bytes(number, names.index("DataBytes"))[rows]
+        identifier = parts["ID"] & 0x1FFF_FFFF
+        length = parts.get("DataLength", parts.get("DLC", np.full(len(stamps), data.shape[1])))
+        if np.isin(length, _ONLY_CODES).any() or ("DLC" in parts and "DataLength" not in parts):
+            length = _LENGTHS[length.clip(0, 15)]
+        extended = (parts["ID"] >> 31 & 1) | (identifier > 0x7FF) | (parts.get("IDE", np.zeros(1)) > 0)
+        frames = {"id": identifier, "length": length.clip(0, data.shape[1]), "is_extended": extended}
+        return Frames(stamps, frames | ({"bus": parts["BusChannel"]} if "BusChannel" in parts else {}), data)
+
+    def _bytes(self, number: int, index: int) -> NDArray[np.uint8]:
+        """Return the data of frames [N, k], zero behind the length."""
+        group = self._groups[number]
+        is_variable = self._is(number, index, _VARIABLE[:1])
+        if is_variable:
+            group.channels[index].channel_type = 0  # its raw values are the places of the data
+        raw, _ = self._raw(number, index)
+        if not is_variable:
+            return np.asarray(raw, np.uint8).reshape(len(raw), -1)
+        stored = np.frombuffer(self._source._mdf._load_signal_data(group, index), np.uint8)
+        begins = raw.astype(np.int64)
+        if begins.min(initial=0) < 0 or begins.max(initial=0) > len(stored) - 4:
+            raise SpanDamageError("data of a frame are missing")
+        frames = np.lib.stride_tricks.sliding_window_view(np.pad(stored, (0, _LENGTHS[-1])), 4 + _LENGTHS[-1])[begins]
+        lengths = frames[:, :4].copy().view("<u4")
+        data = frames[:, 4 : 4 + min(lengths.max(initial=0), _LENGTHS[-1])]
+        return np.where(np.arange(data.shape[1]) < lengths, data, np.uint8(0))

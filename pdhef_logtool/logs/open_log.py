@@ -75,7 +75,7 @@ def open_log(
     if databases and isinstance(log, TableLog):
         from pdhef_logtool.logs.can_decoding import load_dbc
 
-        log.decode_frames([load_dbc(path) for path in databases])
+        log.decode_frames([(path.name, load_dbc(path)) for path in databases])
     return log
 
 

@@ -36,6 +36,7 @@ class ResourceLimits:
     schema_bytes : text or descriptors of one schema. schema_leaves : scalar places of an unfolded schema.
     schema_depth : structs inside one another, also of a JSON message.
     array_width : elements of an array that become columns.
+    table_bytes, table_ratio : bytes of a file's decoded tables: a constant part, and a part by stored bytes.
     seconds, seconds_per_mib : processor time of reading: a constant part, and a part per MiB read.
     """
 
@@ -49,6 +50,8 @@ class ResourceLimits:
     schema_leaves: int = 20_000
     schema_depth: int = 32
     array_width: int = 65_536
+    table_bytes: int = 256 << 20
+    table_ratio: int = 32
     seconds: float = 5.0
     seconds_per_mib: float = 20.0
 
@@ -73,6 +76,13 @@ class ResourceLimits:
         self.check("chunk_bytes", size, what)
         if size > _MIB:
             self.check("chunk_ratio", size / max(stored, 1), what)
+
+    def check_table(self, size: int, stored: int, what: str) -> None:
+        """Raise :class:`LimitError` if ``stored`` bytes may not become, or claim to become, tables of ``size`` bytes.
+
+        Readers call it before they allocate: with rows times width of the metadata, or the size of a container.
+        """
+        self.check("table_bytes", size - self.table_ratio * stored, what)
 
     def check_messages(self, count: int, stored: int) -> None:
         """Raise :class:`LimitError` if ``stored`` bytes may not contain so many messages."""

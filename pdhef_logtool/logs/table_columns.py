@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
-import datetime as dt
 import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs.table_clocks import (
+    NO_TIME,
+    TIME_UNITS_NS,
+    Clock,
+    ascending_rows,
+    number_clock,
+    text_clock,
+    week_clock,
+)
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
@@ -20,30 +28,30 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 if TYPE_CHECKING:
     from polars import Series
 
-#: Stamp of a row without a time.
-NO_TIME = np.iinfo(np.int64).min
-#: Times that count from the start of a recording follow this instant, 1970-01-02, so that none is negative.
-RELATIVE_NS = 86_400_000_000_000
-#: 1973; earlier times count from the start of a recording.
-_FIRST_DATE_NS = 10**17
-#: A column with more missing cells than this has a clock of its own: the rows where it has a value.
-_MISSING_SHARE = 0.01
+#: Steps of a column's own clock are at most this multiple of its usual step.
+_REGULAR = 1.5
+#: A second clock is used if it has times in fewer rows than this share of another one.
+_ENOUGH_ROWS = 0.9
+#: Lengths of two clocks of a table differ by less than this share.
+_ALIKE = 0.01
+#: Share of steps that are not negative, of a column that may contain times.
+_ASCENDING_SHARE = 0.99
 
 #: Spellings of units that are separated from the name of a column, without spaces and in lower case.
 _UNITS = frozenset(
     re.split(
         ",",
         "g,mg,m/s²,m/s^2,m/s2,m/s**2,m/s/s,mps2,m/s,m/sec,mps,km/h,kmh,kph,kmph,mph,kn,kt,kts,knots,deg,°,degree,degrees,"
-        "rad,radians,mrad,deg/s,°/s,dps,deg/sec,degps,rad/s,rad/sec,radps,mdps,rpm,1/min,u/min,/min,min-1,grad,grad/s,min,',s,sec,seconds,ms,us,"
-        "µs,ns,m,cm,mm,km,%,bar,pa,kpa,n,nm,v,mv,a,°c,degc,c,hz,kg,-,1",
+        "rad,radians,mrad,deg/s,°/s,dps,deg/sec,degps,rad/s,rad/sec,radps,mdps,rpm,1/min,u/min,/min,min-1,grad,grad/s,',"
+        "m,cm,mm,km,%,bar,pa,kpa,n,nm,v,mv,a,°c,degc,c,hz,kg,-,1",
     )
-)
+) | {*TIME_UNITS_NS}
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
 _LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"})
 
 _TIME = re.compile(
     r"(?:(?:time|t|timestamp|time_?stamps?|stamp|utc|utc_time|gps_time|date_?time|datetime|zeit|log_time|rel(?:ative)?_time|"
-    r"elapsed(?:_time)?|time_of_day)(?:_(?:s|sec|secs|seconds|ms|us|ns))?|seconds|milli(?:s|seconds)|micros|time_utc|epoch)"
+    rf"elapsed(?:_time)?|time_of_day)(?:_(?:{'|'.join(TIME_UNITS_NS)}))?|seconds|milli(?:s|seconds)|micros|time_utc|epoch)"
 )
 _TIME_LIKE = re.compile(r"time|zeit|clock|stamp")
 _WEEK = re.compile(r"(?:gps|gnss)?_?week(?:_?(?:number|no|nr))?")
@@ -56,14 +64,6 @@ _SIGNAL = re.compile(
 )
 _VALUE = re.compile(r"(?:physical_|signal_|phys_|telemetry_|metric_)?(?:value|val|wert)")
 _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
-_FACTORS_NS = {
-    **dict.fromkeys(("s", "sec", "secs", "seconds"), 10**9), **dict.fromkeys(("ms", "millis"), 10**6),
-    **dict.fromkeys(("us", "µs", "micros"), 10**3), "ns": 1,
-}  # fmt: skip
-_GPS_EPOCH_NS = 315_964_800 * 10**9
-_WEEK_S = 604_800
-#: GPS time minus UTC in s, from a time in s since 1970 on.
-_LEAP_SECONDS = ((1136073600, 14), (1230768000, 15), (1341100800, 16), (1435708800, 17), (1483228800, 18))
 
 
 def field_name(text: str) -> str:
@@ -89,7 +89,7 @@ def is_unit(text: str) -> bool:
 
 
 def split_unit(text: str) -> tuple[str, str]:
-    """Return name and unit of a title (``Speed (km/h)``, ``"Speed"|"km/h"|0|250``); empty where it has none."""
+    """Return name and unit of a title (``Speed (km/h)``, ``"Speed"|"km/h"|0|250``); without a unit, it is empty."""
     if "|" in text:
         text, unit, *_ = (part.strip('" ') for part in text.split("|"))
         return text, unit if is_unit(unit) else ""
@@ -100,74 +100,6 @@ def split_unit(text: str) -> tuple[str, str]:
 def snake(name: str) -> str:
     """Return a name in lower case with words joined by ``_``."""
     return re.sub(r"\W+", "_", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name)).lower()
-
-
-def number_stamps(values: FloatArray, unit: str = "") -> IntArray:
-    """Return times [N] in ns since 1970, or after :data:`RELATIVE_NS` where they count from the start of a recording.
-
-    Without a unit the usual step decides it: seconds below 1, milliseconds below 1000, and so on.
-    """
-    factor = _FACTORS_NS.get(unit.strip("[]() ").lower())
-    finite = np.isfinite(values)
-    if factor is None:
-        steps = np.diff(values[finite])
-        step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
-        factor = next((f for most, f in ((1.0, 10**9), (1e3, 10**6), (1e6, 10**3)) if step < most), 1)
-    stamps = np.full(values.shape, NO_TIME, np.int64)
-    finite &= np.abs(np.where(finite, values, 0.0)) < 9e18 / factor
-    whole = np.floor(values[finite])  # the fraction apart: a product would lose the last digits of a date
-    stamps[finite] = whole.astype(np.int64) * factor + np.round((values[finite] - whole) * factor).astype(np.int64)
-    return placed(stamps)
-
-
-def placed(stamps: IntArray) -> IntArray:
-    """Return stamps [N], moved to :data:`RELATIVE_NS` where they are no dates."""
-    has = stamps != NO_TIME
-    if has.any() and int(np.median(stamps[has])) < _FIRST_DATE_NS:
-        return np.where(has, stamps + RELATIVE_NS, NO_TIME)
-    return stamps
-
-
-def gps_stamps(week: FloatArray, seconds: FloatArray) -> IntArray:
-    """Return UTC in ns [N] from GPS weeks [N] and their seconds (or milliseconds) [N]."""
-    finite = np.isfinite(week) & np.isfinite(seconds)
-    seconds = seconds / 1e3 if finite.any() and float(np.nanmax(seconds[finite])) > _WEEK_S else seconds
-    stamps = np.full(week.shape, NO_TIME, np.int64)
-    stamps[finite] = (
-        _GPS_EPOCH_NS
-        + week[finite].astype(np.int64) * (_WEEK_S * 10**9)
-        + np.round(seconds[finite] * 1e9).astype(np.int64)
-    )
-    leap = [0] + [s for _, s in _LEAP_SECONDS]
-    after = np.searchsorted([since for since, _ in _LEAP_SECONDS], stamps // 10**9, side="right")
-    return np.where(finite, stamps - np.asarray(leap, np.int64)[after] * 10**9, NO_TIME)
-
-
-def text_stamps(texts: Series) -> IntArray:
-    """Return times of ISO 8601 texts, or of texts ``hh:mm:ss`` [N] in ns."""
-    import polars as pl
-
-    texts = texts.str.strip_chars().str.replace(",", ".").str.replace(" ", "T")
-    texts = texts.str.replace(r"^(\d\d)\.(\d\d)\.(\d{4})", "$3-$2-$1")
-    # With a slash the month comes first, where it can be one.
-    texts = texts.str.replace(r"^(1[3-9]|2\d|3[01])/(\d\d?)/(\d{4})", "$2/$1/$3")
-    texts = texts.str.replace(r"^(\d\d?)/(\d\d?)/(\d{4})", "$3-$1-$2")
-    for _ in range(2):
-        texts = texts.str.replace(r"-(\d)([T-])", "-0$1$2")
-    first = next((t for t in texts.drop_nulls().head(100) if t), "")
-    if "-" not in first and "/" not in first:
-        texts = pl.select(pl.when(texts.str.count_matches(":") == 1).then("0:" + texts).otherwise(texts)).to_series()
-        parts = texts.str.split_exact(":", 2).struct.unnest()
-        hours, minutes, seconds = (parts[c].cast(pl.Float64, strict=False).to_numpy() for c in parts.columns)
-        return number_stamps(unwrapped(3600.0 * hours + 60.0 * minutes + seconds), "s")
-    times = texts.str.to_datetime(time_unit="ns", time_zone="UTC", strict=False)
-    return times.dt.epoch("ns").fill_null(NO_TIME).to_numpy()
-
-
-def unwrapped(seconds: FloatArray) -> FloatArray:
-    """Return seconds since midnight [N] that continue behind midnight."""
-    steps = np.diff(seconds, prepend=seconds[:1])
-    return np.asarray(seconds + 86_400.0 * np.cumsum(steps < -43_200.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,8 +117,8 @@ class Sheet:
     type_name: str = ""
 
 
-def stamps_of(sheet: Sheet, where: str) -> tuple[IntArray, frozenset[str]]:
-    """Return the times [N] of a sheet, and the names of the columns that they are from.
+def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = ()) -> Clock:
+    """Return the clock of a sheet; ``others`` are certain clocks of the same recording.
 
     Raises
     ------
@@ -195,57 +127,65 @@ def stamps_of(sheet: Sheet, where: str) -> tuple[IntArray, frozenset[str]]:
     names = {snake(name): name for name in reversed([*sheet.columns])}
     week, seconds = (next((names[n] for n in names if p.fullmatch(n)), None) for p in (_WEEK, _WEEK_TIME))
     if week is not None and seconds is not None:
-        return gps_stamps(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds])), frozenset({week, seconds})
-    clocks = _clocks(sheet, names)
-    if not clocks:
+        clock = week_clock(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds]))
+        return replace(clock, columns=frozenset({week, seconds}))
+    grades = {name: grade for name in sheet.columns if (grade := _grade(sheet, name)) is not None}
+    clocks = {name: _read_clock(sheet, name, others) for name in grades}
+    chosen, *rivals = _best_clocks(clocks, grades)
+    if not chosen:
         raise LogError(
             expected="a column of times (time, t, timestamp; s, ms, ISO 8601, or GPS week and seconds)",
             got=", ".join([*sheet.columns][:8]) or "no columns",
             where=f"{where}, {sheet.name}",
             remedy="name the column of times so",
         )
-    column = sheet.columns[clocks[0]]
-    date = next((names[n] for n in names if _DATE.fullmatch(n)), "")
-    dates = sheet.columns.get(date)
+    certain = [clock for name, clock in clocks.items() if name != chosen and clock.is_certain]
+    clock = _read_clock(sheet, chosen, (*others, *certain)) if certain else clocks[chosen]
+    apart = [n for n in rivals if abs(clocks[n].length_s - clock.length_s) > _ALIKE * clock.length_s]
+    note = f"{chosen} is the clock; the times of {', '.join(apart)} have another length"
+    return replace(clock, notes=(*clock.notes, note)) if apart else clock
+
+
+def _best_clocks(clocks: Mapping[str, Clock], grades: Mapping[str, int]) -> list[str]:
+    """Return the columns of the best grade with enough times, dates first unless their names decide; "" if none."""
+    rows = {n: np.count_nonzero(clocks[n].stamps_ns != NO_TIME) for n in grades if grades[n] == min(grades.values())}
+    enough = [n for n in rows if rows[n] >= _ENOUGH_ROWS * max(rows.values()) > 0.0]
+    return sorted(enough, key=lambda n: not (grades[n] and clocks[n].is_dated)) or [""]
+
+
+def _grade(sheet: Sheet, name: str) -> int | None:
+    """Return how surely a column contains times, 0 by its name alone; None if it does not."""
+    column, text = sheet.columns[name], snake(name)
+    is_time = _TIME.fullmatch(text) is not None
     if not isinstance(column, np.ndarray):
-        if dates is None or isinstance(dates, np.ndarray) or "-" in str(column[0]):
-            return text_stamps(column), frozenset(clocks[:1])
-        return text_stamps(dates + "T" + column), frozenset({clocks[0], date})
-    if column.dtype.kind == "M":
-        return placed(column.astype("datetime64[ns]").astype(np.int64)), frozenset(clocks[:1])
-    unit = sheet.units.get(clocks[0], "") or snake(clocks[0]).rpartition("_")[2]
-    return number_stamps(column.astype(np.float64), unit), frozenset(clocks[:1])
+        if not is_time and not _DATE.fullmatch(text):
+            return None
+        times = {*text_clock(column.drop_nulls().head(20)).stamps_ns.tolist()} - {NO_TIME}
+        return (0 if is_time else 1) if len(times) > (not is_time) else None
+    if column.dtype.kind not in "iufM":
+        return None
+    given = column[~np.isnat(column)].view(np.int64) if column.dtype.kind == "M" else column[np.isfinite(column)]
+    if not len(given) or (len(column) > 1 and (given == given[0]).all()):
+        return None
+    if is_time:
+        return 0
+    if (given[1:] >= given[:-1]).sum() < _ASCENDING_SHARE * (len(given) - 1) or len(column) == 1:
+        return 2 if column.dtype.kind == "M" else None
+    is_unit_of_time = sheet.units.get(name, "").lower() in TIME_UNITS_NS or text.startswith("t_")
+    return 1 if _TIME_LIKE.search(text) else 2 if column.dtype.kind == "M" else 3 if is_unit_of_time else None
 
 
-def _clocks(sheet: Sheet, names: Mapping[str, str]) -> list[str]:
-    """Return the columns with times, the best first; ``names`` are all columns by their names in lower case."""
-    clocks = [name for n, name in names.items() if _TIME.fullmatch(n)]
-    clocks = [n for n in reversed(clocks) if _is_clock(sheet.columns[n])]
-    ascending = [(n, name) for n, name in reversed([*names.items()]) if not clocks and _ascends(sheet.columns[name])]
-    like = [name for n, name in ascending if _TIME_LIKE.search(n)]
-    clocks = clocks or sorted(like, key=lambda n: not _dates(sheet, n))
-    dates = [name for _, name in ascending if sheet.columns[name].dtype.kind == "M"]  # type: ignore[union-attr]
-    return clocks or dates or [name for _, name in ascending if sheet.units.get(name, "").lower() in _FACTORS_NS]
-
-
-def _dates(sheet: Sheet, name: str) -> bool:
-    """Return whether a column contains dates, not times since the start of a recording or of a device."""
-    column = np.asarray(sheet.columns[name])
-    unit = sheet.units.get(name, "")
-    return column.dtype.kind == "M" or int(np.median(number_stamps(column.astype(np.float64), unit))) >= _FIRST_DATE_NS
-
-
-def _is_clock(column: NDArray[Any] | Series) -> bool:
+def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock]) -> Clock:
+    column, columns = sheet.columns[name], {name}
     if isinstance(column, np.ndarray):
-        return column.dtype.kind in "iufM" and (len(column) == 1 or bool((column != column[:1]).any()))
-    return bool((text_stamps(column.head(20)) != NO_TIME).any())
-
-
-def _ascends(column: NDArray[Any] | Series) -> bool:
-    """Return whether a column contains dates, or numbers that never step back."""
-    if not isinstance(column, np.ndarray) or column.dtype.kind not in "iufM":
-        return False
-    return column.dtype.kind == "M" or (len(column) > 1 and bool((np.diff(column.astype(np.float64)) >= 0.0).all()))
+        unit = sheet.units.get(name, "") or snake(name).rpartition("_")[2]
+        clock = number_clock(column, unit, name, others)
+    else:
+        date = next((n for n in sheet.columns if n != name and _DATE.fullmatch(snake(n))), name)
+        dates = sheet.columns[date]
+        clock = text_clock(column, None if date == name or isinstance(dates, np.ndarray) else dates)
+        columns = {name, date}
+    return replace(clock, columns=frozenset(columns))
 
 
 def _numbers(column: NDArray[Any] | Series) -> FloatArray:
@@ -255,44 +195,67 @@ def _numbers(column: NDArray[Any] | Series) -> FloatArray:
 
 
 def tables_of(sheet: Sheet, where: str, losses: list[Loss], stamps: IntArray | None = None) -> Iterator[Table]:
-    """Yield the tables of a sheet: one for all columns with values in the same rows.
+    """Yield the tables of a sheet: one for all columns, and one for each slower clock that some of them have.
 
-    Rows without a time are a loss, rows of a step back in time are sorted, with a note.
+    A row without a time, a row that steps back in time and a column without numbers are losses.
     """
     used: frozenset[str] = frozenset()
     if stamps is None:
-        stamps, used = stamps_of(sheet, where)
+        clock = find_clock(sheet, where)
+        stamps, used = clock.stamps_ns, clock.columns
+        losses.extend(clock_notes(clock, where))
         if long := list(_of_long_form(sheet, stamps)):
             for name, (part, its) in zip(unique(part.name for part, _ in long), long, strict=True):
                 yield from tables_of(Sheet(name, part.columns, part.units), where, losses, its)
             return
-    has_time = stamps != NO_TIME
-    if not has_time.all():
-        losses.append(Loss("bad-stamp", "row without a time", f"{where}, {sheet.name}", count=int((~has_time).sum())))
-    back = int((np.diff(stamps[has_time]) < 0).sum())
-    if back:
-        what = "step back in time: the rows are sorted"
-        losses.append(Loss("out-of-order", what, f"{where}, {sheet.name}", count=back, severity="note"))
-    order = np.flatnonzero(has_time)[np.argsort(stamps[has_time], kind="stable")]
+    rows, lost = ascending_rows(stamps, f"{where}, {sheet.name}")
+    losses.extend(lost)
     groups: dict[bytes, tuple[BoolArray, dict[str, NDArray[Any]]]] = {}
+    unusable = []
     for name, column in sheet.columns.items():
-        if name in used or not isinstance(column, np.ndarray) or column.dtype.kind not in "iufb":
+        if name in used:
             continue
-        values = column[order]
-        there = np.isfinite(values) if values.dtype.kind == "f" else np.ones(len(values), np.bool_)
-        if not there.any():
+        if not isinstance(column, np.ndarray) or column.dtype.kind not in "iufb":
+            unusable.append(name)
             continue
-        if np.count_nonzero(~there) <= _MISSING_SHARE * len(there):
-            there = np.ones(len(values), np.bool_)
+        if not np.isfinite(column).any():  # its cells are empty
+            continue
+        if len(column) != len(stamps):
+            losses.append(Loss("bad-column", f"{name}: {len(column)} values for {len(stamps)} times", where))
+            continue
+        values = column[rows]
+        there = _own_rows(np.isfinite(values), stamps[rows])
         groups.setdefault(np.packbits(there).tobytes(), (there, {}))[1][name] = values[there]
+    if unusable:
+        what = f"columns without numbers are left out: {', '.join(unusable)}"
+        losses.append(Loss("no-numbers", what, f"{where}, {sheet.name}", count=len(unusable), severity="note"))
     ordered = sorted(groups.values(), key=lambda group: -np.count_nonzero(group[0]))
     for number, (there, columns) in enumerate(ordered, 1):
         name = sheet.name if number == 1 else f"{sheet.name}_{number}"
-        yield Table.of_arrays(name, stamps[order][there], columns, sheet.units, sheet.type_name)
+        yield Table.of_arrays(name, stamps[rows][there], columns, sheet.units, sheet.type_name)
+
+
+def clock_notes(clock: Clock, where: str) -> list[Loss]:
+    """Return the assumptions of a clock as notes."""
+    return [Loss("clock", note, where, severity="note") for note in clock.notes]
+
+
+def _own_rows(there: BoolArray, stamps: IntArray) -> BoolArray:
+    """Return the rows of a column with values in some rows [N]: all, with NaN, unless it has a slower clock.
+
+    Of a slower clock most steps that skip rows are no longer than the usual step of the column.
+    """
+    rows = np.flatnonzero(there)
+    if len(rows) < 3 or len(rows) == len(there):
+        return np.ones(len(there), np.bool_)
+    steps = np.diff(stamps[rows])
+    is_usual = (steps <= _REGULAR * np.median(steps))[np.diff(rows) > 1]
+    has_clock = is_usual.any() and is_usual.sum() >= 3 * (~is_usual).sum()
+    return there if has_clock else np.ones(len(there), np.bool_)
 
 
 def _of_long_form(sheet: Sheet, stamps: IntArray) -> Iterator[tuple[Sheet, IntArray]]:
-    """Yield the signals of a table with a row for each value, those with the same times together; of others nothing."""
+    """Yield the signals of a table with a row for each value; signals with equal times are one sheet."""
     named = {snake(name): column for name, column in sheet.columns.items()}
     signal, value = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in (_SIGNAL, _VALUE))
     if signal is None or isinstance(signal, np.ndarray) or not isinstance(value, np.ndarray):
@@ -312,11 +275,6 @@ def _of_long_form(sheet: Sheet, stamps: IntArray) -> Iterator[tuple[Sheet, IntAr
         part.columns[field] = value[rows]  # type: ignore[index]
         part.units[field] = cell or given.get(field, "")  # type: ignore[index]
     yield from clocks.values()
-
-
-def whole_days(date: dt.date) -> int:
-    """Return the ns of a date's midnight."""
-    return (date - dt.date(1970, 1, 1)).days * 86_400 * 10**9
 
 
 def read_head(names: Sequence[str]) -> tuple[list[str], dict[str, str]]:

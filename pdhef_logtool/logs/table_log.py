@@ -1,10 +1,10 @@
-"""A log of columns without messages: what a format of tables (CSV, MDF, MAT, ...) gives its columns to."""
+"""A log of columns without messages, for formats of tables (CSV, MDF, MAT, ...)."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,8 +21,6 @@ from pdhef_logtool.records.signals import IntArray, Loss
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
-
-    from pdhef_logtool.logs.can_decoding import Frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,8 +64,7 @@ class TableLog(DriveLog):
     ----------
     file : that the tables come from; it is released when the log is closed.
     kind : name of the format, for reports.
-    tables : one a topic. lost : what of the file could not be read.
-    frames : raw CAN frames among them, for :meth:`decode_frames`.
+    tables : one per topic. lost : unreadable parts of the file.
 
     Raises
     ------
@@ -80,10 +77,8 @@ class TableLog(DriveLog):
         kind: str,
         tables: Sequence[Table],
         lost: Sequence[Loss] = (),
-        frames: Sequence[Frames] = (),
     ) -> None:
         self.path, self.kind = file.place, kind
-        self._frames = frames
         self._file = file
         self._tables = {table.name: table for table in sorted(tables, key=lambda table: table.name)}
         names = Counter(table.name for table in tables)
@@ -95,15 +90,17 @@ class TableLog(DriveLog):
         cut = [Loss("truncated", file.cut, str(self.path))] if file.cut else []
         self._lost = [*lost, *cut, *self._recording_span.losses]
         self._unreadable: set[tuple[str, str]] = set()
+        self._column_losses: dict[tuple[str, str], list[Loss]] = {}
         self._size = file.path.stat().st_size
 
-    def decode_frames(self, databases: Sequence[Database]) -> None:
-        """Add a table for each message of DBC files that raw CAN frames of the log contain."""
-        tables = [table for frames in self._frames for table in frames.decoded(databases)]
-        for table in tables:
-            number = 1 + sum(name.partition("#")[0] == table.name for name in self._tables)
-            name = table.name if number == 1 else f"{table.name}#{number}"
-            self._tables[name] = replace(table, name=name)
+    def decode_frames(self, databases: Sequence[tuple[str, Database]]) -> None:
+        """Add a table for each message of DBC files, given with their names, that raw CAN frames of the log contain."""
+        from pdhef_logtool.logs.can_decoding import CAN_TYPE, Decoder, Frames
+
+        for frames in [Frames.of_table(table) for table in self._tables.values() if table.type_name == CAN_TYPE]:
+            decoder = Decoder(frames, databases, self._tables, self._lost, self._column_losses)
+            for table in decoder.tables():
+                self._tables[table.name] = table
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
@@ -181,4 +178,6 @@ class TableLog(DriveLog):
                 self._unreadable.add((table.name, path))
                 self._lost.append(Loss("bad-column", f"{path} cannot be read: {describe_damage(error)[1]}", table.name))
             return np.zeros(n, kind) if is_time else np.full(n, np.nan)
+        if not quiet:
+            self._lost += self._column_losses.pop((table.name, path), ())
         return values

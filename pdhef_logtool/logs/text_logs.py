@@ -1,48 +1,48 @@
 """Logs of text: CSV files of any dialect, and Racelogic's VBO files.
 
-CSV: the delimiter, the decimal comma, the header, a row of units and the encoding are found in the file. Columns with
-values in other rows than the rest become a topic of their own. VBO: columns are named as in ``[header]``; latitude and
-longitude stay in arc minutes, longitude positive to the west, as documented (``mapping/vendors.toml``).
+CSV: the delimiter, the decimal mark, the header, a row of units and the encoding are detected. Each row is read, or it
+is a loss with its line. VBO: columns are named as in ``[header]``; latitude and longitude stay in arc minutes with
+longitude positive to the west, as documented (``mapping/vendors.toml``). A file with the other sign, which the heading
+shows, is mirrored.
 """
 
 from __future__ import annotations
 
+import codecs
 import csv
 import datetime as dt
 import io
 import re
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import chain, islice
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pdhef_logtool.logs.log_file import LogFile
-from pdhef_logtool.logs.table_columns import (
-    NO_TIME,
-    Sheet,
-    field_name,
-    is_unit,
-    placed,
-    read_head,
-    tables_of,
-    unique,
-    unwrapped,
-    whole_days,
-)
-from pdhef_logtool.logs.table_log import TableLog
+from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
+from pdhef_logtool.logs.table_clocks import NO_TIME, placed, unwrapped, whole_days
+from pdhef_logtool.logs.table_columns import Sheet, is_unit, read_head, tables_of
+from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
 
-if TYPE_CHECKING:
-    from polars import Series
-
 #: Lines at the start of a CSV file in which its header must be.
 _HEAD_LINES = 200
-_NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*")
-_TIME_TEXT = re.compile(r"\s*(\d{1,4}[./-]\d\d?[./-]\d{2,4}([T ].*)?|(\d\d?:)?\d\d?:\d\d([.,]\d+)?Z?)\s*")
-_EMPTY = frozenset({"", "nan", "null", "none", "na", "n/a", "-"})
-_TRUTHS = {"true": 1.0, "false": 0.0}
+#: Cells below the header that show the decimal mark of the file.
+_CELLS_OF_HEAD = 10_000
+#: Cells that are in memory as texts at the same time.
+_CELLS_AT_ONCE = 1 << 23
+_CELL_END = "\x1f"
+#: Numbers, in any spelling, and times.
+_VALUE = re.compile(
+    r"\s*([-+−]?(0x[\da-f]+|[\d.,'’\s]*\d[.,]?(e[-+]?\d+)?)|true|false|"
+    r"\d{1,4}[./-]\d\d?[./-]\d{2,4}([T ].*)?|(\d\d?:)?\d\d?:\d\d([.,]\d+)?Z?(\s?[AP]M)?)\s*",
+    re.IGNORECASE,
+)
+codecs.register_error("as-latin-1", lambda e: (e.object[e.start : e.end].decode("latin-1"), e.end))  # type: ignore[attr-defined]
 
 VBO_TYPE = "vbox/msg/Vbo"
 #: Channels of the receiver itself, which ``[channel units]`` leaves out.
@@ -51,146 +51,189 @@ _RECEIVER = re.compile(
     r"glonass.*|gps.*|beidou.*|solution type.*|long accel.*|lat accel.*|.*distance m|date|avi.*)",
     re.IGNORECASE,
 )
+#: Share of the path that is along the heading if the signs of the positions are right.
+_ALONG_HEADING = 0.95
 _CREATED = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})")
 
 
-def open_csv(file: LogFile) -> TableLog:
-    """Open a CSV file; raises LogError where it has no header or no column of times."""
-    with file.meter.running(file.path.stat().st_size):
-        lines = _decoded(file.path.read_bytes()).split("\n")
-        separator, header, units, first = _layout(lines, str(file.place))
-        fields, given = read_head(header)
+def open_csv(file: TableFile) -> Tables:
+    """Read a CSV file; raises LogError if the file has no header or no column of times."""
+    import polars as pl
+
+    losses: list[Loss] = []
+    with _text(file) as text:
+        lines = [line for line in islice(text, _HEAD_LINES) if line.strip()]
+        separator = _separator(lines[-20:])
+        file.limits.check("array_width", max((line.count(separator) for line in lines), default=0), file.name)
+        text.seek(0)
+        rows = _rows(text, separator)
+        head = [*islice(rows, _HEAD_LINES)]
+        titles, units, first = _layout([row for _, row in head], file.name)
+        fields, given = read_head(titles)
         given |= {name: unit.strip("[](){} ") for name, unit in zip(fields, units, strict=False) if unit.strip()}
-        losses: list[Loss] = []
-        columns = _columns(lines[first:], separator, fields, str(file.place), losses)
-        sheet = Sheet("csv", columns, given)
-        return TableLog(file, "csv", list(tables_of(sheet, str(file.place), losses)), losses)
+        cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
+        decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
+        columns = _columns(chain(head[first:], rows), fields, file, losses, decimal)
+    return Tables("csv", list(tables_of(Sheet("csv", columns, given), file.name, losses)), losses)
 
 
-def open_vbo(file: LogFile) -> TableLog:
-    """Open a VBO file; raises LogError where a section is missing."""
-    with file.meter.running(file.path.stat().st_size):
-        text = file.path.read_bytes().decode("latin-1").replace("\r\n", "\n")
-        head, mark, data = text.partition("[data]\n")
-        sections = {
-            n.lower(): b.strip("\n").split("\n") for n, b in re.findall(r"^\[([^\]\n]*)\]\n([^\[]*)", head, re.M)
-        }
-        titles = [t.strip() for t in sections.get("header", ()) if t.strip()]
-        if not mark or not titles:
-            raise LogError(expected="a VBO file with [header] and [data]", got="none of them", where=str(file.place))
-        fields = unique(field_name(title) for title in titles)
-        losses: list[Loss] = []
-        columns = _columns(data.split("\n"), " ", fields, str(file.place), losses)
-        units = _vbo_units(titles, fields, sections.get("channel units", []))
-        sheet = Sheet("vbox", {n: c for n, c in columns.items() if n != "time"}, units, VBO_TYPE)
-        if not isinstance(columns.get("time"), np.ndarray):
-            raise LogError(expected="a channel time in hhmmss.sss", got=", ".join(fields[:8]), where=str(file.place))
-        stamps = _vbo_stamps(columns, _CREATED.search(head.partition("\n")[0]))
-        return TableLog(file, "vbo", list(tables_of(sheet, str(file.place), losses, stamps)), losses)
+def open_vbo(file: TableFile) -> Tables:
+    """Read a VBO file; raises LogError if a section is missing."""
+    with _text(file) as text:
+        head, mark, data = text.read().partition("[data]\n")
+    parts = re.split(r"^\[([^\]\n]*)\]\n", head, flags=re.MULTILINE)
+    sections = {n.lower(): b.strip("\n").split("\n") for n, b in zip(parts[1::2], parts[2::2], strict=True)}
+    titles = [t.strip() for t in sections.get("header", ()) if t.strip()]
+    if not mark or not titles:
+        raise LogError(expected="a VBO file with [header] and [data]", got="none of them", where=file.name)
+    fields, given = read_head(titles)
+    losses: list[Loss] = []
+    above = [""] * (head.count("\n") + 1)
+    columns = _columns(_rows(chain(above, data.split("\n")), " "), fields, file, losses, ".")
+    if _is_mirrored(columns):
+        what = "longitude is positive to the east, against the format, as the heading shows: its sign is changed"
+        losses.append(Loss("mirrored", what, file.name, severity="note"))
+        columns["longitude"] = -columns["longitude"]
+    units = _vbo_units(titles, fields, sections.get("channel units", [])) | given
+    sheet = Sheet("vbox", {n: c for n, c in columns.items() if n != "time"}, units, VBO_TYPE)
+    if not isinstance(columns.get("time"), np.ndarray):
+        raise LogError(expected="a channel time in hhmmss.sss", got=", ".join(fields[:8]), where=file.name)
+    stamps = _vbo_stamps(columns, _CREATED.findall(head.partition("\n")[0]))
+    return Tables("vbo", list(tables_of(sheet, file.name, losses, stamps)), losses)
 
 
-def _decoded(data: bytes) -> str:
-    for mark, encoding in ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"), (b"", "utf-8-sig"), (b"", "latin-1")):
-        if data.startswith(mark):
-            try:
-                return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
-            except UnicodeDecodeError:
-                continue
-    return ""
+def _text(file: TableFile) -> io.TextIOWrapper:
+    """Return the text of a file: UTF-16 with a byte order mark, otherwise UTF-8; other bytes are read as Latin-1."""
+    mark = file.stream.read(2)
+    file.stream.seek(0)
+    encoding, errors = ("utf-16", "replace") if mark in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig", "as-latin-1")
+    return io.TextIOWrapper(file.stream, encoding, errors)
 
 
-def _layout(lines: Sequence[str], where: str) -> tuple[str, list[str], list[str], int]:
-    """Return delimiter, titles, units and the number of the first row of values."""
-    head = lines[:_HEAD_LINES]
-    separator = _separator([line for line in head if line.strip()][-20:])
-    rows = [_cells(line, separator) for line in head]
-    width = max((len(row) for row in rows[-20:]), default=0)
-    first = next((i for i, row in enumerate(rows) if len(row) == width > 1 and _is_values(row)), 0)
-    widths = {width, width - 1} if first and not rows[first][-1].strip() else {width}  # rows may end with a separator
-    above = [row for row in rows[:first] if len(row) in widths and not _is_values(row)]
-    if not above:
-        got = "none" if first else "no row of numbers below it"
-        raise LogError(expected="a CSV file with a row of column names", got=got, where=where)
-    below = above[-3:]  # titles, and below them units and sources
-    names = max(reversed(range(len(below))), key=lambda i: len({c.strip() for c in below[i] if not is_unit(c)} - {""}))
-    units = next((row for row in below[names + 1 :] if _are_units(row)), [])
-    return separator, below[names], units, first
-
-
-def _are_units(cells: Sequence[str]) -> bool:
-    """Return whether half of the cells that are not empty, or more, are units."""
-    given = [cell for cell in cells if cell.strip().lower() not in _EMPTY]
-    return 0 < len(given) <= 2 * sum(map(is_unit, given))
+def _rows(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of the last line and the cells of each row; a row with an endless cell has one cell."""
+    reader = csv.reader((" ".join(n.split()) for n in lines) if separator == " " else lines, delimiter=separator)
+    while True:
+        try:
+            yield from ((reader.line_num, row) for row in reader)
+            return
+        except csv.Error as error:
+            yield reader.line_num, [str(error)]
 
 
 def _separator(lines: Sequence[str]) -> str:
     """Return the delimiter that every line contains equally often, otherwise the most frequent one, or a space."""
+    lines = [re.sub(r'"[^"]*"', "", line) for line in lines]
     counts = {s: [line.count(s) for line in lines] for s in (";", "\t", "|", ",")}
     regular = next((s for s, n in counts.items() if n and min(n) > 0 and max(n) == min(n)), "")
     frequent = max(counts, key=lambda s: sum(counts[s]))
     return regular or (frequent if any(counts[frequent]) else " ")
 
 
-def _cells(line: str, separator: str) -> list[str]:
-    line = line.strip().lstrip("#").strip() if separator == " " else line.strip("\r ").lstrip("#")
-    if separator == " ":
-        return line.split()
-    return next(csv.reader([line], delimiter=separator), [])
+def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], Sequence[str], int]:
+    """Return titles, units and the number of the first row of values."""
+    lengths = Counter(len(row) for row in rows[-20:])
+    width = max(lengths, key=lambda n: (n > 1, lengths[n], n), default=0)
+    rows = [_uncommented(row, width) for row in rows]
+    full = next((i for i, row in enumerate(rows) if len(row) == width > 1 and _share(row, _VALUE.fullmatch) >= 0.5), 0)
+    widths = {width, width - 1} if full and not rows[full][-1].strip() else {width}  # rows may end with a separator
+    above = [i for i in range(full) if len(rows[i]) in widths and _share(rows[i], _VALUE.fullmatch) < 0.5]
+    if not above:
+        got = "none" if full else "no row of numbers below it"
+        raise LogError(expected="a CSV file with a row of column names", got=got, where=where)
+    # Titles, and below them units and sources.
+    names = max(reversed(above[-3:]), key=lambda i: len({c.strip() for c in rows[i] if not is_unit(c)} - {""}))
+    below = range(names + 1, full + 1)
+    first = next(i for i in below if i == full or any(_VALUE.fullmatch(c) and not is_unit(c) for c in rows[i]))
+    units = next((rows[i] for i in above if names < i < first and _share(rows[i], is_unit) >= 0.5), [])
+    return rows[names], units, first
 
 
-def _is_values(cells: Sequence[str]) -> bool:
-    given = [c for c in cells if c.strip().lower() not in _EMPTY]
-    values = [c for c in given if _NUMBER.fullmatch(c) or _TIME_TEXT.fullmatch(c) or c.strip().lower() in _TRUTHS]
-    return len(values) > 0 and 2 * len(values) >= len(given)
+def _uncommented(row: Sequence[str], width: int) -> Sequence[str]:
+    """Return a row of ``width`` cells, without the mark of a comment and an empty cell at its end."""
+    if row and row[0].startswith("#"):
+        title = row[0].lstrip("# ")
+        row = [title, *row[1:]] if title or len(row) <= width else row[1:]
+    return row[:-1] if len(row) == width + 1 and not row[-1].strip() else row
+
+
+def _share(cells: Sequence[str], matches: Callable[[str], object]) -> float:
+    """Return the share of cells that match, of those that are not empty; 0 if all are empty."""
+    given = [bool(matches(cell)) for cell in cells if not EMPTY.fullmatch(cell)]
+    return sum(given) / max(1, len(given))
 
 
 def _columns(
-    lines: Sequence[str], separator: str, names: Sequence[str], where: str, losses: list[Loss]
-) -> Mapping[str, NDArray[Any] | Series]:
-    """Return the columns of rows of text; rows with another number of cells are a loss."""
+    rows: Iterable[tuple[int, list[str]]], names: Sequence[str], file: TableFile, losses: list[Loss], decimal: str
+) -> dict[str, Any]:
+    """Return the columns of numbered rows: numbers float64 [N] with NaN, or texts [N].
+
+    ``decimal`` is the decimal mark of columns that do not show theirs.
+    """
     import polars as pl
 
-    lines = [line.strip("\r ") for line in lines]
-    ended = not lines or not lines[-1]
-    if separator == " ":
-        lines = [" ".join(line.split()) for line in lines]
-    rows = [line for line in lines if line and not line.startswith("#")]
-    if not any('"' in row for row in rows[:_HEAD_LINES]):
-        more = len(names) - 1  # and maybe one at the end of a row
-        fits = [more in (n := row.count(separator), n - row.endswith(separator)) for row in rows]
-        kept = [row for row, fit in zip(rows, fits, strict=True) if fit]
-        wrong = len(rows) - len(kept)
-        if wrong and not ended and not fits[-1]:
-            losses.append(Loss("truncated", "the last row is incomplete", where, count=1))
-            wrong -= 1
-        if wrong:
-            losses.append(Loss("bad-row", f"row without {len(names)} cells", where, count=wrong))
-        rows = kept
-    if not rows:
-        raise LogError(expected=f"rows of {len(names)} cells", got="none", where=where)
-    schema = dict.fromkeys(names, pl.String)
-    data = io.BytesIO("\n".join(rows).encode())
-    frame = pl.read_csv(data, has_header=False, separator=separator, schema=schema, truncate_ragged_lines=True)
-    return {name: _column(frame[name]) for name in names}
+    lines, data = _fitting(rows, len(names), file, losses)
+    columns = {}
+    step = max(1, _CELLS_AT_ONCE // len(lines))
+    for start in range(0, len(names), step):
+        places = [*range(len(names))[start : start + step]]
+        part = pl.read_csv(
+            data, has_header=False, separator=_CELL_END, quote_char=None, infer_schema=False, columns=places
+        )
+        plain = part.select(pl.all().str.strip_chars().cast(pl.Float64, strict=False))
+        for name, column, numbers in zip(names[start:], part.iter_columns(), plain.iter_columns(), strict=False):
+            values = numbers.to_numpy()
+            empty = column.null_count()
+            is_plain = decimal == "." and np.count_nonzero(np.isfinite(values)) == len(values) - empty
+            cells = Cells(values, empty) if is_plain else read_cells(column, decimal)
+            columns[name] = column.str.strip_chars() if cells.is_text else cells.values
+            losses += cells.losses(name, file.name, lines)
+    return columns
 
 
-def _column(texts: Series) -> NDArray[Any] | Series:
-    """Return a column as numbers float64 [N], NaN where a cell has none; as it is where it contains texts."""
-    import polars as pl
+def _fitting(
+    rows: Iterable[tuple[int, list[str]]], width: int, file: TableFile, losses: list[Loss]
+) -> tuple[Sequence[int], bytes]:
+    """Return the rows of ``width`` cells: the number of the line of each, and their texts without quotes."""
+    file.limits.check("array_width", width, file.name)
+    lines, wrong, comments = array("q"), array("q"), array("q")
+    data, line = io.BytesIO(), 0
+    for line, row in rows:
+        if len(row) == width + 1 and not row[-1].strip():
+            row.pop()
+        text = _CELL_END.join(row)
+        if len(row) == width and text.count(_CELL_END) == width - 1:
+            lines.append(line)
+            data.write((text.replace("\n", " ") + "\n").encode())
+        elif text.replace(_CELL_END, " ").strip():
+            (comments if text.startswith("#") else wrong).append(line)
+    cut = [wrong.pop()] if wrong[-1:] == array("q", [line]) and len(row) < width else []
+    for kind, what, numbers in (
+        ("truncated", "the last row is incomplete", cut),
+        ("bad-row", f"row without {width} cells", wrong),
+        ("comment", "row that begins with #", comments),
+    ):
+        if numbers:
+            place = f"{file.name}, from line {numbers[0]} on"
+            severity: Literal["note", "lost"] = "note" if numbers is comments else "lost"
+            losses.append(Loss(kind, what, place, count=len(numbers), severity=severity))
+    if not lines:
+        raise LogError(expected=f"rows of {width} cells", got="none", where=file.name)
+    file.limits.check_table(8 * width * len(lines), file.size, file.name)
+    return lines, data.getvalue()
 
-    texts = points = texts.str.strip_chars()
-    if texts.head(1000).str.contains(",", literal=True).any():
-        plain = texts.str.replace_all(".", "", literal=True).str.replace(",", ".", literal=True)
-        points = pl.select(pl.when(texts.str.contains(",", literal=True)).then(plain).otherwise(texts)).to_series()
-    numbers = points.cast(pl.Float64, strict=False)
-    given = texts.filter(~texts.str.to_lowercase().is_in(list(_EMPTY)))
-    if given.len() == 0:
-        return np.full(len(texts), np.nan)
-    if given.str.to_lowercase().is_in(list(_TRUTHS)).all():
-        return texts.str.to_lowercase().replace_strict(_TRUTHS, default=None, return_dtype=pl.Float64).to_numpy()
-    if 2 * numbers.is_not_null().sum() < given.len():
-        return texts
-    return numbers.fill_null(float("nan")).to_numpy()
+
+def _is_mirrored(columns: Mapping[str, Any]) -> bool:
+    """Return whether the path agrees with the heading only if longitude (arc minutes) is positive to the east."""
+    names = ("latitude", "longitude", "heading")
+    if not all(isinstance(columns.get(name), np.ndarray) for name in names):
+        return False
+    latitude, longitude, heading = (columns[name] for name in names)
+    path = np.diff(latitude) + 1j * np.diff(longitude) * np.cos(np.radians(latitude[1:] / 60.0))
+    direction = np.exp(-1j * np.radians(heading[1:]))
+    east, west = (np.nansum((p * direction).real) for p in (path, path.conj()))
+    length = np.nansum(np.abs(path))
+    return bool(east > max(_ALONG_HEADING * length, west + (1.0 - _ALONG_HEADING) * length))
 
 
 def _vbo_units(titles: Sequence[str], fields: Sequence[str], units: Sequence[str]) -> dict[str, str]:
@@ -203,7 +246,7 @@ def _vbo_units(titles: Sequence[str], fields: Sequence[str], units: Sequence[str
     return named
 
 
-def _vbo_stamps(columns: Mapping[str, Any], created: re.Match[str] | None) -> IntArray:
+def _vbo_stamps(columns: Mapping[str, Any], created: Iterable[tuple[str, str, str]]) -> IntArray:
     """Return the times [N] of ``hhmmss.sss`` on the day that the file was created."""
     clock: FloatArray = columns["time"]
     finite = np.isfinite(clock) & (clock >= 0.0) & (clock < 240_000.0)
@@ -212,10 +255,7 @@ def _vbo_stamps(columns: Mapping[str, Any], created: re.Match[str] | None) -> In
     stamps = np.full(len(clock), NO_TIME, np.int64)
     of_day = unwrapped((3600.0 * hours + 60.0 * minutes + seconds)[finite])
     stamps[finite] = np.round(of_day * 1e6).astype(np.int64) * 1000
-    if created is None:
-        return placed(stamps)
-    try:
-        midnight_ns = whole_days(dt.date(int(created[3]), int(created[2]), int(created[1])))
-    except ValueError:
-        return placed(stamps)
-    return np.where(finite, stamps + midnight_ns, NO_TIME)
+    with suppress(ValueError):
+        for day, month, year in created:
+            return np.where(finite, stamps + whole_days(dt.date(int(year), int(month), int(day))), NO_TIME)
+    return placed(stamps)

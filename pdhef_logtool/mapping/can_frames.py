@@ -19,8 +19,12 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.can_decoding import (
+    CAN_TYPE,
+    ID_BITS,
     Selectors,
+    bytes_of,
     fit_of,
+    has_j1939_identifier,
     load_dbc,
     raw_bits,
     selectors_of,
@@ -49,13 +53,12 @@ REMOTE_NAMES = ("isrtr", "isremote", "isremoteframe", "remoteframe", "rtr", "rem
 #: Flags that SocketCAN and DBC files keep above the 29 bits of an identifier.
 EXTENDED_FLAG = 1 << 31
 NO_DATA_FLAGS = (1 << 30) | (1 << 29)
-ID_BITS = (1 << 29) - 1
 STANDARD_ID_BITS = (1 << 11) - 1
 
 #: Parts of a log in which identifiers are looked for.
 _PARTS, _PART_NS = 4, 5_000_000_000
 
-SHORT_FRAME = "frame shorter than its message in the DBC dropped"
+SHORT_FRAME = "frame that ends before its signal dropped"
 
 
 def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
@@ -87,8 +90,11 @@ def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
         if source.topic not in paths:
             paths[source.topic] = _frame_paths(source.topic, log.fields(source.topic), mapping.can)
         view = _make_view(source, paths[source.topic], databases)
+        buses = _buses(log, view) if isinstance(view, _CanView) and mapping.can.bus is None else []
         if isinstance(view, str):
             problems.append(view)
+        elif len(buses) > 1:
+            problems.append(f"message {view.message.name} is on buses {buses}: set [can] bus and bus_field")
         else:
             views[source.read_topic] = view
     if problems:
@@ -135,6 +141,15 @@ def _identifiers(log: DriveLog, topic: str, paths: _FramePaths) -> frozenset[int
         numbers = np.asarray(columns.fields[paths.identifier], np.float64)
         sent |= {int(i) & ID_BITS for i in np.unique(numbers[np.isfinite(numbers)])}
     return frozenset(sent)
+
+
+def _buses(log: DriveLog, view: _CanView) -> list[int]:
+    """Return the buses of a message in a log of frames alone; other logs usually have a topic for each bus."""
+    is_frames = any(t.name == view.topic and t.type_name == CAN_TYPE for t in log.topics)
+    if not is_frames or "bus" not in {f.path for f in log.fields(view.topic)}:
+        return []
+    frames = log.read({view.topic: [view.paths.identifier, "bus"]}, quiet=True)[view.topic].fields
+    return [int(bus) for bus in np.unique(frames["bus"][frames[view.paths.identifier] == view.message.frame_id])]
 
 
 def _is_named_like(path: Path, topic: str) -> bool:
@@ -278,22 +293,25 @@ class CanSignalLog(DriveLog):
         frames = read[view.topic]
         rows = np.flatnonzero(_is_message(frames, view, self._settings))
         data, available = _payload(frames, view.paths, rows)
-        long_enough = available >= view.message.length
+        signals = {p: view.signals[p] for p in paths if p in view.signals}
+        needed = max(map(bytes_of, (*signals.values(), *(s for s, _ in view.selectors))), default=0)
+        long_enough = available >= needed
         if not long_enough.all():
             times = frames.log_time_ns[rows[~long_enough]]
             where = f"{view.topic}.{CAN_PREFIX}{view.message.name}"
-            short[where] = Loss(
-                "undecodable", SHORT_FRAME, where, int(times.min()), int(times.max()) + 1, times.shape[0]
-            )
+            loss = Loss("undecodable", SHORT_FRAME, where, int(times.min()), int(times.max()) + 1, times.shape[0])
+            short[where] = max(loss, short.get(where, loss), key=lambda x: x.count or 0)
         use = long_enough
-        if data.shape[1] >= view.message.length:  # otherwise no frame is long enough
+        if data.shape[1] >= needed:  # otherwise no frame is long enough
             for selector, sent_under in view.selectors:
-                raw = raw_bits(data, selector.start, selector.length, selector.byte_order)
+                raw = raw_bits(data, selector)
                 use = use & np.isin(raw, np.asarray(sent_under, np.uint64))
         rows, data = rows[use], data[use]
         given = {p: frames.fields[p][rows] for p in paths if p not in view.signals}
-        signals = {p: view.signals[p] for p in paths if p in view.signals}
-        values = {p: signal_values(data, s) if rows.shape[0] else np.empty(0) for p, s in signals.items()}
+        is_j1939 = has_j1939_identifier(view.message)
+        values = {
+            p: signal_values(data, s, is_j1939=is_j1939) if rows.shape[0] else np.empty(0) for p, s in signals.items()
+        }
         fields = {**given, **values}
         return Columns(topic, frames.log_time_ns[rows], frames.publish_time_ns[rows], fields)
 

@@ -213,17 +213,16 @@ def _decode(draft: _Draft, topics: list[TopicInfo]) -> tuple[list[TopicInfo], Ca
         if "can" in _words(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))
     ]
     decoded = decoded_frames(log, frames)
+    names = ", ".join(path.name for path in log.databases) if frames else ""
     if decoded is not None:
         draft.log = decoded
         there = {t.name for t in log.topics}
         topics = [t for t in topics if t not in frames] + [t for t in decoded.topics if t.name not in there]
-        names = ", ".join(path.name for path in log.databases)
         draft.notes.append(f"the frames of {', '.join(t.name for t in frames)} are decoded by {names}")
     else:
-        draft.notes += [
-            f"{t.name} contains raw CAN frames: describe them by --set msgs=car.dbc or [can] dbc of a mapping file"
-            for t in frames
-        ]
+        remedy = "describe them by --set msgs=car.dbc or [can] dbc of a mapping file"
+        remedy = f"{names} contains none of their identifiers" if names else remedy
+        draft.notes += [f"{t.name} contains raw CAN frames: {remedy}" for t in frames]
     return topics, decoded
 
 

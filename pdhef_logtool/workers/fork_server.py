@@ -1,7 +1,7 @@
 """The fork server, from which workers are forked, and the loop of a worker: the counterpart of ``supervisor.py``.
 
-The server imports what the workers need and stays otherwise as it is: it has one thread and no open query, so that
-every fork of it is a whole process at the price of a fork.
+The server imports the modules of the workers and does no other work: it has one thread and no open query, so that each
+fork is a complete process.
 """
 
 from __future__ import annotations
@@ -24,9 +24,11 @@ from typing import Any
 
 from pdhef_logtool.records import processes
 from pdhef_logtool.records.printable import printable
+from pdhef_logtool.workers.confinement import bound_memory
 
-#: One thread a worker: what libraries read when they are loaded.
-ONE_THREAD = dict.fromkeys(
+#: Environment of a server, read by libraries when they are loaded: one thread per worker, and no arena of Arrow, which
+#: reserves a GiB that would count as memory of the worker.
+ENVIRONMENT = {"ARROW_DEFAULT_MEMORY_POOL": "system"} | dict.fromkeys(
     (
         "OMP_NUM_THREADS",
         "OPENBLAS_NUM_THREADS",
@@ -39,6 +41,8 @@ ONE_THREAD = dict.fromkeys(
     ),
     "1",
 )
+#: First message to a worker: the function that it calls with its channel.
+WORK = f"{__name__}:work_on_items"
 #: Requests to the server: fork a worker (with its socket), or return the exit status of a worker.
 FORK, STATUS = b"fork", b"stat"
 _REQUEST = struct.Struct("<4sq")
@@ -61,7 +65,7 @@ def receive(channel: socket.socket) -> Any:
     ------
     EOFError : the other side is gone.
     """
-    return pickle.loads(_exactly(channel, _HEAD.unpack(_exactly(channel, _HEAD.size))[0]))  # noqa: S301 (from our own process)
+    return pickle.loads(exactly(channel, _HEAD.unpack(exactly(channel, _HEAD.size))[0]))  # noqa: S301 (from our own process)
 
 
 def split(buffer: bytearray) -> Iterator[Any]:
@@ -82,7 +86,7 @@ def ask(control: socket.socket, what: bytes, number: int, descriptors: Sequence[
 
 def serve(descriptor: int) -> None:
     """Run the server on the socket of this descriptor until the other side closes; no worker outlives it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     control = socket.socket(fileno=descriptor)
     workers: set[int] = set()
     try:
@@ -104,13 +108,13 @@ def serve(descriptor: int) -> None:
         for pid in workers:
             os.kill(pid, signal.SIGKILL)  # not yet waited for: no other process can have its number
         for pid in workers:
-            os.waitpid(pid, 0)  # so that what they took counts as the command's
+            os.waitpid(pid, 0)  # so that their processor time counts as the command's
 
 
 def _prepare(preload: Sequence[str]) -> tuple[str, bool]:
     """Import modules, with ``.*`` all of a package, and call the function after a colon.
 
-    Returns what went wrong, and whether all is warm: nothing that was called has returned False.
+    Returns an error message, and whether all is warm: no function has returned False.
     """
     warm = True
     for name in preload:
@@ -125,7 +129,7 @@ def _prepare(preload: Sequence[str]) -> tuple[str, bool]:
         except Exception as error:  # noqa: BLE001 (the parent reports any error)
             return f"{name}: {describe_error(error)}", warm
     gc.collect()
-    gc.freeze()  # so that collecting in a worker does not copy what all share
+    gc.freeze()  # so that garbage collection in a worker copies no shared memory
     return "", warm
 
 
@@ -141,7 +145,7 @@ def _fork(control: socket.socket, channel: socket.socket, number: int) -> set[in
         try:
             processes.worker_number = number
             control.close()
-            _work(channel)
+            pkgutil.resolve_name(receive(channel))(channel)
         finally:
             with contextlib.suppress(OSError, ValueError):
                 sys.stdout.flush()
@@ -160,7 +164,7 @@ def _say(channel: socket.socket, *message: Any) -> None:
         raise _Gone from None
 
 
-def _work(channel: socket.socket) -> None:
+def work_on_items(channel: socket.socket) -> None:
     """Run a worker: receive the function and its memory limit, then items; reply to each with its result or error."""
     with contextlib.suppress(OSError):
         # If the machine runs out of memory, the system must end a worker and not its supervisor.
@@ -168,7 +172,8 @@ def _work(channel: socket.socket) -> None:
     with contextlib.suppress(_Gone, EOFError, OSError):
         _say(channel, "ready", os.getpid())
         work, more_bytes = receive(channel)
-        _bound(more_bytes)
+        if more_bytes is not None:
+            bound_memory(more_bytes)
         while True:
             _say(channel, *_answer(channel, work, receive(channel)))
 
@@ -202,20 +207,6 @@ def _function(packed: bytes) -> Callable[..., Any]:
     return pickle.loads(packed)  # type: ignore[no-any-return]  # noqa: S301 (from our own process)
 
 
-def _bound(more_bytes: int | None) -> None:
-    """Limit the memory of this process to this much more than it has now (Linux)."""
-    if more_bytes is None:
-        return
-    with contextlib.suppress(ImportError, OSError, ValueError, IndexError):
-        import resource
-
-        # All that is writable and private, whether touched or not: the sixth number, in pages.
-        now = int(Path("/proc/self/statm").read_bytes().split()[5]) * resource.getpagesize()
-        _, most = resource.getrlimit(resource.RLIMIT_DATA)
-        bound = now + more_bytes if most == resource.RLIM_INFINITY else min(now + more_bytes, most)
-        resource.setrlimit(resource.RLIMIT_DATA, (bound, bound))
-
-
 def describe_error(error: BaseException) -> str:
     """Return an exception as one line."""
     try:
@@ -225,7 +216,8 @@ def describe_error(error: BaseException) -> str:
     return printable(f"{type(error).__name__}: {text}", _LONGEST) if text else type(error).__name__
 
 
-def _exactly(channel: socket.socket, count: int) -> bytes:
+def exactly(channel: socket.socket, count: int) -> bytes:
+    """Wait for a number of bytes; raises EOFError where the other side is gone."""
     parts = bytearray()
     while len(parts) < count:
         part = channel.recv(min(count - len(parts), 1 << 20))

@@ -29,7 +29,7 @@ import psutil
 from pdhef_logtool.records.errors import UsageError, WorkerError
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.processes import wait_for_end
-from pdhef_logtool.workers.fork_server import FORK, ONE_THREAD, STATUS, ask, describe_error, receive, send, split
+from pdhef_logtool.workers.fork_server import ENVIRONMENT, FORK, STATUS, WORK, ask, describe_error, receive, send, split
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -166,7 +166,7 @@ class _Worker(Generic[T]):
     """A worker process in the parent; ``pid`` is None until the worker is ready."""
 
     channel: socket.socket
-    server: _Server
+    server: ForkServer
     attempt: _Attempt[T] | None
     pid: int | None = None
     silent_s: float = 0.0
@@ -192,8 +192,8 @@ class _Worker(Generic[T]):
         return f"the worker was killed (signal {-code})" if code < 0 else f"the worker ended with exit code {code}"
 
 
-class _Server:
-    """A fork server of our own."""
+class ForkServer:
+    """A process that has imported modules, and forks workers from itself."""
 
     def __init__(self, preload: Sequence[str]) -> None:
         self._control, theirs = socket.socketpair()
@@ -206,12 +206,17 @@ class _Server:
                 [sys.executable, "-c", start, json.dumps(sys.path), str(theirs.fileno())],
                 stdin=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
-                env={**os.environ, **ONE_THREAD},
+                env={**os.environ, **ENVIRONMENT},
             )
         self._preload = list(preload)
 
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
     def start(self) -> bool | None:
-        """Wait until it has loaded what it is to load; return False if workers have something to compile.
+        """Wait until it has loaded its modules; return False if workers have code to compile.
 
         Returns None if it died.
 
@@ -262,7 +267,7 @@ class _Server:
 
 
 class Crew(Generic[T, R]):
-    """Workers for several lists of items; arguments and errors as those of :func:`supervise`."""
+    """Workers for several lists of items; arguments and errors as for :func:`supervise`."""
 
     def __init__(
         self,
@@ -280,7 +285,7 @@ class Crew(Generic[T, R]):
         self._jobs, self._limits, self._preload = jobs, limits, preload
         self._progress: Progress = lambda _number, _text, _share: None
         self._warn = warn
-        self._server: _Server | None = None
+        self._server: ForkServer | None = None
         self._deaths = 0
         self._returned: list[_Attempt[T]] = []
         self._workers: list[_Worker[T]] = []
@@ -375,6 +380,7 @@ class Crew(Generic[T, R]):
     def _start(self, attempt: _Attempt[T]) -> None:
         ours, theirs = socket.socketpair()
         self._started += 1
+        send(ours, WORK)
         with theirs:
             while not (server := self._live_server()).fork(self._started, theirs):
                 pass
@@ -383,8 +389,8 @@ class Crew(Generic[T, R]):
         self._workers.append(worker)
         self._selector.register(ours, selectors.EVENT_READ, worker)
 
-    def _live_server(self) -> _Server:
-        """Return the fork server, started or restarted where it is necessary.
+    def _live_server(self) -> ForkServer:
+        """Return the fork server; start or restart it if necessary.
 
         Raises
         ------
@@ -393,7 +399,7 @@ class Crew(Generic[T, R]):
         while self._server is None or self._server.is_dead():
             if self._server is not None:
                 self._note_death(self._server.end())
-            self._server = _Server(self._preload)
+            self._server = ForkServer(self._preload)
             if (warm := self._server.start()) is not None:
                 self._warm = warm
         return self._server
@@ -406,7 +412,7 @@ class Crew(Generic[T, R]):
                 expected="a fork server that keeps running",
                 got=f"{self._deaths} that died, the last one by {how}",
                 where="worker processes",
-                remedy="find what kills them, for example the system for lack of memory",
+                remedy="find the process that kills them, for example the system for lack of memory",
             )
         self._warn(f"the fork server died ({how}): restart {self._deaths} of {_RESTARTS}, no item is lost")
 

@@ -16,7 +16,7 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.table_columns import RELATIVE_NS
+from pdhef_logtool.logs.table_clocks import RELATIVE_NS
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import fit_clocks, read_signals
 from pdhef_logtool.mapping.choosing import choose_mapping

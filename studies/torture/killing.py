@@ -21,7 +21,7 @@ TIMED = (".rrd",)
 #: What a whole file has near its end.
 ENDS = {".mcap": b"\x89MCAP0\r\n", ".rrd": b"RRF2FOOT"}
 #: A command that was asked to end must have done so after this; nothing waits for longer.
-LONGEST_END_S = 30.0
+LONGEST_END_S = 120.0
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 COMMANDS = (
     *("inspect", "map", "convert", "plan", "run", "metrics", "report", "compare", "events", "view"),
     *("simulate", "simulate suite", "simulate conditions"),
-    *("learn", "extract", "train", "retrain", "compile"),
+    *("learn", "extract", "train", "compile"),
 )
 
 

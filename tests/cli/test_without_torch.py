@@ -79,13 +79,12 @@ def test_what_trains_one_ends_with_one_line(tmp_path: Path) -> None:
         tmp_path,
         trained,
         (*trained, "--baselines"),
-        ("retrain", "sample_logs/dlc.mcap", *car),
         ("learn", "sample_logs/dlc.mcap", *car, "--stages", "network"),
         ("learn", "sample_logs/dlc.mcap", *car, "--network", "none", "--holdout", "2"),
     )
     *without, other = ended
     remedy = "got an installation without it; pip install 'pdhef-logtool[train]'"
-    for line, name in zip(without, ("train", "train", "retrain", "learn"), strict=True):
+    for line, name in zip(without, ("train", "train", "learn"), strict=True):
         assert line.startswith(f"{name} 2 ") and remedy in line, line
     assert without[-1].endswith("; --network none trains none")
     assert other.startswith("learn 2 ") and "--holdout" in other, "what trains no network asks for nothing"

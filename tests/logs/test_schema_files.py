@@ -29,7 +29,7 @@ def test_a_built_wheel_ships_every_schema_file(tmp_path: Path) -> None:
         shutil.copyfile(ROOT / name, source / name)
     (source / "README.md").write_text("x")
     code = "from setuptools import build_meta; build_meta.build_wheel('dist')"
-    subprocess.run([sys.executable, "-c", code], cwd=source, check=True, capture_output=True, timeout=120)
+    subprocess.run([sys.executable, "-c", code], cwd=source, check=True, capture_output=True, timeout=300)
     (wheel,) = (source / "dist").glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
     schemas = {p.relative_to(ROOT).as_posix() for p in (ROOT / "schemas").rglob("*") if p.is_file()}

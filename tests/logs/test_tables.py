@@ -19,7 +19,8 @@ from pdhef_logtool import inspect_log
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.table_columns import RELATIVE_NS, field_name, gps_stamps, number_stamps, split_unit
+from pdhef_logtool.logs.table_clocks import RELATIVE_NS
+from pdhef_logtool.logs.table_columns import field_name, split_unit
 from pdhef_logtool.records.errors import PdhefError
 from tests.command_line import called
 
@@ -95,6 +96,10 @@ DIALECTS = {
 }
 
 
+#: Dialects whose times need an assumption.
+ASSUMED = {dialect: [("clock", "note")] for dialect in ("milliseconds-by-step", "month-first")}
+
+
 def _log(path: Path, data: bytes) -> DriveLog:
     path.write_bytes(data)
     return open_log(path)
@@ -107,7 +112,7 @@ def test_every_dialect_of_csv_gives_the_same_columns(dialect: str, tmp_path: Pat
         assert [t.name for t in log.topics] == ["csv"]
         assert {f.path: f.unit for f in log.fields("csv") if f.path in UNITS} == UNITS
         read = log.read({"csv": ["ay", "speed"]})["csv"]
-        assert log.lost == ()
+        assert [(x.kind, x.severity) for x in log.lost] == ASSUMED.get(dialect, [])
     np.testing.assert_array_equal(read.fields["ay"], AY)
     np.testing.assert_array_equal(read.fields["speed"], SPEED)
     expected = start_ns + np.round(TIME_S * 1e9).astype(np.int64)
@@ -156,12 +161,110 @@ def test_damaged_rows_are_losses_and_the_others_are_read(tmp_path: Path) -> None
     assert "bad-row" in done.stdout
 
 
-def test_rows_out_of_order_are_sorted_with_a_note(tmp_path: Path) -> None:
+def _read(path: Path, data: bytes | str) -> tuple[dict[str, np.ndarray], list[tuple[str, int | None]]]:
+    """Return the columns of all tables and the losses of a file."""
+    with closing(_log(path, data.encode() if isinstance(data, str) else data)) as log:
+        paths = {topic.name: [f.path for f in log.fields(topic.name)] for topic in log.topics}
+        columns = {name: values for c in log.read(paths).values() for name, values in c.fields.items()}
+        return columns, [(x.kind, x.count) for x in log.lost]
+
+
+def test_rows_without_a_quoted_cell_shift_no_columns(tmp_path: Path) -> None:
+    lines = ["time,note,ay,speed", *(f'{t},"ok, {i}",{AY[i]},{SPEED[i]}' for i, t in enumerate(SECONDS))]
+    lines[1], lines[50], lines[60] = '0.0,"ok",1.0', '0.49,"ok",1,2,3', '0.59,"two\nlines",1.5,2.5'
+    columns, lost = _read(tmp_path / "a.csv", "\n".join([*lines, ""]))
+    assert ("bad-row", 2) in lost
+    others = [i for i in range(N) if i not in (0, 49, 59)]
+    np.testing.assert_array_equal(np.delete(columns["ay"], 57), AY[others])
+    np.testing.assert_array_equal(np.delete(columns["speed"], 57), SPEED[others])
+    assert (columns["ay"][57], columns["speed"][57]) == (1.5, 2.5)
+    with closing(open_log(tmp_path / "a.csv")) as log:
+        assert any("line 2 " in x.where for x in log.lost if x.kind == "bad-row")
+
+
+def test_a_cell_without_an_end_costs_only_the_cells_behind_it(tmp_path: Path) -> None:
+    lines = ["time,ay,speed", *(f"{0.01 * i:.2f},1.5,{i}" for i in range(40_000))]
+    lines[10] = '0.09,"1.5,9'
+    columns, lost = _read(tmp_path / "a.csv", "\n".join([*lines, ""]))
+    assert lost == [("bad-row", 1)]
+    assert columns["speed"][-1] == 39_999
+    assert len(columns["speed"]) > 20_000
+
+
+@pytest.mark.parametrize(
+    ("row", "kinds"),
+    [("#0.1,5,5", {"bad-cell", "bad-stamp"}), ("#a comment", {"comment"}), ("# one, two", {"comment"})],
+)
+def test_rows_that_begin_with_a_hash_are_counted(row: str, kinds: set[str], tmp_path: Path) -> None:
+    lines = ["# made by hand", "# time,ay,speed", *(f"{t},{a},{v}" for t, a, v in zip(SECONDS, AY, SPEED, strict=True))]
+    lines.insert(30, row)
+    columns, lost = _read(tmp_path / "a.csv", "\n".join([*lines, ""]))
+    assert len(columns["ay"]) == N
+    assert set(lost) == {(kind, 1) for kind in kinds}
+
+
+def test_a_decimal_comma_counts_in_whichever_row_it_is(tmp_path: Path) -> None:
+    steer = [0.0] * 1500 + [-0.125, 0.25]
+    rows = [f"{0.01 * i:.2f};{v:g};1.{i % 10}00,5".replace(".", ",", 1) for i, v in enumerate(steer)]
+    text = "\n".join(["time;steer;rpm", *(r.replace("-0.125", "-0,125").replace("0.25", "0,25") for r in rows), ""])
+    columns, lost = _read(tmp_path / "a.csv", text)
+    np.testing.assert_array_equal(columns["steer"], steer)
+    np.testing.assert_array_equal(columns["rpm"][:3], [1000.5, 1100.5, 1200.5])
+    assert lost == []
+
+
+@pytest.mark.parametrize(
+    ("separator", "other", "cell", "value", "note"),
+    [
+        (";", "0,5", "1,234", 1.234, False),  # the file has decimal commas
+        (";", "0,5", "1.234", 1234.0, True),
+        (";", "0.5", "1,234", 1234.0, True),
+        (",", "0.5", '"1,234"', 1234.0, True),
+        (",", "0.5", "1.234", 1.234, False),
+        (",", "0.5", '"8,734.5"', 8734.5, False),
+        (";", "7", "1.234", 1.234, False),
+        (";", "7", "1,234", 1.234, True),  # no other column decides
+    ],
+)
+def test_other_columns_decide_what_a_mark_between_digits_is(
+    separator: str, other: str, cell: str, value: float, note: bool, tmp_path: Path
+) -> None:
+    rows = [separator.join([str(i), other, cell, str(i)]) for i in range(30)]
+    columns, lost = _read(tmp_path / "a.csv", "\n".join([separator.join(["time", "a", "b", "c"]), *rows, ""]))
+    assert set(columns["b"]) == {value}
+    assert lost == ([("ambiguous-number", None)] if note else [])
+
+
+def test_bytes_that_are_no_utf_8_cost_no_other_character(tmp_path: Path) -> None:
+    data = _csv(SECONDS, "time,ay [m/s²],speed [km/h]").encode() + "2.00,1.0,caf\xe9\n".encode("latin-1")
+    columns, lost = _read(tmp_path / "a.csv", data)
+    assert len(columns["ay"]) == N + 1
+    assert ("bad-cell", 1) in lost
+    with closing(open_log(tmp_path / "a.csv")) as log:
+        assert {f.path: f.unit for f in log.fields("csv")}["ay"] == "m/s²"
+
+
+def test_a_title_may_have_two_lines(tmp_path: Path) -> None:
+    columns, lost = _read(
+        tmp_path / "a.csv", _csv(SECONDS, '"time","ay\n[m/s²]","speed, measured"') + '"2.0","1","2"\n'
+    )
+    assert {*columns} == {"ay", "speed_measured"}
+    assert lost == []
+
+
+def test_more_columns_than_the_limit_are_refused_before_they_are_read(tmp_path: Path) -> None:
+    width = 70_000
+    text = "\n".join([",".join(["time", *(f"c{i}" for i in range(width))]), *(f"{i}" + "," * width for i in range(30))])
+    with pytest.raises(PdhefError, match="array width"):
+        _log(tmp_path / "a.csv", text.encode())
+
+
+def test_rows_that_step_back_are_left_out_and_counted(tmp_path: Path) -> None:
     lines = _csv(SECONDS, _HEAD).splitlines()
     lines[50], lines[51] = lines[51], lines[50]
     with closing(_log(tmp_path / "a.csv", "\n".join(lines).encode())) as log:
-        assert [(x.kind, x.severity) for x in log.lost] == [("out-of-order", "note")]
-        np.testing.assert_array_equal(log.read({"csv": ["ay"]})["csv"].fields["ay"], AY)
+        assert [(x.kind, x.count, x.severity) for x in log.lost] == [("out-of-order", 1, "note")]
+        np.testing.assert_array_equal(log.read({"csv": ["ay"]})["csv"].fields["ay"], np.delete(AY, 49))
 
 
 @pytest.mark.parametrize(
@@ -186,14 +289,6 @@ def test_names_and_units_of_titles() -> None:
     assert field_name("Lat._Vel.") == "Lat_Vel"
     assert field_name("Längsbeschl.\\CCP:1") == "Laengsbeschl"
     assert field_name("2nd gear") == "n_2nd_gear"
-
-
-def test_stamps_of_numbers() -> None:
-    week, second = np.array([1773.0, 2312.0]), np.array([0.0, 302_418_000.0])
-    # 2014-01-01 was 16 s, 2024-05-01 is 18 s behind GPS time; 1773 began on 2013-12-29.
-    assert gps_stamps(week, second / 1e3).tolist() == [1_388_275_184 * 10**9, 1_714_564_800 * 10**9]
-    assert gps_stamps(week[1:], second[1:]).tolist() == [1_714_564_800 * 10**9]
-    assert number_stamps(np.array([0.0, 20.0, np.nan]), "us").tolist()[:2] == [RELATIVE_NS, RELATIVE_NS + 20_000]
 
 
 # ------------------------------------------------------------------------------------------------ VBO
@@ -232,6 +327,30 @@ def test_a_vbo_file_keeps_minutes_units_and_the_clock_over_midnight(tmp_path: Pa
 def test_units_that_fit_no_columns_are_left_out(tmp_path: Path) -> None:
     with closing(_log(tmp_path / "a.vbo", vbo(["100000.00", "100000.01"], units="g\n°/s\n"))) as log:
         assert {f.unit for f in log.fields("vbox") if f.path in ("Y_Accel", "YawRate")} == {""}
+
+
+def test_titles_of_a_vbo_file_may_contain_units(tmp_path: Path) -> None:
+    data = vbo(["100000.00", "100000.01"], units="\n\n\n")
+    data = data.replace(b"YawRate\r", b"YawRate [deg/s]\r").replace(b"Y_Accel\r", b"Y_Accel (g)\r")
+    with closing(_log(tmp_path / "a.vbo", data)) as log:
+        units = {f.path: f.unit for f in log.fields("vbox")}
+        assert (units["YawRate"], units["Y_Accel"], units["latitude"]) == ("deg/s", "g", "min")
+        assert log.lost == ()
+
+
+@pytest.mark.parametrize(("east", "turn"), [(1, 90), (-1, 90), (1, 1), (-1, 1)])
+def test_the_heading_shows_which_longitude_is_positive(east: int, turn: int, tmp_path: Path) -> None:
+    head = "File created on 01/05/2024\n\n[header]\ntime\nlatitude\nlongitude\nheading\n\n[data]\n"
+    heading = np.linspace(0.0, turn, N)
+    north, to_east = (np.cumsum(1e-3 * f(np.radians(heading))) for f in (np.cos, np.sin))
+    rows = [
+        f"1000{i // 100:02d}.{i % 100:02d} {3420 + n:+.6f} {east * (720 + 1.84 * e):+.6f} {h:.3f}"
+        for i, (n, e, h) in enumerate(zip(north, to_east, heading, strict=True))
+    ]
+    columns, lost = _read(tmp_path / "a.vbo", head + "\n".join([*rows, ""]))
+    is_clear = turn == 90  # a drive to the north does not show the sign
+    assert lost == ([("mirrored", None)] if is_clear and east > 0 else [])
+    assert (columns["longitude"][0] < 0.0) == (is_clear or east < 0)
 
 
 def test_a_cut_vbo_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
@@ -280,7 +399,7 @@ def test_durations_and_times_of_day_are_times(kind: pa.DataType, tmp_path: Path)
     np.testing.assert_allclose((read.log_time_ns - RELATIVE_NS) * 1e-9, TIME_S, atol=1e-9)
 
 
-def test_a_damaged_row_group_is_a_loss(tmp_path: Path) -> None:
+def test_a_damaged_column_of_a_row_group_is_a_loss(tmp_path: Path) -> None:
     table = pa.table({"t": TIME_S, "ay": AY})
     out = io.BytesIO()
     pq.write_table(table, out, row_group_size=50, compression="zstd")
@@ -289,7 +408,8 @@ def test_a_damaged_row_group_is_a_loss(tmp_path: Path) -> None:
     data[at : at + 60] = b"\xff" * 60
     with closing(_log(tmp_path / "a.parquet", bytes(data))) as log:
         assert [(x.kind, x.count, x.severity) for x in log.lost] == [("bad-rows", 50, "lost")]
-        assert len(log.read({"parquet": ["ay"]})["parquet"]) == N - 50
+        read = log.read({"parquet": ["ay"]})["parquet"].fields["ay"]
+    np.testing.assert_array_equal(read, np.where((np.arange(N) >= 50) & (np.arange(N) < 100), np.nan, AY))
 
 
 # ------------------------------------------------------------------------------------------------ MAT

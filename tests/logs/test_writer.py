@@ -276,7 +276,7 @@ def test_rerun_loads_rows_from_what_is_written(tmp_path: Path) -> None:
     _small_log(path, n=50)
     code = "import sys; import rerun as rr\nrr.init('test'); rr.save(sys.argv[2]); rr.log_file_from_path(sys.argv[1])\n"
     environment = {"RERUN_ANALYTICS": "0", "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
-    subprocess.run([sys.executable, "-c", code, str(path), str(recording)], check=True, timeout=60, env=environment)
+    subprocess.run([sys.executable, "-c", code, str(path), str(recording)], check=True, timeout=300, env=environment)
     from rerun.chunk import RrdReader
 
     chunks = [c for c in RrdReader(str(recording)).stream() if str(c.entity_path).startswith("/imu")]

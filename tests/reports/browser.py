@@ -71,9 +71,9 @@ class Browser:
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(Exception):
             self._session = None
-            self.call("Browser.close", wait_s=5)
+            self.call("Browser.close", wait_s=60.0)
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(5)
+            self._process.wait(60.0)
         self._process.kill()
         self._process.wait()
         os.close(self._in)
@@ -136,7 +136,7 @@ class Browser:
             self._next(end)
         self.wait_for("document.documentElement.dataset.drawn !== undefined", end - time.monotonic())
 
-    def wait_for(self, expression: str, wait_s: float = 30.0) -> None:
+    def wait_for(self, expression: str, wait_s: float = 180.0) -> None:
         """Wait until the expression is true; between two pages it may raise (no document, a context that has gone)."""
         end = time.monotonic() + wait_s
         while True:

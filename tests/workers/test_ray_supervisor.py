@@ -32,7 +32,7 @@ def cluster() -> Iterator[Any]:
 
 def test_faults_end_on_a_node_as_they_do_here(cluster: Any) -> None:
     items = [("well", "x"), ("kill", ""), ("raise", ""), ("hang", "")]
-    found = supervise_on_ray(planted, items, address=cluster.address, limits=Limits(silence_s=1.0), preload=PRELOAD)  # type: ignore[var-annotated]
+    found = supervise_on_ray(planted, items, address=cluster.address, limits=Limits(silence_s=3.0), preload=PRELOAD)  # type: ignore[var-annotated]
     ended = sorted(found, key=lambda e: e.number)
     assert [e.item for e in ended] == items
     assert [(e.result, e.failure) for e in ended] == [

@@ -1,0 +1,158 @@
+"""Conversions of MDF channels from raw to physical values; a formula of a file is parsed, never run as code.
+
+``block`` is a conversion block as ``asammdf`` has parsed it. Source: ASAM MDF 4.2 and MDF 3.3, CCBLOCK.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import count, takewhile
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.records.signals import FloatArray
+
+#: Returns physical values [N] of raw numbers [N].
+Rule: TypeAlias = Callable[[NDArray[Any]], FloatArray]
+
+_LONGEST_FORMULA, _DEEPEST_FORMULA = 500, 40
+_OPERATORS: dict[type[ast.AST], np.ufunc] = {
+    ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide, ast.Pow: np.power,
+    ast.USub: np.negative, ast.UAdd: np.positive,
+}  # fmt: skip
+_NAMES = "abs sqrt exp log log10 sin cos tan arcsin arccos arctan arctan2 sinh cosh tanh"
+_FUNCTIONS: dict[str, np.ufunc] = {name: getattr(np, name) for name in _NAMES.split()} | {
+    "ln": np.log, "pow": np.power, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "atan2": np.arctan2,
+}  # fmt: skip
+
+_LINEAR = "{0.a}*x+{0.b}"
+_RATIONAL = "({0.P1}*x*x+{0.P2}*x+{0.P3})/({0.P4}*x*x+{0.P5}*x+{0.P6})"
+#: Conversions that are formulas of their parameters, by version and type.
+_FORMULAS = {
+    (4, 0): "x", (4, 1): _LINEAR, (4, 2): _RATIONAL, (4, 3): "{0.formula}", (4, 11): "x",
+    (3, 0): _LINEAR, (3, 9): _RATIONAL, (3, 10): "{0.formula}", (3, 11): "x", (3, 65535): "x",
+    (3, 6): "({0.P2}-{0.P4}*(x-{0.P5}-{0.P6}))/({0.P3}*(x-{0.P5}-{0.P6})-{0.P1})",
+}  # fmt: skip
+#: Exponential and logarithmic conversions without P4, and without P1.
+_WITHOUT_P4 = "{1}(((x-{0.P7})*{0.P6}-{0.P3})/{0.P1})/{0.P2}"
+_WITHOUT_P1 = "{1}(({0.P3}/(x-{0.P7})-{0.P6})/{0.P4})/{0.P5}"
+
+
+def conversion_rule(block: Any, version: int) -> Rule:
+    """Return the rule of a conversion block of MDF 3 or 4; ValueError if it is not supported."""
+    if block is None:
+        return _floats
+    kind = (4 if version >= 4 else 3), block.conversion_type
+    try:
+        if kind in _FORMULAS:
+            return formula_rule(_FORMULAS[kind].format(block))
+        match kind:
+            case (3, 7 | 8) if (block.P1 == 0.0) != (block.P4 == 0.0):
+                formula = _WITHOUT_P4 if block.P4 == 0.0 else _WITHOUT_P1
+                return formula_rule(formula.format(block, "exp" if kind[1] == 7 else "log"))
+            case (4, 4 | 5) | (3, 1 | 2):
+                return _table(block, interpolates=kind[1] in (1, 4))
+            case (4, 6):
+                values = [formula_rule(str(value)) for value in _column(block, "phys")]
+                return _pieces(block, values, formula_rule(str(block.default)))
+            case (4, 7 | 8):
+                blocks = block.referenced_blocks.items()
+                rules = {key: None if isinstance(b, bytes | None) else conversion_rule(b, 4) for key, b in blocks}
+                default = rules.pop("default_addr", None)
+                return _pieces(block, [*rules.values()], default)
+            case (3, 12):  # the text of all other numbers may contain a formula of {X}
+                text = (block.referenced_blocks.get("default_addr") or b"").decode("latin-1")
+                default = formula_rule(text.replace("{X}", "x").strip('\0 "')) if "{X}" in text else None
+                return _pieces(block, [None] * len(_column(block, "lower")), default)
+    except AttributeError:  # of a block that asammdf has not read to its end
+        raise ValueError("its conversion is incomplete") from None
+    raise ValueError(f"its conversion is of type {kind[1]}, which is not supported")
+
+
+def formula_rule(text: str) -> Rule:
+    """Return the rule of a formula in X or X1: numbers, ``+ - * / ** ^`` (power) and some functions.
+
+    Raises
+    ------
+    ValueError : the formula contains anything else.
+    """
+    text = text.partition("\0")[0].strip()
+    shown = text if len(text) <= 40 else f"{text[:40]}..."
+    if len(text) > _LONGEST_FORMULA:
+        raise ValueError(f"its formula {shown!r} has more than {_LONGEST_FORMULA} characters")
+    try:
+        tree = ast.parse(text.lower().replace("^", "**"), mode="eval").body
+        _evaluated(tree, np.empty(0), 0)
+    except (SyntaxError, ValueError, TypeError, OverflowError, RecursionError, MemoryError):
+        raise ValueError(f"its formula {shown!r} is no arithmetic of X") from None
+    return lambda raw: np.array(np.broadcast_to(_evaluated(tree, _floats(raw), 0), raw.shape))
+
+
+def _evaluated(node: ast.AST, x: FloatArray, depth: int) -> Any:
+    """Return the value of a node of a formula; ValueError for a node that is no arithmetic."""
+    value = partial(_evaluated, x=x, depth=depth + 1)
+    if depth > _DEEPEST_FORMULA:
+        raise ValueError("too deep")
+    with np.errstate(all="ignore"):
+        match node:
+            case ast.Name(id="x" | "x1"):
+                return x
+            case ast.Name(id="nan" | "inf" as name):
+                return np.float64(name)
+            case ast.Constant(value=int() | float() as number):
+                return np.float64(number)
+            case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
+                return _OPERATORS[type(op)](value(operand))
+            case ast.BinOp(op=op, left=left, right=right) if type(op) in _OPERATORS:
+                return _OPERATORS[type(op)](value(left), value(right))
+            case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if name in _FUNCTIONS:
+                if len(arguments) == _FUNCTIONS[name].nin:
+                    return _FUNCTIONS[name](*map(value, arguments))
+    raise ValueError(node)
+
+
+def _floats(raw: NDArray[Any]) -> FloatArray:
+    return raw.astype(np.float64)
+
+
+def _column(block: Any, name: str) -> list[float]:
+    """Return the numbers of a table: attributes ``name_0``, ``name_1``, ..."""
+    places = takewhile(lambda i: hasattr(block, f"{name}_{i}"), count())
+    return [float(getattr(block, f"{name}_{i}")) for i in places]
+
+
+def _table(block: Any, *, interpolates: bool) -> Rule:
+    """Return the rule of a table: interpolated, or the value of the nearest key, of two equally near the lower."""
+    keys, values = np.asarray(_column(block, "raw")), np.asarray(_column(block, "phys"))
+    if not len(keys) or np.isnan(keys).any():
+        raise ValueError("its conversion table has no keys")
+    order = np.argsort(keys, kind="stable")
+    keys, values = keys[order], values[order]
+    if interpolates:
+        return lambda raw: np.interp(_floats(raw), keys, values)
+    borders = (keys[1:] + keys[:-1]) / 2.0
+    return lambda raw: np.where(np.isnan(_floats(raw)), np.nan, values[np.searchsorted(borders, _floats(raw))])
+
+
+def _pieces(block: Any, rules: Sequence[Rule | None], default: Rule | None) -> Rule:
+    """Return the rule of values or ranges with a rule each, and of a default for all other numbers; None is a text.
+
+    The end of a range belongs to a range of integers. Texts are NaN if other numbers have a rule; otherwise all numbers
+    stay as they are.
+    """
+    if default is None and not any(rules):
+        return _floats
+    lows, highs = (_column(block, "val") or _column(block, name) for name in ("lower", "upper"))
+
+    def convert(raw: NDArray[Any]) -> FloatArray:
+        values = default(raw) if default else np.full(raw.shape, np.nan)
+        for first, last, rule in reversed([*zip(lows, highs, rules, strict=True)]):
+            its = (raw >= first) & (raw < last) | (raw == last) & (raw.dtype.kind != "f" or first == last)
+            values[its] = rule(raw[its]) if rule else np.nan
+        return values
+
+    return convert

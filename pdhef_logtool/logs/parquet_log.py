@@ -1,0 +1,172 @@
+"""Parquet files: one table of all row groups. Structs become columns of their fields."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.logs.container import describe_damage
+from pdhef_logtool.logs.table_cells import read_cells
+from pdhef_logtool.logs.table_clocks import unwrapped
+from pdhef_logtool.logs.table_columns import Sheet, read_head, tables_of
+from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.signals import Loss
+
+_NULL = np.iinfo(np.int64).min
+#: Units of NumPy's dates, by those types of Arrow that have no unit.
+_DATE_UNITS = {"date32[day]": "D", "date64[ms]": "ms"}
+
+
+def open_parquet(file: TableFile) -> Tables:
+    """Read a Parquet file; a column that cannot be read is a loss, in its row group."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    losses: list[Loss] = []
+    schema = pq.read_schema(file.stream)
+    leaves = dict(_leaves(schema, ""))
+    file.limits.check("channels", len(leaves), file.name)
+    kinds = {path: _kind(field.type) for path, field in leaves.items()}
+    paths = [path for path, kind in kinds.items() if kind]
+    if unusable := [f"{path} ({leaves[path].type})" for path, kind in kinds.items() if not kind]:
+        what = f"columns of types without numbers are left out: {', '.join(unusable)}"
+        losses.append(Loss("no-numbers", what, file.name, count=len(unusable), severity="note"))
+    file.stream.seek(0)
+    with pq.ParquetFile(file.stream, read_dictionary=[p for p in paths if kinds[p] == "text"]) as source:
+        parts = _groups(source, paths, file, losses)
+    fields, units = read_head(paths)
+    columns = {}
+    for name, path in zip(fields, paths, strict=True):
+        if unit := _unit_of(leaves[path].metadata):
+            units[name] = unit
+        if kinds[path] == "duration":
+            units[name] = "s"
+        try:
+            chunks = [chunk for part in parts for chunk in part[path].chunks]
+            columns[name] = _column(pa.chunked_array(chunks), kinds[path], name, file, losses)
+        except Exception as error:  # noqa: BLE001  any error of a conversion
+            losses.append(Loss("bad-column", f"{path} cannot be read: {describe_damage(error)[1]}", file.name))
+    return Tables("parquet", list(tables_of(Sheet("parquet", columns, units), file.name, losses)), losses)
+
+
+def _leaves(fields: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+    """Yield the paths of columns, inside of structs too, and their fields."""
+    import pyarrow as pa
+
+    for field in fields:
+        if pa.types.is_struct(field.type):
+            yield from _leaves(field.type, f"{prefix}{field.name}.")
+        else:
+            yield f"{prefix}{field.name}", field
+
+
+def _kind(type_: Any) -> str:
+    """Return how a column of a type is read; empty if it cannot contain numbers or times."""
+    import pyarrow.types as of
+
+    if of.is_dictionary(type_):
+        type_ = type_.value_type
+    kinds = (
+        ("text", of.is_string, of.is_large_string),
+        ("date", of.is_timestamp, of.is_date),
+        ("duration", of.is_duration, of.is_time),
+        ("number", of.is_integer, of.is_floating, of.is_decimal, of.is_boolean),
+    )
+    return next((kind for kind, *tests in kinds if any(test(type_) for test in tests)), "")
+
+
+def _unit_of(metadata: Mapping[bytes, bytes] | None) -> str:
+    values = {key.lower(): value for key, value in (metadata or {}).items()}
+    return next((values[key].decode(errors="replace") for key in (b"unit", b"units") if key in values), "")
+
+
+def _groups(source: Any, paths: Sequence[str], file: TableFile, losses: list[Loss]) -> list[dict[str, Any]]:
+    """Return the columns of row groups by path, null where they cannot be read; no group exceeds the limits."""
+    import pyarrow as pa
+
+    parts: list[dict[str, Any]] = []
+    types = {path: field.type for path, field in _leaves(source.schema_arrow, "")}
+    claimed = 0
+    for number in range(source.num_row_groups):
+        group = source.metadata.row_group(number)
+        where, rows = f"{file.name}, row group {number}", group.num_rows
+        part: dict[str, Any] = {}
+        try:
+            claimed += max(8 * rows * max(1, len(paths)), group.total_byte_size)
+            file.limits.check_table(claimed, file.size, where)
+            errors = dict(_read(source, number, rows, paths, part))
+        except LogError as error:
+            losses.append(Loss("bad-rows", str(error), where, count=rows))
+            continue
+        if errors:
+            bad = ", ".join(errors) if part else "all columns"
+            losses.append(Loss("bad-rows", f"{bad}: cannot be read: {next(iter(errors.values()))}", where, count=rows))
+        if part:
+            parts.append(part | {path: pa.chunked_array([pa.nulls(rows, types[path])]) for path in errors})
+    if not parts:
+        got = losses[-1].what if losses else "none"
+        raise LogError(expected="a row group that can be read", got=got, where=file.name)
+    return parts
+
+
+def _read(source: Any, number: int, rows: int, paths: Sequence[str], part: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Add the columns of a row group to ``part``; yield each that cannot be read, and why."""
+    import pyarrow as pa
+
+    try:
+        table = source.read_row_group(number, columns=[*paths], use_threads=False)
+        while any(map(pa.types.is_struct, table.schema.types)):
+            table = table.flatten()
+        if table.num_rows != rows or {*table.column_names} != {*paths}:
+            raise ValueError(f"{table.num_rows} of {rows} rows")
+        part.update({path: table[path] for path in paths})
+    except Exception as error:  # noqa: BLE001  any error of a damaged page
+        if len(paths) == 1:
+            yield paths[0], describe_damage(error)[1]
+            return
+        for half in (paths[: len(paths) // 2], paths[len(paths) // 2 :]):
+            yield from _read(source, number, rows, half, part)
+
+
+def _column(column: Any, kind: str, name: str, file: TableFile, losses: list[Loss]) -> Any:
+    """Return a column as an array [N] with NaN (NaT) for null, or as texts."""
+    import pyarrow as pa
+
+    if kind == "text":
+        return _texts(column, name, file, losses)
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    unit = _DATE_UNITS.get(str(column.type)) or getattr(column.type, "unit", "")
+    if kind == "date":
+        column = column.cast(pa.int32()) if unit == "D" else column
+        return column.cast(pa.int64()).fill_null(_NULL).to_numpy().view(f"M8[{unit}]")
+    if kind == "duration":
+        is_of_day = pa.types.is_time(column.type)
+        column = column.cast(pa.int32()) if pa.types.is_time32(column.type) else column
+        values = column.cast(pa.int64()).cast(pa.float64(), safe=False).to_numpy()
+        values = values / np.timedelta64(1, "s").astype(f"m8[{unit}]").astype(np.int64)
+        return unwrapped(values) if is_of_day else values
+    if pa.types.is_floating(column.type) or (pa.types.is_integer(column.type) and not column.null_count):
+        return column.to_numpy()
+    return column.cast(pa.float64(), safe=False).to_numpy()
+
+
+def _texts(column: Any, name: str, file: TableFile, losses: list[Loss]) -> NDArray[Any] | Any:
+    """Return texts as numbers if most of them are numbers; a text that repeats counts each time for the limits."""
+    import polars as pl
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    dictionaries = [chunk for chunk in column.chunks if pa.types.is_dictionary(chunk.type)]
+    sizes = (pc.sum(pc.take(pc.binary_length(c.dictionary), c.indices)).as_py() or 0 for c in dictionaries)
+    file.limits.check_table(sum(sizes), file.size, f"{file.name}, {name}")
+    texts = pl.Series(pl.from_arrow(column.cast(pa.large_string())))
+    cells = read_cells(texts)
+    if cells.is_text:
+        return texts
+    losses.extend(cells.losses(name, file.name))
+    return cells.values

@@ -1,0 +1,391 @@
+"""Clocks of tables: unit, epoch and order of the dates are decided once for a whole column, from all evidence.
+
+Evidence, in this order: the unit that the file states; the magnitude, since only a date is of the size of a date; the
+other clocks of the file; rates and durations of usual recordings.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.logs.recording_span import (
+    BREAK_NS,
+    NOTED_SHARE,
+    OTHER_EPOCH,
+    OUTLIER,
+    TIME_JUMP,
+    find_epochs,
+    steps_back,
+)
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
+
+if TYPE_CHECKING:
+    from polars import Series
+
+#: Stamp of a row without a time.
+NO_TIME = np.iinfo(np.int64).min
+_DAY_NS = 86_400 * 10**9
+#: Times that count from the start of a recording follow this instant, 1970-01-02, so that none is negative.
+RELATIVE_NS = _DAY_NS
+#: 1973; earlier times count from the start of a recording.
+_FIRST_DATE_NS = 10**17
+#: Stamps beyond this do not fit into int64.
+_LAST_NS = 9e18
+
+#: Nanoseconds of a unit by its spellings in lower case.
+TIME_UNITS_NS = {
+    spelling: factor
+    for factor, spellings in (
+        (_DAY_NS, "d day days"),
+        (3600 * 10**9, "h hr hrs hour hours"),
+        (60 * 10**9, "min mins minute minutes"),
+        (10**9, "s sec secs second seconds sek"),
+        (10**6, "ms msec millis milliseconds"),
+        (10**3, "us µs μs usec micros microseconds"),
+        (1, "ns nsec nanos nanoseconds"),
+    )
+    for spelling in spellings.split()
+}
+_SECONDS, _SUBUNITS = 10**9, (10**9, 10**6, 10**3, 1)
+_UNIT_NAMES = dict(
+    zip((_DAY_NS, *_SUBUNITS), ("days", "seconds", "milliseconds", "microseconds", "nanoseconds"), strict=True)
+)
+#: 1970-01-01 in the days of Excel, and of MATLAB's ``datenum``.
+_DAYS_TO_1970 = {25_569: "days of Excel", 719_529: "days of MATLAB (datenum)"}
+#: Dates are from 1990 to 2100, in s since 1970, and such clocks have steps of 10 µs to a minute.
+_DATES_S = (631_152_000, 4_102_444_800)
+_DATE_STEPS_S = (1e-5, 60.0)
+#: Usual recordings: steps and durations in s. A reading is rated by the decades outside of these ranges.
+_USUAL_STEP_S = (0.5e-3, 1.0)
+_USUAL_LENGTH_S = (10.0, 14_400.0)
+#: Clocks of one recording have lengths below this ratio.
+_UNLIKE = 1000.0
+#: Clocks with fewer rows are not compared.
+_FEW_ROWS = 10
+
+_GPS_EPOCH_NS = 315_964_800 * 10**9
+_WEEK_S = 604_800
+#: 10-bit weeks are read as dates from 2015 to 2034.
+_FIRST_WEEK, _WEEKS_OF_10_BITS = 1826, 1024
+#: A clock of GPS time that is read as Unix time is before 2018, in s since 1970; logs of cars are younger.
+_GPS_AS_UNIX_S = (1_104_537_600, 1_514_764_800)
+#: GPS time minus UTC in s, from a time in s since 1970 on.
+_LEAP_SECONDS = ((1136073600, 14), (1230768000, 15), (1341100800, 16), (1435708800, 17), (1483228800, 18))
+
+#: A date, a time of day (of 12 hours with AM or PM) or ``minutes:seconds``, and an offset from UTC.
+_TIME_TEXT = (
+    r"^(?:(?P<a>\d{1,4})(?P<mark>[-./])(?P<b>\d{1,2})[-./](?P<c>\d{1,4}),?[T ]*)?"
+    r"(?:(?:(?P<hour>\d{1,3}):)?(?P<minute>\d{1,3}):(?P<second>\d{1,2})(?:[.,](?P<fraction>\d{1,9})\d*)?)?"
+    r"\s*(?:(?P<half>[AaPp])\.?[Mm]\.?)?\s*(?:[Zz]|UTC|(?P<sign>[-+])(?P<zone_hour>\d\d):?(?P<zone_minute>\d\d)?)?$"
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clock:
+    """Times of the rows of a table.
+
+    Attributes
+    ----------
+    stamps_ns : int64 [N], since 1970, or after :data:`RELATIVE_NS` if they count from the start of a recording;
+        :data:`NO_TIME` in rows without a time.
+    notes : assumptions. is_certain : the file states the unit, or the times are dates.
+    columns : names of the columns that the times come from.
+    """
+
+    stamps_ns: IntArray
+    notes: tuple[str, ...] = ()
+    is_certain: bool = True
+    columns: frozenset[str] = frozenset()
+
+    @property
+    def length_s(self) -> float:
+        """Duration in s by the usual step; 0 without times."""
+        step, count = _steps(self.stamps_ns[self.stamps_ns != NO_TIME])
+        return step * 1e-9 * count
+
+    @property
+    def is_dated(self) -> bool:
+        """Whether the times are dates."""
+        return _is_dated(self.stamps_ns)
+
+    @property
+    def middle_ns(self) -> float:
+        """Median of the times; NaN without times."""
+        stamps = self.stamps_ns[self.stamps_ns != NO_TIME]
+        return float(np.median(stamps)) if len(stamps) else math.nan
+
+
+# ---- numbers ----
+
+
+def number_clock(values: NDArray[Any], unit: str = "", name: str = "times", others: Sequence[Clock] = ()) -> Clock:
+    """Return the clock of numbers or NumPy dates [N]; ``others`` are certain clocks of the same recording."""
+    if values.dtype.kind == "M":
+        factor = TIME_UNITS_NS[np.datetime_data(values.dtype)[0].lower()]
+        return Clock(placed(_scaled(values.astype(np.int64), factor, 0, ~np.isnat(values))))
+    finite = np.isfinite(values)
+    stated = TIME_UNITS_NS.get(re.sub(r"[\s\[\](){}.]", "", unit).lower(), 0)
+    factor, epoch, note = _reading(values[finite], stated, others)
+    stamps = placed(_scaled(values, factor, epoch, finite))
+    clock = Clock(stamps, (f"{name}: {note}",) if note else (), bool(stated or epoch) or _is_dated(stamps))
+    return clock if epoch else _of_gps(clock, name, others)
+
+
+def number_stamps(values: FloatArray, unit: str = "") -> IntArray:
+    """Return the times of numbers [N] as :class:`Clock` has them."""
+    return number_clock(values, unit).stamps_ns
+
+
+def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock]) -> tuple[int, int, str]:
+    """Return ns of a unit, the units from an epoch to 1970, and the assumption, from finite values and the unit."""
+    middle = float(np.median(values)) if len(values) else 0.0
+    step, count = _steps(values)
+    lengths = [length for clock in others if (length := clock.length_s) > 0.0]
+
+    def fits(factor: int) -> bool:
+        return step == 0.0 or _DATE_STEPS_S[0] <= step * factor / _SECONDS <= _DATE_STEPS_S[1]
+
+    def decades_off(reading: tuple[int, int]) -> float:
+        step_s = step * reading[0] / _SECONDS
+        length_s = step_s * count
+        if length_s <= 0.0:
+            return 0.0
+        apart = min((abs(math.log10(length_s / length)) for length in lengths), default=0.0)
+        return _outside(step_s, _USUAL_STEP_S) + _outside(length_s, _USUAL_LENGTH_S) + apart
+
+    dates = [(factor, 0) for factor in _SUBUNITS if _is_date(middle * factor / _SECONDS)]
+    days = [(_DAY_NS, epoch) for epoch in _DAYS_TO_1970 if _is_date((middle - epoch) * 86_400.0)]
+    if stated:
+        as_stated = next((r for r in (*dates, *days) if r[0] == stated), (stated, 0))
+        is_sound = fits(stated) and abs(middle) * stated < _LAST_NS
+        better = as_stated if is_sound else next((r for r in (*dates, *days) if fits(r[0])), as_stated)
+        changed = better[0] != stated
+        return *better, f"the unit makes no plausible times, read as {_named(*better)}" if changed else ""
+    dates = [reading for reading in dates if fits(reading[0])]
+    factor, epoch = dates[0] if dates else min((*((f, 0) for f in _SUBUNITS), *days), key=decades_off)
+    assumed = "" if dates or factor == _SECONDS else f"no unit, read as {_named(factor, epoch)}"
+    return factor, epoch, assumed
+
+
+def _of_gps(clock: Clock, name: str, others: Sequence[Clock]) -> Clock:
+    """Return a clock of Unix time, or of GPS time if another clock of the file or the name shows this."""
+    unix_s = clock.middle_ns / _SECONDS
+    if not _GPS_AS_UNIX_S[0] <= unix_s < _GPS_AS_UNIX_S[1]:
+        return clock
+    gps_ns = clock.middle_ns + _GPS_EPOCH_NS
+    dated = next((other.middle_ns for other in others if other.is_dated), None)
+    named = re.search(r"gps|gnss", name, re.IGNORECASE) and not re.search("utc|unix|epoch", name, re.IGNORECASE)
+    if abs(gps_ns - dated) < abs(clock.middle_ns - dated) if dated is not None else named:
+        stamps = _to_utc(clock.stamps_ns + _GPS_EPOCH_NS, clock.stamps_ns != NO_TIME)
+        return replace(clock, stamps_ns=stamps, notes=(*clock.notes, f"{name}: read as GPS time (seconds since 1980)"))
+    if dated is not None:
+        return clock
+    year = dt.datetime.fromtimestamp(unix_s, dt.UTC).year
+    note = f"{name}: read as Unix time, {year}; as GPS time it would be {year + 10}"
+    return replace(clock, notes=(*clock.notes, note))
+
+
+def _named(factor: int, epoch: int) -> str:
+    return _DAYS_TO_1970.get(epoch, _UNIT_NAMES[factor])
+
+
+def _is_date(unix_s: float) -> bool:
+    return _DATES_S[0] <= unix_s <= _DATES_S[1]
+
+
+def _is_dated(stamps: IntArray) -> bool:
+    has = stamps != NO_TIME
+    return bool(has.any()) and float(np.median(stamps[has])) >= _FIRST_DATE_NS
+
+
+def _outside(value: float, usual: tuple[float, float]) -> float:
+    """Return the decades by which a value is outside of a range."""
+    return max(0.0, math.log10(usual[0] / value), math.log10(value / usual[1]))
+
+
+def _steps(values: NDArray[Any]) -> tuple[float, int]:
+    """Return the usual step of finite values, 0 if none is positive, and the number of positive ones."""
+    steps = np.diff(values if values.dtype.kind == "i" else values.astype(np.float64))
+    steps = steps[steps > 0]
+    return (float(np.median(steps)), len(steps)) if len(steps) else (0.0, 0)
+
+
+def _scaled(values: NDArray[Any], factor: int, epoch: int, has_time: BoolArray) -> IntArray:
+    """Return values [N] since an epoch in ns; those that do not fit into int64 have no time."""
+    stamps = np.full(values.shape, NO_TIME, np.int64)
+    has_time = has_time & (np.abs(np.where(has_time, values, 0).astype(np.float64) - epoch) < _LAST_NS / factor)
+    given = values[has_time]
+    # The fraction apart: a product would lose the last digits of a date.
+    whole = given if given.dtype.kind in "iu" else np.floor(given)
+    fraction = np.round((given - whole) * float(factor)).astype(np.int64)
+    stamps[has_time] = (whole.astype(np.int64) - epoch) * factor + fraction
+    return stamps
+
+
+def placed(stamps: IntArray) -> IntArray:
+    """Return stamps [N], moved to :data:`RELATIVE_NS` unless they are dates."""
+    return stamps if _is_dated(stamps) else np.where(stamps != NO_TIME, stamps + RELATIVE_NS, NO_TIME)
+
+
+# ---- GPS weeks ----
+
+
+def week_clock(week: FloatArray, seconds: FloatArray) -> Clock:
+    """Return the clock of GPS weeks [N] and their seconds (or milliseconds) [N]; 10-bit weeks are of 2015 to 2034."""
+    has_time = np.isfinite(week) & np.isfinite(seconds)
+    has_time &= (np.abs(np.where(has_time, week, -1.0) - 5000.0) <= 5000.0) & (np.abs(seconds) <= 2e3 * _WEEK_S)
+    given, within = week[has_time].astype(np.int64), seconds[has_time]
+    notes: tuple[str, ...] = ()
+    if given.size and given.max() < _WEEKS_OF_10_BITS:
+        added = _WEEKS_OF_10_BITS * math.ceil((_FIRST_WEEK - float(np.median(given))) / _WEEKS_OF_10_BITS)
+        notes = (f"GPS weeks have 10 bits: {added} weeks are added, so that they are of 2015 to 2034",)
+        given = given + added
+    within = within / 1e3 if within.max(initial=0.0) > _WEEK_S else within
+    stamps = np.full(week.shape, NO_TIME, np.int64)
+    stamps[has_time] = _GPS_EPOCH_NS + given * (_WEEK_S * _SECONDS) + np.round(within * 1e9).astype(np.int64)
+    return Clock(_to_utc(stamps, has_time), notes)
+
+
+def _to_utc(stamps: IntArray, has_time: BoolArray) -> IntArray:
+    """Return UTC of GPS times [N], both in ns since 1970."""
+    leap = [0] + [s for _, s in _LEAP_SECONDS]
+    after = np.searchsorted([since for since, _ in _LEAP_SECONDS], stamps // _SECONDS, side="right")
+    return np.where(has_time, stamps - np.asarray(leap, np.int64)[after] * _SECONDS, NO_TIME)
+
+
+# ---- texts ----
+
+
+def text_clock(texts: Series, dates: Series | None = None) -> Clock:
+    """Return the clock of texts [N]: ISO 8601, other dates with a time, or times of day; ``dates``: of their days.
+
+    Day and month have one order in the whole column. Numbers above 12 decide it; then the shorter recording; otherwise
+    the month is first, with a note.
+    """
+    parts = texts.str.strip_chars().str.extract_groups(_TIME_TEXT).struct.unnest()
+    if dates is not None and parts["a"].null_count() == len(parts):
+        return text_clock(dates.str.strip_chars() + " " + texts.str.strip_chars())
+    number = {n: parts[n].cast(int, strict=False).fill_null(-1).to_numpy() for n in parts.columns if n not in _WORDS}
+    is_dated = number["a"] >= 0
+    hour, minute, second = number["hour"], number["minute"], number["second"]
+    short = hour < 0
+    if is_dated.any():  # hh:mm behind a date
+        hour, minute, second = (np.where(short, *pair) for pair in ((minute, hour), (second, minute), (0, second)))
+    hour, minute, second = (np.maximum(part, 0) for part in (hour, minute, second))
+    half = parts["half"].str.to_lowercase().fill_null("").to_numpy()
+    hour = np.where(half == "", hour, hour % 12 + 12 * (half == "p"))
+    has_time = (second <= 60) & ((minute < 60) | short & ~is_dated) & ((hour < 24) | ~is_dated)
+    fraction = parts["fraction"].fill_null("").str.pad_end(9, "0").cast(int).to_numpy()
+    of_day = ((hour * 60 + minute) * 60 + second) * _SECONDS + fraction
+    if not is_dated.any():
+        has_time &= number["second"] >= 0
+        period = 3600 * _SECONDS if short[has_time].all() else _DAY_NS
+        stamps = np.full(len(texts), NO_TIME, np.int64)
+        stamps[has_time] = unwrapped(of_day[has_time], period)
+        return Clock(placed(stamps))
+    days, is_day, note = _days(number["a"], number["b"], number["c"], parts["mark"].fill_null("").to_numpy())
+    zone = np.maximum(number["zone_hour"], 0) * 60 + np.maximum(number["zone_minute"], 0)
+    zone = np.where(parts["sign"].fill_null("").to_numpy() == "-", -zone, zone)
+    stamps = days * _DAY_NS + of_day - zone * 60 * _SECONDS
+    return Clock(np.where(has_time & is_dated & is_day, stamps, NO_TIME), (note,) if note else ())
+
+
+_WORDS = frozenset({"mark", "half", "sign", "fraction"})
+
+
+def _days(a: IntArray, b: IntArray, c: IntArray, mark: NDArray[Any]) -> tuple[IntArray, BoolArray, str]:
+    """Return days since 1970 of dates a-b-c [N], a mask of valid days, and the assumption."""
+    year_first = a > 31
+    is_short = (c < 100) & (mark != "-")
+    year = np.where(year_first, a, np.where(is_short, c + 2000, c))
+    days, is_day = _civil(year, b, np.where(year_first, c, a))
+    other, is_other = _civil(year, np.where(year_first, b, a), np.where(year_first, c, b))
+    day_first, month_first = ((-int(is_.sum()), _spread(of[is_])) for of, is_ in ((days, is_day), (other, is_other)))
+    if (mark == ".").any() or year_first.any() or day_first < month_first:
+        return days, is_day, ""
+    is_open = day_first == month_first and bool((days != other)[is_day].any())
+    return other, is_other, "no date shows whether day or month is first: read as month/day" if is_open else ""
+
+
+def _spread(values: IntArray) -> int:
+    return int(np.ptp(values)) if len(values) else 0
+
+
+def _civil(year: IntArray, month: IntArray, day: IntArray) -> tuple[IntArray, BoolArray]:
+    """Return days since 1970 [N], and whether these are days of the calendar from 1900 to 2261."""
+    is_day = (year >= 1900) & (year < 2262) & (month >= 1) & (month <= 12) & (day >= 1)
+    months = np.where(is_day, (year - 1970) * 12 + month - 1, 0).astype("datetime64[M]")
+    days = months.astype("datetime64[D]") + np.where(is_day, day - 1, 0)
+    is_day &= days.astype("datetime64[M]") == months
+    return days.astype(np.int64), is_day
+
+
+def unwrapped(times: NDArray[Any], period: float = 86_400.0) -> NDArray[Any]:
+    """Return times since midnight [N] that continue behind midnight; ``period`` is a day in their unit."""
+    steps = np.diff(times, prepend=times[:1])
+    wraps = np.cumsum((steps < -period / 2).astype(np.int64) - (steps > period / 2))
+    return np.asarray(times + period * np.maximum(wraps, 0))
+
+
+def whole_days(date: dt.date) -> int:
+    """Return the ns of a date's midnight."""
+    return (date - dt.date(1970, 1, 1)).days * _DAY_NS
+
+
+# ---- rows in the order of time ----
+
+
+def ascending_rows(stamps: IntArray, where: str) -> tuple[IntArray, list[Loss]]:
+    """Return the rows that are kept of stamps [N], in file order, and losses.
+
+    As in logs of messages, rows of another time (:mod:`~pdhef_logtool.logs.recording_span`) are left out where they
+    disturb the order. If the clock steps back, the first pass is kept, and rows more than ``BREAK_NS`` after its end.
+    Single rows out of order are left out. No row is moved.
+    """
+    rows: IntArray = np.flatnonzero(stamps != NO_TIME)
+    losses: list[Loss] = []
+
+    def leave_out(kept: BoolArray, reason: str, what: str) -> None:
+        nonlocal rows
+        if not kept.all():
+            out, n = stamps[rows[~kept]], int((~kept).sum())
+            severity: Literal["lost", "note"] = "lost" if n > NOTED_SHARE * len(stamps) else "note"
+            first, last = (int(out.min()), int(out.max())) if reason == TIME_JUMP else (None, None)
+            losses.append(Loss(reason, f"{n} rows are left out: {what}", where, first, last, n, severity))
+            rows = rows[kept]
+
+    if len(rows) < len(stamps):
+        losses.append(Loss("bad-stamp", "row without a time", where, count=len(stamps) - len(rows)))
+    if (np.diff(stamps[rows]) >= 0).all():
+        return rows, losses
+    _, kept, outlier = find_epochs(stamps[rows], stamps[rows] + 1, np.ones(len(rows), np.int64))
+    reason = OUTLIER if outlier[~kept].all() else OTHER_EPOCH
+    leave_out(kept, reason, "their times are far from all others")
+    kept = np.ones(len(rows), np.bool_)
+    begins = steps_back(stamps[rows]).tolist()
+    end_ns = NO_TIME
+    for begin, end in zip([0, *begins], [*begins, len(rows)], strict=True):
+        times = stamps[rows[begin:end]]
+        kept[begin:end] = times > end_ns
+        end_ns = max(end_ns, int(times.max()) + BREAK_NS)
+    leave_out(kept, TIME_JUMP, f"the clock steps back at row {rows[begins[0]] + 1}" if begins else "")
+    times = stamps[rows]
+    behind, ahead = times >= np.maximum.accumulate(times), times <= np.minimum.accumulate(times[::-1])[::-1]
+    leave_out(max(behind, ahead, key=np.count_nonzero), "out-of-order", "their times are not in order")
+    return rows, losses
+
+
+def unlike_lengths(stamps: Mapping[str, IntArray], where: str) -> list[Loss]:
+    """Return a loss if the lengths of the clocks [N] of a file, by table, contradict each other."""
+    compared = [(int(s[-1] - s[0]) * 1e-9, n) for n, s in stamps.items() if len(s) >= _FEW_ROWS and s[-1] > s[0]]
+    (short_s, short), (long_s, long) = (min(compared), max(compared)) if compared else ((1.0, ""), (1.0, ""))
+    what = f"clocks of one recording differ: {short} lasts {short_s:.4g} s, {long} {long_s:.4g} s"
+    return [Loss("clock-lengths", what, where)] if long_s >= _UNLIKE * short_s else []

@@ -1,0 +1,95 @@
+"""The process in which a file of tables is read: what it cannot do, and what its end costs."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.logs import formats
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError
+from pdhef_logtool.records.errors import LogError
+from tests.logs import planted_reader
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="readers have a process of their own on Linux only")
+
+
+@pytest.fixture(autouse=True)
+def _planted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(formats, "FORMATS", (planted_reader.FORMAT,))
+
+
+def _file(folder: Path, deed: str, argument: object = "-") -> Path:
+    path = folder / f"{deed}.planted"
+    path.write_text(f"PLANTED {deed} {argument}")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("deed", "message"),
+    [
+        ("segv", r"got one that ends its reader \(SIGSEGV\); give the recording itself"),
+        ("exit", r"got one that ends its reader \(exit code 0\)"),
+        ("interrupt", r"got one that ends its reader \(exit code 0\)"),
+        ("bad", "a block of it is damaged"),
+        ("refuse", "expected a planted file, got a weed; plant another"),
+    ],
+)
+def test_a_reader_that_ends_costs_its_file_only(tmp_path: Path, deed: str, message: str) -> None:
+    with pytest.raises(LogError, match=message):
+        open_log(_file(tmp_path, deed))
+    open_log(_file(tmp_path, "nothing")).close()
+
+
+@pytest.mark.parametrize("deed", ["read", "link", "write", "run", "connect", "kill"])
+def test_a_reader_reaches_no_other_file_program_or_process(tmp_path: Path, deed: str) -> None:
+    canary = tmp_path / "canary"
+    canary.write_text("as it was")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        argument = server.getsockname()[1] if deed == "connect" else canary
+        with pytest.raises(LogError, match="PermissionError"):
+            open_log(_file(tmp_path, deed, argument))
+    assert canary.read_text() == "as it was"
+
+
+def test_time_and_memory_of_a_reader_are_limited_by_the_budget(tmp_path: Path) -> None:
+    with pytest.raises(LimitError, match=r"537 MB of memory.*--set budget=FACTOR"):
+        open_log(_file(tmp_path, "memory"))
+    with pytest.raises(LimitError, match=r"0.05 s of processor time.*--set budget=FACTOR"):
+        open_log(_file(tmp_path, "hang"), DEFAULT_LIMITS.times(0.01))
+
+
+def test_a_column_that_ends_its_reader_is_a_loss_and_the_others_are_read(tmp_path: Path) -> None:
+    log = open_log(_file(tmp_path, "nothing"))
+    columns = log.read({"t": ["good", "segv", "bad", "better"]})["t"].fields
+    log.close()
+    assert columns["good"].tolist() == columns["better"].tolist() == [0, 1, 2, 3, 4]
+    assert np.isnan(columns["segv"]).all()
+    assert np.isnan(columns["bad"]).all()
+    assert [(loss.kind, loss.where) for loss in log.lost] == [("bad-column", "t")] * 2
+    assert "SIGSEGV" in log.lost[0].what
+    assert "a block of it is damaged" in log.lost[1].what
+
+
+def test_a_reader_is_silent_and_its_folder_is_removed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    open_log(_file(tmp_path, "print")).close()
+    before = set(Path(tempfile.gettempdir()).glob("pdhef-*"))
+    log = open_log(_file(tmp_path, "leave"))
+    assert log.read({"t": ["good"]})["t"].fields["good"][0] == 2  # the folder had this file, and its output
+    log.close()
+    assert set(Path(tempfile.gettempdir()).glob("pdhef-*")) <= before
+    assert not (tmp_path / "left_behind").exists()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_slices_of_a_column_are_those_of_the_reader(tmp_path: Path) -> None:
+    log = open_log(_file(tmp_path, "nothing"))
+    part = log.read({"t": ["good"]}, 10**18 + 10, 10**18 + 40)["t"]
+    log.close()
+    assert part.fields["good"].tolist() == [1, 2, 3]
+    assert (part.log_time_ns - 10**18).tolist() == [10, 20, 30]
