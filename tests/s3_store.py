@@ -43,10 +43,7 @@ def forget_file_systems() -> None:
     """Drop the file systems that this process has opened, with their connections and listings."""
     import s3fs
 
-    from pdhef_logtool.storage import object_store
-
     s3fs.S3FileSystem.clear_instance_cache()
-    object_store._opened.cache_clear()
 
 
 @contextmanager

@@ -22,10 +22,8 @@ from pdhef_logtool.cli import (
     panels,
     reporting,
     running,
-    serving,
     simulating,
     stopping,
-    trending,
     validation,
 )
 from pdhef_logtool.cli.removed_commands import replaced_option, replacement
@@ -59,8 +57,6 @@ for _group in (
     validation,
     reporting,
     comparing,
-    trending,
-    serving,
     simulating,
     learning,
     converting,

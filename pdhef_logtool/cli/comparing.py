@@ -15,7 +15,7 @@ from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
-    from pdhef_logtool.results.gate import Figure, Gate
+    from pdhef_logtool.results.gate import Gate
 
 commands = typer.Typer()
 #: Room around events: a threshold that is crossed to and fro is one event; a clip shows how it came about.
@@ -41,10 +41,21 @@ def compare(
         Path | None,
         Option(metavar="FILE", help='Validation plan for B. baseline = "run" means run A. Exit code 4 if one fails.'),
     ] = None,
-    max_regression: options.MaxRegression = None,
-    estimator: options.ComparedEstimator = None,
-    metric: options.ComparedMetric = None,
-    cluster: options.Cluster = None,
+    max_regression: Annotated[
+        str | None, Option(metavar="SHARE", help="Largest accepted increase of the metric: 5% or 0.05.")
+    ] = None,
+    estimator: Annotated[
+        str | None, Option(help="Estimator to compare. Default: the selected estimate of the first run, per drive.")
+    ] = None,
+    metric: Annotated[str | None, Option(help="Metric of sideslip over the whole drive. Default: rmse.")] = None,
+    cluster: Annotated[
+        str | None,
+        Option(
+            metavar="KEY",
+            help="Groups of dependent drives: car, day, route, a metadata key, or none. Default: the dependence by "
+            "day, car and route is estimated.",
+        ),
+    ] = None,
     allow_unpaired: Annotated[
         bool, Option("--allow-unpaired", help="Accept drives that only one run contains.")
     ] = False,
@@ -92,7 +103,8 @@ def _gate(
     allow_unpaired: bool,
 ) -> Gate:
     """Return the figures that the options ask for; raises UsageError."""
-    from pdhef_logtool.results.gate import Gate, figures_of
+    from pdhef_logtool.evaluation.units import share_of
+    from pdhef_logtool.results.gate import MAIN, Figure, Gate, figure_problems, figures_of
 
     single = {"--max-regression": max_regression, "--estimator": estimator, "--metric": metric}
     given = [name for name, value in single.items() if value is not None]
@@ -100,21 +112,13 @@ def _gate(
         if given:
             raise UsageError(expected=f"--plan or {given[0]}", got="both", where="--plan")
         return Gate(figures_of(plan), allow_unpaired)
-    return Gate((figure_asked(max_regression, estimator, metric),), allow_unpaired)
-
-
-def figure_asked(max_regression: str | None, estimator: str | None, metric: str | None) -> Figure:
-    """Return the figure that options ask for; raises UsageError."""
-    from pdhef_logtool.evaluation.units import share_of
-    from pdhef_logtool.results.gate import MAIN, Figure, figure_problems
-
     limit = None if max_regression is None else share_of(max_regression)
     if max_regression is not None and limit is None:
         raise UsageError(expected="a share such as 5% or 0.05", got=max_regression, where="--max-regression")
     figure = Figure(metric=metric or "rmse", estimator=estimator or MAIN, limit=limit)
     if problems := figure_problems(figure.signal, figure.metric, figure.segment):
         raise UsageError(expected="a figure; lower is better", got="; ".join(problems), where="--metric")
-    return figure
+    return Gate((figure,), allow_unpaired)
 
 
 @options.command(

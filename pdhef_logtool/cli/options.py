@@ -271,21 +271,3 @@ def run_config(options: dict[str, Any]) -> RunConfig:
 def split_names(text: str) -> tuple[str, ...]:
     """Split a comma-separated list."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
-
-
-#: Options of commands that compare runs.
-MaxRegression = Annotated[
-    str | None, Option(metavar="SHARE", help="Largest accepted increase of the metric: 5% or 0.05.")
-]
-ComparedEstimator = Annotated[
-    str | None, Option(help="Estimator to compare. Default: the selected estimate of the first run, per drive.")
-]
-ComparedMetric = Annotated[str | None, Option(help="Metric of sideslip over the whole drive. Default: rmse.")]
-Cluster = Annotated[
-    str | None,
-    Option(
-        metavar="KEY",
-        help="Groups of dependent drives: car, day, route, a metadata key, or none. Default: the dependence by day, "
-        "car and route is estimated.",
-    ),
-]

@@ -148,13 +148,9 @@ def identity_of(log: LogInput) -> str:
             raise LogError(
                 expected="a readable log", got=got, where=str(log.path), remedy=remedy, missing=missing
             ) from error
-    from pdhef_logtool.logs.remote_source import RemoteSource
+    from pdhef_logtool.logs.remote_source import identity_of_object
 
-    source = RemoteSource(log.path, head_bytes=1)
-    try:
-        return source.identity
-    finally:
-        source.close()
+    return identity_of_object(log.path)
 
 
 def hash_log(path: Path) -> str:
@@ -197,7 +193,7 @@ def _expand(argument: str, private_redirects: bool) -> Iterator[LogPlace]:
 
 def _search_store(prefix: RemotePlace) -> list[RemotePlace]:
     """Return the logs below a prefix of a store, by the rules for folders: no hidden ones, none of our outputs."""
-    from pdhef_logtool.logs.remote_objects import keys_below
+    from pdhef_logtool.logs.remote_source import keys_below
 
     keys = keys_below(prefix)
     outputs = tuple(key.removesuffix(RUN_FILE) for key in keys if key.rpartition("/")[2] == RUN_FILE)

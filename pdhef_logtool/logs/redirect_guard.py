@@ -9,11 +9,8 @@ from __future__ import annotations
 import ipaddress
 import socket
 from typing import Any
+from urllib.parse import urlsplit
 from urllib.request import getproxies
-
-import aiohttp
-import yarl
-from aiohttp.abc import AbstractResolver, ResolveResult
 
 #: Translates IPv4 addresses, which are the last 32 bits.
 _NAT64 = ipaddress.ip_network("64:ff9b::/96")
@@ -35,8 +32,8 @@ def is_public(address: str) -> bool:
     return ip.is_global and not ip.is_multicast
 
 
-class RedirectGuard(AbstractResolver):
-    """Resolves names for requests to one server, and checks their redirects.
+class RedirectGuard:
+    """A resolver of aiohttp for requests to one server, which checks their redirects.
 
     Parameters
     ----------
@@ -44,15 +41,15 @@ class RedirectGuard(AbstractResolver):
     """
 
     def __init__(self, origin: str) -> None:
+        import aiohttp
+
         self._origin = _host(origin)
         self._origin_was_public = False
-        proxies = (yarl.URL(proxy if "//" in proxy else f"//{proxy}").raw_host for proxy in getproxies().values())
+        proxies = (urlsplit(proxy if "//" in proxy else f"//{proxy}").hostname for proxy in getproxies().values())
         self._proxies = frozenset(_host(host) for host in proxies if host)
         self._resolver = aiohttp.DefaultResolver()
 
-    async def resolve(
-        self, host: str, port: int = 0, family: socket.AddressFamily = socket.AF_INET
-    ) -> list[ResolveResult]:
+    async def resolve(self, host: str, port: int = 0, family: socket.AddressFamily = socket.AF_INET) -> list[Any]:
         """Return the addresses of a host to connect to; raises PrivateRedirectError."""
         addresses = await self._resolver.resolve(host, port, family)
         public = all(is_public(address["host"]) for address in addresses)
@@ -64,6 +61,8 @@ class RedirectGuard(AbstractResolver):
 
     async def check_redirect(self, _session: Any, _context: Any, redirect: Any) -> None:
         """Raise PrivateRedirectError for a redirect to another host that is not public."""
+        import yarl
+
         headers = redirect.response.headers
         host = _host(redirect.response.url.join(yarl.URL(headers.get("Location") or headers.get("URI", ""))).raw_host)
         if host in ("", self._origin):
@@ -83,12 +82,14 @@ class RedirectGuard(AbstractResolver):
         await self._resolver.close()
 
 
-async def guarded_client(*, origin: str, **options: Any) -> aiohttp.ClientSession:
-    """Return a session for a server whose redirects are checked; ``options`` are those of aiohttp."""
+async def guarded_client(*, origin: str, **options: Any) -> Any:
+    """Return a session of aiohttp that checks redirects of a server."""
+    import aiohttp
+
     guard = RedirectGuard(origin)
     trace = aiohttp.TraceConfig()
     trace.on_request_redirect.append(guard.check_redirect)
-    connector = aiohttp.TCPConnector(resolver=guard)
+    connector = aiohttp.TCPConnector(resolver=guard)  # type: ignore[arg-type]  # its base would need aiohttp
     return aiohttp.ClientSession(connector=connector, trace_configs=[trace], **options)
 
 

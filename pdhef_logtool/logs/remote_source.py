@@ -1,93 +1,43 @@
-"""Bytes of an object on a server: each is fetched once, into a local file from which all reads are served.
+"""Bytes of an object on a server, by fsspec: each block is fetched once, into a local file from which all reads come.
 
-Wanted bytes are joined to ranges of at most 8 MB across gaps of at most 64 kB, and several ranges are fetched in
-parallel. Only blocks in transfer are in memory. An interrupted range continues where it was cut.
+Missing blocks that follow each other are one request of at most 8 MB; four requests run in parallel. Each answer is
+compared with the state of the object when it was opened.
 """
 
 from __future__ import annotations
 
 import asyncio
-import errno
 import hashlib
-import os
-import shutil
-import sys
-from bisect import bisect_right
-from collections.abc import Coroutine, Iterable, Sequence
+import re
+import weakref
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from contextlib import asynccontextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Lock
-from typing import BinaryIO, TypeAlias
+from typing import Any, BinaryIO
 
 from pdhef_logtool.logs.byte_source import ByteSource, ChangedError, SourceError, read_at
-from pdhef_logtool.logs.remote_objects import (
-    EMPTY,
-    Answer,
-    ObjectState,
-    RemoteObject,
-    TryAgainError,
-    remote_object,
-    try_in_turn,
-)
+from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, guarded_client
 from pdhef_logtool.logs.remote_place import RemotePlace
+from pdhef_logtool.records.extras import required
 from pdhef_logtool.storage.files import scratch_folder
+from pdhef_logtool.storage.object_store import s3_system, words_of
 
-Extent: TypeAlias = tuple[int, int]
-
-#: Fetching this many unwanted bytes is cheaper than another request.
-JOINED_GAP_BYTES = 64 << 10
+BLOCK_BYTES = 64 << 10
 MOST_RANGE_BYTES = 8 << 20
 AT_ONCE = 4
-#: Enough to recognise the format of an object.
-HEAD_BYTES = 4 << 10
-#: Free disk space that a scratch file leaves.
-_DISK_RESERVE_BYTES = 256 << 20
-#: Objects that were closed stay for the next opening, so that no pass over the same log fetches it again.
-_KEPT_BYTES = 4 << 30
-_KEPT_OBJECTS = 1000
-
-
-_AT_END = sys.maxsize
-
-
-def join_ranges(extents: Iterable[Extent], held: Sequence[Extent] = ()) -> list[Extent]:
-    """Return the ranges to ask for, ascending, to have all of ``extents``; bytes of ``held`` are in none of them."""
-    joined: list[Extent] = []
-    for start, end in without(extents, held):
-        last = joined[-1] if joined else (0, 0)
-        between = any(low < start and high > last[1] for low, high in held)
-        if joined and start - last[1] <= JOINED_GAP_BYTES and not between:
-            joined[-1] = (last[0], end)
-        else:
-            joined.append((start, end))
-    step = MOST_RANGE_BYTES
-    return [(first, min(first + step, end)) for start, end in joined for first in range(start, end, step)]
-
-
-def without(extents: Iterable[Extent], held: Sequence[Extent]) -> list[Extent]:
-    """Return the parts of some extents that are in none of others, ascending, neighbours joined."""
-    missing: list[Extent] = []
-    taken = sorted(held)
-    for start, end in sorted(extents):
-        position = max(start, missing[-1][1]) if missing else start
-        for low, high in (*taken, (end, end)):
-            stop = min(low, end)
-            if stop > position:
-                joined = missing and missing[-1][1] == position
-                missing.append((missing.pop()[0] if joined else position, stop))
-            position = max(position, high)
-    return missing
+#: Waits before a request is repeated, and timeouts. S3 requests are repeated by its library.
+WAITS_S = (0.5, 1.0, 2.0, 4.0)
+CONNECT_S, SILENCE_S = 15.0, 30.0
+#: Copies of closed objects that are kept for the next opening, so that no pass over the same log fetches it again.
+KEPT_BYTES, KEPT_COPIES = 4 << 30, 100
+_CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(\d+)")
 
 
 class RemoteSource(ByteSource):
-    """An object on a server, read through a scratch file.
-
-    Parameters
-    ----------
-    head_bytes : that are fetched at once.
-    place : its URL. Its state (size, ETag, time of modification) is recorded now; any later read fails if it has
-        changed.
+    """An object on a server, read through a local copy. Any read fails if the object has changed since it was opened.
 
     Raises
     ------
@@ -97,269 +47,310 @@ class RemoteSource(ByteSource):
 
     is_remote = True
 
-    def __init__(self, place: RemotePlace, head_bytes: int = HEAD_BYTES) -> None:
-        self._spool = _acquire(place, head_bytes)
+    def __init__(self, place: RemotePlace) -> None:
+        self._copy = _acquire(place)
         self._closed = False
-        self.place = place
-        super().__init__(self._spool.state.size)
-        self.prefetch([(0, head_bytes)])
-
-    @property
-    def state(self) -> ObjectState:
-        """State of the object when it was opened."""
-        return self._spool.state
-
-    @property
-    def identity(self) -> str:
-        """Hash of the URL without what gives access to it, of the size, and of ETag or time of modification."""
-        parts = (self.place.identity, str(self.size), self.state.etag or self.state.modified)
-        return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+        super().__init__(self._copy.size or 0)
 
     @property
     def path(self) -> Path:
-        """The scratch file: fetched ranges are valid, all of it after :meth:`fetch_whole`."""
-        return self._spool.path
+        """The copy: fetched blocks are valid, all of it after :meth:`fetch_whole`."""
+        return self._copy.path
 
     def fetch(self, offset: int, size: int) -> bytes:
         """See :class:`ByteSource`."""
-        return self._spool.read(offset, min(offset + size, self.size))
+        return self._copy.read(offset, min(offset + size, self.size))
 
     def held_size(self, offset: int, size: int) -> int:
         """See :class:`ByteSource`."""
-        return self._spool.held_to(offset, offset + size) - offset
+        return self._copy.held_to(offset, offset + size) - offset
 
-    def prefetch(self, extents: Iterable[Extent]) -> None:
+    def prefetch(self, extents: Iterable[tuple[int, int]]) -> None:
         """See :class:`ByteSource`."""
-        self._spool.order([(max(start, 0), min(end, self.size)) for start, end in extents])
+        self._copy.order([(max(start, 0), min(end, self.size)) for start, end in extents])
 
     def fetch_whole(self) -> None:
-        """Fetch the whole object into the scratch file."""
-        self.prefetch([(0, self.size)])
-        self._spool.wait(0, self.size)
+        """Fetch the whole object into the copy."""
+        self._copy.wait(0, self.size)
 
     def close(self) -> None:
-        """Release the scratch file, which is kept for some time in case the same object is opened again."""
+        """Release the copy, which is kept for some time in case the same object is opened again."""
         if not self._closed:
             self._closed = True
-            _release(self._spool)
+            _release(self._copy)
 
 
-@dataclass(eq=False)
-class _Spool:
-    """A scratch file with what was fetched of one object.
+class _Copy:
+    """A local file with the blocks that were fetched of one object.
 
     Attributes
     ----------
-    held : extents in the file, ascending, apart. coming : ranges under way. users : sources that read it.
+    size, version : bytes of the object (None: not known yet), and its ETag or time of modification.
+    blocks : by number, the request that brings a block. users : sources that read it.
     """
 
-    place: RemotePlace
-    remote: RemoteObject
-    state: ObjectState = EMPTY
-    held: list[Extent] = field(default_factory=list)
-    coming: list[tuple[Extent, Future[None]]] = field(default_factory=list)
-    users: int = 0
-    failure: SourceError | None = None
-
-    def __post_init__(self) -> None:
-        self._folder = scratch_folder()
-        self.path = Path(self._folder.name) / (self.place.name.replace("/", "_")[-80:] or "log")
-        self._file: BinaryIO | None = None
+    def __init__(self, place: RemotePlace, head_bytes: int) -> None:
+        self.place, self._system = place, _file_system(place)
+        self.size: int | None = None
+        self.version = ""
+        self.blocks: dict[int, Future[None]] = {}
+        self.users = 0
         self._lock = Lock()
-        self._entering = Lock()
         self._at_once = asyncio.Semaphore(AT_ONCE)
-        self._room = 0
+        folder = scratch_folder()
+        self.path = Path(folder.name) / (place.name.replace("/", "_")[-80:] or "log")
+        self._file = self.path.open("x+b", buffering=0)
+        weakref.finalize(self, _remove, self._file, folder)
+        first = self._start(self._get, 0, head_bytes)
+        first.result()
+        if head_bytes >= BLOCK_BYTES:
+            self.blocks.setdefault(0, first)
 
-    def enter(self, head_bytes: int) -> None:
-        """Open the scratch file; the first user records the state of the object, later ones compare it.
+    @property
+    def identity(self) -> str:
+        """Hash of the URL without access tokens, of the size, and of ETag or time of modification."""
+        return hashlib.sha256("\0".join((self.place.identity, str(self.size), self.version)).encode()).hexdigest()
 
-        Raises
-        ------
-        ChangedError : The object has changed. SourceError : It cannot be requested.
-        """
-        with self._entering:
-            if self._file is not None:
-                return
-            self._file = self.path.open("r+b" if self.path.exists() else "x+b", buffering=0)
-            try:
-                if self.state is EMPTY:
-                    self._run(try_in_turn(lambda: self._first(head_bytes), self.remote)).result()
-                elif self.state.size:
-                    self._run(try_in_turn(self._ask_again, self.remote)).result()
-            except BaseException:
-                self.leave()
-                raise
-
-    def leave(self) -> None:
-        """Close the scratch file, after its last use."""
-        for _, future in self.coming:
-            future.cancel()
-        self.coming.clear()
-        with self._lock:  # nothing that is still under way writes to what gets this number next
-            file, self._file = self._file, None
-        if file is not None:
-            file.close()
-
-    async def _first(self, head_bytes: int) -> None:
-        async with self.remote.ask(0, head_bytes, None) as answer:
-            written = await self._write(answer, answer.state.size)
-        size = written if answer.state.size < 0 else answer.state.size
-        if written < min(size, head_bytes):
-            raise TryAgainError("an answer that is cut")
-        self.held = [(0, written)] if written else []
-        self.state = ObjectState(size, answer.state.etag, answer.state.modified)
-
-    async def _ask_again(self) -> None:
-        async with self.remote.ask(0, 1, self.state):
-            pass
-
-    def order(self, extents: Iterable[Extent]) -> None:
-        """Start to fetch what is neither held nor coming."""
+    def order(self, extents: Iterable[tuple[int, int]]) -> Collection[Future[None]]:
+        """Start to fetch the missing blocks of some extents; return the requests that bring all blocks of them."""
+        blocks = (range(start // BLOCK_BYTES, -(-end // BLOCK_BYTES)) for start, end in extents if end > start)
+        wanted = sorted({n for numbers in blocks for n in numbers})
         with self._lock:
-            if self.failure:
-                return
-            there = [*self.held, *(extent for extent, _ in self.coming)]
-            for extent in join_ranges(extents, there):
-                self.coming.append((extent, self._run(self._get(*extent))))
+            runs: list[range] = []
+            for n in (n for n in wanted if n not in self.blocks):
+                if runs and n == runs[-1].stop and len(runs[-1]) * BLOCK_BYTES < MOST_RANGE_BYTES:
+                    runs[-1] = range(runs[-1].start, n + 1)
+                else:
+                    runs.append(range(n, n + 1))
+            for run in runs:
+                request = self._start(self._get, run.start * BLOCK_BYTES, min(run.stop * BLOCK_BYTES, self.size or 0))
+                self.blocks |= dict.fromkeys(run, request)
+            return dict.fromkeys(self.blocks[n] for n in wanted)
 
     def wait(self, start: int, end: int) -> None:
-        """Return when bytes [start, end) are held; raises SourceError where they cannot be had."""
-        self.order([(start, end)])
-        for (low, high), future in list(self.coming):
-            if (low < end and high > start) or future.done():
-                self._take((low, high), future)
-        if self.failure:
-            raise self.failure
-
-    def _take(self, extent: Extent, future: Future[None]) -> None:
-        try:
-            future.result()
-        except SourceError as error:
-            self.failure = self.failure or error
-            for _, other in self.coming:
-                other.cancel()
-            raise self.failure from None
-        with self._lock:
-            if (extent, future) in self.coming:
-                self.coming.remove((extent, future))
-                self.held = without([*self.held, extent], ())
+        """Return when bytes [start, end) are in the file; raises SourceError if they cannot be fetched."""
+        for request in self.order([(start, end)]):
+            request.result()
 
     def read(self, start: int, end: int) -> bytes:
         """Return bytes [start, end)."""
         if end <= start:
             return b""
-        if self.held_to(start, end) < end:
-            self.wait(start, end)
+        self.wait(start, end)
         with self._lock:
-            assert self._file is not None
             return read_at(self._file, start, end - start, end)
 
     def held_to(self, start: int, end: int) -> int:
-        """Return up to where, at most to ``end``, bytes from ``start`` on are held; ``start``: none is."""
-        index = bisect_right(self.held, (start, _AT_END)) - 1
-        return min(self.held[index][1], end) if index >= 0 and self.held[index][1] > start else start
+        """Return up to where, at most to ``end``, bytes from ``start`` on are in the file."""
+        reached = start
+        while reached < end and (request := self.blocks.get(reached // BLOCK_BYTES)) is not None and request.done():
+            reached = (reached // BLOCK_BYTES + 1) * BLOCK_BYTES
+        return min(reached, end)
+
+    def is_current(self) -> bool:
+        """Return whether the object is the one that was copied, and no request for it has failed."""
+        if any(request.done() and request.exception() for request in set(self.blocks.values())):
+            return False
+        try:
+            self._start(self._compare).result()
+        except ChangedError:
+            return False
+        return True
+
+    def cancel(self) -> None:
+        """Stop all requests."""
+        with self._lock:
+            self.blocks = {n: request for n, request in self.blocks.items() if not request.cancel()}
+
+    def _start(self, request: Callable[..., Awaitable[None]], *arguments: int) -> Future[None]:
+        return asyncio.run_coroutine_threadsafe(_repeated(self.place, request, *arguments), self._system.loop)
+
+    async def _compare(self) -> None:
+        async with self._ask(0, 1):
+            pass
 
     async def _get(self, start: int, end: int) -> None:
-        async with self._at_once:
-            position = start
-
-            async def rest() -> None:
-                nonlocal position
-                async with self.remote.ask(position, end, self.state) as answer:
-                    if answer.start != position:
-                        raise self.remote.error("all of it instead of a part", "the server stopped to give ranges")
-                    written = 0
-                    try:
-                        async for block in answer.blocks:
-                            written += self._put(block[: end - position - written], position + written)
-                            if position + written >= end:
-                                break
-                    finally:
-                        position += written
-                if position < end:
-                    raise TryAgainError("an answer that is cut")
-
-            await try_in_turn(rest, self.remote, lambda: position)
-
-    async def _write(self, answer: Answer, size: int) -> int:
-        """Write the blocks of a first answer, which may be all of the object; returns how many bytes came."""
-        position = 0
-        async for block in answer.blocks:
-            position += self._put(block, position)
-        if answer.start == 0 and size >= 0 and position > size:
-            raise self.remote.error("more bytes than its declared size", "read a copy")
-        return position
-
-    def _put(self, block: bytes, offset: int) -> int:
-        """Write a block, leaving some of the disk to others."""
-        self._room -= len(block)
-        if self._room < 0:
-            self._room = shutil.disk_usage(self.path.parent).free - _DISK_RESERVE_BYTES - len(block)
-            self._room = min(self._room, _DISK_RESERVE_BYTES)
-        try:
-            if self._room < 0:
-                raise OSError("the disk is full")
+        async with self._at_once, self._ask(start, end) as (size, first, blocks):
+            position = first
+            async for block in blocks:
+                self._write(position, block)
+                position += len(block)
+        size = position if size is None else size
+        if position < min(end, size):
+            raise ConnectionError("an answer that is cut")
+        if self.size is None:
+            self.size = size
+        if first == 0 and position >= size > end:  # the server gives no ranges
+            done: Future[None] = Future()
+            done.set_result(None)
             with self._lock:
-                if self._file is None:
-                    raise OSError(errno.EBADF, os.strerror(errno.EBADF))
-                self._file.seek(offset)
-                return self._file.write(block)
+                self.blocks |= dict.fromkeys(range(-(-size // BLOCK_BYTES)), done)
+
+    def _write(self, position: int, block: bytes) -> None:
+        try:
+            with self._lock:
+                self._file.seek(position)
+                self._file.write(block)
         except OSError:
-            raise self.remote.error("no room for its bytes on this disk", "set TMPDIR to another") from None
+            raise _error(self.place, "no room for its bytes on this disk", "set TMPDIR to another") from None
 
-    def _run(self, work: Coroutine[None, None, None]) -> Future[None]:
-        return asyncio.run_coroutine_threadsafe(work, self.remote.loop)
+    @asynccontextmanager
+    async def _ask(self, start: int, end: int) -> AsyncIterator[tuple[int | None, int, AsyncIterator[bytes]]]:
+        """Request bytes [start, end); yield object size, offset of the response (0: all bytes) and its blocks."""
+        place, part = self.place, f"bytes={start}-{end - 1}"
+        if place.scheme == "s3":
+            asked = {"Bucket": place.host, "Key": place.key, "Range": part}
+            if self.size is None and (await self._system._info(f"{place.host}/{place.key}"))["size"] == 0:
+                del asked["Range"]  # an empty object has no range
+            response = await self._system._call_s3("get_object", **asked)
+            async with response["Body"] as body:
+                head = {"Content-Length": response["ContentLength"], "ETag": response["ETag"]}
+                head["Content-Range"] = response.get("ContentRange", "")
+                yield *self._compared(head), body.iter_chunks(1 << 20)
+            return
+        headers = {"Range": part, "Accept-Encoding": "identity"}
+        session = await self._system.set_session()
+        async with session.get(self._system.encode_url(place.url), headers=headers) as response:
+            if response.status == 416 and response.headers.get("Content-Range") == "bytes */0":
+                async with session.get(self._system.encode_url(place.url)) as empty:
+                    yield *self._compared(empty.headers), empty.content.iter_chunked(1 << 20)
+                return
+            _check_status(response.status)
+            yield *self._compared(response.headers), response.content.iter_chunked(1 << 20)
 
-    @property
-    def size(self) -> int:
-        """Bytes of the scratch file that take room."""
-        return sum(high - low for low, high in self.held)
+    def _compared(self, head: Mapping[str, Any]) -> tuple[int | None, int]:
+        """Return size and offset of an answer; raises ChangedError if the object is not the one that was opened."""
+        part = _CONTENT_RANGE.match(str(head.get("Content-Range", "")))
+        length = part[2] if part else head.get("Content-Length")
+        size, version = None if length is None else int(length), head.get("ETag") or head.get("Last-Modified") or ""
+        if self.size is None:
+            self.version = version
+        elif version not in ("", self.version) or size not in (None, self.size):
+            raise ChangedError(
+                expected="the object that was opened",
+                got="another one (its size, ETag or time of modification differs)",
+                where=str(self.place),
+                remedy="run again when the object no longer changes",
+            )
+        return size, int(part[1]) if part else 0
 
-    def drop(self) -> None:
-        """Remove the scratch file."""
-        self.leave()
-        self._folder.cleanup()
+
+def _remove(file: BinaryIO, folder: TemporaryDirectory[str]) -> None:
+    file.close()
+    folder.cleanup()
 
 
-#: By place, in order of their last use.
-_spools: dict[RemotePlace, _Spool] = {}
+def identity_of_object(place: RemotePlace) -> str:
+    """Return the hash of URL, size and version of an object; raises SourceError."""
+    return _Copy(place, 1).identity
+
+
+def keys_below(prefix: RemotePlace) -> list[str]:
+    """Return the keys of all objects of a store that begin with a prefix; raises SourceError."""
+    system = _file_system(prefix)
+    listed = _repeated(prefix, system._find, f"{prefix.host}/{prefix.key}".rstrip("/"))
+    paths: list[str] = asyncio.run_coroutine_threadsafe(listed, system.loop).result()
+    return [path.removeprefix(f"{prefix.host}/") for path in paths]
+
+
+async def _repeated(place: RemotePlace, request: Callable[..., Awaitable[Any]], *arguments: object) -> Any:
+    """Return the result of a request, which is repeated after a temporary failure; raises SourceError."""
+    for wait_s in (*WAITS_S, None):
+        try:
+            return await request(*arguments)
+        except SourceError:
+            raise
+        except Exception as error:  # noqa: BLE001 (of any library; it becomes one line)
+            got, remedy, temporary = _words_of(error)
+            if wait_s is None or not temporary:
+                tries = f", {len(WAITS_S) + 1} times in turn" if temporary else ""
+                expected = "a server that answers" if temporary else "an object that can be read"
+                raise _error(place, f"{got}{tries}", remedy, expected) from None
+        await asyncio.sleep(wait_s)
+    raise AssertionError
+
+
+def _error(place: RemotePlace, got: str, remedy: str, expected: str = "an object that can be read") -> SourceError:
+    return SourceError(expected=expected, got=got, where=str(place), remedy=remedy)
+
+
+def _words_of(error: Exception) -> tuple[str, str, bool]:
+    """Return cause, remedy, and whether a new request may help. The texts of aiohttp can contain the URL."""
+    import aiohttp
+
+    if isinstance(error, PrivateRedirectError):
+        remedy = "give the URL that it leads to, or allow it by --set allow_private_redirects=true"
+        return f"a redirect to {error}, an address of this machine or its network", remedy, False
+    if isinstance(error, aiohttp.ClientSSLError):
+        return "a server without a valid certificate", "check the URL", False
+    if isinstance(error, aiohttp.InvalidURL | aiohttp.NonHttpUrlClientError | aiohttp.TooManyRedirects | ValueError):
+        return "a URL that cannot be requested", "check the URL", False
+    if isinstance(error, ConnectionError):
+        return str(error), "try again later", True
+    if isinstance(error, aiohttp.ClientPayloadError):
+        return "an answer that is cut", "try again later", True
+    if isinstance(error, TimeoutError):
+        return f"silence of {SILENCE_S:g} s", "try again later", True
+    if isinstance(error, aiohttp.ClientError):
+        why = getattr(error, "strerror", None) or type(error).__name__
+        return f"no connection ({why})", "check the URL, or try again later", True
+    return *words_of(error), False
+
+
+def _check_status(status: int) -> None:
+    """Raise the error of a status without content; timeouts, too many requests and restarts are temporary."""
+    if status in (408, 425, 429) or status >= 500:
+        raise ConnectionError(f"status {status}")
+    if status in (401, 403, 407):
+        raise PermissionError(f"status {status}")
+    if status in (404, 410):
+        raise FileNotFoundError(f"status {status}")
+    if status not in (200, 206):
+        raise OSError(f"status {status}")
+
+
+def _file_system(place: RemotePlace) -> Any:
+    """Return fsspec's file system of a place. Proxies and ``netrc`` are the environment's; redirects are checked."""
+    if place.scheme == "s3":
+        required("s3fs", "s3", "reads s3://", place)
+        return s3_system()
+    aiohttp = required("aiohttp", "http", f"reads {place.scheme}://", place)
+    import fsspec
+    import yarl
+
+    timeout = aiohttp.ClientTimeout(total=None, sock_connect=CONNECT_S, sock_read=SILENCE_S)
+    client: dict[str, Any] = {"trust_env": True, "auto_decompress": False, "timeout": timeout}
+    options: dict[str, Any] = {}
+    if not place.private_redirects:
+        client["origin"] = yarl.URL(place.url).raw_host or ""
+        options["get_client"] = guarded_client
+    # An encoded URL is sent unchanged: a signature may depend on its characters.
+    encoded = place.url.isascii() and place.url.isprintable() and " " not in place.url
+    return fsspec.filesystem("http", client_kwargs=client, encoded=encoded, **options)
+
+
+#: By place, in order of their last opening.
+_copies: dict[RemotePlace, _Copy] = {}
 _registry = Lock()
 
 
-def _acquire(place: RemotePlace, head_bytes: int) -> _Spool:
+def _acquire(place: RemotePlace) -> _Copy:
+    copy = _copies.get(place)
+    if copy is None or not (copy.users or copy.is_current()):
+        copy = _Copy(place, BLOCK_BYTES)
     with _registry:
-        spool = _spools.pop(place, None) or _Spool(place, remote_object(place))
-        _spools[place] = spool
-        spool.users += 1
-    try:
-        spool.enter(head_bytes)
-    except BaseException as error:
-        with _registry:
-            spool.users -= 1
-            if not spool.users:
-                _forget(spool)
-        if isinstance(error, ChangedError) and spool.state is not EMPTY:
-            return _acquire(place, head_bytes)  # another one since it was closed: opening pins what it is now
-        raise
-    return spool
+        _copies.pop(place, None)
+        _copies[place] = copy
+        copy.users += 1
+    return copy
 
 
-def _release(spool: _Spool) -> None:
+def _release(copy: _Copy) -> None:
     with _registry:
-        spool.users -= 1
-        if spool.users:
+        copy.users -= 1
+        if copy.users:
             return
-        spool.leave()
-        if spool.failure is not None:
-            _forget(spool)
-        idle = [s for s in _spools.values() if not s.users]
-        size = sum(s.size for s in idle)
-        while idle and (size > _KEPT_BYTES or len(idle) > _KEPT_OBJECTS):
-            size -= idle[0].size
-            _forget(idle.pop(0))
-
-
-def _forget(spool: _Spool) -> None:
-    if _spools.get(spool.place) is spool:
-        del _spools[spool.place]
-    spool.drop()
+        copy.cancel()
+        idle = [c for c in _copies.values() if not c.users]
+        while len(idle) > KEPT_COPIES or sum(len(c.blocks) for c in idle) * BLOCK_BYTES > KEPT_BYTES:
+            del _copies[idle.pop(0).place]

@@ -31,13 +31,12 @@ _MOST_SIGNS = 600
 DASH = "–"
 
 
-def render(template: str, charts: Charts | None = None, *, forms: bool = False, **texts: Any) -> bytes:
+def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
     """Return a page.
 
     Parameters
     ----------
     template : file of ``templates/`` that extends ``base.html``. charts : what its ``figure(key)`` places show.
-    forms : whether the page may send forms to its own server.
     texts : what the template prints.
     """
     charts = Charts() if charts is None else charts
@@ -50,7 +49,7 @@ def render(template: str, charts: Charts | None = None, *, forms: bool = False, 
         .render(
             **texts,
             figure=partial(_place, charts),
-            policy=_policy(scripts, style, "'self'" if forms else "'none'"),
+            policy=_policy(scripts, style),
             scripts=[Markup(s) for s in scripts],  # noqa: S704 (files of this package)
             style=Markup(style),  # noqa: S704
             licence=Markup(_asset("UPLOT-LICENSE")),  # noqa: S704
@@ -108,11 +107,11 @@ def _place(charts: Charts, key: str) -> Markup:
     )
 
 
-def _policy(scripts: list[str], style: str, forms: str) -> Markup:
+def _policy(scripts: list[str], style: str) -> Markup:
     of_scripts = " ".join(f"'sha256-{_digest(s)}'" for s in scripts)
     return Markup(  # noqa: S704 (digests)
         f"default-src 'none'; script-src {of_scripts}; style-src 'sha256-{_digest(style)}'; img-src data:; "
-        f"base-uri 'none'; form-action {forms}"
+        f"base-uri 'none'; form-action 'none'"
     )
 
 

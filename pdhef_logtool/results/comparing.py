@@ -279,28 +279,6 @@ def compare_runs(
     )
 
 
-def compared_figure(
-    a: OpenedRun, b: OpenedRun, figure: Figure, cluster: str | None = None
-) -> tuple[ComparedFigure | None, tuple[str, ...]]:
-    """Return one figure of two runs as in :func:`compare_runs` (None without a common drive), and what else differs.
-
-    Raises
-    ------
-    OutputError : The figures of a run are damaged. UsageError : No drive has the estimator, or the key.
-    """
-    pairing = pair_logs(a.logs, b.logs)
-    if not pairing.pairs:
-        return None, ()
-    damaged = _Damaged()
-    tables = _Tables(a, b, pairing.pairs, damaged)
-    (result,) = tables.compared((figure,), _Grouping())
-    if figure.estimator != MAIN:
-        tables.check_estimators((result,))
-    if result.drives and result.verdict != "equal":
-        (result,) = tables.compared((figure,), _grouping(pairing, cluster, damaged))
-    return result, (*damaged.lines, *run_differences(a, b, pairing.pairs))
-
-
 class _Damaged:
     """The files of drives that could not be read."""
 

@@ -88,12 +88,8 @@ def notes_of(comparison: Comparison) -> list[str]:
     return notes
 
 
-def change_text(figure: ComparedFigure | None) -> str:
+def change_text(figure: ComparedFigure) -> str:
     """Return the median change with its interval: ``+3.1 % (+1.0 % to +5.2 %)``."""
-    if figure is None or not figure.drives:
-        return "no common drive with the figure"
-    if figure.verdict == "equal":
-        return "equal"
     median, interval = percent(math.expm1(figure.change.median)), interval_text(figure)
     return median if interval == "-" else f"{median} ({interval})"
 

@@ -1,6 +1,6 @@
-"""A run of many logs in a few lines: how large the errors are, which drives are worst, and what failed.
+"""Summary of a run of many logs: distribution of errors, drives with the largest errors, and failures.
 
-Only the figures of sideslip are read, as columns: what a drive costs here is some bytes.
+Only the figures of sideslip are read, as columns, so that a drive takes some bytes of memory.
 """
 
 from __future__ import annotations
@@ -11,21 +11,20 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pdhef_logtool.results.drive_rows import independent_figures
 from pdhef_logtool.results.fleet import ANSWER, JUDGED, Failures, grouped
 from pdhef_logtool.results.opened_run import OpenedRun
 
 if TYPE_CHECKING:
     import polars as pl
 
-#: Drives that are named as the worst, and estimators that are given beside the selected estimate.
+#: Number of drives with the largest errors, and estimators that are listed beside the selected estimate.
 WORST = 10
 _RIVALS = ("physics", "zero")
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorsOf:
-    """RMSE of sideslip in rad of one estimator over drives whose ground truth is independent of it."""
+    """RMSE of sideslip in rad of one estimator over drives with independent ground truth."""
 
     estimator: str
     drives: int
@@ -36,7 +35,7 @@ class ErrorsOf:
 
 @dataclass(frozen=True, slots=True)
 class WorstDrive:
-    """A drive with a large error: RMSE of sideslip in rad by estimator, that of the selected estimate first."""
+    """A drive with a large error: RMSE of sideslip in rad by estimator, the selected estimate first."""
 
     log: str
     main: str
@@ -45,13 +44,13 @@ class WorstDrive:
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """What a run of many logs is given as.
+    """Summary of a run of many logs.
 
     Attributes
     ----------
     output : folder or URL. exit_code : of the run. logs, done, lost : logs, those with figures, those with input lost.
-    scored : drives whose answer is scored. remaining : logs that are not done. checks_failed : logs with failed checks
-        that count.
+    scored : drives with a scored selected estimate. remaining : logs that are not done. checks_failed : logs with
+        failed checks that count.
     """
 
     output: Path | str
@@ -76,7 +75,7 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
     """Return the summary of a run; raises OutputError where metrics.parquet is damaged."""
     import polars as pl
 
-    errors = independent_figures(run, JUDGED, "rmse")
+    errors = _independent_errors(run)
     answers = errors.filter(pl.col("estimator") == pl.col("main"))
     error_rows = [ErrorsOf(ANSWER, *_spread(answers))] if answers.height else []
     for name in _RIVALS:
@@ -98,6 +97,24 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
         checks_failed=tuple(checks_failed),
         plan=run.document.get("plan"),
     )
+
+
+def _independent_errors(run: OpenedRun) -> pl.DataFrame:
+    """Return log, estimator, RMSE (value) and main (selected estimator) of tracks with independent ground truth.
+
+    Raises
+    ------
+    OutputError : metrics.parquet of the run is damaged.
+    """
+    import polars as pl
+
+    texts = {"log": pl.String, "main": pl.String}
+    mains = pl.DataFrame([(log.label, log.main()) for log in run.logs], schema=texts, orient="row")
+    rows = run.metrics().filter(pl.col("signal") == JUDGED)
+    dependent = rows.filter(pl.col("metric") == "not_independent").select("log", "estimator")
+    scored = rows.filter(pl.col("metric") == "rmse", pl.col("segment") == "all", pl.col("value").is_finite())
+    scored = scored.select("log", "estimator", "value").join(dependent, on=["log", "estimator"], how="anti")
+    return scored.collect().join(mains, on="log").sort("log", "estimator")
 
 
 def _spread(errors: pl.DataFrame) -> tuple[int, float, float, float]:

@@ -1,8 +1,8 @@
-"""The output of a run on an object store: drives are put there where they are worked on, the rest by the command.
+"""The output of a run in an object store: each worker uploads its drives, the command uploads the files of the run.
 
-A drive's work writes into a folder of its machine; then its files are put, report.json last, and only what the tables
-of the run are made of comes back. The command has these, the journal and the pages in a folder of its own, from which
-the store is brought up to date: the journal now and then, all of it at every end.
+A worker writes a drive to a local folder and uploads it, report.json last. It returns the report and the figures to the
+command, which keeps them with the journal and the pages in a local folder. The command uploads the journal every 30 s
+and all files at the end of the run.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from pdhef_logtool.storage.files import open_new, scratch_folder
 from pdhef_logtool.storage.object_store import HeldError, Mirror, ObjectFolder
 from pdhef_logtool.workers.supervisor import Tell
 
-#: The journal is put this often, or less often where putting it takes more than a twentieth of the time.
+#: Interval of the upload of the journal; longer if the upload takes more than a twentieth of the time.
 EVERY_S = 30.0
 _SHARE = 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredEnd:
-    """How a drive ended whose files are in the store: ``names`` of these, and those that the command needs itself."""
+    """Result of a drive that was uploaded: ``names`` of its objects, and the ``files`` that the command needs."""
 
     end: DriveEnd
     names: tuple[str, ...]
@@ -39,13 +39,14 @@ class StoredEnd:
 
 
 def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell) -> StoredEnd | OutputError:
-    """Do a drive's work and put its files into the store; what the store refuses is returned, for it ends the run."""
+    """Process a drive and upload its files. An error of the store is returned, because it ends the run."""
     with scratch_folder() as scratch:
         folder = Path(scratch) / task.output.name
         folder.mkdir()
         end = work(replace(task, output=folder), tell)
-        files = (p for p in folder.rglob("*") if p.is_file() and not _is_hidden(p.relative_to(folder)))
-        names = sorted((p.relative_to(folder).as_posix() for p in files), key=_order)
+        files = (p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+        # The report is last: it states that the drive is done.
+        names = sorted((n for n in files if "/." not in f"/{n}"), key=lambda n: (n.endswith(f"/{REPORT_FILE}"), n))
         here, report = f"{LOGS}/{task.log.stem}", f"{LOGS}/{task.log.stem}/{REPORT_FILE}"
         try:
             if report in names:
@@ -60,19 +61,10 @@ def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell)
         return StoredEnd(end, tuple(names), {name: (folder / name).read_bytes() for name in needed})
 
 
-def _is_hidden(path: Path) -> bool:
-    return any(part.startswith(".") for part in path.parts)
-
-
-def _order(name: str) -> tuple[bool, str]:
-    """Put what states that a drive is done behind all else."""
-    return name.endswith(f"/{REPORT_FILE}"), name
-
-
 class StoredOutput(Mirror):
-    """The output of a run at a URL, held by this command while it is entered.
+    """The output of a run at a URL, locked by this command while the context is entered.
 
-    Pages of drives are in the folder as empty files where the store has them.
+    The local folder contains empty files for the pages of drives in the store.
 
     Raises
     ------
@@ -91,7 +83,7 @@ class StoredOutput(Mirror):
         self._journal_bytes = -1
 
     def __enter__(self) -> Self:
-        """Lock the place and see what is there."""
+        """Lock the URL and list its objects."""
         self.objects.acquire()
         try:
             for name in self.objects.names():
@@ -103,13 +95,13 @@ class StoredOutput(Mirror):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Let go of it."""
+        """Release the lock."""
         self._ended.set()
         self._keeper.join()
         self.objects.release()
 
     def _see(self, name: str) -> None:
-        """Take note of an object of the place."""
+        """Record an object of the store."""
         parts = name.split("/")
         if parts[0] == LOGS and len(parts) > 2:
             self._there.setdefault(parts[1], set()).add(name)
@@ -132,23 +124,23 @@ class StoredOutput(Mirror):
                 )
 
     def fetch_journal(self) -> None:
-        """Have what a run goes on from: its journal, the figures of its drives and their reports."""
+        """Fetch the journal of an earlier run, and figures and reports of its drives."""
         if self.fetch(JOURNAL_FILE) is not None:
             reports = [n for names in self._there.values() for n in names if n.endswith(f"/{REPORT_FILE}")]
             self.objects.get_all(sorted([*(n for n in self._own if n.startswith(f"{PARTS}/")), *reports]), self.folder)
 
     def there(self, label: str) -> tuple[str, ...]:
-        """Return the names of what the store has of a drive."""
+        """Return the names of a drive's objects in the store."""
         return tuple(sorted(self._there.get(label, ())))
 
     def forget(self, part: str | None) -> None:
-        """Remove the figures of a drive that is run again: were the run to end now, it would not be done."""
+        """Remove the figures of a drive that is run again: until its end, it does not count as done."""
         if part in self._own:
             self.objects.remove([str(part)])
             self._own.discard(str(part))
 
     def take(self, stored: StoredEnd) -> DriveEnd:
-        """Take how a drive ended, with what came of it; raises OutputError if another command took the place."""
+        """Store the files of a drive and return its result; raises OutputError if another command has the lock."""
         if self._lost is not None:
             raise self._lost
         for name in stored.names:
@@ -160,12 +152,14 @@ class StoredOutput(Mirror):
         return stored.end
 
     def begin(self) -> None:
-        """Put the journal as the run begins with it; figures that it does not list are removed."""
+        """Upload the journal of the start of the run; remove figures that it does not list."""
         self._put_journal()
-        self._remove_gone()
+        gone = sorted(name for name in self._own if not (self.folder / name).is_file())
+        self.objects.remove(gone)
+        self._own.difference_update(gone)
 
     def publish(self) -> None:
-        """Put what the command has made: figures, pages, run.json; and the journal, last."""
+        """Upload figures, pages and run.json, and the journal last."""
         if self._lost is not None:
             raise self._lost
         pages = [p for p in (self.folder / LOGS).glob(f"*/{PAGE_FILE}") if p.stat().st_size]
@@ -174,13 +168,7 @@ class StoredOutput(Mirror):
                 name = path.relative_to(self.folder).as_posix()
                 self.objects.put(name, path)
                 self._see(name)
-        self._put_journal()
-        self._remove_gone()
-
-    def _remove_gone(self) -> None:
-        gone = sorted(name for name in self._own if not (self.folder / name).is_file())
-        self.objects.remove(gone)
-        self._own.difference_update(gone)
+        self.begin()
 
     def _put_journal(self) -> None:
         path = self.folder / JOURNAL_FILE
@@ -191,7 +179,7 @@ class StoredOutput(Mirror):
                 self._journal_bytes = size
 
     def _keep(self) -> None:
-        """Renew the lock and put the journal until the end; a store that fails for a while is asked again."""
+        """Renew the lock and upload the journal until the end; temporary failures of the store are ignored."""
         wait_s = EVERY_S
         while not self._ended.wait(wait_s):
             began = time.monotonic()

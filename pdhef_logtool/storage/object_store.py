@@ -5,7 +5,6 @@ Credentials come from the environment. Errors of a store are OutputErrors, which
 
 from __future__ import annotations
 
-import os
 import re
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,7 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -24,19 +22,14 @@ from pdhef_logtool.storage.files import scratch_folder
 from pdhef_logtool.storage.outputs import LOCK_FILE
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://.")
-#: Stores whose objects appear when they are complete; elsewhere a temporary name is used.
-_WHOLE = frozenset({"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "memory"})
+#: Schemes of object stores: their objects appear when they are complete.
+_STORES = frozenset({"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "memory"})
 #: A lock that was not renewed for this time is left over. Stores refuse clocks that differ by more than 15 minutes.
 LEFT_OVER_S = 1800.0
 #: Timeouts and retries of S3, by botocore with growing waits.
-S3_CLIENT: dict[str, Any] = {
-    "connect_timeout": 15.0,
-    "read_timeout": 60.0,
-    "retries": {"mode": "standard", "total_max_attempts": 5},
-}
+_S3_CLIENT = {"connect_timeout": 15, "read_timeout": 60, "retries": {"mode": "standard", "total_max_attempts": 5}}
 _AT_ONCE = 16
-_REFUSED = "give credentials that may write, by the environment: docs/remote.md"
-_EXISTING = "make the bucket first, or check the URL"
+_CREDENTIALS = "give credentials that permit this, by the environment: docs/remote.md"
 
 
 class HeldError(OutputError):
@@ -50,7 +43,7 @@ def is_url(place: Path | str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class ObjectFolder:
-    """The objects below a URL of what fsspec can write to, by their names there: ``logs/drive/report.json``."""
+    """The objects below a URL of an object store, by their relative names: ``logs/drive/report.json``."""
 
     url: str
 
@@ -69,23 +62,20 @@ class ObjectFolder:
         """Return the names of all objects, ascending."""
         with self._asking():
             store, root = self._store()
-            store.invalidate_cache()
             paths = store.find(root)
         # Some stores give paths a slash more than they take.
         return sorted(path.lstrip("/").removeprefix(f"{root.lstrip('/')}/") for path in paths)
 
     def get(self, name: str, to: Path) -> bool:
-        """Copy an object to a file; False where there is none."""
+        """Copy an object to a file; False if it does not exist."""
         with self._asking(name):
             store, root = self._store()
+            partial = to.with_name(f".{to.name}.partial")
             try:
-                store.get_file(f"{root}/{name}", str(to))
-            except BaseException as error:
-                with suppress(OSError):
-                    to.unlink(missing_ok=True)  # a part of it must not be taken for the object
-                if isinstance(error, FileNotFoundError):
-                    return False
-                raise
+                store.get_file(f"{root}/{name}", str(partial))
+            except FileNotFoundError:
+                return False
+            partial.replace(to)
         return True
 
     def get_all(self, names: Sequence[str], folder: Path) -> None:
@@ -98,16 +88,10 @@ class ObjectFolder:
                 store.get([f"{root}/{name}" for name in names], [str(folder / name) for name in names])
 
     def put(self, name: str, path: Path) -> None:
-        """Copy a file to an object, in place of what it was."""
+        """Copy a file to an object, which is replaced."""
         with self._asking(name):
             store, root = self._store()
-            if self._is_whole:
-                store.put_file(str(path), f"{root}/{name}")
-                return
-            partial = f"{root}/{name}.{process_name()}.partial"
-            store.makedirs(partial.rpartition("/")[0], exist_ok=True)
-            store.put_file(str(path), partial)
-            store.mv(partial, f"{root}/{name}")
+            store.put_file(str(path), f"{root}/{name}")
 
     def remove(self, names: Iterable[str]) -> None:
         """Remove objects, whether they are there or not."""
@@ -122,16 +106,14 @@ class ObjectFolder:
                 list(several.map(remove_one, gone))
 
     def acquire(self) -> None:
-        """Lock the folder by an object that is created only if there is none; raises OutputError if it is locked.
+        """Create the lock object of the folder; raises OutputError if another command has locked it.
 
-        That of a command that has ended here, or has not renewed it for long, is replaced.
+        The lock of a command that has ended on this machine, or has not renewed it for long, is replaced.
         """
         with self._asking():
             store, root = self._store()
             for _ in range(2):
                 try:
-                    if not self._is_whole:
-                        store.makedirs(root, exist_ok=True)
                     store.pipe_file(f"{root}/{LOCK_FILE}", process_name().encode(), mode="create")
                 except Exception:
                     holder = self._holder()
@@ -154,7 +136,7 @@ class ObjectFolder:
             store.pipe_file(f"{root}/{LOCK_FILE}", process_name().encode())
 
     def release(self) -> None:
-        """Release the lock; harmless if there is none."""
+        """Release the lock if this process has it."""
         with suppress(OutputError), self._asking():
             if self._holder() == process_name():
                 self.remove([LOCK_FILE])
@@ -171,83 +153,72 @@ class ObjectFolder:
             if is_alive(holder) is not None:
                 return not is_alive(holder)
         store, root = self._store()
-        store.invalidate_cache()
         renewed = store.modified(f"{root}/{LOCK_FILE}")
         return bool((datetime.now(UTC) - renewed.astimezone(UTC)).total_seconds() > LEFT_OVER_S)
 
     def _held(self, holder: str) -> HeldError:
-        who = ""
-        with suppress(ValueError, IndexError):
-            who = f"it is process {holder.split('-')[1]}: " if is_alive(holder) else ""
-        ended = "" if who else f", or remove {LOCK_FILE} there if that command has ended"
+        process = ".".join(holder.split("-")[1:2])
         return HeldError(
             expected="an output folder that no other command is writing to",
-            got="one that another command is writing to",
+            got=f"one that process {process} of this or another machine is writing to",
             where=self.shown,
-            remedy=f"{who}wait for it or choose another one{ended}",
+            remedy=f"wait for it, choose another one, or remove {LOCK_FILE} there if that process has ended",
         )
 
-    @property
-    def _is_whole(self) -> bool:
-        return self.url.partition("://")[0].lower() in _WHOLE
-
     def _store(self) -> tuple[Any, str]:
-        return _opened(self.url, os.getpid())
+        """Return the file system and the path there; fsspec opens it once a process."""
+        import fsspec
+
+        scheme = self.url.partition("://")[0].lower()
+        try:
+            if scheme not in _STORES:
+                raise ValueError(f"{scheme}://, which is no object store")
+            options = {"config_kwargs": _S3_CLIENT} if scheme in ("s3", "s3a") else {}
+            store, root = fsspec.core.url_to_fs(self.url, use_listings_cache=False, **options)
+        except (ImportError, ValueError) as error:
+            raise UsageError(
+                expected=f"a folder, or a URL of an object store ({', '.join(sorted(_STORES))})",
+                got=" ".join(str(error).split()),
+                where=self.shown,
+                remedy="pip install 'pdhef-logtool[s3]' for s3://",
+            ) from error
+        return store, root.rstrip("/")
 
     @contextmanager
     def _asking(self, name: str = "") -> Iterator[None]:
-        """Turn what goes wrong with the store into one line."""
+        """Convert the errors of a store to OutputError."""
         try:
             yield
         except (OutputError, UsageError):
             raise
         except Exception as error:
+            got, remedy = words_of(error)
             where = f"{self.shown}/{name}".rstrip("/")
-            got, remedy = _told(error)
-            raise OutputError(expected="an object store that can be used", got=got, where=where, remedy=remedy) from (
-                error
-            )
+            expected = "an object store that can be used"
+            raise OutputError(expected=expected, got=got, where=where, remedy=remedy) from error
 
 
-def _told(error: Exception) -> tuple[str, str]:
-    """Return what went wrong, and what helps."""
+def words_of(error: Exception) -> tuple[str, str]:
+    """Return the cause of an error in one line without credentials, and a remedy."""
     kind = type(error).__name__
+    text = getattr(error, "strerror", None) or (error.args[0] if error.args else "") or kind
+    line = str(text).partition("\n")[0].partition("?")[0][:200]
     if isinstance(error, PermissionError):
-        return f"a refusal ({_first_line(error)})", _REFUSED
+        return f"a refusal ({line})", _CREDENTIALS
     if "Credentials" in kind or "Unauthorized" in kind:
-        return "no credentials", _REFUSED
+        return "no credentials", _CREDENTIALS
     if isinstance(error, FileNotFoundError):
-        return f"no such place ({_first_line(error)})", _EXISTING
+        return f"no such object ({line})", "check the URL; the bucket must exist"
     if "Connect" in kind or "Timeout" in kind:
         return f"no answer ({kind})", "check the network, the URL and AWS_ENDPOINT_URL, or try again later"
-    return f"{kind}: {_first_line(error)}", "check the URL, or try again later"
+    return f"{kind}: {line}", "check the URL, or try again later"
 
 
-def _first_line(error: Exception) -> str:
-    """Return the first line of an error, without credentials."""
-    text = getattr(error, "strerror", None) or (error.args[0] if error.args else "") or type(error).__name__
-    return str(text).partition("\n")[0].partition("?")[0][:200]
-
-
-@cache
-def _opened(url: str, _pid: int) -> tuple[Any, str]:
-    """Return the file system of a URL and the path there; once a process."""
+def s3_system() -> Any:
+    """Return fsspec's file system for S3."""
     import fsspec
 
-    scheme = url.partition("://")[0].lower()
-    options: dict[str, Any] = {"config_kwargs": S3_CLIENT} if scheme in ("s3", "s3a") else {}
-    try:
-        if scheme in ("http", "https"):
-            raise ValueError(f"{scheme}://, which is for reading")
-        store, root = fsspec.core.url_to_fs(url, use_listings_cache=False, **options)
-    except (ImportError, ValueError) as error:
-        raise UsageError(
-            expected="a folder, or a URL that fsspec can write to",
-            got=" ".join(str(error).split()),
-            where=ObjectFolder(url).shown,
-            remedy="pip install 'pdhef-logtool[s3]' for s3://",
-        ) from error
-    return store, root.rstrip("/")
+    return fsspec.filesystem("s3", config_kwargs=_S3_CLIENT, use_listings_cache=False)
 
 
 class Mirror:
@@ -262,7 +233,7 @@ class Mirror:
         self.folder.mkdir()
 
     def fetch(self, name: str) -> Path | None:
-        """Return the local file of an object, fetched once; None if there is none."""
+        """Return the local file of an object, fetched once; None if it does not exist."""
         path = self.folder / name
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)

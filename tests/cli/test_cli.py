@@ -18,7 +18,7 @@ from tests.command_line import called
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = (
-    *("inspect", "map", "convert", "plan", "run", "metrics", "report", "compare", "events", "trend", "serve", "view"),
+    *("inspect", "map", "convert", "plan", "run", "metrics", "report", "compare", "events", "view"),
     *("simulate", "simulate suite", "simulate conditions"),
     *("learn", "extract", "train", "compile"),
 )

@@ -80,7 +80,6 @@ def test_json_and_junit_say_the_same(runs: tuple[str, str], tmp_path: Path) -> N
     ("command", "result"),
     [
         (("compare", "A", "B"), "B is worse"),
-        (("trend", "A", "B", "A"), "1 significant regression of sideslip RMSE in 3 runs"),
         (("events", "B", "--where", "sideslip_deg > 0.5"), "1 event in 1 of 1 drives, 0.49 s in all"),
         (("report", "A"), "pages of the run and of 10 logs"),
     ],

@@ -69,7 +69,7 @@ def test_a_killed_run_goes_on_on_another_machine(tmp_path: Path, sample_logs_dir
         assert holder.split("-")[1] == str(process.pid), "it still holds the place"
         store.put(f"day/out/{LOCK_FILE}", b"00000000-17-1")
         told = start(str(logs), "-o", f"{store.url}/day/out", "--resume")
-        assert f"or remove {LOCK_FILE} there if that command has ended" in told.communicate()[1]
+        assert f"or remove {LOCK_FILE} there if that process has ended" in told.communicate()[1]
         assert told.returncode == 1
         store.put(f"day/out/{LOCK_FILE}", holder.encode())
         again = start(str(logs), "-o", f"{store.url}/day/out", "--resume")

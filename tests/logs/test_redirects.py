@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,7 +16,7 @@ import aiohttp
 
 from pdhef_logtool import Car, ReadOptions, RunConfig, Schedule, read_drive, run
 from pdhef_logtool.cli.app import app
-from pdhef_logtool.logs import remote_objects, remote_source
+from pdhef_logtool.logs import remote_source
 from pdhef_logtool.logs.discovery import LogInput, identity_of
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, RedirectGuard, is_public
@@ -27,14 +26,10 @@ from tests.counting_server import CountingServer, serving
 
 
 @pytest.fixture(autouse=True)
-def _alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    quick = dataclasses.replace(remote_objects.PATIENCE, tries=1, first_wait_s=0.01)
-    monkeypatch.setattr(remote_objects, "PATIENCE", quick)
+def _alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote_source, "WAITS_S", ())
     for name in ("http_proxy", "HTTP_PROXY", "https_proxy", "HTTPS_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
-    yield
-    for spool in list(remote_source._spools.values()):
-        remote_source._forget(spool)
 
 
 @pytest.fixture
