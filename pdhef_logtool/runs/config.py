@@ -90,8 +90,9 @@ class RunConfig:
     reference : sideslip reference (not causal, without tyre data): ``auto`` (where the log has no ground truth of
         sideslip), ``on`` (beside ground truth as well; in ``learn`` and ``extract`` in its place) or ``off``.
     gnss : ``auto`` (``physics``, ``pd-hef`` and the reference use GNSS velocity where the log has it) or ``off``.
-    no_position : keep latitude, longitude and all other positions and headings out of the outputs; topics that may
-        contain one are not copied, and no reduced logs (``cache``) are written.
+    no_position : keep latitude, longitude and all other positions and headings out of the outputs. Topics are copied
+        if each of their fields is known not to be a position; attachments, metadata and names of log files are left
+        out, and no reduced logs (``cache``) are written.
     waived : names of checks whose failure is ignored.
     setup : setup.toml of another run of the same car and recorder, from which mounting, units, delays and clocks are
         taken; None = decided on the log.

@@ -38,9 +38,9 @@ from pdhef_logtool.records.errors import (
 )
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import POSITIONS, SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
 from pdhef_logtool.records.tracks import REFERENCE
-from pdhef_logtool.results.no_position import WithoutPosition, topics_with_position
+from pdhef_logtool.results.no_position import WithoutPosition, topics_with_position, without_names
 from pdhef_logtool.results.opened_run import (
     ESTIMATES_FILE,
     LOGS,
@@ -79,7 +79,7 @@ from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
 from pdhef_logtool.runs.selection import choose_main, choose_over_time, contradiction, default_names
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
-from pdhef_logtool.storage.documents import file_sha256, jsonable
+from pdhef_logtool.storage.documents import digest, file_sha256, jsonable
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder, check_no_input
 
@@ -355,7 +355,8 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
             drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
         losses = merge_losses([drive.losses, *(s.lost for s in sinks), *_losses(drive, scored, causality.failed)])
         facts = _facts(job, config, main, scored, (store, signals), (intervals, causality.failed), losses)
-        report = build_report(facts)
+        log = (drive.log.path, drive.name) if config.no_position else None
+        report = build_report(facts) if log is None else without_names(build_report(facts), log)
         for sink in sinks:
             sink.finish(report, scored.events)
         report = _write_files(change, drive, report, facts.metrics, config.kept)
@@ -367,6 +368,9 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
         files=files_of(change.target),
         failed=_ALL_SILENT if len(scored.silent) == len(job.ready) else None,
     )
+    if log is not None:
+        hidden = without_names({"file": outcome.file, "lost": outcome.lost, "failed": outcome.failed}, log)
+        outcome = replace(outcome, **hidden, route=outcome.route and digest(outcome.route)[:SHOWN_DIGITS])
     failed_checks = sum(c.verdict == "failed" and not c.waived for c in drive.checks)
     return LogResult(outcome, change.target, report, tuple(facts.metrics), failed_checks=failed_checks)
 
@@ -451,6 +455,7 @@ def _facts(
     rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
     truth, selected, vehicle = store.read(TRUTH), store.read(main.name), job.car.vehicle
     space = operating_space(signals, truth, selected, vehicle)
+    details = drive_details(drive, job.ready, main.name, store.read, signals, brief=config.kept != "full")
     others = [t for n in (REFERENCE, PHYSICS, *algorithms) if n != main.name and (t := store.read(n)) is not None]
     return replace(
         report_facts(drive, job.car, estimators, rows, scored.events, losses),
@@ -460,7 +465,7 @@ def _facts(
         main=main,
         space=space,
         largest_errors=[] if selected is None else largest_errors(selected, truth, others, vehicle.low_speed_blend_m_s),
-        details=drive_details(drive, job.ready, main.name, store.read, signals, brief=config.kept != "full"),
+        details=replace(details, metadata={}) if config.no_position else details,
         requirements=_requirements(job, main.name, scored, store, space, brief=config.kept == "metrics"),
     )
 
@@ -601,6 +606,7 @@ def _open_sinks(
     sinks: list[Sink] = []
     drive, car = job.drive, job.car
     colours = {REFERENCE: REFERENCE_COLOUR, **{s.name: s.colour for s in all_specs()}}
+    left_out = _left_out(drive, copied=config.annotation == "full") if config.no_position else None
     try:
         if config.kept != "metrics":
             causal_from_ns = _causal_from_ns(drive, job.ready)
@@ -623,7 +629,7 @@ def _open_sinks(
                 shown=first,
                 others_step_ns=None if is_named else step_ns,
                 min_speed_m_s=car.vehicle.low_speed_blend_m_s,
-                left_out=_left_out(drive) if config.no_position else None,
+                left_out=left_out,
             )
             sinks.append(annotated)
             layouts = change.file("foxglove.json"), change.file("plotjuggler.xml")
@@ -642,12 +648,11 @@ def _open_sinks(
         raise
 
 
-def _left_out(drive: Drive) -> frozenset[str]:
-    """Return the topics that ``--no-position`` keeps out of the copy, and note them."""
-    places = [s for n, s in (drive.plan.mapping.truth | drive.plan.mapping.signals).items() if n in POSITIONS]
-    topics = topics_with_position(drive.log, {s.topic for s in places})
-    if topics:
-        drive.remarks.append(f"--no-position: {', '.join(sorted(topics))} not copied, attachments and metadata neither")
+def _left_out(drive: Drive, *, copied: bool) -> frozenset[str]:
+    """Return the topics that ``--no-position`` keeps out of the copy, if there is one; note what is left out."""
+    topics = topics_with_position(drive.log, drive.plan.mapping) if copied else frozenset()
+    names = f"topics {', '.join(sorted(topics))}, " if topics else ""
+    drive.remarks.append(f"--no-position leaves out {names}attachments, metadata and file names")
     return topics
 
 
