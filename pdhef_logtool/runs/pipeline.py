@@ -22,6 +22,7 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.intervals import TrackCalibrator
+from pdhef_logtool.estimators.plug_ins import package_of
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, Skipped, all_specs, runnable
 from pdhef_logtool.evaluation.dependence import day_and_route, factors_of
 from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
@@ -337,6 +338,7 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
     with outputs.begin(log_place(drive.name), stale=STALE_FILES) as change, ExitStack() as opened:
         store = opened.enter_context(TrackStore(change.scratch / "tracks"))
         causality = CausalityCheck()
+        causality.failed |= {s.name: s.reason for s in job.skipped if s.is_error}
         signals = _estimate(drive, job.ready, intervals, store, reporter, causality)
         job = replace(job, ready=_without_failed(drive, job.ready, causality.failed))
         scored = _score(job, store, signals)
@@ -450,7 +452,8 @@ def _facts(
         for a in (algorithms[e.name],)
     ]
     estimators += [EstimatorFacts(name, causal=False, failed=text) for name, text in failed.items()]
-    estimators += [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in job.skipped]
+    skipped = [s for s in job.skipped if not s.is_error]
+    estimators += [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in skipped]
     digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
     rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
     truth, selected, vehicle = store.read(TRUTH), store.read(main.name), job.car.vehicle
@@ -696,6 +699,9 @@ def _estimate(
     causality: CausalityCheck,
 ) -> Signals:
     """Run all estimators over the drive into the store; return the drive's signals for segments."""
+    plug_ins = ", ".join(filter(None, map(package_of, estimators)))
+    label = f"{drive.name} (plug-ins: {plug_ins})" if plug_ins else drive.name
+    reporter.progress(label, 0.0)
     for window in estimate_windows(drive, estimators, intervals=intervals, causality=causality):
         store.append_signals(window.signals)
         if window.truth is not None:
@@ -704,7 +710,7 @@ def _estimate(
             store.append_drawn(window.drawn_truth)
         for track in window.tracks:
             store.append(track, drawn=True)
-        reporter.progress(drive.name, 0.8 * window.share_done)
+        reporter.progress(label, 0.8 * window.share_done)
     reporter.progress(drive.name, 0.8)
     return store.signals()
 
