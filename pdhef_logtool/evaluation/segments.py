@@ -29,8 +29,9 @@ import numpy as np
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.evaluation.blocks import SegmentMasks, blocks_with_halo, median_step_ns, packed, row_blocks
 from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES, Manoeuvre, find_manoeuvres, manoeuvre_masks
-from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, last_known, reach_rows, runs, smooth
+from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, reach_rows, runs, smooth
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import last_known
 from pdhef_logtool.records.tracks import StateTrack
 
 SEGMENTS = (
