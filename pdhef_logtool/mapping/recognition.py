@@ -632,6 +632,9 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
         draft.notes.append(f"{prefer} ground truth used; {', '.join(left)} not used")
         candidates = kept
     for topic in topics:
+        path = _FIELDS["friction"].get(_type(topic))
+        if path is not None and _truth_group(topic) == prefer and draft.is_given(topic.name, path):
+            draft.take(draft.truth, "friction", topic.name, path)
         if _is_truth(topic) and _type(topic) in _FIELDS["several_positions"]:
             draft.doubt("ground-truth position", (topic.name,), None, _FIELDS["several_positions"][_type(topic)])
     velocity = _map_truth_velocity(draft, candidates)
