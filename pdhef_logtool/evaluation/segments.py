@@ -3,7 +3,7 @@
 Lateral acceleration is that of ground truth if it has one, else the sensor's; likewise yaw rate and speed;
 longitudinal acceleration is always the sensor's. Accelerations and yaw rate are smoothed without phase (Gaussian, over
 at most the gap-free run around a stamp): to 4 Hz for ``linear`` and ``nonlinear``, to 1 Hz for manoeuvres. μ is the
-log's friction, else the vehicle file's, else 1.
+ground truth's friction, else the log's, else the vehicle file's, else 1.
 
 ====================  ==================================================================================================
 ``all``               every stamp

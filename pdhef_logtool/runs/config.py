@@ -74,7 +74,8 @@ class RunConfig:
     sensors : ``full``, or ``esp`` (sensor set of the paper: the speed sensor only initialises the filters).
     sensor_profile : TOML file with ``[sensors]`` (noise, rates and limits of the sensors), or ``production``, in place
         of the car's entries, for ``run`` and ``metrics``; None = those of the car.
-    friction : ``auto`` (from the log, else the car, else estimated), ``file``, ``estimate``, or a number.
+    friction : ``auto`` (from the log, else the car, else estimated; for ``extract`` first from the ground truth),
+        ``file``, ``estimate``, or a number.
     prefer_truth : ground truth of a simulated log that has both: ``perfect`` or ``rtk``.
     window_s : length of the windows in which a log is processed, in s. Results do not depend on it.
     clock : ``arrival`` (a sample is available from its arrival on) or ``stamp`` (from its stamp on; not causal).
