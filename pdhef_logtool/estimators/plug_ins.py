@@ -58,7 +58,9 @@ def contained(name: str, package: str) -> Iterator[None]:
 
 def read_only(signals: Signals) -> Signals:
     """Return copies of the columns that cannot be written to."""
-    copies = {f.name: np.array(getattr(signals, f.name)) for f in fields(signals) if f.name != "available"}
+    copies: dict[str, Any] = {
+        f.name: np.array(getattr(signals, f.name)) for f in fields(signals) if f.name != "available"
+    }
     for copy in copies.values():
         copy.setflags(write=False)
     return replace(signals, **copies)

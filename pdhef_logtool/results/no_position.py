@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 import numpy as np
 
-from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -123,10 +122,9 @@ def neutral_stem(identity: str | None) -> str:
     return f"log-{identity[:_DIGITS]}" if identity else "log"
 
 
-def without_names(document: _T, log: LogInput | tuple[LogPlace, str]) -> _T:
+def without_names(document: _T, place: LogPlace, stem: str) -> _T:
     """Replace the path of a log, its name and those of the files in its folder in all texts of a JSON-able document."""
-    place, stem = (log.path, log.stem) if isinstance(log, LogInput) else log
-    name = stem + "".join(re.findall(r"\.[A-Za-z0-9]{1,8}", place.name)[-1:])
+    name = stem + PurePath(place.name).suffix
     names = {str(place): name, f"{place.name}/": f"{name}/"}
     if str(place.parent) != ".":
         names[f"{place.parent}/"] = ""

@@ -160,8 +160,11 @@ def run_logs(
         return RunResult(fleet.plan.output, tuple(results), stored, verdicts)
 
 
-def _check_names(logs: Sequence[LogInput], output: Path, reporter: Reporter) -> None:
-    """Note the neutral names of logs; raises UsageError if the folder has the outputs of a run with their names."""
+def _check_names(logs: Sequence[LogInput], output: Path, job: _Job, reporter: Reporter) -> None:
+    """Note neutral names of logs; raises UsageError if an output would replace an input, or has names of logs."""
+    job.check_places(logs, output)
+    if not job.config.no_position:
+        return
     with suppress(OSError, ValueError):
         if not json.loads((output / RUN_FILE).read_bytes())["config"]["no_position"]:
             raise UsageError(
@@ -185,10 +188,8 @@ def _given_limits(config: RunConfig) -> Limits | None:
 def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> RunResult:
     """Run one log in this process; its error is that of the run."""
     config, car = job.config, job.cars.of_log(log)
-    if config.no_position:
-        log = replace(log, stem=neutral_stem(log_identity(log)))
-        _check_names([log], output, reporter)
-    job.check_places([log], output)
+    log = replace(log, stem=neutral_stem(log_identity(log))) if config.no_position else log
+    _check_names([log], output, job, reporter)
     pool = calibrate_pool([log], car, job.mapping, config) if config.calibrate == "pool" else None
     with OutputFolder(output, (LOGS,)) as outputs:
         try:
@@ -244,10 +245,7 @@ def _prepare(
         lines = "1 line is" if journal.damaged == 1 else f"{journal.damaged} lines are"
         reporter.note(f"{JOURNAL_FILE}: {lines} damaged or of another version: the drives of these are run again")
     planned = plan_logs(inputs, journal, twice=config.cars is not None, neutral=config.no_position, reporter=reporter)
-    logs = [p.log for p in planned]
-    if job.config.no_position:
-        _check_names(logs, output, reporter)
-    job.check_places(logs, output)
+    _check_names([p.log for p in planned], output, job, reporter)
     pools = calibrate_pools(planned, job.cars, job.mapping, job.config)
     plan = Plan.of(output, journal, planned, settings_of(job.config, pools), job.cars, schedule.only)
     return _Fleet(job, plan, pools, schedule, limits, full_worst, work, reporter, stored)

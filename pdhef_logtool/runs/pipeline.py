@@ -357,22 +357,20 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
             drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
         losses = merge_losses([drive.losses, *(s.lost for s in sinks), *_losses(drive, scored, causality.failed)])
         facts = _facts(job, config, main, scored, (store, signals), (intervals, causality.failed), losses)
-        log = (drive.log.path, drive.name) if config.no_position else None
-        report = build_report(facts) if log is None else without_names(build_report(facts), log)
+        report = build_report(facts)
+        if config.no_position:
+            report = without_names(report, drive.path, drive.name)
         for sink in sinks:
             sink.finish(report, scored.events)
         report = _write_files(change, drive, report, facts.metrics, config.kept)
     outcome = replace(
-        outcome_of(drive, losses),
+        outcome_of(drive, losses, neutral=config.no_position),
         car=_car_facts(drive.car),
         main=None if main is None else main.name,
         algorithms={e.name: resolve(e).identity for e in job.ready},
         files=files_of(change.target),
         failed=_ALL_SILENT if len(scored.silent) == len(job.ready) else None,
     )
-    if log is not None:
-        hidden = without_names({"file": outcome.file, "lost": outcome.lost, "failed": outcome.failed}, log)
-        outcome = replace(outcome, **hidden, route=outcome.route and digest(outcome.route)[:SHOWN_DIGITS])
     failed_checks = sum(c.verdict == "failed" and not c.waived for c in drive.checks)
     return LogResult(outcome, change.target, report, tuple(facts.metrics), failed_checks=failed_checks)
 
@@ -458,7 +456,9 @@ def _facts(
     rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
     truth, selected, vehicle = store.read(TRUTH), store.read(main.name), job.car.vehicle
     space = operating_space(signals, truth, selected, vehicle)
-    details = drive_details(drive, job.ready, main.name, store.read, signals, brief=config.kept != "full")
+    details = drive_details(
+        drive, job.ready, main.name, store.read, signals, brief=config.kept != "full", metadata=not config.no_position
+    )
     others = [t for n in (REFERENCE, PHYSICS, *algorithms) if n != main.name and (t := store.read(n)) is not None]
     return replace(
         report_facts(drive, job.car, estimators, rows, scored.events, losses),
@@ -468,7 +468,7 @@ def _facts(
         main=main,
         space=space,
         largest_errors=[] if selected is None else largest_errors(selected, truth, others, vehicle.low_speed_blend_m_s),
-        details=replace(details, metadata={}) if config.no_position else details,
+        details=details,
         requirements=_requirements(job, main.name, scored, store, space, brief=config.kept == "metrics"),
     )
 
@@ -534,17 +534,19 @@ def _car_facts(car: Car) -> CarFacts:
     return CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, network, sensors)
 
 
-def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
-    """Return how a log that was read is recorded in run.json."""
+def outcome_of(drive: Drive, losses: Sequence[Loss], *, neutral: bool = False) -> LogOutcome:
+    """Return how a log that was read is recorded in run.json; ``neutral``: without names and metadata of its file."""
     day, route = day_and_route(drive.plan.start_ns, drive.log.metadata())
+    texts: dict[str, Any] = {"file": drive.file, "lost": lost_texts(losses)}
+    if neutral:
+        texts, route = without_names(texts, drive.path, drive.name), route and digest(route)[:SHOWN_DIGITS]
     return LogOutcome(
         log=drive.name,
-        file=drive.file,
         sha256=drive.sha256,
         signals_sha256=drive.signals_sha256,
         truth_sha256=drive.truth_sha256,
         mapping_sha256=drive.mapping.sha256,
-        lost=lost_texts(losses),
+        **texts,
         day=day,
         route=route,
     )

@@ -95,8 +95,9 @@ def run_drive(task: DriveTask, tell: Tell) -> DriveEnd:
 
 def failed_outcome(log: LogInput, reason: str, config: RunConfig) -> LogOutcome:
     """Return how a log that nothing came out of is recorded in run.json."""
-    texts = {"file": log.path.name, "failed": reason}
-    return LogOutcome(log=log.stem, sha256=None, **(without_names(texts, log) if config.no_position else texts))
+    texts: dict[str, Any] = {"file": log.path.name, "failed": reason}
+    texts = without_names(texts, log.path, log.stem) if config.no_position else texts
+    return LogOutcome(log=log.stem, sha256=None, **texts)
 
 
 def run_on_node(
