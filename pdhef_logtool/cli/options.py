@@ -156,7 +156,7 @@ _OPTIONS: dict[str, Any] = {
         bool | None,
         Option(
             "--no-position",
-            help="Keep positions out of all outputs; do not copy topics that may contain one.",
+            help="Keep positions, metadata and file names out of all outputs; copy only topics without a position.",
             rich_help_panel=OUTPUT,
         ),
     ],

@@ -58,6 +58,7 @@ class FrictionSource:
     bank : estimates it; None where nothing is estimated.
     factor : error made on purpose in the friction of topic or option, for training (docs/method.md#limits).
     model_std : 1-sigma of the estimate's error that comes of the vehicle file (:data:`MODEL_STD`).
+    of_truth : it is that of the ground truth of each window, for datasets: no estimator of a run is given it.
     """
 
     label: str
@@ -66,6 +67,7 @@ class FrictionSource:
     bank: FrictionBank | None = None
     factor: float = 1.0
     model_std: float = 0.0
+    of_truth: bool = False
     _carry: FrictionState | None = None
     _std: list[FloatArray] = field(default_factory=list)
     _observable: list[BoolArray] = field(default_factory=list)
@@ -88,6 +90,8 @@ class FrictionSource:
     def fill_windows(self, windows: Iterator[DriveWindow]) -> Iterator[DriveWindow]:
         """Yield the windows of a drive with their friction."""
         for window in windows:
+            if self.of_truth and window.truth is not None:
+                window = replace(window, signals=replace(window.signals, friction=window.truth.friction))
             yield replace(window, signals=self.fill(window.signals))
 
     @property

@@ -15,6 +15,7 @@ from pdhef_logtool.drive.relations import (
     COURSE_RATE,
     GNSS_COURSE_RATE,
     POSITION,
+    SPIN_SHARE,
     TURNING,
     direction_rate,
     measured_relations,
@@ -26,10 +27,6 @@ from pdhef_logtool.records.tracks import StateTrack
 
 #: Name of the column that is the mean of the wheel speeds.
 WHEEL_SPEEDS = "wheel_speeds"
-#: A wheel differs from the others by less in a bend. One that spins or locks counts with this; of two that do, or of
-#: four, no wheel shows how fast the car was.
-SPIN_SHARE = 0.2
-
 _EAST_NORTH = ("gnss_velocity_east_m_s", "gnss_velocity_north_m_s")
 _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 
@@ -195,6 +192,7 @@ def _speed_of(columns: dict[str, FloatArray]) -> str | None:
             middle = np.median(wheels, axis=0)
             most = SPIN_SHARE * np.abs(middle)
             with np.errstate(divide="ignore", invalid="ignore"):
+                # A wheel that spins or locks counts with ``most``; of two that do, no wheel shows how fast the car was.
                 shares = wheels / np.where(moving_at(middle), middle, np.nan)
                 typical = [[median_known(share)] for share in shares]  # of another unit, a wheel does not spin
                 spin = np.sum(np.abs(shares - typical) > SPIN_SHARE, axis=0) > 1

@@ -452,9 +452,20 @@ def _tell_doubts(plan: DrivePlan, options: ReadOptions, tell: Tell) -> None:
 
 
 def friction_of(
-    plan: DrivePlan, vehicle: VehicleParameters, options: ReadOptions, factor: float = 1.0, *, validated: bool
+    plan: DrivePlan,
+    vehicle: VehicleParameters,
+    options: ReadOptions,
+    factor: float = 1.0,
+    *,
+    validated: bool,
+    of_truth: bool = False,
 ) -> FrictionSource:
-    """Return the friction of a drive as the options choose it, for a vehicle; ``factor`` makes it wrong on purpose."""
+    """Return the friction of a drive as the options choose it, for a vehicle; ``factor`` makes it wrong on purpose.
+
+    With ``of_truth``, ``auto`` is the friction of the ground truth where the log has one.
+    """
+    if of_truth and options.friction == "auto" and (true := plan.mapping.truth.get("friction")) is not None:
+        return FrictionSource(f"ground truth {true.label}", factor=factor, of_truth=True)
     source = plan.mapping.signals.get("friction")
     topic = "" if source is None else source.label
     if options.friction is None:

@@ -45,6 +45,8 @@ STRAIGHT_M_S2 = 3.0
 AHEAD_SHARE = 0.9
 #: No car reverses for long at more. The sign of a faster speed is known, and not its unit.
 REVERSE_M_S = 10.0
+#: A wheel differs from the others by less in a bend; one that differs by more spins or locks.
+SPIN_SHARE = 0.2
 #: Rim speed over ground speed, 5 % of slip and 5 % of radius; angular over rim speed, wheels of 4 cm to 80 cm radius.
 WHEEL_RANGE = (0.88, 1.14)
 WHEEL_PER_RADIAN_RANGE = (1.25, 25.0)
@@ -255,12 +257,14 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
     wanted |= {"truth.vx_m_s": SAME_RANGE, "truth.position_speed_m_s": SAME_RANGE}
     relations = []
     moving = _moving(columns, speed)
-    # A wheel spins or locks at the limit, and each of them goes its own way where the car does.
+    # At the limit each wheel goes its own way where the car does.
     gentle = moving if "yaw_rate_rad_s" not in columns else gentle_at(columns["yaw_rate_rad_s"] * speed, moving)
     for name, expected in wanted.items():
         column = columns.get(name)
         if column is None or name == speed_name:
             continue
+        if name.startswith("wheel"):
+            column = np.where(np.isfinite(_scaled_to(column, speed, moving)), column, np.nan)
         use = gentle & np.isfinite(column)
         if independent_samples(int(np.count_nonzero(use))) < MIN_SAMPLES:
             use = moving & np.isfinite(column)
@@ -329,9 +333,12 @@ def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed
 
 
 def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> FloatArray:
+    """Return a wheel's speed [N] scaled to that of the car, NaN where the wheel spins or locks."""
     use = moving & np.isfinite(wheel) & np.isfinite(speed)
     ratio = float(np.median(wheel[use] / speed[use])) if use.any() else 0.0
-    return wheel / ratio if ratio != 0.0 else np.full(wheel.shape[0], np.nan)
+    if ratio == 0.0:
+        return np.full(wheel.shape[0], np.nan)
+    return np.where(np.abs(wheel / ratio - speed) <= SPIN_SHARE * np.abs(speed), wheel / ratio, np.nan)
 
 
 def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relation]:

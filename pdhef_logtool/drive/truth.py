@@ -55,6 +55,8 @@ _COLUMNS = {
     **{name: (name,) for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "yaw_rad")},
     "position_m": ("x_m", "y_m"),
 }
+#: A condition of the drive, no part of the state that an estimate is scored against.
+_FRICTION = "friction"
 _AY_DERIVED = "smoothing derivative of v_y plus v_x times yaw rate plus g sin(roll), without body roll"
 _AY_UNKNOWN = "not scored: needs a mapped a_y, or an attitude with roll and the car's roll gradient"
 _SURVEY_NS = 600_000_000_000
@@ -179,7 +181,7 @@ def plan_truth(
     TruthPlan, or None when no channel has two samples.
     """
     survey = _survey(channels)
-    if not survey:
+    if not survey.keys() - {_FRICTION}:
         return None
     has = frozenset(survey)
     origin = _find_origin(survey)
@@ -237,6 +239,8 @@ def derive_truth(
     vx, vy, moved = _velocity_to_cg(plan, vx, vy, rate, says)
     beta = _sideslip(source, vx, vy, moved, says)
     ay = _lateral_acceleration(source, vx, vy, rate, says)
+    if _FRICTION in source:
+        says[_FRICTION] = source.name(_FRICTION)
     px, py, _ = plan.position_m
     if (px, py) != (0.0, 0.0) and np.isfinite(yaw).any():
         x_m = x_m - (np.cos(yaw) * px - np.sin(yaw) * py)
@@ -252,6 +256,7 @@ def derive_truth(
         x_m=x_m,
         y_m=y_m,
         yaw_rad=yaw,
+        friction=source.column(_FRICTION),
     )
     return TruthTrack(track=track, max_gap_s=plan.max_gap_s[plan.base], derivation=says)
 
@@ -290,6 +295,7 @@ def truth_at(
         x_m=bracket.linear(track.x_m),
         y_m=bracket.linear(track.y_m),
         yaw_rad=bracket.angle(track.yaw_rad),
+        friction=bracket.linear(track.friction),
         valid=bracket.inside & np.isfinite(np.stack([vx, vy, rate, beta, ay])).any(axis=0),
     ).without_sideslip_below(standstill_m_s)
 
@@ -460,7 +466,7 @@ def _velocity_source(
         return "ground speed and sideslip", ground
     if ground:
         return "ground speed alone", ground
-    return "none", max(sorted(survey), key=lambda n: len(survey[n]))
+    return "none", max(sorted(survey.keys() - {_FRICTION}), key=lambda n: len(survey[n]))
 
 
 def _pairs(has: frozenset[str]) -> frozenset[str]:

@@ -44,7 +44,8 @@ from pdhef_logtool.mapping import (
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.ledger import Role, SampleCount
 from pdhef_logtool.records.readings import impossible_readings
-from pdhef_logtool.records.signals import Channel, Loss, Signals, join_signals
+from pdhef_logtool.records.signals import Channel, FloatArray, IntArray, Loss, Signals, join_signals
+from pdhef_logtool.records.steps import last_known
 from pdhef_logtool.records.tracks import StateTrack
 
 #: A silence of a channel is given from here on, and from this many of its periods.
@@ -234,6 +235,7 @@ class DriveReader:
     hashes: dict[Role, ChannelHash] = field(default_factory=lambda: {"signal": ChannelHash(), "truth": ChannelHash()})
     _done: bool = False
     _only: DriveWindow | None = None
+    _speed: tuple[IntArray, FloatArray] = (np.empty(0, np.int64), np.empty(0))
 
     @property
     def can_repeat(self) -> bool:
@@ -252,6 +254,7 @@ class DriveReader:
         counts: dict[str, int] = {}
         done_ns: int | None = None
         hashed_ns = _FIRST_NS
+        self._speed = np.empty(0, np.int64), np.empty(0)
         ends = list(windows(plan.start_ns, plan.end_ns, round(self.window_s * 1e9), self.log.recording_span))
         for a, b in ends:
             part = read_signals(self.log, plan.mapping, plan.clocks, a, b)
@@ -335,7 +338,17 @@ class DriveReader:
                 plan.truth_latency_s,
                 standstill_m_s=plan.vehicle.standstill_m_s,
             )
+            at_stamps = replace(at_stamps, measured_speed_m_s=self._measured_speed(aligned))
         return DriveWindow(aligned, at_stamps, share)
+
+    def _measured_speed(self, aligned: Signals) -> FloatArray:
+        """Return the last known speed at the stamps [N] of a window, of GNSS where no other sensor measures it."""
+        of_gnss = np.hypot(*aligned.gnss_velocity_m_s.T)
+        speed = np.where(np.isfinite(aligned.speed_m_s), aligned.speed_m_s, of_gnss)
+        stamps, speed = (np.concatenate(pair) for pair in zip(self._speed, (aligned.stamps_ns, speed), strict=True))
+        last = np.flatnonzero(np.isfinite(speed))[-1:]
+        self._speed = stamps[last], speed[last]
+        return last_known(stamps, speed)[len(stamps) - len(aligned) :]
 
 
 def sample_ledger(

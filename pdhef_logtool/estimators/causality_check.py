@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.records.signals import Signals
@@ -20,13 +21,14 @@ from pdhef_logtool.records.steps import StepColumns
 
 #: A window is checked at two stamps: one anywhere, one among its first samples, which costs little.
 SHORT_CUT = 256
-#: Largest relative change of a step that counts as rounding: matrix products may depend on the window's length.
-RELATIVE_TOLERANCE = 1e-9
+#: Largest relative change of a step that counts as rounding: matrix products, which networks compute in single
+#: precision, may depend on the window's length.
+RELATIVE_TOLERANCE = 4.0 * float(np.finfo(np.float32).eps)
 
 
 @dataclass(slots=True)
 class CausalityCheck:
-    """The check over one drive; ``failed`` has the reason by estimator."""
+    """The check over one drive; ``failed`` has the reason by estimator, also of those that failed otherwise."""
 
     failed: dict[str, str] = field(default_factory=dict)
     _windows: dict[str, int] = field(default_factory=dict)
@@ -65,7 +67,7 @@ def _cuts(count: int, number: int) -> Iterator[int]:
 
 def largest_change(a: Any, b: Any) -> float:
     """Return the largest difference of two records of steps, relative to each column's largest value; inf for NaN."""
-    return max((_change(x, y) for x, y in zip(_columns(a), _columns(b), strict=True)), default=0.0)
+    return max((_change(x, y) for x, y in zip(step_columns(a), step_columns(b), strict=True)), default=0.0)
 
 
 def _change(a: Any, b: Any) -> float:
@@ -79,12 +81,13 @@ def _change(a: Any, b: Any) -> float:
     return float(difference.max(initial=0.0)) / size
 
 
-def _columns(record: Any) -> Iterator[Any]:
+def step_columns(record: Any) -> Iterator[NDArray[Any]]:
+    """Yield the arrays of a record of steps."""
     if isinstance(record, StepColumns):
         for entry in fields(record):
-            yield from _columns(getattr(record, entry.name))
+            yield from step_columns(getattr(record, entry.name))
     elif isinstance(record, tuple):
         for part in record:
-            yield from _columns(part)
+            yield from step_columns(part)
     else:
         yield np.asarray(record)

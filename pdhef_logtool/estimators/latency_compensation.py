@@ -12,8 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from pdhef_logtool.estimators.base import Estimator, look_ahead_of, predict_track, run_steps
-from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.estimators.base import Estimator, Steps, look_ahead_of, predict_track, run_steps
+from pdhef_logtool.estimators.causality_check import CausalityCheck, step_columns
+from pdhef_logtool.estimators.plug_ins import contained, package_of, read_only
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import IntArray, Signals
 from pdhef_logtool.records.steps import StepColumns, extrapolation, release
@@ -55,15 +56,22 @@ def run_window(
     Raises
     ------
     EstimatorError
-        The estimator did not return one step per sample.
+        The estimator did not return one step per sample, or its plug-in failed.
     """
     state = None if before is None else before.estimator
-    copied = None if causality is None else causality.state_before(estimator, state)
-    steps, state = run_steps(estimator, signals, state, ahead)
-    _check_steps(estimator, signals, steps)
-    if causality is not None:
-        causality.check(estimator, signals, copied, steps)
-    track, pending = compensate(estimator, signals, steps, None if before is None else before.pending)
+    package = package_of(estimator)
+    with contained(estimator.name, package):
+        given, follows = (read_only(s) if package and s is not None else s for s in (signals, ahead))
+        assert given is not None
+        copied = None if causality is None else causality.state_before(estimator, state)
+        returned = run_steps(estimator, given, state, follows)
+        if not isinstance(returned, tuple) or len(returned) != 2:
+            raise _wrong_steps(estimator, "a pair of steps and state", type(returned).__name__)
+        steps, state = returned
+        _check_steps(estimator, signals, steps)
+        if causality is not None:
+            causality.check(estimator, given, copied, steps)
+        track, pending = compensate(estimator, signals, steps, None if before is None else before.pending)
     return track, WindowState(state, pending)
 
 
@@ -81,11 +89,20 @@ def compensate(
 
 
 def _check_steps(estimator: Estimator, signals: Signals, steps: Any) -> None:
-    is_record = isinstance(steps, StepColumns)
-    if not is_record or len(steps.valid) != len(signals):
-        raise EstimatorError(
-            expected=f"steps, one per sample ({len(signals)})",
-            got=f"{len(steps.valid)} steps" if is_record else type(steps).__name__,
-            where=estimator.name,
-            remedy="return Steps, or a StepColumns record with a column named valid",
-        )
+    expected = f"steps, one per sample ({len(signals)})"
+    if not isinstance(steps, StepColumns):
+        raise _wrong_steps(estimator, expected, type(steps).__name__)
+    for column in step_columns(steps):
+        if column.shape[:1] != (len(signals),):
+            raise _wrong_steps(estimator, expected, f"{len(column) if column.ndim else 'no'} steps")
+        if column.dtype.kind not in "biuf":
+            raise _wrong_steps(estimator, "steps of numbers", f"a column of type {column.dtype}")
+    if isinstance(steps, Steps) and not steps.values.shape == steps.rates.shape == (len(signals), 4):
+        raise _wrong_steps(estimator, f"values and rates of shape ({len(signals)}, 4)", str(steps.values.shape))
+
+
+def _wrong_steps(estimator: Estimator, expected: str, got: str) -> EstimatorError:
+    package = package_of(estimator)
+    where = f"{estimator.name} (plug-in {package})" if package else estimator.name
+    remedy = "return Steps, or a StepColumns record with a column named valid"
+    return EstimatorError(expected=expected, got=got, where=where, remedy=remedy)

@@ -16,10 +16,11 @@ from typing import Literal
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
+from pdhef_logtool.estimators.plug_ins import contained, package_of
 from pdhef_logtool.estimators.presets import AIDED, check_options, options_of, preset_of
 from pdhef_logtool.estimators.presets import Options as Options
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, SelfCalibrated
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import has_gnss
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
@@ -198,10 +199,11 @@ SPECS: tuple[Spec, ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """An estimator that cannot run, and why."""
+    """An estimator that cannot run, and why; ``is_error``: its plug-in failed."""
 
     spec: Spec
     reason: str
+    is_error: bool = False
 
     @property
     def name(self) -> str:
@@ -219,9 +221,10 @@ def all_specs() -> tuple[Spec, ...]:
     for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
         reason = ""
         try:
-            spec = entry.load()
-        except Exception as error:  # noqa: BLE001 (code of another package may raise anything)
-            reason = f"{type(error).__name__}: {error}"
+            with contained(entry.name, entry.module):
+                spec = entry.load()
+        except EstimatorError as error:
+            reason = error.got
         else:
             if not isinstance(spec, Spec):
                 reason = f"got {type(spec).__name__}, expected {Spec.__module__}.Spec"
@@ -300,8 +303,12 @@ def runnable(
         reason = spec.missing(car) or (lacks if lacking else "")
         if reason:
             skipped.append(Skipped(spec, reason))
-        else:
-            estimators.append(spec.make(car, options))
+            continue
+        try:
+            with contained(spec.name, package_of(spec.build)):
+                estimators.append(spec.make(car, options))
+        except EstimatorError as error:
+            skipped.append(Skipped(spec, f"failed: {error}", is_error=True))
     return estimators, skipped
 
 

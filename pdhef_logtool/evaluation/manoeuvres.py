@@ -16,8 +16,9 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.evaluation.blocks import blocks_with_halo
-from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, last_known, runs, smooth
+from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, runs, smooth
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import last_known
 
 MANOEUVRES = (
     "steady-circle",

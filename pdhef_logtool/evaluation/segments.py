@@ -3,7 +3,7 @@
 Lateral acceleration is that of ground truth if it has one, else the sensor's; likewise yaw rate and speed;
 longitudinal acceleration is always the sensor's. Accelerations and yaw rate are smoothed without phase (Gaussian, over
 at most the gap-free run around a stamp): to 4 Hz for ``linear`` and ``nonlinear``, to 1 Hz for manoeuvres. μ is the
-log's friction, else the vehicle file's, else 1.
+ground truth's friction, else the log's, else the vehicle file's, else 1.
 
 ====================  ==================================================================================================
 ``all``               every stamp
@@ -29,8 +29,9 @@ import numpy as np
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.evaluation.blocks import SegmentMasks, blocks_with_halo, median_step_ns, packed, row_blocks
 from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES, Manoeuvre, find_manoeuvres, manoeuvre_masks
-from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, last_known, reach_rows, runs, smooth
+from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, reach_rows, runs, smooth
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import last_known
 from pdhef_logtool.records.tracks import StateTrack
 
 SEGMENTS = (
@@ -98,7 +99,8 @@ def _masks(
     stamps = signals.stamps_ns
     slow = vehicle.low_speed_blend_m_s
     lateral = _taken(signals, truth, of_truth, "ay_m_s2")
-    linear, nonlinear = _grip_masks(signals, stamps, lateral, step_ns, vehicle)
+    friction = _taken(signals, truth, of_truth, "friction")
+    linear, nonlinear = _grip_masks(friction, stamps, lateral, step_ns, vehicle)
     ay = smooth(stamps, lateral, MANOEUVRE_SMOOTHING_HZ, step_ns)
     driven = manoeuvre_masks(stamps, manoeuvres)
     slalom = driven["slalom"]
@@ -126,11 +128,10 @@ def _masks(
 
 
 def _grip_masks(
-    signals: Signals, stamps: IntArray, ay: FloatArray, step_ns: float, vehicle: VehicleParameters
+    friction: FloatArray, stamps: IntArray, ay: FloatArray, step_ns: float, vehicle: VehicleParameters
 ) -> tuple[BoolArray, BoolArray]:
     """Return where the grip is used little and much, [N]."""
     grip = np.abs(smooth(stamps, ay, GRIP_SMOOTHING_HZ, step_ns))
-    friction = signals.friction
     grip /= np.where(np.isfinite(friction), friction, vehicle.assumed_friction) * GRAVITY_M_S2
     return grip < LINEAR_SHARE, grip > NONLINEAR_SHARE
 
@@ -154,7 +155,7 @@ def known_of(truth: StateTrack | None) -> frozenset[str]:
     """Return what is taken from ground truth: all that it ever has, so that a drive does not mix two sources."""
     if truth is None:
         return frozenset()
-    return frozenset(c for c in ("ay_m_s2", "yaw_rate_rad_s", "vx_m_s") if _known_anywhere(truth, c))
+    return frozenset(c for c in ("ay_m_s2", "yaw_rate_rad_s", "vx_m_s", "friction") if _known_anywhere(truth, c))
 
 
 def speed_and_ay(signals: Signals, truth: StateTrack | None, of_truth: frozenset[str]) -> tuple[FloatArray, FloatArray]:

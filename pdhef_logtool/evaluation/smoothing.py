@@ -75,14 +75,6 @@ def _gaussian_of_ones(n: int, sigma_rows: float) -> FloatArray:
     return np.concatenate([ends[:reach], np.full(n - 2 * reach, ends[reach]), ends[reach + 1 :]])
 
 
-def last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
-    """Carry measurements, which are at one stamp only, forward for up to ``RUN_GAP_S``."""
-    finite = np.isfinite(values)
-    last = np.maximum.accumulate(np.where(finite, np.arange(values.shape[0]), -1))
-    fresh = (last >= 0) & (stamps_ns - stamps_ns[np.maximum(last, 0)] <= RUN_GAP_S * 1e9)
-    return np.where(fresh, values[np.maximum(last, 0)], np.nan)
-
-
 def runs(stamps_ns: IntArray, mask: BoolArray) -> list[tuple[int, int]]:
     """Return [a, b) of the gap-free runs where the mask is True."""
     n = mask.shape[0]

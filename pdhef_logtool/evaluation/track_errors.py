@@ -21,8 +21,10 @@ _STDS = {
 
 
 def truth_speed(truth: StateTrack) -> FloatArray:
-    """Return the ground-truth speed [N] in m/s, abs v_x where v_y is not known; NaN where v_x is not."""
-    return np.where(np.isfinite(truth.vy_m_s), np.hypot(truth.vx_m_s, truth.vy_m_s), np.abs(truth.vx_m_s))
+    """Return the ground-truth speed [N] in m/s, abs v_x where v_y is not known, the measured one where v_x is not."""
+    speed = np.where(np.isfinite(truth.vy_m_s), np.hypot(truth.vx_m_s, truth.vy_m_s), np.abs(truth.vx_m_s))
+    measured = truth.measured_speed_m_s
+    return np.where(np.isfinite(speed), speed, np.abs(measured)) if len(measured) == len(speed) else speed
 
 
 def signal_error(estimate: StateTrack, truth: StateTrack, signal: str, low_speed_m_s: float) -> FloatArray:

@@ -58,10 +58,20 @@ def source_profile(log: ColumnarLog) -> str:
     return str(profiles[0]) if profiles else "ros2"
 
 
+#: Entries of channel metadata that state how messages are sent.
+_TRANSPORT = frozenset({"offered_qos_profiles", "topic_type_hash", "md5sum", "latching"})
+
+
 def register_channels(
-    writer: McapLogWriter, log: ColumnarLog, *, leave_out: Callable[[str], bool] = lambda _topic: False
+    writer: McapLogWriter,
+    log: ColumnarLog,
+    *,
+    leave_out: Callable[[str], bool] = lambda _topic: False,
+    whole_metadata: bool = True,
 ) -> SourceChannels:
     """Add every channel of a log to a writer but those whose topic is to be left out.
+
+    Without ``whole_metadata`` channels keep only the metadata that state how messages are sent.
 
     Channels that only repeat over split files become one. Channels keep their ids (those of the first file where the
     ids of split files contradict each other). A ROS 1 channel whose definition does not parse cannot be
@@ -79,6 +89,8 @@ def register_channels(
             if leave_out(channel.topic):
                 continue
             target = channel
+            if not whole_metadata and not _TRANSPORT.issuperset(channel.metadata):
+                target = replace(channel, metadata={k: v for k, v in channel.metadata.items() if k in _TRANSPORT})
             if channel.encoding == "ros1" and log.kind == "rosbag1":
                 try:
                     target, converters[(c, channel.id)], has_number = _as_ros2(channel)
@@ -88,7 +100,7 @@ def register_channels(
                     lost.append(Loss("not-converted", f"cannot become ROS 2: {error}", channel.topic))
                     continue
             elif channel.encoding == "cdr" and not channel.schema_data:
-                target = _with_definition(channel)
+                target = _with_definition(target)
             identity = (
                 target.topic,
                 target.schema_name,

@@ -186,6 +186,7 @@ def auto_map(
     _map_speed(draft, topics)
     _map_wheel_speeds(draft, topics)
     _map_truth(draft, topics, prefer_truth)
+    _map_truth_friction(draft, topics, prefer_truth)
     _map_documented_truth(draft, topics, vendors)
     unusable = ((t, vendors.of(t.type_name).left_out) for t in topics)
     draft.notes += [f"{t.name} ({t.type_name.replace('/msg/', '/')}) is left out: {why}" for t, why in unusable if why]
@@ -635,6 +636,13 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
             draft.doubt("ground-truth position", (topic.name,), None, _FIELDS["several_positions"][_type(topic)])
     velocity = _map_truth_velocity(draft, candidates)
     _map_truth_position(draft, candidates, velocity)
+
+
+def _map_truth_friction(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
+    for topic in topics:
+        path = _FIELDS["friction"].get(_type(topic), "")
+        if path and _truth_group(topic) == prefer and draft.is_given(topic.name, path):
+            draft.take(draft.truth, "friction", topic.name, path)
 
 
 def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo | None:

@@ -60,6 +60,7 @@ TRUTH_UNITS: dict[str, str] = {
     "course_rad": "rad",  # ENU: counter-clockwise from east
     "yaw_rad": "rad",  # ENU: counter-clockwise from east
     "position_std_m": "m",
+    "friction": "1",
 }
 
 #: Every quantity that a recorded estimate may consist of, with its unit. ``valid`` is 0 where it must not be used.

@@ -84,6 +84,14 @@ def step_durations_s(stamps_ns: IntArray, before_ns: int | None) -> FloatArray:
     return dt
 
 
+def last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
+    """Carry measurements [N], which are at one stamp only, forward for up to :data:`RESTART_GAP_S`."""
+    finite = np.isfinite(values)
+    last = np.maximum.accumulate(np.where(finite, np.arange(values.shape[0]), -1))
+    fresh = (last >= 0) & (stamps_ns - stamps_ns[np.maximum(last, 0)] <= RESTART_GAP_S * 1e9)
+    return np.where(fresh, values[np.maximum(last, 0)], np.nan)
+
+
 def last_stamp_ns(stamps_ns: IntArray, before_ns: int | None) -> int | None:
     """Return the last stamp of a window, or that of the window before where it is empty."""
     return int(stamps_ns[-1]) if len(stamps_ns) else before_ns

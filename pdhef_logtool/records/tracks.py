@@ -54,7 +54,7 @@ ESTIMATED_COLUMNS = TRACK_COLUMNS[-10:-4]
 #: Above this share of GNSS in its information the reference is independent of estimators that use the same IMU.
 INDEPENDENT_SHARE = 0.5
 #: Those that a source may not have at all.
-OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUMNS)
+OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUMNS, "measured_speed_m_s")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +68,8 @@ class StateTrack:
     ``mixture_weight`` (of all filters of an adaptive estimator but its first) and ``reason`` (bits of
     :mod:`pdhef_logtool.records.reasons`, what is reported of a_y and yaw rate) are [N], or of length 0 where the source
     has none; so are roll and bank, the share by which all lateral forces are larger, the biases by which sensors
-    read too much, and the shares of axle law, kinematics and GNSS in the sideslip reference.
+    read too much, and the shares of axle law, kinematics and GNSS in the sideslip reference. ``measured_speed_m_s`` of
+    the ground truth is the speed of the log's sensors; it decides where sideslip is scored if v_x is not known.
     """
 
     name: str
@@ -102,6 +103,7 @@ class StateTrack:
     share_kinematics: FloatArray = field(default_factory=lambda: np.empty(0))
     share_gnss: FloatArray = field(default_factory=lambda: np.empty(0))
     independent: FloatArray = field(default_factory=lambda: np.empty(0))
+    measured_speed_m_s: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __len__(self) -> int:
         """Return the number of stamps."""

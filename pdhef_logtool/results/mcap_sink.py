@@ -157,7 +157,10 @@ class AnnotatedMcapSink(Sink):
             return
         try:
             channels = register_channels(
-                self._writer, self._source, leave_out=lambda t: t.startswith(NAMESPACE) or t in (left_out or ())
+                self._writer,
+                self._source,
+                leave_out=lambda t: t.startswith(NAMESPACE) or t in (left_out or ()),
+                whole_metadata=self._copies_rest,
             )
         except BaseException:
             self._writer.abort()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pdhef_logtool.evaluation.track_errors import NORMAL_95
+from pdhef_logtool.evaluation.track_errors import NORMAL_95, truth_speed
 from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
@@ -25,7 +25,7 @@ def errors(track: StateTrack, truth: StateTrack | None, min_speed_m_s: float) ->
         return columns
     _, of_track, of_truth = np.intersect1d(track.stamps_ns, truth.stamps_ns, assume_unique=True, return_indices=True)
     valid = track.valid[of_track] & truth.valid[of_truth]
-    fast = np.hypot(truth.vx_m_s, truth.vy_m_s)[of_truth] >= min_speed_m_s
+    fast = truth_speed(truth)[of_truth] >= min_speed_m_s
     for name, column in ERRORS.items():
         error = np.asarray(getattr(track, column))[of_track] - getattr(truth, column)[of_truth]
         is_slip = column == "sideslip_rad"

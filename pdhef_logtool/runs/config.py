@@ -74,7 +74,8 @@ class RunConfig:
     sensors : ``full``, or ``esp`` (sensor set of the paper: the speed sensor only initialises the filters).
     sensor_profile : TOML file with ``[sensors]`` (noise, rates and limits of the sensors), or ``production``, in place
         of the car's entries, for ``run`` and ``metrics``; None = those of the car.
-    friction : ``auto`` (from the log, else the car, else estimated), ``file``, ``estimate``, or a number.
+    friction : ``auto`` (from the log, else the car, else estimated; for ``extract`` first from the ground truth),
+        ``file``, ``estimate``, or a number.
     prefer_truth : ground truth of a simulated log that has both: ``perfect`` or ``rtk``.
     window_s : length of the windows in which a log is processed, in s. Results do not depend on it.
     clock : ``arrival`` (a sample is available from its arrival on) or ``stamp`` (from its stamp on; not causal).
@@ -90,8 +91,9 @@ class RunConfig:
     reference : sideslip reference (not causal, without tyre data): ``auto`` (where the log has no ground truth of
         sideslip), ``on`` (beside ground truth as well; in ``learn`` and ``extract`` in its place) or ``off``.
     gnss : ``auto`` (``physics``, ``pd-hef`` and the reference use GNSS velocity where the log has it) or ``off``.
-    no_position : keep latitude, longitude and all other positions and headings out of the outputs; topics that may
-        contain one are not copied, and no reduced logs (``cache``) are written.
+    no_position : keep latitude, longitude and all other positions and headings out of the outputs. Topics are copied
+        if each of their fields is known not to be a position; attachments, metadata and names of log files are left
+        out, and no reduced logs (``cache``) are written.
     waived : names of checks whose failure is ignored.
     setup : setup.toml of another run of the same car and recorder, from which mounting, units, delays and clocks are
         taken; None = decided on the log.

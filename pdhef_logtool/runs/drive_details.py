@@ -41,6 +41,7 @@ def drive_details(
     signals: Signals,
     *,
     brief: bool = False,
+    metadata: bool = True,
 ) -> DriveDetails:
     """Return the details of a drive.
 
@@ -49,6 +50,7 @@ def drive_details(
     ready : the estimators that ran. main : name of the selected estimate. read : returns the track of a name.
     signals : what the estimators saw.
     brief : without innovations and error decomposition, for which estimators run once more.
+    metadata : with the metadata of the log.
     """
     truth, slow = read(TRUTH), drive.car.vehicle.low_speed_blend_m_s
     answer = read(main)
@@ -66,7 +68,7 @@ def drive_details(
         standings=[] if truth is None else standings(main, _rivals(ready, by_name[main], read), read, truth, slow),
         error_budget=no_budget(_LEFT_OUT) if brief else _budget(drive, by_name.get(PHYSICS), read, signals),
         path_drift=None if truth is None else path_drift(answer, truth),
-        metadata=_metadata(drive),
+        metadata=_metadata(drive) if metadata else {},
     )
 
 

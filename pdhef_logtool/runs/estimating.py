@@ -19,6 +19,7 @@ from pdhef_logtool.estimators.latency_compensation import WindowState, run_windo
 from pdhef_logtool.estimators.online_calibrated import OnlineBand, OnlineCalibrated
 from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.self_calibrated import SELF_CALIBRATED, CalibratedBand
+from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import DeadReckoner
 from pdhef_logtool.records.readings import without_impossible_states
 from pdhef_logtool.records.signals import Signals
@@ -56,7 +57,8 @@ def estimate_windows(
     ----------
     watched : complete ``diverged`` by the monitor of wrong branches. drawn : dead-reckon poses.
     intervals : calibrates them; None leaves them as the estimators give them.
-    causality : collects the estimators that declare themselves causal and look ahead; None does not check.
+    causality : collects the estimators that fail, or declare themselves causal and look ahead: they have no further
+        tracks. None does not check, and a failure is raised.
 
     Raises
     ------
@@ -83,7 +85,15 @@ def estimate_windows(
         tracks = []
         for estimator in estimators:
             before = states.get(estimator.name)
-            track, states[estimator.name] = run_window(estimator, signals, before, ahead, causality)
+            try:
+                if causality is not None and estimator.name in causality.failed:
+                    continue
+                track, states[estimator.name] = run_window(estimator, signals, before, ahead, causality)
+            except EstimatorError as error:
+                if causality is None:
+                    raise
+                causality.failed[estimator.name] = f"failed: {error}"
+                continue
             track = without_impossible_states(track)
             track = track if watch is None else watch.add(track, signals)
             track = track if intervals is None else intervals.add(track, signals)

@@ -8,6 +8,7 @@ and no figure is kept in memory.
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, field, replace
@@ -16,13 +17,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.estimators.table import FILTERS
-from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
+from pdhef_logtool.logs.discovery import RUN_FILE, LogInput, Logs, find_logs
 from pdhef_logtool.mapping import Mapping, mapping_of
-from pdhef_logtool.records.errors import OutputError, PdhefError, WorkerError
+from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, WorkerError
 from pdhef_logtool.records.processes import process_name
 from pdhef_logtool.records.reporter import SILENT, Reporter
+from pdhef_logtool.results.no_position import neutral_stem
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, LOGS
-from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.journal import Entry, Journal
@@ -41,7 +42,7 @@ from pdhef_logtool.runs.planning import Plan, PlannedLog, calibrate_pools, plan_
 from pdhef_logtool.runs.reporting import FleetProgress, collect, remove_part, sweep_parts, write_run_pages
 from pdhef_logtool.runs.self_calibrating import calibrate_pool
 from pdhef_logtool.runs.stored_output import StoredEnd, StoredOutput, stored_drive
-from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work, run_drive, run_on_node
+from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work, failed_outcome, log_identity, run_drive, run_on_node
 from pdhef_logtool.storage.files import writing
 from pdhef_logtool.storage.object_store import is_url
 from pdhef_logtool.storage.outputs import OutputFolder
@@ -159,6 +160,23 @@ def run_logs(
         return RunResult(fleet.plan.output, tuple(results), stored, verdicts)
 
 
+def _check_names(logs: Sequence[LogInput], output: Path, job: _Job, reporter: Reporter) -> None:
+    """Note neutral names of logs; raises UsageError if an output would replace an input, or has names of logs."""
+    job.check_places(logs, output)
+    if not job.config.no_position:
+        return
+    with suppress(OSError, ValueError):
+        if not json.loads((output / RUN_FILE).read_bytes())["config"]["no_position"]:
+            raise UsageError(
+                expected="a folder without outputs of another kind of run",
+                got="outputs of a run without --no-position, which contain names and positions",
+                where=str(output),
+                remedy="choose another folder with -o, or delete this one",
+            )
+    names = [f"{log.path.name} is {log.stem}" for log in logs[:FEW_LOGS]]
+    reporter.note(f"--no-position: outputs name a log by its SHA-256: {', '.join(names)}")
+
+
 def _given_limits(config: RunConfig) -> Limits | None:
     """Return the limits of a log that users give; None if they give none."""
     silence_s, memory_mb = config.log_timeout_s, config.max_memory_mb
@@ -169,8 +187,9 @@ def _given_limits(config: RunConfig) -> Limits | None:
 
 def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> RunResult:
     """Run one log in this process; its error is that of the run."""
-    job.check_places([log], output)
     config, car = job.config, job.cars.of_log(log)
+    log = replace(log, stem=neutral_stem(log_identity(log))) if config.no_position else log
+    _check_names([log], output, job, reporter)
     pool = calibrate_pool([log], car, job.mapping, config) if config.calibrate == "pool" else None
     with OutputFolder(output, (LOGS,)) as outputs:
         try:
@@ -225,8 +244,8 @@ def _prepare(
     if journal.damaged:
         lines = "1 line is" if journal.damaged == 1 else f"{journal.damaged} lines are"
         reporter.note(f"{JOURNAL_FILE}: {lines} damaged or of another version: the drives of these are run again")
-    planned = plan_logs(inputs, journal, twice=config.cars is not None, reporter=reporter)
-    job.check_places([p.log for p in planned], output)
+    planned = plan_logs(inputs, journal, twice=config.cars is not None, neutral=config.no_position, reporter=reporter)
+    _check_names([p.log for p in planned], output, job, reporter)
     pools = calibrate_pools(planned, job.cars, job.mapping, job.config)
     plan = Plan.of(output, journal, planned, settings_of(job.config, pools), job.cars, schedule.only)
     return _Fleet(job, plan, pools, schedule, limits, full_worst, work, reporter, stored)
@@ -381,8 +400,7 @@ class _Fleet:
         log, failure = ended.item.log, ended.failure
         last = f"; last heard: {failure.last}" if failure.last else ""
         tries = f", {failure.tries} tries" if failure.tries > 1 else ""
-        outcome = LogOutcome(log=log.stem, file=log.path.name, sha256=None, failed=f"{failure.reason}{tries}{last}")
-        return DriveEnd(outcome, None, again=True)
+        return DriveEnd(failed_outcome(log, f"{failure.reason}{tries}{last}", self.job.config), None, again=True)
 
     def _record(self, log: PlannedLog, end: DriveEnd, keep: str, *, quarantined: bool) -> None:
         """Write how a drive ended into the journal, then remove its former figures."""

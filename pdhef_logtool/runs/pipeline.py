@@ -22,6 +22,7 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.intervals import TrackCalibrator
+from pdhef_logtool.estimators.plug_ins import package_of
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, Skipped, all_specs, runnable
 from pdhef_logtool.evaluation.dependence import day_and_route, factors_of
 from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
@@ -38,9 +39,9 @@ from pdhef_logtool.records.errors import (
 )
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import POSITIONS, SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
 from pdhef_logtool.records.tracks import REFERENCE
-from pdhef_logtool.results.no_position import WithoutPosition, topics_with_position
+from pdhef_logtool.results.no_position import WithoutPosition, topics_with_position, without_names
 from pdhef_logtool.results.opened_run import (
     ESTIMATES_FILE,
     LOGS,
@@ -79,7 +80,7 @@ from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
 from pdhef_logtool.runs.selection import choose_main, choose_over_time, contradiction, default_names
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
-from pdhef_logtool.storage.documents import file_sha256, jsonable
+from pdhef_logtool.storage.documents import digest, file_sha256, jsonable
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder, check_no_input
 
@@ -337,6 +338,7 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
     with outputs.begin(log_place(drive.name), stale=STALE_FILES) as change, ExitStack() as opened:
         store = opened.enter_context(TrackStore(change.scratch / "tracks"))
         causality = CausalityCheck()
+        causality.failed |= {s.name: s.reason for s in job.skipped if s.is_error}
         signals = _estimate(drive, job.ready, intervals, store, reporter, causality)
         job = replace(job, ready=_without_failed(drive, job.ready, causality.failed))
         scored = _score(job, store, signals)
@@ -356,11 +358,13 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
         losses = merge_losses([drive.losses, *(s.lost for s in sinks), *_losses(drive, scored, causality.failed)])
         facts = _facts(job, config, main, scored, (store, signals), (intervals, causality.failed), losses)
         report = build_report(facts)
+        if config.no_position:
+            report = without_names(report, drive.path, drive.name)
         for sink in sinks:
             sink.finish(report, scored.events)
         report = _write_files(change, drive, report, facts.metrics, config.kept)
     outcome = replace(
-        outcome_of(drive, losses),
+        outcome_of(drive, losses, neutral=config.no_position),
         car=_car_facts(drive.car),
         main=None if main is None else main.name,
         algorithms={e.name: resolve(e).identity for e in job.ready},
@@ -446,11 +450,15 @@ def _facts(
         for a in (algorithms[e.name],)
     ]
     estimators += [EstimatorFacts(name, causal=False, failed=text) for name, text in failed.items()]
-    estimators += [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in job.skipped]
+    skipped = [s for s in job.skipped if not s.is_error]
+    estimators += [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in skipped]
     digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
     rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
     truth, selected, vehicle = store.read(TRUTH), store.read(main.name), job.car.vehicle
     space = operating_space(signals, truth, selected, vehicle)
+    details = drive_details(
+        drive, job.ready, main.name, store.read, signals, brief=config.kept != "full", metadata=not config.no_position
+    )
     others = [t for n in (REFERENCE, PHYSICS, *algorithms) if n != main.name and (t := store.read(n)) is not None]
     return replace(
         report_facts(drive, job.car, estimators, rows, scored.events, losses),
@@ -460,7 +468,7 @@ def _facts(
         main=main,
         space=space,
         largest_errors=[] if selected is None else largest_errors(selected, truth, others, vehicle.low_speed_blend_m_s),
-        details=drive_details(drive, job.ready, main.name, store.read, signals, brief=config.kept != "full"),
+        details=details,
         requirements=_requirements(job, main.name, scored, store, space, brief=config.kept == "metrics"),
     )
 
@@ -526,17 +534,19 @@ def _car_facts(car: Car) -> CarFacts:
     return CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, network, sensors)
 
 
-def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
-    """Return how a log that was read is recorded in run.json."""
+def outcome_of(drive: Drive, losses: Sequence[Loss], *, neutral: bool = False) -> LogOutcome:
+    """Return how a log that was read is recorded in run.json; ``neutral``: without names and metadata of its file."""
     day, route = day_and_route(drive.plan.start_ns, drive.log.metadata())
+    texts: dict[str, Any] = {"file": drive.file, "lost": lost_texts(losses)}
+    if neutral:
+        texts, route = without_names(texts, drive.path, drive.name), route and digest(route)[:SHOWN_DIGITS]
     return LogOutcome(
         log=drive.name,
-        file=drive.file,
         sha256=drive.sha256,
         signals_sha256=drive.signals_sha256,
         truth_sha256=drive.truth_sha256,
         mapping_sha256=drive.mapping.sha256,
-        lost=lost_texts(losses),
+        **texts,
         day=day,
         route=route,
     )
@@ -601,6 +611,7 @@ def _open_sinks(
     sinks: list[Sink] = []
     drive, car = job.drive, job.car
     colours = {REFERENCE: REFERENCE_COLOUR, **{s.name: s.colour for s in all_specs()}}
+    left_out = _left_out(drive, copied=config.annotation == "full") if config.no_position else None
     try:
         if config.kept != "metrics":
             causal_from_ns = _causal_from_ns(drive, job.ready)
@@ -623,7 +634,7 @@ def _open_sinks(
                 shown=first,
                 others_step_ns=None if is_named else step_ns,
                 min_speed_m_s=car.vehicle.low_speed_blend_m_s,
-                left_out=_left_out(drive) if config.no_position else None,
+                left_out=left_out,
             )
             sinks.append(annotated)
             layouts = change.file("foxglove.json"), change.file("plotjuggler.xml")
@@ -642,12 +653,11 @@ def _open_sinks(
         raise
 
 
-def _left_out(drive: Drive) -> frozenset[str]:
-    """Return the topics that ``--no-position`` keeps out of the copy, and note them."""
-    places = [s for n, s in (drive.plan.mapping.truth | drive.plan.mapping.signals).items() if n in POSITIONS]
-    topics = topics_with_position(drive.log, {s.topic for s in places})
-    if topics:
-        drive.remarks.append(f"--no-position: {', '.join(sorted(topics))} not copied, attachments and metadata neither")
+def _left_out(drive: Drive, *, copied: bool) -> frozenset[str]:
+    """Return the topics that ``--no-position`` keeps out of the copy, if there is one; note what is left out."""
+    topics = topics_with_position(drive.log, drive.plan.mapping) if copied else frozenset()
+    names = f"topics {', '.join(sorted(topics))}, " if topics else ""
+    drive.remarks.append(f"--no-position leaves out {names}attachments, metadata and file names")
     return topics
 
 
@@ -691,6 +701,9 @@ def _estimate(
     causality: CausalityCheck,
 ) -> Signals:
     """Run all estimators over the drive into the store; return the drive's signals for segments."""
+    plug_ins = ", ".join(filter(None, map(package_of, estimators)))
+    label = f"{drive.name} (plug-ins: {plug_ins})" if plug_ins else drive.name
+    reporter.progress(label, 0.0)
     for window in estimate_windows(drive, estimators, intervals=intervals, causality=causality):
         store.append_signals(window.signals)
         if window.truth is not None:
@@ -699,7 +712,7 @@ def _estimate(
             store.append_drawn(window.drawn_truth)
         for track in window.tracks:
             store.append(track, drawn=True)
-        reporter.progress(drive.name, 0.8 * window.share_done)
+        reporter.progress(label, 0.8 * window.share_done)
     reporter.progress(drive.name, 0.8)
     return store.signals()
 

@@ -14,6 +14,7 @@ from pdhef_logtool.logs.discovery import LogInput, as_taken, hash_log, with_free
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.errors import PdhefError, UsageError
 from pdhef_logtool.records.reporter import Reporter
+from pdhef_logtool.results.no_position import neutral_stem
 from pdhef_logtool.results.opened_run import REPORT_FILE
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.cars import RunCars, car_record
@@ -44,7 +45,7 @@ _NO_SETTING = frozenset(
         "intervals",
     }
 )
-_FILES = ("mapping", "msgs", "plan", "cars")
+_FILES = ("mapping", "msgs", "plan", "cars", "setup", "sensor_profile")
 _READERS = 16
 _REPEATED = "they are tried again"
 _DAMAGED = "their outputs are damaged"
@@ -60,14 +61,18 @@ class PlannedLog:
     moved: bool = False
 
 
-def plan_logs(inputs: Sequence[LogInput], journal: Journal, *, twice: bool, reporter: Reporter) -> list[PlannedLog]:
+def plan_logs(
+    inputs: Sequence[LogInput], journal: Journal, *, twice: bool, neutral: bool = False, reporter: Reporter
+) -> list[PlannedLog]:
     """Return the logs of a run with their labels, without logs of equal content unless ``twice``.
+
+    ``neutral`` labels are made from the content, not from the name.
 
     A log whose path, size and time are in the journal is not read; a new one only if another log has its size.
     """
     places = [Place.of(log) for log in inputs]
     sizes = Counter(place.bytes for place in places)
-    labels = _Labels(journal)
+    labels = _Labels(journal, neutral)
     later: list[tuple[int, str | None]] = []
     for number, (log, place) in enumerate(zip(inputs, places, strict=True)):
         label, identity = (place.is_local and journal.known(place)) or ("", None)
@@ -75,7 +80,7 @@ def plan_logs(inputs: Sequence[LogInput], journal: Journal, *, twice: bool, repo
             labels.claim(number, PlannedLog(replace(log, stem=label), place, identity))
         else:
             later.append((number, identity))
-    unknown = [n for n, identity in later if identity is None and _may_be_known(places[n], journal, sizes)]
+    unknown = [n for n, identity in later if identity is None and (neutral or _may_be_known(places[n], journal, sizes))]
     identities = dict(later) | dict(zip(unknown, _identities([inputs[n] for n in unknown]), strict=True))
     for number, identity in identities.items():
         log = inputs[number]
@@ -91,6 +96,7 @@ class _Labels:
     """Labels of logs while they are assigned: those of the journal stay with their content, else with their path."""
 
     journal: Journal
+    neutral: bool
     planned: dict[int, PlannedLog] = field(default_factory=dict)
     owner: dict[str, str] = field(default_factory=dict)
     claimed: set[str] = field(default_factory=set)
@@ -113,6 +119,7 @@ class _Labels:
                 return PlannedLog(replace(log, stem=label), place, identity, moved=True)
         if (was := self.journal.label_at(place)) is not None and was not in self.claimed:
             return PlannedLog(replace(log, stem=was), place, identity)  # another content: it is run again
+        log = replace(log, stem=neutral_stem(identity)) if self.neutral else log
         new = with_free_stem(log, self._taken)
         self._taken.add(as_taken(new.stem))
         return PlannedLog(new, place, identity)

@@ -16,6 +16,7 @@ from pdhef_logtool.logs.discovery import LogInput, identity_of
 from pdhef_logtool.mapping import Mapping, mapping_of
 from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.records.reporter import Reporter
+from pdhef_logtool.results.no_position import without_names
 from pdhef_logtool.results.opened_run import PARTS, REPORT_FILE, OpenedLog
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs.cars import RunCars, car_record
@@ -87,9 +88,16 @@ def run_drive(task: DriveTask, tell: Tell) -> DriveEnd:
     except Exception as error:  # noqa: BLE001 (one bad log never stops the others, for any error)
         expected = isinstance(error, PdhefError)
         reason = str(error) if expected else f"internal error, {type(error).__name__}: {error}"
-        outcome = LogOutcome(log=task.log.stem, file=task.log.path.name, sha256=None, failed=reason)
+        outcome = failed_outcome(task.log, reason, task.config)
         again = not expected or isinstance(error, OutputError)
         return DriveEnd(outcome, log_identity(task.log), warned=tuple(warned), again=again)
+
+
+def failed_outcome(log: LogInput, reason: str, config: RunConfig) -> LogOutcome:
+    """Return how a log that nothing came out of is recorded in run.json."""
+    texts: dict[str, Any] = {"file": log.path.name, "failed": reason}
+    texts = without_names(texts, log.path, log.stem) if config.no_position else texts
+    return LogOutcome(log=log.stem, sha256=None, **texts)
 
 
 def run_on_node(

@@ -157,7 +157,7 @@ def test_an_estimator_that_skips_samples_is_refused(signals: Signals) -> None:
         def run(self, signals: Signals, state: None) -> tuple[Steps, None]:
             return super().run(cut(signals, 0, len(signals) // 2), state)
 
-    with pytest.raises(EstimatorError, match=r"cheat: expected steps, one per sample \(401\), got 200 steps"):
+    with pytest.raises(EstimatorError, match=r"cheat .*: expected steps, one per sample \(401\), got 200 steps"):
         run_window(Sparse(past), signals)
 
 

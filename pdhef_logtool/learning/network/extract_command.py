@@ -484,7 +484,9 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         varied = vary(physics.vehicle, settings.vary, f"{settings.seed}:{source}")
         physics = replace(physics, vehicle=varied.vehicle)
         validated = drive.car.has_evidence
-        drive.friction = friction_of(plan, varied.vehicle, drive.options, varied.friction_factor, validated=validated)
+        drive.friction = friction_of(
+            plan, varied.vehicle, drive.options, varied.friction_factor, validated=validated, of_truth=True
+        )
         condition = None if settings.where is None else condition_of(settings.where)
         writer = DriveWriter(target, Picking(condition, f"{settings.seed}:{source}"), truth_source=truth["kind"])
         try:

@@ -1,0 +1,66 @@
+"""Containment of estimators of other packages: their errors, what they print, and their writes to shared data."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout, suppress
+from dataclasses import fields, replace
+from pathlib import Path
+from traceback import extract_tb
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.records.errors import EstimatorError, PdhefError
+from pdhef_logtool.records.signals import Signals
+
+_PACKAGE = __name__.partition(".")[0]
+
+
+def package_of(code: Any) -> str:
+    """Return the package that an estimator, a class or a function belongs to; empty for this one."""
+    module = getattr(code, "__module__", type(code).__module__)
+    package = str(module).partition(".")[0]
+    return "" if package == _PACKAGE else package
+
+
+@contextmanager
+def contained(name: str, package: str) -> Iterator[None]:
+    """Run code of another package, ``package``, for the estimator ``name``; code of this one (empty) runs as it is.
+
+    Its output goes to stderr, and its change of the working folder is undone.
+
+    Raises
+    ------
+    EstimatorError
+        It raised an exception, or tried to end the process.
+    """
+    if not package:
+        yield
+        return
+    folder = Path.cwd()
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    except PdhefError:
+        raise
+    except (Exception, SystemExit) as error:
+        frames = extract_tb(error.__traceback__)
+        last = next((f for f in reversed(frames) if package in f.filename), frames[-1])
+        got = f"{type(error).__name__}: {error} ({Path(last.filename).name}, line {last.lineno})"
+        raise EstimatorError(expected="an estimator that runs", got=got, where=f"{name} (plug-in {package})") from error
+    finally:
+        with suppress(OSError):
+            os.chdir(folder)
+
+
+def read_only(signals: Signals) -> Signals:
+    """Return copies of the columns that cannot be written to."""
+    copies: dict[str, Any] = {
+        f.name: np.array(getattr(signals, f.name)) for f in fields(signals) if f.name != "available"
+    }
+    for copy in copies.values():
+        copy.setflags(write=False)
+    return replace(signals, **copies)

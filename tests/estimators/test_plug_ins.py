@@ -1,0 +1,162 @@
+"""An estimator of another package that misbehaves is named, and costs nothing but its own estimates."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from reference_car import drive, slalom
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators import table
+from pdhef_logtool.estimators.base import Steps, make_steps
+from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.table import Spec, runnable
+from pdhef_logtool.records.errors import EXIT_PARTIAL, EstimatorError
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import run_logs
+
+
+@dataclass(frozen=True)
+class PlugIn:
+    """Passes the sensors on after a misbehaviour."""
+
+    algorithm = "plug-in"
+    version = 1
+
+    misbehave: Callable[[Signals, Any], Any]
+    name: str = "plug"
+    causal: bool = True
+
+    def run(self, signals: Signals, state: Any) -> Any:
+        returned = self.misbehave(signals, state)
+        return (sound(signals), 1) if returned is None else returned
+
+
+def sound(signals: Signals) -> Steps:
+    """Return the steps of a sound estimator."""
+    rate = np.array(signals.yaw_rate_rad_s)
+    return make_steps(np.full(len(rate), 20.0), 0.0 * rate, rate)
+
+
+def raise_later(_signals: Signals, state: Any) -> None:
+    if state is not None:
+        raise KeyError("boom")
+
+
+def raise_at_once(signals: Signals, _state: Any) -> None:
+    raise_later(signals, 1)
+
+
+def end_process(_signals: Signals, _state: Any) -> None:
+    sys.exit(0)
+
+
+def write_through_view(signals: Signals, _state: Any) -> None:
+    signals.rows(0, len(signals)).yaw_rate_rad_s[::2] = 0.5
+
+
+def write_by_force(signals: Signals, _state: Any) -> None:
+    signals.yaw_rate_rad_s.setflags(write=True)
+    signals.yaw_rate_rad_s[:] = 0.5
+
+
+@pytest.fixture(scope="module")
+def signals() -> Signals:
+    return drive(slalom(0.03, 0.5), 4.0, speed=22.0).signals
+
+
+@pytest.mark.parametrize(
+    ("misbehave", "got"),
+    [
+        (raise_at_once, r"expected an estimator that runs, got KeyError: 'boom' \(test_plug_ins.py, line \d+\)"),
+        (end_process, "expected an estimator that runs, got SystemExit: 0"),
+        (write_through_view, "got ValueError: assignment destination is read-only"),
+        (lambda s, _: 3, "expected a pair of steps and state, got int"),
+        (lambda s, _: (sound(s).until(7), None), r"expected steps, one per sample \(401\), got 7 steps"),
+        (lambda s, _: (None, None), r"expected steps, one per sample \(401\), got NoneType"),
+        (lambda s, _: (replace(sound(s), values=np.zeros((len(s), 3))), None), r"shape \(401, 4\), got \(401, 3\)"),
+        (lambda s, _: (replace(sound(s), rates=np.zeros((9, 4))), None), r"one per sample \(401\), got 9 steps"),
+        (lambda s, _: (replace(sound(s), values=sound(s).values.astype(object)), None), "a column of type object"),
+    ],
+)
+def test_what_a_plug_in_does_wrong_is_an_error_that_names_it(
+    misbehave: Callable[..., Any], got: str, signals: Signals
+) -> None:
+    with pytest.raises(EstimatorError, match=r"^plug \(plug-in test_plug_ins\): .*" + got):
+        run_window(PlugIn(misbehave), signals)
+
+
+def test_no_plug_in_changes_the_signals_of_others(signals: Signals) -> None:
+    before = signals.yaw_rate_rad_s.copy()
+    track, _ = run_window(PlugIn(write_by_force), signals)
+    assert np.nanmax(track.yaw_rate_rad_s) == 0.5
+    np.testing.assert_array_equal(signals.yaw_rate_rad_s, before)
+    assert signals.yaw_rate_rad_s.flags.writeable
+
+
+def test_what_a_plug_in_prints_goes_to_stderr_and_its_folder_is_left_again(
+    signals: Signals, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def prints(_signals: Signals, _state: Any) -> None:
+        print("hello")
+        os.chdir(tmp_path)
+
+    folder = Path.cwd()
+    try:
+        run_window(PlugIn(prints), signals)
+        assert Path.cwd() == folder
+    finally:
+        os.chdir(folder)
+    assert capsys.readouterr() == ("", "hello\n")
+
+
+def test_rounding_in_single_precision_is_no_looking_ahead(signals: Signals) -> None:
+    check = CausalityCheck()
+    network = PlugIn(lambda s, _: (replace(sound(s), values=sound(s).values * (1.0 + 1e-10 * len(s))), None))
+    run_window(network, signals, causality=check)
+    assert check.failed == {}
+
+
+def _spec(name: str, misbehave: Callable[[Signals, Any], Any]) -> Spec:
+    needs = frozenset({"speed_m_s", "yaw_rate_rad_s"})
+    return Spec(name, "a plug-in", lambda name, _car, _options: PlugIn(misbehave, name), needs, 0x123456)
+
+
+def test_a_plug_in_that_cannot_be_built_is_left_out_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    unbuilt = Spec("plug", "a plug-in", lambda *_: sys.exit(0), frozenset(), 0x123456)
+    monkeypatch.setattr(table, "all_specs", lambda: (*table.SPECS, unbuilt))
+    available = frozenset({"speed_m_s", "yaw_rate_rad_s"})
+    ready, (skipped,) = runnable(("zero", "plug"), Car.of(default_vehicle()), available)
+    assert [e.name for e in ready] == ["zero"]
+    assert skipped.is_error and "plug (plug-in test_plug_ins): expected an estimator that runs" in skipped.reason
+
+
+def test_a_plug_in_that_fails_costs_only_its_own_estimates(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, sample_logs_dir: Path
+) -> None:
+    specs = (*table.SPECS, _spec("late", raise_later), _spec("ends", end_process))
+    monkeypatch.setattr(table, "all_specs", lambda: specs)
+    config = RunConfig(
+        car=Path("saloon"), estimators=("zero",), keep="estimates", calibrate="off", reference="off", window_s=2.0
+    )
+    log = [str(sample_logs_dir / "dlc.mcap")]
+    run_logs(log, tmp_path / "alone", config, report=False)
+    result = run_logs(log, tmp_path / "out", replace(config, estimators=("zero", "late", "ends")), report=False)
+    assert result.exit_code == EXIT_PARTIAL
+    lost = result.results[0].outcome.lost
+    assert any("late failed" in text and "KeyError: 'boom'" in text for text in lost)
+    assert any("ends failed" in text and "SystemExit: 0" in text for text in lost)
+    rows, alone = (pl.read_parquet(tmp_path / o / "logs/dlc/estimates.parquet") for o in ("out", "alone"))
+    assert rows.filter(pl.col("estimator") == "zero").equals(alone.filter(pl.col("estimator") == "zero"))
+    assert not {"late", "ends"} & set(rows["estimator"])
