@@ -2,7 +2,7 @@
 
     python -m studies.conditions [--car CAR] [--network FOLDER] [--drives 30] [--jobs 2] [--rows NAME,...] [--render]
 
-Simulates the drives (``pdhef simulate conditions``), runs all estimators that can run, and writes the page
+Simulates the drives, runs all estimators that can run, and writes the page
 ``conditions.md`` with two figures to ``--out``, and all tables to ``--results``. ``--work`` keeps logs and rows: a
 repeated call computes the rows whose drives, car, network, settings or sources have changed. ``--render`` renders the
 page from ``--results``. The runs of the independent simulator are a row if ``../shared`` is beside the repository.

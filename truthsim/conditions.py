@@ -229,7 +229,7 @@ def write_conditions(
     OutputError : the folder or a file cannot be written.
     """
     jobs, chosen = plan_conditions(drives, seed, rows)
-    command = f"pdhef simulate conditions --drives {drives} --seed {seed}"
+    command = f"python -m studies.conditions --drives {drives} --seed {seed}"
     head = {
         "command": command if rows is None else f"{command} --rows {','.join(row.name for row in chosen)}",
         "seed": seed,

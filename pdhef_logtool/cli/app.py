@@ -26,7 +26,6 @@ from pdhef_logtool.cli import (
     stopping,
     validation,
 )
-from pdhef_logtool.cli.removed_commands import replaced_option, replacement
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, PdhefError, UsageError
 from pdhef_logtool.storage.files import OF_WRITING, cannot_write
 
@@ -123,8 +122,6 @@ def _run() -> int:
     except _WrongWord as error:
         if len(sys.argv) == 1:
             error.show()  # pdhef alone is asked for its help
-        elif message := replacement(sys.argv[1:]) or replaced_option(sys.argv[1:]):
-            console.error(f"pdhef: {message}")
         else:
             command = error.ctx.command_path if error.ctx else "pdhef"
             console.error(f"{command}: {' '.join(error.format_message().split()).rstrip('.')}; see {command} --help")

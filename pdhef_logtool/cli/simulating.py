@@ -1,4 +1,4 @@
-"""``pdhef simulate MANOEUVRE``, ``pdhef simulate suite`` and ``pdhef simulate conditions``: drives of truthsim."""
+"""``pdhef simulate MANOEUVRE`` and ``pdhef simulate suite``: drives of truthsim."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SetOutput = Annotated[Path, Option("--output", "-o", help="Output folder. Existi
     "pdhef simulate dlc --vehicle suv --fault burst20:yaw_rate:3:5 \\",
     "  --fault dropout:wheels:6:end -o faulty.mcap",
     panel=panels.TOOLS,
-    notes="""A training set: pdhef simulate suite. The drives of the condition table: pdhef simulate conditions.
+    notes="""A training set: pdhef simulate suite.
 
 Faults: KIND:WHAT:START:END in seconds (END may be end). Kinds: burst<FACTOR>, stuck, dead, flip, bias<SI>, dropout,
 delay<MS>, jump<S> (of the stamps), float, lost (the RTK's fix). What: imu, steering, wheels, rtk, all (sensors), or one
@@ -138,33 +138,6 @@ def suite(
     _tell_of_set(manifest, output, shown_keys, console.print_json if as_json else console.print_facts)
 
 
-@options.command(
-    commands,
-    "pdhef simulate conditions --drives 30 --jobs 2 -o table/",
-    "pdhef simulate conditions --rows in-domain,gyro-dead -o table/",
-    panel=panels.TOOLS,
-    notes="manifest.json contains, for each row, its drives and the settings of the estimator.",
-    name="simulate conditions",
-)
-def conditions(
-    output: SetOutput,
-    drives: Annotated[int, Option(help="Drives per row.")] = 30,
-    rows: Annotated[str | None, Option(help="Comma-separated rows. Default: all.")] = None,
-    seed: Annotated[int, Option(help="Seed of all draws.")] = 0,
-    jobs: options.Jobs = 1,
-    as_json: options.JsonFlag = False,
-) -> None:
-    """Simulate the drives of the condition table: one disturbance per row."""
-    from truthsim.conditions import write_conditions
-
-    names = None if rows is None else options.split_names(rows)
-    with console.reporter() as report:
-        manifest = write_conditions(
-            output, drives=drives, seed=seed, rows=names, processes=jobs, progress=report.progress
-        )
-    _tell_of_set(manifest, output, ("rows",), console.print_json if as_json else _print_rows)
-
-
 def _numbers(pairs: Sequence[str]) -> dict[str, float]:
     values = {}
     for pair in pairs:
@@ -181,15 +154,6 @@ def _tell_of_set(manifest: dict[str, Any], folder: Path, keys: Sequence[str], te
     for entry in manifest["drives"]:
         if "sha256" not in entry:
             console.warn(f"{entry['file']}: no drive: {entry['dropped'][-1]['reason']}")
-
-
-def _print_rows(facts: dict[str, Any]) -> None:
-    bins = list(facts["rows"][0]["drives_in_bin"])
-    table = console.table("row", "drives", *bins, "what is wrong")
-    for row in facts["rows"]:
-        counts = [str(row["drives_in_bin"][b]) for b in bins]
-        table.add_row(row["name"], str(len(row["files"])), *counts, row["description"])
-    console.stdout().print(table)
 
 
 def _list_manoeuvres(as_json: bool) -> None:

@@ -17,7 +17,6 @@ commands = typer.Typer()
 @options.command(
     commands,
     "pdhef plan init -o plan.toml",
-    "pdhef plan init --from thresholds.toml -o plan.toml",
     panel=panels.RUN,
     notes="docs/formats.md describes the entries, schemas/plan.schema.json is the JSON Schema.",
 )
@@ -25,20 +24,14 @@ def plan(
     action: Annotated[str, Argument(metavar="init", help="init: write a commented plan.")],
     *,
     output: Annotated[Path, Option("--output", "-o", metavar="FILE", help="File for the plan.")],
-    source: Annotated[
-        Path | None,
-        Option("--from", metavar="FILE", help="thresholds.toml or gate.toml of an earlier version to convert."),
-    ] = None,
 ) -> None:
     """Write a validation plan: requirements for run, metrics and compare."""
-    from pdhef_logtool.evaluation.plan_example import EXAMPLE, converted
+    from pdhef_logtool.evaluation.plan_example import EXAMPLE
     from pdhef_logtool.storage.files import write_bytes
-    from pdhef_logtool.storage.outputs import check_no_input
 
     if action != "init":
         raise UsageError(expected="init", got=action, where="pdhef plan", remedy="pdhef plan init -o plan.toml")
-    check_no_input([] if source is None else [source], [output])
     if output.exists():
         raise UsageError(expected="a new file", got="one that exists", where=str(output), remedy="choose another name")
-    write_bytes(output, (EXAMPLE if source is None else converted(source)).encode())
+    write_bytes(output, EXAMPLE.encode())
     console.say(f"{output} written; use it: pdhef run LOGS -o OUT --plan {output}")

@@ -56,11 +56,6 @@ class PairedTest:
         """Whether the 95 % bounds of the difference are below 0."""
         return self.difference.blocks >= MIN_BLOCKS and self.difference.high < 0.0
 
-    @property
-    def refuted(self) -> bool:
-        """Whether they are above 0; too few blocks for bounds, a higher error."""
-        return self.difference.low > 0.0 if self.difference.blocks >= MIN_BLOCKS else self.better is False
-
 
 def paired_test(old: Errors, new: Errors) -> PairedTest:
     """Compare errors at the same stamps [N]; much fewer of them (:data:`MIN_AVAILABILITY`) are worse."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.mat_arrays import DEEPEST, HDF5_MAT, hdf5_variables, mat5_variables
-from pdhef_logtool.logs.table_clocks import Clock, unlike_lengths
+from pdhef_logtool.logs.table_clocks import Clock
 from pdhef_logtool.logs.table_columns import Sheet, clock_notes, field_name, find_clock, tables_of, unique
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.logs.table_log import Table
@@ -54,7 +54,6 @@ def open_mat(file: TableFile) -> Tables:
             where=file.name,
             remedy="name the vector of times so",
         )
-    losses += unlike_lengths({table.name: table.stamps_ns for table in tables}, file.name)
     return Tables("mat-7.3" if hdf5 else "mat", tables, losses)
 
 

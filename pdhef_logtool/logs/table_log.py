@@ -16,6 +16,7 @@ from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, nearest
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.recording_span import RecordingSpan, survey_stamps
+from pdhef_logtool.logs.table_clocks import unlike_lengths
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray, Loss
 
@@ -86,9 +87,10 @@ class TableLog(DriveLog):
         if wrong:
             got = f"others: {', '.join(wrong)}"
             raise LogError(expected="tables of different names with ascending times", got=got, where=str(self.path))
-        self._recording_span = survey_stamps({name: t.stamps_ns for name, t in self._tables.items()}, str(self.path))
+        stamps = {name: table.stamps_ns for name, table in self._tables.items()}
+        self._recording_span = survey_stamps(stamps, str(self.path))
         cut = [Loss("truncated", file.cut, str(self.path))] if file.cut else []
-        self._lost = [*lost, *cut, *self._recording_span.losses]
+        self._lost = [*lost, *cut, *unlike_lengths(stamps, str(self.path)), *self._recording_span.losses]
         self._unreadable: set[tuple[str, str]] = set()
         self._column_losses: dict[tuple[str, str], list[Loss]] = {}
         self._size = file.path.stat().st_size

@@ -111,7 +111,6 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         samples=[s for s in report["ledger"]["samples"] if s["dropped"]][:_MOST_ROWS],
         budget=report.get("error_budget"),
         faults=report.get("faults"),
-        innovations=report.get("innovations") or (),
         metadata=report.get("metadata") or {},
         ay_note=AY_NOTE,
         over_time=OVER_TIME,

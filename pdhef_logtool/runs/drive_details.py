@@ -14,7 +14,6 @@ from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
-from pdhef_logtool.evaluation.segments import moving_mask
 from pdhef_logtool.evaluation.standing import standings
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -23,7 +22,6 @@ from pdhef_logtool.results.run_report import DriveDetails
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.runs.drive_sample import sample_drive
 from pdhef_logtool.runs.error_budget import ErrorBudget, error_budget, no_budget
-from pdhef_logtool.runs.innovations import channel_innovations
 
 #: Entries of a log's metadata that a report keeps, and signs of each.
 _MOST_METADATA, _MOST_SIGNS = 64, 200
@@ -49,7 +47,7 @@ def drive_details(
     ----------
     ready : the estimators that ran. main : name of the selected estimate. read : returns the track of a name.
     signals : what the estimators saw.
-    brief : without innovations and error decomposition, for which estimators run once more.
+    brief : without error decomposition, for which estimators run once more.
     metadata : with the metadata of the log.
     """
     truth, slow = read(TRUTH), drive.car.vehicle.low_speed_blend_m_s
@@ -57,14 +55,8 @@ def drive_details(
     assert answer is not None
     by_name = {e.name: e for e in ready}
     asked = [by_name[n] for n in dict.fromkeys((main, PHYSICS)) if n in by_name]
-    sample = (
-        None
-        if brief
-        else sample_drive(signals, None, np.where(moving_mask(signals, truth, drive.car.vehicle), 1.0, np.nan))
-    )
     return DriveDetails(
         faults=next((f for e in asked if (f := _faults(read, e.name)) is not None), None),
-        innovations=[] if sample is None else channel_innovations(asked, sample),
         standings=[] if truth is None else standings(main, _rivals(ready, by_name[main], read), read, truth, slow),
         error_budget=no_budget(_LEFT_OUT) if brief else _budget(drive, by_name.get(PHYSICS), read, signals),
         path_drift=None if truth is None else path_drift(answer, truth),

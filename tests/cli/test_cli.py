@@ -12,14 +12,13 @@ from typing import Any
 
 import pytest
 
-from pdhef_logtool.cli.removed_commands import REMOVED
 from pdhef_logtool.storage.documents import seal
 from tests.command_line import called
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = (
     *("inspect", "map", "convert", "plan", "run", "metrics", "report", "compare", "events", "view"),
-    *("simulate", "simulate suite", "simulate conditions"),
+    *("simulate", "simulate suite"),
     *("learn", "extract", "train", "compile"),
 )
 
@@ -135,7 +134,6 @@ def test_what_is_no_log_is_one_line_and_exit_code_1(tmp_path: Path, content: byt
         "run NONE.mcap -o OUT", "inspect NONE.mcap", "metrics NONE.mcap --estimate /x --car saloon", "report NONE",
         "compare NONE NONE", "events NONE --where valid", "view NONE", "learn NONE.mcap --car saloon -o OUT",
         "train NONE -o OUT", "run LOG -o OUT --plan NONE", "run LOG -o OUT --setup NONE",
-        "plan init --from NONE -o OUT",
     ],
 )  # fmt: skip
 def test_a_missing_file_is_one_line_and_exit_code_2(sample_logs_dir: Path, tmp_path: Path, arguments: str) -> None:
@@ -144,15 +142,6 @@ def test_a_missing_file_is_one_line_and_exit_code_2(sample_logs_dir: Path, tmp_p
     result = called(*words)
     assert result.returncode == 2, result.stderr
     assert "none" in _one_line_error(result)
-
-
-@pytest.mark.parametrize(
-    "words", [("run", "x", "-o", "y", "--thresholds", "t.toml"), ("compare", "a", "b", "--gate", "g")]
-)
-def test_an_option_that_plans_replaced_is_answered_with_the_plan(words: tuple[str, ...]) -> None:
-    result = called(*words)
-    assert result.returncode == 2
-    assert "was replaced by --plan; convert the file: pdhef plan init --from FILE" in _one_line_error(result)
 
 
 def test_a_plan_is_written_once(tmp_path: Path) -> None:
@@ -201,15 +190,6 @@ def test_misspelt_words_are_one_line_and_exit_code_2(arguments: tuple[str, ...],
     assert result.returncode == 2
     assert said in _one_line_error(result)
     assert result.stdout == ""
-
-
-@pytest.mark.parametrize("command", sorted(REMOVED.keys() - set(COMMANDS)))
-def test_removed_commands_name_the_one_that_does_their_work(command: str) -> None:
-    for words in ((command,), (command, "x", "-o", "y"), (command, "--help")):
-        result = called(*words)
-        assert result.returncode == 2
-        assert result.stdout == ""
-        assert _one_line_error(result) == f"pdhef: '{command}' was removed; use: {REMOVED[command]}"
 
 
 def test_bare_command_shows_its_help() -> None:

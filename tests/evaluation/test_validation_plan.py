@@ -12,7 +12,7 @@ from typing import Any
 import jsonschema
 import pytest
 
-from pdhef_logtool.evaluation.plan_example import EXAMPLE, converted
+from pdhef_logtool.evaluation.plan_example import EXAMPLE
 from pdhef_logtool.evaluation.validation_plan import PlanTable, default_plan, load_plan, plan_from_dict
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.results.arrow_schema import load_schema
@@ -86,28 +86,3 @@ def test_ids_are_unique_and_a_missing_file_is_a_usage_error(tmp_path: Path) -> N
         read(WHOLE, WHOLE)
     with pytest.raises(UsageError, match=r"pdhef plan init -o plan\.toml writes an example"):
         load_plan(tmp_path / "none.toml")
-
-
-def test_earlier_files_are_converted(tmp_path: Path) -> None:
-    old = tmp_path / "old.toml"
-    old.write_text(
-        '[[threshold]]\nsignal = "sideslip_rad"\nmetric = "rmse"\nmax = 0.5\nunit = "deg"\n'
-        '[[threshold]]\nsignal = "sideslip_rad"\nmetric = "max_abs"\nmax = 0.1\nestimator = "pd-hef"\n'
-        'segment = "linear"\n'
-        '[[threshold]]\nsignal = "sideslip_rad"\nmetric = "coverage95"\nmin = 90\nunit = "%"\n'
-        '[[threshold]]\nsignal = "sideslip_rad"\nmetric = "rmse"\nmin = 0.5\n'
-        '[[figure]]\nmax_regression = "5%"\n[[figure]]\nmetric = "max_abs"\nmax_regression = 0.1\n'
-    )
-    text = converted(old)
-    assert "# threshold 4 has no counterpart (a plan has no max for rmse" in text.replace("no min", "no max")
-    plan = plan_from_dict(tomllib.loads(text), where="converted")
-    assert [r.label for r in plan.requirements] == [
-        "sideslip RMSE ≤ 0.5°",
-        "sideslip max ≤ 5.73° (linear, worst drive, pd-hef)",
-        "sideslip in 95 % CI ≥ 90 %",
-        "sideslip RMSE ≤ 1.05 × run A",
-        "sideslip max ≤ 1.1 × run A (worst drive)",
-    ]
-    old.write_text("[mapping]\n")
-    with pytest.raises(UsageError, match=r"\[\[threshold\]\] or \[\[figure\]\] tables, got mapping"):
-        converted(old)

@@ -234,18 +234,16 @@ def test_the_path_is_aligned_and_its_drift_is_stated(tmp_path):
     assert labels[0] == "truth" and all("°" in label for label in labels[1:])
 
 
-def test_budget_faults_and_innovations_are_shown_where_a_report_has_them(tmp_path):
+def test_budget_and_faults_are_shown_where_a_report_has_them(tmp_path):
     moved = [{"name": "friction", "unit": "1", "value": -0.12}]
     budget = {"reason": "", "seconds": 60.0, "rmse_rad": 0.01, "causes": [
         {"name": "tyres", "rmse_left_rad": 0.004, "moved": moved, "reason": ""},
         {"name": "delay", "rmse_left_rad": None, "moved": [], "reason": "not excited"}]}  # fmt: skip
     faults = [{"sensor": "ay_m_s2", "kind": "stuck", "count": 1, "seconds": 2.0,
                "intervals": [{"start_ns": START_NS + 10**9, "end_ns": START_NS + 3 * 10**9}]}]  # fmt: skip
-    innovations = [{"estimator": "physics", "channel": "ay_m_s2", "unit": "m/s^2", "n": 9, "mean": 0.1, "rms": 0.2,
-                    "autocorrelation": None}]  # fmt: skip
-    changes = {"error_budget": budget, "faults": faults, "innovations": innovations}
+    changes = {"error_budget": budget, "faults": faults}
     text = words(page_of(write_run(tmp_path, drive_tracks(), **changes)))
-    for said in ("tyres 0.229° 60.0%", "not excited", "ay_m_s2 stuck 1 2.00", "physics ay_m_s2 0.1 0.2"):
+    for said in ("tyres 0.229° 60.0%", "not excited", "ay_m_s2 stuck 1 2.00"):
         assert said in text
 
 

@@ -18,7 +18,6 @@ from pdhef_logtool.evaluation.standing import Standing
 from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.results.run_report import DriveDetails, TruthFacts, tool_versions
 from pdhef_logtool.runs.error_budget import no_budget
-from pdhef_logtool.runs.innovations import ChannelInnovations
 
 NAN = float("nan")
 METRICS = errors_deg(pd_hef=0.1, physics=0.12, zero=1.0)
@@ -35,7 +34,7 @@ def standing(difference: Interval | None, rival: str | None = "physics", own: In
 
 
 def details(*standings: Standing, **changes: Any) -> DriveDetails:
-    empty = DriveDetails([], [], standings, no_budget("the log contains no ground truth"), {})
+    empty = DriveDetails([], standings, no_budget("the log contains no ground truth"), {})
     return replace(empty, **changes)
 
 
@@ -98,10 +97,8 @@ def test_a_truth_that_never_slips_gives_no_verdict() -> None:
 
 def test_the_other_details_follow_the_schema_and_an_older_report_does_without() -> None:
     fault = SensorFault("ay_m_s2", "spike", 70, 1.0, (Span(1, 2),))
-    channel = ChannelInnovations("physics", "ay_m_s2", "m/s^2", 5, 0.1, 0.2, NAN)
-    found = details(faults=[fault], innovations=[channel], metadata={"vehicle": "a"})
+    found = details(faults=[fault], metadata={"vehicle": "a"})
     document = valid(details=found, space=OperatingSpace([Cell(3, 2, 1.5, 0, NAN)], 0.9))
-    assert document["innovations"][0]["autocorrelation"] is None
     assert document["operating_space"]["cells"][0]["sideslip_mse_rad2"] is None
     assert valid(details=details(faults=None))["faults"] is None
     assert "verdicts" not in valid()
