@@ -139,11 +139,6 @@ def number_clock(values: NDArray[Any], unit: str = "", name: str = "times", othe
     return clock if epoch else _of_gps(clock, name, others)
 
 
-def number_stamps(values: FloatArray, unit: str = "") -> IntArray:
-    """Return the times of numbers [N] as :class:`Clock` has them."""
-    return number_clock(values, unit).stamps_ns
-
-
 def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock]) -> tuple[int, int, str]:
     """Return ns of a unit, the units from an epoch to 1970, and the assumption, from finite values and the unit."""
     middle = float(np.median(values)) if len(values) else 0.0

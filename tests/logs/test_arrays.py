@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from contextlib import closing
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from scipy.io import savemat
 from scipy.sparse import eye_array
 
 from pdhef_logtool.logs.mat_log import open_mat
+from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.parquet_log import open_parquet
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.logs.table_file import TableFile, Tables
@@ -201,13 +203,15 @@ def test_any_damage_of_a_mat_file_is_a_loss_or_one_line(changes: list[tuple[int,
     )
 
 
-def test_clocks_of_one_mat_file_share_a_unit_and_unlike_lengths_are_a_loss() -> None:
+def test_clocks_of_one_mat_file_share_a_unit_and_unlike_lengths_are_a_loss(tmp_path: Path) -> None:
     slow = {"time": np.arange(4) * 10.0, "x": AY[:4]}
     one = open_mat(_file(_mat({"imu": {"time": np.arange(1800) * 0.02, "x": np.ones(1800)}, "gnss": slow})))
     assert [int(np.ptp(t.stamps_ns)) // 10**9 for t in one.tables] == [35, 30]
     fast = {"time_ms": np.arange(100) * 0.01, "x": AY[:100]}
-    two = open_mat(_file(_mat({"imu": {"time": np.arange(1800) * 0.02, "x": np.ones(1800)}, "gnss": fast})))
-    assert [loss.kind for loss in two.losses] == ["clock-lengths"]
+    path = tmp_path / "two.mat"
+    path.write_bytes(_mat({"imu": {"time": np.arange(1800) * 0.02, "x": np.ones(1800)}, "gnss": fast}))
+    with closing(open_log(path)) as two:
+        assert [loss.kind for loss in two.lost] == ["clock-lengths"]
 
 
 def test_a_vector_beside_several_clocks_of_its_length_is_named() -> None:
