@@ -16,6 +16,7 @@ from pdhef_logtool.logs.table_clocks import (
     RELATIVE_NS,
     TIME_UNITS_NS,
     ascending_rows,
+    number_clock,
     text_clock,
     unlike_lengths,
     week_clock,
