@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
@@ -134,8 +134,11 @@ def suite(
             processes=jobs,
             progress=report.progress,
         )
-    shown_keys = ("splits", "written", "dropped_draws")
-    _tell_of_set(manifest, output, shown_keys, console.print_json if as_json else console.print_facts)
+    facts = {key: manifest[key] for key in ("command", "splits", "written", "dropped_draws")}
+    (console.print_json if as_json else console.print_facts)({"output": str(output), **facts})
+    for entry in manifest["drives"]:
+        if "sha256" not in entry:
+            console.warn(f"{entry['file']}: no drive: {entry['dropped'][-1]['reason']}")
 
 
 def _numbers(pairs: Sequence[str]) -> dict[str, float]:
@@ -147,13 +150,6 @@ def _numbers(pairs: Sequence[str]) -> dict[str, float]:
         except ValueError:
             raise UsageError(expected="NAME=NUMBER", got=repr(pair), where="--sensor") from None
     return values
-
-
-def _tell_of_set(manifest: dict[str, Any], folder: Path, keys: Sequence[str], tell: Callable[[Any], None]) -> None:
-    tell({"output": str(folder), **{key: manifest[key] for key in ("command", *keys)}})
-    for entry in manifest["drives"]:
-        if "sha256" not in entry:
-            console.warn(f"{entry['file']}: no drive: {entry['dropped'][-1]['reason']}")
 
 
 def _list_manoeuvres(as_json: bool) -> None:

@@ -339,10 +339,6 @@ class ColumnarLog(DriveLog):
         times = {topic: _Plan((), {}) for topic in stamps if topic not in plans}
         return self._collect(plans | times, start_ns, end_ns)
 
-    def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
-        """Read only log and publish times of every topic."""
-        return self._collect({t.name: _Plan((), {}) for t in self.topics}, start_ns, end_ns)
-
     def close(self) -> None:
         """Release the files."""
         self._kept.clear()

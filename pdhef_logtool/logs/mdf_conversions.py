@@ -1,6 +1,7 @@
 """Conversions of MDF channels from raw to physical values; a formula of a file is parsed, never run as code.
 
-``block`` is a conversion block as ``asammdf`` has parsed it. Source: ASAM MDF 4.2 and MDF 3.3, CCBLOCK.
+``block`` is a conversion block as ``asammdf`` has parsed it. Source: ASAM MDF 4.2 and MDF 3.3, CCBLOCK. The
+exponential and logarithmic types of MDF 3 are not supported, as readers disagree on which is which.
 """
 
 from __future__ import annotations
@@ -37,9 +38,6 @@ _FORMULAS = {
     (3, 0): _LINEAR, (3, 9): _RATIONAL, (3, 10): "{0.formula}", (3, 11): "x", (3, 65535): "x",
     (3, 6): "({0.P2}-{0.P4}*(x-{0.P5}-{0.P6}))/({0.P3}*(x-{0.P5}-{0.P6})-{0.P1})",
 }  # fmt: skip
-#: Exponential and logarithmic conversions without P4, and without P1.
-_WITHOUT_P4 = "{1}(((x-{0.P7})*{0.P6}-{0.P3})/{0.P1})/{0.P2}"
-_WITHOUT_P1 = "{1}(({0.P3}/(x-{0.P7})-{0.P6})/{0.P4})/{0.P5}"
 
 
 def conversion_rule(block: Any, version: int) -> Rule:
@@ -51,9 +49,6 @@ def conversion_rule(block: Any, version: int) -> Rule:
         if kind in _FORMULAS:
             return formula_rule(_FORMULAS[kind].format(block))
         match kind:
-            case (3, 7 | 8) if (block.P1 == 0.0) != (block.P4 == 0.0):
-                formula = _WITHOUT_P4 if block.P4 == 0.0 else _WITHOUT_P1
-                return formula_rule(formula.format(block, "exp" if kind[1] == 7 else "log"))
             case (4, 4 | 5) | (3, 1 | 2):
                 return _table(block, interpolates=kind[1] in (1, 4))
             case (4, 6):

@@ -109,7 +109,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 def _read_everything(path: Path) -> tuple[int, bool]:
     log = open_log(path)
     try:
-        count = sum(len(c) for c in log.read_stamps().values())
+        count = sum(len(c) for c in log.read({}, stamps=[t.name for t in log.topics]).values())
         for topic in log.topics:
             log.read({topic.name: numeric_paths(log, topic.name)})
         return count, bool(log.lost)
@@ -154,7 +154,7 @@ def test_every_byte_ends_somewhere_and_no_message_is_missing_in_silence(
         log = open_log(path)
     except PdhefError:
         return
-    count = sum(len(c) for c in log.read_stamps().values())
+    count = sum(len(c) for c in log.read({}, stamps=[t.name for t in log.topics]).values())
     (ledger,) = log.byte_ledgers
     claimed, lost = sum(t.messages for t in log.topics), any(loss.severity == "lost" for loss in log.lost)
     log.close()
@@ -182,11 +182,11 @@ def test_what_was_not_asked_for_is_unwanted(tmp_path: Path) -> None:
     (before,) = log.byte_ledgers
     spans = log.containers[0].spans  # type: ignore[attr-defined]
     extents = [log.containers[0].extent(span) for span in spans]  # type: ignore[attr-defined]
-    log.read_stamps(T0, T0 + 10)
+    log.read({}, T0, T0 + 10, stamps=[t.name for t in log.topics])
     (after,) = log.byte_ledgers
     begun = [end - at for span, (at, end) in zip(spans, extents, strict=True) if span.start_ns < T0 + 10]
     assert after.decoded - before.decoded == before.unwanted - after.unwanted == sum(begun) > 0
-    log.read_stamps()
+    log.read({}, stamps=[t.name for t in log.topics])
     (whole,) = log.byte_ledgers
     assert whole.decoded - before.decoded == sum(end - at for at, end in extents)
     assert whole.unwanted > 5000
@@ -300,6 +300,6 @@ def test_a_chunk_whose_index_is_cut_gives_all_its_topics(tmp_path: Path) -> None
     second_index = sorted(chunk.message_index_offsets.values())[1]
     path.write_bytes(path.read_bytes()[: second_index + 20])
     log = open_log(path)
-    assert {t: len(c) for t, c in log.read_stamps().items()} == {"/a": N, "/b": N}
+    assert {t: len(c) for t, c in log.read({}, stamps=[t.name for t in log.topics]).items()} == {"/a": N, "/b": N}
     assert [loss.kind for loss in log.lost] == ["truncated"]
     log.close()

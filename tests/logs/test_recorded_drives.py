@@ -120,7 +120,7 @@ def test_a_flipped_byte_costs_its_chunk_and_says_which_interval(shared_dir: Path
     log = open_log(shared_dir / FAULTY / name)
     good = open_log(shared_dir / REVS)
     fields = {"/imu/data": ["angular_velocity.z"]}
-    counts = {topic: len(columns) for topic, columns in log.read_stamps().items()}
+    counts = {topic: len(columns) for topic, columns in log.read({}, stamps=[t.name for t in log.topics]).items()}
     assert counts == facts["messages_in_the_other_chunks"]
     (loss,) = log.lost
     first, last = facts["chunk_log_time_ns"]
@@ -139,7 +139,7 @@ def test_a_truncated_log_gives_its_complete_chunks(shared_dir: Path) -> None:
     facts = json.loads((shared_dir / FAULTY / "faults.json").read_text())["revs_250lm_a_truncated60.mcap"]
     log = open_log(shared_dir / FAULTY / "revs_250lm_a_truncated60.mcap")
     good = open_log(shared_dir / REVS)
-    counts = {topic: len(columns) for topic, columns in log.read_stamps().items()}
+    counts = {topic: len(columns) for topic, columns in log.read({}, stamps=[t.name for t in log.topics]).items()}
     assert counts == facts["messages_in_complete_chunks"]
     (loss,) = log.lost
     assert (loss.kind, loss.severity) == ("truncated", "lost")
@@ -169,7 +169,7 @@ def test_a_split_folder_is_one_log(shared_dir: Path) -> None:
 
 def test_bursts_out_of_order_come_in_log_time_order(shared_dir: Path) -> None:
     log = open_log(shared_dir / FAULTY / "revs_250lm_a_disorder.mcap")
-    columns = log.read_stamps()
+    columns = log.read({}, stamps=[t.name for t in log.topics])
     assert sum(len(c) for c in columns.values()) == 117_010
     assert all(np.all(np.diff(c.log_time_ns) >= 0) for c in columns.values())
     assert log.lost == ()
