@@ -537,7 +537,7 @@ class _Source:
     def column(self, name: str) -> FloatArray:
         """Return a channel at the base stamps, [N] or [N, k]; NaN where it has a gap."""
         channel = self._channels.get(name)
-        if channel is None:
+        if channel is None or name not in self.plan.max_gap_s:
             n, k = self.stamps_ns.shape[0], VECTOR_COLUMNS.get(name, 1)
             return np.full((n, k) if k > 1 else n, np.nan)
         bracket = Bracket(channel.stamps_ns, self.stamps_ns, round(self.plan.max_gap_s[name] * 1e9))

@@ -142,7 +142,6 @@ def test_failed_gate_wins_over_lost_input_and_both_are_said(sample_logs_dir: Pat
         ((), 2, "--estimate"),
         ((*ESTIMATE, "--junit", "gate.xml"), 2, "--plan"),
         ((*ESTIMATE, "--plan", "none.toml"), 2, "none.toml"),
-        ((*ESTIMATE, "--thresholds", "none.toml"), 2, "--thresholds was replaced by --plan"),
         ((*ESTIMATE, "--start", "900"), 2, "--start"),
     ],
 )

@@ -45,15 +45,6 @@ def test_a_suite_and_each_of_its_commands(tmp_path: Path) -> None:
     assert hashlib.sha256((tmp_path / "x.mcap").read_bytes()).hexdigest() == entry["sha256"]
 
 
-def test_rows_of_the_condition_table(tmp_path: Path) -> None:
-    made = called(
-        *("simulate", "conditions", "-o", str(tmp_path), "--drives", "1", "--rows", "gyro-dead,friction-unknown")
-    )
-    assert made.returncode == 0, made.stderr
-    assert "gyro-dead" in made.stdout and "friction not given" in made.stdout
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["gyro-dead", "in-domain", "manifest.json"]
-
-
 def test_the_fix_quality_gates_the_rtk_truth(tmp_path: Path) -> None:
     log, mapping, out = tmp_path / "gap.mcap", tmp_path / "mapping.toml", tmp_path / "out"
     made = called("simulate", "step-steer", "--fault", "lost:rtk:2:4", "-o", str(log))
@@ -74,14 +65,13 @@ def test_all_manoeuvres_are_listed_and_the_help_tells_of_faults() -> None:
     listed = json.loads(called("simulate", "--list", "--json").stdout)["manoeuvres"]
     assert [row["name"] for row in listed] == list(MANOEUVRES)
     text = called("simulate", "--help").stdout
-    assert "KIND:WHAT:START:END" in text and "--keep-spins" in text and "suite" in text and "conditions" in text
+    assert "KIND:WHAT:START:END" in text and "--keep-spins" in text and "suite" in text
 
 
 @pytest.mark.parametrize(
     ("command", "own"),
     [
         ("suite", {"--output", "--count", "--seed", "--duration", "--vehicles", "--jobs", "--json", "--help"}),
-        ("conditions", {"--output", "--drives", "--rows", "--seed", "--jobs", "--json", "--help"}),
     ],
 )
 def test_sets_have_a_help_of_their_own(command: str, own: set[str]) -> None:
@@ -115,10 +105,8 @@ def test_a_file_may_be_called_as_a_set(tmp_path: Path) -> None:
     ("arguments", "code", "words"),
     [
         (("suite", "--mu", "0.5"), 2, ("--mu", "suite")),
-        (("conditions", "--count", "5"), 2, ("--count", "conditions")),
         (("dlc", "--jobs", "2"), 2, ("--jobs", "pdhef simulate: No such option")),
         (("suite", "--count", "0"), 2, ("count 0",)),
-        (("conditions", "--rows", "hail"), 2, ("hail", "in-domain")),
         (("dlc", "--sensor", "jitter_s"), 2, ("NAME=NUMBER",)),
         (("dlc", "--sensor", "gps=1"), 2, ("gps", "jitter_s")),
         (("dlc", "--fault", "nonsense"), 2, ("--fault", "KIND:WHAT:START:END", "nonsense")),

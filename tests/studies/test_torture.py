@@ -133,7 +133,7 @@ def test_what_outlives_a_command_or_its_limit_is_ended(
         return subprocess.Popen(["sh", "-c", script], start_new_session=True, **options)  # type: ignore[call-overload,no-any-return]
 
     monkeypatch.setattr(outside, "start", shell)
-    monkeypatch.setattr(outside, "END_S", 0.5)
+    monkeypatch.setattr(outside, "END_S", 0.5 if left else 60.0)
     process = outside.measured(limit_s=1.0 if late else 600.0)
     assert (process.late, process.left, process.code) == (late, left, -signal.SIGKILL if late else 3)
 
