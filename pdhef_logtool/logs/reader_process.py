@@ -241,8 +241,7 @@ def serve_tables(channel: socket.socket) -> None:
                     number, path, start, stop = arguments
                     head, arrays = {}, [np.asarray(tables.tables[number].load(path, slice(start, stop)))]
             except MemoryError:
-                error = _over("memory", f"{order.more_bytes / 1e6:.0f} MB", order.name)
-                head, arrays = _failure(error), []
+                head, arrays = _failure(_over("memory", f"{order.more_bytes / 1e6:.0f} MB", order.name)), []
             except Exception as error:  # noqa: BLE001  any error of a library
                 head, arrays = _failure(error), []
             _reply(channel, head, arrays)

@@ -89,8 +89,7 @@ class TableLog(DriveLog):
             raise LogError(expected="tables of different names with ascending times", got=got, where=str(self.path))
         stamps = {name: table.stamps_ns for name, table in self._tables.items()}
         self._recording_span = survey_stamps(stamps, str(self.path))
-        start, end = self.start_ns, self.end_ns
-        inside = {name: times[(times >= start) & (times < end)] for name, times in stamps.items()}
+        inside = {n: s[slice(*np.searchsorted(s, (self.start_ns, self.end_ns)))] for n, s in stamps.items()}
         cut = [Loss("truncated", file.cut, str(self.path))] if file.cut else []
         self._lost = [*lost, *cut, *unlike_lengths(inside, str(self.path)), *self._recording_span.losses]
         self._unreadable: set[tuple[str, str]] = set()
