@@ -82,14 +82,18 @@ def test_a_column_that_ends_its_reader_is_a_loss_and_the_others_are_read(tmp_pat
     assert "a block of it is damaged" in log.lost[1].what
 
 
-def test_a_reader_is_silent_and_its_folder_is_removed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_reader_is_silent_and_its_folder_is_removed(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     open_log(_file(tmp_path, "print")).close()
-    before = set(Path(tempfile.gettempdir()).glob("pdhef-*"))
     log = open_log(_file(tmp_path, "leave"))
     assert log.read({"t": ["good"]})["t"].fields["good"][0] == 2  # the folder had this file, and its output
+    assert len(list(temporary.glob("pdhef-*/left_behind"))) == 1
     log.close()
-    assert set(Path(tempfile.gettempdir()).glob("pdhef-*")) <= before
-    assert not (tmp_path / "left_behind").exists()
+    assert not list(temporary.iterdir())
     assert capfd.readouterr() == ("", "")
 
 
