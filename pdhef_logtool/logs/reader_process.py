@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.container import SpanDamageError, describe_damage
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.resource_limits import LimitError, ResourceLimits
+from pdhef_logtool.logs.resource_limits import RAISE_LIMIT, LimitError, ResourceLimits
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.records.errors import LogError, PdhefError, UsageError
@@ -43,7 +43,6 @@ from pdhef_logtool.workers.confinement import allow_processor_time, confine
 from pdhef_logtool.workers.fork_server import exactly, receive, send
 from pdhef_logtool.workers.supervisor import ForkServer, can_fork
 
-_SERVE = f"{__name__}:serve_tables"
 _HEAD = struct.Struct("<q")
 _ERRORS: Mapping[str, type[PdhefError]] = {e.__name__: e for e in (LogError, LimitError, UsageError)}
 #: Timeout of a request: the allowed processor time by this factor, and a constant part.
@@ -150,7 +149,7 @@ class _Session:
         ours, theirs = socket.socketpair()
         with ExitStack() as resources, self._file.path.open("rb") as stream:
             folder = resources.enter_context(scratch_folder())
-            send(ours, _SERVE)
+            send(ours, f"{__name__}:serve_tables")
             with theirs:
                 server.fork(next(_numbers), theirs)
             socket.send_fds(ours, [b"f"], [stream.fileno()])
@@ -260,8 +259,9 @@ def _failure(error: Exception) -> dict[str, Any]:
 
 
 def _over(what: str, most: str, where: str) -> LimitError:
-    remedy = "if the recording is sound, raise the limit with --set budget=FACTOR"
-    return LimitError(expected=f"a file that is read with {most} of {what}", got="more", where=where, remedy=remedy)
+    return LimitError(
+        expected=f"a file that is read with {most} of {what}", got="more", where=where, remedy=RAISE_LIMIT
+    )
 
 
 def _reply(channel: socket.socket, head: dict[str, Any], arrays: Sequence[NDArray[Any]]) -> None:

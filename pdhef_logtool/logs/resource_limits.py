@@ -13,7 +13,8 @@ from dataclasses import dataclass, fields
 
 from pdhef_logtool.records.errors import LogError
 
-_OPTION = "--set budget=FACTOR"
+#: Remedy of an exceeded limit.
+RAISE_LIMIT = "if the recording is sound, raise the limit with --set budget=FACTOR"
 _MIB = 1 << 20
 _FEW_MESSAGES = 1 << 16
 
@@ -68,7 +69,7 @@ class ResourceLimits:
                 expected=f"at most {allowed:.10g} {limit.replace('_', ' ')}",
                 got=f"{amount:.10g}",
                 where=what,
-                remedy=f"if the recording is sound, raise the limit with {_OPTION}",
+                remedy=RAISE_LIMIT,
             )
 
     def check_unpacked(self, size: int, stored: int, what: str) -> None:
@@ -119,7 +120,7 @@ class Meter:
                 expected="a log that is read in time",
                 got=f"reading took longer than {self.allowed_s:.3g} s",
                 where=f"{self._bytes} bytes read",
-                remedy=f"if the recording is sound, raise the limit with {_OPTION}",
+                remedy=RAISE_LIMIT,
             )
 
     @contextmanager
