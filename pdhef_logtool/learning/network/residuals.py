@@ -28,7 +28,7 @@ import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.drive.windows import DriveWindow
+from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.corrected import CorrectedPhysics, CorrectedState
 from pdhef_logtool.estimators.filter_base import U_AX, U_FRICTION, U_STEER, FilterState, HeldInputs, PosteriorSteps
 from pdhef_logtool.estimators.parallel_physics import run_features
@@ -305,7 +305,7 @@ class _Steps(StepColumns):
 
 
 def residual_windows(
-    windows: Iterable[DriveWindow],
+    windows: Iterable[WholeDrive],
     physics: PhysicsFilter | PhysicsUkf,
     *,
     period_s: float,
@@ -383,7 +383,7 @@ def residual_windows(
 
 
 def _steps_of(
-    window: DriveWindow,
+    window: WholeDrive,
     features: FloatArray,
     filtered: PosteriorSteps,
     segment: IntArray,
@@ -419,14 +419,14 @@ def _complete(values: FloatArray) -> BoolArray:
     return np.asarray(np.isfinite(values).all(axis=1), dtype=np.bool_)
 
 
-def _truth_std(window: DriveWindow, state: FloatArray, std_m_s: float) -> FloatArray:
+def _truth_std(window: WholeDrive, state: FloatArray, std_m_s: float) -> FloatArray:
     """Return the 1-sigma of the true sideslip [N] in rad: that of the ground truth's track, else of its v_y."""
     of_noise = std_m_s / np.maximum(np.abs(state[:, 0]), 1.0)
     of_track = of_noise if window.truth is None else window.truth.sideslip_std_rad
     return np.where(np.isfinite(of_track), of_track, of_noise)
 
 
-def _true_state(window: DriveWindow) -> FloatArray:
+def _true_state(window: WholeDrive) -> FloatArray:
     truth = window.truth
     if truth is None:
         return np.full((len(window.signals), 3), np.nan)
