@@ -64,7 +64,7 @@ def banded(car: Car, *windows: Signals, name: str = "physics") -> tuple[list[Sta
     for window in windows:
         track, carry = run_window(estimator, window, carry)
         plain.append(track)
-        wide.append(applied.add(track, window))
+        wide.append(applied.apply(track, window))
     return plain, wide
 
 
@@ -125,7 +125,7 @@ def test_only_what_runs_on_physics_has_it_and_it_is_told(signals: Signals) -> No
         estimator = make_estimator(name, car)
         applied = calibrator(car, [estimator])
         track, _ = run_window(estimator, signals, None)
-        assert (applied.add(track, signals) is track) == (name == "phy-ukf")
+        assert (applied.apply(track, signals) is track) == (name == "phy-ukf")
         assert applied.notes(name) == (note,)
 
 
@@ -136,7 +136,7 @@ def test_calibrated_intervals_come_first(signals: Signals) -> None:
     inflation = make_inflation((0.0, 9.0, *(0.0,) * (len(TERMS) - 2)), (9.0,) * 3)
     entry = IntervalEntry(estimator="physics", algorithm=resolve(estimator), inflation=inflation)
     intervals = Intervals(car="c", physics_sha256="ab" * 32, roll_gradient_rad_per_m_s2=0.0, entries=(entry,))
-    wide = calibrator(replace(car, intervals=intervals), [estimator]).add(track, signals)
+    wide = calibrator(replace(car, intervals=intervals), [estimator]).apply(track, signals)
     np.testing.assert_allclose(wide.sideslip_std_rad, np.minimum(9.0 * track.sideslip_std_rad, 1.0))
 
 

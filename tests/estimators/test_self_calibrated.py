@@ -70,7 +70,7 @@ def tracks(name: str, car: Car, *parts: Signals) -> list[StateTrack]:
     intervals = calibrator(car, [estimator])
     for part in parts:
         track, state = run_window(estimator, part, state)
-        found.append(intervals.add(track, part))
+        found.append(intervals.apply(track, part))
     return found
 
 
@@ -145,7 +145,7 @@ def test_estimators_of_a_run_share_what_their_bands_compare(signals: Signals, mo
     for number, window in enumerate(windows):
         for i, estimator in enumerate(estimators):
             track, states[i] = run_window(estimator, window, states[i])
-            track, expected = intervals.add(track, window), alone[names[i]][number]
+            track, expected = intervals.apply(track, window), alone[names[i]][number]
             np.testing.assert_array_equal(track.sideslip_std_rad, expected.sideslip_std_rad)
             np.testing.assert_array_equal(track.vy_m_s, expected.vy_m_s)
     own = len(names)  # each estimator is one filter
@@ -200,8 +200,8 @@ def test_intervals_of_other_driving_are_not_taken(signals: Signals) -> None:
     intervals = Intervals(car="c", physics_sha256="ab" * 32, roll_gradient_rad_per_m_s2=0.0, entries=entries)
     track, _ = run_window(estimator, signals)
     applied = calibrator(replace(with_band(), intervals=intervals), [estimator])
-    without = calibrator(with_band(), [estimator]).add(track, signals)
-    np.testing.assert_array_equal(applied.add(track, signals).sideslip_std_rad, without.sideslip_std_rad)
+    without = calibrator(with_band(), [estimator]).apply(track, signals)
+    np.testing.assert_array_equal(applied.apply(track, signals).sideslip_std_rad, without.sideslip_std_rad)
     assert (without.sideslip_std_rad != track.sideslip_std_rad).any()
     assert applied.notes(estimator.name) == ("intervals: own, parameters and d2",)
 

@@ -10,9 +10,9 @@ import math
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from pdhef_logtool.drive.windows import DriveWindow
 
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
-from pdhef_logtool.drive.windows import DriveWindow
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 

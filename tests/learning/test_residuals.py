@@ -10,11 +10,11 @@ import pytest
 import reference_car
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pdhef_logtool.drive.windows import DriveWindow
 from physics_oracle import Oracle, parts
 from reference_car import Drive
 from residual_car import CAR, FRICTION, START_NS, Motion, Wave, drive, pick, truth_of, window
 
-from pdhef_logtool.drive.windows import DriveWindow
 from pdhef_logtool.estimators.parallel_physics import parallel_filter
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.learning.network.dataset import DriveArrays
