@@ -120,7 +120,7 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[str | No
 
 @pytest.mark.slow
 def test_a_slim_copy_and_other_containers_have_one_hash(tmp_path: Path, full: tuple[Path, tuple[str, str]]) -> None:
-    path, expected = full
+    _, expected = full
     assert None not in expected
     assert expected[0] != expected[1]
     assert _hashes(_bag2(tmp_path / "slim", MAPPED, StoragePlugin.MCAP)) == expected

@@ -127,13 +127,6 @@ def test_windows_change_no_bit(name: str, signals: Signals) -> None:
     np.testing.assert_array_equal(np.concatenate([p.vy_m_s for p in parts]), whole.vy_m_s)
 
 
-def test_windows_change_no_bit_of_the_band(signals: Signals) -> None:
-    (whole,) = tracks("physics", with_band(), signals)
-    parts = tracks("physics", with_band(), *(cut(signals, a, b) for a, b in ((0, 1), (1, 111), (111, len(signals)))))
-    for column in ("vy_m_s", "sideslip_std_rad", "covariance"):
-        np.testing.assert_array_equal(np.concatenate([getattr(p, column) for p in parts]), getattr(whole, column))
-
-
 def test_estimators_of_a_run_share_what_their_bands_compare(signals: Signals, monkeypatch: pytest.MonkeyPatch) -> None:
     car, names, half = with_band(), ("physics", "pd-hef"), len(signals) // 2
     windows = cut(signals, 0, half), cut(signals, half, len(signals))

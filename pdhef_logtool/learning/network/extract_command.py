@@ -61,7 +61,7 @@ from pdhef_logtool.learning.network.residuals import (
     SMOOTHING_HALF_S,
     ResidualRows,
     difference_noise,
-    residual_windows,
+    residual_rows,
 )
 from pdhef_logtool.learning.truth import TruthAt, teaching_reference
 from pdhef_logtool.learning.variation import MAX_VARIATION, vary
@@ -576,23 +576,23 @@ def _counted(
     """Write the residuals of a drive and return their sums."""
     whole = drive.whole()
     truth = whole.truth if reference is None else reference(whole.signals.stamps_ns)
-    whole = replace(whole, signals=service.read(whole.signals), truth=truth)
     counts, period_s = _Counts(), drive.plan.alignment.grid_period_s
     half_window = round(smoothing.half_s / period_s)
     taught = None
     if service.model is not None and isinstance(physics, PhysicsFilter):
         taught = CorrectedPhysics(AdaptivePhysics(physics), service.model)
     noise = smoothing.noise[0] * period_s / math.sqrt(2.0)  # of v_y itself
-    for rows in residual_windows(
-        [whole],
+    rows = residual_rows(
+        service.read(whole.signals),
+        truth,
         physics,
         period_s=period_s,
         half_window=half_window,
         truth_std_m_s=noise if math.isfinite(noise) else 0.0,
         taught=taught,
-    ):
-        counts.add(rows, writer.append(rows))
-        progress(1.0)
+    )
+    counts.add(rows, writer.append(rows))
+    progress(1.0)
     return counts
 
 
