@@ -22,7 +22,6 @@ _MODEL = ROOT / "pdhef_logtool" / "models" / "default"
 _CONFIG = """estimators = ["zero", "kinematic"]
 annotate = "none"
 start = "0"
-window_s = 600.0
 friction = 0.9
 sensors = "full"
 """
