@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.extras import required
 from pdhef_logtool.records.processes import process_name
-from pdhef_logtool.workers.fork_server import describe_error
+from pdhef_logtool.workers.supervisor import describe_error
 from pdhef_logtool.workers.supervisor import Crew, Ended, Failure, Limits, Tell
 
 T = TypeVar("T")
