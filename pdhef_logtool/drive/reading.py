@@ -15,7 +15,7 @@ from pdhef_logtool.drive.setup import CLOCK_START_S, LogUntil, Setup, is_device_
 from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive, setup_of
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.container import Wanted
-from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
+from pdhef_logtool.logs.discovery import LogInput, check_unchanged, find_logs, identity_of, log_state
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -101,6 +101,7 @@ class Drive:
     remarks: list[str] = field(default_factory=list)
     _reader: DriveReader | None = None
     _sha256: str = ""
+    _state: tuple[tuple[int, int, int], ...] = ()
 
     @property
     def path(self) -> LogPlace:
@@ -170,6 +171,7 @@ class Drive:
         if self.log.reduced is not None:
             return self.log.reduced.record.identity
         self._sha256 = self._sha256 or identity_of(LogInput(self.path, self.name))
+        check_unchanged(self.path, self._state)
         return self._sha256
 
     @property
@@ -315,6 +317,7 @@ def read_drive(
         notes.append(text)
         tell(f"{log_input.stem}: {text}")
 
+    state = log_state(log_input.path)
     opened = open_log(log_input.path, options.limits, options.msgs, wanted=Wanted(frozenset()))
     try:
         undecided, prefer = _as_far_as_decided(opened, options), options.prefer_truth
@@ -349,7 +352,7 @@ def read_drive(
         _name_damage(error, opened)
         opened.close()
         raise
-    return Drive(log_input.stem, opened, car, options, plan, chosen, notes, friction, tell, remarks)
+    return Drive(log_input.stem, opened, car, options, plan, chosen, notes, friction, tell, remarks, _state=state)
 
 
 def _setup_of(

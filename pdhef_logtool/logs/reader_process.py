@@ -27,6 +27,7 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.container import SpanDamageError, describe_damage
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.message_schema import FieldInfo
@@ -39,7 +40,7 @@ from pdhef_logtool.storage.files import scratch_folder
 from pdhef_logtool.workers.confinement import allow_processor_time, confine
 from pdhef_logtool.workers.forking import Child, ForkServer, can_fork
 
-_ERRORS: Mapping[str, type[PdhefError]] = {e.__name__: e for e in (LogError, LimitError, UsageError)}
+_ERRORS: Mapping[str, type[PdhefError]] = {e.__name__: e for e in (LogError, LimitError, SourceError, UsageError)}
 #: Timeout of a request: the allowed processor time by this factor, and a constant part.
 _PATIENCE, _PATIENCE_S = 10.0, 60.0
 #: Restarts of a reader that died while it loaded a column: the other columns can still be read.
@@ -226,7 +227,10 @@ def _failure(error: Exception) -> dict[str, Any]:
     if isinstance(error, PdhefError):
         parts = {name: getattr(error, name) for name in ("expected", "got", "where", "remedy")}
         return {"error": type(error).__name__, "parts": parts, "text": str(error)}
-    return {"error": "damage", "text": describe_damage(error)[1]}
+    try:
+        return {"error": "damage", "text": describe_damage(error)[1]}
+    except SourceError as source_error:
+        return _failure(source_error)
 
 
 def _over(what: str, most: str, where: str) -> LimitError:

@@ -22,12 +22,12 @@ from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.opened_run import JOURNAL_FILE
 from pdhef_logtool.results.run_report import CarFacts, LogOutcome
-from pdhef_logtool.storage.documents import digest, jsonable
+from pdhef_logtool.storage.documents import digest, file_sha256, jsonable
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
-_FORMAT = {"format": "pdhef.journal", "version": 2}
+_FORMAT = {"format": "pdhef.journal", "version": 3}
 #: Part of what a checksum is of, so that lines of another version of the format are left out as damaged ones are.
-_VERSION = b"pdhef.journal 2"
+_VERSION = b"pdhef.journal 3"
 #: Takes the place of a damaged line.
 _LEFT_OUT = {"left_out": "a damaged line"}
 _DIGITS = 16
@@ -83,7 +83,6 @@ class Entry:
     identity : what the log is known by, None where nobody could read it. setting, car : digests of what it was run
         with; car None where it has none. keep : what was written.
     part : the file of its figures below the run's folder, None without. failed_checks : those that count.
-    outputs : :func:`outputs_digest` of what it left, None where that is not known.
     error_rad : RMSE of the selected sideslip, None where it is not scored against independent ground truth.
     failed : whether nothing came out. again : whether that may be otherwise next time, as on a full disk.
     quarantined : whether it took its worker along.
@@ -97,7 +96,6 @@ class Entry:
     car: str | None
     keep: str
     part: str | None = None
-    outputs: str | None = None
     failed_checks: int = 0
     error_rad: float | None = None
     failed: bool = False
@@ -191,6 +189,16 @@ class Journal:
 
     def outcome(self, entry: Entry) -> LogOutcome:
         """Return how a drive ended; raises OutputError where its line was damaged since it was read."""
+        outcome = self._document_of(entry)["outcome"]
+        car = None if outcome["car"] is None else CarFacts(**outcome["car"])
+        return LogOutcome(**{**outcome, "car": car, "lost": tuple(outcome["lost"])})
+
+    def outputs(self, entry: Entry) -> dict[str, str]:
+        """Return the :func:`outputs_below` of a drive; raises OutputError as :meth:`outcome` does."""
+        outputs: dict[str, str] = self._document_of(entry)["outputs"]
+        return outputs
+
+    def _document_of(self, entry: Entry) -> dict[str, Any]:
         with self.path.open("rb") as file:
             file.seek(entry.offset)
             document = _document(file.readline())
@@ -201,16 +209,16 @@ class Journal:
                 where=str(self.path),
                 remedy="--resume runs it again",
             )
-        outcome = document["outcome"]
-        car = None if outcome["car"] is None else CarFacts(**outcome["car"])
-        return LogOutcome(**{**outcome, "car": car, "lost": tuple(outcome["lost"])})
+        return document
 
-    def add(self, entry: Entry, outcome: LogOutcome) -> None:
-        """Write down how a drive ended; raises OutputError."""
+    def add(self, entry: Entry, outcome: LogOutcome, outputs: Mapping[str, str]) -> Entry:
+        """Write how a drive ended and return the entry with its offset; raises OutputError."""
         document = asdict(entry)
         del document["offset"]
-        offset = self._append({**document, "outcome": jsonable(outcome)})
-        self._keep(replace(entry, offset=offset))
+        offset = self._append({**document, "outcome": jsonable(outcome), "outputs": dict(outputs)})
+        entry = replace(entry, offset=offset)
+        self._keep(entry)
+        return entry
 
     def add_place(self, label: str, place: Place, identity: str) -> None:
         """Write down that a known log lies there too."""
@@ -251,7 +259,7 @@ class Journal:
                 if entry.failed:
                     self.entries[label] = replace(entry, again=True, quarantined=False)
         elif "label" in document:
-            content = {k: v for k, v in document.items() if k != "outcome"}
+            content = {k: v for k, v in document.items() if k not in ("outcome", "outputs")}
             self._keep(Entry(**{**content, "place": Place(**content["place"])}, offset=offset))
 
     def _keep(self, entry: Entry) -> None:
@@ -283,12 +291,24 @@ def _sum(data: bytes) -> bytes:
     return b',"sum":"%s"}\n' % text.encode()
 
 
-def outputs_digest(*paths: Path) -> str:
-    """Return a digest of the files by which a drive counts as done; raises OSError."""
-    total = hashlib.sha256()
-    for path in paths:
-        total.update(hashlib.sha256(path.read_bytes()).digest())
-    return total.hexdigest()[:_DIGITS]
+def outputs_below(output: Path, *places: str) -> dict[str, str]:
+    """Return size and digest of the files of a drive by name below the output: of files and of all files of folders."""
+    paths = [
+        p for place in places for p in ((output / place).rglob("*") if (output / place).is_dir() else [output / place])
+    ]
+    return {p.relative_to(output).as_posix(): _state_of(p) for p in sorted(paths) if p.is_file()}
+
+
+def is_unchanged(path: Path, state: str) -> bool:
+    """Return whether a file has this size and digest."""
+    try:
+        return state.startswith(f"{path.stat().st_size} ") and state == _state_of(path)
+    except OSError:
+        return False
+
+
+def _state_of(path: Path) -> str:
+    return f"{path.stat().st_size} {file_sha256(path)[:_DIGITS]}"
 
 
 def digest_of(content: Any) -> str:

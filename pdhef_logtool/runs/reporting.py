@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Callable, Collection
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.logs.discovery import RUN_FILE, folders_of
 from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.results.opened_run import METRICS_FILE, PAGE_FILE, PARTS, open_run
+from pdhef_logtool.results.opened_run import METRICS_FILE, PAGE_FILE, open_run
 from pdhef_logtool.results.run_report import build_run, run_versions, write_json
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.journal import Entry, Journal
+from pdhef_logtool.runs.journal import Entry
 from pdhef_logtool.runs.pipeline import FEW_LOGS, LogResult, judge, log_place
 from pdhef_logtool.runs.planning import Plan
 from pdhef_logtool.storage.documents import file_sha256
@@ -109,20 +107,3 @@ class FleetProgress:
         self.ended += 1
         if self.count > FEW_LOGS:
             self.update(number, "", 0.0)
-
-
-def sweep_parts(journal: Journal, output: Path) -> None:
-    """Remove figure files that no drive of the journal has, and the remains of killed workers."""
-    kept = {entry.part for entry in journal.entries.values()}
-    root = output / PARTS
-    for path in list(itertools.chain(root.rglob("*.parquet"), root.rglob(".*.partial"))):
-        if path.relative_to(output).as_posix() not in kept:
-            remove_part(output, path.relative_to(output).as_posix())
-
-
-def remove_part(output: Path, part: str) -> None:
-    """Remove a file of figures and the folders that this leaves empty."""
-    with suppress(OSError):
-        (output / part).unlink(missing_ok=True)
-        for folder in itertools.islice((output / part).parents, 3):
-            folder.rmdir()

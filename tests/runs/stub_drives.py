@@ -12,7 +12,7 @@ from pdhef_logtool.logs.discovery import identity_of
 from pdhef_logtool.results.parquet_sink import write_metrics
 from pdhef_logtool.results.run_report import CarFacts, LogOutcome, write_json
 from pdhef_logtool.runs.cars import RunCars, car_record
-from pdhef_logtool.runs.journal import digest_of, outputs_digest
+from pdhef_logtool.runs.journal import digest_of, outputs_below
 from pdhef_logtool.runs.pipeline import files_of
 from pdhef_logtool.runs.working import DriveEnd, DriveTask
 from pdhef_logtool.storage.files import PendingFile
@@ -36,7 +36,7 @@ def stub_drive(task: DriveTask, tell: Tell) -> DriveEnd:
     outcome = LogOutcome(
         log.stem, Path(str(log.path)).name, identity, car=facts, main="physics", files=files_of(report.parent)
     )
-    outputs = outputs_digest(report, task.output / part)
+    outputs = outputs_below(task.output, f"logs/{log.stem}", part)
     record = {"digest": digest_of(record["parts"]), **record}
     return DriveEnd(outcome, identity, record, part, error_rad=value, outputs=outputs)
 

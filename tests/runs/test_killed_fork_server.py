@@ -103,7 +103,7 @@ def test_the_command_outlives_its_fork_server_or_says_why_not(
         killed: set[int] = set()
         while process.poll() is None:
             for pid in _children(process.pid):
-                if b"fork_server" in _command_line(pid) and pid not in killed and len(killed) < kills:
+                if b"forking import serve" in _command_line(pid) and pid not in killed and len(killed) < kills:
                     os.kill(pid, signal.SIGKILL)
                     killed.add(pid)
             time.sleep(0.005)
