@@ -76,7 +76,7 @@ def open_tables(file: LogFile, reader: str, libraries: Sequence[str] = ()) -> Ta
             raise
 
 
-def _closing(file: LogFile, close: Callable[[], None]) -> LogFile:
+def _closing(file: LogFile, close: Callable[[], object]) -> LogFile:
     def release() -> None:
         close()
         file.release()

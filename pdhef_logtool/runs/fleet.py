@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pdhef_logtool.estimators.table import FILTERS
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput, Logs, find_logs
@@ -43,11 +43,10 @@ from pdhef_logtool.runs.reporting import FleetProgress, collect, write_run_pages
 from pdhef_logtool.runs.self_calibrating import calibrate_pool
 from pdhef_logtool.runs.stored_output import StoredEnd, StoredOutput, stored_drive
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work, failed_outcome, log_identity, run_drive, run_on_node
-from pdhef_logtool.storage.files import writing
 from pdhef_logtool.storage.object_store import is_url
 from pdhef_logtool.storage.outputs import OutputFolder
 from pdhef_logtool.workers.ray_supervisor import supervise_on_ray
-from pdhef_logtool.workers.supervisor import Ended, Limits, Tell, supervise
+from pdhef_logtool.workers.supervisor import Ended, Limits, supervise
 
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
@@ -60,8 +59,6 @@ FULL_WORST = 5
 SILENCE_S = 600.0
 #: Modules that workers have loaded; polars starts threads at its first query, and none of these makes one.
 _PRELOAD = ("pdhef_logtool.runs.*", "pdhef_logtool.logs.*", "pdhef_logtool.results.parquet_sink", *FILTERS)
-#: Start of the name of the file by which nodes recognise the output folder.
-_MARK = ".nodes-"
 #: Numbers the runs of this process.
 _RUNS = itertools.count()
 
@@ -246,8 +243,8 @@ def _prepare(
     planned = plan_logs(inputs, journal, twice=config.cars is not None, neutral=config.no_position, reporter=reporter)
     _check_names([p.log for p in planned], output, job, reporter)
     pools = calibrate_pools(planned, job.cars, job.mapping, job.config)
-    settings = settings_of(job.config, pools)
-    plan = Plan.of(output, journal, planned, settings, job.cars, schedule.only, stored is not None)
+    plan = Plan(output, journal, planned, settings_of(job.config, pools), job.cars, stored is not None)
+    plan.check_only(schedule.only)
     return _Fleet(job, plan, pools, schedule, limits, full_worst, work, reporter, stored)
 
 
@@ -337,13 +334,15 @@ class _Fleet:
     ) -> Iterator[Ended[DriveTask, DriveEnd]]:
         """Yield how the tasks end, on this machine or on a cluster."""
         work = self.work if self.stored is None else partial(stored_drive, self.stored.objects, self.work)
-        if self.schedule.ray is None:
+        schedule, limits = self.schedule, self.limits
+        if schedule.ray is None:
             ends = supervise(
-                work, tasks, jobs=self.schedule.jobs, limits=self.limits, preload=_PRELOAD, progress=update,
+                work, tasks, jobs=schedule.jobs, limits=limits, preload=_PRELOAD, progress=update,
                 warn=self.reporter.warn,
             )  # fmt: skip
         else:
-            ends = self._on_cluster(work, tasks, self.schedule.ray)
+            on_node = partial(run_on_node, work, Path.cwd(), self.stored is None)
+            ends = supervise_on_ray(on_node, tasks, address=schedule.ray, limits=limits, preload=_PRELOAD)
         with closing(ends):
             for ended in ends:
                 result = ended.result
@@ -353,23 +352,6 @@ class _Fleet:
                     assert self.stored is not None
                     result = self.stored.take(result)
                 yield Ended(ended.number, ended.item, result, ended.failure)
-
-    def _on_cluster(
-        self, work: Callable[[DriveTask, Tell], Any], tasks: Iterator[DriveTask], address: str
-    ) -> Generator[Ended[DriveTask, Any], None, None]:
-        """Yield how the tasks end on the nodes of a cluster, which must see the output folder unless it is a URL."""
-        mark = None if self.stored is not None else self.plan.output.resolve() / f"{_MARK}{self._name}"
-        on_node = partial(run_on_node, work, Path.cwd(), mark)
-        if mark is not None:
-            with writing(mark):
-                for left in mark.parent.glob(f"{_MARK}*"):  # of killed runs
-                    left.unlink(missing_ok=True)
-                mark.touch()
-        try:
-            yield from supervise_on_ray(on_node, tasks, address=address, limits=self.limits, preload=_PRELOAD)
-        finally:
-            if mark is not None:
-                mark.unlink(missing_ok=True)
 
     def _task(self, planned: PlannedLog, keep: Keep) -> DriveTask:
         label = planned.log.stem

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.remote_place import RemotePlace
@@ -28,8 +28,6 @@ from pdhef_logtool.storage.files import PendingFile, open_new, writing
 _FORMAT = {"format": "pdhef.journal", "version": 3}
 #: Part of what a checksum is of, so that lines of another version of the format are left out as damaged ones are.
 _VERSION = b"pdhef.journal 3"
-#: Takes the place of a damaged line.
-_LEFT_OUT = {"left_out": "a damaged line"}
 _DIGITS = 16
 #: Bytes of the last entry of a line: the checksum of what is before it.
 _SUM_BYTES = len(b',"sum":""}\n') + _DIGITS
@@ -110,14 +108,13 @@ class Journal:
 
     Attributes
     ----------
-    entries : the last of each label. settings, cars : by digest, in words what a drive was run with.
+    entries : the last of each label. described : settings and cars by digest.
     damaged : lines that were left out when it was read.
     """
 
     path: Path
     entries: dict[str, Entry] = field(default_factory=dict)
-    settings: dict[str, dict[str, str]] = field(default_factory=dict)
-    cars: dict[str, dict[str, Any]] = field(default_factory=dict)
+    described: dict[str, dict[str, dict[str, Any]]] = field(default_factory=lambda: {"setting": {}, "car": {}})
     damaged: int = 0
     _places: dict[str, tuple[Place, str | None, str]] = field(default_factory=dict)
     _labels: dict[str, list[str]] = field(default_factory=dict)
@@ -140,11 +137,19 @@ class Journal:
         """
         journal = cls.of(folder)
         for line in journal._lines():
-            document = _document(line)
-            journal.damaged += document is None
-            journal._take(_LEFT_OUT if document is None else document, journal._end)
+            if (document := _document(line)) is None:
+                journal.damaged += 1
+            else:
+                journal._take(document, journal._end)
             journal._end += len(line)
+        journal._repeat_failures()
         return journal
+
+    def _repeat_failures(self) -> None:
+        """Repeat failed drives if a line is damaged: it may have recorded that a drive has not failed since."""
+        for label, entry in self.entries.items():
+            if self.damaged and entry.failed:
+                self.entries[label] = replace(entry, again=True, quarantined=False)
 
     def _lines(self) -> Iterator[bytes]:
         try:
@@ -157,17 +162,17 @@ class Journal:
             raise OutputError(expected="a readable journal", got=got, where=str(self.path)) from error
 
     def begin(self) -> None:
-        """Make it a whole file: a new one in place of an old one, or the old one with a mark for each damaged line."""
+        """Make it a complete file: a new one in place of an old one, or the old one without damaged lines."""
         if self._end and not self.damaged:
             return
         with writing(self.path), PendingFile(self.path) as pending, open_new(pending.path) as new:
             had, self._end = self._end, new.write(_line(_FORMAT))
             for line in self._lines() if had else ():
-                if (document := _document(line)) is None:
-                    document, line = _LEFT_OUT, _line(_LEFT_OUT)
-                if "format" not in document:
+                document = _document(line)
+                if document is not None and "format" not in document:
                     self._take(document, self._end)
                     self._end += new.write(line)
+        self._repeat_failures()
 
     def known(self, place: Place) -> tuple[str, str | None] | None:
         """Return label and identity of the log that lies there, if it lay there before and has not been changed."""
@@ -225,17 +230,11 @@ class Journal:
         self._append({"label": label, "place": asdict(place), "identity": identity, "moved": True})
         self._places[place.key] = place, identity, label
 
-    def add_setting(self, digest: str, description: Mapping[str, str]) -> None:
-        """Write down what a setting is, once."""
-        if digest not in self.settings:
-            self._append({"setting": digest, "is": dict(description)})
-            self.settings[digest] = dict(description)
-
-    def add_car(self, digest: str, description: Mapping[str, Any]) -> None:
-        """Write down what a car is, once."""
-        if digest not in self.cars:
-            self._append({"car": digest, "is": dict(description)})
-            self.cars[digest] = dict(description)
+    def describe(self, kind: Literal["setting", "car"], digest: str, description: Mapping[str, Any]) -> None:
+        """Record the values of a setting or a car once."""
+        if digest not in (known := self.described[kind]):
+            self._append({kind: digest, "is": dict(description)})
+            known[digest] = dict(description)
 
     def _append(self, document: Mapping[str, Any]) -> int:
         offset, data = self._end, _line(document)
@@ -248,16 +247,11 @@ class Journal:
 
     def _take(self, document: dict[str, Any], offset: int) -> None:
         if "is" in document:
-            kind, descriptions = ("setting", self.settings) if "setting" in document else ("car", self.cars)
-            descriptions[document[kind]] = document["is"]
+            kind = "setting" if "setting" in document else "car"
+            self.described[kind][document[kind]] = document["is"]
         elif "moved" in document:
             place = Place(**document["place"])
             self._places[place.key] = place, document["identity"], document["label"]
-        elif document == _LEFT_OUT:
-            # The line may have stated that a drive that failed before has not failed since.
-            for label, entry in self.entries.items():
-                if entry.failed:
-                    self.entries[label] = replace(entry, again=True, quarantined=False)
         elif "label" in document:
             content = {k: v for k, v in document.items() if k not in ("outcome", "outputs")}
             self._keep(Entry(**{**content, "place": Place(**content["place"])}, offset=offset))

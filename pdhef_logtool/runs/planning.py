@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.logs.discovery import LogInput, as_taken, hash_log, with_free_stem
 from pdhef_logtool.mapping import Mapping
@@ -190,21 +190,10 @@ class Plan:
     def __post_init__(self) -> None:
         self.setting = digest_of(self.settings)
 
-    @classmethod
-    def of(
-        cls, output: Path, journal: Journal, logs: Sequence[PlannedLog], settings: dict[str, str], cars: RunCars,
-        only: Sequence[str], is_remote: bool,
-    ) -> Self:  # fmt: skip
-        """Return a plan; raises UsageError if ``only`` names no log or the settings differ from the folder's run."""
-        plan = cls(output, journal, logs, settings, cars, is_remote)
-        if only:
-            plan._check_only(only)
-        return plan
-
     def begin(self) -> None:
         """Begin the journal with the settings and the new places of logs."""
         self.journal.begin()
-        self.journal.add_setting(self.setting, self.settings)
+        self.journal.describe("setting", self.setting, self.settings)
         for log in self.logs:
             if log.moved:
                 self.journal.add_place(log.log.stem, log.place, log.identity or "")
@@ -239,7 +228,7 @@ class Plan:
     def add_car(self, record: dict[str, Any]) -> str:
         """Write a car's record into the journal; return its digest."""
         digest: str = record["digest"]
-        self.journal.add_car(digest, record)
+        self.journal.describe("car", digest, record)
         self.cars_of_run()[digest] = record
         return digest
 
@@ -253,13 +242,14 @@ class Plan:
                     self._current_cars[digest_of(record["parts"])] = record
         return self._current_cars
 
-    def _check_only(self, names: Sequence[str]) -> None:
+    def check_only(self, names: Sequence[str]) -> None:
+        """Check the names of ``--only``; raises UsageError if one names no log or the settings of the run differ."""
         labels = {p.log.stem for p in self.logs}
         if missing := [name for name in names if name not in labels]:
             near = ", ".join(sorted(labels)[:10]) + (" and more" if len(labels) > 10 else "")
             raise UsageError(expected=f"the name of a log ({near})", got=missing[0], where="--only")
-        for log in self.logs:
-            entry = self.journal.entries.get(log.log.stem)
+        entries = (self.journal.entries.get(p.log.stem) for p in self.logs if names)
+        for entry in entries:
             if entry is not None and (why := [*self._changes(entry)]):
                 raise UsageError(
                     expected="the settings of the run in the folder",
@@ -311,9 +301,9 @@ class Plan:
     def _changes(self, entry: Entry) -> Iterator[str]:
         """Yield as texts which settings and car of a drive have changed."""
         if entry.setting != self.setting:
-            yield from changes(self.journal.settings.get(entry.setting, {}), self.settings)
+            yield from changes(self.journal.described["setting"].get(entry.setting, {}), self.settings)
         if entry.car is not None and entry.car not in self.cars_of_run():
-            old = self.journal.cars.get(entry.car, {})
+            old = self.journal.described["car"].get(entry.car, {})
             new = next((c for c in self.cars_of_run().values() if c["name"] == old.get("name")), {})
             yield from [*changes(old.get("parts", {}), new.get("parts", {}))] if new else ["another car"]
 

@@ -41,7 +41,7 @@ def collect(
     results = [_result(plan, entry, folder) for entry, folder in entries]
     metrics = output / METRICS_FILE
     join_metrics(metrics, [r.figures_file for r in results if r.figures_file is not None])
-    cars = plan.journal.cars | plan.cars_of_run()  # the journal's line of a car may be damaged
+    cars = plan.journal.described["car"] | plan.cars_of_run()  # the journal's line of a car may be damaged
     networks = {
         None if (network := cars[e.car]["network"]) is None else (network[0], network[1])
         for e, _ in entries
@@ -92,18 +92,18 @@ class FleetProgress:
     def update(self, number: int, text: str, share: float) -> None:
         """Take the progress of one log."""
         self._shares[number] = min(share, 1.0)
-        done = (self.ended + sum(self._shares.values())) / self.count
-        if self.count <= FEW_LOGS:
-            self.progress(text, done)
-            return
-        rate = self.ended / max(time.monotonic() - self._since, 1e-9)
-        failed = f", {self.failed} failed" if self.failed else ""
-        speed = f", {rate:.1f}/s" if self.ended else ""
-        self.progress(f"{self.ended} of {self.count}{failed}{speed}", done)
+        self._show(text)
 
     def end(self, number: int) -> None:
         """Take the end of one log."""
         self._shares.pop(number, None)
         self.ended += 1
         if self.count > FEW_LOGS:
-            self.update(number, "", 0.0)
+            self._show("")
+
+    def _show(self, text: str) -> None:
+        if self.count > FEW_LOGS:
+            rate = self.ended / max(time.monotonic() - self._since, 1e-9)
+            failed = f", {self.failed} failed" if self.failed else ""
+            text = f"{self.ended} of {self.count}{failed}, {rate:.1f}/s"
+        self.progress(text, (self.ended + sum(self._shares.values())) / self.count)

@@ -20,7 +20,7 @@ from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.no_position import without_names
-from pdhef_logtool.results.opened_run import PARTS, OpenedLog
+from pdhef_logtool.results.opened_run import JOURNAL_FILE, PARTS, OpenedLog
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.config import RunConfig
@@ -118,22 +118,20 @@ def failed_outcome(log: LogInput, reason: str, config: RunConfig) -> LogOutcome:
     return LogOutcome(log=log.stem, sha256=None, **texts)
 
 
-def run_on_node(
-    work: Callable[[DriveTask, Tell], Any], here: Path, mark: Path | None, task: DriveTask, tell: Tell
-) -> Any:
+def run_on_node(work: Callable[[DriveTask, Tell], Any], here: Path, shared: bool, task: DriveTask, tell: Tell) -> Any:
     """Process a drive on a node of a cluster, in the folder that the run was started in if the node has it.
 
-    ``mark``: a file by which the node recognises the output folder; None if it does not need to see the folder.
+    ``shared``: the output is a folder that the node must see; it contains the journal of the run.
     """
-    if mark is not None and not mark.is_file():
+    with suppress(OSError):
+        os.chdir(here)
+    if shared and not (task.output / JOURNAL_FILE).is_file():
         return OutputError(
             expected="a folder that all nodes of the cluster see under this path",
             got=f"another one, or none, on {platform.node()}",
-            where=str(mark.parent),
+            where=str(task.output),
             remedy="choose one on a shared file system, or a URL, with -o",
         )
-    with suppress(OSError):
-        os.chdir(here)
     return work(task, tell)
 
 

@@ -8,6 +8,7 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -92,8 +93,10 @@ def test_a_fleet_on_a_cluster_whose_output_is_in_a_store_equals_one_here(
     assert {name: data for name, data in found.items() if name not in timed} == files_of(tmp_path / "out")
 
 
-def test_an_output_that_a_node_does_not_see_is_told(tmp_path: Path) -> None:
-    told = run_on_node(stub_drive, tmp_path, tmp_path / ".nodes-x", None, lambda *_: None)  # type: ignore[arg-type]
+def test_an_output_that_a_node_does_not_see_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    task = SimpleNamespace(output=Path("out"))
+    told = run_on_node(stub_drive, tmp_path, True, task, lambda *_: None)  # type: ignore[arg-type]
     assert isinstance(told, OutputError)
     assert "a folder that all nodes of the cluster see" in str(told)
 
@@ -108,4 +111,3 @@ def test_without_ray_or_a_cluster_there_is_one_line(tmp_path: Path) -> None:
             schedule=Schedule(ray="127.0.0.1:1", limits=Limits()),
             work=stub_drive,
         )
-    assert not list((tmp_path / "out").glob(".nodes-*"))
