@@ -302,8 +302,8 @@ class _Fleet:
         notes = [f"{self.plan.done} of {len(self.plan.logs)} logs are done", "--resume goes on"]
         if isinstance(stop, OutputError | WorkerError):
             stop.remedy = "; ".join(filter(None, [stop.remedy, *notes]))
-        for note in reversed(notes):
-            stop.add_note(note)
+        else:
+            stop.__notes__ = notes[::-1]
         sweep_parts(self.plan.journal, self.plan.output)
         with suppress(PdhefError):
             collect(self.plan, self.job.config, self.job.validation)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -199,7 +199,7 @@ class Journal:
         return LogOutcome(**{**outcome, "car": car, "lost": tuple(outcome["lost"])})
 
     def outputs(self, entry: Entry) -> dict[str, str]:
-        """Return the :func:`outputs_below` of a drive; raises OutputError as :meth:`outcome` does."""
+        """Return the :func:`states_of` a drive's files; raises OutputError as :meth:`outcome` does."""
         outputs: dict[str, str] = self._document_of(entry)["outputs"]
         return outputs
 
@@ -285,12 +285,9 @@ def _sum(data: bytes) -> bytes:
     return b',"sum":"%s"}\n' % text.encode()
 
 
-def outputs_below(output: Path, *places: str) -> dict[str, str]:
-    """Return size and digest of the files of a drive by name below the output: of files and of all files of folders."""
-    paths = [
-        p for place in places for p in ((output / place).rglob("*") if (output / place).is_dir() else [output / place])
-    ]
-    return {p.relative_to(output).as_posix(): _state_of(p) for p in sorted(paths) if p.is_file()}
+def states_of(output: Path, names: Iterable[str]) -> dict[str, str]:
+    """Return size and digest of the files below an output that exist, by name."""
+    return {name: _state_of(output / name) for name in names if (output / name).is_file()}
 
 
 def is_unchanged(path: Path, state: str) -> bool:

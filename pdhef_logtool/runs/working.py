@@ -24,8 +24,8 @@ from pdhef_logtool.results.opened_run import JOURNAL_FILE, PARTS, OpenedLog
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.journal import digest_of, outputs_below
-from pdhef_logtool.runs.pipeline import LogResult, log_place, run_log
+from pdhef_logtool.runs.journal import digest_of, states_of
+from pdhef_logtool.runs.pipeline import LOG_FILES, LogResult, log_place, run_log
 from pdhef_logtool.storage.outputs import OutputFolder
 from pdhef_logtool.workers.supervisor import Tell
 
@@ -65,7 +65,7 @@ class DriveEnd:
     ----------
     identity : of the log's content. car : :func:`~.cars.car_record`. part, error_rad : as in the journal.
     warned : lines for users. again : whether a failed drive may succeed next time.
-    outputs : :func:`~.journal.outputs_below`.
+    outputs : size and digest of its files.
     """
 
     outcome: LogOutcome
@@ -172,7 +172,7 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
         result.failed_checks,
         _sideslip_error_rad(result),
         tuple(warned),
-        outputs=outputs_below(task.output, log_place(task.log.stem), part),
+        outputs=states_of(task.output, [part, *(f"{log_place(task.log.stem)}/{name}" for name in LOG_FILES)]),
     )
 
 

@@ -9,7 +9,6 @@ import time
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -72,8 +71,10 @@ def test_a_fleet_on_three_nodes_one_of_which_goes_equals_one_here(
     run(output=Path("here"), work=stub_drive)
     assert files_of(Path("out")) == files_of(Path("here"))
     assert METRICS_FILE in files_of(Path("out"))
-    again: dict[str, Any] = {"resume": True, "ray": "127.0.0.1:1", "work": work}
-    assert run(output=Path("out"), **again).exit_code == 0, "nothing is left to do: no cluster is asked for"
+    again = Schedule(ray="127.0.0.1:1", resume=True)
+    assert run(output=Path("out"), schedule=again, work=work).exit_code == 0, (
+        "nothing is left to do: no cluster is asked for"
+    )
 
 
 @pytest.mark.fleet
