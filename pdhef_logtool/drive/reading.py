@@ -16,7 +16,7 @@ from pdhef_logtool.drive.recorded import Recorded, read_recorded
 from pdhef_logtool.drive.setup import CLOCK_START_S, LogUntil, Setup, is_device_clock, load_setup
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.container import Wanted
-from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
+from pdhef_logtool.logs.discovery import LogInput, check_unchanged, find_logs, identity_of, log_state
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -98,6 +98,7 @@ class Drive:
     remarks: list[str] = field(default_factory=list)
     _recorded: Recorded | None = None
     _sha256: str = ""
+    _state: tuple[tuple[int, int, int], ...] = ()
 
     @property
     def path(self) -> LogPlace:
@@ -167,6 +168,7 @@ class Drive:
         if self.log.reduced is not None:
             return self.log.reduced.record.identity
         self._sha256 = self._sha256 or identity_of(LogInput(self.path, self.name))
+        check_unchanged(self.path, self._state)
         return self._sha256
 
     @property
@@ -299,6 +301,7 @@ def read_drive(
         notes.append(text)
         tell(f"{log_input.stem}: {text}")
 
+    state = log_state(log_input.path)
     opened = open_log(log_input.path, options.limits, options.msgs, wanted=Wanted(frozenset()))
     try:
         undecided, prefer = _as_far_as_decided(opened, options), options.prefer_truth
@@ -333,7 +336,7 @@ def read_drive(
         _name_damage(error, opened)
         opened.close()
         raise
-    return Drive(log_input.stem, opened, car, options, plan, chosen, notes, friction, tell, remarks)
+    return Drive(log_input.stem, opened, car, options, plan, chosen, notes, friction, tell, remarks, _state=state)
 
 
 def _setup_of(

@@ -14,7 +14,7 @@ import numpy as np
 from mcap.records import Metadata
 
 from pdhef_logtool.logs.byte_account import ByteAccount
-from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, SourceError
+from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, raise_source_error
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.records.errors import LogError, PdhefError
@@ -201,10 +201,9 @@ class SpanDamageError(Exception):
 def describe_damage(error: Exception) -> tuple[str, str]:
     """Return kind and text of the loss that an error causes.
 
-    A log that cannot be reached is not damaged: a :class:`SourceError` is raised again.
+    A log that cannot be reached is not damaged: it raises a :class:`~.byte_source.SourceError`.
     """
-    if isinstance(error, SourceError):
-        raise error
+    raise_source_error(error)
     if isinstance(error, LimitError):
         return "over-budget", f"expected {error.expected}, got {error.got} ({error.where}); {error.remedy}"
     if isinstance(error, LogError):
