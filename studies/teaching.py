@@ -46,7 +46,7 @@ from pdhef_logtool.runs.self_calibrating import driven_d2, self_calibrated
 from pdhef_logtool.storage.files import write_bytes
 from studies.pages import DOCS, DRIVES, RESULTS, number, options, table, write
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_of, vehicle_of
-from studies.reference import MADE, RECEIVERS, ScoredDrive, with_gnss, with_receiver
+from studies.reference import MADE, RECEIVERS, ScoredDrive, with_gnss
 from studies.self_calibration import simulated_drives
 from truthsim.drive import write_drive
 
@@ -219,7 +219,7 @@ def received(part: TeachPart, car: Car) -> Signals | None:
     """Return the signals of a part with those of its receiver, None if it has none."""
     if not part.log.startswith("v40_"):
         return None
-    with read_drive(DRIVES / part.log, car, with_receiver(mapping_of(peer_of(part))), ReadOptions()) as drive:
+    with read_drive(DRIVES / part.log, car, mapping_of(peer_of(part), receiver=True), ReadOptions()) as drive:
         return drive.whole().signals
 
 

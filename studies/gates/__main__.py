@@ -15,6 +15,7 @@ from __future__ import annotations
 import csv
 import math
 import shutil
+import subprocess
 import sys
 import threading
 import time
@@ -149,7 +150,7 @@ class Session:
         except SkippedRowError as reason:
             print(f"{row.gate}/{row.name}: skipped: {reason}", file=sys.stderr)
             return
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
+        except (OSError, RuntimeError, KeyError, ValueError, subprocess.SubprocessError) as error:
             with self.lock:
                 self.lines.append(f"{row.gate}: {row.name}: {type(error).__name__}: {error}")
             return

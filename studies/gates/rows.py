@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from studies.conditions import row_inputs, row_logs
 from studies.gates.tool import (
     Tool,
     commands_and_options,
@@ -26,8 +27,10 @@ from studies.gates.tool import (
 from studies.mapping_mistakes import VERDICTS, outcomes
 from studies.pages import DRIVES, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
+from studies.torture.mutating import mutant
+from studies.torture.seeds import write_seeds
 from truthsim.batch import DriveSpec
-from truthsim.conditions import ROWS, write_conditions
+from truthsim.conditions import ROWS
 from truthsim.drive import write_drive
 from truthsim.sensors import SensorNoise
 
@@ -87,19 +90,9 @@ _SIMULATING = threading.Lock()
 def condition(row: str, drives: int, tool: Tool) -> Figures:
     """Run the estimators on the drives of a row of the condition table."""
     with _SIMULATING:
-        manifest = write_conditions(tool.work / f"conditions-{row}-{drives}", drives=drives, rows=[row])
-    (entry,) = (e for e in manifest["rows"] if e["name"] == row)
-    logs = [tool.work / f"conditions-{row}-{drives}" / file for file in entry["files"]]
-    assume = entry["assume"]
-    mapping = tool.mapping(logs[0])
-    if assume.get("friction") != "unknown":
-        friction = {"topic": "/truth/perfect/state", "field": "friction", "stamp": "header.stamp"}
-        mapping["signals"]["friction"] = friction | {"scale": assume.get("friction_factor", 1.0)}
-    # The first drive of a row may lack a signal that others have: the sensors of all rows are those of the simulator.
-    file = write_toml(tool.work / "mappings" / f"condition-{row}.toml", mapping)
-    sensors = ["--set", f"sensors={assume['sensors']}"] if "sensors" in assume else []
-    given = ("--car", "saloon", "--mapping", file, "--keep", "metrics", "--estimators", ESTIMATORS)
-    run = tool.run(f"condition-{row}-{drives}", *logs, *given, *sensors)
+        logs, assume = row_logs(tool.work, row, drives)
+    given = ("--car", "saloon", "--keep", "metrics", "--estimators", ESTIMATORS)
+    run = tool.run(f"condition-{row}-{drives}", *logs, *given, *row_inputs(tool, row, logs[0], assume))
     return rmse_figures(run, 0.003, "pd-hef")
 
 
@@ -305,7 +298,7 @@ def mistake_rows() -> Iterator[GateRow]:
 
 def strangers(only: tuple[str, ...], tool: Tool) -> Figures:
     """Count what becomes of the signals of logs of unknown layout."""
-    name = "-".join(("strangers", *only))
+    name = f"strangers-{len(only)}"
     kept = tool.work / f"{name}.json"
     chosen = ("--only", *only) if only else ()
     done = tool.python("studies.strangers", "--held-out", "--work", tool.work / name, "--keep", kept,
@@ -322,8 +315,8 @@ def strangers(only: tuple[str, ...], tool: Tool) -> Figures:
 def stranger_rows() -> Iterator[GateRow]:
     """Yield the third-party logs."""
     yield GateRow("third-party logs", "all", (FULL,), partial(strangers, ()))
-    few = ("csv", "can")
-    yield GateRow("third-party logs", ", ".join(few), (QUICK, FULL), partial(strangers, few))
+    few = ("csv-german", "can-mdf", "vbo-file", "z-down", "steering-deg", "kart-parquet", "electric-blf")
+    yield GateRow("third-party logs", "7 layouts", (QUICK, FULL), partial(strangers, few))
 
 
 # ------------------------------------------------------------------------------------------------ fuzz
@@ -346,17 +339,31 @@ def fuzz(part: str, options: tuple[str, ...], tool: Tool) -> Figures:
     return figures
 
 
+def mutants(suffix: str, count: int, tool: Tool) -> Figures:
+    """Count how ``inspect`` ends on mutated recordings; a problem is a traceback or another exit code."""
+    seeds = write_seeds(tool.work / "seeds")
+    names = sorted(name for name in seeds if name.endswith(suffix))
+    ends: Counter[str] = Counter()
+    for i in range(count):
+        name = names[i % len(names)]
+        path = tool.work / f"mutant-{count}-{i}{suffix}"
+        path.write_bytes(mutant(name, seeds[name], 1, i)[1])
+        done = tool.pdhef("inspect", path, "--json")
+        sound = done.returncode in (0, 1, 3) and "Traceback" not in done.stderr
+        ends[f"exit {done.returncode}" if sound else "problems"] += 1
+    figures = {end: Figure(float(ends[end]), "count", 0.03, 1.0) for end in ("exit 0", "exit 1", "exit 3")}
+    return figures | {"problems": Figure(float(ends["problems"]), "count", 0.0)}
+
+
 def fuzz_rows() -> Iterator[GateRow]:
-    """Yield the mutants of each format, of logs and of settings."""
+    """Yield the mutants of each format."""
     for name in ("csv", "vbo", "parquet", "mat5", "mat73", "mdf3", "mdf4", "blf", "asc"):
-        yield GateRow("fuzz", name, (FULL,), partial(fuzz, "formats", ("--format", name, "--count", "50")))
-    for name in ("csv", "blf"):
-        yield GateRow("fuzz", f"{name}, 3 mutants", (QUICK, FULL),
-                      partial(fuzz, "formats", ("--format", name, "--count", "3")))  # fmt: skip
-    yield GateRow("fuzz", "logs", (FULL,), partial(fuzz, "mutations", ("--logs", "550", "--configs", "200")))
-    yield GateRow(
-        "fuzz", "logs, 11 mutants", (QUICK, FULL), partial(fuzz, "mutations", ("--logs", "11", "--configs", "5"))
-    )
+        few = ((QUICK, FULL), f"{name}, 3 mutants", "3")
+        for sets, text, count in (((FULL,), name, "50"), *([few] if name in ("csv", "blf") else [])):
+            yield GateRow("fuzz", text, sets, partial(fuzz, "formats", ("--format", name, "--count", count)))
+    for suffix in ("mcap", "bag", "db3"):
+        yield GateRow("fuzz", suffix, (FULL,), partial(mutants, f".{suffix}", 50))
+        yield GateRow("fuzz", f"{suffix}, 3 mutants", (QUICK, FULL), partial(mutants, f".{suffix}", 3))
 
 
 # ------------------------------------------------------------------------------------------------ contract
@@ -380,7 +387,7 @@ def exit_codes(tool: Tool) -> Figures:
         "run, log cut in half": ("run", folder / "cut.mcap", "-o", folder / "cut", *quiet),
         "run, all logs unreadable": ("run", folder / "noise.mcap", "-o", folder / "noise", *quiet),
         "run, one of two logs unreadable": ("run", sample, folder / "noise.mcap", "-o", folder / "two", *quiet),
-        "run, requirement failed": (
+        "run, requirement not met": (
             "run",
             sample,
             "-o",
@@ -471,7 +478,7 @@ def speed_rows() -> Iterator[GateRow]:
 
 
 def all_rows() -> list[GateRow]:
-    """Return all rows in the order of the file; the quickest gates first."""
-    makers = (contract_rows, speed_rows, mistake_rows, reference_rows, recorded_rows, conditions,
-              plus_minus_rows, fuzz_rows, stranger_rows)  # fmt: skip
+    """Return all rows in the order of the file; the fuzz tests, which take longest, are last."""
+    makers = (contract_rows, reference_rows, recorded_rows, conditions, speed_rows, stranger_rows,
+              plus_minus_rows, mistake_rows, fuzz_rows)  # fmt: skip
     return [row for make in makers for row in make()]

@@ -142,10 +142,10 @@ def _document(path: Path) -> dict[str, Any]:
     return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
-def mapping_of(drive: PeerDrive, folder: Path = DRIVES) -> Mapping:
-    """Return the mapping of a drive."""
+def mapping_of(drive: PeerDrive, folder: Path = DRIVES, *, receiver: bool = False) -> Mapping:
+    """Return the mapping of a drive, as :func:`mapping_table`."""
     with tempfile.TemporaryDirectory() as work:
-        return load_mapping(write_toml(Path(work) / "mapping.toml", mapping_table(drive, folder)))
+        return load_mapping(write_toml(Path(work) / "mapping.toml", mapping_table(drive, folder, receiver=receiver)))
 
 
 def vehicle_of(drive: PeerDrive, folder: Path = DRIVES) -> VehicleParameters:
