@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from studies.calibration import errors_over_sd, true_values, wrong_file
 from studies.conditions import row_inputs, row_logs
 from studies.gates.tool import (
     Tool,
@@ -161,13 +162,19 @@ REFERENCE_DRIVES: dict[str, tuple[str, float, float, float | None]] = {
 }
 
 
-def simulated_log(tool: Tool, name: str, spec: tuple[str, float, float, float | None], seed: int) -> Path:
-    """Simulate a drive of the saloon and return its log."""
+def simulated_log(
+    tool: Tool, name: str, spec: tuple[str, float, float, float | None], seed: int, *, steering_wheel: bool = False
+) -> Path:
+    """Simulate a drive of the saloon and return its log; ``steering_wheel``: the log has this angle."""
     log = tool.work / "simulated" / f"{name.replace(' ', '-')}-{seed}.mcap"
     if not log.is_file():
         log.parent.mkdir(parents=True, exist_ok=True)
         manoeuvre, speed, friction, duration_s = spec
-        write_drive(DriveSpec(manoeuvre, speed, friction, seed, duration_s, amplitude=1.0).simulate(), log)
+        write_drive(
+            DriveSpec(manoeuvre, speed, friction, seed, duration_s, amplitude=1.0).simulate(),
+            log,
+            steering_wheel=steering_wheel,
+        )
     return log
 
 
@@ -196,7 +203,6 @@ def reference_rows() -> Iterator[GateRow]:
 # ------------------------------------------------------------------------------------------------ ±
 
 _PRINTED = re.compile(r"(-?[\d.]+) \+- ([\d.]+)")
-GRAVITY_M_S2 = 9.80665
 PLUS_MINUS_DRIVES = (
     ("sine-sweep-wide", 90.0, 0.85, None),
     ("road", 100.0, 0.85, 120.0),
@@ -206,60 +212,26 @@ PLUS_MINUS_DRIVES = (
 )
 
 
-def wrong_vehicle(seed: int) -> dict[str, Any]:
-    """Return the vehicle file of the saloon with errors as the prior of the calibration expects."""
-    rng, car = np.random.default_rng(seed), bare_vehicle()
-    front, rear, inertia, roll = (*rng.uniform(-0.69, 0.69, 2), 0.2 * rng.normal(), 0.003 * rng.normal())
-    for axle, factor in (("front", front), ("rear", rear)):
-        car["tyres"][axle]["B"] *= math.exp(factor)
-    car["yaw_inertia_kg_m2"] *= math.exp(inertia)
-    car["roll_gradient_rad_per_m_s2"] = max(0.0, car["roll_gradient_rad_per_m_s2"] + roll)
-    car["imu_position_m"] = [1.1 * rng.normal(), 0.0, 0.0]
-    return car
-
-
 def plus_minus(seeds: range, tool: Tool) -> Figures:
-    """Return coverage and RMS of error over standard deviation of the calibrated parameters over cars."""
-    scores: dict[str, list[float]] = {}
+    """Return RMS of error over standard deviation of what the tool estimates of the saloon with wrong vehicle files."""
+    right, noise, scores = bare_vehicle(), SensorNoise(), dict[str, list[float]]()
+    true = true_values(right, noise.imu_x_m, noise.rtk_x_m, noise.rtk_heading_offset_rad)
     for seed in seeds:
-        log = simulated_log(tool, "plus-minus", PLUS_MINUS_DRIVES[seed % len(PLUS_MINUS_DRIVES)], seed)
-        car = write_toml(tool.work / "cars" / f"wrong-{seed}.toml", wrong_vehicle(seed))
+        log = simulated_log(
+            tool, "plus-minus", PLUS_MINUS_DRIVES[seed % len(PLUS_MINUS_DRIVES)], seed, steering_wheel=True
+        )
+        car = write_toml(tool.work / "cars" / f"wrong-{seed}.toml", wrong_file(right, np.random.default_rng(seed)))
         run = tool.run(f"plus-minus-{seed}", log, "--car", car, "--keep", "estimates", "--estimators", "zero,physics")
         (report,) = reports(run).values()
-        for name, score in normalized_errors(report):
+        for name, score in errors_over_sd(report, true):
             scores.setdefault(name, []).append(score)
-    figures: Figures = {}
-    for name, values in sorted(scores.items()):
-        rms = float(np.sqrt(np.mean(np.square(values))))
-        figures[f"RMS error / sd, {name}"] = Figure(rms, "1", absolute=0.03)
-    everything = np.concatenate([np.abs(v) for v in scores.values()])
-    figures["within ± 1.96 sd"] = Figure(100.0 * float(np.mean(everything <= 1.96)), "%", absolute=1.0)
-    figures["values"] = Figure(float(len(everything)), "count", 0.0)
-    return figures
-
-
-def normalized_errors(report: dict[str, Any]) -> Iterator[tuple[str, float]]:
-    """Yield the error over its standard deviation of parameters and checks whose true value the saloon has."""
-    car, noise = bare_vehicle(), SensorNoise()
-    true = {
-        "yaw inertia": car["yaw_inertia_kg_m2"],
-        "steering ratio": car["steering_ratio"],
-        "lever of a_y": noise.imu_x_m,
-        "roll gain": 1.0 + GRAVITY_M_S2 * car["roll_gradient_rad_per_m_s2"],
-        **{
-            f"{axle} cornering stiffness": math.prod(tyre[name] for name in ("B", "C", "D_n"))
-            for axle, tyre in car["tyres"].items()
-        },
+    figures = {
+        f"RMS error / sd, {name}": Figure(float(np.sqrt(np.mean(np.square(values)))), "1", absolute=0.03)
+        for name, values in sorted(scores.items())
     }
-    for p in (report["self_calibration"] or {}).get("parameters", ()):
-        if p["name"] in true:
-            value, right = float(p["value"]), true[p["name"]]
-            error = math.log(value / right) if p.get("log") else value - right
-            yield p["name"], error / float(p["sd"])
-    printed = {"ay_m_s2.place": 0.0, "yaw_rate_rad_s.gain": 1.0, "truth.sideslip_rad.offset": 0.0}
-    for check in report["checks"]:
-        if check["name"] in printed and (shown := _PRINTED.search(check["evidence"])):
-            yield f"check {check['name']}", (float(shown[1]) - printed[check["name"]]) / max(float(shown[2]), 0.005)
+    everything = np.abs(np.concatenate(list(scores.values())))
+    share = Figure(100.0 * float(np.mean(everything <= 1.96)), "%", absolute=1.0)
+    return figures | {"within ± 1.96 sd": share, "values": Figure(float(len(everything)), "count", 0.0)}
 
 
 def plus_minus_rows() -> Iterator[GateRow]:
