@@ -143,13 +143,13 @@ def test_files_beside_a_drive_become_mapping_and_vehicle():
     ]
     place = {"topic": "/t", "field": "f", "stamp": "header.stamp", "offset": 0.5}
     mapping = beside_mapping({"signal": [entry | place for entry in entries]})
-    assert (mapping.signals.keys(), mapping.truth.keys()) == ({"ay_m_s2"}, {"vy_m_s"})
-    assert (mapping.signals["ay_m_s2"].scale, mapping.signals["ay_m_s2"].offset) == (-1.0, 0.5)
+    assert (mapping["signals"].keys(), mapping["truth"].keys()) == ({"ay_m_s2"}, {"vy_m_s"})
+    assert mapping["signals"]["ay_m_s2"] == place | {"scale": -1.0}
     given = {"name": "car", "mass_kg": 1500.0, "yaw_inertia_kg_m2": 2500.0, "lf_m": 1.2, "lr_m": 1.4}
     given |= {"cf_axle_n_per_rad": 9e4, "cr_axle_n_per_rad": 1.1e5, "friction_front": 0.9, "friction_rear": 0.94}
     vehicle = beside_vehicle({"vehicle": given})
-    assert (vehicle.cg_to_rear_axle_m, vehicle.friction) == (1.4, pytest.approx(0.92))
-    assert vehicle.tyres.rear.cornering_stiffness_n_per_rad == 1.1e5
+    assert (vehicle["cg_to_rear_axle_m"], vehicle["friction"]) == (1.4, pytest.approx(0.92))
+    assert vehicle["tyres"]["rear"] == {"cornering_stiffness_n_per_rad": 1.1e5}
 
 
 def test_without_the_drives_it_writes_nothing_and_ends_with_0(monkeypatch, tmp_path: Path, capsys):
