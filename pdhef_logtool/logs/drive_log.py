@@ -25,7 +25,6 @@ from pdhef_logtool.records.signals import IntArray, Loss
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.columnar_log import ColumnarLog
-    from pdhef_logtool.logs.reduced_log import ReducedLog
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,11 +142,6 @@ class DriveLog(ABC):
     @property
     def index(self) -> ColumnarLog | None:
         """The log's index; None if there is none, or an inconsistent one."""
-        return None
-
-    @property
-    def reduced(self) -> ReducedLog | None:
-        """The log as a reduced log, with the record of its source; None if it is a complete log."""
         return None
 
     def metadata(self) -> dict[str, str]:
