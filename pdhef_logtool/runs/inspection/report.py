@@ -292,6 +292,7 @@ def inspect_drive_log(
     head = (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS))
     whole = _Look(windows(log.start_ns, log.end_ns, WINDOW_NS, log.recording_span), tuple(t.name for t in log.topics))
     look = whole if index is None else _sample_look(log, index, mapping, head)
+    log.expect(dict.fromkeys(look.stamps, ()))
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     looked_at = survey_log(log, mapping, clocks, head)
     mapping = looked_at.mapping
