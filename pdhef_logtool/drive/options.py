@@ -31,8 +31,6 @@ class ReadOptions:
     setup : file with what is decided once per drive; None decides it on the log. setup_from_s : decided on the first so
         many seconds of the slice; None = its first ten minutes, and clocks on all of it.
     msgs : folder with definitions of message types that a log does not define.
-    cache : folder or URL of reduced logs, which represent logs that were read before; changes no number.
-    cache_max_gb : what the cache may contain, in GB, if it is a folder; None = any.
     allow_private_redirects : whether a web server may redirect to other hosts of this machine and its network.
     """
 
@@ -47,15 +45,12 @@ class ReadOptions:
     setup: Path | None = None
     setup_from_s: float | None = None
     msgs: Path | None = None
-    cache: str | None = None
-    cache_max_gb: float | None = None
     allow_private_redirects: bool = False
 
     def __post_init__(self) -> None:
         """Take places as texts or paths."""
         object.__setattr__(self, "setup", None if self.setup is None else Path(self.setup))
         object.__setattr__(self, "msgs", None if self.msgs is None else Path(self.msgs))
-        object.__setattr__(self, "cache", None if self.cache is None else str(self.cache))
 
     @property
     def use_speed(self) -> bool:

@@ -112,8 +112,8 @@ class Drive:
 
     @property
     def file(self) -> str:
-        """Name of the file or folder; of a reduced log that of the one that it represents."""
-        return self.path.name if self.log.reduced is None else self.log.reduced.record.file
+        """Name of the file or folder."""
+        return self.path.name
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -161,12 +161,7 @@ class Drive:
 
     @property
     def sha256(self) -> str:
-        """What the log is known by (:func:`identity_of`), computed when it is first asked for.
-
-        Of a reduced log it is that of the one that it represents.
-        """
-        if self.log.reduced is not None:
-            return self.log.reduced.record.identity
+        """Identity of the log (:func:`identity_of`), computed at the first access."""
         self._sha256 = self._sha256 or identity_of(LogInput(self.path, self.name))
         check_unchanged(self.path, self._state)
         return self._sha256
@@ -309,8 +304,6 @@ def read_drive(
         for ambiguity in chosen.ambiguities:
             told(str(ambiguity))
         remarks += chosen.remarks
-        if opened.reduced is not None:
-            remarks.append(f"a reduced log replaces {opened.reduced.record.file}")
         used = chosen.mapping
         if adjust is not None:
             used = adjust(opened, used, told)

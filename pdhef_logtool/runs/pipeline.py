@@ -16,10 +16,9 @@ import numpy as np
 
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
 from pdhef_logtool.car.parts import PHYSICS
-from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.plan import DrivePlan, setup_of
-from pdhef_logtool.drive.reading import Drive, lost_texts
+from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
 from pdhef_logtool.drive.setup import setup_toml
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
@@ -301,7 +300,7 @@ def run_log(
         Nothing of the log can be used; nothing is then left under a final name.
     """
     reporter.progress(log_input.stem, 0.0)
-    with read_cached(log_input, car, mapping, config.read_options, reporter.warn) as drive:
+    with read_drive(log_input, car, mapping, config.read_options, tell=reporter.warn) as drive:
         calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
         car = self_calibrated(drive, calibration)
         ready, skipped, requested = _choose_estimators(drive, config, car)

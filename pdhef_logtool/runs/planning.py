@@ -35,8 +35,6 @@ _NO_SETTING = frozenset(
     {
         "keep",
         "annotate",
-        "cache",
-        "cache_max_gb",
         "allow_private_redirects",
         "car",
         "cars",

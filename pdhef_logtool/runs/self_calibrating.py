@@ -13,8 +13,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.drive.cached import read_cached
-from pdhef_logtool.drive.reading import Drive
+from pdhef_logtool.drive.reading import Drive, read_drive
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.logs.discovery import LogInput
@@ -55,7 +54,7 @@ def calibrate_pool(
     drivings = []
     for log_input in inputs:
         try:
-            with read_cached(log_input, car, mapping, config.read_options) as drive:
+            with read_drive(log_input, car, mapping, config.read_options) as drive:
                 if not lacking(drive):
                     drivings.append(read_driving(drive))
         except PdhefError:

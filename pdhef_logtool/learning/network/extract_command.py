@@ -18,10 +18,9 @@ from pdhef_logtool.car.car import NO_INTERVALS, VEHICLE_FILE, Car
 from pdhef_logtool.car.parts import PHYSICS, physics_sha256
 from pdhef_logtool.car.taught import ESTIMATED
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.plan import DrivePlan
-from pdhef_logtool.drive.reading import Drive, Tell, friction_of, no_samples
+from pdhef_logtool.drive.reading import Drive, Tell, friction_of, no_samples, read_drive
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.calibration import self_calibrate
@@ -473,7 +472,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
     fingerprint, target = _fingerprint(job, split), job.target(split)
     if job.resume and (kept := _kept(job, target, source, split, fingerprint)) is not None:
         return kept
-    with read_cached(job.log_input, job.car, job.mapping, settings.config.read_options) as drive:
+    with read_drive(job.log_input, job.car, job.mapping, settings.config.read_options) as drive:
         drive.plan = plan = _strict_truth(drive.plan)
         reference, _ = teaching_reference(drive, settings.config)
         _check_plan(plan, job, estimated=reference is not None)
