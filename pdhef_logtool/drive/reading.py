@@ -13,7 +13,6 @@ from pdhef_logtool.drive.friction import FrictionSource, friction_source
 from pdhef_logtool.drive.options import ReadOptions, time_slice
 from pdhef_logtool.drive.setup import CLOCK_START_S, LogUntil, Setup, is_device_clock, load_setup
 from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive, setup_of
-from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -189,11 +188,6 @@ class Drive:
             [self.log.lost, () if self._reader is None else self._reader.losses, damage(self.sample_ledger)]
         )
         return tuple(replace(x, where=self.without_folder(x.where)) for x in merged)
-
-    @property
-    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Where the bytes of each file of the log went so far. Files are named without their folder."""
-        return tuple(replace(x, file=self.without_folder(x.file)) for x in self.log.byte_ledgers)
 
     def without_folder(self, where: str) -> str:
         """Return a place in the log without the folder that the log lies in."""

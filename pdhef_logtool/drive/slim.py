@@ -54,7 +54,7 @@ def slim_log(
 def write_slim(drive: Drive, target: Path) -> ReducedRecord:
     """Write the reduced log of a drive that was read from start to end, and return its record."""
     log = _messages_of(drive)
-    lost, ledgers = log.lost, drive.byte_ledgers  # before the copy, which may look at more than a run does
+    lost = log.lost  # before the copy, which may look at more than a run does
     record = ReducedRecord(
         format=FORMAT,
         tool=__version__,
@@ -66,7 +66,7 @@ def write_slim(drive: Drive, target: Path) -> ReducedRecord:
         left_out={topic: dict(by_reason) for topic, by_reason in log.recording_span.left_out.items()},
         topics=log.topics,
         losses=tuple(replace(x, where=drive.without_folder(x.where)) for x in lost),
-        byte_ledgers=ledgers,
+        size=drive.log.size,
         metadata=log.metadata(),
         mapped=drive.chosen.to_dict(),
         signals_sha256=drive.signals_sha256,

@@ -15,7 +15,6 @@ from typing import Any
 
 from mcap.opcode import Opcode
 
-from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import MAX_TIME_NS, MCAP_MAGIC, Container
 from pdhef_logtool.logs.drive_log import TopicInfo
@@ -28,7 +27,7 @@ from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.version import LIBRARY
 
 #: Of the record's content; another one is not read.
-FORMAT = 1
+FORMAT = 2
 #: Name of the MCAP metadata record, and of its one entry.
 RECORD_NAME, RECORD_ENTRY = "pdhef_slim", "json"
 #: Opcode, size; CRC of all before it.
@@ -49,7 +48,7 @@ class ReducedRecord:
     file, kind, identity : name, format and identity of the source. tool : version that wrote this.
     distro : ROS distribution of types that the source does not define.
     intervals, left_out : of its :class:`RecordingSpan`. topics : all of them with their messages, kept or not.
-    losses, byte_ledgers : complete, as after a run of the whole source.
+    losses : complete, as after a run of the whole source. size : bytes of the source.
     metadata : of the source. mapped : the mapping, as the package ``drive`` writes it.
     signals_sha256, truth_sha256 : hashes of the mapped channels.
     """
@@ -64,7 +63,7 @@ class ReducedRecord:
     left_out: dict[str, dict[str, int]]
     topics: tuple[TopicInfo, ...]
     losses: tuple[Loss, ...]
-    byte_ledgers: tuple[ByteLedger, ...]
+    size: int
     metadata: dict[str, str]
     mapped: dict[str, Any]
     signals_sha256: str | None
@@ -109,9 +108,9 @@ class ReducedLog(ColumnarLog):
         return (*self.record.losses, *(x for x in super().lost if x.kind not in _FOUND_AGAIN))
 
     @property
-    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Byte ledger of each file of the source."""
-        return self.record.byte_ledgers
+    def size(self) -> int:
+        """Bytes of the source."""
+        return self.record.size
 
     def attached(self, name: str) -> Path:
         """Return a file that was attached, to be read until the log is closed; raises LogError where there is none."""

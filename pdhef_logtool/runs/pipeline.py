@@ -623,7 +623,7 @@ def _open_sinks(
             first = frozenset({shown.main, TRUTH})
             is_named = bool(config.estimators) and config.estimators != (ALL_ESTIMATORS,)
             step_ns = thinned_step_ns(
-                sum(ledger.size for ledger in drive.byte_ledgers),
+                drive.log.size,
                 rows=rows,
                 others=len(job.ready) - 1,
                 span_ns=drive.plan.end_ns - drive.plan.start_ns,
@@ -800,7 +800,6 @@ def report_facts(
         metrics=rows,
         segments=events,
         losses=losses,
-        file_bytes=drive.byte_ledgers,
         samples=drive.sample_ledger if ledger is None else ledger,
         warnings=drive.notes,
         remarks=drive.remarks,

@@ -55,7 +55,7 @@ def _facts(path: Path, mapping: Mapping | None, options: ReadOptions) -> dict[st
             "told": (drive.checks, drive.notes, drive.missing),
             "remarks": [r for r in drive.remarks if not r.startswith("a reduced log replaces")],
             "losses": drive.losses,
-            "samples": (drive.samples, drive.sample_ledger, drive.byte_ledgers),
+            "samples": (drive.samples, drive.sample_ledger, drive.log.size),
             "log": (drive.file, log.kind, log.topics, log.start_ns, log.end_ns),
             "plan": repr((plan.clocks, plan.alignment, plan.latency, plan.dependent, plan.derivation)),
         }
