@@ -107,7 +107,6 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         checks=sorted(report.get("checks") or (), key=lambda c: ("failed", "undecided", "passed").index(c["verdict"])),
         losses=(report.get("losses") or ())[:_MOST_ROWS],
         samples=[s for s in report["ledger"]["samples"] if s["dropped"]][:_MOST_ROWS],
-        budget=report.get("error_budget"),
         faults=report.get("faults"),
         metadata=report.get("metadata") or {},
         ay_note=AY_NOTE,

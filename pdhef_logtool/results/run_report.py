@@ -139,13 +139,11 @@ class DriveDetails:
 
     ``faults`` of the sensors, None where no estimator detects them.
     ``standings`` of the selected estimate, empty without ground truth.
-    ``error_budget`` has a reason where there is none.
     ``metadata`` : what the log states of itself.
     """
 
     faults: Sequence[SensorFault] | None
     standings: Sequence[Standing]
-    error_budget: Any
     metadata: Mapping[str, str]
     path_drift: PathDrift | None = None
 
@@ -355,7 +353,6 @@ def _detailed(details: DriveDetails) -> dict[str, Any]:
     """Return the keys that only a run writes."""
     values = {
         "faults": details.faults,
-        "error_budget": details.error_budget,
         "path_drift": details.path_drift,
         "metadata": dict(details.metadata),
     }
@@ -374,7 +371,7 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
     if space := report.get("operating_space"):
         first["operating_space"] = {**space, "cells": [*map(_rounded, space["cells"])]}
     return {
-        **{key: value for key, value in report.items() if key not in ("error_budget", "plan")},
+        **{key: value for key, value in report.items() if key != "plan"},
         **first,
         "log": {**report["log"], "topics": [t for t in report["log"]["topics"] if t["mapped"]]},
         "estimators": [_brief_estimator(e, names) for e in report["estimators"]],

@@ -456,9 +456,7 @@ def _facts(
     rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
     truth, selected, vehicle = store.read(TRUTH), store.read(main.name), job.car.vehicle
     space = operating_space(signals, truth, selected, vehicle)
-    details = drive_details(
-        drive, job.ready, main.name, store.read, signals, brief=config.kept != "full", metadata=not config.no_position
-    )
+    details = drive_details(drive, job.ready, main.name, store.read, metadata=not config.no_position)
     others = [t for n in (REFERENCE, PHYSICS, *algorithms) if n != main.name and (t := store.read(n)) is not None]
     return replace(
         report_facts(drive, job.car, estimators, rows, scored.events, losses),
