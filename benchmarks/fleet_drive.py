@@ -2,7 +2,7 @@
 
 The default estimators on the shipped car with its network, and on the default sedan, which each log calibrates first:
 all of ``pdhef run --keep metrics`` except the files of the whole run. Then the parts, all estimators, and further
-outputs: tracks, and with ``full`` the recording, annotated copy, error decomposition and page.
+outputs: tracks, and with ``full`` the recording, annotated copy and page.
 """
 
 from __future__ import annotations

@@ -130,7 +130,7 @@ def _parts_of_a_run() -> None:
     timed(estimating, "run_estimator", None)
     timed(pipeline, "_estimate", "monitors, intervals, poses")
     timed(pipeline, "evaluate", "figures")
-    timed(drive_details, "drive_details", "error decomposition and details")
+    timed(drive_details, "drive_details", "details")
     for sink, what in (
         (parquet.EstimatesSink, "estimates.parquet"),
         (mcap.AnnotatedMcapSink, "annotated.mcap"),

@@ -14,7 +14,6 @@ from pdhef_logtool.drive.options import ReadOptions, time_slice
 from pdhef_logtool.drive.plan import DrivePlan, plan_drive, setup_of
 from pdhef_logtool.drive.recorded import Recorded, read_recorded
 from pdhef_logtool.drive.setup import CLOCK_START_S, LogUntil, Setup, is_device_clock, load_setup
-from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput, check_unchanged, find_logs, identity_of, log_state
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -183,11 +182,6 @@ class Drive:
             [self.log.lost, () if self._recorded is None else self._recorded.losses, damage(self.sample_ledger)]
         )
         return tuple(replace(x, where=self.without_folder(x.where)) for x in merged)
-
-    @property
-    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Where the bytes of each file of the log went so far. Files are named without their folder."""
-        return tuple(replace(x, file=self.without_folder(x.file)) for x in self.log.byte_ledgers)
 
     def without_folder(self, where: str) -> str:
         """Return a place in the log without the folder that the log lies in."""

@@ -13,7 +13,6 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.compression import decompress_messages
 from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, count_text, describe_damage
@@ -164,11 +163,6 @@ class ColumnarLog(DriveLog):
                     losses.append(Loss("bad-schema", what, container.channels[channel].topic))
         return tuple(losses)
 
-    @property
-    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Byte ledger of each file so far."""
-        return tuple(c.account.ledger(str(c.path)) for c in self.containers)
-
     def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
         counts: Counter[int] = Counter()
         for (of, channel, _), rows in self._undecodable.items():
@@ -235,7 +229,7 @@ class ColumnarLog(DriveLog):
     @property
     def size(self) -> int:
         """Bytes of all files."""
-        return sum(container.account.size for container in self.containers)
+        return sum(container.size for container in self.containers)
 
     @property
     def chunks_read(self) -> tuple[int, int]:
@@ -386,7 +380,6 @@ class ColumnarLog(DriveLog):
             container.meter.check()
         except LimitError:
             self._late.setdefault(c, {})[span.index] = span
-            container.account.lose(*extent)
             return None
         try:
             with container.meter.running(extent[1] - extent[0]):
@@ -398,11 +391,9 @@ class ColumnarLog(DriveLog):
             count = sum(span.counts.values()) or None
             what = f"{count_text(count)} lost at byte {extent[0]}: {text}"
             self._damaged[key] = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
-            container.account.lose(*extent)
             return None
         if (*key, want) not in self._seen:
             self._seen.add((*key, want))
-            container.account.decode(*extent)
             self._correct_span(c, span, block, want)
         if kept is None and self._kept_bytes < _KEPT_BYTES:
             self._kept[(*key, want)] = small = block.without_large(_LARGE_BYTES)
@@ -425,7 +416,7 @@ class ColumnarLog(DriveLog):
         others = {id_: n for id_, n in span.counts.items() if id_ not in claimed}
         container.spans[span.index] = replace(span, counts=others | declared)
         missing = sum(max(n - declared.get(id_, 0), 0) for id_, n in claimed.items())
-        start, end = container.extent(span)
+        start, _ = container.extent(span)
         for kind, count, text in (
             ("missing-messages", missing, "that the index names are not there"),
             ("unknown-channel", undeclared, "are on channels that no readable record declares"),
@@ -435,7 +426,6 @@ class ColumnarLog(DriveLog):
                 what = f"{count} messages {text}, at byte {start}"
                 loss = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
                 self._partial[c, span.index, (kind, want)] = loss
-                container.account.lose_share((start, end), count / (len(block) + missing))
 
     def schema_of(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
         """Return the schema of a channel of the c-th container, or why there is none."""

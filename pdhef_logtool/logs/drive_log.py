@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -100,8 +99,8 @@ class DriveLog(ABC):
 
     @property
     @abstractmethod
-    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Byte ledger of each file so far."""
+    def size(self) -> int:
+        """Bytes of all files."""
 
     @abstractmethod
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:

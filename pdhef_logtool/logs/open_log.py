@@ -185,7 +185,6 @@ def _open_plain(file: LogFile) -> Container | DriveLog:
         opened.on_close(file.release)
         if file.cut:
             opened.lose("truncated", file.cut)
-            opened.account.cut = True
     return opened
 
 

@@ -459,15 +459,7 @@ def _facts(
     rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
     truth, selected, vehicle = estimated.truth, estimated.read(main.name), job.car.vehicle
     space = operating_space(signals, truth, selected, vehicle)
-    details = drive_details(
-        drive,
-        job.ready,
-        main.name,
-        estimated.read,
-        signals,
-        brief=config.kept != "full",
-        metadata=not config.no_position,
-    )
+    details = drive_details(drive, job.ready, main.name, estimated.read, metadata=not config.no_position)
     others = [t for n in (REFERENCE, PHYSICS, *algorithms) if n != main.name and (t := estimated.read(n)) is not None]
     return replace(
         report_facts(drive, job.car, estimators, rows, scored.events, losses),
@@ -632,7 +624,7 @@ def _open_sinks(
             first = frozenset({shown.main, TRUTH})
             is_named = bool(config.estimators) and config.estimators != (ALL_ESTIMATORS,)
             step_ns = thinned_step_ns(
-                sum(ledger.size for ledger in drive.byte_ledgers),
+                drive.log.size,
                 rows=rows,
                 others=len(job.ready) - 1,
                 span_ns=drive.plan.end_ns - drive.plan.start_ns,
@@ -809,7 +801,6 @@ def report_facts(
         metrics=rows,
         segments=events,
         losses=losses,
-        file_bytes=drive.byte_ledgers,
         samples=drive.sample_ledger if ledger is None else ledger,
         warnings=drive.notes,
         remarks=drive.remarks,

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool import Car, ReadOptions, estimate, inspect_log, read_drive
+from pdhef_logtool import Car, estimate, inspect_log, read_drive
 from pdhef_logtool.logs import formats
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.log_file import LogFile

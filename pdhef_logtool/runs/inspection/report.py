@@ -15,7 +15,6 @@ import numpy as np
 
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
-from pdhef_logtool.logs.byte_account import checksummed_share
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
@@ -164,7 +163,6 @@ class Inspection:
     ambiguities, notes : of the mapping. candidates : fields that were weighed for it.
     checks : what physics states of signals and ground truth. proposals : corrections of the mapping that are certain.
     lost : every loss and note of reading. sample : what was looked at; None: everything.
-    checksummed_share : which share of the bytes that were read a verified checksum covers; None where none was read.
     lines : extremes in equal parts of the log [C] by section and signal, no part of the JSON.
     refused : by channel why a run computes nothing from it.
     """
@@ -186,7 +184,6 @@ class Inspection:
     lost: tuple[Loss, ...]
     candidates: tuple[Candidate, ...] = ()
     sample: Sample | None = None
-    checksummed_share: float | None = None
     lines: MappingABC[tuple[str, str], tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     refused: MappingABC[str, str] = field(default_factory=dict)
 
@@ -228,7 +225,6 @@ class Inspection:
             "checks": self.checks,
             "proposals": [{"subject": p.subject, "evidence": p.evidence} for p in self.proposals],
             "lost": self.lost,
-            "checksummed_share": self.checksummed_share,
             "candidates": self.candidates,
             **self.uses,
         }
@@ -320,7 +316,6 @@ def inspect_drive_log(
         lost=merge_losses([log.lost, reading]),
         candidates=candidates,
         sample=None if look.sample is None else look.sample(),
-        checksummed_share=checksummed_share(log.byte_ledgers),
         lines={key: (entry.line.low, entry.line.high) for key, entry in gathered.items()},
         refused=looked_at.refused(),
     )
