@@ -23,8 +23,7 @@ from pdhef_logtool.estimators.calibration.driving import DrivingReader
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.self_calibrated import CAR_STD_RAD, D2_SHARE, OPEN_LOOP
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, signal_error
-from pdhef_logtool.evaluation.metrics.lateral_consistency import consistency_rows
+from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, EvaluatedDrive, evaluate_drive, signal_error
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -165,7 +164,6 @@ def errors_of(
     drive: WholeDrive, car: Car, names: Sequence[str], calibration: SelfCalibration
 ) -> dict[str, tuple[float, float]]:
     """Return sideslip RMSE in degrees and d2 in m/s of estimators, by name."""
-    whole = {ALL: np.ones(len(drive.signals), dtype=np.bool_)}
     sensors = log_sensors(car.vehicle, calibration)
     errors = {}
     truth = drive.truth
@@ -176,7 +174,7 @@ def errors_of(
             car = car.with_noise("physics", calibration.noise.model_copy(update={"r_std": {}}))
         used = "open-loop" if name == OPEN_LOOP and car.self_calibrated is None else name
         track, _ = run_window(make_estimator(used, car), drive.signals)
-        rows = consistency_rows([track], drive.signals, whole, log="", low_speed_m_s=low, sensors=sensors)
+        rows = evaluate_drive(EvaluatedDrive("", {name: track}, None, drive.signals, {}, low, sensors), ("d2",))
         rmse = float(np.degrees(np.sqrt(np.nanmean(signal_error(track, truth, SIDESLIP, low) ** 2))))
         errors[name] = rmse, rows[0].value if rows else float("nan")
     return errors

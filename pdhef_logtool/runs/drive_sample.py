@@ -12,7 +12,6 @@ from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.gnss_aided import GnssAided
 from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
 from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
-from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
@@ -64,7 +63,7 @@ def sample_drive(signals: Signals, truth: StateTrack | None, weight: FloatArray)
     finite_index = np.flatnonzero(np.isfinite(weight))
     if finite_index.size < BLOCKS:
         return None
-    stamps = np.concatenate([signals.rows(a, b).stamps_ns for a, b in row_blocks(len(signals))])
+    stamps = signals.stamps_ns
     step_s = float(np.median(np.diff(stamps))) * 1e-9
     want = min(MOST_STAMPS // BLOCKS, finite_index.size // BLOCKS, max(1, int(SECONDS / BLOCKS / step_s)))
     spans: list[tuple[int, int, int]] = []

@@ -7,7 +7,7 @@ the log has an IMU; the sensors, which only cut the drive into segments, are int
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,6 +43,7 @@ from pdhef_logtool.records.signals import (
     ALIGNED_SIGNALS,
     TRUTH_UNITS,
     WHEELS,
+    BoolArray,
     Channel,
     FloatArray,
     IntArray,
@@ -50,7 +51,7 @@ from pdhef_logtool.records.signals import (
     Signals,
     join_signals,
 )
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.tracks import REFERENCE, StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
 from pdhef_logtool.results.run_report import EstimatorFacts, build_report, write_json
@@ -77,7 +78,6 @@ from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
-    from pdhef_logtool.evaluation.blocks import SegmentMasks
     from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
@@ -305,8 +305,7 @@ class _Scoring:
 
         Return the blocks of the plan's requirements, too.
         """
-        from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, score_track
-        from pdhef_logtool.evaluation.metrics.reference import reference_rows
+        from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, EvaluatedDrive, evaluate_drive
         from pdhef_logtool.evaluation.segments import segment_masks
 
         rows: list[MetricRow] = []
@@ -317,9 +316,6 @@ class _Scoring:
             seen = signals_at(signals, r.track.stamps_ns)
             masks = segment_masks(seen, at_stamps, self.car.vehicle, manoeuvres)
             slow = self.car.vehicle.low_speed_blend_m_s
-            figures: list[MetricRow] = []
-            if reference is not None:
-                figures += reference_rows([r.track], reference, masks, log=drive.name, low_speed_m_s=slow)
             same = {
                 name: f"the ground truth's {name} equals that of the estimate {r.track.name}"
                 for name in SCORED_SIGNALS
@@ -330,15 +326,9 @@ class _Scoring:
             for base in (b for b in (at_stamps, reference) if b is not None):
                 more = self._blocks(r, base, masks, tainted, alone=alone, estimated=base is reference)
                 blocks += [b for b in more if all((b.of, b.estimator) != (x.of, x.estimator) for x in blocks)]
-            if at_stamps is not None:
-                figures += score_track(
-                    r.track,
-                    at_stamps,
-                    masks,
-                    log=drive.name,
-                    low_speed_m_s=slow,
-                    not_independent={**plan.dependent, **same},
-                )
+            tracks = {r.track.name: r.track} | ({} if reference is None else {REFERENCE: reference})
+            scored = EvaluatedDrive(drive.name, tracks, at_stamps, None, masks, slow, dependent=tainted)
+            figures = [row for row in evaluate_drive(scored) if row.estimator == r.track.name]
             if not any(row.metric in ("rmse", "reference_rms") for row in figures):
                 drive.tell(
                     f"{r.track.name}: nowhere are estimate and ground truth known together, so there are no errors"
@@ -356,7 +346,7 @@ class _Scoring:
         self,
         r: RecordedEstimate,
         truth: StateTrack,
-        masks: SegmentMasks,
+        masks: Mapping[str, BoolArray],
         tainted: frozenset[str],
         *,
         alone: bool,
