@@ -66,12 +66,11 @@ def evaluate(
     tracks = {name: track for name in names if (track := read(name)) is not None}
     slow, dependent = vehicle.low_speed_blend_m_s, drive.plan.dependent
     rows = evaluate_drive(EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, sensors, dependent))
-    events = segment_events(signals, masks, manoeuvres)
-    events += [event for track in tracks.values() for event in diverged_events(track)]
+    events = drive_events(signals, masks, manoeuvres, [*tracks.values()])
     moves = bool(moving.any())
     silent = [n for n, track in tracks.items() if moves and not (moving & track.valid & track.something_known).any()]
     reasons = {name: summarise_reasons(track) for name, track in tracks.items()}
-    return Evaluation(rows, sorted(events, key=in_time), reasons, tuple(silent), moves, masks)
+    return Evaluation(rows, events, reasons, tuple(silent), moves, masks)
 
 
 def in_time(event: Event) -> tuple[int, int, str]:
@@ -79,16 +78,22 @@ def in_time(event: Event) -> tuple[int, int, str]:
     return event.start_ns, event.end_ns, event.name
 
 
-def segment_events(
-    stamped: Signals | StateTrack, masks: Mapping[str, BoolArray], manoeuvres: Sequence[Manoeuvre]
+def drive_events(
+    stamped: Signals | StateTrack,
+    masks: Mapping[str, BoolArray],
+    manoeuvres: Sequence[Manoeuvre],
+    tracks: Sequence[StateTrack],
 ) -> list[Event]:
-    """Return the segments that are worth an event, not the whole drive, nor ``linear``; manoeuvres with their peaks."""
+    """Return segments, manoeuvres with their peaks, and intervals in which an estimator reports divergence, in order.
+
+    The whole drive and ``linear`` are no events.
+    """
     from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES
     from pdhef_logtool.evaluation.segments import find_intervals
 
     spans = [s for s in find_intervals(stamped, masks) if s.name not in ("all", "linear", *MANOEUVRES)]
     events = [Event(s.name, s.start_ns, s.end_ns, "") for s in spans]
-    return events + [
+    events += [
         ManoeuvreEvent(
             name=m.name,
             start_ns=m.start_ns,
@@ -103,12 +108,9 @@ def segment_events(
         )
         for m in manoeuvres
     ]
-
-
-def diverged_events(track: StateTrack) -> list[Event]:
-    """Return when an estimator states of itself that it diverges."""
-    from pdhef_logtool.evaluation.segments import find_intervals
-
-    name, text = f"{track.name} diverged", "the estimator reports its own divergence"
-    spans = find_intervals(track, {"diverged": track.diverged})
-    return [Event(name, s.start_ns, s.end_ns, text) for s in spans]
+    for track in tracks:
+        events += [
+            Event(f"{track.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
+            for s in find_intervals(track, {"diverged": track.diverged})
+        ]
+    return sorted(events, key=in_time)
