@@ -334,9 +334,7 @@ def test_the_file_says_where_it_is_from(calibration: Path, sample_logs_dir: Path
     assert {c["wrong_vehicle"] for c in document["entries"][0]["coverage"]} == {False, True}
 
 
-def test_a_run_uses_it_and_says_so(
-    calibration: Path, sample_logs_dir: Path, tmp_path: Path
-) -> None:
+def test_a_run_uses_it_and_says_so(calibration: Path, sample_logs_dir: Path, tmp_path: Path) -> None:
     figures = {}
     for name, made in (("plain", Path("none")), ("whole", calibration)):
         config = RunConfig(
