@@ -34,7 +34,6 @@ from pdhef_logtool.evaluation.comparison import end_to_end
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.learning.car.taught_prior import TaughtDriving, taught_driving, taught_parameters
 from pdhef_logtool.learning.drives import TEACH, DriveRecord, no_drive, record_of
-from pdhef_logtool.learning.split import TRAINING
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.learning.truth import teaching_reference, weight_of
 from pdhef_logtool.logs.discovery import LogInput
@@ -145,7 +144,7 @@ def teach(task: Task) -> StageOutput:
         with read_cached(log, car, task.mapping, task.options) as drive:
             return open_drive(drive, task.settings.config)
 
-    records, drives = task.read(task.split.parts[TRAINING], read, 0.3)
+    records, drives = task.read(read, 0.3)
     if not drives:
         raise no_drive("a true sideslip and the signals of a calibration", TEACH)
     seconds = math.fsum(d.seconds for d in drives)
