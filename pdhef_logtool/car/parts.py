@@ -31,7 +31,7 @@ PHYSICS = "physics"
 #: Filters whose noise a car may contain, by the name of the estimator that it belongs to.
 NOISY_FILTERS = ("phy-ukf:tuned", PHYSICS)
 #: By what the process noise of v_y and yaw rate is multiplied where ``physics`` is smoothed, and nothing was found on
-#: ground truth: ``studies.defaults.tune_smoothing``, on simulated cars.
+#: ground truth: by a search on simulated cars.
 SMOOTHING = (0.5, 3.0)
 #: Measurements that ``r_std`` is about.
 MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
