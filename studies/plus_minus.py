@@ -122,7 +122,7 @@ def of_calibration(
 
 def of_friction(drive: Drive, friction: float) -> Iterator[tuple[str, float, float]]:
     """Yield the friction estimate once a second where the drive shows it."""
-    estimate = np.concatenate([w.signals.friction for w in drive.windows()])
+    estimate = drive.whole().signals.friction
     source = drive.friction
     std = source.std
     for i in np.flatnonzero(source.observable)[::100]:

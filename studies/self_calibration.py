@@ -19,7 +19,7 @@ from pdhef_logtool.car.toml_files import load_vehicle
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
-from pdhef_logtool.estimators.calibration.driving import DrivingReader
+from pdhef_logtool.estimators.calibration.driving import driving_of
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.self_calibrated import CAR_STD_RAD, D2_SHARE, OPEN_LOOP
 from pdhef_logtool.estimators.table import make_estimator
@@ -102,9 +102,7 @@ def simulated_drives(
 
 def calibrate(signals: Signals, file: VehicleParameters) -> SelfCalibration:
     """Calibrate a car on the signals of a log, read with its file."""
-    reader = DrivingReader(file)
-    reader.add(signals)
-    return self_calibrate([reader.finish()], file)
+    return self_calibrate([driving_of(signals, file)], file)
 
 
 def taken(signals: Signals, file: VehicleParameters, calibration: SelfCalibration) -> Car:

@@ -13,8 +13,6 @@ from pdhef_logtool.records.errors import UsageError
 
 #: A bare integer from here on is nanoseconds, not seconds from the log's start.
 NANOSECONDS_FROM = 10**15
-#: Short enough that what is worked on stays in a processor's cache, long enough that a window's own cost is small.
-WINDOW_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +25,6 @@ class ReadOptions:
     sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
     friction : of :func:`~pdhef_logtool.drive.friction.parse_friction`; None leaves what the log states, if anything.
     prefer_truth : which ground truth counts in a simulated log that has both.
-    window_s : length of the windows that the log is processed in; changes no number.
     clock : ``arrival`` takes samples as known when they arrived, as in a car; ``stamp`` by their stamps (not causal).
     budget : factor on what reading a log may cost.
     waived : names of checks that do not count.
@@ -44,7 +41,6 @@ class ReadOptions:
     sensors: Literal["full", "esp"] = "full"
     friction: str | float | None = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
-    window_s: float = WINDOW_S
     clock: Literal["arrival", "stamp"] = "arrival"
     budget: float = 1.0
     waived: tuple[str, ...] = ()

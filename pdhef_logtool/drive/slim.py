@@ -46,7 +46,7 @@ def slim_log(
     whole = replace(options, start=None, end=None)
     with read_drive(replace(log, span_s=None), Car.load(None), mapping, whole, tell=tell) as drive:
         _messages_of(drive)
-        for _ in drive.windows(fill_friction=False):
+        for _ in (drive.recorded(),):
             pass
         return write_slim(drive, target)
 

@@ -17,8 +17,8 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import LearntOn
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import MAX_BYTES, Drive, Tell, WholeDrive, lost_texts
-from pdhef_logtool.drive.windows import DrivePlan
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
 from pdhef_logtool.mapping import Mapping as SignalMapping

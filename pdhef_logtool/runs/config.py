@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 from pdhef_logtool.car.car import NO_INTERVALS, SHIPPED_CARS, UNSURE
 from pdhef_logtool.car.vehicle import SENSOR_PROFILES
 from pdhef_logtool.drive.friction import parse_friction
-from pdhef_logtool.drive.options import WINDOW_S, ReadOptions, parse_time
+from pdhef_logtool.drive.options import ReadOptions, parse_time
 from pdhef_logtool.estimators.presets import split_names
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
@@ -77,7 +77,6 @@ class RunConfig:
     friction : ``auto`` (from the log, else the car, else estimated; for ``extract`` first from the ground truth),
         ``file``, ``estimate``, or a number.
     prefer_truth : ground truth of a simulated log that has both: ``perfect`` or ``rtk``.
-    window_s : length of the windows in which a log is processed, in s. Results do not depend on it.
     clock : ``arrival`` (a sample is available from its arrival on) or ``stamp`` (from its stamp on; not causal).
     budget : factor on the limits of memory and time for reading a log.
     msgs : folder, zip file or wheel with .msg files of types that a log does not define; or a DBC file, or a folder of
@@ -119,7 +118,6 @@ class RunConfig:
     sensor_profile: File | None = None
     friction: Literal["auto", "file", "estimate"] | Friction = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
-    window_s: Annotated[float, Field(ge=1, le=1e9)] = WINDOW_S
     clock: Literal["arrival", "stamp"] = "arrival"
     budget: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     msgs: File | None = None

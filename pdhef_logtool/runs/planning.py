@@ -38,7 +38,6 @@ _NO_SETTING = frozenset(
         "cache",
         "cache_max_gb",
         "allow_private_redirects",
-        "window_s",
         "car",
         "cars",
         "network",

@@ -107,16 +107,9 @@ def test_an_inspection_shows_tables_and_their_units(npz: Path) -> None:
 
 
 @pytest.mark.usefixtures("_installed")
-def test_a_drive_of_tables_is_estimated_in_windows(npz: Path) -> None:
-    tracks = []
-    for window_s in (2.0, 60.0):
-        with read_drive(npz, Car.load("saloon"), options=ReadOptions(window_s=window_s)) as drive:
-            tracks.append(estimate(drive, ["zero", "phy-ukf"]).tracks["phy-ukf"])
-            (ledger,) = drive.byte_ledgers
-            assert (ledger.size, ledger.decoded, ledger.lost) == (npz.stat().st_size, npz.stat().st_size, 0)
-    assert tracks[0].valid.any()
-    for name in ("sideslip_rad", "vx_m_s", "yaw_rate_rad_s"):
-        np.testing.assert_array_equal(*(getattr(t, name) for t in tracks))
+def test_a_drive_of_tables_is_estimated(npz: Path) -> None:
+    with read_drive(npz, Car.load("saloon")) as drive:
+        assert estimate(drive, ["zero", "phy-ukf"]).tracks["phy-ukf"].valid.any()
 
 
 @pytest.mark.usefixtures("_installed")
