@@ -82,7 +82,7 @@ class Block:
     buffer : bytes that contain all payloads.
     channel, log_time_ns, publish_time_ns, sequence, offset, length : int64 [N]; message i is
         ``buffer[offset[i]:offset[i] + length[i]]``.
-    dropped : channels of which payloads are left out.
+    dropped : channels that lack payloads.
     """
 
     buffer: bytes | memoryview

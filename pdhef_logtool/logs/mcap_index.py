@@ -25,11 +25,13 @@ _MOST_SUMMARY_BYTES = 64 << 20
 RECORD = struct.Struct("<BQ")  # opcode, size of what follows
 FOOTER = struct.Struct("<BQQQI")  # the same, then: start of summary and of its offsets, CRC of the summary
 _CHUNK_INDEX = struct.Struct("<QQQQI")  # first and last time, offset, length, bytes of the message indexes' offsets
-_STATISTICS = struct.Struct("<QHIIIIQQI")
+STATISTICS = struct.Struct("<QHIIIIQQI")
+_CRC = struct.Struct("<I")
 _EXTENT = struct.Struct("<QQ")
 _OFFSETS = np.dtype([("id", "<u2"), ("at", "<u8")])
-_COUNTS = np.dtype([("id", "<u2"), ("n", "<u8")])
-_INDEX_BYTES, _PAIR_BYTES = 15, 16  # of a message index, and of each message in it
+COUNTS = np.dtype([("id", "<u2"), ("n", "<u8")])
+_INDEX = struct.Struct("<BQHI")  # message index: opcode, size, channel, size of its pairs
+_PAIR = struct.Struct("<QQ")  # log time and offset of a message
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,13 +75,13 @@ def _summary(source: ByteSource) -> tuple[bytes, int] | None:
     source.prefetch([(tail, size)])
     end = source.read(foot, size - foot)
     opcode, length, start, _, crc = FOOTER.unpack_from(end)
-    if opcode != Opcode.FOOTER or length != FOOTER.size - 9 or end[FOOTER.size :] != MCAP_MAGIC:
+    if opcode != Opcode.FOOTER or length != FOOTER.size - RECORD.size or end[FOOTER.size :] != MCAP_MAGIC:
         return None
     if not 0 < start < foot or foot - start > _MOST_SUMMARY_BYTES:
         return None
     source.prefetch([(start, size)])
     summary = source.read(start, foot - start)
-    if crc and crc32(end[: FOOTER.size - 4], crc32(summary)) != crc:
+    if crc and crc32(end[: FOOTER.size - _CRC.size], crc32(summary)) != crc:
         return None
     return summary, start
 
@@ -88,10 +90,10 @@ def _records(summary: bytes) -> Iterator[tuple[int, bytes]]:
     offset = 0
     while offset < len(summary):
         opcode, length = RECORD.unpack_from(summary, offset)
-        if offset + 9 + length > len(summary):
+        if offset + RECORD.size + length > len(summary):
             raise ValueError("a cut record")
-        yield opcode, summary[offset + 9 : offset + 9 + length]
-        offset += 9 + length
+        yield opcode, summary[offset + RECORD.size : offset + RECORD.size + length]
+        offset += RECORD.size + length
 
 
 def _index(summary: bytes, start: int) -> McapIndex | None:
@@ -109,8 +111,8 @@ def _index(summary: bytes, start: int) -> McapIndex | None:
             begin, length = _EXTENT.unpack_from(record)
             attachments.append((begin, begin + length))
         elif opcode == Opcode.STATISTICS:
-            total, _, _, files, _, n, _, _, size = _STATISTICS.unpack_from(record)
-            entries = np.frombuffer(record, _COUNTS, size // _COUNTS.itemsize, _STATISTICS.size)
+            total, _, _, files, _, n, _, _, size = STATISTICS.unpack_from(record)
+            entries = np.frombuffer(record, COUNTS, size // COUNTS.itemsize, STATISTICS.size)
             claimed = Counter(dict(zip(entries["id"].tolist(), entries["n"].tolist(), strict=True)))
             counted = total, n, files
     chunks.sort(key=lambda chunk: chunk.start)
@@ -135,7 +137,7 @@ def _chunk(record: bytes) -> IndexedChunk:
     begins = offsets["at"][order].tolist()
     counts: dict[int, int] = {}
     for id_, low, high in zip(offsets["id"][order].tolist(), begins, [*begins[1:], index_end], strict=True):
-        n, rest = divmod(high - low - _INDEX_BYTES, _PAIR_BYTES)
+        n, rest = divmod(high - low - _INDEX.size, _PAIR.size)
         if n < 0 or rest or id_ in counts:
             raise ValueError("message indexes that do not follow each other")
         if n:

@@ -45,7 +45,7 @@ from pdhef_logtool.logs.container import (
     block_from_lists,
     describe_damage,
 )
-from pdhef_logtool.logs.mcap_index import FOOTER, RECORD, IndexedChunk, read_index
+from pdhef_logtool.logs.mcap_index import COUNTS, FOOTER, RECORD, STATISTICS, IndexedChunk, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.logs.type_names import ros2_type_name
@@ -54,14 +54,15 @@ from pdhef_logtool.records.signals import IntArray, Loss
 UintArray: TypeAlias = NDArray[np.uint64]
 
 _MESSAGE_RECORD = struct.Struct("<BQHIQ")
-_CHUNK = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
+_CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, uncompressed CRC, length of the compression's name
 _INDEX_HEAD = struct.Struct("<9sHI")  # head of the record, channel, bytes of the pairs
 _INDEX_RECORD = struct.Struct("<BQHI")  # the same, with opcode and size
+_CHUNK_PLACE = struct.Struct("<QQQ")  # start of a chunk index: first and last time, offset of the chunk
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
-_FOOTER_BYTES = 9 + 20
 _UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
 _CRC_BLOCK_BYTES = 4 << 20
-_CHUNK_HEAD_BYTES = 49 + 4  # with the longest name of a compression
+_CHUNK_HEAD_BYTES = RECORD.size + _CHUNK.size + _U64.size  # without the name of the compression
+_LONGEST_NAME = 4  # of a compression
 _MESSAGES_A_CHECK = 1 << 16
 #: Plain numbers: comparing with the members of an enumeration takes longer than reading a record.
 _OP_MESSAGE, _OP_CHUNK, _OP_MESSAGE_INDEX = int(Opcode.MESSAGE), int(Opcode.CHUNK), int(Opcode.MESSAGE_INDEX)
@@ -84,6 +85,8 @@ _FIRST_PRIVATE = 0x80  # what is neither known nor private is no record of the f
 MESSAGE_HEAD = np.dtype(
     [("op", "u1"), ("size", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
+_MESSAGE_BYTES = MESSAGE_HEAD.itemsize - RECORD.size
+_INDEX_PAIR = np.dtype([("log", "<u8"), ("offset", "<u8")])
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,8 +140,8 @@ class McapContainer(FileContainer):
             if size - offset == len(MCAP_MAGIC) and source.read(offset, len(MCAP_MAGIC)) == MCAP_MAGIC:
                 walk.closed = True
                 return
-            opcode, length = RECORD.unpack(source.read(offset, 9)) if offset + 9 <= size else (0, 0)
-            end = offset + 9 + length
+            opcode, length = RECORD.unpack(source.read(offset, RECORD.size)) if offset + RECORD.size <= size else (0, 0)
+            end = offset + RECORD.size + length
             if end > size or opcode == 0:
                 if not header_seen:
                     raise self.no_log("a complete header record", "none, or one that runs past the end of the file")
@@ -200,15 +203,17 @@ class McapContainer(FileContainer):
 
     def _read_header(self, offset: int, length: int) -> None:
         self.meter.limits.check("metadata_bytes", length, "the header record")
-        payload = self.source.read(offset + 9, length)
+        payload = self.source.read(offset + RECORD.size, length)
         try:
             (n,) = _U32.unpack_from(payload, 0)
-            (m,) = _U32.unpack_from(payload, 4 + n)
-            self.profile = payload[4 : 4 + n].decode()
-            self.library = payload[8 + n : 8 + n + m].decode()
+            library = _U32.size + n
+            (m,) = _U32.unpack_from(payload, library)
+            self.profile = payload[_U32.size : library].decode()
+            library += _U32.size
+            self.library = payload[library : library + m].decode()
         except (struct.error, UnicodeDecodeError) as error:
             raise self.no_log("a header record with profile and library", "a malformed one") from error
-        if 8 + n + m > length:
+        if library + m > length:
             raise self.no_log("a header record with profile and library", "a draft of the format before 1.0")
 
     def _next_indexed_chunk(self, after: int) -> int | None:
@@ -220,18 +225,22 @@ class McapContainer(FileContainer):
 
     def _indexed_chunks(self) -> list[int]:
         read, size = self.source.read, self.source.size
-        foot = size - len(MCAP_MAGIC) - _FOOTER_BYTES
-        if foot <= 0 or read(foot, 1)[0] != Opcode.FOOTER or read(size - len(MCAP_MAGIC), 8) != MCAP_MAGIC:
+        foot = size - len(MCAP_MAGIC) - FOOTER.size
+        if (
+            foot <= 0
+            or read(foot, 1)[0] != Opcode.FOOTER
+            or read(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) != MCAP_MAGIC
+        ):
             return []
-        (offset,) = _U64.unpack(read(foot + 9, 8))
+        (offset,) = _U64.unpack(read(foot + RECORD.size, _U64.size))
         chunks: list[int] = []
-        while offset > 0 and offset + 9 <= foot:
-            opcode, length = RECORD.unpack(read(offset, 9))
-            if opcode == Opcode.CHUNK_INDEX and length >= 24 and offset + 9 + length <= foot:
-                (chunk,) = _U64.unpack(read(offset + 9 + 16, 8))
+        while offset > 0 and offset + RECORD.size <= foot:
+            opcode, length = RECORD.unpack(read(offset, RECORD.size))
+            if opcode == Opcode.CHUNK_INDEX and length >= _CHUNK_PLACE.size and offset + RECORD.size + length <= foot:
+                chunk = _CHUNK_PLACE.unpack(read(offset + RECORD.size, _CHUNK_PLACE.size))[-1]
                 if chunk < foot and read(chunk, 1)[0] == Opcode.CHUNK:
                     chunks.append(chunk)
-            offset += 9 + length
+            offset += RECORD.size + length
         return sorted(chunks)
 
     def add_schema(self, payload: bytes) -> None:
@@ -266,6 +275,10 @@ class McapContainer(FileContainer):
                 metadata=dict(channel.metadata),
                 schema_id=channel.schema_id if schema else 0,
             )
+
+    def payload(self, start: int, end: int) -> bytes:
+        """Return the content of the record in bytes [start, end)."""
+        return self.source.read(start + RECORD.size, end - start - RECORD.size)
 
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes of the span's record or records."""
@@ -306,14 +319,14 @@ class McapContainer(FileContainer):
         offsets = array("q")
         offset, size = 0, len(content)
         while offset < size:
-            if offset + 9 > size:
+            if offset + RECORD.size > size:
                 raise SpanDamageError("its last record is cut")
             opcode, length = RECORD.unpack_from(content, offset)
-            end = offset + 9 + length
+            end = offset + RECORD.size + length
             if end > size:
                 raise SpanDamageError("its last record is cut")
             if opcode == _OP_MESSAGE:
-                if length < 22:
+                if length < _MESSAGE_BYTES:
                     raise SpanDamageError("a message record is too short")
                 if len(offsets) % _MESSAGES_A_CHECK == 0:
                     self.meter.limits.check("chunk_messages", len(offsets), "a chunk")
@@ -321,7 +334,7 @@ class McapContainer(FileContainer):
                 offsets.append(offset)
             elif declare and opcode in _DECLARATIONS:
                 try:
-                    (self.add_schema if opcode == _OP_SCHEMA else self.add_channel)(content[offset + 9 : end])
+                    (self.add_schema if opcode == _OP_SCHEMA else self.add_channel)(content[offset + RECORD.size : end])
                 except LimitError as error:
                     self.lose(*describe_damage(error))
             elif opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS:
@@ -401,7 +414,7 @@ class McapContainer(FileContainer):
     def _sound_records(self, extents: Iterable[tuple[int, int]], kind: Any) -> Iterator[Any]:
         for start, end in extents:
             try:
-                record = kind.read(ReadDataStream(BytesIO(self.source.read(start + 9, end - start - 9))))
+                record = kind.read(ReadDataStream(BytesIO(self.payload(start, end))))
             except Exception as error:  # noqa: BLE001 (the boundary)
                 self.lose_record(start, error)
                 continue
@@ -410,21 +423,22 @@ class McapContainer(FileContainer):
     def note_attachment(self, start: int, end: int) -> None:
         """Add an attachment record; check its CRC block by block."""
         source = self.source
-        place = start + 9 + 16  # behind both times
+        place = start + RECORD.size + 2 * _U64.size  # behind both times
         name = ""
         for width in (_U32, _U32):  # name and media type
-            (n,) = width.unpack(source.read(place, 4))
-            if place + 4 + n > end:
+            (n,) = width.unpack(source.read(place, width.size))
+            place += width.size
+            if place + n > end:
                 raise SpanDamageError("it runs past its end")
             self.meter.limits.check("metadata_bytes", n, "an attachment's name")
-            text = source.read(place + 4, n).decode()
-            name, place = name or text, place + 4 + n
-        (n,) = _U64.unpack(source.read(place, 8))
-        place += 8 + n  # a record may be padded behind its last member
-        if place + 4 > end:
+            text = source.read(place, n).decode()
+            name, place = name or text, place + n
+        (n,) = _U64.unpack(source.read(place, _U64.size))
+        place += _U64.size + n  # a record may be padded behind its last member
+        if place + _U32.size > end:
             raise SpanDamageError("it runs past its end")
-        (crc,) = _U32.unpack(source.read(place, 4))
-        if crc and self.crc(start + 9, place) != crc:
+        (crc,) = _U32.unpack(source.read(place, _U32.size))
+        if crc and self.crc(start + RECORD.size, place) != crc:
             self.lose("bad-attachment", f"attachment {name!r} has a wrong CRC", count=1)
             return
         self.add_attachment(start, end)
@@ -436,7 +450,7 @@ class McapContainer(FileContainer):
     def note_metadata(self, start: int, end: int) -> None:
         """Add a metadata record that can be read."""
         self.meter.limits.check("metadata_bytes", end - start, "a metadata record")
-        Metadata.read(ReadDataStream(BytesIO(self.source.read(start + 9, end - start - 9))))
+        Metadata.read(ReadDataStream(BytesIO(self.payload(start, end))))
         self._metadata_at.append((start, end))
 
     def open_chunk(self, extent: _Extent, claimed: Span) -> None:
@@ -528,7 +542,7 @@ class _Walk:
             return
         self._end_run()
         if opcode == _OP_CHUNK:
-            first, last, size, crc = _CHUNK.unpack(source.read(start + 9, _CHUNK.size))
+            first, last, size, crc, _ = _CHUNK.unpack(source.read(start + RECORD.size, _CHUNK.size))
             self.bare_chunks |= bool(size and not crc)
             self.chunk, self.index_end = (start, end), end
             self.head = (min(first, MAX_TIME_NS), min(last, MAX_TIME_NS), size)
@@ -550,11 +564,12 @@ class _Walk:
 
     def _is_chunk(self, start: int, end: int) -> bool:
         """Return whether a record of a private kind is laid out like a chunk."""
-        head = self.of.source.read(start, min(end - start, _CHUNK_HEAD_BYTES))
-        if len(head) < _CHUNK_HEAD_BYTES:
+        head = self.of.source.read(start, min(end - start, _CHUNK_HEAD_BYTES + _LONGEST_NAME))
+        if len(head) < _CHUNK_HEAD_BYTES + _LONGEST_NAME:
             return False
-        (n,) = _U32.unpack_from(head, 37)
-        return n <= 4 and bool(49 + n + _U64.unpack_from(head, 41 + n)[0] == end - start)
+        n = _CHUNK.unpack_from(head, RECORD.size)[-1]
+        place = RECORD.size + _CHUNK.size + n
+        return n <= _LONGEST_NAME and bool(place + _U64.size + _U64.unpack_from(head, place)[0] == end - start)
 
     def add_indexed(self, indexed: IndexedChunk | tuple[int, int]) -> int:
         """Add a chunk or an attachment by its entry in the index; return the start of the next record."""
@@ -582,8 +597,8 @@ class _Walk:
         first = place
         while place <= last and block[place] == _OP_MESSAGE:
             _, length, channel, _, log_time = unpack(block, place)
-            end = place + 9 + length
-            if length < 22 or base + end > size:
+            end = place + RECORD.size + length
+            if length < _MESSAGE_BYTES or base + end > size:
                 break
             if log_time < first_ns:
                 first_ns = log_time
@@ -596,7 +611,7 @@ class _Walk:
             if base + place - start >= _UNCHUNKED_RUN_BYTES:
                 break
         if place == first:  # not even the first one is a message
-            end = offset + 9 + int(RECORD.unpack(of.source.read(offset, 9))[1])
+            end = offset + RECORD.size + int(RECORD.unpack(of.source.read(offset, RECORD.size))[1])
             self._end_run()
             of.lose_record(offset, SpanDamageError("a message record is too short"))
             return end
@@ -615,11 +630,14 @@ class _Walk:
         sound, self.index_sound = self.index_sound, False
         block, place = of.source.ahead(start, min(end - start, _INDEX_HEAD.size))
         _, channel, n = _INDEX_HEAD.unpack_from(block, place)
-        if n % 16 or start + 15 + n > end or channel in self.index_counts:
-            raise SpanDamageError(f"a message index that names {n / 16:.10g} messages of channel {channel}")
+        if n % _INDEX_PAIR.itemsize or start + _INDEX_HEAD.size + n > end or channel in self.index_counts:
+            raise SpanDamageError(
+                f"a message index that names {n / _INDEX_PAIR.itemsize:.10g} messages of channel {channel}"
+            )
         if n:
-            self.index_counts[channel] = n // 16
-            self.index_at.append((start + 15, start + 15 + n))
+            self.index_counts[channel] = n // _INDEX_PAIR.itemsize
+            pairs = start + _INDEX_HEAD.size
+            self.index_at.append((pairs, pairs + n))
         self.index_sound = sound
 
     def _index_agrees(self) -> tuple[bool, bool]:
@@ -683,9 +701,10 @@ class _Walk:
 
     def _statistics(self, start: int, end: int) -> None:
         """Note how many messages the file claims by channel."""
-        payload = self.of.source.read(start + 9, min(end - start - 9, 46 + 10 * (1 << 16)))
-        (total,), (n,) = _U64.unpack_from(payload, 0), _U32.unpack_from(payload, 42)
-        entries = np.frombuffer(payload, dtype=np.dtype([("id", "<u2"), ("n", "<u8")]), count=n // 10, offset=46)
+        most = STATISTICS.size + COUNTS.itemsize * (1 << 16)
+        payload = self.of.source.read(start + RECORD.size, min(end - start - RECORD.size, most))
+        total, *_, n = STATISTICS.unpack_from(payload)
+        entries = np.frombuffer(payload, COUNTS, n // COUNTS.itemsize, STATISTICS.size)
         counts = {c: k for c, k in zip(entries["id"].tolist(), entries["n"].tolist(), strict=True) if k}
         self.statistics = (total, counts)
 
@@ -750,15 +769,15 @@ class _Walk:
 def _chunk_head(record: bytes, end: int) -> tuple[int, int, str, int, int]:
     """Return size, CRC, compression, and place and length of the stored bytes of the chunk record up to ``end``."""
     try:
-        _, _, size, crc = _CHUNK.unpack_from(record, 9)
-        (n,) = _U32.unpack_from(record, 37)
-        compression = record[41 : 41 + n].decode()
-        (stored,) = _U64.unpack_from(record, 41 + n)
+        _, _, size, crc, n = _CHUNK.unpack_from(record, RECORD.size)
+        name = RECORD.size + _CHUNK.size
+        compression = record[name : name + n].decode()
+        (stored,) = _U64.unpack_from(record, name + n)
     except (struct.error, UnicodeDecodeError) as error:
         raise SpanDamageError(f"malformed chunk header: {error}") from error
-    if 49 + n + stored > end:
+    if _CHUNK_HEAD_BYTES + n + stored > end:
         raise SpanDamageError("the chunk's records run past its end")
-    return size, crc, compression, 49 + n, stored
+    return size, crc, compression, _CHUNK_HEAD_BYTES + n, stored
 
 
 def _message_indexes(record: bytes, offset: int) -> list[tuple[int, UintArray, UintArray]] | None:
@@ -766,11 +785,12 @@ def _message_indexes(record: bytes, offset: int) -> list[tuple[int, UintArray, U
     indexes: list[tuple[int, UintArray, UintArray]] = []
     while offset < len(record):
         opcode, length, channel, n = _INDEX_RECORD.unpack_from(record, offset)
-        if opcode != _OP_MESSAGE_INDEX or n % 16 or n + 6 > length:
+        end = offset + RECORD.size + length
+        if opcode != _OP_MESSAGE_INDEX or n % _INDEX_PAIR.itemsize or offset + _INDEX_RECORD.size + n > end:
             return None
-        pairs = np.frombuffer(record, dtype="<u8", count=n // 8, offset=offset + 15)
-        indexes.append((channel, pairs[0::2], pairs[1::2]))
-        offset += 9 + length
+        pairs = np.frombuffer(record, _INDEX_PAIR, n // _INDEX_PAIR.itemsize, offset + _INDEX_RECORD.size)
+        indexes.append((channel, pairs["log"], pairs["offset"]))
+        offset = end
     return indexes
 
 
@@ -794,9 +814,9 @@ def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
     heads = np.ndarray((n - plain.itemsize + 1,), dtype=plain, buffer=content, strides=(1,))[offset]
     heads = heads.view(MESSAGE_HEAD)
     size = heads["size"].astype(np.int64)  # what does not fit is below 0
-    if (heads["op"] != _OP_MESSAGE).any() or size.min() < 22 or size.max() > n:
+    if (heads["op"] != _OP_MESSAGE).any() or size.min() < _MESSAGE_BYTES or size.max() > n:
         return None
-    ends = offset + (9 + size)
+    ends = offset + (RECORD.size + size)
     if ends.max() > n:
         return None
     if offset[0] != 0 or ends[-1] != n or (offset[1:] != ends[:-1]).any():
@@ -809,8 +829,8 @@ def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
         log_time_ns=_held_times(heads["log"]),
         publish_time_ns=_held_times(heads["publish"]),
         sequence=heads["sequence"].astype(np.int64),
-        offset=offset + 31,
-        length=size - 22,
+        offset=offset + MESSAGE_HEAD.itemsize,
+        length=size - _MESSAGE_BYTES,
     )
 
 
@@ -827,11 +847,11 @@ def _records_between(content: bytes, starts: IntArray, ends: IntArray) -> list[t
     gaps = np.flatnonzero(starts != ends)
     for offset, end in zip(starts[gaps].tolist(), ends[gaps].tolist(), strict=True):
         while offset < end:
-            if offset + 9 > end:
+            if offset + RECORD.size > end:
                 return None
             opcode, length = RECORD.unpack_from(content, offset)
-            records.append((opcode, offset + 9, offset + 9 + length))
-            offset += 9 + length
+            records.append((opcode, offset + RECORD.size, offset + RECORD.size + length))
+            offset += RECORD.size + length
         if offset != end:
             return None
     return records

@@ -15,7 +15,7 @@ from pdhef_logtool.mapping import Mapping, SignalSource, fit_clocks, read_signal
 from pdhef_logtool.mapping.clocks import why_unusable, with_usable_stamps
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.runs.inspection import inspect_drive_log, render_inspection
-from pdhef_logtool.runs.inspection.step_statistics import StepStatistics
+from pdhef_logtool.runs.inspection.step_statistics import Steps
 
 MS, S = 1_000_000, 1_000_000_000
 T0 = 1_700_000_000 * S
@@ -193,10 +193,7 @@ def test_the_rate_of_any_burst_pattern_is_messages_over_time(
 ) -> None:
     jitter = np.random.default_rng(seed).integers(0, 1 + 1000 * spread_us, 200 * burst)
     stamps = np.sort(T0 + np.repeat(np.arange(200) * period_ms * MS, burst) + jitter)
-    steps = StepStatistics()
-    for part in np.array_split(stamps, 7):
-        steps.add(part)
-    assert steps.rate_hz == pytest.approx(burst * 1000.0 / period_ms, rel=0.06)
+    assert Steps.of([stamps]).rate_hz == pytest.approx(burst * 1000.0 / period_ms, rel=0.06)
 
 
 def test_a_delay_of_another_clock_is_named_and_not_shown_as_a_delay() -> None:
@@ -217,9 +214,6 @@ def test_a_delay_of_another_clock_is_named_and_not_shown_as_a_delay() -> None:
 
 def test_rates_of_bursts_are_those_of_their_messages() -> None:
     bursts = T0 + np.repeat(np.arange(0, 60 * S, 100 * MS), 4) + np.tile(np.arange(4) * 40_000, 600)
-    steps = StepStatistics()
-    steps.add(bursts)
-    assert steps.rate_hz == pytest.approx(40.0, rel=0.01)
-    regular = StepStatistics()
-    regular.add(np.delete(TRUE, [100, 200, 201, *range(500, 700)]))
-    assert regular.rate_hz == pytest.approx(100.0)
+    assert Steps.of([bursts]).rate_hz == pytest.approx(40.0, rel=0.01)
+    regular = np.delete(TRUE, [100, 200, 201, *range(500, 700)])
+    assert Steps.of([regular]).rate_hz == pytest.approx(100.0)

@@ -16,7 +16,7 @@ from mcap.writer import Writer
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.runs.inspection import inspect_log
 from pdhef_logtool.runs.inspection.page import inspection_page, sparkline
-from pdhef_logtool.runs.inspection.step_statistics import COLUMNS, Outline
+from pdhef_logtool.runs.inspection.step_statistics import COLUMNS, outline
 from tests.command_line import called
 from tests.reports.browser import AXE, CHROMIUM, WHY_NOT, Browser, serious
 
@@ -76,16 +76,14 @@ def test_a_sparkline_shows_each_run_of_finite_values_within_its_box(values: list
 
 
 def test_an_outline_keeps_extremes_where_they_were() -> None:
-    outline = Outline(1_000_000_000)
     stamps = 10**18 + np.arange(1000, dtype=np.int64) * 1_000_000
     values = np.zeros(1000)
     values[503], values[507] = 5.0, -3.0
-    outline.add(stamps[:400], values[:400])
-    outline.add(stamps[400:], values[400:])
-    assert (outline.high.argmax(), outline.low.argmin()) == (50, 50)
-    assert (outline.high.max(), outline.low.min()) == (5.0, -3.0)
-    assert np.isfinite(outline.low).all()
-    assert outline.low.shape == (COLUMNS,)
+    low, high = outline(stamps, values, 1_000_000_000)
+    assert (high.argmax(), low.argmin()) == (50, 50)
+    assert (high.max(), low.min()) == (5.0, -3.0)
+    assert np.isfinite(low).all()
+    assert low.shape == (COLUMNS,)
 
 
 def test_a_page_shows_fields_reasons_and_a_mapping_to_paste(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from pdhef_logtool.records.errors import MappingError, OutputError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.inspection import inspect_drive_log, inspect_log, render_inspection, write_mapping
 from pdhef_logtool.runs.inspection.report import WINDOW_NS
-from pdhef_logtool.runs.inspection.step_statistics import ValueStatistics
 
 T0 = 1_700_000_000_000_000_000
 MAPPINGS = Path(__file__).parents[1] / "reference" / "mappings"
@@ -232,12 +231,3 @@ def test_signal_and_truth_of_one_name_keep_their_own_comments(shared_dir: Path, 
     above = {line.split("]")[0]: lines[i - 1] for i, line in enumerate(lines) if line.startswith("[")}
     assert "Imu" in above["[signals.yaw_rate_rad_s"]
     assert "TwistStamped" in above["[truth.yaw_rate_rad_s"]
-
-
-def test_statistics_of_values_that_are_no_measurements_overflow_in_silence() -> None:
-    statistics = ValueStatistics()
-    for window in ([1.0, 2.0], [1e300, -1e300], [1e308, 1e308]):
-        statistics.add(np.array(window))
-    assert statistics.count == 6
-    assert (statistics.low, statistics.high) == (-1e300, 1e308)
-    assert not np.isfinite(statistics.std)

@@ -17,7 +17,7 @@ from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import Wanted
-from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -45,8 +45,8 @@ from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.records import RECORDER_STAMPS
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, FloatArray, Loss
-from pdhef_logtool.runs.inspection.step_statistics import DelayStatistics, Outline, StepStatistics, ValueStatistics
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, FloatArray, Loss
+from pdhef_logtool.runs.inspection.step_statistics import Steps, outline
 from pdhef_logtool.runs.inspection.uses import uses_of
 from pdhef_logtool.storage.documents import jsonable
 from pdhef_logtool.storage.files import write_bytes
@@ -242,10 +242,13 @@ def inspect_log(
 ) -> Inspection:
     """Look a log through and report on it; without a mapping (or its file) the well-known types are recognised.
 
-    Of a large MCAP whose index agrees with itself values are looked at in a part of the chunks (``sample``), unless
-    ``whole``; if anything is wrong in them, or little is left, all of it is read. Memory is bounded by windows of ten
-    minutes, regardless of the log's length. ``prefer_truth`` is the choice of :func:`pdhef_logtool.mapping.auto_map`;
-    ``budget`` is what reading may cost, ``msgs`` a folder with definitions of types that the log does not define.
+    Of an MCAP above 32 MB with a consistent index, only a part of the chunks is read (``sample``), unless ``whole`` is
+    given, the part is damaged, or it is most of the log.
+
+    Parameters
+    ----------
+    prefer_truth : as for :func:`pdhef_logtool.mapping.auto_map`. budget : resource limits of reading.
+    msgs : folder with definitions of types that the log does not define.
 
     Raises
     ------
@@ -286,23 +289,27 @@ def inspect_drive_log(
         mapping = choose_mapping(log, given, prefer_truth=prefer_truth, require_signals=False).mapping
     mapping = resolve_mapping(log, mapping)
     head = (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS))
-    whole = _Look(windows(log.start_ns, log.end_ns, WINDOW_NS, log.recording_span), tuple(t.name for t in log.topics))
+    whole = _Look(((log.start_ns, log.end_ns),), tuple(t.name for t in log.topics))
     look = whole if index is None else _sample_look(log, index, mapping, head)
     log.expect(dict.fromkeys(look.stamps, ()))
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     looked_at = survey_log(log, mapping, clocks, head)
     mapping = looked_at.mapping
-    steps, delays, gathered, reading = _read_windows(log, mapping, clocks, look)
+    parts = [read_signals(log, mapping, clocks, start, end, stamps=look.stamps) for start, end in look.windows]
+    losses = merge_losses(part.losses for part in parts)
+    channels = {("signals", n): [part.signals[n] for part in parts] for n in mapping.signals}
+    channels |= {("truth", n): [part.truth[n] for part in parts] for n in mapping.truth}
     signals, truth = (
-        {n: _signal_report(s, section, gathered, clocks, reading, log, mapping.quality) for n, s in sources.items()}
+        {n: _signal_report(s, section, channels[section, n], clocks[clock_key(s)], losses, log, mapping.quality)
+         for n, s in sources.items()}
         for section, sources in (("signals", mapping.signals), ("truth", mapping.truth))
-    )
+    )  # fmt: skip
     return Inspection(
         path=str(log.path),
         kind=log.kind,
         start_ns=log.start_ns,
         end_ns=log.end_ns,
-        topics=tuple(_topic_report(t, steps[t.name], delays[t.name], log) for t in log.topics),
+        topics=_topic_reports(log, look, parts),
         clocks=tuple(_clock_report(s, clocks[key]) for key, s in sources_by_clock(mapping).items()),
         mapping=mapping,
         signals=signals,
@@ -313,38 +320,12 @@ def inspect_drive_log(
         checks=looked_at.checks,
         proposals=mapping_proposals(looked_at),
         # Last, since a log has all its losses only after it was read through.
-        lost=merge_losses([log.lost, reading]),
+        lost=merge_losses([log.lost, losses]),
         candidates=candidates,
         sample=None if look.sample is None else look.sample(),
-        lines={key: (entry.line.low, entry.line.high) for key, entry in gathered.items()},
+        lines={key: _line(of, log.end_ns - log.start_ns) for key, of in channels.items()},
         refused=looked_at.refused(),
     )
-
-
-def _read_windows(
-    log: DriveLog, mapping: Mapping, clocks: dict[str, ClockModel], look: _Look
-) -> tuple[dict[str, StepStatistics], dict[str, DelayStatistics], dict[tuple[str, str], _Gathered], tuple[Loss, ...]]:
-    """Return steps and delays by topic, statistics by section and signal, and losses."""
-    steps = {t.name: StepStatistics() for t in log.topics}
-    delays = {t.name: DelayStatistics() for t in log.topics}
-    gathered: dict[tuple[str, str], _Gathered] = {}
-    losses: list[tuple[Loss, ...]] = []
-    if look.by_index is not None:
-        for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.recording_span):
-            for name, times in look.by_index.index_times(start, end).items():
-                steps[name].add(times)
-    for start, end in look.windows:
-        if look.sample is not None:  # windows of a sample are not contiguous
-            for stream in (*(steps.values() if look.by_index is None else ()), *(g.steps for g in gathered.values())):
-                stream.last_ns = None
-        channels = read_signals(log, mapping, clocks, start, end, stamps=look.stamps)
-        for name, columns in channels.stamps.items():
-            if look.by_index is None:
-                steps[name].add(columns.log_time_ns)
-            delays[name].add(columns.log_time_ns, columns.publish_time_ns)
-        losses.append(channels.losses)
-        _gather(channels, gathered, log.end_ns - log.start_ns)
-    return steps, delays, gathered, merge_losses(losses)
 
 
 # ------------------------------------------------------------------------------------------------ what is read
@@ -361,7 +342,7 @@ class _Look:
     sample : states what was looked at in the end; None: all of the log is.
     """
 
-    windows: Iterable[tuple[int, int]]
+    windows: Sequence[tuple[int, int]]
     stamps: tuple[str, ...]
     by_index: ColumnarLog | None = None
     sample: Callable[[], Sample] | None = None
@@ -376,30 +357,6 @@ def _sample_look(log: DriveLog, index: ColumnarLog, mapping: Mapping, head: tupl
     times: Literal["sample", "index"] = "sample" if index.is_remote else "index"
     covered = tuple(sorted(index.covered_topics(mapped)))
     return _Look(spread, covered, None if index.is_remote else index, lambda: Sample(*index.chunks_read, times=times))
-
-
-# ---------------------------------------------------------------------------------------------- gathering
-
-
-@dataclass(slots=True)
-class _Gathered:
-    line: Outline
-    steps: StepStatistics = field(default_factory=StepStatistics)
-    values: ValueStatistics = field(default_factory=ValueStatistics)
-
-
-def _gather(channels: MappedChannels, gathered: dict[tuple[str, str], _Gathered], span_ns: int) -> None:
-    for section, partial in (("signals", channels.signals), ("truth", channels.truth)):
-        for name, channel in partial.items():
-            entry = gathered.setdefault((section, name), _Gathered(Outline(span_ns)))
-            stamps = channel.stamps_ns
-            values = channel.values if channel.values.ndim == 1 else np.linalg.norm(channel.values, axis=1)
-            entry.line.add(stamps, values)
-            if entry.steps.last_ns is not None:
-                # Stamps at the seam of two windows may be out of order by the jitter of their delays.
-                stamps = stamps[stamps > entry.steps.last_ns]
-            entry.steps.add(stamps)
-            entry.values.add(values)
 
 
 # ------------------------------------------------------------------------------------------------ reports
@@ -417,62 +374,92 @@ def collapsed(fields: Sequence[FieldInfo]) -> list[tuple[str, str, list[str]]]:
     return [(name, kind, paths) for name, (kind, paths) in lines.items()]
 
 
-def _topic_report(topic: TopicInfo, steps: StepStatistics, delays: DelayStatistics, log: DriveLog) -> TopicReport:
-    largest = steps.largest
+def _topic_reports(log: DriveLog, look: _Look, parts: Sequence[MappedChannels]) -> tuple[TopicReport, ...]:
+    stamps = {topic: [part.stamps[topic] for part in parts] for topic in look.stamps}
+    steps = {topic: Steps.of([c.log_time_ns for c in columns]) for topic, columns in stamps.items()}
+    if look.by_index is not None:
+        steps |= {n: Steps.of([times]) for n, times in look.by_index.index_times(log.start_ns, log.end_ns).items()}
+    none = Steps.of([])
+    return tuple(_topic_report(t, steps.get(t.name, none), stamps.get(t.name, ()), log) for t in log.topics)
+
+
+def _topic_report(topic: TopicInfo, steps: Steps, stamps: Sequence[Columns], log: DriveLog) -> TopicReport:
+    largest = steps.longest()
     log_s = (log.end_ns - log.start_ns) * 1e-9
     numbers = tuple(name for name, _, _ in collapsed(log.fields(topic.name)))
+    times = np.concatenate([np.empty(0), *((c.log_time_ns - log.start_ns) * 1e-9 for c in stamps)])
+    delays = np.concatenate([np.empty(0), *((c.log_time_ns - c.publish_time_ns) * 1e-9 for c in stamps)])
+    median, late = np.quantile(delays, [0.5, 0.95]).tolist() if delays.size else (math.nan, math.nan)
     return TopicReport(
         name=topic.name,
         type=topic.type_name,
         encoding=topic.encoding,
         messages=topic.messages,
-        rate_hz=steps.rate_hz if steps.count else topic.messages / log_s if log_s > 0.0 else float("nan"),
+        rate_hz=steps.rate_hz if steps.count else topic.messages / log_s if log_s > 0.0 else math.nan,
         jitter_p95_s=steps.jitter_p95_s,
-        largest_gap_s=largest[0] if largest else float("nan"),
-        largest_gap_at_s=(largest[1] - log.start_ns) * 1e-9 if largest else float("nan"),
-        delay_median_s=delays.quantile(0.5),
-        delay_p95_s=delays.quantile(0.95),
-        delay_drift_ppm=delays.drift_ppm,
-        delay_negative_share=delays.negative / delays.count if delays.count else float("nan"),
+        largest_gap_s=largest[0] if largest else math.nan,
+        largest_gap_at_s=(largest[1] - log.start_ns) * 1e-9 if largest else math.nan,
+        delay_median_s=median,
+        delay_p95_s=late,
+        delay_drift_ppm=_slope(times, delays) * 1e6,
+        delay_negative_share=float(np.mean(delays < 0.0)) if delays.size else math.nan,
         fields=numbers[:MAX_LISTED_FIELDS],
+    )
+
+
+def _slope(x: FloatArray, y: FloatArray) -> float:
+    """Return the slope of y over x by least squares, [N] each; NaN without a span."""
+    x = x - x.mean() if x.size else x
+    spread = float(np.dot(x, x))
+    return float(np.dot(x, y - y.mean()) / spread) if spread > 0.0 else math.nan
+
+
+def _values(channels: Sequence[Channel]) -> FloatArray:
+    """Return the values of a channel's parts [N]; of vectors their lengths."""
+    values = (c.values if c.values.ndim == 1 else np.linalg.norm(c.values, axis=1) for c in channels)
+    return np.concatenate([np.empty(0), *values])
+
+
+def _line(channels: Sequence[Channel], span_ns: int) -> tuple[FloatArray, FloatArray]:
+    return outline(
+        np.concatenate([np.empty(0, np.int64), *(c.stamps_ns for c in channels)]), _values(channels), span_ns
     )
 
 
 def _signal_report(
     source: SignalSource,
     section: str,
-    gathered: dict[tuple[str, str], _Gathered],
-    clocks: dict[str, ClockModel],
+    channels: Sequence[Channel],
+    clock: ClockModel,
     losses: Iterable[Loss],
     log: DriveLog,
     quality: QualityGate | None,
 ) -> SignalReport:
-    entry = gathered.get((section, source.name), _Gathered(Outline(0)))
-    gaps = entry.steps.gaps()
-    largest = max(gaps, key=lambda g: g[0]) if gaps else None
-    has_values = entry.values.count > 0
+    steps, values = Steps.of([c.stamps_ns for c in channels]), _values(channels)
+    largest = steps.longest(steps.gap_limit_s)
     places = {f"{source.name} ({source.label})"}
     if section == "truth" and quality is not None:
         places.add(f"{source.name} ({quality.describe()})")
     dropped = {x.kind: x.count or 0 for x in losses if x.where in places}
     # Messages that were sorted back are used.
     dropped |= {x.kind: x.count or 0 for x in losses if x.where == source.read_topic and x.kind in TOPIC_DROPS}
-    clock = clocks[clock_key(source)]
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are no measurements
+        mean, std = (float(values.mean()), float(values.std())) if values.size else (math.nan, math.nan)
     return SignalReport(
         name=source.name,
         unit=(SIGNAL_UNITS if section == "signals" else TRUTH_UNITS)[source.name],
         topic=source.topic,
         field=source.field if isinstance(source.field, str) else ", ".join(source.field),
-        samples=entry.steps.count,
-        rate_hz=entry.steps.rate_hz,
+        samples=steps.count,
+        rate_hz=steps.rate_hz,
         latency_s=clock.median_delay_s + source.latency_s,
-        mean=entry.values.mean if has_values else float("nan"),
-        std=entry.values.std,
-        minimum=entry.values.low if has_values else float("nan"),
-        maximum=entry.values.high if has_values else float("nan"),
-        gaps=len(gaps),
-        largest_gap_s=largest[0] if largest else float("nan"),
-        largest_gap_at_s=(largest[1] - log.start_ns) * 1e-9 if largest else float("nan"),
+        mean=mean,
+        std=std,
+        minimum=float(values.min()) if values.size else math.nan,
+        maximum=float(values.max()) if values.size else math.nan,
+        gaps=steps.gaps,
+        largest_gap_s=largest[0] if largest else math.nan,
+        largest_gap_at_s=(largest[1] - log.start_ns) * 1e-9 if largest else math.nan,
         dropped=dropped,
     )
 
