@@ -29,9 +29,6 @@ ROWS_A_GROUP = 32768
 _LEVEL = 3
 #: Files of figures that are read before a row group of theirs is written.
 _PARTS_AT_ONCE = 256
-#: Columns that files of earlier versions have not.
-_LATER_COLUMNS = ("diverged", *OPTIONAL_COLUMNS)
-_LATER_METRIC_COLUMNS = ("algorithm",)
 _ESTIMATES, _METRICS = "estimates.parquet", "metrics.parquet"
 #: Name of the copy of the selected estimate in estimates.parquet.
 SELECTED = "selected"
@@ -251,15 +248,13 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
 def read_blocks(path: Path, estimator: str, columns: Iterable[str]) -> Iterator[StateTrack]:
     """Yield one track of an estimates.parquet in order of time, a row group at once; none where it is not in the file.
 
-    As :func:`read_track` states; a column that an earlier version did not write stays NaN.
+    As :func:`read_track` states.
 
     Raises
     ------
     OutputError : When the file is no estimates.parquet or damaged.
     """
-    with _open(path, _ESTIMATES) as file:
-        later = set(_LATER_COLUMNS) - set(file.schema_arrow.names)
-    for table in _tables(path, estimator, set(columns) - later):
+    for table in _tables(path, estimator, set(columns)):
         yield _track_from_table(estimator, table)
 
 
@@ -272,11 +267,6 @@ def _tables(path: Path, estimator: str, columns: set[str] | None) -> Iterator[pa
             expected=f"columns of {', '.join(TRACK_COLUMNS)}", got=", ".join(sorted(unknown)), where=str(path)
         )
     with _open(path, _ESTIMATES) as file:
-        absent = set(wanted) - set(file.schema_arrow.names)
-        if columns is None:  # a file from before these columns is whole without them
-            wanted = [c for c in wanted if c not in absent]
-        elif absent:
-            raise _without(path, _ESTIMATES, absent)
         for group in range(file.num_row_groups):
             with _reading(path):
                 names = _estimators_of(file, group)
@@ -324,14 +314,15 @@ def _estimators_of(file: pq.ParquetFile, group: int) -> tuple[str, ...]:
 
 
 def _open(path: Path, kind: str) -> pq.ParquetFile:
-    """Open a file that has the columns of its kind, but for those that earlier versions did not write."""
+    """Open a file that has the columns of its kind."""
     with _reading(path):
         file = pq.ParquetFile(path)
         types = {f.name: _class_of(f.type) for f in file.schema_arrow}
     wanted = {f.name: _class_of(f.type) for f in arrow_schema(f"{kind}.json")}
-    if absent := wanted.keys() - types.keys() - {*_LATER_COLUMNS, *_LATER_METRIC_COLUMNS}:
+    if absent := sorted(wanted.keys() - types.keys()):
         file.close()
-        raise _without(path, kind, absent)
+        got = f"a Parquet file without {', '.join(absent)}"
+        raise OutputError(expected=f"the columns of {kind}", got=got, where=str(path), remedy=_AGAIN)
     if other := sorted(name for name in wanted.keys() & types.keys() if types[name] != wanted[name]):
         file.close()
         raise OutputError(
@@ -352,11 +343,6 @@ def _class_of(kind: pa.DataType) -> str:
     if pa.types.is_integer(kind):
         return "whole numbers"
     return "numbers" if pa.types.is_floating(kind) else str(kind)
-
-
-def _without(path: Path, kind: str, absent: Iterable[str]) -> OutputError:
-    got = f"a Parquet file without {', '.join(sorted(absent))}"
-    return OutputError(expected=f"the columns of {kind}", got=got, where=str(path), remedy=_AGAIN)
 
 
 @contextmanager
