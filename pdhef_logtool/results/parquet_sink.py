@@ -22,7 +22,7 @@ from pdhef_logtool.results.sink import TRUTH, Event, Sink, rounded
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
 #: Rows that are gathered of one estimator before a row group is written: 10 h at 100 Hz make 110 row groups an
-#: estimator, and what waits of six estimators stays below 30 MB.
+#: estimator, and the waiting rows of six estimators need less than 30 MB.
 ROWS_A_GROUP = 32768
 
 #: Of zstd, of estimates: less work than the lowest level, and 4 % fewer bytes.
@@ -96,7 +96,7 @@ class RowGroups:
         waiting[:] = [joined.slice(whole)]
 
     def finish(self, metadata: Mapping[str, str] | None = None) -> None:
-        """Write what waits and the file's metadata, and give the file its name."""
+        """Write the waiting rows and the metadata, and give the file its name."""
         try:
             for tables in self._waiting.values():
                 self._write(pa.concat_tables(tables))
@@ -111,7 +111,7 @@ class RowGroups:
         self._pending.commit()
 
     def abort(self) -> None:
-        """Remove what was written."""
+        """Remove the unfinished file."""
         with suppress(OSError, ValueError):  # its last words may not fit the disk either, or come after the file's end
             self._writer.close()
         self._drop()
@@ -182,11 +182,11 @@ class EstimatesSink(Sink):
         return np.zeros(len(track), np.bool_) if first is None else track.stamps_ns >= first
 
     def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
-        """Write what waits and give the file its name; the report is not part of this file."""
+        """Write the waiting rows and give the file its name; the report is not part of this file."""
         self._file.finish()
 
     def abort(self) -> None:
-        """Remove what was written."""
+        """Remove the unfinished file."""
         self._file.abort()
 
 
@@ -246,7 +246,7 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
 
 
 def read_blocks(path: Path, estimator: str, columns: Iterable[str]) -> Iterator[StateTrack]:
-    """Yield one track of an estimates.parquet in order of time, a row group at once; none where it is not in the file.
+    """Yield one track of an estimates.parquet in order of time, a row group at once; none if it is not in the file.
 
     As :func:`read_track` states.
 
@@ -259,7 +259,7 @@ def read_blocks(path: Path, estimator: str, columns: Iterable[str]) -> Iterator[
 
 
 def _tables(path: Path, estimator: str, columns: set[str] | None) -> Iterator[pa.Table]:
-    """Yield the row groups of an estimator with the columns asked for, all that there are when None."""
+    """Yield the row groups of an estimator with the given columns; None: all."""
     wanted = [c for c in TRACK_COLUMNS if c == "stamp_ns" or columns is None or c in columns]
     unknown = (columns or set()) - set(TRACK_COLUMNS)
     if unknown:
@@ -335,7 +335,7 @@ def _open(path: Path, kind: str) -> pq.ParquetFile:
 
 
 def _class_of(kind: pa.DataType) -> str:
-    """Return what the values of a column are, however many bits they have; texts may be in a dictionary."""
+    """Return the kind of the values of a column, without their size; texts may be in a dictionary."""
     if pa.types.is_dictionary(kind):
         kind = kind.value_type
     if pa.types.is_string(kind) or pa.types.is_large_string(kind):
@@ -347,7 +347,7 @@ def _class_of(kind: pa.DataType) -> str:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Turn what Arrow states of a damaged file into an OutputError."""
+    """Turn the errors of Arrow into an OutputError."""
     try:
         yield
     except (OSError, ValueError, LookupError, pa.ArrowException) as error:
@@ -356,7 +356,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def check_parquet(path: Path, kind: str) -> None:
-    """Read all of a file and raise OutputError where it is damaged or has not the columns of ``kind``.
+    """Read all of a file and raise OutputError if it is damaged or lacks columns of ``kind``.
 
     ``kind`` : ``estimates.parquet`` or ``metrics.parquet``.
     """
