@@ -16,7 +16,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randomly-seed=$(ORDER_SEED))
 
 .PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions peers torture \
-  recalibrate docs docs-truthsim paper strangers wheel release lock clean
+  gates gates-quick gates-freeze recalibrate docs docs-truthsim paper strangers wheel release lock clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
@@ -29,6 +29,7 @@ help:
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make torture  damaged, hostile and odd input, counted: docs/reliability.md (four hours or less on two cores; resumable)"
 	@echo "make strangers  docs/third_party_logs.md: signals recognised in logs with unknown layouts (under two minutes)"
+	@echo "make gates    figures of the tool that moved since they were frozen (an hour; make gates-quick: five minutes)"
 	@echo "make bench    speed against peers"
 	@echo "make recalibrate  regenerate all that is derived: shipped cars and networks, evidence pages (hours; resumable)"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
@@ -122,6 +123,19 @@ check: lint test
 
 bench: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.performance
+
+# studies/results/gates.csv has the figures. ONLY="conditions contract/options": parts of gate/row. TREE: another
+# source tree under test.
+GATES = $(BIN)/python -m studies.gates --jobs $(JOBS) $(if $(ONLY),--only $(ONLY)) $(if $(TREE),--tree $(TREE))
+gates: $(VENV)/installed-dev $(VENV)/compiled
+	$(GATES)
+
+gates-quick: $(VENV)/installed-dev $(VENV)/compiled
+	$(GATES) --quick
+
+# The figures of the commit that is checked out become those of the file; resumable.
+gates-freeze: $(VENV)/installed-dev $(VENV)/compiled
+	$(GATES) --freeze $$(git rev-parse --short=8 HEAD)
 
 # Stages with their durations: python -m studies.recalibrate --list; a part of them: make recalibrate ONLY="noise gain".
 recalibrate: $(VENV)/installed-dev $(VENV)/compiled

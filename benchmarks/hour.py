@@ -120,15 +120,15 @@ def _parts_of_a_run() -> None:
         setattr(module, name, each if lazy else call)
 
     from pdhef_logtool.cli.app import main
-    from pdhef_logtool.drive import windows
+    from pdhef_logtool.drive import reading
     from pdhef_logtool.results import mcap_sink as mcap
     from pdhef_logtool.results import parquet_sink as parquet
     from pdhef_logtool.results import rerun_sink as rerun
     from pdhef_logtool.runs import drive_details, estimating, pipeline
 
-    timed(windows.DriveReader, "windows", "reading and aligning", lazy=True)
-    timed(estimating, "run_window", None)
-    timed(pipeline, "_estimate", "monitors, intervals, poses, store")
+    timed(reading, "read_recorded", "reading and aligning")
+    timed(estimating, "run_estimator", None)
+    timed(pipeline, "_estimate", "monitors, intervals, poses")
     timed(pipeline, "evaluate", "figures")
     timed(drive_details, "drive_details", "details")
     for sink, what in (

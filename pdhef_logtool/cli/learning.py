@@ -38,7 +38,7 @@ Several stages share the drives: they are split into training, validation and te
 error is undone; the test part is scored once (learn.md in the car's folder). An interrupted call continues when it is
 repeated. One stage alone uses all drives and is not undone. Drives that a simulated set marks test or extrapolation are
 refused; for gain alone, those marked train or validation (docs/learn.md).""",
-    shared="cache sensors friction network",
+    shared="sensors friction network",
     car="Car to start from (mass, geometry, sensor noise, priors)",
 )
 def learn(
@@ -108,7 +108,7 @@ def learn(
     "--split defines the split. Duplicates (drives with identical signals) are used once. Columns of --where: the "
     "features, truth_vx_m_s, truth_vy_m_s; _deg and _km_h instead of _rad and _m_s (docs/retrain.md). With --set "
     "reference=on the sideslip reference takes the place of ground truth where a log has none.",
-    shared="cache sensors friction",
+    shared="sensors friction",
     car="Nominal car (default: from the manifest of a simulated set)",
 )
 def extract(

@@ -12,13 +12,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from pdhef_logtool.estimators.base import Estimator, Steps, look_ahead_of, predict_track, run_steps
 from pdhef_logtool.estimators.causality_check import CausalityCheck, step_columns
 from pdhef_logtool.estimators.plug_ins import contained, package_of, read_only
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import IntArray, Signals
 from pdhef_logtool.records.steps import StepColumns, extrapolation, release
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.tracks import StateTrack, concatenate
+
+#: A longer drive is processed in parts of this length, with so much overlap that a filter has settled.
+LONGEST_WHOLE_S, PART_S, OVERLAP_S = 7200.0, 3600.0, 60.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,6 +78,46 @@ def run_window(
             causality.check(estimator, given, copied, steps)
         track, pending = compensate(estimator, signals, steps, None if before is None else before.pending)
     return track, WindowState(state, pending)
+
+
+def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCheck | None = None) -> StateTrack:
+    """Return the track of an estimator over a drive [N]; above 2 h it starts anew for each hour.
+
+    Parameters
+    ----------
+    causality : checks the steps of an estimator that declares itself causal, in the first part.
+
+    Raises
+    ------
+    EstimatorError
+        The estimator did not return one step per sample, or its plug-in failed.
+    """
+    tracks: list[StateTrack] = []
+    for lead, first, last, end in parts(signals.stamps_ns, looks_ahead=look_ahead_of(estimator) > 0.0):
+        track, _ = run_window(estimator, signals.rows(lead, end), causality=None if tracks else causality)
+        tracks.append(track.rows(first - lead, last - lead))
+    return tracks[0] if len(tracks) == 1 else concatenate(tracks)
+
+
+def parts(stamps_ns: IntArray, *, looks_ahead: bool = False) -> list[tuple[int, int, int, int]]:
+    """Return the parts of a drive [N]: rows [lead, end) that are processed for the rows [first, last).
+
+    A drive of up to :data:`LONGEST_WHOLE_S` is one part. Longer ones have parts of :data:`PART_S`, each processed from
+    :data:`OVERLAP_S` before, and where later samples count to as much behind.
+    """
+    count = len(stamps_ns)
+    if not count or stamps_ns[-1] - stamps_ns[0] <= LONGEST_WHOLE_S * 1e9:
+        return [(0, 0, count, count)]
+    part_ns, overlap_ns = round(PART_S * 1e9), round(OVERLAP_S * 1e9)
+    edges_ns = np.arange(stamps_ns[0], stamps_ns[-1] + 1, part_ns)
+    rows = np.append(np.searchsorted(stamps_ns, edges_ns), count)
+    leads = np.searchsorted(stamps_ns, edges_ns - overlap_ns)
+    ends = np.searchsorted(stamps_ns, edges_ns + part_ns + (overlap_ns if looks_ahead else 0))
+    return [
+        (int(lead), int(first), int(last), int(end))
+        for lead, first, last, end in zip(leads, rows[:-1], rows[1:], ends, strict=True)
+        if last > first
+    ]
 
 
 def compensate(

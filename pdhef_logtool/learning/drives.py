@@ -15,10 +15,9 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import LearntOn
-from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import MAX_BYTES, Drive, Tell, WholeDrive, lost_texts
-from pdhef_logtool.drive.windows import DrivePlan
+from pdhef_logtool.drive.plan import DrivePlan
+from pdhef_logtool.drive.reading import MAX_BYTES, Drive, Tell, WholeDrive, lost_texts, read_drive
 from pdhef_logtool.learning.noise.search import MIN_TRIALS, scorable_stamps
 from pdhef_logtool.learning.variation import MAX_VARIATION
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
@@ -329,7 +328,7 @@ def load_drive(
     PdhefError
         The log cannot be read, or takes more than ``max_bytes``.
     """
-    with read_cached(log_input, car, mapping, options) as drive:
+    with read_drive(log_input, car, mapping, options) as drive:
         left_out = no_true_sideslip(drive.plan) or refuse(drive)
         if left_out:
             return record_of(drive, split=split, left_out=left_out), None

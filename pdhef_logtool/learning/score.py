@@ -21,8 +21,8 @@ from pdhef_logtool.learning.noise.search import MIN_AVAILABILITY
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
-from pdhef_logtool.records.tracks import StateTrack, concatenate
-from pdhef_logtool.runs.estimating import calibrator, estimate_windows
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.runs.estimating import calibrator, estimate_drive
 
 #: What a filter needs from the start of a slice before its error counts.
 SETTLE_S = 3.0
@@ -105,12 +105,8 @@ def _tracks(
     car: Car, names: Sequence[str], drive: WholeDrive, options: ReadOptions
 ) -> tuple[dict[str, StateTrack], dict[str, str]]:
     estimators, skipped = runnable(names, car, drive.plan.alignment.available, Options(options.use_speed))
-    by_estimator: dict[str, list[StateTrack]] = {e.name: [] for e in estimators}
-    for window in estimate_windows(drive, estimators, drawn=False, intervals=calibrator(car, estimators)):
-        for estimator, track in zip(estimators, window.tracks, strict=True):
-            by_estimator[estimator.name].append(track)
-    tracks = {name: parts[0] if len(parts) == 1 else concatenate(parts) for name, parts in by_estimator.items()}
-    return tracks, {s.name: s.reason for s in skipped}
+    estimated = estimate_drive(drive, estimators, drawn=False, intervals=calibrator(car, estimators))
+    return estimated.tracks, {s.name: s.reason for s in skipped}
 
 
 def _errors(track: StateTrack | None, drive: WholeDrive, slow_m_s: float) -> tuple[FloatArray, BoolArray]:

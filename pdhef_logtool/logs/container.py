@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from mcap.records import Metadata
 
-from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, SourceError
+from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, raise_source_error
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.records.errors import LogError, PdhefError
@@ -82,6 +82,7 @@ class Block:
     buffer : bytes that contain all payloads.
     channel, log_time_ns, publish_time_ns, sequence, offset, length : int64 [N]; message i is
         ``buffer[offset[i]:offset[i] + length[i]]``.
+    dropped : channels of which payloads are left out.
     """
 
     buffer: bytes | memoryview
@@ -91,10 +92,29 @@ class Block:
     sequence: IntArray
     offset: IntArray
     length: IntArray
+    dropped: frozenset[int] = field(default=frozenset(), kw_only=True)
 
     def __len__(self) -> int:
         """Return the number of messages."""
         return int(self.channel.shape[0])
+
+    def without_large(self, most: int) -> Block:
+        """Return the block without payloads above ``most`` bytes."""
+        large = self.length > most
+        if not large.any() or (np.diff(self.offset) < 0).any():
+            return self
+        # Copy each run of messages between two large ones as a whole.
+        small = np.flatnonzero(~large)
+        first = small[np.diff(small, prepend=-2) > 1]
+        last = small[np.diff(small, append=len(self) + 1) > 1]
+        begin, end = self.offset[first], self.offset[last] + self.length[last]
+        view = memoryview(self.buffer)
+        buffer = b"".join([view[a:b] for a, b in zip(begin.tolist(), end.tolist(), strict=True)])
+        offset, length = np.zeros_like(self.offset), np.where(large, 0, self.length)
+        moved = begin - (np.cumsum(end - begin) - (end - begin))
+        offset[small] = self.offset[small] - np.repeat(moved, last - first + 1)
+        dropped = frozenset(np.unique(self.channel[large]).tolist())
+        return replace(self, buffer=buffer, offset=offset, length=length, dropped=dropped)
 
     def message(self, row: int) -> bytes:
         """Return the payload of a message."""
@@ -200,10 +220,9 @@ class SpanDamageError(Exception):
 def describe_damage(error: Exception) -> tuple[str, str]:
     """Return kind and text of the loss that an error causes.
 
-    A log that cannot be reached is not damaged: a :class:`SourceError` is raised again.
+    A log that cannot be reached is not damaged: it raises a :class:`~.byte_source.SourceError`.
     """
-    if isinstance(error, SourceError):
-        raise error
+    raise_source_error(error)
     if isinstance(error, LimitError):
         return "over-budget", f"expected {error.expected}, got {error.got} ({error.where}); {error.remedy}"
     if isinstance(error, LogError):

@@ -8,7 +8,6 @@ remote file, chunks that are not wanted are taken from the index, if it is consi
 from __future__ import annotations
 
 import struct
-import zlib
 from array import array
 from bisect import bisect_right
 from collections import Counter
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -297,7 +297,7 @@ class McapContainer(FileContainer):
         """Decompress the chunk record that is the first ``end`` bytes, and check its CRC."""
         size, crc, compression, start, stored = _chunk_head(record, end)
         content = decompress(compression, memoryview(record)[start : start + stored], size, self.meter.limits)
-        if crc and zlib.crc32(content) != crc:
+        if crc and crc32(content) != crc:
             raise SpanDamageError("its CRC does not match")
         return content
 
@@ -352,7 +352,7 @@ class McapContainer(FileContainer):
             compression=compression,
             stored=record[start : start + length],
             size=size,
-            crc=crc or zlib.crc32(content),
+            crc=crc or crc32(content),
             channel=block.channel,
             log_time_ns=block.log_time_ns,
             offset=head,
@@ -386,7 +386,7 @@ class McapContainer(FileContainer):
         """Return the CRC-32 of bytes [start, end)."""
         crc: int = 0
         for offset in range(start, end, _CRC_BLOCK_BYTES):
-            crc = zlib.crc32(self.source.read(offset, min(_CRC_BLOCK_BYTES, end - offset)), crc)
+            crc = crc32(self.source.read(offset, min(_CRC_BLOCK_BYTES, end - offset)), crc)
         return crc
 
     def attachments(self) -> Iterator[Attachment]:

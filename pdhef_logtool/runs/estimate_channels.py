@@ -9,12 +9,12 @@ import numpy as np
 
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.estimators.filter_base import sideslip_std
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
+from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import SignalSource, clock_key, fit_clocks, resolve_mapping
 from pdhef_logtool.mapping.can_frames import with_can_signals
-from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, request_source, si_values
-from pdhef_logtool.mapping.clocks import stamps_on_log_clock
+from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, si_values
+from pdhef_logtool.mapping.clocks import request_source, stamps_on_log_clock
 from pdhef_logtool.mapping.estimates import BASE_ORDER, STDS, CovarianceSource, EstimateSource
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.geometry import wrap_angle
@@ -41,7 +41,7 @@ class RecordedEstimate:
 
 
 def read_estimate(
-    log: DriveLog, source: EstimateSource, start_ns: int, end_ns: int, window_s: float
+    log: DriveLog, source: EstimateSource, start_ns: int, end_ns: int
 ) -> tuple[RecordedEstimate, list[Loss]]:
     """Read one recorded estimate with log time in [start, end) onto the stamps of its first quantity of BASE_ORDER.
 
@@ -63,8 +63,7 @@ def read_estimate(
     matrices: list[FloatArray] = []
     losses: list[Loss] = []
     base = next(name for name in BASE_ORDER if name in mapping.signals)
-    for a, b in windows(start_ns, end_ns, round(window_s * 1e9), log.recording_span):
-        columns = log.read(requests, a, b)
+    for columns in (log.read(requests, start_ns, end_ns),):
         for name, s in mapping.signals.items():
             topic = columns.get(s.read_topic)
             if topic is None or len(topic) == 0:

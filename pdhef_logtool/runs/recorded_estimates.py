@@ -17,7 +17,9 @@ import numpy as np
 
 from pdhef_logtool.car.car import NO_INTERVALS, Car
 from pdhef_logtool.drive.interpolation import Bracket
+from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
+from pdhef_logtool.drive.recorded import sample_ledger
 from pdhef_logtool.drive.truth import (
     SAME_SHARE,
     TruthTrack,
@@ -27,13 +29,12 @@ from pdhef_logtool.drive.truth import (
     truth_at,
     valid_as_a_whole,
 )
-from pdhef_logtool.drive.windows import DrivePlan, sample_ledger
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput
-from pdhef_logtool.logs.drive_log import DriveLog, windows
+from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import check_mapping, join_channels, mapping_of, merge_losses, read_signals
+from pdhef_logtool.mapping import check_mapping, mapping_of, merge_losses, read_signals
 from pdhef_logtool.mapping.choosing import mapping_for_recorder
 from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
 from pdhef_logtool.records.errors import MappingError
@@ -43,21 +44,19 @@ from pdhef_logtool.records.signals import (
     ALIGNED_SIGNALS,
     TRUTH_UNITS,
     WHEELS,
-    Channel,
     FloatArray,
     IntArray,
     Loss,
     Signals,
-    join_signals,
 )
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
 from pdhef_logtool.results.run_report import EstimatorFacts, build_report, write_json
 from pdhef_logtool.results.sink import TRUTH, Event
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
-from pdhef_logtool.runs.estimating import DeadReckoning, first_pose
+from pdhef_logtool.runs.estimating import dead_reckoned, first_pose
 from pdhef_logtool.runs.pipeline import (
     LogResult,
     RunResult,
@@ -253,7 +252,7 @@ class _Scoring:
         """Return what :func:`read_truth` does, nothing where no ground truth is mapped."""
         if not drive.mapping.truth:
             return None, (), {}, {}
-        return read_truth(drive.log, drive.plan, drive.options.window_s)
+        return read_truth(drive.log, drive.plan)
 
     def _reference(self, drive: Drive, *, scored: bool) -> ReferenceEstimator | None:
         """Return the sideslip reference of the sensors: without ground truth, or beside it where asked for."""
@@ -275,9 +274,7 @@ class _Scoring:
         losses: list[Loss] = []
         recorded = []
         for estimate in self.estimates:
-            recorded_estimate, lost = read_estimate(
-                drive.log, estimate, drive.plan.start_ns, drive.plan.end_ns, drive.options.window_s
-            )
+            recorded_estimate, lost = read_estimate(drive.log, estimate, drive.plan.start_ns, drive.plan.end_ns)
             for note in recorded_estimate.notes:
                 drive.tell(f"{estimate.name}: {note}")
             recorded.append(recorded_estimate)
@@ -421,8 +418,8 @@ def _read_sensors(drive: Drive) -> Signals | None:
         drive.tell("no IMU in the mapping: segments come from the ground truth alone")
         return None
     drive.plan = replace(drive.plan, truth=None, mapping=replace(drive.mapping, truth={}, quality=None))
-    seen = [w.signals for w in drive.windows() if len(w.signals)]
-    return join_signals(seen) if seen else None
+    signals = drive.recorded().signals
+    return drive.friction.fill(signals) if len(signals) else None
 
 
 def _same_column(estimate: FloatArray, truth: FloatArray) -> bool:
@@ -444,7 +441,7 @@ def _write(
     try:
         for track in tracks:
             has_pose = track.name == TRUTH and plan.has_truth_pose
-            sink.append(track if has_pose else DeadReckoning().add(track, start))
+            sink.append(track if has_pose else dead_reckoned(track, start))
         sink.finish(report)
     except BaseException:
         sink.abort()
@@ -454,55 +451,32 @@ def _write(
 
 
 def read_truth(
-    log: DriveLog, plan: DrivePlan, window_s: float
+    log: DriveLog, plan: DrivePlan
 ) -> tuple[TruthTrack, tuple[Loss, ...], dict[str, int], dict[tuple[Role, str], Counter[str]]]:
     """Read and derive the whole ground truth on its own clock, window by window.
 
     Returns
     -------
-    ground truth, losses, samples by source, and the counts for :func:`~pdhef_logtool.drive.windows.sample_ledger`.
+    ground truth, losses, samples by source, and the counts for :func:`~pdhef_logtool.drive.recorded.sample_ledger`.
 
     Raises
     ------
     MappingError : The slice contains no ground truth.
     """
-    alone = replace(plan.mapping, signals={})
-    channels: dict[str, Channel] = {}
-    tracks: list[StateTrack] = []
-    losses: tuple[Loss, ...] = ()
-    samples: dict[str, int] = {}
-    counts: dict[tuple[Role, str], Counter[str]] = {}
-    done_ns: int | None = None
-    ends = list(windows(plan.start_ns, plan.end_ns, round(window_s * 1e9), log.recording_span))
-    for a, b in ends:
-        if plan.truth is None:
-            break
-        part = read_signals(log, alone, plan.clocks, a, b)
-        losses = merge_losses([losses, part.losses])
-        for key, count in part.counts.items():
-            counts.setdefault(key, Counter()).update(count)
-        for name, channel in part.truth.items():
-            samples[channel.source] = samples.get(channel.source, 0) + len(channel)
-            channels[name] = join_channels([channels[name], channel]) if name in channels else channel
-        stamps = [c.stamps_ns for c in channels.values() if len(c)]
-        if not stamps:
-            continue
-        newest = max(int(s[-1]) for s in stamps) + 1
-        until = newest if (a, b) == ends[-1] else min(newest, b) - plan.truth.margin_ns
-        if done_ns is not None and until <= done_ns:
-            continue
-        tracks.append(derive_truth(channels, plan=plan.truth).track.between(done_ns, until))
-        done_ns = until
-        channels = {n: c.between(until - plan.truth.margin_ns) for n, c in channels.items()}
-    if plan.truth is None or not sum(len(t) for t in tracks):
+    part = read_signals(log, replace(plan.mapping, signals={}), plan.clocks, plan.start_ns, plan.end_ns)
+    if plan.truth is None or not any(map(len, part.truth.values())):
         raise MappingError(
             expected="ground truth in the chosen slice",
             got="no samples that can be used",
             where=f"{log.path} {', '.join(s.label for s in plan.mapping.truth.values())}",
             remedy="pdhef inspect LOG shows what the log contains and what was dropped",
         )
+    samples: Counter[str] = Counter()
+    for channel in part.truth.values():
+        samples[channel.source] += len(channel)
+    track = derive_truth(part.truth, plan=plan.truth).track
     gap_s = plan.truth.max_gap_s[plan.truth.base]
-    return TruthTrack(concatenate(tracks), gap_s, plan.derivation), losses, samples, counts
+    return TruthTrack(track, gap_s, plan.derivation), part.losses, dict(samples), part.counts
 
 
 def signals_at(signals: Signals | None, stamps_ns: IntArray) -> Signals:

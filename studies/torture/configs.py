@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.evaluation.plan_example import EXAMPLE
+from pdhef_logtool.storage.toml_text import toml_text
 from studies.pages import ROOT
 from studies.torture.mutating import EDGES, TEXTS, damage_bytes
 from studies.torture.seeds import SEEDS
@@ -22,7 +23,6 @@ _MODEL = ROOT / "pdhef_logtool" / "models" / "default"
 _CONFIG = """estimators = ["zero", "kinematic"]
 annotate = "none"
 start = "0"
-window_s = 600.0
 friction = 0.9
 sensors = "full"
 """
@@ -119,9 +119,7 @@ def damage_document(name: str, content: bytes, rng: random.Random) -> bytes:
 
 def _dumped(document: Any, toml: bool, lines: bool) -> bytes:
     if toml:
-        import tomlkit
-
-        text = tomlkit.dumps(document)
+        text = toml_text(document)
     else:
         text = "\n".join(json.dumps(x, ensure_ascii=False) for x in (document if lines else [document]))
     return text.encode("utf-8", errors="surrogatepass")

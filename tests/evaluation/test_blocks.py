@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pdhef_logtool.runs.track_store import TrackStore
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.evaluation import blocks
@@ -27,7 +28,6 @@ from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.runs import track_store
 from pdhef_logtool.runs.scoring import segment_events
-from pdhef_logtool.runs.track_store import TrackStore
 
 T0 = 1_700_000_000_000_000_000
 VEHICLE = default_vehicle()

@@ -121,7 +121,7 @@ def test_a_truth_is_missing_underived_or_no_truth() -> None:
 
 
 class ReadDrive:
-    """What ``read_cached`` gives, of :data:`WHOLE`."""
+    """What ``read_drive`` gives, of :data:`WHOLE`."""
 
     def __init__(self, whole: WholeDrive = WHOLE) -> None:
         self.name, self.path, self.plan, self.sha256 = whole.name, whole.path, whole.plan, "1" * 64
@@ -146,7 +146,7 @@ class ReadDrive:
 
 def test_a_drive_is_loaded_with_what_is_known_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     read = ReadDrive()
-    monkeypatch.setattr(learning_drives, "read_cached", lambda *_: read)
+    monkeypatch.setattr(learning_drives, "read_drive", lambda *_: read)
     log, car = LogInput(Path("made.mcap"), "made"), Car.of(VEHICLE)
     found, whole = load_drive(log, car, None, SALOON.read_options, split="test", fill_friction=False, max_bytes=7)
     assert whole is WHOLE

@@ -13,7 +13,7 @@ from pdhef_logtool.car.car import FIT_FILE, Car
 from pdhef_logtool.car.parts import Fit, FittedPhysics, FittedValues, LearntOn, physics_sha256
 from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.toml_files import part_toml
-from pdhef_logtool.drive.cached import read_cached
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import Driving
 from pdhef_logtool.learning.drives import CALIBRATE, DriveRecord, record_of
@@ -39,7 +39,7 @@ def calibrate(task: Task) -> StageOutput:
     car = Car.of(start)
 
     def read(log: LogInput) -> tuple[DriveRecord, Driving | None]:
-        with read_cached(log, car, task.mapping, task.options) as drive:
+        with read_drive(log, car, task.mapping, task.options) as drive:
             if missing := lacking(drive):
                 return record_of(drive, left_out=f"the log has no {', '.join(missing)}"), None
             driving = read_driving(drive)

@@ -39,7 +39,7 @@ from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.run_report import json_bytes, tool_versions
-from pdhef_logtool.runs.estimating import estimate_windows
+from pdhef_logtool.runs.estimating import estimate_drive
 
 #: Neighbouring errors are correlated: one sample in this time is kept.
 SAMPLE_EVERY_S = 0.05
@@ -143,11 +143,12 @@ def _run_drive(log: LogInput, number: int, task: Task) -> tuple[DriveRecord, _Ra
         presumed = car if assumed is vehicle else car.with_vehicle(assumed)
         available = drive.plan.alignment.available
         estimators, _ = runnable(task.estimators or (ALL_ESTIMATORS,), presumed, available, Options(options.use_speed))
-        for window in estimate_windows(replace(drive, signals=seen), estimators, watched=False, drawn=False):
-            for estimator, track in zip(estimators, window.tracks, strict=True):
-                part = drive_samples(track, seen, signals, drive.truth, vehicle, number, wrong=wrong)
-                if len(part) >= MIN_SAMPLES:
-                    ran.append((track.name, resolve(estimator), part))
+        estimated = estimate_drive(replace(drive, signals=seen), estimators, watched=False, drawn=False)
+        for estimator in estimators:
+            track = estimated.tracks[estimator.name]
+            part = drive_samples(track, seen, signals, drive.truth, vehicle, number, wrong=wrong)
+            if len(part) >= MIN_SAMPLES:
+                ran.append((track.name, resolve(estimator), part))
     if not ran:
         return replace(record, left_out="no estimate with an interval where the ground truth is known"), None
     return replace(record, counts={**record.counts, "runs": len(runs)}), ran

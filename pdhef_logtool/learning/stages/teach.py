@@ -19,8 +19,7 @@ from pdhef_logtool.car.car import TAUGHT_FILE, Car
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.taught import ESTIMATED, GROUND_TRUTH, Taught, TaughtParameter
-from pdhef_logtool.drive.cached import read_cached
-from pdhef_logtool.drive.reading import Drive, WholeDrive
+from pdhef_logtool.drive.reading import Drive, WholeDrive, read_drive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import STEP_S
@@ -142,7 +141,7 @@ def teach(task: Task) -> StageOutput:
     car = Car.of(task.car.datasheet)
 
     def read(log: LogInput) -> tuple[DriveRecord, OpenedDrive | None]:
-        with read_cached(log, car, task.mapping, task.options) as drive:
+        with read_drive(log, car, task.mapping, task.options) as drive:
             return open_drive(drive, task.settings.config)
 
     records, drives = task.read(task.split.parts[TRAINING], read, 0.3)

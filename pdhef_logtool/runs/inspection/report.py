@@ -29,13 +29,13 @@ from pdhef_logtool.mapping import (
     Mapping,
     QualityGate,
     SignalSource,
+    auto_map,
     clock_key,
     fit_clocks,
     mapping_of,
     mapping_to_toml,
     merge_losses,
     read_signals,
-    recognise,
     resolve_mapping,
 )
 from pdhef_logtool.mapping.candidates import Candidate
@@ -244,7 +244,7 @@ def inspect_log(
 
     Of a large MCAP whose index agrees with itself values are looked at in a part of the chunks (``sample``), unless
     ``whole``; if anything is wrong in them, or little is left, all of it is read. Memory is bounded by windows of ten
-    minutes, regardless of the log's length. ``prefer_truth`` is the choice of :func:`pdhef_logtool.mapping.recognise`;
+    minutes, regardless of the log's length. ``prefer_truth`` is the choice of :func:`pdhef_logtool.mapping.auto_map`;
     ``budget`` is what reading may cost, ``msgs`` a folder with definitions of types that the log does not define.
 
     Raises
@@ -280,7 +280,7 @@ def inspect_drive_log(
     ambiguities: tuple[Ambiguity, ...] = ()
     candidates: tuple[Candidate, ...] = ()
     if given is None:
-        auto = recognise(log, prefer_truth=prefer_truth)
+        auto = auto_map(log, prefer_truth=prefer_truth)
         mapping, ambiguities, candidates = auto.mapping, auto.ambiguities, auto.candidates
     else:
         mapping = choose_mapping(log, given, prefer_truth=prefer_truth, require_signals=False).mapping
@@ -288,6 +288,7 @@ def inspect_drive_log(
     head = (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS))
     whole = _Look(windows(log.start_ns, log.end_ns, WINDOW_NS, log.recording_span), tuple(t.name for t in log.topics))
     look = whole if index is None else _sample_look(log, index, mapping, head)
+    log.expect(dict.fromkeys(look.stamps, ()))
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     looked_at = survey_log(log, mapping, clocks, head)
     mapping = looked_at.mapping
