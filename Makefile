@@ -16,7 +16,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randomly-seed=$(ORDER_SEED))
 
 .PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions peers torture \
-  gates gates-quick gates-freeze recalibrate docs docs-truthsim paper strangers wheel release lock clean
+  gates gates-quick gates-freeze recalibrate docs paper strangers wheel release lock clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
@@ -37,7 +37,7 @@ help:
 	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
 	@echo "make peers    docs/peers.md: published sideslip estimators on the recorded drives in ../shared (three minutes)"
 	@echo "make docs     the documentation as a site: out/site/index.html (a broken link is an error)"
-	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
+	@echo "make  figures and tables of docs/truthsim.md anew"
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
 	@echo "make wheel    dist/: the wheel and the source archive of what is committed, looked at"
 	@echo "make release  the same, installed into a new environment, where the sample job runs"
@@ -143,7 +143,6 @@ recalibrate: $(VENV)/installed-dev $(VENV)/compiled
 
 train-default: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.defaults.train_default
-	$(BIN)/python -m studies.model_card
 
 # Without --quiet, which would hide the warnings that make it fail.
 docs: $(VENV)/installed-docs
@@ -152,9 +151,6 @@ docs: $(VENV)/installed-docs
 
 samples: $(VENV)/installed $(VENV)/compiled
 	$(BIN)/python -m truthsim.samples sample_logs
-
-docs-truthsim: $(VENV)/installed
-	$(BIN)/python -m studies.truthsim_docs
 
 # One core: step times are measured in the same run.
 paper: $(VENV)/installed-dev $(VENV)/compiled

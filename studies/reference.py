@@ -33,11 +33,10 @@ from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference, refer, sideslip_std
 from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator, steps_at
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.evaluation.metrics import ALL
-from pdhef_logtool.evaluation.metrics.reference import reference_rows
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.referencing import prior_of
 from pdhef_logtool.runs.self_calibrating import calibrate_drive
@@ -380,9 +379,9 @@ def _rms_deg(values_rad: FloatArray) -> float:
 def _pairs(found: SideslipReference, drive: ScoredDrive, least_speed_m_s: float) -> tuple[int, int, int, int]:
     """Return ``pairs`` of :class:`Figures`."""
     reference = ReferenceEstimator((found,)).at(drive.signals.stamps_ns)
-    everywhere = {ALL: np.ones(len(reference), dtype=np.bool_)}
-    rows = reference_rows(drive.estimates, reference, everywhere, log="", low_speed_m_s=least_speed_m_s)
-    claims = {row.estimator: row.value for row in rows if row.metric == "reference_further"}
+    tracks = {t.name: t for t in drive.estimates} | {REFERENCE: reference}
+    rows = evaluate_drive(EvaluatedDrive("", tracks, None, None, {}, least_speed_m_s), ("reference_further",))
+    claims = {row.estimator: row.value for row in rows}
     errors = {t.name: _rms_deg(drive.error_rad(t, least_speed_m_s)) for t in drive.estimates}
     further = {f"{a}~{b}": errors[a] - errors[b] for a, b in combinations(errors, 2)}
     agreed = sum(claim * further[pair] > 0.0 for pair, claim in claims.items())

@@ -96,7 +96,7 @@ def taken(signals: Signals, file: VehicleParameters, calibration: SelfCalibratio
         calibration.vehicle, calibration.noise, told_friction=True, note="", error_scale=calibration.error_scale
     )
     car = replace(Car.of(file), self_calibrated=calibrated)
-    driven = driven_d2([signals], car, calibration)
+    driven = driven_d2(signals, car, calibration)
     return replace(car, self_calibrated=replace(calibrated, varied=calibration.varied, driven_d2_m_s=driven))
 
 

@@ -258,8 +258,3 @@ def run_config(options: dict[str, Any]) -> RunConfig:
     flags = {key: value for key, value in options.items() if value not in (None, [])}
     assigned = parse_assignments(flags.pop("assignments", ()))
     return load_config(flags.pop("config_file", None), assigned | flags)
-
-
-def split_names(text: str) -> tuple[str, ...]:
-    """Split a comma-separated list."""
-    return tuple(name.strip() for name in text.split(",") if name.strip())

@@ -115,10 +115,7 @@ class TrackCalibrator:
         made = [e.algorithm.identity for e in self.intervals.entries if e.estimator == name]
         if not made:
             return ""
-        return (
-            f"the calibrated intervals of {name} are not applied: expected {made[0]}, got {ran[0].identity}; "
-            "run pdhef learn --stages intervals"
-        )
+        return f"the calibrated intervals of {name} are not applied: expected {made[0]}, got {ran[0].identity}"
 
     def _found(self, name: str) -> tuple[IntervalEntry, Algorithm] | None:
         """Return the entry for a name and the algorithm that it belongs to."""

@@ -22,8 +22,8 @@ from pdhef_logtool.records.signals import IntArray, Signals
 from pdhef_logtool.records.steps import StepColumns, extrapolation, release
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
-#: A longer drive is processed in parts of this length, with so much overlap that a filter has settled.
-LONGEST_WHOLE_S, PART_S, OVERLAP_S = 7200.0, 3600.0, 60.0
+#: Steps that an estimator makes at a time: those of an hour with their covariances take 350 MB per filter.
+PIECE_STEPS = 8192
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,11 +81,11 @@ def run_window(
 
 
 def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCheck | None = None) -> StateTrack:
-    """Return the track of an estimator over a drive [N]; above 2 h it starts anew for each hour.
+    """Return the track of an estimator over a drive [N]; it runs piece by piece, so that its steps take little memory.
 
     Parameters
     ----------
-    causality : checks the steps of an estimator that declares itself causal, in the first part.
+    causality : checks the steps of an estimator that declares itself causal.
 
     Raises
     ------
@@ -93,31 +93,17 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
         The estimator did not return one step per sample, or its plug-in failed.
     """
     tracks: list[StateTrack] = []
-    for lead, first, last, end in parts(signals.stamps_ns, looks_ahead=look_ahead_of(estimator) > 0.0):
-        track, _ = run_window(estimator, signals.rows(lead, end), causality=None if tracks else causality)
-        tracks.append(track.rows(first - lead, last - lead))
+    state = None
+    for first in range(0, max(len(signals), 1), PIECE_STEPS):
+        piece = signals.rows(first, first + PIECE_STEPS)
+        ahead_ns = round(look_ahead_of(estimator) * 1e9)
+        ahead = None
+        if ahead_ns and first + PIECE_STEPS < len(signals):
+            until = int(np.searchsorted(signals.stamps_ns, piece.stamps_ns[-1] + ahead_ns, side="right"))
+            ahead = signals.rows(first + PIECE_STEPS, until)
+        track, state = run_window(estimator, piece, state, ahead, causality)
+        tracks.append(track)
     return tracks[0] if len(tracks) == 1 else concatenate(tracks)
-
-
-def parts(stamps_ns: IntArray, *, looks_ahead: bool = False) -> list[tuple[int, int, int, int]]:
-    """Return the parts of a drive [N]: rows [lead, end) that are processed for the rows [first, last).
-
-    A drive of up to :data:`LONGEST_WHOLE_S` is one part. Longer ones have parts of :data:`PART_S`, each processed from
-    :data:`OVERLAP_S` before, and where later samples count to as much behind.
-    """
-    count = len(stamps_ns)
-    if not count or stamps_ns[-1] - stamps_ns[0] <= LONGEST_WHOLE_S * 1e9:
-        return [(0, 0, count, count)]
-    part_ns, overlap_ns = round(PART_S * 1e9), round(OVERLAP_S * 1e9)
-    edges_ns = np.arange(stamps_ns[0], stamps_ns[-1] + 1, part_ns)
-    rows = np.append(np.searchsorted(stamps_ns, edges_ns), count)
-    leads = np.searchsorted(stamps_ns, edges_ns - overlap_ns)
-    ends = np.searchsorted(stamps_ns, edges_ns + part_ns + (overlap_ns if looks_ahead else 0))
-    return [
-        (int(lead), int(first), int(last), int(end))
-        for lead, first, last, end in zip(leads, rows[:-1], rows[1:], ends, strict=True)
-        if last > first
-    ]
 
 
 def compensate(

@@ -65,7 +65,7 @@ if TYPE_CHECKING:
 
 #: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r] where the car has none of its own,
 #: and where identification searches it. By innovation likelihood over simulated drives, as that of ``phy-ukf``, with
-#: lag, load transfer and biases, and frozen: ``studies.defaults.tune_physics_q`` finds 0.078, 0.13, 0.01, 0.062, 0.39.
+#: lag, load transfer and biases, and frozen. The present simulator gives 0.078, 0.13, 0.01, 0.062, 0.39.
 PHYSICS_Q_STD = (0.085, 0.12, 0.012, 0.086, 0.41, 0.41)
 #: 1-sigma of the axles' forces over the mass at the start, and at a standstill, m/s².
 _FORCE_STD, _STANDSTILL_FORCE_STD = 0.5, 0.05

@@ -9,13 +9,12 @@ half its peak. Every rule is mirror symmetric. Thresholds are in :class:`Manoeuv
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.evaluation.blocks import blocks_with_halo
 from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, runs, smooth
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import last_known
@@ -37,8 +36,6 @@ MANOEUVRES = (
 )
 _STEP_NS = 20_000_000
 _STEP_S = 0.02
-#: A manoeuvre that lasts longer on both sides of a block's border is joined from its parts.
-_HALO_S = 90.0
 #: Of the steering's zero one row in so many is enough.
 _ZERO_EVERY = 10
 
@@ -166,17 +163,8 @@ def find_manoeuvres(signals: Signals, vehicle: VehicleParameters, rules: Manoeuv
     """Return the manoeuvres of a drive in order of time; no two overlap."""
     wheelbase_m = vehicle.cg_to_front_axle_m + vehicle.cg_to_rear_axle_m
     zeros = _zeros(signals, wheelbase_m, rules)
-    by_name: dict[str, list[Manoeuvre]] = {}
-    for first, a, b, end in blocks_with_halo(signals, _HALO_S, 0):
-        if a == b:
-            continue
-        part = signals.rows(first, end)
-        from_ns, to_ns = int(part.stamps_ns[a - first]), int(part.stamps_ns[b - 1 - first])
-        for run in _runs_of(part, wheelbase_m, zeros, rules):
-            for driven in _manoeuvres_of(run, rules):
-                if driven.end_ns > from_ns and driven.start_ns <= to_ns:
-                    _join(by_name.setdefault(driven.name, []), driven)
-    return sorted((m for ones in by_name.values() for m in ones), key=lambda m: m.start_ns)
+    found = [m for run in _runs_of(signals, wheelbase_m, zeros, rules) for m in _manoeuvres_of(run, rules)]
+    return sorted(found, key=lambda m: m.start_ns)
 
 
 def manoeuvre_masks(stamps_ns: IntArray, manoeuvres: Sequence[Manoeuvre]) -> dict[str, BoolArray]:
@@ -185,21 +173,6 @@ def manoeuvre_masks(stamps_ns: IntArray, manoeuvres: Sequence[Manoeuvre]) -> dic
     for m in manoeuvres:
         masks[m.name][np.searchsorted(stamps_ns, m.start_ns) : np.searchsorted(stamps_ns, m.end_ns)] = True
     return masks
-
-
-def _join(before: list[Manoeuvre], new: Manoeuvre) -> None:
-    """Add a manoeuvre, or the rest of one that the block before has found."""
-    if before and new.start_ns < before[-1].end_ns:
-        old = before.pop()
-        new = replace(
-            old,
-            end_ns=max(old.end_ns, new.end_ns),
-            peak_ay_m_s2=max(old.peak_ay_m_s2, new.peak_ay_m_s2),
-            peak_yaw_rate_rad_s=max(old.peak_yaw_rate_rad_s, new.peak_yaw_rate_rad_s),
-            peak_steer_rad=max(old.peak_steer_rad, new.peak_steer_rad),
-            lowest_ax_m_s2=min(old.lowest_ax_m_s2, new.lowest_ax_m_s2),
-        )
-    before.append(new)
 
 
 # ---- a run of samples without a gap, on a grid of 20 ms ----
@@ -262,18 +235,11 @@ def _zeros(signals: Signals, wheelbase_m: float, rules: ManoeuvreRules) -> tuple
 
     Of the steering the median of what turning does not explain; of the gyro the median with the wheels straight.
     """
-    parts = []
-    for first, a, b, _ in blocks_with_halo(signals, RUN_GAP_S, 0):
-        speed = _speed(signals.rows(first, b))[a - first :]
-        part = signals.rows(a, b)
-        rate = part.yaw_rate_rad_s
-        straight = (np.abs(rate * speed) < rules.straight_m_s2) & (speed > rules.least_speed_m_s)
-        rows = np.flatnonzero(straight & (np.arange(a, b) % _ZERO_EVERY == 0))
-        gain = _gain(speed[rows], wheelbase_m, rules)
-        parts.append(
-            np.stack([part.steer_rad[rows] - rate[rows] * speed[rows] / gain, part.steer_rad[rows], rate[rows]])
-        )
-    left, steer, rates = np.concatenate(parts, axis=1)
+    speed, rate = _speed(signals), signals.yaw_rate_rad_s
+    straight = (np.abs(rate * speed) < rules.straight_m_s2) & (speed > rules.least_speed_m_s)
+    rows = np.flatnonzero(straight[::_ZERO_EVERY]) * _ZERO_EVERY
+    steer, rates = signals.steer_rad[rows], rate[rows]
+    left = steer - rates * speed[rows] / _gain(speed[rows], wheelbase_m, rules)
     finite = left[np.isfinite(left)]
     zero = float(np.median(finite)) if finite.size else 0.0
     ahead = rates[np.abs(steer - zero) < rules.wheels_straight_rad]

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.evaluation.blocks import blocks_with_halo, median_step_ns
-from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.segments import MANOEUVRE_SMOOTHING_HZ, known_of, speed_and_ay
-from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, reach_rows, smooth
+from pdhef_logtool.evaluation.smoothing import median_step_ns, smooth
+from pdhef_logtool.evaluation.track_errors import signal_error
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -63,29 +62,23 @@ def operating_space(
     """
     shape = len(SPEED_EDGES_M_S), len(AY_EDGES_M_S2)
     size = shape[0] * shape[1]
-    totals = np.zeros((3, size))
-    step_ns = median_step_ns(signals)
-    taken = known_of(truth)
-    for first, a, b, end in blocks_with_halo(signals, RUN_GAP_S, reach_rows(step_ns, MANOEUVRE_SMOOTHING_HZ)):
-        part = signals.rows(first, end)
-        of_truth = None if truth is None else truth.rows(first, end)
-        speed, lateral = speed_and_ay(part, of_truth, taken)
-        ay = np.abs(smooth(part.stamps_ns, lateral, MANOEUVRE_SMOOTHING_HZ, step_ns))
-        steps = np.diff(part.stamps_ns, append=part.stamps_ns[-1:]) * 1e-9
-        steps = np.minimum(np.where(steps > 0.0, steps, step_ns * 1e-9), MAX_STEP_S)
-        core = slice(a - first, b - first)
-        finite = (np.isfinite(speed) & np.isfinite(ay))[core]
-        i = np.searchsorted(SPEED_EDGES_M_S, speed[core][finite], side="right") - 1
-        j = np.searchsorted(AY_EDGES_M_S2, ay[core][finite], side="right") - 1
-        cell = np.maximum(i, 0) * shape[1] + j
-        totals[0] += np.bincount(cell, weights=steps[core][finite], minlength=size)
-        if truth is not None and estimate is not None:
-            slow = vehicle.low_speed_blend_m_s
-            error = signal_error(estimate.rows(a, b), truth.rows(a, b), "sideslip_rad", slow)[finite]
-            scored = np.isfinite(error)
-            totals[1] += np.bincount(cell[scored], minlength=size)
-            totals[2] += np.bincount(cell[scored], weights=error[scored] ** 2, minlength=size)
-    seconds, counts, squares = totals
+    stamps = signals.stamps_ns
+    step_ns = median_step_ns(stamps)
+    speed, lateral = speed_and_ay(signals, truth, known_of(truth))
+    ay = np.abs(smooth(stamps, lateral, MANOEUVRE_SMOOTHING_HZ, step_ns))
+    steps = np.diff(stamps, append=stamps[-1:]) * 1e-9
+    steps = np.minimum(np.where(steps > 0.0, steps, step_ns * 1e-9), MAX_STEP_S)
+    finite = np.isfinite(speed) & np.isfinite(ay)
+    i = np.searchsorted(SPEED_EDGES_M_S, speed[finite], side="right") - 1
+    j = np.searchsorted(AY_EDGES_M_S2, ay[finite], side="right") - 1
+    cell = np.maximum(i, 0) * shape[1] + j
+    seconds = np.bincount(cell, weights=steps[finite], minlength=size)
+    counts, squares = np.zeros(size), np.zeros(size)
+    if truth is not None and estimate is not None:
+        error = signal_error(estimate, truth, "sideslip_rad", vehicle.low_speed_blend_m_s)[finite]
+        scored = np.isfinite(error)
+        counts = np.bincount(cell[scored], minlength=size)
+        squares = np.bincount(cell[scored], weights=error[scored] ** 2, minlength=size)
     with np.errstate(invalid="ignore"):
         errors = squares / counts
     cells = [

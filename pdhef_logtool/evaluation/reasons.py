@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.records.tracks import StateTrack
@@ -164,12 +163,10 @@ def sensor_faults(track: StateTrack) -> tuple[SensorFault, ...] | None:
 
 
 def _gathered(track: StateTrack) -> ReasonIntervals | None:
-    if not len(track.rows(0, 1).reason) == len(track.rows(0, 1)) > 0:
+    if not len(track.reason) == len(track) > 0:
         return None
     gathered = ReasonIntervals()
-    for a, b in row_blocks(len(track)):
-        part = track.rows(a, b)
-        gathered.append(part.stamps_ns, part.reason)
+    gathered.append(track.stamps_ns, track.reason)
     return gathered
 
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.evaluation.blocks import SegmentMasks, median_step_ns, row_blocks
+from pdhef_logtool.evaluation.smoothing import median_step_ns
 from pdhef_logtool.evaluation.track_errors import NORMAL_95, raw_error, scorable, total_std, truth_speed
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.evaluation.validation_plan import MEANS, POOLED, SQUARES, Requirement
 from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Errors are correlated over seconds (docs/method.md#evaluation).
@@ -61,7 +61,7 @@ class ScoredDrive:
 
     read: _Read
     truth: StateTrack
-    masks: SegmentMasks
+    masks: Mapping[str, BoolArray]
     low_speed_m_s: float
     not_independent: frozenset[str] = frozenset()
     estimated: bool = False
@@ -104,26 +104,18 @@ def _blocks(
     requirement: Requirement, name: str, tracks: Sequence[StateTrack], drive: ScoredDrive, most: int
 ) -> RequirementBlocks | None:
     """Sum the summands of one requirement by block of time."""
-    truth, n = drive.truth, len(drive.truth)
-    if not n:
+    truth = drive.truth
+    if not len(truth):
         return None
-    start_ns = int(truth.rows(0, 1).stamps_ns[0])
-    duration_s = float(int(truth.rows(n - 1, n).stamps_ns[0]) - start_ns) * 1e-9
-    block_s = BLOCK_S * max(1, math.ceil(duration_s / (BLOCK_S * most)))
-    step_s = median_step_ns(truth) * 1e-9
-    count = int(duration_s // block_s) + 1
-    sums = np.zeros((3 + len(tracks), count))
-    for a, b in row_blocks(n):
-        part = truth.rows(a, b)
-        columns = _summands(requirement, [t.rows(a, b) for t in tracks], part, drive)
-        used = np.isfinite(columns).all(axis=0) & drive.masks.rows(a, b)[requirement.segment]
-        if not used.any():
-            continue
-        block = ((part.stamps_ns[used] - start_ns) // round(block_s * 1e9)).astype(np.int64)
-        way = np.nan_to_num(truth_speed(part)[used]) * step_s
-        std = part.sideslip_std_rad[used] ** 2 if drive.estimated else np.zeros(len(block))
-        for row, weights in enumerate((np.ones(len(block)), way, std, *columns[:, used])):
-            sums[row] += np.bincount(block, weights=weights, minlength=count)
+    since_ns = truth.stamps_ns - truth.stamps_ns[0]
+    block_s = BLOCK_S * max(1, math.ceil(float(since_ns[-1]) * 1e-9 / (BLOCK_S * most)))
+    step_s = median_step_ns(truth.stamps_ns) * 1e-9
+    columns = _summands(requirement, tracks, truth, drive)
+    used = np.isfinite(columns).all(axis=0) & drive.masks[requirement.segment]
+    block = since_ns[used] // round(block_s * 1e9)
+    way = np.nan_to_num(truth_speed(truth)[used]) * step_s
+    std = truth.sideslip_std_rad[used] ** 2 if drive.estimated else np.zeros(len(block))
+    sums = np.stack([np.bincount(block, weights) for weights in (np.ones(len(block)), way, std, *columns[:, used])])
     numbers = np.flatnonzero(sums[0])
     kept = sums[:, numbers]
     if not kept.shape[1]:

@@ -22,14 +22,13 @@ manoeuvres            :mod:`~pdhef_logtool.evaluation.manoeuvres`, from sensors 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.evaluation.blocks import SegmentMasks, blocks_with_halo, median_step_ns, packed, row_blocks
 from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES, Manoeuvre, find_manoeuvres, manoeuvre_masks
-from pdhef_logtool.evaluation.smoothing import RUN_GAP_S, reach_rows, runs, smooth
+from pdhef_logtool.evaluation.smoothing import median_step_ns, runs, smooth
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import last_known
 from pdhef_logtool.records.tracks import StateTrack
@@ -52,8 +51,6 @@ STANDSTILL_YAW_RATE_RAD_S, STANDSTILL_S = 0.05, 0.5
 STRAIGHT_M_S2, STRAIGHT_S = 0.5, 2.0
 CORNERING_M_S2, CORNERING_S = 1.0, 1.5
 BRAKING_M_S2, ACCELERATING_M_S2, PEDAL_S = -1.5, 1.0, 0.5
-#: What is further away than this decides nothing.
-HALO_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +67,7 @@ def segment_masks(
     truth: StateTrack | None,
     vehicle: VehicleParameters,
     manoeuvres: Sequence[Manoeuvre] | None = None,
-) -> SegmentMasks:
+) -> dict[str, BoolArray]:
     """Return the masks [N] of every segment by name, in the order of this file's table; none is left out when empty.
 
     Parameters
@@ -79,23 +76,8 @@ def segment_masks(
     manoeuvres : of the drive; None: they are detected.
     """
     manoeuvres = find_manoeuvres(signals, vehicle) if manoeuvres is None else manoeuvres
-    step_ns, of_truth, bits = median_step_ns(signals), known_of(truth), []
-    for first, a, b, end in blocks_with_halo(signals, HALO_S, reach_rows(step_ns, MANOEUVRE_SMOOTHING_HZ)):
-        part = truth.rows(first, end) if truth else None
-        masks = _masks(signals.rows(first, end), part, of_truth, step_ns, vehicle, manoeuvres)
-        bits.append(packed(masks, end - first).bits[a - first : b - first])
-    return SegmentMasks(SEGMENTS, np.concatenate(bits))
-
-
-def _masks(
-    signals: Signals,
-    truth: StateTrack | None,
-    of_truth: frozenset[str],
-    step_ns: float,
-    vehicle: VehicleParameters,
-    manoeuvres: Sequence[Manoeuvre],
-) -> dict[str, BoolArray]:
-    """Return the masks of a part of a drive, right where it reaches far enough to both sides or to the drive's end."""
+    of_truth = known_of(truth)
+    step_ns = median_step_ns(signals.stamps_ns)
     stamps = signals.stamps_ns
     slow = vehicle.low_speed_blend_m_s
     lateral = _taken(signals, truth, of_truth, "ay_m_s2")
@@ -142,20 +124,17 @@ def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehiclePara
     ``signals``, ``truth`` as for :func:`segment_masks`.
     """
     of_truth = known_of(truth)
-    if "vx_m_s" not in of_truth and not _known_anywhere(signals, "speed_m_s"):
+    if "vx_m_s" not in of_truth and not np.isfinite(signals.speed_m_s).any():
         return np.ones(len(signals), dtype=np.bool_)
-    blocks = []
-    for first, a, b, end in blocks_with_halo(signals, RUN_GAP_S, 0):
-        speed = _speed(signals.rows(first, end), truth.rows(first, end) if truth else None, of_truth)
-        blocks.append(speed[a - first : b - first] > vehicle.low_speed_blend_m_s)
-    return np.concatenate(blocks)
+    return np.asarray(_speed(signals, truth, of_truth) > vehicle.low_speed_blend_m_s)
 
 
 def known_of(truth: StateTrack | None) -> frozenset[str]:
     """Return what is taken from ground truth: all that it ever has, so that a drive does not mix two sources."""
     if truth is None:
         return frozenset()
-    return frozenset(c for c in ("ay_m_s2", "yaw_rate_rad_s", "vx_m_s", "friction") if _known_anywhere(truth, c))
+    columns = ("ay_m_s2", "yaw_rate_rad_s", "vx_m_s", "friction")
+    return frozenset(c for c in columns if np.isfinite(getattr(truth, c)).any())
 
 
 def speed_and_ay(signals: Signals, truth: StateTrack | None, of_truth: frozenset[str]) -> tuple[FloatArray, FloatArray]:
@@ -168,10 +147,6 @@ def _taken(signals: Signals, truth: StateTrack | None, of_truth: frozenset[str],
     return values
 
 
-def _known_anywhere(record: Signals | StateTrack, column: str) -> bool:
-    return any(np.isfinite(getattr(record.rows(a, b), column)).any() for a, b in row_blocks(len(record)))
-
-
 def _speed(signals: Signals, truth: StateTrack | None, of_truth: frozenset[str]) -> FloatArray:
     """Return the speed [N] in m/s, of one source."""
     if truth is not None and "vx_m_s" in of_truth:
@@ -180,23 +155,17 @@ def _speed(signals: Signals, truth: StateTrack | None, of_truth: frozenset[str])
 
 
 def find_intervals(stamped: Signals | StateTrack, masks: Mapping[str, BoolArray]) -> list[Segment]:
-    """Turn masks [N] into intervals in order of time; a step of more than ``RUN_GAP_S`` ends an interval.
+    """Turn masks [N] into intervals in order of time; a step of more than ``smoothing.RUN_GAP_S`` ends an interval.
 
     ``end_ns`` is one past the last stamp inside.
     """
-    masks = packed(masks, len(stamped))
-    by_name: dict[str, list[Segment]] = {name: [] for name in masks}
-    for a, b in row_blocks(len(stamped)):
-        # From the last row of the block before on: what goes across the border overlaps there.
-        start = max(a - 1, 0)
-        stamps = stamped.rows(start, b).stamps_ns
-        for name, mask in masks.rows(start, b).items():
-            for i, j in runs(stamps, mask):
-                new = Segment(name, int(stamps[i]), int(stamps[j - 1]) + 1)
-                if by_name[name] and new.start_ns < by_name[name][-1].end_ns:
-                    new = replace(new, start_ns=by_name[name].pop().start_ns)
-                by_name[name].append(new)
-    return sorted((s for spans in by_name.values() for s in spans), key=lambda s: (s.start_ns, s.end_ns, s.name))
+    stamps = stamped.stamps_ns
+    spans = [
+        Segment(name, int(stamps[i]), int(stamps[j - 1]) + 1)
+        for name, mask in masks.items()
+        for i, j in runs(stamps, mask)
+    ]
+    return sorted(spans, key=lambda s: (s.start_ns, s.end_ns, s.name))
 
 
 def _lasting(stamps_ns: IntArray, mask: BoolArray, least_s: float) -> BoolArray:

@@ -12,9 +12,9 @@ RUN_GAP_S = 0.5
 _NEAR_ROWS = 1 << 12
 
 
-def reach_rows(step_ns: float, cutoff_hz: float) -> int:
-    """Return how many rows to each side :func:`smooth` takes."""
-    return int(4.0 * _sigma_rows(step_ns, cutoff_hz) + 0.5)
+def median_step_ns(stamps_ns: IntArray) -> float:
+    """Return the median step between stamps; 1 for a single stamp."""
+    return float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 1.0
 
 
 def _sigma_rows(step_ns: float, cutoff_hz: float) -> float:
@@ -26,12 +26,12 @@ def smooth(stamps_ns: IntArray, values: FloatArray, cutoff_hz: float, step_ns: f
     """Smooth [N] without phase by a Gaussian whose gain is 1/√2 at ``cutoff_hz``; NaN stays, but does not spread.
 
     The Gaussian runs over samples of the median step, cut off at 4 σ, and does not reach across steps of more than
-    ``RUN_GAP_S``. ``step_ns``: the median step, of the whole drive for a part of it.
+    ``RUN_GAP_S``. ``step_ns``: the median step, None: it is computed.
     """
     out = np.full(values.shape, np.nan)
     if values.shape[0] < 2:
         return values.astype(np.float64)
-    sigma = _sigma_rows(float(np.median(np.diff(stamps_ns))) if step_ns is None else step_ns, cutoff_hz)
+    sigma = _sigma_rows(median_step_ns(stamps_ns) if step_ns is None else step_ns, cutoff_hz)
     finite = np.isfinite(values)
     for a, b in runs(stamps_ns, np.ones(values.shape[0], dtype=np.bool_)):
         here = finite[a:b]

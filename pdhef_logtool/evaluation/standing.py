@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.evaluation.blocks import packed
 from pdhef_logtool.evaluation.bootstrap import Interval, rmse_difference_interval
 from pdhef_logtool.evaluation.requirement_blocks import BLOCK_S, RequirementBlocks, ScoredDrive, requirement_blocks
 from pdhef_logtool.evaluation.requirement_bounds import LEAST_BLOCKS, pooled
@@ -52,7 +51,7 @@ def standings(
     ----------
     rivals : estimators on physics alone. read : returns the track of a name, at the stamps of ``truth``.
     """
-    everywhere = packed({"all": np.ones(len(truth), dtype=np.bool_)}, len(truth))
+    everywhere = {"all": np.ones(len(truth), dtype=np.bool_)}
     drive = ScoredDrive(read, truth, everywhere, low_speed_m_s)
     results = []
     for signal in JUDGED_SIGNALS:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pdhef_logtool.evaluation.metrics.metric import OfSignal
+from pdhef_logtool.evaluation.metrics.independence import NOT_INDEPENDENT
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.units import LABELS, SCORED_SIGNALS, SIGNALS, read_unit
 from pdhef_logtool.reports.drive_figures import Roles
@@ -77,7 +77,7 @@ def scores(report: Mapping[str, Any], roles: Roles) -> list[ScoreTable]:
         shown = [
             m
             for m in registered().values()
-            if isinstance(m.function, OfSignal) and any(m.name in figures[n] for n in order)
+            if m.of_truth and m.name != NOT_INDEPENDENT and any(m.name in figures[n] for n in order)
         ]
         rows = [Score(n, causal[n], [_read(figures[n], m.name) for m in shown], figures[n]["rmse"]["n"]) for n in order]
         unit = read_unit(figures[order[0]]["rmse"]["unit"])[0]
@@ -112,7 +112,7 @@ def consistency(report: Mapping[str, Any], roles: Roles | None) -> Consistency |
         (signal, m)
         for m in registered().values()
         for signal, by_name in by_signal.items()
-        if not isinstance(m.function, OfSignal) and m.function is not None and m.name not in _RATIO
+        if not m.of_truth and m.name not in _RATIO
         if any(_read(by_name.get(name, {}), m.name) is not None for name in names)
     ]
     rows = []

@@ -14,7 +14,7 @@ import numpy as np
 
 from pdhef_logtool.evaluation.dependence import FACTORS, factors_of
 from pdhef_logtool.evaluation.metrics.registry import registered
-from pdhef_logtool.evaluation.metrics.sensor_residuals import SENSORS
+from pdhef_logtool.evaluation.metrics.sensors import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.units import SIGNALS
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError

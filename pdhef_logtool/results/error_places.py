@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.evaluation.largest_errors import largest_places
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.records.geometry import wrap_angle
@@ -37,13 +36,12 @@ def largest_errors(
     for reference in (truth, *others):
         if reference is None or len(reference) != len(estimate):
             continue
-        parts = [(estimate.rows(a, b), reference.rows(a, b)) for a, b in row_blocks(len(reference))]
         if reference is truth:
-            error = np.concatenate([signal_error(e, r, "sideslip_rad", low_speed_m_s) for e, r in parts])
+            error = signal_error(estimate, reference, "sideslip_rad", low_speed_m_s)
         else:
-            error = np.concatenate([wrap_angle(_known(e, low_speed_m_s) - _known(r, low_speed_m_s)) for e, r in parts])
-        stamps, beta = (np.concatenate([getattr(e, key) for e, _ in parts]) for key in ("stamps_ns", "sideslip_rad"))
+            error = wrap_angle(_known(estimate, low_speed_m_s) - _known(reference, low_speed_m_s))
         if np.isfinite(error).any():
+            stamps, beta = estimate.stamps_ns, estimate.sideslip_rad
             return [
                 ErrorPlace(int(stamps[i]), float(beta[i]), float(beta[i] - error[i]), float(error[i]), reference.name)
                 for i in largest_places(stamps, error)

@@ -10,7 +10,6 @@ from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
 from pdhef_logtool.evaluation.standing import standings
@@ -74,8 +73,7 @@ def _is_same(track: StateTrack | None, main: StateTrack | None) -> bool:
     """Whether two tracks [N] have the same sideslip bit for bit: one filter under two names (residual gain 0)."""
     if track is None or main is None or len(track) != len(main):
         return False
-    blocks = ((track.rows(a, b), main.rows(a, b)) for a, b in row_blocks(len(main)))
-    return all(np.array_equal(t.sideslip_rad, m.sideslip_rad, equal_nan=True) for t, m in blocks)
+    return np.array_equal(track.sideslip_rad, main.sideslip_rad, equal_nan=True)
 
 
 def _metadata(drive: Drive) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,16 +13,17 @@ from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import SignalSource, clock_key, fit_clocks, resolve_mapping
 from pdhef_logtool.mapping.can_frames import with_can_signals
-from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, si_values
-from pdhef_logtool.mapping.clocks import request_source, stamps_on_log_clock
+from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, request_source, si_values
+from pdhef_logtool.mapping.clocks import stamps_on_log_clock
 from pdhef_logtool.mapping.estimates import BASE_ORDER, STDS, CovarianceSource, EstimateSource
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import ESTIMATE_UNITS, Channel, FloatArray, IntArray, Loss
+from pdhef_logtool.records.signals import ESTIMATE_UNITS, BoolArray, Channel, FloatArray, IntArray, Loss
 from pdhef_logtool.records.tracks import StateTrack, diagonal_covariance, make_track
 
 #: Nothing is interpolated across a step of more than this many of its median periods.
 GAP_PERIODS = 3.0
+_NO_SAMPLES = (np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,35 +60,31 @@ def read_estimate(
         request_source(log, s, requests)
     if source.covariance is not None:
         requests[source.covariance.topic].append(source.covariance.field)
-    parts: dict[str, list[tuple[IntArray, IntArray, FloatArray]]] = {name: [] for name in mapping.signals}
-    matrices: list[FloatArray] = []
     losses: list[Loss] = []
     base = next(name for name in BASE_ORDER if name in mapping.signals)
-    for columns in (log.read(requests, start_ns, end_ns),):
-        for name, s in mapping.signals.items():
-            topic = columns.get(s.read_topic)
-            if topic is None or len(topic) == 0:
-                continue
-            stamps, usable = stamps_on_log_clock(log, topic, s, clocks[clock_key(s)])
-            stamps = stamps - np.int64(round(s.latency_s * 1e9))
-            values = _in_range(si_values(topic, s), s)
-            parts[name].append((stamps[usable], topic.log_time_ns[usable], values[usable]))
-            if name == base:
-                if not usable.all():
-                    losses.append(dropped("bad-stamp", s.topic, topic.log_time_ns[~usable]))
-                if source.covariance is not None:
-                    matrices.append(_planar_covariance(topic, source.covariance)[usable])
-    channels, kept = {}, {}
+    columns = log.read(requests, start_ns, end_ns)
+    channels: dict[str, Channel] = {}
+    covariance = None
     for name, s in mapping.signals.items():
-        channels[name], kept[name] = _ordered(name, s, parts[name])
-    stamps_ns = channels[base].stamps_ns
+        topic = columns.get(s.read_topic)
+        if topic is None or len(topic) == 0:
+            channels[name] = Channel(name, ESTIMATE_UNITS[name], s.label, *_NO_SAMPLES)
+            continue
+        stamps, usable = stamps_on_log_clock(log, topic, s, clocks[clock_key(s)])
+        stamps = stamps - np.int64(round(s.latency_s * 1e9))
+        kept = _in_order(stamps, topic.log_time_ns, usable)
+        values = _in_range(si_values(topic, s), s)[kept]
+        channels[name] = Channel(name, ESTIMATE_UNITS[name], s.label, stamps[kept], topic.log_time_ns[kept], values)
+        if name == base:
+            if not usable.all():
+                losses.append(dropped("bad-stamp", s.topic, topic.log_time_ns[~usable]))
+            if repeated := int(np.count_nonzero(usable)) - len(kept):
+                text = LOSS_TEXTS["duplicate-stamp"]
+                losses.append(Loss("duplicate-stamp", text, s.topic, count=repeated, severity="note"))
+            if source.covariance is not None:
+                covariance = _planar_covariance(topic, source.covariance)[kept]
     _check_has_numbers(log, mapping, channels)
-    repeated = sum(p[0].shape[0] for p in parts[base]) - len(channels[base])
-    if repeated:
-        where = mapping.signals[base].topic
-        losses.append(Loss("duplicate-stamp", LOSS_TEXTS["duplicate-stamp"], where, count=repeated, severity="note"))
-    covariance = np.concatenate(matrices)[kept[base]] if matrices else None
-    track, notes = _track(source.name, stamps_ns, channels, covariance)
+    track, notes = _track(source.name, channels[base].stamps_ns, channels, covariance)
     finite = {n: _without_nan(c) for n, c in channels.items() if n in BASE_ORDER}
     samples = {s.label: len(channels[n]) for n, s in mapping.signals.items()}
     return RecordedEstimate(track, finite, frozenset(channels), samples, notes), losses
@@ -119,18 +116,11 @@ def _in_range(values: FloatArray, source: SignalSource) -> FloatArray:
     return np.where(outside | ~np.isfinite(values), np.nan, values)
 
 
-def _ordered(
-    name: str, source: SignalSource, parts: Sequence[tuple[IntArray, IntArray, FloatArray]]
-) -> tuple[Channel, IntArray]:
-    """Return the samples in order of unique stamps, the first arrival of each kept, and their places in the parts."""
-    empty = np.empty(0, dtype=np.int64)
-    stamps, arrival = (np.concatenate([p[i] for p in parts]) if parts else empty for i in (0, 1))
-    values = np.concatenate([p[2] for p in parts]) if parts else np.empty(0)
-    order = np.lexsort((arrival, stamps))
-    ordered = stamps[order]
-    first = np.concatenate([[True], ordered[1:] > ordered[:-1]]) if len(ordered) else np.empty(0, dtype=np.bool_)
-    kept = order[first]
-    return Channel(name, ESTIMATE_UNITS[name], source.label, stamps[kept], arrival[kept], values[kept]), kept
+def _in_order(stamps_ns: IntArray, arrival_ns: IntArray, usable: BoolArray) -> IntArray:
+    """Return the places of usable samples in order of unique stamps; of equal stamps the first arrival."""
+    places = np.flatnonzero(usable)
+    order = places[np.lexsort((arrival_ns[places], stamps_ns[places]))]
+    return order[np.diff(stamps_ns[order], prepend=stamps_ns[order[:1]] - 1) > 0]
 
 
 def _planar_covariance(topic: Columns, source: CovarianceSource) -> FloatArray:

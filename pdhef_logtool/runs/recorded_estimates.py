@@ -6,8 +6,7 @@ the log has an IMU; the sensors, which only cut the drive into segments, are int
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdhef_logtool.car.car import NO_INTERVALS, Car
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
@@ -38,22 +38,23 @@ from pdhef_logtool.mapping import check_mapping, mapping_of, merge_losses, read_
 from pdhef_logtool.mapping.choosing import mapping_for_recorder
 from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
 from pdhef_logtool.records.errors import MappingError
-from pdhef_logtool.records.ledger import Role, damage
+from pdhef_logtool.records.ledger import SampleCount, damage
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import (
     ALIGNED_SIGNALS,
     TRUTH_UNITS,
     WHEELS,
+    Channel,
     FloatArray,
     IntArray,
     Loss,
     Signals,
 )
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
 from pdhef_logtool.results.run_report import EstimatorFacts, build_report, write_json
-from pdhef_logtool.results.sink import TRUTH, Event
+from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
 from pdhef_logtool.runs.estimating import dead_reckoned, first_pose
@@ -71,14 +72,13 @@ from pdhef_logtool.runs.pipeline import (
     write_run,
     write_verdicts,
 )
-from pdhef_logtool.runs.scoring import diverged_events, in_time, segment_events
+from pdhef_logtool.runs.scoring import drive_events
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
-    from pdhef_logtool.evaluation.blocks import SegmentMasks
     from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
-    from pdhef_logtool.evaluation.metrics import MetricRow
+    from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
     from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 
@@ -185,45 +185,32 @@ class _Scoring:
 
     def score(self, drive: Drive, outputs: OutputFolder | None) -> LogResult:
         """Read, compare and, with a folder, write."""
-        from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
         from pdhef_logtool.evaluation.operating_space import operating_space
         from pdhef_logtool.results.error_places import largest_errors
 
-        plan = drive.plan
         self.reporter.progress(drive.name, 0.1)
-        recorded, losses = self._read_estimates(drive)
-        self.reporter.progress(drive.name, 0.3)
-        truth, truth_losses, samples, counts = self._read_truth(drive)
-        ledger = sample_ledger(drive.log, plan, counts)
-        self.reporter.progress(drive.name, 0.6)
-        signals = _read_sensors(drive)
-        reference = self._reference(drive, scored=truth is not None)
-        manoeuvres = [] if signals is None else find_manoeuvres(signals, self.car.vehicle)
-        all_losses = merge_losses([drive.losses, losses, truth_losses, damage(ledger)])
+        log = self._read(drive)
         self.reporter.progress(drive.name, 0.8)
-        scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in recorded]))
-        plan = self._with_dependence(plan, recorded)
-        against = _Against(truth, plan.truth_latency_s, self.car.vehicle.standstill_m_s, reference)
-        rows, dependent, blocks = self._figures(drive, plan, recorded, against, signals, manoeuvres)
-        drive.plan = plan = replace(plan, dependent={**dependent, **plan.dependent})
-        truth_track = against.truth_at(scored_ns)
-        seen = signals_at(signals, scored_ns)
-        events = self._events(truth_track, seen, recorded, manoeuvres)
-        alone, vehicle = recorded[0].track if len(recorded) == 1 else None, self.car.vehicle
-        space = operating_space(seen, truth_track, alone, vehicle)
-        others = [t for t in (against.reference_at(scored_ns),) if t is not None]
-        places = [] if alone is None else largest_errors(alone, truth_track, others, vehicle.low_speed_blend_m_s)
-        samples |= drive.samples
-        for r in recorded:
-            samples |= r.samples
+        rows, blocks = self._figures(log)
+        scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in log.recorded]))
+        whole, seen = log.at(scored_ns)
+        others = [*whole.tracks.values()]
+        alone = log.recorded[0].track if len(log.recorded) == 1 else None
+        space = operating_space(seen, whole.truth, alone, log.vehicle)
+        places = [] if alone is None else largest_errors(alone, whole.truth, others, whole.low_speed_m_s)
         facts = report_facts(
-            drive, self.car,
-            [EstimatorFacts(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in recorded],
-            rows, events, all_losses, samples, (*drive.sample_ledger, *ledger),
-        )  # fmt: skip
+            drive,
+            self.car,
+            [EstimatorFacts(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in log.recorded],
+            rows,
+            drive_events(seen, whole.masks, log.manoeuvres, [r.track for r in log.recorded]),
+            log.losses,
+            drive.samples | log.samples,
+            (*drive.sample_ledger, *log.ledger),
+        )
         read = {s.topic for e in self.estimates for s in e.signals.values()}
         topics = [replace(t, mapped=t.mapped or t.name in read) for t in facts.log.topics]
-        unknown = truth is not None and plan.latency is None
+        unknown = log.truth is not None and drive.plan.latency is None
         latency = ["no gyro to measure the ground truth's latency with: taken as 0"] if unknown else []
         facts = replace(
             facts,
@@ -236,23 +223,47 @@ class _Scoring:
         report = build_report(facts)
         folder = None
         if outputs is not None:
-            tracks = [*(r.track for r in recorded), *others]
-            if truth_track is not None:
-                tracks.insert(0, valid_as_a_whole(truth_track, plan.derivation, self.car.vehicle.standstill_m_s))
+            tracks = [*(r.track for r in log.recorded), *others]
+            if whole.truth is not None:
+                tracks.insert(0, valid_as_a_whole(whole.truth, drive.plan.derivation, log.vehicle.standstill_m_s))
             with outputs.begin(log_place(drive.name), stale=(PAGE_FILE,)) as change:
-                _write(change, report, rows, tracks, plan)
+                _write(change, report, rows, tracks, drive.plan)
             folder = change.target
         self.reporter.progress(drive.name, 1.0)
         files = {} if folder is None else files_of(folder)
-        return LogResult(replace(outcome_of(drive, all_losses), files=files), folder, report, tuple(rows))
+        return LogResult(replace(outcome_of(drive, log.losses), files=files), folder, report, tuple(rows))
 
-    def _read_truth(
-        self, drive: Drive
-    ) -> tuple[TruthTrack | None, tuple[Loss, ...], dict[str, int], dict[tuple[Role, str], Counter[str]]]:
-        """Return what :func:`read_truth` does, nothing where no ground truth is mapped."""
-        if not drive.mapping.truth:
-            return None, (), {}, {}
-        return read_truth(drive.log, drive.plan)
+    def _read(self, drive: Drive) -> _Recording:
+        """Read estimates, ground truth and sensors; add to the plan which ground truth depends on an estimate."""
+        from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
+
+        plan, samples, losses = drive.plan, dict[str, int](), list[Loss]()
+        recorded, dependent = [], dict(plan.dependent)
+        for source in self.estimates:
+            estimate, lost = read_estimate(drive.log, source, plan.start_ns, plan.end_ns)
+            for note in estimate.notes:
+                drive.tell(f"{source.name}: {note}")
+            recorded.append(estimate)
+            losses += lost
+            samples |= estimate.samples
+            same = dependent_signals(estimate.channels, plan.survey_truth, role=f"estimate {source.name}'s")
+            dependent |= {name: why for name, why in same.items() if name not in dependent}
+        truth, ledger = None, ()
+        if drive.mapping.truth:
+            part = read_signals(drive.log, replace(plan.mapping, signals={}), plan.clocks, plan.start_ns, plan.end_ns)
+            truth = _truth_of(part.truth, drive)
+            samples |= {c.source: len(c) for c in part.truth.values()}
+            losses += part.losses
+            ledger = sample_ledger(drive.log, plan, part.counts)
+        self.reporter.progress(drive.name, 0.6)
+        signals = _read_sensors(drive)
+        drive.plan = replace(plan, dependent=dependent)
+        manoeuvres = [] if signals is None else find_manoeuvres(signals, self.car.vehicle)
+        reference = self._reference(drive, scored=truth is not None)
+        every_loss = merge_losses([drive.losses, losses, damage(ledger)])
+        return _Recording(
+            drive, self.car.vehicle, recorded, truth, reference, signals, manoeuvres, every_loss, samples, ledger
+        )
 
     def _reference(self, drive: Drive, *, scored: bool) -> ReferenceEstimator | None:
         """Return the sideslip reference of the sensors: without ground truth, or beside it where asked for."""
@@ -270,137 +281,72 @@ class _Scoring:
         drive.tell("estimated sideslip reference: differences from it are no errors (docs/estimators.md#reference)")
         return made.estimator
 
-    def _read_estimates(self, drive: Drive) -> tuple[list[RecordedEstimate], list[Loss]]:
-        losses: list[Loss] = []
-        recorded = []
-        for estimate in self.estimates:
-            recorded_estimate, lost = read_estimate(drive.log, estimate, drive.plan.start_ns, drive.plan.end_ns)
-            for note in recorded_estimate.notes:
-                drive.tell(f"{estimate.name}: {note}")
-            recorded.append(recorded_estimate)
-            losses += lost
-        return recorded, losses
-
-    def _with_dependence(self, plan: DrivePlan, recorded: Sequence[RecordedEstimate]) -> DrivePlan:
-        """Add the truth channels that one of the estimates is, as a recorded channel."""
-        dependent = dict(plan.dependent)
-        for r in recorded:
-            same = dependent_signals(r.channels, plan.survey_truth, role=f"estimate {r.track.name}'s")
-            dependent |= {name: reason for name, reason in same.items() if name not in dependent}
-        return replace(plan, dependent=dependent)
-
-    def _figures(
-        self,
-        drive: Drive,
-        plan: DrivePlan,
-        recorded: Sequence[RecordedEstimate],
-        against: _Against,
-        signals: Signals | None,
-        manoeuvres: Sequence[Manoeuvre],
-    ) -> tuple[list[MetricRow], dict[str, str], list[RequirementBlocks]]:
-        """Score each estimate at its own stamps; return what of the derived ground truth equals an estimate besides.
-
-        Return the blocks of the plan's requirements, too.
-        """
-        from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, score_track
-        from pdhef_logtool.evaluation.metrics.reference import reference_rows
-        from pdhef_logtool.evaluation.segments import segment_masks
-
-        rows: list[MetricRow] = []
-        dependent: dict[str, str] = {}
-        blocks: list[RequirementBlocks] = []
-        for r in recorded:
-            at_stamps, reference = against.truth_at(r.track.stamps_ns), against.reference_at(r.track.stamps_ns)
-            seen = signals_at(signals, r.track.stamps_ns)
-            masks = segment_masks(seen, at_stamps, self.car.vehicle, manoeuvres)
-            slow = self.car.vehicle.low_speed_blend_m_s
-            figures: list[MetricRow] = []
-            if reference is not None:
-                figures += reference_rows([r.track], reference, masks, log=drive.name, low_speed_m_s=slow)
-            same = {
-                name: f"the ground truth's {name} equals that of the estimate {r.track.name}"
-                for name in SCORED_SIGNALS
-                if at_stamps is not None and _same_column(getattr(r.track, name), getattr(at_stamps, name))
-            }
-            dependent |= same
-            tainted, alone = frozenset({**plan.dependent, **same}), len(recorded) == 1
-            for base in (b for b in (at_stamps, reference) if b is not None):
-                more = self._blocks(r, base, masks, tainted, alone=alone, estimated=base is reference)
-                blocks += [b for b in more if all((b.of, b.estimator) != (x.of, x.estimator) for x in blocks)]
-            if at_stamps is not None:
-                figures += score_track(
-                    r.track,
-                    at_stamps,
-                    masks,
-                    log=drive.name,
-                    low_speed_m_s=slow,
-                    not_independent={**plan.dependent, **same},
-                )
-            if not any(row.metric in ("rmse", "reference_rms") for row in figures):
-                drive.tell(
-                    f"{r.track.name}: nowhere are estimate and ground truth known together, so there are no errors"
-                )
-            # What the estimate does not claim is not missing from it.
-            silent = {n for n in SCORED_SIGNALS if n not in r.claimed and not np.isfinite(getattr(r.track, n)).any()}
-            rows += [
-                row
-                for row in figures
-                if row.signal not in silent and (row.metric != "diverged" or "diverged" in r.claimed)
-            ]
-        return rows, dependent, blocks
-
-    def _blocks(
-        self,
-        r: RecordedEstimate,
-        truth: StateTrack,
-        masks: SegmentMasks,
-        tainted: frozenset[str],
-        *,
-        alone: bool,
-        estimated: bool,
-    ) -> list[RequirementBlocks]:
-        """Return the blocks of the requirements on one estimate; one without a name is on the ``alone`` recorded."""
+    def _figures(self, log: _Recording) -> tuple[list[MetricRow], list[RequirementBlocks]]:
+        """Score each estimate at its own stamps; add to the plan which derived ground truth equals an estimate."""
+        from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, evaluate_drive
         from pdhef_logtool.evaluation.requirement_blocks import ScoredDrive, requirement_blocks
 
-        name, slow = r.track.name, self.car.vehicle.low_speed_blend_m_s
-        drive = ScoredDrive(lambda n: r.track if n == name else None, truth, masks, slow, tainted, estimated=estimated)
-        asked = [q for q in self.validation.requirements if q.estimator in (name, None if alone else name)]
-        return requirement_blocks(asked, name if alone else None, drive)
-
-    def _events(
-        self,
-        truth: StateTrack | None,
-        signals: Signals,
-        recorded: Sequence[RecordedEstimate],
-        manoeuvres: Sequence[Manoeuvre],
-    ) -> list[Event]:
-        from pdhef_logtool.evaluation.segments import segment_masks
-
-        masks = segment_masks(signals, truth, self.car.vehicle, manoeuvres)
-        events = segment_events(signals if truth is None else truth, masks, manoeuvres) + [
-            e for r in recorded for e in diverged_events(r.track)
-        ]
-        return sorted(events, key=in_time)
+        rows: list[MetricRow] = []
+        blocks: dict[tuple[str, str], RequirementBlocks] = {}
+        drive, equal = log.drive, dict[str, str]()
+        alone = len(log.recorded) == 1
+        for r in log.recorded:
+            track, name = r.track, r.track.name
+            at, _ = log.at(track.stamps_ns)
+            same = {
+                signal: f"the ground truth's {signal} equals that of the estimate {name}"
+                for signal in SCORED_SIGNALS
+                if at.truth is not None and _same_column(getattr(track, signal), getattr(at.truth, signal))
+            }
+            tainted = frozenset({**drive.plan.dependent, **same})
+            equal |= same
+            asked = [q for q in self.validation.requirements if q.estimator in (name, None if alone else name)]
+            for base in (b for b in (at.truth, at.tracks.get(REFERENCE)) if b is not None):
+                scored = ScoredDrive(
+                    {name: track}.get, base, at.masks, at.low_speed_m_s, tainted, estimated=base is not at.truth
+                )
+                for block in requirement_blocks(asked, name if alone else None, scored):
+                    blocks.setdefault((block.of, block.estimator), block)
+            figures = evaluate_drive(replace(at, tracks={name: track, **at.tracks}, dependent=tainted))
+            figures = [row for row in figures if row.estimator == name]
+            if not any(row.metric in ("rmse", "reference_rms") for row in figures):
+                drive.tell(f"{name}: nowhere are estimate and ground truth known together, so there are no errors")
+            # A quantity that the estimate does not contain has no availability, and so no row.
+            silent = {n for n in SCORED_SIGNALS if n not in r.claimed and not np.isfinite(getattr(track, n)).any()}
+            silent |= {"diverged"} - r.claimed
+            rows += [row for row in figures if silent.isdisjoint((row.signal, row.metric))]
+        drive.plan = replace(drive.plan, dependent={**equal, **drive.plan.dependent})
+        return rows, [*blocks.values()]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Against:
-    """What estimates are compared with: ground truth, the sideslip reference, or both."""
+class _Recording:
+    """What a log states: estimates, ground truth, reference and signals, each at its own stamps."""
 
+    drive: Drive
+    vehicle: VehicleParameters
+    recorded: Sequence[RecordedEstimate]
     truth: TruthTrack | None
-    latency_s: float
-    standstill_m_s: float
     reference: ReferenceEstimator | None
+    signals: Signals | None
+    manoeuvres: Sequence[Manoeuvre]
+    losses: tuple[Loss, ...]
+    samples: dict[str, int]
+    ledger: tuple[SampleCount, ...]
 
-    def truth_at(self, stamps_ns: IntArray) -> StateTrack | None:
-        """Return the ground truth at stamps [N]."""
-        if self.truth is None:
-            return None
-        return truth_at(self.truth, stamps_ns, self.latency_s, standstill_m_s=self.standstill_m_s)
+    def at(self, stamps_ns: IntArray) -> tuple[EvaluatedDrive, Signals]:
+        """Return ground truth, reference and segments at stamps [N], and the signals interpolated to them."""
+        from pdhef_logtool.evaluation.metrics import EvaluatedDrive
+        from pdhef_logtool.evaluation.segments import segment_masks
 
-    def reference_at(self, stamps_ns: IntArray) -> StateTrack | None:
-        """Return the sideslip reference at stamps [N]."""
-        return None if self.reference is None else self.reference.at(stamps_ns)
+        latency_s, standstill_m_s = self.drive.plan.truth_latency_s, self.vehicle.standstill_m_s
+        truth = None
+        if self.truth is not None:
+            truth = truth_at(self.truth, stamps_ns, latency_s, standstill_m_s=standstill_m_s)
+        tracks = {} if self.reference is None else {REFERENCE: self.reference.at(stamps_ns)}
+        seen = signals_at(self.signals, stamps_ns)
+        masks = segment_masks(seen, truth, self.vehicle, self.manoeuvres)
+        return EvaluatedDrive(self.drive.name, tracks, truth, None, masks, self.vehicle.low_speed_blend_m_s), seen
 
 
 def _nothing_to_score_against(got: str, where: str) -> MappingError:
@@ -450,33 +396,18 @@ def _write(
     write_json(change.file("report.json"), report)
 
 
-def read_truth(
-    log: DriveLog, plan: DrivePlan
-) -> tuple[TruthTrack, tuple[Loss, ...], dict[str, int], dict[tuple[Role, str], Counter[str]]]:
-    """Read and derive the whole ground truth on its own clock, window by window.
-
-    Returns
-    -------
-    ground truth, losses, samples by source, and the counts for :func:`~pdhef_logtool.drive.recorded.sample_ledger`.
-
-    Raises
-    ------
-    MappingError : The slice contains no ground truth.
-    """
-    part = read_signals(log, replace(plan.mapping, signals={}), plan.clocks, plan.start_ns, plan.end_ns)
-    if plan.truth is None or not any(map(len, part.truth.values())):
+def _truth_of(channels: Mapping[str, Channel], drive: Drive) -> TruthTrack:
+    """Derive the ground truth on its own clock; raises MappingError where the slice contains none."""
+    plan = drive.plan.truth
+    track = None if plan is None else derive_truth(channels, plan=plan).track
+    if plan is None or track is None or not len(track):
         raise MappingError(
             expected="ground truth in the chosen slice",
             got="no samples that can be used",
-            where=f"{log.path} {', '.join(s.label for s in plan.mapping.truth.values())}",
+            where=f"{drive.log.path} {', '.join(s.label for s in drive.plan.mapping.truth.values())}",
             remedy="pdhef inspect LOG shows what the log contains and what was dropped",
         )
-    samples: Counter[str] = Counter()
-    for channel in part.truth.values():
-        samples[channel.source] += len(channel)
-    track = derive_truth(part.truth, plan=plan.truth).track
-    gap_s = plan.truth.max_gap_s[plan.truth.base]
-    return TruthTrack(track, gap_s, plan.derivation), part.losses, dict(samples), part.counts
+    return TruthTrack(track, plan.max_gap_s[plan.base], drive.plan.derivation)
 
 
 def signals_at(signals: Signals | None, stamps_ns: IntArray) -> Signals:

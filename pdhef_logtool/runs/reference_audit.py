@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
@@ -53,22 +52,16 @@ def audit_truth(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) 
 
 
 def _blocks(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) -> _Blocks:
-    numbers, parts = [], []
-    origin = int(reference.rows(0, 1).stamps_ns[0]) if len(reference) else 0
-    for start, end in row_blocks(len(reference)):
-        a, b = truth.rows(start, end), reference.rows(start, end)
-        used = a.valid & b.valid & (a.vx_m_s > low_speed_m_s) & (b.vx_m_s > low_speed_m_s)
-        used &= np.isfinite(a.sideslip_rad) & np.isfinite(b.sideslip_std_rad)
-        same = np.diff(a.vy_m_s, prepend=np.nan) == 0.0
-        columns = wrap_angle(a.sideslip_rad - b.sideslip_rad), b.sideslip_std_rad, same.astype(np.float64)
-        numbers.append((b.stamps_ns[used] - origin) // round(BLOCK_S * 1e9))
-        parts.append(np.stack([c[used] for c in columns], axis=1))
-    if not numbers:
+    if not len(reference):
         return _Blocks(*(np.empty(0) for _ in range(4)))
-    number = np.concatenate(numbers)
+    used = truth.valid & reference.valid & (truth.vx_m_s > low_speed_m_s) & (reference.vx_m_s > low_speed_m_s)
+    used &= np.isfinite(truth.sideslip_rad) & np.isfinite(reference.sideslip_std_rad)
+    same = (np.diff(truth.vy_m_s, prepend=np.nan) == 0.0).astype(np.float64)
+    columns = wrap_angle(truth.sideslip_rad - reference.sideslip_rad), reference.sideslip_std_rad, same
+    number = (reference.stamps_ns[used] - reference.stamps_ns[0]) // round(BLOCK_S * 1e9)
     ids, inverse, counts = np.unique(number, return_inverse=True, return_counts=True)
     sums = np.zeros((len(ids), 3))
-    np.add.at(sums, inverse, np.concatenate(parts))
+    np.add.at(sums, inverse, np.stack([c[used] for c in columns], axis=1))
     means = sums / counts[:, None]
     return _Blocks(np.asarray(ids * BLOCK_S, dtype=np.float64), means[:, 0], means[:, 1], means[:, 2])
 

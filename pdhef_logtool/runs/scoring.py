@@ -1,4 +1,4 @@
-"""The figures and events of one drive, of tracks that are read one at a time."""
+"""The figures and events of one drive."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.evaluation.blocks import SegmentMasks, row_blocks
 from pdhef_logtool.records.signals import BoolArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH, Event, ManoeuvreEvent
@@ -36,7 +35,7 @@ class Evaluation:
     reasons: dict[str, tuple[ReasonFacts, ...] | None]
     silent: tuple[str, ...]
     moves: bool
-    masks: SegmentMasks
+    masks: Mapping[str, BoolArray]
 
 
 def evaluate(
@@ -46,7 +45,7 @@ def evaluate(
     signals: Signals,
     sensors: SensorErrors | None = None,
 ) -> Evaluation:
-    """Score the tracks of a drive, block by block where they are on disk.
+    """Score the tracks of a drive.
 
     Parameters
     ----------
@@ -54,36 +53,24 @@ def evaluate(
     signals : what the estimators saw. sensors : as the log calibrated them; None: as the car's file states.
     """
     from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
-    from pdhef_logtool.evaluation.metrics import Scorer
-    from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive
-    from pdhef_logtool.evaluation.metrics.scoring import drive_rows, track_rows
+    from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
     from pdhef_logtool.evaluation.reasons import summarise_reasons
     from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
 
-    stem, truth, vehicle = drive.name, read(TRUTH), drive.car.vehicle
+    truth, vehicle = read(TRUTH), drive.car.vehicle
+    signals = Signals.rows(signals, 0, len(signals))  # in memory
     manoeuvres = find_manoeuvres(signals, vehicle)
     masks = segment_masks(signals, truth, vehicle, manoeuvres)
     moving = moving_mask(signals, truth, vehicle)
-    silent = []
-    slow = vehicle.low_speed_blend_m_s
     sensors = log_sensors(vehicle, None) if sensors is None else sensors
-    rows: list[MetricRow] = []
-    reasons: dict[str, tuple[ReasonFacts, ...] | None] = {}
-    events = segment_events(signals, masks, manoeuvres)
-    scorer = None
-    if truth is not None:
-        scorer = Scorer(truth, masks, log=stem, low_speed_m_s=slow, not_independent=drive.plan.dependent)
     tracks = {name: track for name in names if (track := read(name)) is not None}
-    of_drive = drive_rows(EvaluatedDrive(stem, tracks, truth, signals, masks, slow, sensors))
-    for name, track in tracks.items():
-        if moving.any() and not _known_at(track, moving):
-            silent.append(name)
-        rows += track_rows(track, None, masks, log=stem) if scorer is None else scorer.rows(track)
-        rows += of_drive.pop(name, ())
-        reasons[name] = summarise_reasons(track)
-        events += diverged_events(track)
-    rows += [row for of_one in of_drive.values() for row in of_one]
-    return Evaluation(rows, sorted(events, key=in_time), reasons, tuple(silent), bool(moving.any()), masks)
+    slow, dependent = vehicle.low_speed_blend_m_s, drive.plan.dependent
+    rows = evaluate_drive(EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, sensors, dependent))
+    events = drive_events(signals, masks, manoeuvres, [*tracks.values()])
+    moves = bool(moving.any())
+    silent = [n for n, track in tracks.items() if moves and not (moving & track.valid & track.something_known).any()]
+    reasons = {name: summarise_reasons(track) for name, track in tracks.items()}
+    return Evaluation(rows, events, reasons, tuple(silent), moves, masks)
 
 
 def in_time(event: Event) -> tuple[int, int, str]:
@@ -91,21 +78,22 @@ def in_time(event: Event) -> tuple[int, int, str]:
     return event.start_ns, event.end_ns, event.name
 
 
-def _known_at(track: StateTrack, mask: BoolArray) -> bool:
-    parts = ((track.rows(a, b), mask[a:b]) for a, b in row_blocks(len(track)))
-    return any((inside & part.valid & part.something_known).any() for part, inside in parts)
-
-
-def segment_events(
-    stamped: Signals | StateTrack, masks: Mapping[str, BoolArray], manoeuvres: Sequence[Manoeuvre]
+def drive_events(
+    stamped: Signals | StateTrack,
+    masks: Mapping[str, BoolArray],
+    manoeuvres: Sequence[Manoeuvre],
+    tracks: Sequence[StateTrack],
 ) -> list[Event]:
-    """Return the segments that are worth an event, not the whole drive, nor ``linear``; manoeuvres with their peaks."""
+    """Return segments, manoeuvres with their peaks, and intervals in which an estimator reports divergence, in order.
+
+    The whole drive and ``linear`` are no events.
+    """
     from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES
     from pdhef_logtool.evaluation.segments import find_intervals
 
     spans = [s for s in find_intervals(stamped, masks) if s.name not in ("all", "linear", *MANOEUVRES)]
     events = [Event(s.name, s.start_ns, s.end_ns, "") for s in spans]
-    return events + [
+    events += [
         ManoeuvreEvent(
             name=m.name,
             start_ns=m.start_ns,
@@ -120,12 +108,9 @@ def segment_events(
         )
         for m in manoeuvres
     ]
-
-
-def diverged_events(track: StateTrack) -> list[Event]:
-    """Return when an estimator states of itself that it diverges."""
-    from pdhef_logtool.evaluation.segments import find_intervals
-
-    name, text = f"{track.name} diverged", "the estimator reports its own divergence"
-    spans = find_intervals(track, {"diverged": track.diverged})
-    return [Event(name, s.start_ns, s.end_ns, text) for s in spans]
+    for track in tracks:
+        events += [
+            Event(f"{track.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
+            for s in find_intervals(track, {"diverged": track.diverged})
+        ]
+    return sorted(events, key=in_time)

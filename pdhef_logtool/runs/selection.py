@@ -163,18 +163,16 @@ def choose_over_time(
     ----------
     read : returns the track of an estimator [N]. signals : of the drive [N]. sensors_of : a stage of the calibration.
     """
-    from pdhef_logtool.evaluation.metrics.lateral_consistency import consistency_rows
-    from pdhef_logtool.evaluation.metrics.yaw_consistency import yaw_rows
+    from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
 
     causal = [e for e in ran if e.causal]
     chosen = [(0, choose_main(causal, (), proven=False, named=False).name)]
     for stage in (*calibration.earlier, calibration)[1:]:
         first, last = np.searchsorted(signals.stamps_ns, [stage.since_ns - _LOOK_BACK_NS, stage.since_ns]).tolist()
-        tracks = [track.rows(first, last) for e in causal if (track := read(e.name)) is not None]
-        part, masks, sensors = signals.rows(first, last), {"all": np.ones(last - first, np.bool_)}, sensors_of(stage)
+        tracks = {e.name: track.rows(first, last) for e in causal if (track := read(e.name)) is not None}
         slow = stage.vehicle_file.low_speed_blend_m_s
-        rows = consistency_rows(tracks, part, masks, log="", low_speed_m_s=slow, sensors=sensors)
-        rows += yaw_rows(tracks, part, masks, log="", sensors=sensors)
+        drive = EvaluatedDrive("", tracks, None, signals.rows(first, last), {}, slow, sensors_of(stage))
+        rows = evaluate_drive(drive, ("d2", "yaw_consistency"))
         name = choose_main(causal, rows, proven=False, named=False).name
         if name != chosen[-1][1]:
             chosen.append((stage.since_ns, name))

@@ -179,7 +179,6 @@ def figures_of(track: StateTrack, drive: ReadDrive) -> dict[str, float]:
         segment_masks(drive.signals, truth, plan.vehicle),
         log=drive.scenario.name,
         low_speed_m_s=plan.vehicle.low_speed_blend_m_s,
-        not_independent=plan.dependent,
     )
     by_key: dict[tuple[str, str, str], MetricRow] = {(r.signal, r.segment, r.metric): r for r in rows}
     values = {

@@ -238,7 +238,7 @@ def test_without_an_entry_a_track_stays_as_it_is() -> None:
         assert calibrator.notes("e")[1:] == ((calibrator.mismatch("e"),) if ran is other else ())
     assert calibrator.mismatch("e") == (
         "the calibrated intervals of e are not applied: expected physics-ukf 1 (roll_correction=True), "
-        "got physics-filter 1 (roll_correction=True); run pdhef learn --stages intervals"
+        "got physics-filter 1 (roll_correction=True)"
     )
     assert calibrator.warning == calibrator.mismatch("e")
     # Those of the shipped car were never this car's.
@@ -310,7 +310,7 @@ def test_a_wrong_file_is_one_clear_error(tmp_path: Path, change: dict[str, Any],
         load_intervals(path)
     assert said in str(caught.value)
     assert "c.json" in str(caught.value)
-    assert "pdhef learn --stages intervals" in str(caught.value)
+    assert "intervals.json" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

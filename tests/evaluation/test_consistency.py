@@ -7,18 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pdhef_logtool.evaluation.metrics import MetricRow, score_track
-from pdhef_logtool.evaluation.metrics.disagreement import disagreement_rows
-from pdhef_logtool.evaluation.metrics.innovations import state_rows
-from pdhef_logtool.evaluation.metrics.sensor_residuals import sensor_rows
-from pdhef_logtool.evaluation.metrics.whiteness import whiteness_rows
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow, evaluate_drive
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 
 T0 = 1_700_000_000_000_000_000
 T = np.arange(0, 60, 0.01)
 STAMPS = T0 + np.round(T * 1e9).astype(np.int64)
-EVERYTHING = {"all": np.ones(T.size, bool)}
 
 
 def drive() -> Signals:
@@ -38,9 +33,14 @@ def drive() -> Signals:
     )
 
 
+def rows_of(tracks, signals=None, names=None, masks=None) -> list[MetricRow]:
+    signals = drive() if signals is None else signals
+    evaluated = EvaluatedDrive("drive", {t.name: t for t in tracks}, None, signals, masks or {}, 3.0)
+    return evaluate_drive(evaluated, names)
+
+
 def residuals(signals):
-    rows = sensor_rows(signals, EVERYTHING, log="drive", low_speed_m_s=3.0)
-    return {(r.signal, r.metric): r for r in rows}
+    return {(r.signal, r.metric): r for r in rows_of([], signals, ("residual_rms", "residual_bias"))}
 
 
 def test_consistent_sensors_leave_no_residual():
@@ -86,12 +86,11 @@ def test_white_and_coloured_innovations():
     dof = np.full(T.size, 2.0)
     for nis, expected, slack in ((white, 0.0, 2.6 / T.size**0.5), (coloured, 0.81, 0.08)):
         track = make_track("ukf", STAMPS, nis=nis, nis_dof=dof)
-        (row,) = whiteness_rows(track, EVERYTHING, log="drive")
-        assert row.value == pytest.approx(expected, abs=slack)
-        rows = {r.metric: r.value for r in state_rows(track, EVERYTHING, log="drive")}
+        rows = {r.metric: r.value for r in rows_of([track])}
+        assert rows["nis_autocorrelation"] == pytest.approx(expected, abs=slack)
         assert rows["nis"] == pytest.approx(2.0, rel=0.1)
         assert rows["nis_dof"] == 2.0
-    assert whiteness_rows(make_track("zero", STAMPS), EVERYTHING, log="drive") == []
+    assert not [r for r in rows_of([make_track("zero", STAMPS)]) if r.metric.startswith("nis")]
 
 
 def test_disagreement_is_pairwise_above_the_blend_and_wraps():
@@ -101,29 +100,29 @@ def test_disagreement_is_pairwise_above_the_blend_and_wraps():
         return make_track(name, STAMPS, vx_m_s=fast, sideslip_rad=np.where(T < 30, beta, 3.0))
 
     tracks = [track("a", 0.0), track("b", 0.02), track("c", 2 * np.pi - 0.01)]
-    rows = disagreement_rows(tracks, EVERYTHING, log="drive", low_speed_m_s=3.0)
+    rows = rows_of(tracks, names=("disagreement_rms",))
     values = {r.estimator: r.value for r in rows}
     assert values == pytest.approx({"a~b": 0.02, "a~c": 0.01, "b~c": 0.03})
     assert all(r.n == 3000 for r in rows)
 
 
-def test_rows_of_a_filter_are_filed_under_log_estimator_and_segment() -> None:
-    n = 40
-    stamps = 10**18 + np.arange(n, dtype=np.int64) * 10_000_000
-    nis = np.where(np.arange(n) % 2, 1.0, 3.0)
-    speed, zero, dof = np.full(n, 20.0), np.zeros(n), np.full(n, 2.0)
-    track = make_track("e", stamps, vx_m_s=speed, vy_m_s=zero, nis=nis, nis_dof=dof, diverged=np.arange(n) < 4)
-    other = make_track("f", stamps, vx_m_s=speed, vy_m_s=speed * np.tan(0.01))
-    masks = {"turn": np.arange(n) < 20}
-
-    def filed(rows: list[MetricRow]) -> list[tuple]:
-        return [(r.log, r.estimator, r.signal, r.segment, r.metric, round(r.value, 9), r.unit, r.n) for r in rows]
-
-    turn = ("drive", "e", "state", "turn")
-    assert filed(whiteness_rows(track, masks, log="drive")) == [(*turn, "nis_autocorrelation", -1.0, "1", 19)]
-    (pair,) = filed(disagreement_rows([track, other], masks, log="drive", low_speed_m_s=3.0))
-    assert pair == ("drive", "e~f", "sideslip_rad", "turn", "disagreement_rms", 0.01, "rad", 20)
-    state = [r for r in filed(score_track(track, other, masks, log="drive", low_speed_m_s=3.0)) if r[2] == "state"]
-    of_nis = {r[4]: r for r in state if r[3] == "turn" and r[4].startswith("nis")}
-    assert of_nis == {"nis": (*turn, "nis", 2.0, "1", 20), "nis_dof": (*turn, "nis_dof", 2.0, "1", 20)}
-    assert [r[5] for r in state if r[3:5] == ("turn", "diverged")]
+def test_figures_of_a_segment_are_formulas_over_its_stamps_and_steps() -> None:
+    n = T.size
+    rng = np.random.default_rng(1)
+    nis, dof = rng.chisquare(2, n), rng.choice([0.0, 1.0, 2.0], n)
+    track = make_track("e", STAMPS, nis=nis, nis_dof=dof, diverged=rng.random(n) < 0.1)
+    mask, has_nis, ratio = rng.random(n) < 0.7, dof > 0, nis / np.where(dof > 0, dof, 1.0)
+    pairs = (has_nis & mask)[1:] & (has_nis & mask)[:-1]
+    speed, step_s = 20 + 4 * np.sin(0.3 * T), 0.01
+    held = speed[np.arange(n) // 5 * 5]
+    expected = {
+        "nis": (nis[mask & has_nis].mean(), (mask & has_nis).sum()),
+        "nis_dof": (dof[mask & has_nis].mean(), (mask & has_nis).sum()),
+        "diverged": (track.diverged[mask].mean(), mask.sum()),
+        "nis_autocorrelation": (np.corrcoef(ratio[:-1][pairs], ratio[1:][pairs])[0, 1], pairs.sum()),
+        "exposure_s": (mask.sum() * step_s, mask.sum()),
+        "exposure_m": (held[mask].sum() * step_s, mask.sum()),
+    }
+    rows = {r.metric: (r.value, r.n) for r in rows_of([track], masks={"turn": mask}) if r.segment == "turn"}
+    for metric, (value, count) in expected.items():
+        assert rows[metric] == (pytest.approx(value, rel=1e-9), count)

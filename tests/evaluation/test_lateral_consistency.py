@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pdhef_logtool.evaluation import blocks
-from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.evaluation.metrics.lateral_consistency import consistency_rows, driven_consistency, driving_products
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow, evaluate_drive
+from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency, driving_products
 from pdhef_logtool.evaluation.metrics.metric import SensorErrors
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
@@ -17,7 +16,6 @@ from pdhef_logtool.runs.selection import FACTOR, YAW_FACTOR, contradiction
 
 T = np.arange(0, 60, 0.01)
 STAMPS = 1_700_000_000_000_000_000 + np.round(T * 1e9).astype(np.int64)
-EVERYTHING = {"all": np.ones(T.size, bool)}
 SPEED, RATE, VY = 20.0 + 0.0 * T, 0.1 * np.sin(0.5 * T), 0.4 * np.sin(0.8 * T)
 VY_RATE, YAW_ACCELERATION = 0.32 * np.cos(0.8 * T), 0.05 * np.cos(0.5 * T)
 SENSORS = SensorErrors(ay_bias_m_s2=0.2, yaw_rate_bias_rad_s=0.003, ay_gain=1.08, lever_m=0.7)
@@ -44,8 +42,12 @@ def track(vy: np.ndarray) -> StateTrack:
     return make_track("e", STAMPS, vx_m_s=SPEED, vy_m_s=vy, valid=np.ones(T.size, bool))
 
 
+def figures(of: Signals, vy: np.ndarray, sensors: SensorErrors, low_speed_m_s: float = 3.0) -> list[MetricRow]:
+    return evaluate_drive(EvaluatedDrive("drive", {"e": track(vy)}, None, of, {}, low_speed_m_s, sensors), ("d2",))
+
+
 def d2(of: Signals, vy: np.ndarray, sensors: SensorErrors) -> MetricRow:
-    (row,) = consistency_rows([track(vy)], of, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=sensors)
+    (row,) = figures(of, vy, sensors)
     return row
 
 
@@ -106,19 +108,8 @@ def test_gaps_and_invalid_stamps_are_left_out() -> None:
     row = d2(replace(s, ay_m_s2=ay), VY, SENSORS)
     assert row.value < 2e-3
     assert row.n < T.size - 300
-    nothing = consistency_rows(
-        [track(np.full(T.size, np.nan))], s, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=SENSORS
-    )
-    assert nothing == []
-    assert consistency_rows([track(VY)], s, EVERYTHING, log="drive", low_speed_m_s=30.0, sensors=SENSORS) == []
-
-
-def test_blocks_change_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = d2(signals(SENSORS), VY + 0.1 * T, SENSORS)
-    monkeypatch.setattr(blocks, "BLOCK_ROWS", 333)
-    parts = d2(signals(SENSORS), VY + 0.1 * T, SENSORS)
-    assert parts.n == whole.n
-    assert parts.value == pytest.approx(whole.value, rel=1e-9)
+    assert figures(s, np.full(T.size, np.nan), SENSORS) == []
+    assert figures(s, VY, SENSORS, low_speed_m_s=30.0) == []
 
 
 def rows(yaw: dict[str, float], **values: float) -> list[MetricRow]:

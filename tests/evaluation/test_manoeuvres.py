@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.evaluation import blocks
 from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES, RULES, find_manoeuvres, manoeuvre_masks
 from pdhef_logtool.evaluation.segments import SEGMENTS, segment_masks
 from pdhef_logtool.records.signals import Signals
@@ -156,15 +154,13 @@ def test_neither_time_nor_rate_nor_side_changes_what_is_found(name, shift_ns, ra
         assert abs(getattr(after, end) - shift_ns - getattr(before, end)) < limit_ns
 
 
-def test_two_manoeuvres_of_a_drive_are_told_apart_and_blocks_do_not_matter():
+def test_the_manoeuvres_of_a_drive_are_told_apart():
     parts = [simulated(n) for n in ("dlc", "sine-with-dwell", "steady-circle")]
     columns = ("steer_rad", "speed_m_s", "yaw_rate_rad_s", "ax_m_s2", "ay_m_s2")
     joined = [np.concatenate([getattr(p, c) for p in parts]) for c in columns]
     s = signals(np.arange(len(joined[0])) * 0.01, *joined)
     whole = find_manoeuvres(s, VEHICLE)
     assert [m.name for m in whole] == ["dlc", "sine-with-dwell", "steady-circle"]
-    with patch.object(blocks, "BLOCK_ROWS", 700):
-        assert find_manoeuvres(s, VEHICLE) == whole
     masks = segment_masks(s, None, VEHICLE)
     assert set(MANOEUVRES) <= set(SEGMENTS)
     for name, mask in manoeuvre_masks(s.stamps_ns, whole).items():

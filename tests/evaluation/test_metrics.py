@@ -1,6 +1,8 @@
-"""Metrics: figures by hand, known lags, calibrated Gaussians, closed-form positions, and what must not be counted."""
+"""Metrics against one-line numpy formulas, known lags, calibrated Gaussians and closed-form positions."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,30 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference, block_bootstrap_interval
-from pdhef_logtool.evaluation.dead_reckoned import Seconds, position_error
-from pdhef_logtool.evaluation.metrics import Scorer, score_track
-from pdhef_logtool.evaluation.metrics.errors import ErrorSums
-from pdhef_logtool.evaluation.metrics.innovations import state_rows
+from pdhef_logtool.evaluation.dead_reckoned import lateral_errors, position_error
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
+from pdhef_logtool.evaluation.metrics.innovations import nees
 from pdhef_logtool.evaluation.metrics.lag import lag_s
-from pdhef_logtool.evaluation.metrics.nees import nees
-from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 T0 = 1_700_000_000_000_000_000
-
-
-def summarise_errors(error: FloatArray) -> dict[str, float]:
-    """Return rmse, mae, bias, p95_abs and max_abs of finite errors [N], N ≥ 1."""
-    sums = ErrorSums(len(error))
-    sums.add(error)
-    return sums.figures()
-
-
-def lateral_errors_after_one_second(estimate: StateTrack, truth: StateTrack) -> FloatArray:
-    """Return the lateral error [K] in m at the end of each second that can be scored; positive = estimate left."""
-    seconds = Seconds()
-    seconds.add(estimate, truth)
-    return seconds.lateral_errors()
 
 
 def stamps_of(n, rate=100):
@@ -45,33 +30,73 @@ def track(name="x", n=4, **columns) -> StateTrack:
     )
 
 
-def score(estimate, truth, masks=None, low=3.0, **kwargs):
-    rows = score_track(estimate, truth, masks or {}, log="drive", low_speed_m_s=low, **kwargs)
+def score(estimate, truth, masks=None, low=3.0, dependent=()):
+    drive = EvaluatedDrive("drive", {estimate.name: estimate}, truth, None, masks or {}, low, dependent=dependent)
+    rows = evaluate_drive(drive)
     keys = [(r.signal, r.segment, r.metric) for r in rows]
     assert len(set(keys)) == len(keys)
     return dict(zip(keys, rows, strict=True))
 
 
-def test_figures_by_hand():
+#: Each formula over the errors, ground truth and 1-sigma of the scored stamps.
+ORACLES = {
+    "rmse": lambda e, truth, std: np.sqrt(np.mean(e**2)),
+    "mae": lambda e, truth, std: np.mean(np.abs(e)),
+    "bias": lambda e, truth, std: np.mean(e),
+    "p95_abs": lambda e, truth, std: np.percentile(np.abs(e), 95),
+    "max_abs": lambda e, truth, std: np.abs(e).max(),
+    "rmse_relative": lambda e, truth, std: np.sqrt(np.mean(e**2) / np.mean(truth**2)),
+    "coverage95": lambda e, truth, std: np.mean(np.abs(e) <= 1.959963984540054 * std),
+}
+SIGNALS = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad")
+
+
+def holed(rng, values, share=0.2):
+    return np.where(rng.random(len(values)) < share, np.nan, values)
+
+
+@settings(derandomize=True, max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 60))
+def test_every_error_figure_is_its_formula_over_the_scored_stamps(seed, n):
+    rng = np.random.default_rng(seed)
+    motion = [rng.normal([10.0, 0.0, 0.0], 1.0, (n, 3)).T for _ in range(2)]
+    truth, estimate = (
+        track(name, n, **{c: holed(rng, v) for c, v in zip(SIGNALS, m, strict=False)}, valid=rng.random(n) < 0.9)
+        for name, m in zip(("truth", "e"), motion, strict=True)
+    )
+    stds = rng.uniform(0.1, 2.0, (n, 3))
+    covariance = np.array([np.diag(s**2) for s in stds])
+    estimate = replace(estimate, covariance=covariance, sideslip_std_rad=stds[:, 1])
+    masks = {"all": np.ones(n, bool), "part": rng.random(n) < 0.5, "empty": np.zeros(n, bool)}
+    rows = score(estimate, truth, masks)
+    seen = 0
+    for i, signal in enumerate(SIGNALS):
+        e, reference = getattr(estimate, signal) - getattr(truth, signal), getattr(truth, signal)
+        known = truth.valid & np.isfinite(reference)
+        scored = known & estimate.valid & np.isfinite(e)
+        for segment, mask in masks.items():
+            use, asked = mask & scored, int(np.sum(mask & known))
+            if asked:
+                row = rows[signal, segment, "availability"]
+                assert (row.value, row.n) == (pytest.approx(use.sum() / asked), asked)
+            for metric, formula in ORACLES.items():
+                row = rows.get((signal, segment, metric))
+                assert (row is None) == (not use.any())
+                if row is not None:
+                    expected = formula(e[use], reference[use], stds[use, 1 if signal == "sideslip_rad" else i])
+                    assert (row.value, row.n) == (pytest.approx(expected, rel=1e-9), use.sum())
+                    seen += 1
+    assert len([r for r in rows.values() if r.metric in ORACLES]) == seen
+
+
+def test_a_row_names_log_estimator_and_unit_and_what_is_unknown_has_none():
     truth = track(vx_m_s=[10, 10, 10, 10], vy_m_s=[0, 0, 0, 0])
-    estimate = track("ukf", vx_m_s=[11, 7, 10, 12], vy_m_s=[0, 0, 0, 0])
-    rows = score(estimate, truth)
-
-    def value(metric):
-        return rows["vx_m_s", "all", metric].value
-
-    assert value("rmse") == pytest.approx(np.sqrt((1 + 9 + 0 + 4) / 4))
-    assert value("mae") == pytest.approx(1.5)
-    assert value("bias") == pytest.approx(0.0)
-    assert value("max_abs") == 3.0
-    assert value("p95_abs") == pytest.approx(2.85)  # sorted 0 1 2 3, linear at 0.95 · 3
-    assert value("rmse_relative") == pytest.approx(np.sqrt(3.5) / 10)
-    assert value("availability") == 1.0
+    rows = score(track("ukf", vx_m_s=[11, 7, 10, 12], vy_m_s=[0, 0, 0, 0]), truth)
     row = rows["vx_m_s", "all", "rmse"]
     assert (row.log, row.estimator, row.unit, row.n, row.independent) == ("drive", "ukf", "m/s", 4, True)
-    assert ("vx_m_s", "all", "coverage95") not in rows  # no covariance, no claim
-    assert ("position_m", "all", "rmse") not in rows  # no truth pose
-    assert ("yaw_rate_rad_s", "all", "rmse") not in rows  # no truth yaw rate
+    assert ("vx_m_s", "all", "coverage95") not in rows  # no covariance
+    assert ("position_m", "all", "rmse") not in rows  # no pose of the ground truth
+    assert ("yaw_rate_rad_s", "all", "rmse") not in rows  # no yaw rate of the ground truth
 
 
 def test_only_valid_finite_scored_stamps_count():
@@ -120,29 +145,11 @@ def test_sideslip_errors_wrap():
 def test_dependent_truth_is_marked_in_rows_and_in_the_file():
     truth = track(vx_m_s=[10] * 4, yaw_rate_rad_s=[0.1] * 4)
     estimate = track(vx_m_s=[10] * 4, yaw_rate_rad_s=[0.2] * 4)
-    rows = score(estimate, truth, not_independent={"yaw_rate_rad_s": "same channel", "x_m": "not scored"})
+    rows = score(estimate, truth, dependent=("yaw_rate_rad_s", "x_m"))
     assert rows["yaw_rate_rad_s", "all", "not_independent"].value == 1.0
     assert not any(r.independent for k, r in rows.items() if k[0] == "yaw_rate_rad_s")
     assert all(r.independent for k, r in rows.items() if k[0] != "yaw_rate_rad_s")
     assert [k for k in rows if k[2] == "not_independent"] == [("yaw_rate_rad_s", "all", "not_independent")]
-
-
-@settings(derandomize=True, max_examples=60, deadline=None)
-@given(st.lists(st.floats(-100, 100), min_size=1, max_size=50), st.integers(0, 10**6))
-def test_summary_properties(errors, seed):
-    e = np.array(errors)
-    s = summarise_errors(e)
-    slack = 1e-9 * (1 + s["max_abs"])
-    assert s["mae"] <= s["rmse"] + slack
-    assert s["rmse"] <= s["max_abs"] + slack
-    assert abs(s["bias"]) <= s["mae"] + slack
-    assert s["p95_abs"] <= s["max_abs"] + slack
-    mirrored = summarise_errors(-e)
-    assert mirrored["bias"] == -s["bias"]
-    assert {k: v for k, v in mirrored.items() if k != "bias"} == {k: v for k, v in s.items() if k != "bias"}
-    shuffled = summarise_errors(np.random.default_rng(seed).permutation(e))
-    for k, v in s.items():
-        assert shuffled[k] == pytest.approx(v, abs=slack)
 
 
 # ---- lag ----
@@ -225,11 +232,18 @@ def test_nees_by_hand_and_a_broken_covariance_does_not_count():
     np.testing.assert_allclose(nees(e, p), [2.0, np.nan, np.nan, np.nan])
 
 
-def test_nis_is_given_with_its_degrees_of_freedom_without_truth():
-    rows = state_rows(track("e", nis=[1, 3, np.nan, 5], nis_dof=[1, 3, 0, 2]), {"all": np.ones(4, bool)}, log="drive")
-    values = {r.metric: (r.value, r.n) for r in rows}
-    assert values == {"nis": (3.0, 3), "nis_dof": (2.0, 3), "diverged": (0.0, 4)}
-    assert "nis" not in {r.metric for r in state_rows(track("zero"), {"all": np.ones(4, bool)}, log="drive")}
+@pytest.mark.parametrize("spread", [1.0, 1e-3, 1e-6])
+def test_nees_is_that_of_every_eigenvalue_and_solution(spread):
+    rng = np.random.default_rng(0)
+    turned = np.linalg.qr(rng.standard_normal((400, 3, 3)))[0]
+    sizes = 10.0 ** rng.uniform(np.log10(spread), 0.0, (400, 3)) * rng.choice([1.0, 1.0, 1.0, -1.0], (400, 3))
+    p = (turned * sizes[:, None, :]) @ turned.transpose(0, 2, 1)
+    e = rng.standard_normal((400, 3))
+    whole = np.linalg.eigvalsh(p)[:, 0] > 0
+    expected = np.full(400, np.nan)
+    expected[whole] = (e[whole] * np.linalg.solve(p[whole], e[whole, :, None])[:, :, 0]).sum(axis=1)
+    np.testing.assert_allclose(nees(e, p), expected, rtol=1e-8)
+    assert 50 < whole.sum() < 350
 
 
 # ---- position ----
@@ -275,9 +289,9 @@ def test_a_sideways_velocity_error_becomes_its_distance():
     )
     estimate = make_track("e", stamps, vx_m_s=z + 10, vy_m_s=z + 0.1, yaw_rate_rad_s=z)
     np.testing.assert_allclose(position_error(estimate, truth), 0.1 * t, atol=1e-9)
-    np.testing.assert_allclose(lateral_errors_after_one_second(estimate, truth), 0.1, atol=1e-9)
+    np.testing.assert_allclose(lateral_errors(estimate, truth), 0.1, atol=1e-9)
     faster = make_track("e", stamps, vx_m_s=z + 11, vy_m_s=z, yaw_rate_rad_s=z)
-    np.testing.assert_allclose(lateral_errors_after_one_second(faster, truth), 0.0, atol=1e-9)
+    np.testing.assert_allclose(lateral_errors(faster, truth), 0.0, atol=1e-9)
 
 
 def test_lateral_seconds_agree_with_a_plain_restart_every_second():
@@ -302,7 +316,7 @@ def test_lateral_seconds_agree_with_a_plain_restart_every_second():
         j = 100 * k + 100
         left = np.array([-np.sin(truth.yaw_rad[j]), np.cos(truth.yaw_rad[j])])
         expected.append(left @ [x - truth.x_m[j], y - truth.y_m[j]])
-    np.testing.assert_allclose(lateral_errors_after_one_second(estimate, truth), expected, atol=1e-9)
+    np.testing.assert_allclose(lateral_errors(estimate, truth), expected, atol=1e-9)
 
 
 def test_seconds_with_holes_do_not_count():
@@ -322,7 +336,7 @@ def test_seconds_with_holes_do_not_count():
     estimate = make_track(
         "e", truth.stamps_ns, vx_m_s=truth.vx_m_s, vy_m_s=truth.vy_m_s, yaw_rate_rad_s=truth.yaw_rate_rad_s, valid=valid
     )
-    assert lateral_errors_after_one_second(estimate, holed).size == 10 - 1 - 2
+    assert lateral_errors(estimate, holed).size == 10 - 1 - 2
     keep = np.ones(1001, bool)
     keep[720:760] = False  # a gap of 0.41 s in the stamps
 
@@ -335,7 +349,7 @@ def test_seconds_with_holes_do_not_count():
             },
         )
 
-    assert lateral_errors_after_one_second(thin(estimate), thin(holed)).size == 10 - 1 - 2 - 1
+    assert lateral_errors(thin(estimate), thin(holed)).size == 10 - 1 - 2 - 1
 
 
 @settings(derandomize=True, max_examples=20, deadline=None)
@@ -361,8 +375,8 @@ def test_position_figures_do_not_depend_on_place_heading_or_time(turn, dx, dy, s
 
     np.testing.assert_allclose(position_error(wrong(moved), moved), position_error(wrong(truth), truth), atol=1e-7)
     np.testing.assert_allclose(
-        lateral_errors_after_one_second(wrong(moved), moved),
-        lateral_errors_after_one_second(wrong(truth), truth),
+        lateral_errors(wrong(moved), moved),
+        lateral_errors(wrong(truth), truth),
         atol=1e-7,
     )
 
@@ -420,40 +434,3 @@ def test_too_short_for_an_interval():
     assert (one.value, one.blocks) == (1.0, 1)
     assert np.isnan(one.low)
     assert np.isnan(block_bootstrap_interval(np.full(5, np.nan), stamps_of(5)).value)
-
-
-@pytest.mark.parametrize("spread", [1.0, 1e-4, 1e-7, 1e-12])
-def test_nees_is_that_of_every_eigenvalue_and_solution(spread: float) -> None:
-    rng = np.random.default_rng(0)
-    turned = np.linalg.qr(rng.standard_normal((400, 3, 3)))[0]
-    sizes = 10.0 ** rng.uniform(np.log10(spread), 0.0, (400, 3)) * rng.choice([1.0, 1.0, 1.0, -1.0], (400, 3))
-    p = (turned * sizes[:, None, :]) @ turned.transpose(0, 2, 1)
-    e = rng.standard_normal((400, 3))
-    whole = np.linalg.eigvalsh(p)[:, 0] > 0
-    expected = np.full(400, np.nan)
-    expected[whole] = (e[whole] * np.linalg.solve(p[whole], e[whole, :, None])[:, :, 0]).sum(axis=1)
-    np.testing.assert_array_equal(nees(e, p), expected)
-    assert 50 < whole.sum() < 350
-
-
-def test_estimates_do_not_know_what_was_scored_before_them() -> None:
-    rng = np.random.default_rng(4)
-    n = 3000
-    stamps = T0 + np.arange(n, dtype=np.int64) * 10_000_000
-    motion = {"vx_m_s": 10.0 + np.sin(np.arange(n) * 0.01), "vy_m_s": np.cumsum(rng.standard_normal(n)) * 0.01}
-    motion["yaw_rate_rad_s"] = np.cumsum(rng.standard_normal(n)) * 0.01
-    pose = {"x_m": np.arange(n) * 0.1, "y_m": np.zeros(n), "yaw_rad": np.zeros(n)}
-    truth = make_track("truth", stamps, **motion, **pose)
-    estimates = []
-    for i, lost in enumerate((0, 0, 40, 700, 0)):
-        noisy = {c: v + 0.1 * rng.standard_normal(n) for c, v in motion.items()}
-        valid = np.arange(n) >= lost
-        estimates.append(
-            make_track(f"e{i}", stamps, **noisy, covariance=np.tile(0.01 * np.eye(3), (n, 1, 1)), valid=valid)
-        )
-    masks = {"all": np.ones(n, dtype=bool), "late": np.arange(n) > 1000}
-    scorer = Scorer(truth, masks, log="drive", low_speed_m_s=3.0)
-    for estimate in estimates:
-        alone = score_track(estimate, truth, masks, log="drive", low_speed_m_s=3.0)
-        assert repr(scorer.rows(estimate)) == repr(alone)
-        assert {"lag_s", "nees", "coverage95"} <= {r.metric for r in alone}

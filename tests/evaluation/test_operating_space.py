@@ -1,4 +1,4 @@
-"""The operating space: every second of driving in one cell, whatever the blocks that it is read in."""
+"""The operating space: every second of driving in one cell."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import pytest
 from reference_car import make_signals
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.evaluation import blocks
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S, operating_space
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
@@ -30,7 +29,7 @@ def test_a_steady_drive_is_in_one_cell_for_as_long_as_it_lasts(speed: float, ay:
     assert found.scored == 0 and np.isnan(found.sideslip_mse_rad2)
 
 
-def test_cells_have_the_error_of_their_stamps_and_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cells_have_the_error_of_their_stamps() -> None:
     made = signals(20.0, 0.2)
     n, at = len(made), np.arange(len(made))
     vx, ay = np.where(at < n // 2, 12.0, 33.0), np.where(at < n // 4, 0.5, 3.5)
@@ -43,9 +42,6 @@ def test_cells_have_the_error_of_their_stamps_and_blocks_change_nothing(monkeypa
     assert {AY_EDGES_M_S2[c.ay] for c in whole} >= {0.0, 3.0}
     assert sum(c.scored for c in whole) == n
     assert sum(c.seconds for c in whole) == pytest.approx(20.0)
-    monkeypatch.setattr(blocks, "BLOCK_ROWS", 251)
-    parts = operating_space(made, truth, own, VEHICLE).cells
-    assert [(c.speed, c.ay, c.scored) for c in parts] == [(c.speed, c.ay, c.scored) for c in whole]
 
 
 def test_a_gap_is_no_driving() -> None:

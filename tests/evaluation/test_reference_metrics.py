@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
-from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive
-from pdhef_logtool.evaluation.metrics.reference import METRICS
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
 from pdhef_logtool.records.tracks import make_track
 
 N = 400
@@ -32,11 +29,7 @@ def _rows(independent, std_deg=0.2, stamps=STAMPS):
 
 
 def _of(tracks):
-    masks = {"all": np.ones(N, dtype=np.bool_)}
-    none: Any = None
-    drive = EvaluatedDrive("a", tracks, None, none, masks, 3.0, none)
-    (function,) = {m.function for m in METRICS}
-    return {(r.estimator, r.metric): r for r in function.rows(drive)}
+    return {(r.estimator, r.metric): r for r in evaluate_drive(EvaluatedDrive("a", tracks, None, None, {}, 3.0))}
 
 
 def test_the_further_estimate_is_claimed():

@@ -12,9 +12,8 @@ from pdhef_logtool import Car, read_drive
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.evaluation import blocks
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
 from pdhef_logtool.evaluation.metrics.metric import SensorErrors
-from pdhef_logtool.evaluation.metrics.yaw_consistency import yaw_residual, yaw_rows
 from pdhef_logtool.records.tracks import StateTrack
 
 SALOON = Car.load("saloon")
@@ -28,8 +27,9 @@ def lane_change(sample_logs_dir: Path) -> WholeDrive:
 
 
 def figure(tracks: list[StateTrack], drive: WholeDrive, sensors: SensorErrors = SENSORS) -> list[float]:
-    whole = {"all": np.ones(len(drive.signals), np.bool_)}
-    return [row.value for row in yaw_rows(tracks, drive.signals, whole, log="", sensors=sensors)]
+    named = {str(i): track for i, track in enumerate(tracks)}
+    evaluated = EvaluatedDrive("", named, None, drive.signals, {}, 3.0, sensors)
+    return [row.value for row in evaluate_drive(evaluated, ("yaw_consistency",))]
 
 
 def test_the_true_sideslip_explains_the_yaw_rate_and_zero_does_not(sample_logs_dir: Path) -> None:
@@ -67,11 +67,4 @@ def test_there_is_no_figure_without_vehicle_steering_or_speed(lane_change: Whole
     nothing = np.full(len(lane_change.signals), np.nan)
     for name in ("steer_rad", "speed_m_s"):
         blind = replace(lane_change.signals, **{name: nothing})
-        assert np.isnan(yaw_residual(lane_change.truth, blind, SALOON.vehicle, SENSORS)).all()
-
-
-def test_blocks_hardly_change_the_figure(lane_change: WholeDrive, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert lane_change.truth is not None
-    whole = figure([lane_change.truth], lane_change)
-    monkeypatch.setattr(blocks, "BLOCK_ROWS", 333)
-    assert figure([lane_change.truth], lane_change) == pytest.approx(whole, rel=1e-3)
+        assert figure([lane_change.truth], replace(lane_change, signals=blind)) == []

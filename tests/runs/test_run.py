@@ -265,7 +265,7 @@ def test_an_error_half_way_leaves_nothing_behind(
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("broken on purpose")
 
-    monkeypatch.setattr(metrics, "Scorer", broken)
+    monkeypatch.setattr(metrics, "evaluate_drive", broken)
     with pytest.raises(RuntimeError, match="on purpose"):
         run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path, _config(sample_logs_dir, annotate="full"))
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == []
@@ -283,7 +283,7 @@ def test_an_error_half_way_keeps_the_outputs_of_the_run_before(
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("broken on purpose")
 
-    monkeypatch.setattr(metrics, "Scorer", broken)
+    monkeypatch.setattr(metrics, "evaluate_drive", broken)
     with pytest.raises(RuntimeError, match="on purpose"):
         run_logs([log], tmp_path, _config(sample_logs_dir))
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before

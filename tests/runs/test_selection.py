@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,8 +19,9 @@ from pdhef_logtool.estimators.calibration.calibration import calibrate_online
 from pdhef_logtool.estimators.calibration.driving import driving_of
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.records.signals import ALIGNED_SIGNALS
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
+from pdhef_logtool.evaluation.metrics.metric import SensorErrors
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.results.selected_estimate import MainFacts
 from pdhef_logtool.runs import frames, selection
 from pdhef_logtool.runs.config import RunConfig
@@ -182,20 +184,19 @@ def test_a_choice_on_line_depends_on_nothing_that_follows(sample_logs_dir: Path)
 
 def test_a_choice_on_line_can_change(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first stages contradict ``pd-hef``, the last one does not."""
-    signals = SimpleNamespace(stamps_ns=np.arange(100), rows=lambda first, last: (first, last))
+    stamps = np.arange(100)
+    nan = np.full(100, np.nan)
+    signals = Signals(stamps, stamps, nan, nan, nan, nan, nan, nan, np.full((100, 4), np.nan))
     bad = {10: 5.0, 20: 5.0, 30: 0.5}
 
-    def rows(_tracks: Any, part: tuple[int, int], *_: Any, **__: Any) -> list[MetricRow]:
-        return [row for row in d2(open_loop=0.5, pd_hef=bad[part[1]]) if row.metric == "d2"]
+    def figures(drive: EvaluatedDrive, _names: Sequence[str]) -> list[MetricRow]:
+        assert drive.signals is not None
+        return d2(open_loop=0.5, pd_hef=bad[int(drive.signals.stamps_ns[-1]) + 1])
 
-    of_yaw = [row for row in d2(open_loop=0.5, pd_hef=0.5) if row.metric == "yaw_consistency"]
-    monkeypatch.setattr("pdhef_logtool.evaluation.metrics.lateral_consistency.consistency_rows", rows)
-    monkeypatch.setattr("pdhef_logtool.evaluation.metrics.yaw_consistency.yaw_rows", lambda *_, **__: of_yaw)
+    monkeypatch.setattr("pdhef_logtool.evaluation.metrics.evaluate_drive", figures)
     stages = [SimpleNamespace(since_ns=t, vehicle_file=default_vehicle()) for t in (0, 10, 20, 30)]
     calibration: Any = SimpleNamespace(**vars(stages[-1]), earlier=tuple(stages[:-1]))
     causal = [cast(Estimator, SimpleNamespace(name=n, causal=c)) for n, c in (("pd-hef", True), ("open-loop", True))]
     later = cast(Estimator, SimpleNamespace(name="pd-hef-smoothed", causal=False))
-    spans = choose_over_time(
-        [*causal, later], calibration, lambda _: None, cast(Any, signals), lambda _: cast(Any, None)
-    )
+    spans = choose_over_time([*causal, later], calibration, lambda _: None, signals, lambda _: SensorErrors())
     assert spans == [(0, "pd-hef"), (10, "open-loop"), (30, "pd-hef")]

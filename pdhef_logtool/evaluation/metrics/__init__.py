@@ -1,31 +1,39 @@
-"""Metrics: each is registered by one file, from which files, terminal, pages, plans and documentation derive it.
+"""Metrics: each is a formula over columns of a drive; files, terminal, pages, plans and documentation derive from it.
 
 A new metric is a file that exports ``METRICS`` (:class:`~.metric.Metric`) and its name in ``MODULES`` of
 :mod:`~.registry`. ``interval_width.py`` would be::
 
-    from pdhef_logtool.evaluation.metrics.metric import Metric, SignalBlock, mean_by_segment
+    from pdhef_logtool.evaluation.metrics.errors import errors_of_drive
+    from pdhef_logtool.evaluation.metrics.metric import Metric
     from pdhef_logtool.evaluation.track_errors import NORMAL_95
-
-
-    def _width(block: SignalBlock):
-        return None if block.std is None else 2.0 * NORMAL_95 * block.std
-
 
     METRICS = (
         Metric(
             "interval_width",
             "interval width",
             "mean width of the 95 % confidence interval",
-            mean_by_segment("interval_width", _width),
+            columns=errors_of_drive,
+            formula=lambda std: 2.0 * NORMAL_95 * float(std.mean()),
+            over=("std",),
             best="lower",
+            of_truth=True,
             terminal=("sideslip_rad",),
         ),
     )
 """
 
-from pdhef_logtool.evaluation.metrics.metric import ALL, MetricRow
-from pdhef_logtool.evaluation.metrics.scoring import Scorer, score_track
+from pdhef_logtool.evaluation.metrics.metric import ALL, EvaluatedDrive, MetricRow
+from pdhef_logtool.evaluation.metrics.registry import evaluate_drive, score_track
 from pdhef_logtool.evaluation.track_errors import NORMAL_95, signal_error
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 
-__all__ = ["ALL", "NORMAL_95", "SCORED_SIGNALS", "MetricRow", "Scorer", "score_track", "signal_error"]
+__all__ = [
+    "ALL",
+    "NORMAL_95",
+    "SCORED_SIGNALS",
+    "EvaluatedDrive",
+    "MetricRow",
+    "evaluate_drive",
+    "score_track",
+    "signal_error",
+]

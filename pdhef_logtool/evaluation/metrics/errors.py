@@ -1,79 +1,120 @@
-"""Metrics of the size and the mean of errors: one pass over the errors serves all of them.
+"""Errors e = estimate − ground truth (angles wrapped) where both are valid and finite.
 
-a_y is the lateral specific force at the CG in the road plane (:data:`~pdhef_logtool.evaluation.units.AY_NOTE`), of
-estimates and of ground truth; a ground truth that lacks it is not scored.
+Sideslip counts only where the ground-truth speed exceeds the low-speed blend. a_y is the lateral specific force at the
+CG in the road plane (:data:`~pdhef_logtool.evaluation.units.AY_NOTE`), of estimates and of ground truth; a ground truth
+that lacks it is not scored.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import partial
+
 import numpy as np
 
-from pdhef_logtool.evaluation.blocks import ErrorSums
-from pdhef_logtool.evaluation.metrics.metric import Figure, Metric, OfSignal, Reference, SignalBlock
-from pdhef_logtool.evaluation.track_errors import selected
-from pdhef_logtool.records.signals import BoolArray
+from pdhef_logtool.evaluation.dead_reckoned import lateral_errors, pose_known, position_error
+from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric, mean, rms
+from pdhef_logtool.evaluation.track_errors import NORMAL_95, raw_error, scorable, total_std
+from pdhef_logtool.evaluation.units import SCORED_SIGNALS
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 
 
-class _Errors:
-    """Errors of one signal of an estimate by segment."""
-
-    def __init__(self, reference: Reference, _estimate: StateTrack, _signal: str) -> None:
-        self._truth = reference.once(_TruthSquares)
-        self._errors = {s: ErrorSums(int(np.count_nonzero(mask))) for s, mask in reference.masks.items()}
-        self._squares: dict[str, list[list[float]]] = {}
-
-    def add(self, block: SignalBlock) -> None:
-        """Take the next block."""
-        squares = self._truth.of(block)
-        for segment, mask in block.inside.items():
-            errors = selected(block.error, mask & block.scored)
-            self._errors[segment].add(errors)
-            if errors.size:
-                self._squares.setdefault(segment, []).append([errors.size, squares[segment]])
-
-    def of(self, segment: str) -> dict[str, Figure]:
-        """Return the figures of a segment; none without an error."""
-        n = self._errors[segment].n
-        if n == 0:
-            return {}
-        figures = self._errors[segment].figures()
-        size = float(np.sqrt(np.sum(self._squares[segment], axis=0)[1] / n))
-        figures["rmse_relative"] = figures["rmse"] / size if size > 0 else float("nan")
-        return {name: (value, n) for name, value in figures.items()}
+def errors_of_drive(drive: EvaluatedDrive) -> Iterator[Columns]:
+    """Yield the columns of each track and signal, and the errors of dead-reckoned positions."""
+    truth = drive.truth
+    if truth is None:
+        return
+    at_truth = {signal: scorable(truth, signal, drive.low_speed_m_s) for signal in SCORED_SIGNALS}
+    since_start_ns = truth.stamps_ns - truth.stamps_ns[:1]
+    has_pose = bool(pose_known(truth).any())
+    for track in drive.tracks.values():
+        for signal, known in at_truth.items():
+            yield _errors(track, truth, signal, known, since_start_ns)
+        if has_pose:
+            lateral = lateral_errors(track, truth)
+            yield Columns(track.name, "position_m", {"error": position_error(track, truth)}, whole=True)
+            yield Columns(track.name, "lateral_1s_m", {"error": lateral, "signed": lateral}, whole=True)
 
 
-class _TruthSquares:
-    """Sums of the ground-truth squares by segment of each block; most estimates are known at the same stamps."""
+def _errors(track: StateTrack, truth: StateTrack, signal: str, known: BoolArray, since_start_ns: IntArray) -> Columns:
+    """Return ``available`` (0 or 1 where ground truth is known) and, where the estimate is scored, the other columns.
 
-    def __init__(self, _reference: Reference) -> None:
-        self._found: dict[tuple[str, int], tuple[BoolArray, dict[str, float]]] = {}
+    ``std`` is the 1-sigma of the error; it is absent where the estimate has none.
+    """
+    error = raw_error(track, truth, signal)
+    scored = track.valid & known & np.isfinite(error)
+    error = np.where(scored, error, np.nan)
+    values = {
+        "available": np.where(known, scored, np.nan),
+        "error": error,
+        "signed": error,
+        "truth": getattr(truth, signal),
+        "estimate": getattr(track, signal),
+        "since_start_ns": since_start_ns,
+    }
+    std = total_std(track, truth, signal)
+    if std is not None:
+        values["std"] = np.where(scored, std, np.nan)
+    return Columns(track.name, signal, values)
 
-    def of(self, block: SignalBlock) -> dict[str, float]:
-        key = block.signal, block.start
-        cached = self._found.get(key)
-        if cached is None or not np.array_equal(cached[0], block.scored):
-            values = getattr(block.truth, block.signal)
-            sums = {s: float(np.sum(selected(values, mask & block.scored) ** 2)) for s, mask in block.inside.items()}
-            self._found[key] = cached = block.scored, sums
-        return cached[1]
+
+def _p95(error: FloatArray) -> float:
+    """Return the 95th percentile of absolute values as ``np.percentile`` does, without its overhead."""
+    rank = 0.95 * (len(error) - 1)
+    below, above = int(rank), min(int(rank) + 1, len(error) - 1)
+    low, high = np.partition(np.abs(error), (below, above))[[below, above]]
+    share, step = rank - below, high - low
+    return float(low + step * share if share < 0.5 else high - step * (1.0 - share))
 
 
-_FUNCTION = OfSignal(_Errors)
+def _relative(error: FloatArray, truth: FloatArray) -> float:
+    size = rms(truth)
+    return rms(error) / size if size > 0 else float("nan")
+
+
 _ALWAYS = ("vy_m_s", "vx_m_s", "yaw_rate_rad_s", "ay_m_s2", "lateral_1s_m")
+_ERROR = partial(Metric, columns=errors_of_drive, over=("error",), best="lower", of_truth=True)
 METRICS = (
-    Metric(
-        "rmse",
-        "RMSE",
-        "√ mean e²",
-        _FUNCTION,
-        best="lower",
-        terminal=("sideslip_rad", *_ALWAYS),
+    _ERROR(
+        "availability",
+        "available",
+        "share of the stamps with scorable ground truth at which the estimate is valid and finite; n = all of them",
+        formula=mean,
+        over=("available",),
+        best="higher",
+        unit="1",
+    ),
+    _ERROR("rmse", "RMSE", "√ mean e²", formula=rms, terminal=("sideslip_rad", *_ALWAYS), brief=("sideslip_rad",)),
+    _ERROR("mae", "MAE", "mean abs e", formula=lambda e: float(np.mean(np.abs(e)))),
+    _ERROR("bias", "bias", "mean e; positive = estimate too large", formula=mean, over=("signed",), best=0.0),
+    _ERROR("p95_abs", "p95", "95th percentile of abs e", formula=_p95, terminal=("sideslip_rad",)),
+    _ERROR(
+        "max_abs",
+        "max",
+        "maximum of abs e",
+        formula=lambda e: float(np.max(np.abs(e))),
+        digits=2,
+        terminal=("sideslip_rad",),
+    ),
+    _ERROR(
+        "rmse_relative",
+        "relative",
+        "rmse / √ mean truth² over the same stamps",
+        formula=_relative,
+        over=("error", "truth"),
+        unit="1",
+    ),
+    _ERROR(
+        "coverage95",
+        "in 95 % CI",
+        "share of stamps with abs e ≤ 1.96 σ; σ² is the estimate's variance plus that of ground truth if known",
+        formula=lambda std, e: float(np.mean(np.abs(e) <= NORMAL_95 * std)),
+        over=("std", "error"),
+        best=0.95,
+        unit="1",
+        digits=2,
+        terminal=("sideslip_rad",),
         brief=("sideslip_rad",),
     ),
-    Metric("mae", "MAE", "mean abs e", _FUNCTION, best="lower"),
-    Metric("bias", "bias", "mean e; positive = estimate too large", _FUNCTION, best=0.0),
-    Metric("p95_abs", "p95", "95th percentile of abs e", _FUNCTION, best="lower", terminal=("sideslip_rad",)),
-    Metric("max_abs", "max", "maximum of abs e", _FUNCTION, best="lower", digits=2, terminal=("sideslip_rad",)),
-    Metric("rmse_relative", "relative", "rmse / √ mean truth² over the same stamps", _FUNCTION, best="lower", unit="1"),
 )

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
 
-from pdhef_logtool.evaluation.metrics.metric import ALL, Metric, MetricRow
+import numpy as np
+
+from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric, mean
+from pdhef_logtool.evaluation.track_errors import scorable
+from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 
 NOT_INDEPENDENT = "not_independent"
 
 
-def marked(rows: Sequence[MetricRow], dependent: Collection[str]) -> list[MetricRow]:
-    """Return the rows of one estimator with those of dependent signals marked, and a row for each such signal."""
-    signals = sorted({r.signal for r in rows} & {*dependent})
-    rows_out = [replace(r, independent=False) if r.signal in signals else r for r in rows]
-    for signal in signals:
-        of_signal = [r for r in rows if r.signal == signal]
-        n = max(r.n for r in of_signal)
-        rows_out.append(
-            MetricRow(of_signal[0].log, of_signal[0].estimator, signal, ALL, NOT_INDEPENDENT, 1.0, "1", n, False)
-        )
-    return rows_out
+def _marks(drive: EvaluatedDrive) -> Iterator[Columns]:
+    for signal in sorted(SCORED_SIGNALS.keys() & drive.dependent) if drive.truth is not None else ():
+        known = scorable(drive.truth, signal, drive.low_speed_m_s)
+        for name in drive.tracks:
+            yield Columns(name, signal, {NOT_INDEPENDENT: np.where(known, 1.0, np.nan)})
 
 
 METRICS = (
@@ -28,7 +25,10 @@ METRICS = (
         NOT_INDEPENDENT,
         "not independent",
         "1 where the ground truth of this signal is one of the estimators' inputs: keep it out of rankings",
-        None,
+        columns=_marks,
+        formula=mean,
         unit="1",
+        whole=True,
+        of_truth=True,
     ),
 )

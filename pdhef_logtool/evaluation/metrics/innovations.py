@@ -1,60 +1,108 @@
-"""What a filter reports of itself: normalized innovations and divergence; needs no ground truth."""
+"""Whether the covariance that a filter reports fits its errors and its innovations, signal ``state``."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
-from pdhef_logtool.evaluation.blocks import SegmentMasks, SegmentSums, packed, row_blocks
-from pdhef_logtool.evaluation.metrics.metric import Metric, MetricRow, OfTrack
-from pdhef_logtool.records.signals import BoolArray
+from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric, mean
+from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
-
-def _rows(estimate: StateTrack, _truth: StateTrack | None, masks: SegmentMasks, log: str) -> list[MetricRow]:
-    return state_rows(estimate, masks, log=log)
-
-
-def state_rows(track: StateTrack, masks: Mapping[str, BoolArray], *, log: str) -> list[MetricRow]:
-    """Return ``nis``, ``nis_dof`` and ``diverged`` of a track; no NIS rows without innovations."""
-    masks = packed(masks, len(track))
-    innovation, diverged = SegmentSums(), SegmentSums()
-    for a, b in row_blocks(len(track)):
-        part, inside = track.rows(a, b), masks.rows(a, b)
-        dof = part.nis_dof
-        innovation.add(inside, np.where(dof > 0, part.nis, np.nan), dof)
-        diverged.add(inside, part.diverged)
-    figures = [
-        (segment, metric, float(total[i]) / n, n)
-        for sums, metrics in ((innovation, ("nis", "nis_dof")), (diverged, ("diverged",)))
-        for segment, (n, total) in sums.totals().items()
-        for i, metric in enumerate(metrics)
-    ]
-    place = list(masks).index
-    return [
-        MetricRow(log, track.name, "state", *figure[:3], "1", figure[3])
-        for figure in sorted(figures, key=lambda f: place(f[0]))
-    ]
+#: Fewer pairs of stamps have no autocorrelation.
+LEAST_PAIRS = 10
 
 
-_FUNCTION = OfTrack(_rows)
+def _errors(drive: EvaluatedDrive) -> Iterator[Columns]:
+    for track in () if drive.truth is None else drive.tracks.values():
+        if track.covariance.shape[0]:
+            yield Columns(track.name, "state", {"nees": _nees_of(track, drive.truth)})
+
+
+def _nees_of(estimate: StateTrack, truth: StateTrack) -> FloatArray:
+    error = np.stack([getattr(estimate, s) - getattr(truth, s) for s in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")], axis=1)
+    error[~(estimate.valid & truth.valid)] = np.nan
+    return nees(error, estimate.covariance + truth.covariance if truth.covariance.shape[0] else estimate.covariance)
+
+
+def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return eᵀ P⁻¹ e, [N], of errors [N, k] and covariances [N, k, k]; NaN where P is not positive definite.
+
+    By elimination, P = L D Lᵀ, in the lower triangle, on all matrices at once.
+    """
+    left, e = covariance.transpose(1, 2, 0).copy(), error.T.copy()
+    total = np.zeros(error.shape[0])
+    with np.errstate(all="ignore"):
+        for j, row in enumerate(left):
+            pivot = np.where(row[j] > 0.0, row[j], np.nan)
+            total += e[j] ** 2 / pivot
+            for i in range(j + 1, len(left)):
+                share = left[i, j] / pivot
+                e[i] -= share * e[j]
+                for m in range(j + 1, i + 1):
+                    left[i, m] -= share * left[m, j]
+    return total
+
+
+def _innovations(drive: EvaluatedDrive) -> Iterator[Columns]:
+    for track in drive.tracks.values():
+        has_nis = track.nis_dof > 0
+        nis = np.where(has_nis, track.nis, np.nan)
+        dof = np.where(np.isfinite(nis), track.nis_dof, np.nan)
+        yield Columns(track.name, "state", {"nis": nis, "nis_dof": dof, "diverged": track.diverged})
+
+
+def _pairs(drive: EvaluatedDrive) -> Iterator[Columns]:
+    """Yield NIS per degree of freedom before and after each step, where both are known."""
+    for track in () if drive.signals is None else drive.tracks.values():
+        ratio = track.nis / np.where(track.nis_dof > 0, track.nis_dof, np.nan)
+        before = np.where(np.isfinite(ratio[1:]), ratio[:-1], np.nan)
+        yield Columns(track.name, "state", {"before": before, "after": ratio[1:]}, of_steps=True)
+
+
+def _autocorrelation(before: FloatArray, after: FloatArray) -> float | None:
+    if len(before) < LEAST_PAIRS:
+        return None
+    x, y = before - before.mean(), after - after.mean()
+    power = float(np.sqrt(np.sum(x**2) * np.sum(y**2)))
+    return float(np.sum(x * y)) / power if power > 0 else float("nan")
+
+
+_NIS = partial(Metric, columns=_innovations, formula=mean, unit="1")
 METRICS = (
-    Metric("nis", "NIS", "mean normalized innovation squared. Signal `state`", _FUNCTION, unit="1", brief=("state",)),
     Metric(
+        "nees",
+        "NEES",
+        "mean eᵀ (P + P_truth)⁻¹ e over [v_x, v_y, r]; 3 when P is right. Signal `state`",
+        columns=_errors,
+        formula=mean,
+        best=3.0,
+        unit="1",
+    ),
+    _NIS("nis", "NIS", "mean normalized innovation squared. Signal `state`", brief=("state",)),
+    _NIS(
         "nis_dof",
         "degrees of freedom",
         "mean of the degrees of freedom of NIS, which `nis` should equal. Signal `state`",
-        _FUNCTION,
-        unit="1",
         brief=("state",),
     ),
-    Metric(
+    _NIS(
         "diverged",
         "diverged",
         "share of stamps at which the estimator itself reports divergence. Signal `state`",
-        _FUNCTION,
         best="lower",
+    ),
+    Metric(
+        "nis_autocorrelation",
+        "whiteness",
+        "autocorrelation of NIS per degree of freedom from one stamp to the next, signal `state`; 0 for white "
+        "innovations, beyond ± 2/√n they are not white",
+        columns=_pairs,
+        formula=_autocorrelation,
+        over=("before", "after"),
+        best=0.0,
         unit="1",
     ),
 )

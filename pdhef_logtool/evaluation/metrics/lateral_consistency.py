@@ -2,53 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
-from pdhef_logtool.evaluation.blocks import SegmentSums, blocks_with_halo, packed
-from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive, SensorErrors
-from pdhef_logtool.evaluation.metrics.sensor_residuals import MAX_STEP_S, carried_speed
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric, SensorErrors, rms
+from pdhef_logtool.evaluation.metrics.sensors import MAX_STEP_S, carried_speed
+from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 SPAN_S = 2.0
 
 
-def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
-    return consistency_rows(
-        [*drive.tracks.values()],
-        drive.signals,
-        drive.masks,
-        log=drive.log,
-        low_speed_m_s=drive.low_speed_m_s,
-        sensors=drive.sensors,
-    )
-
-
-def consistency_rows(
-    tracks: Sequence[StateTrack],
-    signals: Signals,
-    masks: Mapping[str, BoolArray],
-    *,
-    log: str,
-    low_speed_m_s: float,
-    sensors: SensorErrors,
-) -> list[MetricRow]:
-    """Return ``d2`` of estimators at the same stamps as the signals [N], one row per segment with a finite residual."""
-    masks = packed(masks, len(signals))
-    sums_by_track = [SegmentSums() for _ in tracks]
-    for first, a, b, end in blocks_with_halo(signals, SPAN_S + MAX_STEP_S, 1):
-        core, inside = slice(a - first, b - first), dict(masks.rows(a, b))
-        driven = _Driven(signals.rows(first, end), low_speed_m_s, sensors)
-        for track, sums in zip(tracks, sums_by_track, strict=True):
-            residual = driven.residual(track.rows(first, end))[core]
-            sums.add(inside, residual, residual**2)
-    return [
-        MetricRow(log, track.name, "vy_m_s", segment, "d2", float(np.sqrt(squares / n)), "m/s", n)
-        for track, sums in zip(tracks, sums_by_track, strict=True)
-        for segment, (n, (_, squares)) in sums.totals().items()
-    ]
+def _columns(drive: EvaluatedDrive) -> Iterator[Columns]:
+    if drive.signals is not None:
+        driven = _Driven(drive.signals, drive.low_speed_m_s, drive.sensors)
+        for track in drive.tracks.values():
+            yield Columns(track.name, "vy_m_s", {"d2": driven.residual(track)})
 
 
 def driving_products(
@@ -131,7 +101,8 @@ METRICS = (
         "signal `vy_m_s`: RMS of the change of the estimated v_y over 2 s minus the integral of a_y − v_x r, above the "
         "low-speed blend; a_y without bias, roll gain and lever arm as the log has them; large with a wrong "
         "model. `kinematic` integrates the same, so that its figure shows nothing",
-        OfDrive(_rows),
+        columns=_columns,
+        formula=rms,
         best="lower",
         unit="m/s",
         brief=("vy_m_s",),

@@ -1,31 +1,27 @@
-"""What a metric is: a record that one file of this package exports, its function, and the row of its figures."""
+"""What a metric is: columns of a drive and a formula over the values that lie in a segment."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias, TypeVar
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.evaluation.blocks import HeldRows, SegmentMasks, SegmentSums, packed, row_blocks
-from pdhef_logtool.evaluation.track_errors import scorable
-from pdhef_logtool.evaluation.units import SCORED_SIGNALS, SIGNALS, read_unit
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.evaluation.units import SIGNALS, read_unit
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 ALL = "all"
-_T = TypeVar("_T")
-#: A figure and the number of samples behind it.
-Figure: TypeAlias = tuple[float, int]
 
 
 @dataclass(frozen=True, slots=True)
 class MetricRow:
     """One figure. The first eight fields and ``algorithm`` are the columns of metrics.parquet.
 
-    ``algorithm`` is the digest of what ran under the estimator's name; empty where nobody has (recorded estimates).
+    ``algorithm`` is the digest of the algorithm that ran under the estimator's name; empty for recorded estimates.
 
     ``independent`` is False when ground truth of this signal is one of the estimators' inputs; tables and rankings
     leave such rows out. In the file a row with metric ``not_independent`` shows it for its estimator and signal.
@@ -44,17 +40,93 @@ class MetricRow:
 
 
 @dataclass(frozen=True, slots=True)
+class SensorErrors:
+    """Errors of a log's sensors, relative to the vehicle that its signals were read with.
+
+    Attributes
+    ----------
+    ay_bias_m_s2, yaw_rate_bias_rad_s : reading minus true value. ay_gain : of a_y, by body roll. lever_m : position of
+        the accelerometer ahead of the centre of gravity.
+    vehicle, read_with : calibrated vehicle, and the vehicle that the signals were read with; None: unknown.
+    steer_delay_s : of the steering angle. friction : of the road; None: that of the signals.
+    """
+
+    ay_bias_m_s2: float = 0.0
+    yaw_rate_bias_rad_s: float = 0.0
+    ay_gain: float = 1.0
+    lever_m: float = 0.0
+    vehicle: VehicleParameters | None = None
+    read_with: VehicleParameters | None = None
+    steer_delay_s: float = 0.0
+    friction: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EvaluatedDrive:
+    """The tracks of a drive by estimator, ground truth and signals, all at the same stamps [N].
+
+    Attributes
+    ----------
+    masks : bool [N] by segment. truth, signals : None: metrics that need them have no figures.
+    low_speed_m_s : sideslip is scored above this ground-truth speed. sensors : errors of the sensors.
+    dependent : signals whose ground truth is one of the estimators' inputs.
+    """
+
+    log: str
+    tracks: Mapping[str, StateTrack]
+    truth: StateTrack | None
+    signals: Signals | None
+    masks: Mapping[str, BoolArray]
+    low_speed_m_s: float
+    sensors: SensorErrors = field(default_factory=SensorErrors)
+    dependent: Collection[str] = ()
+
+    def __post_init__(self) -> None:
+        """Add segment ``all``; raises ValueError where tracks or masks are not at the same stamps."""
+        records = [r for r in (self.truth, self.signals, *self.tracks.values()) if r is not None]
+        stamps_ns = records[0].stamps_ns
+        if not all(np.array_equal(record.stamps_ns, stamps_ns) for record in records):
+            raise ValueError(f"estimates {', '.join(self.tracks)} and ground truth must be at the same stamps")
+        for name, mask in self.masks.items():
+            if mask.shape != stamps_ns.shape:
+                raise ValueError(f"mask {name}: expected shape {stamps_ns.shape}, got {mask.shape}")
+        if ALL not in self.masks:
+            object.__setattr__(self, "masks", {ALL: np.ones(stamps_ns.shape, np.bool_), **self.masks})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """Columns [N] of one signal of one estimator, by name; a stamp counts where a column is finite.
+
+    Columns ``of_steps`` have N − 1 rows, the steps between stamps: a segment contains a step if it contains both ends.
+    Columns of the ``whole`` drive may have any length; only segment ``all`` has figures.
+    """
+
+    estimator: str
+    signal: str
+    values: Mapping[str, NDArray[Any]]
+    of_steps: bool = False
+    whole: bool = False
+
+
+Formula: TypeAlias = Callable[..., "float | None"]
+
+
+@dataclass(frozen=True, slots=True)
 class Metric:
-    """One metric, as its file registers it; every output derives from this record what it needs.
+    """One metric, as its file registers it; every output is derived from this record.
 
     Attributes
     ----------
     name : in metrics.parquet and plans.
     label : head of a column, without the unit.
     definition : one or two sentences for the documentation and for pages.
-    function : computes the figures; metrics that share a computation share the function. None: the scoring sets it.
+    columns : returns the columns of a drive; metrics with the same function share its columns.
+    formula : returns the figure of a segment from the values of its columns; None: the segment has no figure.
+    over : names of these columns; values count where the first one is finite. Empty: the name of the metric.
     best : ``lower``, ``higher``, the value at which it is best, or None where no value is better than another.
     unit : of its figures; None: that of the signal.
+    whole : only segment ``all`` has a figure. of_truth : it compares with ground truth.
     digits : decimal places in the terminal, in the unit that people read.
     terminal : signals whose figure has a column in the terminal's table; narrow terminals leave it out.
     brief : signals whose figure the report.json of a run with ``--keep metrics`` retains.
@@ -63,9 +135,13 @@ class Metric:
     name: str
     label: str
     definition: str
-    function: OfSignal | OfTrack | OfDrive | None
+    columns: Callable[[EvaluatedDrive], Iterable[Columns]]
+    formula: Formula
+    over: tuple[str, ...] = ()
     best: Literal["lower", "higher"] | float | None = None
     unit: str | None = None
+    whole: bool = False
+    of_truth: bool = False
     digits: int = 3
     terminal: tuple[str, ...] = ()
     brief: tuple[str, ...] = ()
@@ -87,147 +163,66 @@ class Metric:
         return f"closest to {self.best:g}"
 
 
-@dataclass(frozen=True, slots=True)
-class SignalBlock:
-    """A block of M stamps of one signal of an estimate and of its ground truth.
-
-    Attributes
-    ----------
-    start : its first row. error : estimate − ground truth [M], angles wrapped, also where it is not scored.
-    scorable, scored : where ground truth can score the signal, and where the estimate is valid and finite besides [M].
-    std : 1-sigma of the error [M], with that of ground truth where it is known; None where the estimate never has one.
-    inside : mask [M] by segment.
-    """
-
-    signal: str
-    start: int
-    estimate: StateTrack
-    truth: StateTrack
-    error: FloatArray
-    scorable: BoolArray
-    scored: BoolArray
-    std: FloatArray | None
-    inside: Mapping[str, BoolArray]
+def rms(values: FloatArray, *_: FloatArray) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
 
 
-class SignalFigures(Protocol):
-    """The figures of one signal of one estimate, which is given block by block."""
-
-    def add(self, block: SignalBlock) -> None:
-        """Take the next block."""
-
-    def of(self, segment: str) -> Mapping[str, Figure]:
-        """Return the figures of a segment by metric; none where nothing in it counts."""
+def mean(values: NDArray[Any], *_: FloatArray) -> float:
+    """Return the mean."""
+    return float(np.mean(values))
 
 
-class Reference:
-    """Ground truth [N] and masks by segment of a drive, and intermediate results that its estimates share.
-
-    ``scorable``: where ground truth can score each signal.
-    """
-
-    def __init__(self, truth: StateTrack, masks: Mapping[str, BoolArray], *, log: str, low_speed_m_s: float) -> None:
-        if ALL not in masks:
-            masks = {ALL: np.ones(len(truth), dtype=np.bool_), **masks}
-        self.truth = truth
-        self.masks = packed(masks, len(truth))
-        self.log = log
-        self.scorable = _scorable_bits(truth, low_speed_m_s)
-        self._shared: dict[Callable[[Reference], object], object] = {}
-
-    def once(self, make: Callable[[Reference], _T]) -> _T:
-        """Return what ``make`` returns for this reference; it is called once."""
-        if make not in self._shared:
-            self._shared[make] = make(self)
-        return self._shared[make]  # type: ignore[return-value]
+def figures(drive: EvaluatedDrive, metrics: Iterable[Metric]) -> list[MetricRow]:
+    """Return the rows of metrics: by estimator in the order of the tracks, then by metric, signal and segment."""
+    families: dict[Callable[[EvaluatedDrive], Iterable[Columns]], list[Metric]] = {}
+    for metric in metrics:
+        families.setdefault(metric.columns, []).append(metric)
+    everywhere = [(ALL, slice(None))]
+    stamps = _places(drive.masks)
+    steps = _places({name: mask[1:] & mask[:-1] for name, mask in drive.masks.items()})
+    rows: dict[str, list[MetricRow]] = {name: [] for name in drive.tracks}
+    for columns_of, family in families.items():
+        for columns in columns_of(drive):
+            places = everywhere if columns.whole else steps if columns.of_steps else stamps
+            for segment, place in places:
+                rows.setdefault(columns.estimator, []).extend(_rows(drive, columns, family, segment, place))
+    return [row for of_estimator in rows.values() for row in of_estimator]
 
 
-def _scorable_bits(truth: StateTrack, low_speed_m_s: float) -> SegmentMasks:
-    blocks = []
-    for a, b in row_blocks(len(truth)):
-        part = HeldRows(truth.rows(a, b))
-        blocks.append(packed({s: scorable(part, s, low_speed_m_s) for s in SCORED_SIGNALS}, b - a).bits)
-    return SegmentMasks([*SCORED_SIGNALS], np.concatenate(blocks))
+_Place: TypeAlias = "IntArray | slice"
 
 
-@dataclass(frozen=True, slots=True)
-class SensorErrors:
-    """Errors of a log's sensors, relative to the vehicle that its signals were read with.
-
-    Attributes
-    ----------
-    ay_bias_m_s2, yaw_rate_bias_rad_s : reading minus true value. ay_gain : of a_y, by body roll. lever_m : position of
-        the accelerometer ahead of the centre of gravity.
-    vehicle, read_with : with which the log explains its yaw rate, and with which its signals were read; None: unknown.
-    steer_delay_s : of the steering angle. friction : of the road; None: that of the signals.
-    """
-
-    ay_bias_m_s2: float = 0.0
-    yaw_rate_bias_rad_s: float = 0.0
-    ay_gain: float = 1.0
-    lever_m: float = 0.0
-    vehicle: VehicleParameters | None = None
-    read_with: VehicleParameters | None = None
-    steer_delay_s: float = 0.0
-    friction: float | None = None
+def _places(masks: Mapping[str, BoolArray]) -> list[tuple[str, _Place]]:
+    """Return the indices of each segment that is not empty."""
+    return [(name, slice(None) if mask.all() else np.flatnonzero(mask)) for name, mask in masks.items() if mask.any()]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EvaluatedDrive:
-    """All tracks of a drive with what its sensors measured, at the same stamps [N].
-
-    ``tracks`` by estimator. ``sensors``: errors of the sensors, as the log calibrated them.
-    """
-
-    log: str
-    tracks: Mapping[str, StateTrack]
-    truth: StateTrack | None
-    signals: Signals
-    masks: SegmentMasks
-    low_speed_m_s: float
-    sensors: SensorErrors
-
-
-@dataclass(frozen=True, slots=True)
-class OfSignal:
-    """Function of a metric of each scored signal: called for a reference, an estimate [N] and a signal."""
-
-    start: Callable[[Reference, StateTrack, str], SignalFigures]
-
-
-@dataclass(frozen=True, slots=True)
-class OfTrack:
-    """Function of a metric of a whole track [N]: called with ground truth or None, masks and the name of the log."""
-
-    rows: Callable[[StateTrack, StateTrack | None, SegmentMasks, str], Iterable[MetricRow]]
-
-
-@dataclass(frozen=True, slots=True)
-class OfDrive:
-    """Function of a metric that takes the sensors or several tracks; recorded estimates have no such figures."""
-
-    rows: Callable[[EvaluatedDrive], Iterable[MetricRow]]
-
-
-def mean_by_segment(name: str, values: Callable[[SignalBlock], FloatArray | None]) -> OfSignal:
-    """Return the function of a metric that is a mean over the scored stamps of a segment.
-
-    ``values``: returns the summand at each stamp [M], NaN where there is none; None where the estimate lacks what it
-    takes.
-    """
-    return OfSignal(lambda _reference, _estimate, _signal: _Mean(name, values))
-
-
-class _Mean:
-    def __init__(self, name: str, values: Callable[[SignalBlock], FloatArray | None]) -> None:
-        self._name, self._values = name, values
-        self._sums = SegmentSums()
-
-    def add(self, block: SignalBlock) -> None:
-        values = self._values(block)
-        if values is not None:
-            self._sums.add(block.inside, np.where(block.scored, values, np.nan))
-
-    def of(self, segment: str) -> dict[str, Figure]:
-        n, sums = self._sums.totals().get(segment, (0, np.zeros(1)))
-        return {self._name: (float(sums[0]) / n, n)} if n else {}
+def _rows(
+    drive: EvaluatedDrive, columns: Columns, family: Sequence[Metric], segment: str, place: _Place
+) -> Iterator[MetricRow]:
+    """Yield the rows of one signal of one estimator in a segment."""
+    chosen: dict[tuple[str, ...], list[NDArray[Any]]] = {}
+    for metric in family:
+        over = metric.over or (metric.name,)
+        if not columns.values.keys() >= {*over} or (metric.whole and segment != ALL):
+            continue
+        if over not in chosen:
+            values = [columns.values[name][place] for name in over]
+            finite = np.isfinite(values[0])
+            chosen[over] = values if finite.all() else [v[finite] for v in values]
+        values = chosen[over]
+        value = metric.formula(*values) if len(values[0]) else None
+        if value is not None:
+            independent = not (metric.of_truth and columns.signal in drive.dependent)
+            yield MetricRow(
+                drive.log,
+                columns.estimator,
+                columns.signal,
+                segment,
+                metric.name,
+                value,
+                metric.unit_of(columns.signal),
+                len(values[0]),
+                independent,
+            )

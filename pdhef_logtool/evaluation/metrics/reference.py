@@ -1,120 +1,135 @@
-"""How far estimates are from the sideslip reference, where no ground truth states their error, and which is closer."""
+"""Estimates against one another and against the sideslip reference, where no ground truth states their error."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from functools import partial
 from itertools import combinations
 
 import numpy as np
 
-from pdhef_logtool.evaluation.blocks import SegmentMasks, SegmentSums, packed, row_blocks
-from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive
+from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric, mean, rms
 from pdhef_logtool.evaluation.track_errors import NORMAL_95
 from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import BoolArray, FloatArray
+from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 
 #: Time within which the error of the reference is taken to be the same, s.
 BLOCK_S = 10.0
 
 
-def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
-    others = dict(drive.tracks)
-    reference = others.pop(REFERENCE, None)
-    if reference is None:
-        return []
-    estimates = list(others.values())
-    return reference_rows(estimates, reference, drive.masks, log=drive.log, low_speed_m_s=drive.low_speed_m_s)
+def _pairs(drive: EvaluatedDrive) -> Iterator[tuple[str, StateTrack, StateTrack]]:
+    tracks = [track for name, track in drive.tracks.items() if name != REFERENCE]
+    return ((f"{a.name}~{b.name}", a, b) for a, b in combinations(tracks, 2))
 
 
-def reference_rows(
-    estimates: Sequence[StateTrack],
-    reference: StateTrack,
-    masks: Mapping[str, BoolArray],
-    *,
-    log: str,
-    low_speed_m_s: float,
-) -> list[MetricRow]:
-    """Return the figures of estimates and of their pairs against the reference, all [N] at the same stamps."""
-    place = _Place(log, low_speed_m_s, packed(masks, len(reference)))
-    rows = [row for track in estimates for row in _against(track, reference, place)]
-    return rows + [row for a, b in combinations(estimates, 2) for row in _ranked(a, b, reference, place)]
+def _disagreement(drive: EvaluatedDrive) -> Iterator[Columns]:
+    """Yield the difference of the sideslip of each pair of estimates, without ground truth only."""
+    for name, a, b in () if drive.truth is not None or drive.signals is None else _pairs(drive):
+        moving = a.valid & b.valid & (a.vx_m_s > drive.low_speed_m_s) & (b.vx_m_s > drive.low_speed_m_s)
+        difference = np.where(moving, wrap_angle(a.sideslip_rad - b.sideslip_rad), np.nan)
+        yield Columns(name, "sideslip_rad", {"difference": difference})
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
-    log: str
-    low_speed_m_s: float
-    masks: SegmentMasks
-
-    def row(self, estimator: str, segment: str, metric: str, value: float, n: int, unit: str = "rad") -> MetricRow:
-        return MetricRow(self.log, estimator, "sideslip_rad", segment, metric, value, unit, n)
-
-
-def _against(track: StateTrack, reference: StateTrack, place: _Place) -> Iterator[MetricRow]:
-    sums = SegmentSums()
-    for start, end in row_blocks(len(track)):
-        a, b = track.rows(start, end), reference.rows(start, end)
-        used = a.valid & b.valid & (b.vx_m_s > place.low_speed_m_s) & ~(a.vx_m_s <= place.low_speed_m_s)
-        difference = np.where(used, wrap_angle(a.sideslip_rad - b.sideslip_rad), np.nan)
-        independent = np.where(used, b.independent, np.nan)
-        sums.add(place.masks.rows(start, end), difference**2, b.sideslip_std_rad**2, independent)
-    for segment, (n, (squares, variances, independents)) in sums.totals().items():
-        yield place.row(track.name, segment, "reference_rms", float(np.sqrt(squares / n)), n)
-        yield place.row(track.name, segment, "reference_std", float(np.sqrt(variances / n)), n)
-        yield place.row(track.name, segment, "reference_independent", float(independents / n), n, "1")
+def _activity(drive: EvaluatedDrive) -> Iterator[Columns]:
+    """Yield where a residual with a region of validity acts."""
+    for name, track in () if drive.signals is None else drive.tracks.items():
+        if ":" not in name and _has_region(track):
+            moving = track.valid & (track.vx_m_s > drive.low_speed_m_s)
+            active = np.where(moving, track.network_trust > 0.0, np.nan)
+            yield Columns(name, "sideslip_rad", {"residual_active": active})
 
 
-def _ranked(a: StateTrack, b: StateTrack, reference: StateTrack, place: _Place) -> Iterator[MetricRow]:
-    """Yield by how much the first of two estimates [N] is further off, by segment, where that may be claimed.
+def _has_region(track: StateTrack) -> bool:
+    """Return whether the gain is not a constant below 1, which belongs to a network without a region."""
+    gain = track.network_trust[np.isfinite(track.network_trust)]
+    return bool(gain.size and gain.max() > 0.0 and (gain.min() < gain.max() or gain.max() == 1.0))
+
+
+def _against_reference(drive: EvaluatedDrive) -> Iterator[Columns]:
+    reference = drive.tracks.get(REFERENCE)
+    for name, track in () if reference is None else drive.tracks.items():
+        if name == REFERENCE:
+            continue
+        used = track.valid & reference.valid
+        used &= (reference.vx_m_s > drive.low_speed_m_s) & ~(track.vx_m_s <= drive.low_speed_m_s)
+        difference = np.where(used, wrap_angle(track.sideslip_rad - reference.sideslip_rad), np.nan)
+        values = {
+            "difference": difference,
+            "std": reference.sideslip_std_rad,
+            "independent": reference.independent,
+        }
+        yield Columns(name, "sideslip_rad", values)
+
+
+def _ranked(drive: EvaluatedDrive) -> Iterator[Columns]:
+    """Yield the squared differences of each pair from the reference c, with the standard deviation of their difference.
 
     An error of the reference δ changes the difference of the squares Σ (β_a − β_c)² − (β_b − β_c)² by
     2 Σ (β_a − β_b) δ; δ is its standard deviation, of one sign within ``BLOCK_S`` and independent between.
     """
-    sums, doubts = SegmentSums(), dict[str, FloatArray]()
-    start_ns, block_ns = reference.stamps_ns[0], round(BLOCK_S * 1e9)
-    blocks = int((reference.stamps_ns[-1] - start_ns) // block_ns) + 1
-    for start, end in row_blocks(len(a)):
-        first, second, c = (t.rows(start, end) for t in (a, b, reference))
-        used = first.valid & second.valid & c.valid & (c.vx_m_s > place.low_speed_m_s)
-        errors = [wrap_angle(t.sideslip_rad - c.sideslip_rad) ** 2 for t in (first, second)]
-        doubt = 2.0 * np.abs(wrap_angle(first.sideslip_rad - second.sideslip_rad)) * c.sideslip_std_rad
-        used &= np.isfinite(errors[0] + errors[1] + doubt)
-        masks = place.masks.rows(start, end)
-        sums.add(masks, *(np.where(used, e, np.nan) for e in errors))
-        number = (c.stamps_ns - start_ns) // block_ns
-        for segment, mask in masks.items():
-            of_blocks = doubts.setdefault(segment, np.zeros(blocks))
-            of_blocks += np.bincount(number[mask & used], doubt[mask & used], blocks)
-    for segment, (n, (of_a, of_b)) in sums.totals().items():
-        if abs(of_a - of_b) > NORMAL_95 * np.linalg.norm(doubts[segment]):
-            further = float(np.sqrt(of_a / n) - np.sqrt(of_b / n))
-            yield place.row(f"{a.name}~{b.name}", segment, "reference_further", further, n)
+    c = drive.tracks.get(REFERENCE)
+    for name, a, b in () if c is None else _pairs(drive):
+        used = a.valid & b.valid & c.valid & (c.vx_m_s > drive.low_speed_m_s)
+        of_a, of_b = (wrap_angle(t.sideslip_rad - c.sideslip_rad) ** 2 for t in (a, b))
+        std = 2.0 * np.abs(wrap_angle(a.sideslip_rad - b.sideslip_rad)) * c.sideslip_std_rad
+        of_a = np.where(used & np.isfinite(of_b + std), of_a, np.nan)
+        block = (c.stamps_ns - c.stamps_ns[:1]) // round(BLOCK_S * 1e9)
+        yield Columns(name, "sideslip_rad", {"of_a": of_a, "of_b": of_b, "std": std, "block": block})
 
 
-_FUNCTION = OfDrive(_rows)
+def _further(of_a: FloatArray, of_b: FloatArray, std: FloatArray, block: IntArray) -> float | None:
+    significant = NORMAL_95 * float(np.linalg.norm(np.bincount(block, std)))
+    if abs(np.sum(of_a) - np.sum(of_b)) <= significant:
+        return None
+    return float(np.sqrt(np.mean(of_a)) - np.sqrt(np.mean(of_b)))
+
+
+_REFERENCE = partial(Metric, columns=_against_reference)
 METRICS = (
     Metric(
+        "disagreement_rms",
+        "RMS difference",
+        "RMS of the difference of two estimates' sideslip, both above the low-speed blend; estimator `a~b`. Without "
+        "ground truth only",
+        columns=_disagreement,
+        formula=rms,
+        over=("difference",),
+        best="lower",
+    ),
+    Metric(
+        "residual_active",
+        "residual active",
+        "share of the stamps above the low-speed blend at which the residual acts, for a residual with a region of "
+        "validity",
+        columns=_activity,
+        formula=mean,
+        best="higher",
+        unit="1",
+    ),
+    _REFERENCE(
         "reference_rms",
         "RMS from reference",
         "RMS of the difference of an estimate's sideslip from the sideslip reference, where the reference is valid and "
         "both are above the low-speed blend. The reference is estimated: no error, and never mixed with ground truth",
-        _FUNCTION,
+        formula=rms,
+        over=("difference",),
         best="lower",
     ),
-    Metric(
+    _REFERENCE(
         "reference_std",
         "reference ±",
         "RMS of the 1-sigma of the sideslip reference at these stamps: smaller differences state nothing",
-        _FUNCTION,
+        formula=lambda _, std: rms(std),
+        over=("difference", "std"),
     ),
-    Metric(
+    _REFERENCE(
         "reference_independent",
         "reference independent",
         "share of these stamps at which GNSS has more than half of the reference's information; at the others axle law "
         "and kinematics of the same IMU prevail",
-        _FUNCTION,
+        formula=lambda _, independent: mean(independent),
+        over=("difference", "independent"),
         unit="1",
     ),
     Metric(
@@ -123,6 +138,8 @@ METRICS = (
         "by how much the first of two estimates `a~b` is further from the sideslip reference, as RMS, than the second. "
         "Only where the difference of their mean squares exceeds 1.96 of its standard deviation, which follows from "
         "the reference's own, with one error in each 10 s: other pairs are not ranked",
-        _FUNCTION,
+        columns=_ranked,
+        formula=_further,
+        over=("of_a", "of_b", "std", "block"),
     ),
 )

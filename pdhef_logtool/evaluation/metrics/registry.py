@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cache
 from importlib import import_module
 from types import MappingProxyType
 
-from pdhef_logtool.evaluation.metrics.metric import Metric
+from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, figures
+from pdhef_logtool.records.signals import BoolArray
+from pdhef_logtool.records.tracks import StateTrack
 
 #: Files of this package that export ``METRICS``. A new metric: a file, and its name here.
 MODULES = (
-    "availability",
     "errors",
-    "coverage",
     "lag",
-    "nees",
     "innovations",
-    "whiteness",
     "lateral_consistency",
     "yaw_consistency",
-    "disagreement",
-    "residual_active",
     "reference",
-    "sensor_residuals",
-    "exposure",
+    "sensors",
     "independence",
 )
 
@@ -43,3 +38,23 @@ def _load(modules: tuple[str, ...]) -> Mapping[str, Metric]:
                 raise ValueError(f"metric {metric.name!r} of {module}.py is registered twice")
             metrics[metric.name] = metric
     return MappingProxyType(metrics)
+
+
+def evaluate_drive(drive: EvaluatedDrive, names: Collection[str] | None = None) -> list[MetricRow]:
+    """Return the figures of all metrics, or of those with these names."""
+    return figures(drive, [m for m in registered().values() if names is None or m.name in names])
+
+
+def score_track(
+    estimate: StateTrack, truth: StateTrack, masks: Mapping[str, BoolArray], *, log: str, low_speed_m_s: float
+) -> list[MetricRow]:
+    """Return the figures of one estimate against ground truth at the same stamps [N].
+
+    ``masks``: bool [N] by segment; ``all`` is added when it is absent. ``low_speed_m_s``: sideslip is scored above
+    this ground-truth speed.
+
+    Raises
+    ------
+    ValueError : The tracks or masks are not at the same stamps.
+    """
+    return evaluate_drive(EvaluatedDrive(log, {estimate.name: estimate}, truth, None, masks, low_speed_m_s))

@@ -3,71 +3,52 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.evaluation.blocks import SegmentSums, blocks_with_halo, packed
-from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, OfDrive, SensorErrors
-from pdhef_logtool.evaluation.metrics.sensor_residuals import MAX_STEP_S, carried_speed
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric, SensorErrors, rms
+from pdhef_logtool.evaluation.metrics.sensors import MAX_STEP_S, carried_speed
+from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
-#: The yaw rate forgets its start within this time.
-SETTLE_S = 2.0
 #: Longest step of its integration: the yaw motion of any car has time constants above 20 ms at 3 m/s and more.
 _STEP_S = 0.004
 
 
-def _rows(drive: EvaluatedDrive) -> list[MetricRow]:
-    return yaw_rows([*drive.tracks.values()], drive.signals, drive.masks, log=drive.log, sensors=drive.sensors)
+def _columns(drive: EvaluatedDrive) -> Iterator[Columns]:
+    if drive.signals is not None and drive.sensors.vehicle is not None:
+        yaw = YawModel(drive.signals, drive.sensors.vehicle, drive.sensors)
+        for track in drive.tracks.values():
+            yield Columns(track.name, "yaw_rate_rad_s", {"yaw_consistency": yaw.residual(track)})
 
 
-def yaw_rows(
-    tracks: Sequence[StateTrack], signals: Signals, masks: Mapping[str, BoolArray], *, log: str, sensors: SensorErrors
-) -> list[MetricRow]:
-    """Return the figure of estimators at the same stamps as the signals [N], one row per segment."""
-    if sensors.vehicle is None:
-        return []
-    masks = packed(masks, len(signals))
-    sums_by_track = [SegmentSums() for _ in tracks]
-    for first, a, b, end in blocks_with_halo(signals, SETTLE_S, 1):
-        core, inside = slice(a - first, b - first), dict(masks.rows(a, b))
-        window = signals.rows(first, end)
-        part = Signals.rows(
-            window, 0, len(window)
-        )  # of signals on disk each column is read once, and no more than this
-        for track, sums in zip(tracks, sums_by_track, strict=True):
-            residual = yaw_residual(track.rows(first, end), part, sensors.vehicle, sensors)[core]
-            sums.add(inside, residual, residual**2)
-    return [
-        MetricRow(
-            log, track.name, "yaw_rate_rad_s", segment, "yaw_consistency", float(np.sqrt(squares / n)), "rad/s", n
-        )
-        for track, sums in zip(tracks, sums_by_track, strict=True)
-        for segment, (n, (_, squares)) in sums.totals().items()
-    ]
-
-
-def yaw_residual(track: StateTrack, signals: Signals, vehicle: VehicleParameters, sensors: SensorErrors) -> FloatArray:
-    """Return the modelled minus the measured yaw rate [N]; NaN across gaps, at low speed, and without steering.
+class YawModel:
+    """The inputs of the yaw model that do not depend on the estimate, for signals [N].
 
     The steering, its delay, the gyro's bias and the tyres are those of the calibrated ``vehicle``.
     """
-    friction = signals.friction if sensors.friction is None else np.full(len(signals), sensors.friction)
-    read, t = corrected_anew(signals, sensors.read_with or vehicle, vehicle), signals.stamps_ns
-    steer = np.interp(t - round(sensors.steer_delay_s * 1e9), t, read.steer_rad)
-    friction = np.where(np.isfinite(friction), friction, vehicle.assumed_friction)
-    dt = np.diff(t, prepend=t[:1]) * 1e-9
-    dt[dt > MAX_STEP_S] = np.nan
-    vy = np.where(track.valid, track.vy_m_s, np.nan)
-    modelled = np.full(len(t), np.nan)
-    inputs = (dt, carried_speed(signals), vy, steer, friction, read.yaw_rate_rad_s)
-    _yaw_rates(inputs, _tyres_of(vehicle), modelled)
-    return modelled - read.yaw_rate_rad_s
+
+    def __init__(self, signals: Signals, vehicle: VehicleParameters, sensors: SensorErrors) -> None:
+        friction = signals.friction if sensors.friction is None else np.full(len(signals), sensors.friction)
+        read, t = corrected_anew(signals, sensors.read_with or vehicle, vehicle), signals.stamps_ns
+        steer = np.interp(t - round(sensors.steer_delay_s * 1e9), t, read.steer_rad)
+        friction = np.where(np.isfinite(friction), friction, vehicle.assumed_friction)
+        dt = np.diff(t, prepend=t[:1]) * 1e-9
+        dt[dt > MAX_STEP_S] = np.nan
+        self._tyres, self._measured = _tyres_of(vehicle), read.yaw_rate_rad_s
+        self._inputs = dt, carried_speed(signals), steer, friction, read.yaw_rate_rad_s
+
+    def residual(self, track: StateTrack) -> FloatArray:
+        """Return the modelled minus the measured yaw rate [N]; NaN across gaps, at low speed, and without steering."""
+        modelled = np.full(len(track), np.nan)
+        dt, vx, steer, friction, measured = self._inputs
+        vy = np.where(track.valid, track.vy_m_s, np.nan)
+        _yaw_rates((dt, vx, vy, steer, friction, measured), self._tyres, modelled)
+        return modelled - self._measured
 
 
 class _Tyres(NamedTuple):
@@ -140,7 +121,8 @@ METRICS = (
         "signal `yaw_rate_rad_s`: RMS of the gyro minus the yaw rate that the car's tyres have at the estimated v_y "
         "and the measured steering, above the low-speed blend; tyres, steering and gyro "
         "bias as the log calibrated them",
-        OfDrive(_rows),
+        columns=_columns,
+        formula=rms,
         best="lower",
         unit="rad/s",
         brief=("yaw_rate_rad_s",),

@@ -233,7 +233,6 @@ def extract(
     *,
     jobs: int = 1,
     resume: bool = False,
-    splits: Mapping[str, str] | None = None,
     reporter: Reporter = SILENT,
 ) -> ExtractResult:
     """Write the residual dataset of logs with ground truth to a folder.
@@ -244,7 +243,6 @@ def extract(
     ----------
     arguments : logs, folders, glob patterns. jobs : processes at work; changes nothing that is written.
     resume : keep drives whose log and settings are as they were.
-    splits : of each log by its stem, instead of what the manifests of sets state.
 
     Raises
     ------
@@ -259,8 +257,6 @@ def extract(
     inputs = find_logs(arguments, private_redirects=settings.config.allow_private_redirects)
     mapping = open_mapping(settings.config)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, reporter.warn))
-    if splits is not None:
-        work = [replace(job, listed_split=splits[job.log_input.stem]) for job in work]
     before = _earlier(output, settings)
     names = {settings.name_of(i.stem) for i in inputs}
     read = [*(i.local for i in inputs), *settings.config.files, *(j.car.source for j in work)]
@@ -284,7 +280,7 @@ def extract(
         with writing(output):
             remove_unnamed(output, manifest)
     empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
-    if empty and manifest["drives"] and splits is None and settings.split is None:
+    if empty and manifest["drives"] and settings.split is None:
         reporter.warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
     return ExtractResult(output, manifest, results)
 

@@ -1,23 +1,17 @@
-"""Stage intervals: known scales are recovered, unseen drives are covered, and a run uses what it wrote."""
+"""Fit of the 95 % intervals of the shipped car."""
 
 from __future__ import annotations
 
-import json
-import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import polars as pl
 import pytest
 
-from pdhef_logtool.car.car import Car, load_intervals
 from pdhef_logtool.car.parts import Inflation
 from pdhef_logtool.estimators.error_features import grip_share
 from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS, YAW_RATE_TERMS, combined, grip_factor
-from pdhef_logtool.learning.drives import LearnSettings, choose_drives
-from pdhef_logtool.learning.engine import learn
-from pdhef_logtool.learning.evidence.calibrate import (
+from pdhef_logtool.records.signals import FloatArray
+from studies.defaults.interval_fit import (
     FOLDS,
     Samples,
     bin_numbers,
@@ -28,14 +22,7 @@ from pdhef_logtool.learning.evidence.calibrate import (
     fit_inflation,
     folds,
     grip_factors,
-    share_for,
 )
-from pdhef_logtool.logs.discovery import find_logs
-from pdhef_logtool.records.errors import EstimatorError, UsageError
-from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import run_logs
 
 pytestmark = pytest.mark.slow
 
@@ -75,16 +62,6 @@ def _terms(rng: np.random.Generator, n: int) -> FloatArray:
     return terms
 
 
-def test_a_known_scale_is_recovered() -> None:
-    rng = np.random.default_rng(1)
-    n = 20_000
-    terms = _terms(rng, n)
-    error = 2.5 * terms[:, 1] * rng.standard_normal(n)
-    k = fit_coefficients(terms, error, np.full(n, 1.0 / n))
-    assert k[1] == pytest.approx(2.5, rel=0.05)
-    np.testing.assert_allclose(np.median(combined(terms, k) / terms[:, 1]), 2.5, rtol=0.05)
-
-
 def test_two_causes_are_told_apart() -> None:
     rng = np.random.default_rng(2)
     n = 40_000
@@ -94,12 +71,6 @@ def test_two_causes_are_told_apart() -> None:
     assert k[1] == pytest.approx(1.5, rel=0.1)
     assert k[5] == pytest.approx(0.6, rel=0.2)
     assert max(k[i] for i in (2, 3, 4, 6)) < 0.25
-
-
-def test_what_widens_nothing_is_0_but_the_first_coefficient() -> None:
-    rng = np.random.default_rng(5)
-    k = fit_coefficients(rng.uniform(0.5, 1.5, (400, 3)), 1e-5 * rng.standard_normal(400), np.full(400, 1 / 400))
-    assert 0.0 < k[0] < 1e-3 and k[1:] == (0.0, 0.0)
 
 
 def test_new_drives_are_covered_where_errors_are_small_and_where_they_are_large() -> None:
@@ -189,14 +160,6 @@ def test_a_drive_that_is_lost_near_the_limit_widens_nothing_elsewhere() -> None:
     assert high >= middle, "two drives near the limit say nothing"
 
 
-def test_the_covering_factor_is_the_weighted_quantile() -> None:
-    error, std = np.arange(1.0, 100.0), np.full(99, 1.0 / 1.959963984540054)
-    alike = np.full(99, 1.0 / 99.0)
-    assert covering_factor(error, std, alike) == pytest.approx(95.0)
-    assert covering_factor(-error, 2.0 * std, alike) == pytest.approx(47.5)
-    assert covering_factor(error, std, np.where(error <= 10.0, 0.1, 0.0)) == pytest.approx(10.0)
-
-
 def test_the_covering_factor_is_the_least_that_covers_whatever_the_weights_add_up_to() -> None:
     rng = np.random.default_rng(8)
     error, std = 3.0 * rng.standard_normal(400), rng.uniform(0.5, 1.5, 400)
@@ -230,20 +193,6 @@ def test_the_fit_minimises_the_pinball_loss_of_the_files_head() -> None:
         aside = np.maximum(k, 0.05)
         aside[i] *= factor
         assert loss(aside) > loss(k)
-
-
-def test_few_drives_must_be_covered_further() -> None:
-    assert share_for(0.95, 10**6) == pytest.approx(0.95, abs=1e-5)
-    assert share_for(0.95, 60) == pytest.approx(0.95 * 61 / 60)
-    assert share_for(0.95, 5) == 0.975
-    assert share_for(0.85, 5) == 0.925
-
-
-def test_bins_count_alike() -> None:
-    weight = bin_weights(np.array([0] * 900 + [2] * 100), np.zeros(1000, dtype=np.int64))
-    assert weight.sum() == pytest.approx(1.0)
-    assert weight[:900].sum() == pytest.approx(0.5)
-    assert np.ptp(weight[900:]) == 0.0
 
 
 def test_drives_of_a_bin_count_alike_but_for_those_that_hardly_see_it() -> None:
@@ -292,120 +241,3 @@ def test_few_drives_are_refused() -> None:
     rng = np.random.default_rng(6)
     with pytest.raises(ValueError, match="5 drives"):
         fit_inflation(_samples(rng, np.ones(400), np.ones((400, 9)), drives=4))
-
-
-# ---- the command ----
-
-
-def _settings(sample_logs_dir: Path, estimators: tuple[str, ...] = ("phy-ukf", "zero")) -> LearnSettings:
-    car = sample_logs_dir / "vehicle.toml"
-    config = RunConfig(estimators=estimators, car=car, network=Path("none"), end="+6s")
-    return LearnSettings(config=config, stages=("intervals",), spread=0.1)
-
-
-@pytest.fixture(scope="module")
-def calibration(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("calibration")
-    logs = [str(sample_logs_dir / f"{n}.mcap") for n in ("dlc", "step", "fishhook", "sweep", "road", "no_truth")]
-    told: list[str] = []
-    result = learn(logs, folder / "mycar", _settings(sample_logs_dir), reporter=Reporter(warn=told.append))
-    assert result.exit_code == 3
-    assert [d.name for d in result.left_out] == ["no_truth"]
-    assert [r.counts for r in result.drives] == [
-        {"scored_stamps": r.counts["scored_stamps"], "runs": 3} for r in result.drives
-    ]
-    assert any("no_truth" in t for t in told)
-    again = learn(logs[:5], folder / "again", _settings(sample_logs_dir))
-    assert again.exit_code == 0
-    assert (again.car / "intervals.json").read_bytes() == (result.car / "intervals.json").read_bytes()
-    return result.car / "intervals.json"
-
-
-def test_the_file_says_where_it_is_from(calibration: Path, sample_logs_dir: Path) -> None:
-    assert calibration.name == "intervals.json"
-    document = json.loads(calibration.read_text())
-    assert [e["estimator"] for e in document["entries"]] == ["phy-ukf"]  # zero claims no interval
-    assert document["entries"][0]["algorithm"]["algorithm"] == "physics-ukf"
-    assert len(document["drives"]) == 5
-    assert document["spread"] == document["settings"]["spread"] == 0.1
-    assert document["settings"]["estimators"] == ["phy-ukf", "zero"]
-    assert document["physics_sha256"] == Car.load(sample_logs_dir / "vehicle.toml").physics_sha256
-    assert str(calibration.parent) not in calibration.read_text()
-    assert {c["wrong_vehicle"] for c in document["entries"][0]["coverage"]} == {False, True}
-
-
-def test_a_run_uses_it_and_says_so(
-    calibration: Path, sample_logs_dir: Path, tmp_path: Path
-) -> None:
-    figures = {}
-    for name, made in (("plain", Path("none")), ("whole", calibration)):
-        config = RunConfig(
-            estimators=("phy-ukf", "zero"),
-            car=sample_logs_dir / "vehicle.toml",
-            network=Path("none"),
-            intervals=made,
-            annotate="none",
-        )
-        result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config)
-        report = result.results[0].report
-        assert report is not None
-        notes = {e["name"]: "; ".join(e["intervals"]) for e in report["estimators"]}
-        expected = "intervals: own, parameters" if name == "plain" else "calibrated on truthsim saloon"
-        assert expected in notes["phy-ukf"]
-        assert "calibrated" not in notes["zero"]
-        assert "other physics" not in notes["phy-ukf"]
-        metrics = pl.read_parquet(tmp_path / name / "metrics.parquet").filter(pl.col("estimator") == "phy-ukf")
-        figures[name] = {
-            metric: metrics.filter(pl.col("metric") == metric)["value"].to_list() for metric in ("rmse", "nis", "nees")
-        }
-    # NEES is that of the calibrated covariance; the filter's own innovations know nothing of it.
-    assert {m: figures["whole"][m] == figures["plain"][m] for m in figures["plain"]} == {
-        "rmse": True,
-        "nis": True,
-        "nees": False,
-    }
-    assert all(figures["plain"].values())
-    same = [c for c in tables["whole"].columns if c not in ("vy_std_m_s", "yaw_rate_std_rad_s", "sideslip_std_rad")]
-    assert tables["whole"].select(same).equals(tables["plain"].select(same))
-    assert not tables["whole"]["sideslip_std_rad"].equals(tables["plain"]["sideslip_std_rad"])
-    (entry,) = load_intervals(calibration).entries
-    assert entry.inflation.sideslip.floor > 0.0
-    assert Car.load(calibration.parent).intervals == load_intervals(calibration)
-
-
-def test_too_few_drives_with_truth(sample_logs_dir: Path, tmp_path: Path) -> None:
-    with pytest.raises(EstimatorError, match="5 drives"):
-        learn([str(sample_logs_dir / "step.mcap")], tmp_path / "c", _settings(sample_logs_dir))
-    assert not (tmp_path / "c").exists()
-
-
-def test_held_out_drives_are_refused(sample_logs_dir: Path, tmp_path: Path) -> None:
-    entries = []
-    for name, split in (("dlc", "validation"), ("step", "test")):
-        shutil.copy(sample_logs_dir / f"{name}.mcap", tmp_path)
-        entries.append({"file": f"{name}.mcap", "split": split})
-    (tmp_path / "manifest.json").write_text(json.dumps({"drives": entries}))
-    settings = _settings(sample_logs_dir)
-    inputs = find_logs([str(tmp_path)])
-    with pytest.raises(UsageError, match=r"step \(test\)"):
-        choose_drives(inputs, settings)
-    chosen, splits = choose_drives(inputs, replace(settings, split="validation"))
-    assert [i.stem for i in chosen] == ["dlc"]
-    assert splits == {"dlc": "validation"}
-    assert len(choose_drives(inputs, replace(settings, any_split=True))[0]) == 2
-    with pytest.raises(UsageError, match="train"):
-        choose_drives(inputs, replace(settings, split="train"))
-
-
-def test_wrong_options(sample_logs_dir: Path, tmp_path: Path) -> None:
-    settings = _settings(sample_logs_dir)
-    log = [str(sample_logs_dir / "step.mcap")]
-    with pytest.raises(UsageError, match="--output"):
-        learn(log, tmp_path / "nowhere.toml", settings)
-    with pytest.raises(UsageError, match="--vary"):
-        replace(settings, spread=0.5)
-    (tmp_path / "notes.txt").write_text("no car")
-    with pytest.raises(UsageError, match="--output"):
-        learn(log, tmp_path, settings)
-    with pytest.raises(UsageError, match="--car"):
-        learn(log, tmp_path, replace(settings, config=replace(settings.config, car=None)))

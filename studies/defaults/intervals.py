@@ -1,4 +1,4 @@
-"""Stage ``intervals``: 95 % intervals of estimators, filed under the algorithm that ran (``intervals.json``)."""
+"""95 % intervals of the estimators of the shipped car, by the algorithm that ran (``intervals.json``)."""
 
 from __future__ import annotations
 
@@ -20,26 +20,23 @@ from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, runnable
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ
 from pdhef_logtool.evaluation.smoothing import smooth
-from pdhef_logtool.learning.drives import INTERVALS, DriveRecord, load_drive
-from pdhef_logtool.learning.evidence.calibrate import (
+from pdhef_logtool.learning.drives import DriveRecord, load_drive
+from pdhef_logtool.learning.stages.task import Task
+from pdhef_logtool.learning.variation import Variation, vary
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.results.run_report import json_bytes, tool_versions
+from pdhef_logtool.runs.estimating import estimate_drive
+from studies.defaults.interval_fit import (
     COVERED,
     FOLDS,
     MIN_DRIVES,
-    Fitted,
     Samples,
     bin_numbers,
     fit_inflation,
     join_samples,
 )
-from pdhef_logtool.learning.split import VALIDATION
-from pdhef_logtool.learning.stages.task import StageOutput, Task
-from pdhef_logtool.learning.variation import Variation, vary
-from pdhef_logtool.logs.discovery import LogInput
-from pdhef_logtool.records.errors import EstimatorError
-from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.run_report import json_bytes, tool_versions
-from pdhef_logtool.runs.estimating import estimate_drive
 
 #: Neighbouring errors are correlated: one sample in this time is kept.
 SAMPLE_EVERY_S = 0.05
@@ -47,75 +44,56 @@ SAMPLE_EVERY_S = 0.05
 WRONG_RUNS = 2
 #: A drive with fewer kept samples does not count.
 MIN_SAMPLES = 20
-#: Share of the progress that running the estimators takes.
-RUNNING = 0.9
-#: A piece of a divided drive that counts as a drive of its own.
-PIECE_S = 20.0
 
 _Ran = list[tuple[str, Algorithm, Samples]]
 
 
-def fit_intervals(task: Task) -> StageOutput:
-    """Fit the intervals of every algorithm that gives one on the validation drives, each judged by a fit without it.
+def fit_intervals(task: Task, spread: float) -> Change:
+    """Return the intervals of every algorithm that has enough drives.
 
-    Raises
-    ------
-    EstimatorError
-        There are too few drives with ground truth.
+    ``spread`` is that of the random errors of friction and vehicle in further runs of each drive.
     """
-    logs = task.split.pieces(VALIDATION, PIECE_S)
-    if len(logs) < MIN_DRIVES:
-        raise _too_few(len(logs))
-    if task.car.network is not None and "train" in task.set_splits.values():
-        task.reporter.warn(
-            "drives of split train: a network is better there than in service, and its intervals too narrow"
-        )
     numbers = itertools.count()
-    records, ran = task.read(logs, lambda log: _run_drive(log, next(numbers), task), RUNNING)
+    records, ran = task.read(lambda log: _run_drive(log, next(numbers), task, spread))
     names: dict[str, tuple[str, Algorithm]] = {}
     samples: dict[str, list[Samples]] = {}
     for name, algorithm, part in itertools.chain.from_iterable(ran):
         names.setdefault(algorithm.identity, (name, algorithm))
         samples.setdefault(algorithm.identity, []).append(part)
     entries: list[IntervalEntry] = []
-    for number, (identity, parts) in enumerate(samples.items()):
+    for identity, parts in samples.items():
         name, algorithm = names[identity]
-        task.reporter.progress(f"fitting {name}", RUNNING + (1.0 - RUNNING) * number / len(samples))
         joined = join_samples(parts)
-        count = int(np.unique(joined.drive[~joined.wrong]).size)
-        if count < MIN_DRIVES:
-            task.reporter.warn(f"{name} is not calibrated: it has {count} drives, at least {MIN_DRIVES} are needed")
+        if np.unique(joined.drive[~joined.wrong]).size < MIN_DRIVES:
+            print(f"{name} is not calibrated: at least {MIN_DRIVES} drives are needed", flush=True)
             continue
-        entries.append(_entry(name, algorithm, fit_inflation(joined)))
+        fitted = fit_inflation(joined)
+        entries.append(
+            IntervalEntry(
+                estimator=name,
+                algorithm=algorithm,
+                inflation=fitted.inflation,
+                unseen_factor=fitted.unseen_factor,
+                coverage=tuple(asdict(c) for c in fitted.coverage),
+            )
+        )
     if not entries:
-        raise _too_few(len(ran))
-    vehicle = task.car.vehicle
-    fitted = Intervals(
+        raise SystemExit(f"intervals: at least {MIN_DRIVES} drives with a true sideslip are needed, got {len(ran)}")
+    vehicle, settings = task.car.vehicle, {**task.settings.to_dict(), "spread": spread}
+    fitted_intervals = Intervals(
         car=vehicle.name,
         physics_sha256=task.car.physics_sha256,
         roll_gradient_rad_per_m_s2=vehicle.roll_gradient_rad_per_m_s2,
-        spread=task.settings.spread,
+        spread=spread,
         entries=tuple(entries),
-        settings=task.settings.to_dict(),
+        settings=settings,
         fit={"covered": COVERED, "folds": FOLDS, "wrong_runs": WRONG_RUNS, "sample_every_s": SAMPLE_EVERY_S},
         drives=tuple(r.learnt_on for r in records if not r.left_out),
         versions=tool_versions(),
     )
-    files = {INTERVALS_FILE: json_bytes(fitted.model_dump(mode="json"))}
-    change = Change(
-        f"learn --stages {INTERVALS}", INTERVALS_FILE, files, settings=task.settings.to_dict(), drives=fitted.drives
-    )
-    coverage = {e.estimator: list(e.coverage) for e in entries}
-    return StageOutput(change, records, f"{', '.join(coverage)}, on {len(ran)} drives", {"coverage": coverage})
-
-
-def _too_few(count: int) -> EstimatorError:
-    return EstimatorError(
-        expected=f"at least {MIN_DRIVES} drives, or pieces of {PIECE_S:g} s of one, with a true sideslip",
-        got=str(count),
-        where=INTERVALS,
-        remedy="give more drives; the same number of short drives of many kinds is worth more than a long one",
-    )
+    files = {INTERVALS_FILE: json_bytes(fitted_intervals.model_dump(mode="json"))}
+    command = "studies.defaults.train_default intervals"
+    return Change(command, INTERVALS_FILE, files, settings=settings, drives=fitted_intervals.drives)
 
 
 def made_wrong(vehicle: VehicleParameters, spread: float, key: str) -> Iterator[Variation]:
@@ -124,16 +102,16 @@ def made_wrong(vehicle: VehicleParameters, spread: float, key: str) -> Iterator[
     return (draw for draw in draws if draw.vehicle is not vehicle)
 
 
-def _run_drive(log: LogInput, number: int, task: Task) -> tuple[DriveRecord, _Ran | None]:
+def _run_drive(log: LogInput, number: int, task: Task, spread: float) -> tuple[DriveRecord, _Ran | None]:
     """Run the estimators on a drive, once as given and some times with a wrong vehicle; return errors and terms."""
-    settings, car, vehicle, options = task.settings, task.car, task.car.vehicle, task.options
+    car, vehicle, options = task.car, task.car.vehicle, task.options
     record, drive = load_drive(log, car, task.mapping, options, fill_friction=False)
     if drive is None or drive.truth is None:
         return record, None
     signals = drive.signals
     runs = [(vehicle, 1.0, False)]
-    if settings.spread > 0.0:
-        draws = itertools.islice(made_wrong(vehicle, settings.spread, f"{settings.seed}:{record.sha256}"), WRONG_RUNS)
+    if spread > 0.0:
+        draws = itertools.islice(made_wrong(vehicle, spread, f"{task.settings.seed}:{record.sha256}"), WRONG_RUNS)
         runs += [(draw.vehicle, draw.friction_factor, True) for draw in draws]
     ran: _Ran = []
     for assumed, factor, wrong in runs:
@@ -142,7 +120,7 @@ def _run_drive(log: LogInput, number: int, task: Task) -> tuple[DriveRecord, _Ra
             signals = replace(signals, friction=seen.friction)  # the best that is known of the drive, for the bins
         presumed = car if assumed is vehicle else car.with_vehicle(assumed)
         available = drive.plan.alignment.available
-        estimators, _ = runnable(task.estimators or (ALL_ESTIMATORS,), presumed, available, Options(options.use_speed))
+        estimators, _ = runnable((ALL_ESTIMATORS,), presumed, available, Options(options.use_speed))
         estimated = estimate_drive(replace(drive, signals=seen), estimators, watched=False, drawn=False)
         for estimator in estimators:
             track = estimated.tracks[estimator.name]
@@ -151,7 +129,7 @@ def _run_drive(log: LogInput, number: int, task: Task) -> tuple[DriveRecord, _Ra
                 ran.append((track.name, resolve(estimator), part))
     if not ran:
         return replace(record, left_out="no estimate with an interval where the ground truth is known"), None
-    return replace(record, counts={**record.counts, "runs": len(runs)}), ran
+    return record, ran
 
 
 def drive_samples(
@@ -198,14 +176,4 @@ def drive_samples(
         bin=bins[kept],
         drive=np.full(count, drive, dtype=np.int64),
         wrong=np.full(count, wrong, dtype=np.bool_),
-    )
-
-
-def _entry(name: str, algorithm: Algorithm, fitted: Fitted) -> IntervalEntry:
-    return IntervalEntry(
-        estimator=name,
-        algorithm=algorithm,
-        inflation=fitted.inflation,
-        unseen_factor=fitted.unseen_factor,
-        coverage=tuple(asdict(c) for c in fitted.coverage),
     )
