@@ -58,7 +58,7 @@ class Frames:
     Attributes
     ----------
     stamps_ns : [N], ascending.
-    parts : by name, [N]: ``id``, ``length`` (bytes), ``is_extended``, and what else the file contains of a frame.
+    parts : by name, [N]: ``id``, ``length`` (bytes), ``is_extended``, and other parts of a frame.
     data : [N, k], zero behind the length.
     """
 
@@ -235,7 +235,7 @@ def described_sources(database: Database, sources: Iterable[Source]) -> dict[Sou
     """Return the messages of a database by source.
 
     A 29-bit identifier that is not in the database is compared by PGN: with J1939 messages, and with messages with a
-    broadcast PGN whose identifier no frame has.
+    broadcast PGN if no frame has their identifier.
     """
     exact = {(m.is_extended_frame, m.frame_id): m for m in reversed(database.messages)}
     sent = {source.identifier for source in sources if source.is_extended}
@@ -317,7 +317,7 @@ def leaves_range(values: FloatArray, signal: Signal) -> tuple[NDArray[np.bool_],
 
 
 def fit_of(database: Database, sent: frozenset[int]) -> float:
-    """Return how well a database describes the identifiers of a bus: those it defines, times their share of its own."""
+    """Return the number of identifiers of a bus that a database defines, times their share of its definitions."""
     defined = sum(m.frame_id in sent for m in database.messages)
     return defined**2 / max(1, len(database.messages))
 

@@ -79,7 +79,7 @@ _FRAMES: dict[int, tuple[str, int, int, int]] = numbered(_BLF["frames"])
 
 
 def open_blf(file: TableFile) -> Tables:
-    """Read a BLF file; raises LogError where it has no frames."""
+    """Read a BLF file; raises LogError if it has no frames."""
     if file.size < _FILE_HEAD.size:
         raise LogError(expected="a BLF file", got=f"{file.size} bytes", where=file.name)
     return _Blf(file, mmap(file.stream.fileno(), 0, access=ACCESS_READ)).tables()
@@ -244,7 +244,7 @@ _STEP_NS = 10**9
 
 
 def open_asc(file: TableFile) -> Tables:
-    """Read an ASC file; raises LogError where it has no frames."""
+    """Read an ASC file; raises LogError if it has no frames."""
     return _Asc(file).tables()
 
 

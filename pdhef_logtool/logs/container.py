@@ -248,7 +248,7 @@ class Container(ABC):
     form : ``mcap``, ``rosbag1`` or ``sqlite3``.
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
-    remedy : what to do about a file that is none of this format.
+    remedy : remedy for a file of another format.
     zstd_messages : whether each message is a zstd frame. whole_chunks : whether chunks can be copied as they are.
     is_remote : whether each read is a network request. by_index : whether a sound index names all messages.
     """
@@ -299,7 +299,7 @@ class Container(ABC):
 
         Parameters
         ----------
-        span, block : the span, and what :meth:`load` returned, so that the chunk is known to be sound.
+        span, block : the span and the result of :meth:`load`, which shows that the chunk is sound.
         kept : channels that have the same id and definition in the other file.
 
         Returns
@@ -371,13 +371,13 @@ class FileContainer(Container):
     Parameters
     ----------
     path : file to read, or its bytes wherever they lie.
-    shown_path : what to call it in messages (a decompressed copy has another name than its source).
+    shown_path : name of the file in messages (a decompressed copy has another name than its source).
     undeclared : messages by span that are not in its counts, as no record declares their channels.
     meter : resource limits; None: the default.
 
     Raises
     ------
-    LogError : the file is none of this format.
+    LogError : the file has another format.
     """
 
     magic = b""

@@ -159,13 +159,13 @@ def _degrees_of_freedom(report: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _peaks(report: Mapping[str, Any]) -> tuple[Peak, ...]:
-    """Return the largest errors of a report; those of an earlier version are against ground truth."""
+    """Return the largest errors of a report."""
     peaks = []
     for place in report.get("largest_errors") or ():
         stamp = int(place["stamp_ns"])
         names = [s["name"] for s in report["segments"] if s["start_ns"] <= stamp < s["end_ns"]]
         at_s, during = (stamp - int(report["log"]["start_ns"])) * 1e-9, ", ".join(dict.fromkeys(names))
-        peaks.append(Peak(**{"against": TRUTH, **place}, at_s=at_s, during=during))
+        peaks.append(Peak(**place, at_s=at_s, during=during))
     return tuple(peaks)
 
 

@@ -51,7 +51,7 @@ class PlanHead:
 
 
 def plan_head(plan: Mapping[str, Any] | None) -> PlanHead | None:
-    """Return the verdicts of a report.json or run.json, None where it has none (earlier versions)."""
+    """Return the verdicts of a report.json or run.json, None where it has none."""
     if not plan or not plan.get("requirements"):
         return None
     requirements = plan["requirements"]

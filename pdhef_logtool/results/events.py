@@ -35,10 +35,10 @@ _NUMBERS = (*(c for c in TRACK_COLUMNS if c != "stamp_ns" and c not in FLAGS), S
 
 @dataclass(frozen=True, slots=True)
 class FoundEvent:
-    """A condition that held in [start_ns, end_ns); ``*_s``: seconds from the log's start.
+    """An interval [start_ns, end_ns) in which a condition is true; ``*_s``: seconds from the start of the log.
 
-    ``peak``: the largest value in between of the left side of the first comparison, the smallest where it asks for
-    what is below; None without. ``peak_ns``: when.
+    ``peak``: largest value of the left side of the first comparison, or smallest value if the comparison is < or <=;
+    None without a comparison. ``peak_ns``: time of the peak.
     """
 
     drive: str
@@ -52,7 +52,7 @@ class FoundEvent:
 
 @dataclass(frozen=True, slots=True)
 class FoundEvents:
-    """What was found in a run.
+    """The events of a run.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class FoundEvents:
 
     @property
     def exit_code(self) -> int:
-        """3 where something could not be read, 1 where no drive could, else 0."""
+        """3 if a file could not be read, 1 if no drive could be read, otherwise 0."""
         if self.unreadable and not self.searched and self.unreadable == len(self.left_out):
             return EXIT_FAILURE
         return EXIT_PARTIAL if self.failed else EXIT_OK
@@ -109,7 +109,7 @@ def find_events(
 
     Parameters
     ----------
-    estimator : what columns without a prefix are of; None: each drive's selected estimate.
+    estimator : track of columns without a prefix; None: the selected estimate of each drive.
     least_s : minimum duration of an event.
     pad_s : events closer than twice this become one.
 
@@ -167,7 +167,7 @@ def write_events(path: Path, events: FoundEvents) -> None:
 
 
 def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str | None:
-    """Return why a drive cannot be searched, None where it can."""
+    """Return why a drive cannot be searched, otherwise None."""
     frame = log.estimates()
     if frame is None:
         return log.outcome if log.outcome.startswith("failed") else f"it has no {ESTIMATES_FILE}"
@@ -331,7 +331,7 @@ class _Builder:
         return (vx * vx + vy.fill_null(0.0) * vy.fill_null(0.0)).sqrt()
 
     def _error(self, track: str, signal: str) -> pl.Expr:
-        """Return estimate − ground truth where it is scored: both valid, and for sideslip above the lowest speed."""
+        """Return estimate − ground truth at scored stamps: both valid, and for sideslip above the lowest speed."""
         import polars as pl
 
         error = self._read(track, signal) - self._read(TRUTH, signal)

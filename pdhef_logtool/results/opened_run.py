@@ -1,7 +1,6 @@
 """A finished run, read back from the files that it left; every command that reads a run reads it here.
 
-run.json contains its own digest and the sha256 of the files that are read back. What earlier versions wrote has
-neither: its entries and columns are checked instead.
+run.json contains its own digest and the sha256 of the files that are read back; entries and columns are checked.
 """
 
 from __future__ import annotations

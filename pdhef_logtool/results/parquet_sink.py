@@ -22,16 +22,13 @@ from pdhef_logtool.results.sink import TRUTH, Event, Sink, rounded
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
 #: Rows that are gathered of one estimator before a row group is written: 10 h at 100 Hz make 110 row groups an
-#: estimator, and what waits of six estimators stays below 30 MB.
+#: estimator, and the waiting rows of six estimators need less than 30 MB.
 ROWS_A_GROUP = 32768
 
 #: Of zstd, of estimates: less work than the lowest level, and 4 % fewer bytes.
 _LEVEL = 3
 #: Files of figures that are read before a row group of theirs is written.
 _PARTS_AT_ONCE = 256
-#: Columns that files of earlier versions have not.
-_LATER_COLUMNS = ("diverged", *OPTIONAL_COLUMNS)
-_LATER_METRIC_COLUMNS = ("algorithm",)
 _ESTIMATES, _METRICS = "estimates.parquet", "metrics.parquet"
 #: Name of the copy of the selected estimate in estimates.parquet.
 SELECTED = "selected"
@@ -99,7 +96,7 @@ class RowGroups:
         waiting[:] = [joined.slice(whole)]
 
     def finish(self, metadata: Mapping[str, str] | None = None) -> None:
-        """Write what waits and the file's metadata, and give the file its name."""
+        """Write the waiting rows and the metadata, and give the file its name."""
         try:
             for tables in self._waiting.values():
                 self._write(pa.concat_tables(tables))
@@ -114,7 +111,7 @@ class RowGroups:
         self._pending.commit()
 
     def abort(self) -> None:
-        """Remove what was written."""
+        """Remove the unfinished file."""
         with suppress(OSError, ValueError):  # its last words may not fit the disk either, or come after the file's end
             self._writer.close()
         self._drop()
@@ -185,11 +182,11 @@ class EstimatesSink(Sink):
         return np.zeros(len(track), np.bool_) if first is None else track.stamps_ns >= first
 
     def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
-        """Write what waits and give the file its name; the report is not part of this file."""
+        """Write the waiting rows and give the file its name; the report is not part of this file."""
         self._file.finish()
 
     def abort(self) -> None:
-        """Remove what was written."""
+        """Remove the unfinished file."""
         self._file.abort()
 
 
@@ -249,22 +246,20 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
 
 
 def read_blocks(path: Path, estimator: str, columns: Iterable[str]) -> Iterator[StateTrack]:
-    """Yield one track of an estimates.parquet in order of time, a row group at once; none where it is not in the file.
+    """Yield one track of an estimates.parquet in order of time, a row group at once; none if it is not in the file.
 
-    As :func:`read_track` states; a column that an earlier version did not write stays NaN.
+    As :func:`read_track` states.
 
     Raises
     ------
     OutputError : When the file is no estimates.parquet or damaged.
     """
-    with _open(path, _ESTIMATES) as file:
-        later = set(_LATER_COLUMNS) - set(file.schema_arrow.names)
-    for table in _tables(path, estimator, set(columns) - later):
+    for table in _tables(path, estimator, set(columns)):
         yield _track_from_table(estimator, table)
 
 
 def _tables(path: Path, estimator: str, columns: set[str] | None) -> Iterator[pa.Table]:
-    """Yield the row groups of an estimator with the columns asked for, all that there are when None."""
+    """Yield the row groups of an estimator with the given columns; None: all."""
     wanted = [c for c in TRACK_COLUMNS if c == "stamp_ns" or columns is None or c in columns]
     unknown = (columns or set()) - set(TRACK_COLUMNS)
     if unknown:
@@ -272,11 +267,6 @@ def _tables(path: Path, estimator: str, columns: set[str] | None) -> Iterator[pa
             expected=f"columns of {', '.join(TRACK_COLUMNS)}", got=", ".join(sorted(unknown)), where=str(path)
         )
     with _open(path, _ESTIMATES) as file:
-        absent = set(wanted) - set(file.schema_arrow.names)
-        if columns is None:  # a file from before these columns is whole without them
-            wanted = [c for c in wanted if c not in absent]
-        elif absent:
-            raise _without(path, _ESTIMATES, absent)
         for group in range(file.num_row_groups):
             with _reading(path):
                 names = _estimators_of(file, group)
@@ -324,14 +314,15 @@ def _estimators_of(file: pq.ParquetFile, group: int) -> tuple[str, ...]:
 
 
 def _open(path: Path, kind: str) -> pq.ParquetFile:
-    """Open a file that has the columns of its kind, but for those that earlier versions did not write."""
+    """Open a file that has the columns of its kind."""
     with _reading(path):
         file = pq.ParquetFile(path)
         types = {f.name: _class_of(f.type) for f in file.schema_arrow}
     wanted = {f.name: _class_of(f.type) for f in arrow_schema(f"{kind}.json")}
-    if absent := wanted.keys() - types.keys() - {*_LATER_COLUMNS, *_LATER_METRIC_COLUMNS}:
+    if absent := sorted(wanted.keys() - types.keys()):
         file.close()
-        raise _without(path, kind, absent)
+        got = f"a Parquet file without {', '.join(absent)}"
+        raise OutputError(expected=f"the columns of {kind}", got=got, where=str(path), remedy=_AGAIN)
     if other := sorted(name for name in wanted.keys() & types.keys() if types[name] != wanted[name]):
         file.close()
         raise OutputError(
@@ -344,7 +335,7 @@ def _open(path: Path, kind: str) -> pq.ParquetFile:
 
 
 def _class_of(kind: pa.DataType) -> str:
-    """Return what the values of a column are, however many bits they have; texts may be in a dictionary."""
+    """Return the kind of the values of a column, without their size; texts may be in a dictionary."""
     if pa.types.is_dictionary(kind):
         kind = kind.value_type
     if pa.types.is_string(kind) or pa.types.is_large_string(kind):
@@ -354,14 +345,9 @@ def _class_of(kind: pa.DataType) -> str:
     return "numbers" if pa.types.is_floating(kind) else str(kind)
 
 
-def _without(path: Path, kind: str, absent: Iterable[str]) -> OutputError:
-    got = f"a Parquet file without {', '.join(sorted(absent))}"
-    return OutputError(expected=f"the columns of {kind}", got=got, where=str(path), remedy=_AGAIN)
-
-
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Turn what Arrow states of a damaged file into an OutputError."""
+    """Turn the errors of Arrow into an OutputError."""
     try:
         yield
     except (OSError, ValueError, LookupError, pa.ArrowException) as error:
@@ -370,7 +356,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def check_parquet(path: Path, kind: str) -> None:
-    """Read all of a file and raise OutputError where it is damaged or has not the columns of ``kind``.
+    """Read all of a file and raise OutputError if it is damaged or lacks columns of ``kind``.
 
     ``kind`` : ``estimates.parquet`` or ``metrics.parquet``.
     """

@@ -1,4 +1,4 @@
-"""What the page of a drive shows and no table contains, gathered while the drive's tracks are still at hand."""
+"""Contents of the page of a drive that no table contains; they need the tracks of the drive."""
 
 from __future__ import annotations
 

@@ -197,18 +197,12 @@ def test_weights_and_reasons_come_back_where_there_are_some(tmp_path, circle):
     assert rows["mixture_weight"].null_count() == rows["reason"].null_count() == 600
 
 
-def test_a_file_from_before_the_later_columns_is_read(tmp_path, circle):
+def test_a_file_without_a_column_is_one_line(tmp_path, circle):
     path = tmp_path / "estimates.parquet"
     write(path, circle)
-    old = tmp_path / "old.parquet"
-    pl.read_parquet(path).drop("mixture_weight", "reason", "diverged").write_parquet(old)
-    track = read_track(old, "phy-ukf")
-    assert_array_equal(track.sideslip_rad, as_written(circle("phy-ukf", 0, 600).sideslip_rad, "sideslip_rad"))
-    assert len(track.reason) == len(track.mixture_weight) == 0
-    assert circle("phy-ukf", 0, 600).diverged.any()
-    assert not track.diverged.any()
-    with pytest.raises(OutputError, match="reason"):
-        read_track(old, "phy-ukf", ["reason"])
+    pl.read_parquet(path).drop("mixture_weight", "reason").write_parquet(path)
+    with pytest.raises(OutputError, match="a Parquet file without mixture_weight, reason; run the log again"):
+        read_track(path, "phy-ukf", ["sideslip_rad"])
 
 
 def test_only_the_row_groups_of_the_estimator_are_read(tmp_path, circle, monkeypatch):
@@ -332,11 +326,9 @@ def test_polars_reads_the_metrics(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.parquet"]
 
 
-def test_metrics_of_an_older_version_name_no_algorithm(tmp_path):
+def test_metrics_without_a_column_are_one_line(tmp_path):
     path = tmp_path / "metrics.parquet"
     write_metrics(path, ROWS)
-    pl.read_parquet(path).drop("algorithm").write_parquet(path)
-    assert [r.algorithm for r in read_metrics(path)] == ["", ""]
     pl.read_parquet(path).drop("unit").write_parquet(path)
     with pytest.raises(OutputError, match="without unit"):
         read_metrics(path)
