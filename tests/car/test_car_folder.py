@@ -373,10 +373,7 @@ def test_trust_changes_no_physics_so_that_intervals_stay_those_of_the_car(folder
     assert after.intervals is not None and after.intervals.physics_sha256 == after.physics_sha256
     assert after.notes == ()
     edit(folder, "mass_kg = 1440.0 ", "mass_kg = 1450.0 ")
-    assert (
-        "intervals.json was made with other physics"
-        in Car.load(folder).notes
-    )
+    assert "intervals.json was made with other physics" in Car.load(folder).notes
     assert not any("intervals" in note for note in load(folder).notes)  # they are not in force
 
 
@@ -639,9 +636,7 @@ def test_noise_of_physics_belongs_to_the_values_that_were_found_through_it(folde
     write_part(folder / NOISE_FILE, Noise(filter={OURS: tuned.model_copy(update={"physics_sha256": "ab" * 32})}))
     car = load(folder)
     assert car.noise[OURS] == found.noise
-    assert car.notes == (
-        "noise of physics is not used: it belongs to other physics",
-    )
+    assert car.notes == ("noise of physics is not used: it belongs to other physics",)
 
 
 def test_the_folder_of_a_cars_drives_is_short_and_portable() -> None:
