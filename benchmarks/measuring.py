@@ -1,4 +1,4 @@
-"""How the benchmarks measure: processor seconds, the best of several rounds, peak memory of a process of its own.
+"""How the benchmarks measure: processor seconds, the best of several rounds, peak memory of a separate process.
 
 Processor seconds (user + system) of a single-threaded way and the best of interleaved rounds make a ratio stand still
 on a machine that others use too.
@@ -31,11 +31,11 @@ class Row:
 
     Attributes
     ----------
-    work : what was measured, in words.
+    work : the measured work, in words.
     value, unit : the figure.
-    target : what it must not exceed (``at most``) or fall below (``at least``); None without a target.
+    target : upper (``at most``) or lower (``at least``) limit; None without a target.
     peers : how many times as much as ours each peer takes, measured in the same run.
-    command : what a user types for this work, where there is such a command.
+    command : command line for this work, empty without.
     """
 
     work: str
@@ -124,7 +124,7 @@ def gauge_seconds() -> float:
 
 
 def machine_facts() -> dict[str, str]:
-    """Return what a figure depends on, without names of hosts or folders."""
+    """Return the machine and the versions that a figure depends on, without names of hosts or folders."""
     packages = ("numpy", "mcap", "rosbags", "zstandard", "numba", "filterpy")
     return {
         "gauge": f"{gauge_seconds():.3f} s",

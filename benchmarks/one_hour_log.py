@@ -39,7 +39,7 @@ RAW_BYTES_PER_S = 124_650
 _WINDOW_S = 60
 _IMAGE = "sensor_msgs/msg/Image"
 
-#: What a mapped run reads: eleven fields of all five topics.
+#: Fields of a mapped run: eleven of all five topics.
 MAPPED = {
     "/imu": ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z"),
     "/odometry": ("twist.twist.linear.x", "twist.twist.linear.y"),
@@ -65,7 +65,7 @@ def image_log() -> Path:
 
 
 def shared_log() -> Path:
-    """Return a minute with images whose chunks contain images and all other topics."""
+    """Return a minute with images; its chunks contain images and all other topics."""
     path = CACHE / "shared_chunks.mcap"
     if path.exists():
         return path

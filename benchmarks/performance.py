@@ -4,7 +4,7 @@
     python -m benchmarks.performance --against TREE
 
 A benchmark is a module of this package: its docstring heads its section of the page, ``rows()`` measures. With
-``--gate`` it ends with 4 if a target is missed. ``--against`` compares with another source tree, for example that of
+``--gate`` it ends with 4 if a target is missed. ``--against`` compares with another source tree, for example of
 the last release (``git worktree add``): commands of both run in turns (:mod:`benchmarks.against`).
 """
 
@@ -70,9 +70,9 @@ def page(old: str, measured: dict[str, str]) -> str:
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the benchmarks of the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.performance", description="Speed against peers.")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; all when none is given")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; default: all")
     parser.add_argument("--write-docs", action="store_true", help="write the sections into docs/performance.md")
     parser.add_argument("--against", type=Path, metavar="TREE", help="source tree of another version to compare with")
     parser.add_argument("--gate", action="store_true", help="end with 4 if a target is missed")

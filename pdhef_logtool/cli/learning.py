@@ -37,7 +37,7 @@ def learn(
     *,
     logs: options.TruthLogs,
     output: Annotated[
-        Path, Option("--output", "-o", metavar="CAR", help="Folder of the car to write; may be that of --car.")
+        Path, Option("--output", "-o", metavar="CAR", help="Folder of the car to write; may equal --car.")
     ],
     config: RunConfig,
     stages: Annotated[str, Option(help="Stage: teach, calibrate or gain.")] = "teach",
@@ -104,7 +104,7 @@ def extract(
         ),
     ] = None,
     jobs: options.Jobs = 1,
-    resume: Annotated[bool, Option("--resume", help="Keep drives whose log and settings have not changed.")] = False,
+    resume: Annotated[bool, Option("--resume", help="Keep drives with unchanged log and settings.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Write the residual dataset for train: the accelerations that the physics do not explain."""
@@ -142,7 +142,7 @@ def train(
     baselines: Annotated[bool, Option("--baselines", help="Train pure-lstm and linear-regression instead.")] = False,
     paper: Annotated[bool, Option("--paper", help="Use the hyperparameters of Table 1 of the paper.")] = False,
     seed: Annotated[int, Option(help="Seed of initial weights, sample order and dropout.")] = 0,
-    epochs: Annotated[int | None, Option(help="Number of epochs. Default: that of the hyperparameters.")] = None,
+    epochs: Annotated[int | None, Option(help="Number of epochs. Default: from the hyperparameters.")] = None,
     device: Annotated[str, Option(help="PyTorch device: cpu or cuda.")] = "cpu",
     as_json: options.JsonFlag = False,
 ) -> None:

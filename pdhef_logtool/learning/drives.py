@@ -33,7 +33,7 @@ from pdhef_logtool.runs.config import RunConfig
 TEACH, CALIBRATE, GAIN = STAGES = ("teach", "calibrate", "gain")
 #: Splits of a simulated set that results are reported on, and those that a network is trained on and chosen by.
 HELD_OUT, SEEN = ("test", "extrapolation"), ("train", "validation")
-#: Entries of the configuration that decide what is learned.
+#: Entries of the configuration that affect the result of learning.
 _SETTINGS = (
     "car", "mapping", "network", "start", "end", "sensors", "friction", "prefer_truth", "reference", "gnss",
 )  # fmt: skip
@@ -74,7 +74,7 @@ class LearnSettings:
 
 
 def config_document(config: RunConfig) -> dict[str, Any]:
-    """Return the entries of a configuration that decide what is learned, as JSON-able values; files by name only."""
+    """Return the entries of a configuration that affect learning, as JSON-able values; files by name only."""
     document = config.to_dict()
     return {k: document[k] for k in _SETTINGS}
 
@@ -152,7 +152,7 @@ def set_manifest(folder: Path | None) -> Mapping[str, Mapping[str, Any]]:
         return {}
     documents: list[Any] = []
     for name, parse in (("manifest.json", json.loads), ("manifest.toml", tomllib.loads)):
-        with suppress(OSError, ValueError, RecursionError):  # there is none, or it is somebody else's
+        with suppress(OSError, ValueError, RecursionError):  # no manifest, or a file of another program
             documents.append(parse((folder / name).read_text(encoding="utf-8")))
     entries = [e for d in documents if isinstance(d, dict) for key in ("drives", "log") for e in _entries(d.get(key))]
     return {e["file"]: e for e in entries if isinstance(e.get("file"), str)}
@@ -170,7 +170,7 @@ class DriveRecord:
     ----------
     seconds : from first to last stamp. span_s : these two, in seconds from the log's start.
     truth : sources of the ground truth. friction_from : in the words of the report. notes : of the reading.
-    counts : what a command counts of it, by name.
+    counts : counts of the command, by name.
     """
 
     name: str
@@ -194,7 +194,7 @@ class DriveRecord:
 
     @property
     def lost(self) -> tuple[str, ...]:
-        """What of the input is gone, in words."""
+        """Losses of the input, in words."""
         return lost_texts(self.losses)
 
     def to_dict(self) -> dict[str, Any]:

@@ -113,5 +113,5 @@ def _open(settings: LearnSettings, warn: Tell) -> Car:
         return open_car(config, warn)
     car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
     if config.car is None:
-        warn(f"no --car: mass, geometry and priors are those of the default {car.datasheet.name}")
+        warn(f"no --car: mass, geometry and priors come from the default {car.datasheet.name}")
     return car

@@ -1,1 +1,1 @@
-"""What made the frozen constants and the shipped car."""
+"""Generators of the shipped car and of the sample vehicle files."""

@@ -8,10 +8,10 @@ is minimal where a share q of the errors lies inside; taken on the logarithm it 
 manoeuvre. Bins of grip use weigh alike, so do drives in a bin, and drives with the vehicle file as given and the same
 ones with it made wrong: the sensors often do not show which it is, so that one interval has to apply to both.
 
-Errors of one drive are alike, so that the drives are the unit: what a fit is worth is found on drives that it has not
-seen (five folds of drives), and last factors make a share of *those* errors lie inside, each where a part of the grip
-is used: a drive that is lost near the limit states nothing of a straight road. That share is q (n + 1) / n of n drives,
-as in conformal prediction: the next drive is one more that may be the worst.
+Errors of one drive are alike, so that the drives are the unit. Five folds of drives validate a fit on drives that it
+does not contain; factors then make a share of *those* errors lie inside, each for a range of grip use: a drive that is
+lost near the limit does not widen the intervals on a straight road. That share is q (n + 1) / n of n drives, as in
+conformal prediction: the next drive is one more that may be the worst.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ COVERED = 0.95
 #: Bins of true abs a_y over μ g (docs/method.md#evaluation), by name: lower and upper limit.
 BINS: dict[str, tuple[float, float]] = {"low": (0.0, 0.3), "middle": (0.3, 0.6), "high": (0.6, np.inf)}
 FOLDS = 5
-#: A fit on fewer drives states nothing of a further one.
+#: A fit on fewer drives does not generalise to a further drive.
 MIN_DRIVES = 5
 #: Samples from which on a drive counts in full: a second of them.
 FULL_SAMPLES = 20
 #: Errors are not distinguished below this: 6e-5 degrees.
 LEAST_ERROR = 1e-6
-#: Coefficients below count for nothing.
+#: Smaller coefficients are set to 0.
 LEAST_COEFFICIENT = 1e-3
 #: Natural logarithm of the coefficients: range of the search, and its starts.
 LOG_RANGE = (-9.0, 5.0)
@@ -47,10 +47,10 @@ LOG_STARTS = (-0.5, -2.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Errors of one estimator and what was known when it was made; all [n] but the terms [n, m].
+    """Errors of one estimator and the inputs of its interval; all [n] but the terms [n, m].
 
-    ``vy_per_sideslip`` is the estimator's 1-sigma of v_y over its 1-sigma of the sideslip: what a calibrated one
-    is multiplied by. ``bin``: number of the bin of grip use, −1 for none. ``drive``: number of the drive, the same for
+    ``vy_per_sideslip`` is the estimator's 1-sigma of v_y over its 1-sigma of the sideslip, the factor of a
+    calibrated one. ``bin``: number of the bin of grip use, −1 for none. ``drive``: number of the drive, the same for
     both runs of a drive. ``wrong``: the vehicle file was made wrong.
     """
 
@@ -83,7 +83,7 @@ def join_samples(parts: Sequence[Samples]) -> Samples:
 class Coverage:
     """How the 95 % intervals of sideslip are in one bin, before and after; after is of drives not fitted to.
 
-    ``width_*``: mean width over 3.92 times the RMSE; 1 for normal errors whose size is known.
+    ``width_*``: mean width over 3.92 times the RMSE; 1 for normal errors of known size.
     """
 
     bin: str
@@ -138,7 +138,7 @@ def fit_inflation(samples: Samples) -> Fitted:
 def _fit(
     samples: Samples, terms: FloatArray, error: FloatArray, weight: FloatArray
 ) -> tuple[tuple[float, ...], FloatArray]:
-    """Return coefficients, and the 1-sigma [n] that those of the other folds give each drive."""
+    """Return coefficients, and the 1-sigma [n] of each drive by the coefficients of the other folds."""
     unseen = np.empty(len(samples))
     for seen, held in folds(samples.drive):
         unseen[held] = combined(terms[held], fit_coefficients(terms[seen], error[seen], weight[seen]))
@@ -154,7 +154,7 @@ def _factor(samples: Samples, error: FloatArray, std: FloatArray, weight: FloatA
 def grip_factors(
     samples: Samples, share: FloatArray, std: FloatArray, weight: FloatArray
 ) -> tuple[float, float, float]:
-    """Return the factors on ``std`` [n] by the share of the grip [n]; few drives have that of less grip, or more."""
+    """Return the factors on ``std`` [n] by grip use [n]; a bin with few drives takes the previous factor."""
     whole = _factor(samples, samples.sideslip_error, std, weight, np.ones(len(samples), dtype=np.bool_))
     factors: list[float] = []
     for low, high in BINS.values():
@@ -169,7 +169,7 @@ def grip_factors(
 def share_for(covered: float, drives: int) -> float:
     """Return the share of known drives that must lie inside for ``covered`` of the next one, q (n + 1) / n.
 
-    No more than half of what q leaves out is added: few drives state little of such far quantiles.
+    At most half of 1 − q is added: few drives do not determine such extreme quantiles.
     """
     return min(covered * (drives + 1) / drives, 0.5 * (1.0 + covered))
 
@@ -261,7 +261,7 @@ def coverage_rows(samples: Samples, std: FloatArray) -> Iterator[Coverage]:
 
 
 def bin_numbers(grip_share: FloatArray) -> IntArray:
-    """Return the number of the bin [n] of a grip use [n]; −1 where it is not known."""
+    """Return the number of the bin [n] of a grip use [n]; −1 for an unknown grip use."""
     number = np.full(grip_share.shape[0], -1, dtype=np.int64)
     for i, (low, high) in enumerate(BINS.values()):
         number[(grip_share >= low) & (grip_share < high)] = i

@@ -51,7 +51,7 @@ _Ran = list[tuple[str, Algorithm, Samples]]
 def fit_intervals(task: Task, spread: float) -> Change:
     """Return the intervals of every algorithm that has enough drives.
 
-    ``spread`` is that of the random errors of friction and vehicle in further runs of each drive.
+    ``spread`` : 1-sigma of the random errors of friction and vehicle in further runs of each drive.
     """
     numbers = itertools.count()
     records, ran = task.read(lambda log: _run_drive(log, next(numbers), task, spread))

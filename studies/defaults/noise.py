@@ -33,13 +33,13 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
-#: Filters whose noise is searched; that of ``physics`` is identified together with its values.
+#: Filters with a searched noise; the noise of ``physics`` is identified together with its values.
 TUNED = ("phy-ukf:tuned",)
 #: Added to each drive's RMSE as squares.
 FLOOR_RAD = math.radians(0.05)
 #: Drives with fewer scored stamps are left out.
 MIN_SCORED_STAMPS = 100
-#: If an estimate is missing at more of the scored stamps, its error is at least that of sideslip 0 on that drive.
+#: If an estimate is missing at more of the scored stamps, its error is at least the error of sideslip 0.
 MIN_AVAILABILITY = 0.9
 #: Share of the trials that explore the whole space.
 EXPLORING_SHARE = 0.5
@@ -66,7 +66,7 @@ class Trial:
 
 
 def tune(task: Task, trials: int) -> Change:
-    """Return the noise of the tuned filters by the best of so many trials each.
+    """Return the noise of the tuned filters: the best of ``trials`` each.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def filter_noise(values: Point) -> FilterNoise:
 def error_rad(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -> float:
     """Return the sideslip RMSE of a drive as ``pdhef run`` scores it.
 
-    It is at least that of sideslip 0 if too much of the estimate is missing.
+    It is at least the RMSE of sideslip 0 if too much of the estimate is missing.
     """
     error = signal_error(estimate, truth, "sideslip_rad", low_speed_m_s)
     error = error[np.isfinite(error)]

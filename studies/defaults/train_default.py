@@ -1,13 +1,13 @@
-"""Make the car that the package ships from nothing: simulate, fit, extract, train, tune, evaluate, calibrate.
+"""Regenerate the shipped car: simulate, fit, extract, train, tune, evaluate, calibrate.
 
     python -m studies.defaults.train_default [--seed 0] [-o FOLDER] [--work out/train-default] [--steps STEP ...]
 
-Short drives of one simulated car whose vehicle file is right, with the true friction. ``physics`` is fitted on five
+Short drives of one simulated car with its correct vehicle file and the true friction. ``physics`` is fitted on five
 minutes of other drives (:mod:`studies.defaults.fit_physics`), its noise with it; the residual network learns what it
 lacks. The direct network, the regression and the paper's network see the same drives, with the nominal model. Filter
-noise of all tuned estimators is chosen on validation drives in one search (stage noise). Seeds other than 0 train
-networks for spreads and take fit and noise of the shipped car. A second set, of other cars of the same kind, is for the
-model card. Logs that are there already as they should be are kept.
+noise of all tuned estimators is chosen on validation drives in one search. Seeds other than 0 train
+networks for spreads and take fit and noise of the shipped car. A second set has other cars of the same kind. Existing
+logs with unchanged settings are kept.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ from studies.defaults.noise import tune
 from studies.pages import SAMPLE_VEHICLE, options
 
 HOME = SHIPPED_CARS["saloon"]
-#: Seeds and vehicles of the sets: apart from those of the condition table, the paper's scenarios and the tests.
+#: Seeds and vehicles of the sets. The condition table, the paper and the tests use other seeds.
 SETS = {"one_car": (1000, "default"), "other_cars": (2000, "randomised"), "evidence": (3000, "default")}
 DRIVES = 800
-#: Of the sets that nothing is trained on: for the card, and for the evidence that the network helps.
+#: Sets without training: drives of other cars, and the evidence that the network helps.
 OTHER_DRIVES = {"other_cars": 200, "evidence": 200}
 EPOCHS, BASELINE_EPOCHS = 66, 40
 PAPER_EPOCHS = 15
@@ -88,7 +88,7 @@ class Training:
 
     @property
     def is_shipped(self) -> bool:
-        """Whether the car is that of the package."""
+        """Whether the output is the car of the package."""
         return self.car.resolve() == HOME.resolve()
 
     @property
@@ -131,7 +131,7 @@ def simulate(t: Training) -> None:
 
 
 def fit(t: Training) -> None:
-    """Fit ``physics``, whose residual the network learns."""
+    """Fit ``physics``; the network learns its residual."""
     fit_physics.main(["-o", str(t.car), "--work", str(t.work / "fit"), "--jobs", str(t.jobs)])
 
 
@@ -148,7 +148,7 @@ def train(t: Training) -> None:
     beside = _start("train", t.work / NOMINAL_MODEL, "-o", t.network, *how)
     if t.jobs == 1:
         _finish(beside)
-    torch.set_num_threads(1)  # small networks: a second thread brings nothing, a second process does
+    torch.set_num_threads(1)  # small networks: a second process is faster than a second thread
     recipe = Recipe(seed=t.seed, epochs=t.epochs)
 
     def epoch(text: str, _share: float) -> None:

@@ -106,7 +106,7 @@ def find_gain(task: Task) -> StageOutput:
 def errors_by_trust(car: Car, drive: WholeDrive, *, use_speed: bool) -> BlockErrors:
     """Return the sideslip errors of ``pd-hef`` on a drive with ground truth at every residual gain, in blocks.
 
-    The true v_x times the gyro's yaw rate is the lateral acceleration that decides what counts as excited: no
+    The true v_x times the gyro's yaw rate is the lateral acceleration that defines excited driving: no
     bank, bias or vibration is in it.
     """
     signals, truth = drive.signals, drive.truth

@@ -1,4 +1,4 @@
-"""Stage ``teach``: what drives with ground truth teach about a car (``taught.json``).
+"""Stage ``teach``: prior and residual of a car from drives with ground truth (``taught.json``).
 
 All driving with ground truth counts, at any speed above the car's low-speed limit. First the prior of the calibration
 of every later drive is fitted; then the drives calibrate the car as later drives will, without ground truth, and the
@@ -57,9 +57,9 @@ LEAST_S, ENOUGH_S = 20.0, 150.0
 SETTLE_NS = 3_000_000_000
 #: Shortest half of a drive that teaches the other one in a test, and length of the blocks of a test.
 LEAST_HALF_S, TEST_BLOCK_S = 8.0, 5.0
-#: The prior is tested with each drive left out, on at most so many drives.
+#: The prior is tested with each drive left out, on at most this number of drives.
 MOST_LEFT_OUT = 8
-#: Lateral acceleration below which driving teaches nothing of the tyres, and that near the limit, m/s².
+#: Lateral acceleration below which driving does not teach the tyres, and lateral acceleration near the limit, m/s².
 BENDS_M_S2, LIMIT_M_S2 = 2.0, 5.0
 
 
@@ -95,7 +95,7 @@ class TestedPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Teaching:
-    """What drives taught: priors with their parameters, residual, whether they calibrated their car, what next."""
+    """Result of teaching: priors, parameters, residual, whether the drives calibrated their car, next drives."""
 
     priors: tuple[TestedPrior, ...]
     parameters: tuple[TaughtParameter, ...]
@@ -158,7 +158,7 @@ def teach(task: Task) -> StageOutput:
 
 
 def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDrive | None]:
-    """Return the record of an open drive and what teaching takes of it; None with the reason in the record."""
+    """Return the record of an open drive and its content for teaching; None with the reason in the record."""
     missing = sorted({*lacking(drive), *(FEATURES - drive.available)})
     truth_at, lacks = (None, f"the log has no {', '.join(missing)}") if missing else teaching_reference(drive, config)
     if lacks:
@@ -175,7 +175,7 @@ def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDriv
 
 
 def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = lambda _text, _share: None) -> Teaching:
-    """Return what drives of one car teach, which were read with its vehicle file."""
+    """Return prior and residual from drives of one car, read with its vehicle file."""
     progress("fitting the prior", 0.3)
     groups = like_drives([level_of([d.taught.driving]) for d in drives])
     priors = tuple(_prior_of([drives[k] for k in group], progress) for group in groups)
@@ -186,7 +186,7 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
     seconds = {False: 0.0, True: 0.0}
     for drive, calibration in zip(drives, calibrations, strict=True):
         seconds[not calibration.refused] += drive.taught.driving.seconds
-    calibrated = seconds[True] >= seconds[False]  # a residual of one kind of physics is none of the other
+    calibrated = seconds[True] >= seconds[False]  # calibrated and uncalibrated physics differ
     fitted = [lack for lack, c in zip(lacks, calibrations, strict=True) if calibrated is not bool(c.refused)]
     ladder = fit_ladder(fitted, seed=seed)
     lines = []
@@ -205,7 +205,7 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
 
 
 def _prior_of(drives: Sequence[OpenedDrive], progress: Any) -> TestedPrior:
-    """Return the prior of like drives with its test; without parameters where nothing supports it."""
+    """Return the prior of like drives with its test; without parameters if the test does not support it."""
     test, taught = _prior_test(drives, progress), [d.taught for d in drives]
     support, level = _support(test), float(f"{level_of([d.driving for d in taught]):.4g}")
     parameters = taught_parameters(taught, drives[0].drive.car.vehicle, support) if support > 0.0 else ()
@@ -310,7 +310,7 @@ def _more(drives: Sequence[OpenedDrive], ladder: LadderFit) -> tuple[str, ...]:
     ay = ay[np.isfinite(ay)]
     if ladder.seconds < ENOUGH_S:
         texts.append(
-            f"{ladder.seconds:.0f} s of driving were used; up to {ENOUGH_S:g} s of driving like that of later drives "
+            f"{ladder.seconds:.0f} s of driving were used; up to {ENOUGH_S:g} s of driving like later drives "
             "lower the error further"
         )
     left, right = np.mean(ay > BENDS_M_S2), np.mean(ay < -BENDS_M_S2)
