@@ -12,6 +12,7 @@ setup(
             "models/*/*/*",
             "models/*/*/*/*",
             "models/*/*/*/*/*",
+            "car/*.toml",
             "mapping/*.toml",
             "reports/assets/*",
             "reports/templates/*",
