@@ -2,8 +2,8 @@
 
 An unscented filter on the model of :mod:`~.physics_model` (docs/method.md#filter). As the axles' forces and the roll
 are states, the sensors' readings are linear in the state except for a lever arm's r²: the update uses the Jacobian,
-which equals the result of the sigma points for a linear function. Points that differ in the sensors' biases alone move with
-their centre.
+which equals the result of the sigma points for a linear function. Points that differ in the sensors' biases alone move
+with their centre.
 
 A residual rate of v̇_y and ṙ enters as in ``phy-ukf``: half before and half after the model's step, and in the
 predicted a_y, times the force scale where that is a state. Zeros change no bit.
@@ -256,7 +256,7 @@ def _predict(x, P, over, rate, dt, noise, layout, p, f, points, size):  # type: 
 # positional: as _predict.
 @_inlined
 def _measure(x, P, steer, rate_vy, layout, p, f, row, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
-    """Write the expected readings of the sensors [3], its covariance without R [3, 3] and the cross covariance [3, PLACES].
+    """Write the expected readings [3], their covariance without R [3, 3] and the cross covariance [3, PLACES].
 
     ``rate_vy`` is the residual of v̇_y, which the accelerometer feels as it does the tyres' forces.
     """
