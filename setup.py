@@ -12,6 +12,7 @@ setup(
             "models/*/*/*",
             "models/*/*/*/*",
             "models/*/*/*/*/*",
+            "car/*.toml",
             "logs/*.toml",
             "mapping/*.toml",
             "reports/assets/*",

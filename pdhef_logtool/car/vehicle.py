@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -340,26 +343,11 @@ def corrected_anew(signals: Signals, was: VehicleParameters, vehicle: VehiclePar
     return correct_signals(raw, vehicle)
 
 
-#: Table 3 of the paper, with axle tyres fitted at friction 0.85. Used when no vehicle file is given.
 DEFAULT_VEHICLE_NAME = "sedan"
 
 
+@cache
 def default_vehicle() -> VehicleParameters:
-    """Return the paper's sedan (Table 3) with nominal tyres at friction 0.85."""
-    return VehicleParameters(
-        name=DEFAULT_VEHICLE_NAME,
-        mass_kg=1440.0,
-        yaw_inertia_kg_m2=1523.0,
-        cg_to_front_axle_m=1.16,
-        cg_to_rear_axle_m=1.71,
-        track_m=1.57,
-        cg_height_m=0.64,
-        wheel_radius_m=0.30,
-        steering_ratio=16.0,
-        roll_gradient_rad_per_m_s2=0.0105,
-        friction=0.85,
-        tyres=Tyres(
-            front=AxleTyre(B=12.3, C=1.41, D_n=7600.0, E=0.30),
-            rear=AxleTyre(B=15.4, C=1.17, D_n=6110.0, E=0.20),
-        ),
-    )
+    """Return the paper's sedan (Table 3) with nominal tyres at friction 0.85, used when no vehicle file is given."""
+    text = Path(__file__).with_name(f"{DEFAULT_VEHICLE_NAME}.toml").read_text(encoding="utf-8")
+    return VehicleParameters.model_validate(tomllib.loads(text))

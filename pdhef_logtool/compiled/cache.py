@@ -40,7 +40,7 @@ COMPILING_S = 40
 def _without_blas() -> None:
     """Let numba load without SciPy's BLAS, which takes longer than a short log: no function here needs it.
 
-    What needs LAPACK, such as the repair of a covariance, loads that when it is called.
+    Functions that need LAPACK, such as the repair of a covariance, load it when they are called.
     """
 
     def none() -> None:
@@ -68,7 +68,7 @@ def _raise_that_sizes_differ(_given: Any, _expected: Any) -> Any:
 
 
 _without_blas()
-# Numba's own writes both shapes into the message, and compiles its text functions for that: a sixth of all compiling.
+# Numba's function writes both shapes into the message: compiling its text functions takes a sixth of all compiling.
 arrayobj.raise_with_shape_context = _sizes_differ
 
 
@@ -105,7 +105,7 @@ def _installed() -> Path:
 
 def _places() -> Iterator[Path]:
     """Yield the places of this installation, in the order in which they are taken."""
-    # Several installations may share all places but their own.
+    # Several installations may share the other places.
     name = f"pdhef_logtool_{hashlib.sha256(os.fsencode(sources.ROOT)).hexdigest()[:16]}"
     if config.CACHE_DIR:
         yield Path(config.CACHE_DIR) / name
@@ -139,9 +139,9 @@ def _remove_stale(place: Path) -> None:
 
 
 def _private_folder() -> Path | None:
-    """Return a temporary folder that this user alone can write, for what lies in it is executed; None if there is none.
+    """Return a temporary folder that only this user can write, because its code is executed; None if that fails.
 
-    It has the same name in every process of the user: workers and later runs find what is there.
+    It has the same name in every process of the user, so that workers and later runs find it.
     """
     if not hasattr(os, "getuid"):  # such systems have a temporary folder a user
         return Path(tempfile.gettempdir()) / "pdhef-compiled"

@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property, lru_cache
 from itertools import combinations
 
 import numpy as np
 
-from pdhef_logtool.mapping.naming import G_M_S2
+from pdhef_logtool.mapping.naming import CACHED_NAMES, G_M_S2
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
 DEGREE = float(np.pi / 180.0)
@@ -136,7 +136,7 @@ class Relation:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Hypothesis:
     """A mistake of a mapping: ``factors`` by signal undo it, NaN: nothing does. ``kind``: a key of :data:`PRIORS`."""
 
@@ -149,7 +149,7 @@ class Hypothesis:
         """Whether the factors are those of units and signs, not a typical steering ratio or wheel radius."""
         return not any(abs(f) in _TYPICAL or math.isnan(f) for f in self.factors.values())
 
-    @property
+    @cached_property
     def energy(self) -> float:
         """The negative logarithm of its prior odds."""
         if self.kind.startswith("open"):
@@ -229,9 +229,10 @@ def _compatible(mistakes: Sequence[Hypothesis]) -> BoolArray:
     return np.asarray(np.outer(common, common) & ~(about @ about.T))
 
 
+@lru_cache
 def known_hypotheses(
-    names: Sequence[str], together: Sequence[tuple[str, ...]] = (), open_signs: Sequence[tuple[str, ...]] = ()
-) -> list[Hypothesis]:
+    names: tuple[str, ...], together: tuple[tuple[str, ...], ...] = (), open_signs: tuple[tuple[str, ...], ...] = ()
+) -> tuple[Hypothesis, ...]:
     """List the mistakes that mappings make with these signals.
 
     Parameters
@@ -249,7 +250,7 @@ def known_hypotheses(
     for part in dict.fromkeys([*open_signs, *([every] if every else [])]):
         out.append(Hypothesis(dict.fromkeys(part, -1.0), f"{_together(part)} count to the right", "open sign"))
     wheels = [(*g,) for g in groups if g and all(n.startswith("wheel_speed") for n in g)]
-    return out + [Hypothesis(dict.fromkeys(part, math.nan), _together(part), "field") for part in (*alone, *wheels)]
+    return (*out, *(Hypothesis(dict.fromkeys(part, math.nan), _together(part), "field") for part in (*alone, *wheels)))
 
 
 def _of_part(part: tuple[str, ...]) -> Iterator[Hypothesis]:
@@ -318,6 +319,7 @@ def _of_scales(mistake: Hypothesis, scales: Mapping[str, object]) -> float:
     return sum(energies) / max(len(energies), 1)
 
 
+@lru_cache(maxsize=CACHED_NAMES)
 def is_odd(name: str, scale: float) -> bool:
     """Return whether no unit of a signal has this scale."""
     return not any(abs(abs(scale) - unit) < 0.01 * unit for unit in _unit_scales(name))

@@ -76,8 +76,10 @@ class Measured:
 
     def posterior(self, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> Posterior:
         """Return the probabilities of the mistakes that mappings make with these signals."""
-        groups = self.groups(mounting_is_known=mounting_is_known)
-        return posterior(self.relations, known_hypotheses(list(self.columns), groups, open_signs), self.scales)
+        groups = tuple(self.groups(mounting_is_known=mounting_is_known))
+        return posterior(
+            self.relations, known_hypotheses((*self.columns,), groups, tuple(map(tuple, open_signs))), self.scales
+        )
 
     def agrees(self, name: str, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> bool:
         """Return whether a signal is wrong by these relations too, if one of them counts."""

@@ -19,7 +19,8 @@ from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.steps import StepColumns
 
-#: A window is checked at two stamps: one anywhere, one among its first samples, which costs little.
+#: A full check masks samples behind two stamps, one anywhere and one among the first samples; a short one behind the
+#: latter alone.
 SHORT_CUT = 256
 #: Largest relative change of a step that counts as rounding: matrix products, which networks compute in single
 #: precision, may depend on the window's length.
@@ -28,8 +29,12 @@ RELATIVE_TOLERANCE = 4.0 * float(np.finfo(np.float32).eps)
 
 @dataclass(slots=True)
 class CausalityCheck:
-    """The check over one drive; ``failed`` has the reason by estimator, also of those that failed otherwise."""
+    """The check over one drive; ``failed`` has the reason by estimator, also of those that failed otherwise.
 
+    A check that is not ``full`` costs little: the first drive of a run has the full one.
+    """
+
+    full: bool = True
     failed: dict[str, str] = field(default_factory=dict)
     _windows: dict[str, int] = field(default_factory=dict)
 
@@ -37,7 +42,7 @@ class CausalityCheck:
         """Return a copy of the state to check the next window from; None where that window is not checked."""
         number = self._windows[estimator.name] = self._windows.get(estimator.name, 0) + 1
         # Windows 1, 4, 16, 64, ...: look-ahead that the first does not show has more chances, at a falling cost.
-        is_checked = number & (number - 1) == 0 and number.bit_length() % 2 == 1
+        is_checked = number & (number - 1) == 0 and number.bit_length() % 2 == 1 if self.full else number == 1
         if not estimator.causal or not is_checked or estimator.name in self.failed:
             return None
         return (deepcopy(state),)
@@ -46,7 +51,7 @@ class CausalityCheck:
         """Compare the ``steps`` of a window with those of the same window cut short; ``before`` as returned above."""
         if before is None or len(signals) < 2:
             return
-        for count in _cuts(len(signals), self._windows[estimator.name]):
+        for count in _cuts(len(signals), self._windows[estimator.name], self.full):
             again, _ = estimator.run(signals.rows(0, count), deepcopy(before[0]))
             change = largest_change(steps.until(count), again)
             if change > RELATIVE_TOLERANCE:
@@ -58,10 +63,10 @@ class CausalityCheck:
                 return
 
 
-def _cuts(count: int, number: int) -> Iterator[int]:
+def _cuts(count: int, number: int, full: bool) -> Iterator[int]:
     """Yield how many samples of a window of ``count`` are kept, the same in every run."""
     random = np.random.default_rng((count, number))
-    for most in (min(count, SHORT_CUT), count):
+    for most in (min(count, SHORT_CUT), count) if full else (min(count, SHORT_CUT),):
         yield int(random.integers(1, most))
 
 

@@ -1,9 +1,9 @@
 """``physics``: the strongest filter on physics alone, with the parts that a car's driving gives evidence for.
 
 An unscented filter on the model of :mod:`~.physics_model` (docs/method.md#filter). As the axles' forces and the roll
-are states, what the sensors read is linear in the state but for a lever arm's r²: the update takes the derivative,
-which for a linear function is what the sigma points give. Points that differ in the sensors' biases alone move with
-their centre.
+are states, the sensors' readings are linear in the state except for a lever arm's r²: the update uses the Jacobian,
+which equals the result of the sigma points for a linear function. Points that differ in the sensors' biases alone move
+with their centre.
 
 A residual rate of v̇_y and ṙ enters as in ``phy-ukf``: half before and half after the model's step, and in the
 predicted a_y, times the force scale where that is a state. Zeros change no bit.
@@ -87,7 +87,7 @@ UNKNOWN_STEER_STD, MAX_STEER_STD, UNKNOWN_STEER_WALK = 0.1, 0.2, 0.2
 #: wheelbases: chosen on simulated cars with right and wrong files. More helps single manoeuvres and harms laps.
 LINEAR_SHARE, LIMIT_TIME_S, FILE_LAG = 0.36, 0.5, 1.1
 
-#: The columns of a block of points: one and the other side of the centre, of which the last of each half is the centre.
+#: The columns of a block of points: each half is one side of the centre, and ends with the centre.
 _HALF = WIDTH // 2
 _CENTRE = _HALF - 1
 #: Rows of a block of points: those of the entries, and zeros up to a multiple of four.
@@ -98,8 +98,8 @@ _compiled = njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc
 # To hand arrays on costs as much as a part of a step computes.
 _inlined = njit(forceinline=True, error_model="numpy", fastmath={"contract", "reassoc"})
 
-# In the compiled code every part has its place in the state, whether or not a car has it (``spread_layout``); what it
-# lacks is 0 and has no variance. x has PLACES entries, P and the factor PLACES rows.
+# In the compiled code every part has its place in the state, whether or not a car has it (``spread_layout``); missing
+# parts are 0 and have no variance. x has PLACES entries, P and the factor PLACES rows.
 
 
 @_inlined
@@ -107,8 +107,8 @@ def _draw(x, L, scale, points):  # type: ignore[no-untyped-def]
     """Write a block of sigma points about x to points [_ROWS · WIDTH]; L as of :func:`~.unscented.partial_root`.
 
     Columns i and _HALF + i differ from the centre along column i of the factor. Points that differ in the sensors'
-    biases alone move with their centre and are left out; the rows of these biases contain what the other points differ
-    from their centre.
+    biases alone move with their centre and are left out; the rows of these biases contain the differences of the
+    other points from their centre.
     """
     root = math.sqrt(scale)
     for j in range(PLACES):
@@ -139,8 +139,8 @@ def _four_products(left, right, a, b):  # type: ignore[no-untyped-def]
 def _moments(points, scale, q, x, P, size):  # type: ignore[no-untyped-def]
     """Write mean and covariance of points that :func:`_draw` drew, with ``q`` [PLACES] added to the variances.
 
-    Of the covariance only the first ``size`` rows and columns. In place of the points is what they differ from their
-    centre, e. With δ the mean of e, the moments about the mean, the weight of the centre among them, are
+    Only the first ``size`` rows and columns of the covariance are written. The points are replaced by their differences
+    from their centre, e. With δ the mean of e, the moments about the mean, the weight of the centre among them, are
     Σ w e eᵀ + δ δᵀ: in the centre's place is δ / √w.
     """
     weight = 0.5 / scale
@@ -167,7 +167,7 @@ def _moments(points, scale, q, x, P, size):  # type: ignore[no-untyped-def]
 
 @_inlined
 def _keep_before(points, x, P, places, before, cross):  # type: ignore[no-untyped-def]
-    """Write what drawn points differ from their centre x, and of the cross covariance [n, n] the sensors' biases."""
+    """Write the differences of drawn points from their centre x, and P as the cross covariance [n, n]."""
     for j in range(PLACES):
         centre = x[j] if j < AY_BIAS else 0.0
         for i in range(j * WIDTH, (j + 1) * WIDTH):
@@ -256,7 +256,7 @@ def _predict(x, P, over, rate, dt, noise, layout, p, f, points, size):  # type: 
 # positional: as _predict.
 @_inlined
 def _measure(x, P, steer, rate_vy, layout, p, f, row, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
-    """Write what the sensors should read [3], its covariance without R [3, 3] and the cross covariance [3, PLACES].
+    """Write the expected readings [3], their covariance without R [3, 3] and the cross covariance [3, PLACES].
 
     ``rate_vy`` is the residual of v̇_y, which the accelerometer feels as it does the tyres' forces.
     """
@@ -293,7 +293,7 @@ def _measure(x, P, steer, rate_vy, layout, p, f, row, z_hat, S, Pxz):  # type: i
 # positional: as _predict.
 @_inlined
 def _update(x, P, nu, S, Pxz, use, index, root, w, gain):  # type: ignore[no-untyped-def]
-    """Do what :func:`~.unscented.kalman_update` does, but for the check of P; ``gain`` [3, PLACES] is work space."""
+    """Update as :func:`~.unscented.kalman_update` does, without the check of P; ``gain`` [3, PLACES] is work space."""
     nis, used, log_likelihood = whiten(nu, S, use, index, root, w)
     if used == 0:
         return nis, used, log_likelihood
@@ -630,7 +630,7 @@ class PhysicsFilter(base.LinkedFilter):
 def physics_filter(
     vehicle: VehicleParameters, noise: FilterNoise | None = None, *, use_speed: bool = True
 ) -> PhysicsFilter:
-    """Return the filter with a noise; what that leaves out is :data:`PHYSICS_Q_STD` and the sensors' noise."""
+    """Return the filter with a noise, completed by :data:`PHYSICS_Q_STD` and the sensors' noise."""
     if noise is None:
         return PhysicsFilter(vehicle, use_speed=use_speed)
     return PhysicsFilter(
@@ -643,7 +643,7 @@ def physics_filter(
 
 
 def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
-    """Return ``physics`` of a car, with what was found through it and its noise where the car has them.
+    """Return ``physics`` of a car, with its identified parts and noise where the car has them.
 
     A car without identified parts has none: a static single track with the sensors' noise. If no drive with ground
     truth has validated it, its body rolls, which a_y feels, and its axle forces may depart from the tyre model, for

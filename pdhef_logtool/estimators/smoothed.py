@@ -160,7 +160,7 @@ Smoothed: TypeAlias = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForwardSteps(StepColumns):
-    """Steps of a filter's forward pass: posteriors, and what ties them."""
+    """Steps of a filter's forward pass: posteriors and the links between them."""
 
     posterior: PosteriorSteps
     links: StepLinks
@@ -235,7 +235,7 @@ def _smooth_pieces(
 
 
 def _tie(piece: ForwardSteps) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Return what ties each step to the one before: kind, predicted covariance, cross covariance and prior state."""
+    """Return the link of each step to the one before: kind, predicted covariance, cross covariance and prior state."""
     return piece.links.kind, piece.links.predicted_P, piece.links.cross, piece.posterior.prior
 
 
@@ -263,7 +263,7 @@ def for_smoothing(physics: PhysicsFilter, factors: Sequence[float]) -> PhysicsFi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedSteps(StepColumns):
-    """What all filters share, and what weighs them.
+    """Columns that all filters share, and their weights.
 
     Their evidence Λ and log-likelihood [K, H] and where the first of them starts [K]; of the detector ``extra_r``
     [K, 2] and ``reason`` [K].
@@ -309,9 +309,9 @@ class SmoothedPhysics:
 
     Parameters
     ----------
-    filtered : what is smoothed: its inputs, and its filters run forward.
+    filtered : the smoothed estimator: its inputs, and its filters run forward.
     block_s : a step sees at least this much ahead, in s, and at most twice as much.
-    notes : what the report states of it.
+    notes : for the report.
     """
 
     algorithm = "smoothed-physics"

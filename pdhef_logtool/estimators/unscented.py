@@ -56,7 +56,7 @@ def cholesky_lower(P, L):  # type: ignore[no-untyped-def]
 def repair_covariance(P):  # type: ignore[no-untyped-def]
     """Make P [n, n] symmetric positive definite in place: eigenvalues below the floor are raised to it.
 
-    What is not finite stays, for the filter to notice.
+    Non-finite values are kept; the filter detects them.
     """
     n = P.shape[0]
     for i in range(n):
@@ -104,7 +104,7 @@ def _partial_root(P, there, L):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def partial_root(P, places, there, L):  # type: ignore[no-untyped-def]
-    """Write what :func:`_partial_root` does; P is repaired in ``places``, the entries that may be there, if needed."""
+    """Write the factor as :func:`_partial_root`; P is repaired in ``places`` if needed."""
     if _partial_root(P, there, L):
         return
     n = places.shape[0]
@@ -179,7 +179,7 @@ def innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz):  # type: ignore[no-
 
 @njit(cache=True)
 def _factor_used(S, index, used, L):  # type: ignore[no-untyped-def]
-    """Do what :func:`cholesky_lower` does with the first ``used`` rows and columns of S that ``index`` names."""
+    """Factor as :func:`cholesky_lower` the first ``used`` rows and columns of S that ``index`` names."""
     for i in range(used):
         for j in range(i + 1):
             s = S[index[i], index[j]]

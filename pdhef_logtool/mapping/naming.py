@@ -13,6 +13,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
 
+#: Names whose words, units and meanings are kept: the drives of a fleet have the same ones.
+CACHED_NAMES = 8192
 #: Gravity by which accelerations in g are written.
 G_M_S2 = 9.80665
 
@@ -32,7 +34,7 @@ _AXES: dict[str, str] = {word: axis for axis, words in VOCABULARY["axes"].items(
 _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 
 
-@lru_cache(maxsize=8192)
+@lru_cache(maxsize=CACHED_NAMES)
 def words_of(name: str) -> tuple[str, ...]:
     """Cut a name into lower-case words: at signs, at capitals, and where known words are written as one."""
     words: list[str] = []
@@ -118,6 +120,7 @@ def _plain_unit(text: str) -> str:
     return re.sub(r"_+", "_", text).strip("_")
 
 
+@lru_cache(maxsize=CACHED_NAMES)
 def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
     """Return the unit that a name contains, and its factor to SI; ``("", None)`` without one.
 
@@ -138,6 +141,7 @@ def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
     return "", None
 
 
+@lru_cache(maxsize=CACHED_NAMES)
 def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Meaning | None:
     """Return the quantity that a field's name gives, with its parents' or topic's words where the leaf has none.
 

@@ -370,6 +370,7 @@ class _Fleet:
             self.job.report and keep == "full",
             self._name,
             stored,
+            label == self.plan.logs[0].log.stem,
         )
 
     def _end(self, ended: Ended[DriveTask, DriveEnd]) -> DriveEnd:

@@ -285,6 +285,7 @@ def run_log(
     *,
     pool: SelfCalibration | None = None,
     validation: ValidationPlan | None = None,
+    is_first: bool = True,
     reporter: Reporter = SILENT,
 ) -> LogResult:
     """Run one log and replace its folder ``logs/<stem>`` of the outputs.
@@ -293,6 +294,7 @@ def run_log(
     ----------
     pool : what all logs of the run together state of the car; None: the log states it, if it is asked.
     validation : plan that the report gives verdicts on; None: the default plan.
+    is_first : whether it is the run's first log, whose estimators get the full causality check.
 
     Raises
     ------
@@ -307,7 +309,9 @@ def run_log(
         reference = reference_of(drive, calibration, config)
         if reference is not None and reference.estimator is not None:
             ready, requested = [*ready, reference.estimator], requested | {REFERENCE}
-        job = _Job(drive, car, calibration, reference, ready, skipped, requested, validation or default_plan())
+        job = _Job(
+            drive, car, calibration, reference, ready, skipped, requested, validation or default_plan(), is_first
+        )
         result = _run_estimators(job, outputs, config, reporter)
     reporter.progress(result.outcome.log, 1.0)
     return result
@@ -328,6 +332,7 @@ class _Job:
     skipped: Sequence[Skipped]
     requested: frozenset[str]
     validation: ValidationPlan
+    is_first: bool
 
     def sensors(self, calibration: SelfCalibration | None) -> SensorErrors:
         """Return the errors of the log's sensors that a calibration states."""
@@ -339,7 +344,7 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
     drive, car = job.drive, job.car
     intervals = calibrator(car, job.ready)
     with outputs.begin(log_place(drive.name), stale=STALE_FILES) as change, ExitStack() as opened:
-        causality = CausalityCheck()
+        causality = CausalityCheck(job.is_first)
         causality.failed |= {s.name: s.reason for s in job.skipped if s.is_error}
         estimated = _estimate(drive, job.ready, intervals, reporter, causality)
         job = replace(job, ready=_without_failed(drive, job.ready, causality.failed))

@@ -44,6 +44,7 @@ class DriveTask:
     setting : digest of the settings that the drive is run with.
     pool : calibration of the car from all logs of the run. page : whether the drive's page is written.
     run : name of this run in its process, the key of cars that were read. stored : names of the drive's stored files.
+    is_first : whether the log is the first of the run's list, which has the full causality check.
     """
 
     log: LogInput
@@ -55,6 +56,7 @@ class DriveTask:
     page: bool
     run: str
     stored: tuple[str, ...] = ()
+    is_first: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,7 +158,8 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
     outputs = OutputFolder(task.output)  # locked by the run
     result = run_log(
         task.log, outputs, task.config, car, mapping,
-        pool=task.pool, validation=task.validation, reporter=Reporter(progress=tell, warn=warned.append),
+        pool=task.pool, validation=task.validation, is_first=task.is_first,
+        reporter=Reporter(progress=tell, warn=warned.append),
     )  # fmt: skip
     record = car_record(car)
     place = car_folder(car.vehicle.name, car.physics_sha256)

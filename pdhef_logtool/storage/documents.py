@@ -269,11 +269,11 @@ def jsonable(value: Any) -> Any:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
+    if isinstance(value, dict) or (not isinstance(value, list | tuple) and isinstance(value, Mapping)):  # ABCs are slow
         return {utf8(str(k)): jsonable(v) for k, v in value.items()}
     if isinstance(value, set | frozenset):
         value = sorted(value)
-    if isinstance(value, Sequence):
+    if isinstance(value, (list, tuple, Sequence)):
         return [jsonable(v) for v in value]
     if isinstance(value, PurePath):
         return utf8(str(value))

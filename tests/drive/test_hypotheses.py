@@ -29,7 +29,7 @@ def relation(*gains: float, powers: dict[str, int] = TURN, text: str = "a_y") ->
 
 
 def probabilities(*relations: Relation) -> dict[str, float]:
-    found = posterior(relations, known_hypotheses(NAMES))
+    found = posterior(relations, known_hypotheses((*NAMES,)))
     assert sum(p for p, _ in found.sets) == pytest.approx(1.0)
     return {n: sum(p for p, _ in found.of(n)) for n in NAMES}
 
@@ -58,7 +58,7 @@ def test_two_mistakes_are_found_that_are_worse_than_none_alone() -> None:
         relation(*(-g for g in steady), powers={"yaw_rate_rad_s": 1}, text="path"),
     ]
     imu = ("ay_m_s2", "yaw_rate_rad_s")
-    found = posterior(relations, known_hypotheses([*NAMES, "steer_rad"], [imu], [("steer_rad",)]))
+    found = posterior(relations, known_hypotheses((*NAMES, "steer_rad"), (imu,), (("steer_rad",),)))
     probability, chosen = found.sets[0]
     assert probability > 0.97 and {n for h in chosen for n in h.factors} == {*imu, "steer_rad"}
 
@@ -67,13 +67,13 @@ def test_scales_of_right_mappings_are_those_of_units() -> None:
     """What a gain leaves open between km/h and mph, a scale that would be no unit's decides; sums of both do not."""
     between = relation(2.8, 2.9, 2.85, powers={"speed_m_s": 1}, text="another speed")
     likeliest = {
-        scale: posterior([between], known_hypotheses(["speed_m_s"]), {"speed_m_s": scale}).of("speed_m_s")[0]
+        scale: posterior([between], known_hypotheses(("speed_m_s",)), {"speed_m_s": scale}).of("speed_m_s")[0]
         for scale in (3.6, 1.0 / 0.44704)
     }
     assert [h.factors["speed_m_s"] for _, h in likeliest.values()] == pytest.approx([1.0 / 3.6, 0.44704])
     assert all(p > 0.75 for p, _ in likeliest.values())
-    counts = posterior([between], known_hypotheses(["speed_m_s"]), {"speed_m_s": 0.0123})
-    assert counts == posterior([between], known_hypotheses(["speed_m_s"]))
+    counts = posterior([between], known_hypotheses(("speed_m_s",)), {"speed_m_s": 0.0123})
+    assert counts == posterior([between], known_hypotheses(("speed_m_s",)))
 
 
 def test_signals_without_a_relation_take_no_probability_from_a_mistake() -> None:
@@ -85,7 +85,7 @@ def test_signals_without_a_relation_take_no_probability_from_a_mistake() -> None
     steered = relation(-1.0, -1.0, -1.0, powers={"ay_m_s2": 1, "speed_m_s": -2}, text="steering")
     together = ("ay_m_s2", "roll_rate_rad_s", "pitch_rate_rad_s")
     alone, beside = (
-        posterior([backwards, steered, sound], known_hypotheses([*NAMES, *more], [together]))
+        posterior([backwards, steered, sound], known_hypotheses((*NAMES, *more), (together,)))
         for more in ((), together[1:])
     )
     assert alone.sets[0][0] == pytest.approx(beside.sets[0][0])

@@ -23,7 +23,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators import table
 from pdhef_logtool.estimators.base import Steps, make_steps
-from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.estimators.causality_check import SHORT_CUT, CausalityCheck
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import Spec, make_estimator
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError
@@ -97,6 +97,18 @@ def test_looking_ahead_that_begins_late_is_found_in_a_later_window(signals: Sign
     windows = [*zip(starts, [*starts[1:], 197], strict=True)]
     assert windows[3][1] - windows[3][0] == 77
     assert reason(late, signals, *windows)
+
+
+def test_a_short_check_runs_few_samples_again(signals: Signals) -> None:
+    lengths: list[int] = []
+    check = CausalityCheck(full=False)
+    run_window(Cheat(lambda rate: lengths.append(len(rate)) or rate), signals, causality=check)
+    assert lengths[0] == len(signals) and max(lengths[1:]) <= SHORT_CUT
+    run_window(Cheat(peek), signals, causality=check)
+    assert "causality check" not in check.failed.get("cheat", "")  # the second window of this name is not checked
+    late = CausalityCheck(full=False)
+    run_window(Cheat(peek), signals, causality=late)
+    assert "causality check" in late.failed["cheat"]
 
 
 @pytest.mark.parametrize("of", [past, lambda rate: rate, np.cumsum])
