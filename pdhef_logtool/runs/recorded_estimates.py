@@ -248,7 +248,8 @@ class _Scoring:
             samples |= estimate.samples
             same = dependent_signals(estimate.channels, plan.survey_truth, role=f"estimate {source.name}'s")
             dependent |= {name: why for name, why in same.items() if name not in dependent}
-        truth, ledger = None, ()
+        truth: TruthTrack | None = None
+        ledger: tuple[SampleCount, ...] = ()
         if drive.mapping.truth:
             part = read_signals(drive.log, replace(plan.mapping, signals={}), plan.clocks, plan.start_ns, plan.end_ns)
             truth = _truth_of(part.truth, drive)

@@ -14,7 +14,9 @@ NOT_INDEPENDENT = "not_independent"
 
 
 def _marks(drive: EvaluatedDrive) -> Iterator[Columns]:
-    for signal in sorted(SCORED_SIGNALS.keys() & drive.dependent) if drive.truth is not None else ():
+    if drive.truth is None:
+        return
+    for signal in sorted({*SCORED_SIGNALS} & {*drive.dependent}):
         known = scorable(drive.truth, signal, drive.low_speed_m_s)
         for name in drive.tracks:
             yield Columns(name, signal, {NOT_INDEPENDENT: np.where(known, 1.0, np.nan)})
