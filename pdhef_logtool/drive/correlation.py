@@ -80,9 +80,9 @@ def _without_trend(values: FloatArray) -> FloatArray:
     if finite.size < 2:
         return values
     time = finite / n
-    known, centred = values if finite.size == n else values[finite], time - time.mean()
-    slope = float(centred @ known) / float(centred @ centred)
-    offset = float(known.mean()) - slope * float(time.mean())
+    finite_values, centred = values if finite.size == n else values[finite], time - time.mean()
+    slope = float(centred @ finite_values) / float(centred @ centred)
+    offset = float(finite_values.mean()) - slope * float(time.mean())
     return np.asarray(values - offset - slope * (np.arange(n) / n), dtype=np.float64)
 
 

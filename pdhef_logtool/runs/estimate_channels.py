@@ -23,7 +23,6 @@ from pdhef_logtool.records.tracks import StateTrack, diagonal_covariance, make_t
 
 #: Nothing is interpolated across a step of more than this many of its median periods.
 GAP_PERIODS = 3.0
-_NO_SAMPLES = (np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +67,9 @@ def read_estimate(
     for name, s in mapping.signals.items():
         topic = columns.get(s.read_topic)
         if topic is None or len(topic) == 0:
-            channels[name] = Channel(name, ESTIMATE_UNITS[name], s.label, *_NO_SAMPLES)
+            channels[name] = Channel(
+                name, ESTIMATE_UNITS[name], s.label, *2 * (np.empty(0, dtype=np.int64),), np.empty(0)
+            )
             continue
         stamps, usable = stamps_on_log_clock(log, topic, s, clocks[clock_key(s)])
         stamps = stamps - np.int64(round(s.latency_s * 1e9))

@@ -17,9 +17,9 @@ def _marks(drive: EvaluatedDrive) -> Iterator[Columns]:
     if drive.truth is None:
         return
     for signal in sorted({*SCORED_SIGNALS} & {*drive.dependent}):
-        known = scorable(drive.truth, signal, drive.low_speed_m_s)
+        has_truth = scorable(drive.truth, signal, drive.low_speed_m_s)
         for name in drive.tracks:
-            yield Columns(name, signal, {NOT_INDEPENDENT: np.where(known, 1.0, np.nan)})
+            yield Columns(name, signal, {NOT_INDEPENDENT: np.where(has_truth, 1.0, np.nan)})
 
 
 METRICS = (
