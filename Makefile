@@ -16,7 +16,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randomly-seed=$(ORDER_SEED))
 
 .PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions peers torture \
-  recalibrate docs docs-truthsim paper strangers wheel release lock clean
+  gates gates-quick gates-freeze recalibrate docs paper strangers wheel release lock clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
@@ -29,6 +29,7 @@ help:
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make torture  damaged, hostile and odd input, counted: docs/reliability.md (four hours or less on two cores; resumable)"
 	@echo "make strangers  docs/third_party_logs.md: signals recognised in logs with unknown layouts (under two minutes)"
+	@echo "make gates    figures of the tool that moved since they were frozen (an hour; make gates-quick: five minutes)"
 	@echo "make bench    speed against peers"
 	@echo "make recalibrate  regenerate all that is derived: shipped cars and networks, evidence pages (hours; resumable)"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
@@ -36,7 +37,7 @@ help:
 	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
 	@echo "make peers    docs/peers.md: published sideslip estimators on the recorded drives in ../shared (three minutes)"
 	@echo "make docs     the documentation as a site: out/site/index.html (a broken link is an error)"
-	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
+	@echo "make  figures and tables of docs/truthsim.md anew"
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
 	@echo "make wheel    dist/: the wheel and the source archive of what is committed, looked at"
 	@echo "make release  the same, installed into a new environment, where the sample job runs"
@@ -123,13 +124,25 @@ check: lint test
 bench: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.performance
 
+# studies/results/gates.csv has the figures. ONLY="conditions contract/options": parts of gate/row. TREE: another
+# source tree under test.
+GATES = $(BIN)/python -m studies.gates --jobs $(JOBS) $(if $(ONLY),--only $(ONLY)) $(if $(TREE),--tree $(TREE))
+gates: $(VENV)/installed-dev $(VENV)/compiled
+	$(GATES)
+
+gates-quick: $(VENV)/installed-dev $(VENV)/compiled
+	$(GATES) --quick
+
+# The figures of the commit that is checked out become those of the file; resumable.
+gates-freeze: $(VENV)/installed-dev $(VENV)/compiled
+	$(GATES) --freeze $$(git rev-parse --short=8 HEAD)
+
 # Stages with their durations: python -m studies.recalibrate --list; a part of them: make recalibrate ONLY="noise gain".
 recalibrate: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.recalibrate $(if $(ONLY),--only $(ONLY))
 
 train-default: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.defaults.train_default
-	$(BIN)/python -m studies.model_card
 
 # Without --quiet, which would hide the warnings that make it fail.
 docs: $(VENV)/installed-docs
@@ -138,9 +151,6 @@ docs: $(VENV)/installed-docs
 
 samples: $(VENV)/installed $(VENV)/compiled
 	$(BIN)/python -m truthsim.samples sample_logs
-
-docs-truthsim: $(VENV)/installed
-	$(BIN)/python -m studies.truthsim_docs
 
 # One core: step times are measured in the same run.
 paper: $(VENV)/installed-dev $(VENV)/compiled

@@ -12,6 +12,7 @@ setup(
             "models/*/*/*",
             "models/*/*/*/*",
             "models/*/*/*/*/*",
+            "logs/*.toml",
             "mapping/*.toml",
             "reports/assets/*",
             "reports/templates/*",

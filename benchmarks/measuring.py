@@ -11,6 +11,7 @@ import os
 import platform
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -85,34 +86,48 @@ def peak_bytes(module: str, *arguments: str) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Processor seconds and peak resident memory of a command, and the last line on stderr."""
+    """Processor seconds and peak resident memory of a command."""
 
     seconds: float
     peak_bytes: int
-    last_line: str
 
 
-def command_cost(*arguments: str | Path, module: str = "pdhef_logtool") -> Cost:
-    """Return what ``pdhef ARGUMENTS`` costs on one thread; it must end with 0 or, where input was lost, with 3."""
+def command_cost(*arguments: str | Path, tree: Path = ROOT) -> Cost:
+    """Return the cost of ``pdhef ARGUMENTS`` of a source tree on one thread; its exit code must be 0 or 3."""
     code = (
         "import json, resource, subprocess, sys; done = subprocess.run(sys.argv[1:], capture_output=True, text=True);"
-        "used = resource.getrusage(resource.RUSAGE_CHILDREN); said = done.stderr.splitlines()[-1:];"
-        "print(json.dumps([done.returncode, used.ru_utime + used.ru_stime, used.ru_maxrss, *said]))"
+        "used = resource.getrusage(resource.RUSAGE_CHILDREN);"
+        "print(json.dumps([done.returncode, used.ru_utime + used.ru_stime, used.ru_maxrss]))"
     )
-    command = [sys.executable, "-c", code, sys.executable, "-m", module, *map(str, arguments)]
-    # As where it is installed: its modules are not compiled again by every command.
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"} | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True, env=environment)
-    code_of, seconds, peak, *said = json.loads(done.stdout)
+    command = [sys.executable, "-c", code, sys.executable, "-m", "pdhef_logtool", *map(str, arguments)]
+    # Byte code is kept, as in an installation.
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+    environment |= {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(tree)}
+    done = subprocess.run(command, cwd=tree, check=True, capture_output=True, text=True, env=environment)
+    code_of, seconds, peak = json.loads(done.stdout)
     if code_of not in (0, 3):
         raise SystemExit(f"pdhef {' '.join(map(str, arguments))} ended with {code_of}")
-    return Cost(seconds, peak * _RSS_UNIT, said[0] if said else "")
+    return Cost(seconds, peak * _RSS_UNIT)
+
+
+def gauge_seconds() -> float:
+    """Return the processor seconds of a fixed loop: the speed of the machine at the time of a measurement."""
+
+    def loop() -> None:
+        total, block = 0, bytes(1 << 20)
+        for number in range(2_000_000):
+            total += number * number % 7
+        for _ in range(100):
+            zlib.crc32(block)
+
+    return best_seconds({"gauge": loop})["gauge"]
 
 
 def machine_facts() -> dict[str, str]:
     """Return what a figure depends on, without names of hosts or folders."""
     packages = ("numpy", "mcap", "rosbags", "zstandard", "numba", "filterpy")
     return {
+        "gauge": f"{gauge_seconds():.3f} s",
         "processor": _processor(),
         "cores": str(os.cpu_count()),
         "system": f"{platform.system()} {platform.machine()}",

@@ -10,7 +10,8 @@
 
 The values are smooth motions with sensor noise, so that they compress like recorded ones. The variant with images holds
 the same messages and /image (sensor_msgs/msg/Image) with 20 times as many bytes of noise, which nobody maps. It is
-shorter than an hour (an hour would be 9 GB), and memory is compared with a log of the same length without images.
+shorter than an hour (an hour would be 9 GB), and memory is compared with a log of the same length without images. A
+third log has a minute of them, 150 MB of images, in chunks that images and sensors share, as recorders write them.
 """
 
 from __future__ import annotations
@@ -26,10 +27,12 @@ from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.geometry import quat_from_yaw
 from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.storage.files import PendingFile
 
 START_NS = 1_700_000_000_000_000_000
 HOUR_S = 3600
 IMAGE_LOG_S = 360
+SHARED_S = 60
 IMAGE_TIMES = 20
 IMAGE_HZ = 5
 RAW_BYTES_PER_S = 124_650
@@ -59,6 +62,28 @@ def short_log() -> Path:
 def image_log() -> Path:
     """Return the short log with images."""
     return _cached("short_with_images.mcap", IMAGE_LOG_S, images=True)
+
+
+def shared_log() -> Path:
+    """Return a minute with images whose chunks contain images and all other topics."""
+    path = CACHE / "shared_chunks.mcap"
+    if path.exists():
+        return path
+    from mcap.reader import make_reader
+    from mcap.writer import CompressionType, Writer
+
+    with _cached("minute_with_images.mcap", SHARED_S, images=True).open("rb") as file, PendingFile(path) as pending:
+        writer = Writer(str(pending.path), chunk_size=4 << 20, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2", library="benchmark")
+        channels: dict[int, int] = {}
+        for schema, channel, message in make_reader(file).iter_messages():
+            if channel.id not in channels:
+                id_ = writer.register_schema(schema.name, schema.encoding, schema.data) if schema else 0
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, id_)
+            to = channels[channel.id]
+            writer.add_message(to, message.log_time, message.data, message.publish_time, message.sequence)
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it without types
+    return path
 
 
 def _cached(name: str, seconds: int, images: bool) -> Path:

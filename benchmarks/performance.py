@@ -1,9 +1,11 @@
 """Run the speed benchmarks and print their tables; ``--write-docs`` puts them into docs/performance.md.
 
     python -m benchmarks.performance [NAME ...] [--write-docs] [--gate]
+    python -m benchmarks.performance --against TREE
 
 A benchmark is a module of this package: its docstring heads its section of the page, ``rows()`` measures. With
-``--gate`` it ends with 4 if a target is missed.
+``--gate`` it ends with 4 if a target is missed. ``--against`` compares with another source tree, for example that of
+the last release (``git worktree add``): commands of both run in turns (:mod:`benchmarks.against`).
 """
 
 from __future__ import annotations
@@ -13,10 +15,12 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 from inspect import cleandoc
+from pathlib import Path
 
+from benchmarks import against
 from benchmarks.measuring import ROOT, Row, machine_facts
 
-NAMES = ("hour", "reading", "reading_mdf", "writing", "copying", "filtering", "fleet_drive", "starting")
+NAMES = ("hour", "reading", "reading_mdf", "fleet_drive", "starting")
 DOCUMENT = ROOT / "docs" / "performance.md"
 _HEADINGS = ("work", "figure", "target", "", "against peers")
 _SECTION = "\n## "
@@ -25,6 +29,10 @@ _INTRODUCTION = """# Performance
 This page shows processor time and memory, also against peers. Command: `python -m benchmarks.performance
 --write-docs`; `make bench` prints the tables. Seconds are processor seconds (user and system, with child processes),
 the best of several interleaved rounds unless stated otherwise. A ratio to a peer is measured in the same run.
+
+The gauge is the processor time of a fixed loop, measured beside each table: divide the figures of two days or machines
+by it to compare them. `python -m benchmarks.performance --against TREE` runs commands of this version and of another
+source tree in turns and prints the ratios.
 """
 
 
@@ -66,10 +74,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.performance", description="Speed against peers.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; all when none is given")
     parser.add_argument("--write-docs", action="store_true", help="write the sections into docs/performance.md")
+    parser.add_argument("--against", type=Path, metavar="TREE", help="source tree of another version to compare with")
     parser.add_argument("--gate", action="store_true", help="end with 4 if a target is missed")
     arguments = parser.parse_args()
     if set(arguments.names) - set(NAMES):
         parser.error(f"expected names out of {', '.join(NAMES)}, got {', '.join(arguments.names)}")
+    if arguments.against is not None:
+        print(table(against.rows(arguments.against.resolve())))
+        return 0
     missed = False
     for name in arguments.names or NAMES:
         print(f"{name} ...", file=sys.stderr)

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.records.errors import PdhefError as PdhefError
     from pdhef_logtool.records.reporter import Reporter as Reporter
     from pdhef_logtool.runs.config import RunConfig as RunConfig
-    from pdhef_logtool.runs.estimating import estimate_windows as estimate_windows
     from pdhef_logtool.runs.fleet import Schedule as Schedule
     from pdhef_logtool.runs.fleet import run_logs as run  # noqa: F401
     from pdhef_logtool.runs.frames import choose as choose
@@ -46,7 +45,6 @@ _HOMES = {
     "Reporter": "records.reporter",
     "RunConfig": "runs.config",
     "Schedule": "runs.fleet",
-    "estimate_windows": "runs.estimating",
     "choose": "runs.frames",
     "estimate": "runs.frames",
     "score": "runs.frames",

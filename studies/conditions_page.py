@@ -5,321 +5,164 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
-from pdhef_logtool import __version__
-from pdhef_logtool.estimators.table import SPECS
-from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.storage.files import PendingFile
-from studies.condition_drives import BIN_LEAST_S, BINS, NONLINEAR, SIDESLIP
 from studies.pages import number, table, write
 from studies.pictures import save, subplots
-from studies.table_maths import (
-    RESAMPLES,
-    Bound,
-    median,
-    median_ratio,
-    percentiles,
-    pooled_mean,
-    pooled_rmse,
-    verdict,
-)
+from studies.table_maths import RESAMPLES, Bound, median, median_ratio, percentiles, pooled_rmse, verdict
 
-ALL = "all"
-NOT_CAUSAL = {s.name for s in SPECS if not s.causal}
-#: Below this share of the scorable stamps an RMSE is marked: it leaves out what the estimator gave up on.
-AVAILABLE = 0.99
-#: A bin with fewer drives is marked.
-BIN_DRIVES = 30
-#: Steps of the aligned signals per second.
-RATE_HZ = 100.0
+#: The estimator of interest, and the references of its RMSE ratios.
+SUBJECT = "pd-hef"
+REFERENCES = ("physics", "phy-ukf", "pd-hef-paper")
 MARGIN = 1.05
 #: In the picture with their spans, from the naive to the best; the others are medians in grey.
 DRAWN = ("zero", "open-loop", "phy-ukf", "physics", "pd-hef", "pd-hef-smoothed")
 #: Okabe and Ito (2008), without yellow.
 COLOURS = ("#000000", "#E69F00", "#56B4E9", "#0072B2", "#D55E00", "#009E73")
-_UNAVAILABLE = f"""† the estimator has no valid estimate at more than {100 * (1 - AVAILABLE):.0f} % of the stamps,
-which the figure leaves out.
-
-"""
 _RATIOS = f"""With the 95 % CI of a paired bootstrap over drives ({RESAMPLES} resamples). **<** the CI is below 1;
 = it is below {MARGIN}; **>** it is above {MARGIN}; ? otherwise.
 
 """
 _MARKS = {"better": "**<**", "not worse": "=", "worse": "**>**", "open": "?", "–": ""}
 
+PAGE = """# Simulated conditions
 
-@dataclass(frozen=True, slots=True)
-class Facts:
-    """What the page contains besides figures. ``rows``: description by name; ``order``: of the estimators."""
+This page shows the sideslip error of all estimators on simulated drives. Each row changes one condition.
+Command: `{command}`.
 
-    command: str
-    car: str
-    setup: Mapping[str, str | None]
-    rows: Mapping[str, str]
-    subject: str | None
-    references: Sequence[str]
-    order: Sequence[str]
-    notes: Sequence[str]
-    version: str = __version__
+Car: {car}; pdhef-logtool {version}. The vehicle file is the same in all rows. Estimators get the true friction, unless
+the row changes it. The ground truth is the state of the simulator.
+
+Sideslip RMSE in degrees, median over drives. `pd-hef-smoothed` is not causal: it uses later measurements.
+Coverage: share of samples in the 95 % confidence interval.
+
+{summary}
+
+All estimators, percentiles and pooled errors: `studies/results/conditions/tables.md`. All figures by drive:
+`metrics.parquet` in the same folder.
+
+![Sideslip RMSE by row](conditions/sideslip.png)
+
+Rows by the ratio of the median RMSE of `{subject}` to a reference, with 95 % CI of a paired bootstrap
+over drives. Better: the CI is below 1; not worse: below {margin}; worse: above {margin}; open: else.
+
+{counts}
+
+![Ratio of {subject} to its references](conditions/ratios.png)
+"""
+FloatArray = NDArray[np.float64]
 
 
 class Figures:
-    """Per-drive figures by row, estimator, signal, segment and metric: drive names, values and samples."""
+    """Sideslip figures by row, estimator, metric and segment: values over drives."""
 
-    def __init__(self, table: pl.DataFrame) -> None:
-        self._by: dict[tuple[str, ...], dict[str, tuple[float, int]]] = {}
-        columns = ("row", "estimator", "signal", "segment", "metric", "drive", "value", "n")
-        for row, estimator, signal, segment, metric, drive, value, n in table.select(columns).iter_rows():
-            self._by.setdefault((row, estimator, signal, segment, metric), {})[drive] = (value, n)
+    def __init__(self, metrics: pl.DataFrame) -> None:
+        sideslip = metrics.filter(pl.col("signal").cast(pl.String) == "sideslip_rad")
+        columns = ("row", "estimator", "metric", "segment", "drive", "value", "n")
+        self._by: dict[tuple[str, ...], dict[str, tuple[float, float]]] = {}
+        for *key, drive, value, n in sideslip.select(columns).sort("drive").iter_rows():
+            self._by.setdefault(tuple(key), {})[drive] = (value, n)
+        self.rows = {key[0] for key in self._by}
+        self.estimators = {key[1] for key in self._by if key[2] == "rmse"}
 
     def get(
-        self, row: str, estimator: str, metric: str = "rmse", *, signal: str = SIDESLIP, segment: str = ALL
+        self, row: str, estimator: str, metric: str = "rmse", segment: str = "all"
     ) -> tuple[FloatArray, FloatArray]:
         """Return values [N] and samples [N] over the drives; empty where there are none."""
-        by_drive = self._by.get((row, estimator, signal, segment, metric), {})
-        pairs = [by_drive[d] for d in sorted(by_drive)]
-        return np.array([v for v, _ in pairs], dtype=np.float64), np.array([n for _, n in pairs], dtype=np.float64)
+        pairs = np.array([*self._by.get((row, estimator, metric, segment), {}).values()]).reshape(-1, 2)
+        return pairs[:, 0], pairs[:, 1]
 
-    def pair(self, row: str, first: str, second: str) -> tuple[FloatArray, FloatArray]:
-        """Return sideslip RMSE [N] of two estimators on the drives that both have."""
-        a, b = (self._by.get((row, e, SIDESLIP, ALL, "rmse"), {}) for e in (first, second))
+    def ratio(self, row: str, reference: str) -> Bound:
+        """Return the ratio of the median RMSE of the subject to that of a reference on the drives that both have."""
+        a, b = (self._by.get((row, name, "rmse", "all"), {}) for name in (SUBJECT, reference))
         both = sorted(a.keys() & b.keys())
-        return np.array([a[d][0] for d in both]), np.array([b[d][0] for d in both])
-
-    def estimators(self, row: str | None = None) -> set[str]:
-        """Return who has a sideslip RMSE, anywhere or in a row."""
-        return {k[1] for k in self._by if k[2:] == (SIDESLIP, ALL, "rmse") and row in (None, k[0])}
-
-    def rows(self) -> set[str]:
-        """Return the rows that have figures."""
-        return {k[0] for k in self._by}
-
-
-def write_results(folder: Path, facts: Facts, metrics: pl.DataFrame) -> None:
-    """Write the results from which the page is rendered: ``facts.json`` and ``metrics.parquet``."""
-    folder.mkdir(parents=True, exist_ok=True)
-    texts = ("row", "drive", "estimator", "signal", "segment", "metric", "unit")
-    compact = [
-        *(pl.col(t).cast(pl.Categorical) for t in texts),
-        pl.col("value").cast(pl.Float32),
-        pl.col("n").cast(pl.Int32),
-    ]
-    with PendingFile(folder / "metrics.parquet") as pending:
-        metrics.select(compact).write_parquet(pending.path, compression="zstd", compression_level=19)
-    write(folder / "facts.json", json.dumps(asdict(facts), indent=1) + "\n")
+        return median_ratio(np.array([a[d][0] for d in both]), np.array([b[d][0] for d in both]))
 
 
 def write_page(out: Path, folder: Path) -> None:
     """Render the page, its two figures, and all tables (``tables.md``) from the results in a folder."""
-    facts = Facts(**json.loads((folder / "facts.json").read_text(encoding="utf-8")))
+    facts = json.loads((folder / "facts.json").read_text(encoding="utf-8"))
     figures = Figures(pl.read_parquet(folder / "metrics.parquet"))
-    ran = figures.estimators()
-    names = sorted((n for n in facts.order if n in ran), key=lambda n: n in NOT_CAUSAL)
-    rows = [r for r in facts.rows if r in figures.rows()]
-    references = [r for r in facts.references if r in ran and r != facts.subject]
-    write(folder / "tables.md", _tables(figures, rows, names, facts))
+    names = [n for n in facts["order"] if n in figures.estimators]
+    rows = [r for r in facts["rows"] if r in figures.rows]
+    references = [r for r in REFERENCES if r in names] if SUBJECT in names else []
+    write(folder / "tables.md", tables(figures, rows, names, references))
     pictures = out / "conditions"
     pictures.mkdir(parents=True, exist_ok=True)
-    _plot_rows(pictures / "sideslip.png", figures, rows, names)
-    parts = [_head(facts), _summary(facts, figures, rows, [n for n in DRAWN if n in names])]
-    parts.append("![Sideslip RMSE by row](conditions/sideslip.png)\n")
-    if facts.subject is not None and references:
-        _plot_ratios(pictures / "ratios.png", figures, rows, facts.subject, references)
-        parts += [_counts(figures, rows, facts.subject, references)]
-        parts.append(f"![Ratio of {facts.subject} to its references](conditions/ratios.png)\n")
-    if facts.notes:
-        parts.append("\n".join(["Estimators that did not run:", "", *(f"- {note}" for note in facts.notes), ""]))
-    write(out / "conditions.md", "\n".join(parts))
+    spans = {n: np.degrees([percentiles(figures.get(r, n)[0]) for r in rows]).reshape(-1, 3) for n in names}
+    drawn = {n: spans.pop(n) for n in DRAWN if n in spans}
+    label = "sideslip RMSE in degrees: median and 10th to 90th percentile over drives"
+    plot(pictures / "sideslip.png", rows, drawn, label, medians=spans)
+    bounds = {name: [figures.ratio(r, name) for r in rows] for name in references}
+    label = f"median sideslip RMSE of {SUBJECT} over that of the reference, 95 % interval"
+    ratios = {name: np.array([(b.low, b.value, b.high) for b in of]) for name, of in bounds.items()}
+    plot(pictures / "ratios.png", rows, ratios, label, limits={1.0: "-", MARGIN: ":"})
+    texts = {"summary": summary(figures, facts["rows"], rows, [*drawn]), "counts": counts(rows, bounds)}
+    given = {key: facts[key] for key in ("command", "car", "version")}
+    write(out / "conditions.md", PAGE.format(**given, **texts, subject=SUBJECT, margin=MARGIN))
 
 
 def _deg(value: float, digits: int = 3) -> str:
     return number(math.degrees(value), digits)
 
 
-def _table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """Return a table with what parts it from the next."""
-    return table(head, body) + "\n"
-
-
-def _head(facts: Facts) -> str:
-    network, calibrated = facts.setup["network"], facts.setup["intervals"]
-    physics, noise = (str(facts.setup[k])[:12] for k in ("physics", "noise"))
-    return "\n".join(
-        [
-            "# Simulated conditions",
-            "",
-            "This page shows the sideslip error of all estimators on simulated drives. Each row changes one condition.",
-            f"Command: `{facts.command}`.",
-            "",
-            f"Car: {facts.car} (physics {physics}, noise {noise}); network "
-            f"{'none' if network is None else network[:12]}; 95 % intervals "
-            f"{'as the estimators return them' if calibrated is None else calibrated[:12]}; "
-            f"pdhef-logtool {facts.version}.",
-            "The vehicle file is the same in all rows. Estimators get the true friction, unless the row changes it.",
-            "The ground truth is the state of the simulator.",
-            "",
-        ]
-    )
-
-
-def _summary(facts: Facts, figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
+def summary(figures: Figures, described: Mapping[str, str], rows: Sequence[str], names: Sequence[str]) -> str:
     """Return the median RMSE of the main estimators, and the coverage of the subject, by row."""
-    drives = {r: max(figures.get(r, n)[0].size for n in figures.estimators(r)) for r in rows}
-    subject = facts.subject
-    head = ["row", "condition", "drives", *names, *([] if subject is None else [f"coverage of {subject}"])]
     body = []
     for row in rows:
         cells = [_deg(median(figures.get(row, n)[0])) for n in names]
-        if subject is not None:
-            covered = [figures.get(row, subject, "coverage95", segment=b) for b in BINS]
-            values, samples = (np.concatenate([c[i] for c in covered]) for i in (0, 1))
-            cells.append(f"{100 * pooled_mean(values, samples):.0f} %" if values.size else "–")
-        body.append([row, facts.rows[row], str(drives[row]), *cells])
-    lines = [
-        "Sideslip RMSE in degrees, median over drives. `pd-hef-smoothed` is not causal: it uses later measurements.",
-        "Coverage: share of samples in the 95 % confidence interval.",
-        "",
-        _table(head, body),
-        "All estimators, percentiles, pooled errors, NEES, NIS, coverage by use of grip, and lag:",
-        "`studies/results/conditions/tables.md`. All figures by drive: `metrics.parquet` in the same folder.",
-        "",
-    ]
-    return "\n".join(lines)
+        covered, samples = figures.get(row, SUBJECT, "coverage95")
+        share = f"{100 * np.average(covered, weights=samples):.0f} %" if covered.size else "–"
+        body.append([row, described[row], str(figures.get(row, names[0])[0].size), *cells, share])
+    return table(["row", "condition", "drives", *names, f"coverage of {SUBJECT}"], body)
 
 
-def _counts(figures: Figures, rows: Sequence[str], subject: str, references: Sequence[str]) -> str:
+def counts(rows: Sequence[str], bounds: Mapping[str, Sequence[Bound]]) -> str:
     """Return in how many rows the ratio of medians is better, not worse, open or worse."""
     body = []
-    for reference in references:
-        bounds = {r: b for r in rows if math.isfinite((b := ratio(figures, r, subject, reference)).value)}
-        words = [verdict(b) for b in bounds.values()]
-        above = [f"{r} ({b.value:.2f})" for r, b in bounds.items() if b.value > MARGIN]
-        counts = [str(words.count(w)) for w in ("better", "not worse", "open", "worse")]
-        body.append([reference, *counts, ", ".join(above) or "none"])
-    return "\n".join(
-        [
-            f"Rows by the ratio of the median RMSE of `{subject}` to a reference, with 95 % CI of a paired bootstrap",
-            f"over drives. Better: the CI is below 1; not worse: below {MARGIN}; worse: above {MARGIN}; open: else.",
-            "",
-            _table(["reference", "better", "not worse", "open", "worse", f"ratio above {MARGIN}"], body),
-        ]
-    )
+    for reference, of in bounds.items():
+        words = [verdict(b) for b in of]
+        above = [f"{r} ({b.value:.2f})" for r, b in zip(rows, of, strict=True) if b.value > MARGIN]
+        numbers = [str(words.count(w)) for w in ("better", "not worse", "open", "worse")]
+        body.append([reference, *numbers, ", ".join(above) or "none"])
+    return table(["reference", "better", "not worse", "open", "worse", f"ratio above {MARGIN}"], body)
 
 
-def _tables(figures: Figures, rows: Sequence[str], names: Sequence[str], facts: Facts) -> str:
+def tables(figures: Figures, rows: Sequence[str], names: Sequence[str], references: Sequence[str]) -> str:
     """Return all tables: a line for each row, a column for each estimator."""
-    references = [r for r in facts.references if r in names and r != facts.subject]
-    compared = [n for n in names if n in {facts.subject, *references}]
-
-    def mark(row: str, name: str) -> str:
-        return "†" if pooled_mean(*figures.get(row, name, "availability")) < AVAILABLE else ""
-
-    def middle(row: str, name: str) -> str:
-        return _deg(median(figures.get(row, name)[0])) + mark(row, name)
 
     def spread(row: str, name: str) -> str:
         low, high = percentiles(figures.get(row, name)[0], (10.0, 90.0))
         return f"{_deg(low)}–{_deg(high)}" if math.isfinite(low) else "–"
 
-    def pooled(row: str, name: str) -> str:
-        return _deg(pooled_rmse(*figures.get(row, name))) + mark(row, name)
+    def ratio(row: str, reference: str) -> str:
+        bound = figures.ratio(row, reference)
+        span = f"[{number(bound.low, 2)}, {number(bound.high, 2)}] {_MARKS[verdict(bound)]}"
+        return f"{bound.value:.2f} {span}" if math.isfinite(bound.value) else "–"
 
-    def ratio_text(row: str, reference: str) -> str:
-        bound = ratio(figures, row, str(facts.subject), reference)
-        if not math.isfinite(bound.value):
-            return "–"
-        return f"{bound.value:.2f} [{number(bound.low, 2)}, {number(bound.high, 2)}] {_MARKS[verdict(bound)]}"
-
-    def nonlinear(row: str, name: str) -> str:
-        return _deg(median(figures.get(row, name, segment=NONLINEAR)[0]))
-
-    def consistency(row: str, name: str) -> str:
-        nees, nis, dof = (
-            pooled_mean(*figures.get(row, name, metric, signal="state")) for metric in ("nees", "nis", "nis_dof")
-        )
-        return f"{number(nees / 3.0, 2)} / {number(nis / dof, 2)}"
-
-    sections = (
-        ("Sideslip RMSE in degrees: median over drives", _UNAVAILABLE, names, middle),
+    sections: tuple[tuple[str, str, Sequence[str], Any], ...] = (
+        ("Sideslip RMSE in degrees: median over drives", "", names, lambda r, n: _deg(median(figures.get(r, n)[0]))),
         ("Sideslip RMSE in degrees: 10th to 90th percentile over drives", "", names, spread),
-        ("Sideslip RMSE in degrees: pooled over all samples", "", names, pooled),
-        (f"`{facts.subject}` against its references: ratio of the medians", _RATIOS, references, ratio_text),
-        ("Sideslip RMSE in degrees in the nonlinear range (|a_y| > 0.5 μ g): median over drives", "", names, nonlinear),
-        ("NEES and NIS over their degrees of freedom (expected value 1)", "", compared, consistency),
-    )
+        ("Sideslip RMSE in degrees: pooled over all samples", "", names,
+         lambda r, n: _deg(pooled_rmse(*figures.get(r, n)))),
+        (f"`{SUBJECT}` against its references: ratio of the medians", _RATIOS, references, ratio),
+        ("Sideslip RMSE in degrees in the nonlinear range (|a_y| > 0.5 μ g): median over drives", "", names,
+         lambda r, n: _deg(median(figures.get(r, n, segment="nonlinear")[0]))),
+    )  # fmt: skip
     texts = [
-        f"## {title}\n\n{text}{_table(['row', *columns], [[r, *(cell(r, n) for n in columns)] for r in rows])}"
+        f"## {title}\n\n{text}{table(['row', *columns], [[r, *(cell(r, n) for n in columns)] for r in rows])}\n"
         for title, text, columns, cell in sections
-        if columns
     ]
-    return "\n".join(["# Tables of the simulated conditions\n", *texts, _coverage(figures, rows, names, facts.subject)])
+    return "\n".join(["# Tables of the simulated conditions\n", *texts])
 
 
-def ratio(figures: Figures, row: str, subject: str, reference: str) -> Bound:
-    """Return the ratio of the medians of two estimators in a row, paired."""
-    return median_ratio(*figures.pair(row, subject, reference))
-
-
-def _bin_cell(figures: Figures, row: str, name: str, segment: str) -> str:
-    width, samples = figures.get(row, name, "width95", segment=segment)
-    if not width.size:
-        return "–"
-    coverage = pooled_mean(*figures.get(row, name, "coverage95", segment=segment))
-    score = pooled_mean(*figures.get(row, name, "interval_score95", segment=segment))
-    drives = int(np.count_nonzero(samples >= BIN_LEAST_S * RATE_HZ))
-    few = "" if drives >= BIN_DRIVES else f" ({drives})"
-    return f"{100 * coverage:.0f} % / {_deg(score, 2)} / {_deg(pooled_mean(width, samples), 2)}{few}"
-
-
-def _coverage(figures: Figures, rows: Sequence[str], names: Sequence[str], subject: str | None) -> str:
-    banded = [n for n in names if any(figures.get(r, n, "width95")[0].size for r in rows)]
-    if not banded:
-        return ""
-    limits = [
-        f"{b} ({low:g}–{high:g})" if math.isfinite(high) else f"{b} (> {low:g})" for b, (low, high) in BINS.items()
-    ]
-    lines = [
-        "## Uncertainty of the sideslip by share of the grip",
-        "",
-        "Share of samples inside ± 1.96 σ (95 % is right) / interval score in degrees (smaller is better) / mean width",
-        "in degrees, in bins of |a_y| / (μ g). In parentheses the number of drives with at least",
-        f"{BIN_LEAST_S:g} s in the bin, where it is below {BIN_DRIVES}.",
-        "",
-    ]
-    first = rows[0]
-    body = [[n, *(_bin_cell(figures, first, n, b) for b in BINS)] for n in banded]
-    lines += [f"All estimators in the row `{first}`:", "", _table(["estimator", *limits], body)]
-    if subject in banded:
-        body = [[r, *(_bin_cell(figures, r, str(subject), b) for b in BINS)] for r in rows]
-        lines += [f"`{subject}` in all rows:", "", _table(["row", *limits], body)]
-    return "\n".join(lines)
-
-
-def _plot_rows(path: Path, figures: Figures, rows: Sequence[str], names: Sequence[str]) -> None:
-    """Median with the span from the 10th to the 90th percentile, a line a row; most estimators as grey dots."""
-    spans = {n: np.degrees([percentiles(figures.get(r, n)[0]) for r in rows]).reshape(-1, 3) for n in names}
-    drawn = {n: spans.pop(n) for n in DRAWN if n in spans}
-    label = "sideslip RMSE in degrees: median and 10th to 90th percentile over drives"
-    _plot(path, rows, drawn, label, medians=spans)
-
-
-def _plot_ratios(path: Path, figures: Figures, rows: Sequence[str], subject: str, references: Sequence[str]) -> None:
-    """Ratios of medians with their intervals."""
-    spans = {}
-    for reference in references:
-        bounds = [ratio(figures, r, subject, reference) for r in rows]
-        spans[reference] = np.array([(b.low, b.value, b.high) for b in bounds])
-    label = f"median sideslip RMSE of {subject} over that of the reference, 95 % interval"
-    _plot(path, rows, spans, label, limits={1.0: "-", MARGIN: ":"})
-
-
-def _plot(
+def plot(
     path: Path, rows: Sequence[str], spans: Mapping[str, FloatArray], label: str, *,
     medians: Mapping[str, FloatArray] = MappingProxyType({}), limits: Mapping[float, str] = MappingProxyType({}),
 ) -> None:  # fmt: skip

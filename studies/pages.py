@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from pdhef_logtool.storage.files import write_bytes
 
@@ -61,6 +63,22 @@ def write(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, text.encode())
     print(path)
+
+
+def toml_text(document: Mapping[str, Any], path: str = "") -> str:
+    """Return a document of tables, texts, numbers and lists of these as TOML."""
+    tables = {name: value for name, value in document.items() if isinstance(value, dict)}
+    lines = [f"{name} = {json.dumps(value)}" for name, value in document.items() if name not in tables]
+    for name, value in tables.items():
+        lines += ["", f"[{path}{name}]", toml_text(value, f"{path}{name}.")]
+    return "\n".join(lines)
+
+
+def write_toml(path: Path, document: Mapping[str, Any]) -> Path:
+    """Write a document as TOML and return its path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(toml_text(document) + "\n", encoding="utf-8")
+    return path
 
 
 def options(name: str, text: str | None) -> argparse.ArgumentParser:

@@ -5,8 +5,8 @@
 The stages run in the order of ``recalibrate.toml``. A stage is skipped if the command and the digest of its inputs are
 those of its last completion and its outputs exist. After a failure or an interruption, the same command continues with
 the stage that was not completed; if its inputs have changed since, its work folders are deleted first. Comments,
-docstrings and the layout of pages (``studies.pages``, ``studies.pictures``) do not count as inputs. Constants that were
-chosen once (``studies/defaults/tune_*.py``) stay. The stamp files are in ``out/recalibrate``.
+docstrings and the layout of pages (``studies.pages``, ``studies.pictures``) do not count as inputs. The stamp files are
+in ``out/recalibrate``.
 """
 
 from __future__ import annotations

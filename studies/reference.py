@@ -34,7 +34,6 @@ from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipRef
 from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator, steps_at
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
-from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
@@ -43,10 +42,10 @@ from pdhef_logtool.runs.referencing import prior_of
 from pdhef_logtool.runs.self_calibrating import calibrate_drive
 from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.files import write_bytes
-from studies.condition_runs import source_digest
 from studies.drawn_cars import FIT_FRICTION, fit_vehicle
 from studies.pages import DOCS, DRIVES, RESULTS, ROOT, number, options, table, write
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_of, vehicle_of
+from studies.recalibrate import input_digest
 from truthsim.batch import DriveSpec
 from truthsim.drive import DEFAULT_VEHICLE, write_drive
 from truthsim.vehicle_choice import choose_vehicle
@@ -129,9 +128,7 @@ class ScoredDrive:
 
 def recorded_drive(drive: PeerDrive) -> ScoredDrive:
     """Read a recorded drive as ``pdhef run`` does; a receiver's velocity is mapped where the log has one."""
-    mapping = mapping_of(drive)
-    if drive.log.startswith("v40_"):
-        mapping = with_receiver(mapping)
+    mapping = mapping_of(drive, receiver=drive.log.startswith("v40_"))
     car = Car.of(vehicle_of(drive))
     with read_drive(DRIVES / drive.log, car, mapping, ReadOptions()) as opened:
         prior = prior_of(car, calibrate_drive(opened, RunConfig()))
@@ -145,22 +142,6 @@ def recorded_drive(drive: PeerDrive) -> ScoredDrive:
 
 def _estimates(car: Car, signals: Signals) -> tuple[StateTrack, ...]:
     return tuple(run_window(make_estimator(name, car), signals)[0] for name in RANKED)
-
-
-def with_receiver(mapping: Mapping) -> Mapping:
-    """Return the mapping of a V40's drive with its receiver, in place of the speed, and roll and pitch rate."""
-    rates = {
-        name: SignalSource(name, "/imu/data", f"angular_velocity.{axis}", "header.stamp")
-        for name, axis in (("roll_rate_rad_s", "x"), ("pitch_rate_rad_s", "y"))
-    }
-    gnss = {
-        f"gnss_velocity_{to}_m_s": SignalSource(
-            f"gnss_velocity_{to}_m_s", "/gnss/velocity", f"twist.linear.{axis}", "header.stamp"
-        )
-        for to, axis in (("east", "x"), ("north", "y"))
-    }
-    others = {name: source for name, source in mapping.signals.items() if name != "speed_m_s"}
-    return replace(mapping, signals={**others, **gnss, **rates})
 
 
 def simulated_drive(spec: DriveSpec, vehicle: VehicleParameters | None = None) -> ScoredDrive:
@@ -556,7 +537,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     file = given.results / STORED
     stored: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     wanted = given.cases.split(",")
-    source = source_digest()
+    source = input_digest(ROOT, [f"{folder}/**/*.py" for folder in ("pdhef_logtool", "truthsim", "studies")])
     drives: dict[str, ScoredDrive] = {}
     for case in cases():
         key = digest([repr(case), source, Path(__file__).read_text(encoding="utf-8")])

@@ -1,4 +1,4 @@
-"""The maths of the condition table: pooling, percentiles, paired bootstrap over drives, intervals.
+"""The maths of the condition table: pooling, percentiles, paired bootstrap over drives.
 
 All functions take one figure a drive. A drive whose figure is NaN (nothing to score) does not count.
 """
@@ -8,14 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pdhef_logtool.evaluation.metrics import NORMAL_95
-from pdhef_logtool.records.signals import FloatArray
-
+FloatArray = NDArray[np.float64]
 #: Resamples of a bootstrap, and the level of its intervals.
 RESAMPLES, LEVEL = 2000, 0.95
-#: Share of samples that a 95 % interval may miss; weight of a miss in the interval score is 2 / ALPHA.
-ALPHA = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,16 +65,6 @@ def median_ratio(rmse: FloatArray, other: FloatArray) -> Bound:
         resampled = np.median(a[draw], axis=1) / np.median(b[draw], axis=1)
     low, high = np.nanpercentile(resampled, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
     return Bound(value, float(low), float(high), drives)
-
-
-def interval_score(error: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Return the interval score (Gneiting and Raftery 2007, Eq 43) of central 95 % intervals ± 1.96 σ, [N].
-
-    Width of the interval plus 2/α times the distance by which the error lies outside; smaller is better, and the true
-    quantiles minimise its mean. Unit of the error.
-    """
-    half = NORMAL_95 * sigma
-    return np.asarray(2.0 * half + 2.0 / ALPHA * np.maximum(np.abs(error) - half, 0.0))
 
 
 def verdict(bound: Bound, *, margin: float = 1.05) -> str:

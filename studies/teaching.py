@@ -2,11 +2,10 @@
 
     python -m studies.teaching [--cars GTI,...] [--out docs] [--stored]
 
-Each drive calibrates its car on its own sensors, without ground truth. Columns: ``physics`` of the untaught car, of the
-taught car, and ``pd-hef`` of the taught car with its residual, also of a car that the sideslip reference taught, where
-it is independent, in place of ground truth. The drives are in ``../shared`` and may not be
-redistributed. Without them, the command ends with 0 and writes nothing. Simulated cars have a file with a stiffness
-error of a factor 0.5 to 2 at each axle; a drive with a simulated RTK teaches, and the exact sideslip scores.
+``pdhef learn`` teaches; ``pdhef run`` calibrates the car on the sensors of the scored drive, without ground truth.
+Columns: ``physics`` of the untaught car, of the taught car, and ``pd-hef`` of the taught car with its residual, also of
+a car that the sideslip reference taught, where it is independent, in place of ground truth. The drives are in
+``../shared`` and may not be redistributed. Without them, the command ends with 0 and writes nothing.
 """
 
 from __future__ import annotations
@@ -14,47 +13,21 @@ from __future__ import annotations
 import json
 import math
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import permutations
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
+import polars as pl
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.taught import Taught
-from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.estimators.calibration.calibration import self_calibrate
-from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.reference.drive import refer
-from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
-from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
-from pdhef_logtool.learning.car.taught_prior import taught_driving
-from pdhef_logtool.learning.stages.teach import LEAST_S, OpenedDrive, learn_from, open_drive
-from pdhef_logtool.learning.truth import independent
-from pdhef_logtool.mapping import Mapping
-from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.residual_model.bundle import open_model
-from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.estimating import calibrator
-from pdhef_logtool.runs.referencing import prior_of
-from pdhef_logtool.runs.self_calibrating import driven_d2, self_calibrated
-from pdhef_logtool.storage.files import write_bytes
-from studies.pages import DOCS, DRIVES, RESULTS, number, options, table, write
-from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_of, vehicle_of
-from studies.reference import MADE, RECEIVERS, ScoredDrive, with_gnss, with_receiver
-from studies.self_calibration import simulated_drives
-from truthsim.drive import write_drive
+from studies.gates.tool import Tool
+from studies.pages import DOCS, DRIVES, RESULTS, ROOT, number, options, table, write, write_toml
+from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 
 RESULTS_FILE = RESULTS / "teaching.json"
 #: No pair may be worse than untaught by more than the larger of this share and this many degrees.
 WORSE_SHARE, WORSE_DEG = 0.05, 0.03
-#: Intervals run six filters, and longer drives have none here.
-MOST_STAMPS = 20_000
 #: Driving counts as alike where the residual is active on so much of it.
 ALIKE = 0.5
 #: The paper's network, trained in simulation, in the sigma points of the paper's filter.
@@ -99,14 +72,6 @@ CARS = (
     TeachCar("1:10 DART", (TeachPart("dart_circles_fast.mcap"), TeachPart("dart_steer_rate.mcap"))),
     TeachCar("1:10 F1TENTH", tuple(map(TeachPart, _F1TENTH)), taught_on=5),
 )  # fmt: skip
-SIMULATED = "simulated"
-#: Manoeuvre, km/h, seconds of the drives of a simulated car; seeds of the cars, and cars of each seed. The settings
-#: were chosen on the first seed.
-SIMULATED_DRIVES = (
-    ("road", 90.0, 120.0), ("sine-sweep", 90.0, 30.0), ("dlc", 80.0, 26.0), ("fishhook", 70.0, 24.0),
-    ("sine-with-dwell", 80.0, 24.0),
-)  # fmt: skip
-SEEDS, CARS_PER_SEED, LEAST_SPEED_M_S = (29, 31), 4, 3.0
 
 PAGE = """# Teaching on recorded drives
 
@@ -120,23 +85,16 @@ residual acts. *paper*: `pd-hef-paper`, the ST-ResNet of the simulated saloon in
 it is not taught. *95 %*: coverage of the confidence intervals of untaught `physics` and of `pd-hef`.
 *reference*: the ratio if the [sideslip reference](reference.md) teaches (below).
 
-These are development figures: the settings were chosen on these pairs and on the simulated cars of seed {seed}; one
-variant was also seen on the second seed.
+These are development figures: the settings were chosen on these pairs.
 
 {pairs}
 
 {summary}
 
-Simulated cars with wrong files, each taught on the drive of a row: geometric mean of the ratio (largest ratio; pairs
-worse by more than max(5 %, 0.03°)).
-
-{simulated}
-
 ## Taught by the reference
 With `--set reference=on`, `learn` takes the [sideslip reference](reference.md) of drives without ground truth, weighted
-by its standard deviation, where GNSS makes it independent of the other sensors. Pairs with at least {least_s:.0f} s of
-that are in the table above, others have –. GNSS of the V40 is recorded, that of the others is made from ground truth
-(Doppler 10 Hz). The default is off: it is not validated with a recorded receiver. The simulated drives are too short.
+by its standard deviation, where GNSS makes it independent of the other sensors. In the table above these are the pairs
+of the V40 with its recorded GNSS receiver; others have –. The default is off: it is not validated with other receivers.
 """
 
 
@@ -187,141 +145,92 @@ def peer_of(part: TeachPart) -> PeerDrive:
     return next(p for p in PEER_DRIVES if p.log == part.log)
 
 
-def opened(part: TeachPart, car: Car) -> OpenedDrive:
-    """Read a part for a car."""
-    mapping = mapping_of(peer_of(part))
+def inputs(tool: Tool, part: TeachPart, *, receiver: bool = False, truth: bool = True) -> list[str | Path]:
+    """Return the log of a part with the options for its mapping and slice; ``receiver``: of the V40's GNSS."""
+    mapping = mapping_table(peer_of(part), receiver=receiver)
     if part.steering_gain != 1.0:
-        wheel = mapping.signals["steering_wheel_rad"]
-        assert isinstance(wheel.scale, float)
-        angle = replace(wheel, name="steer_rad", scale=wheel.scale * part.steering_gain)
-        others = {k: v for k, v in mapping.signals.items() if k != "steering_wheel_rad"}
-        mapping = Mapping({**others, "steer_rad": angle}, mapping.truth)
-    config = RunConfig(start=part.start, end=part.end)
-    with read_drive(DRIVES / part.log, car, mapping, config.read_options) as drive:
-        record, found = open_drive(drive, config)
-    if found is None:
-        raise SystemExit(f"{part.name}: {record.left_out}")
+        wheel = mapping["signals"].pop("steering_wheel_rad")
+        mapping["signals"]["steer_rad"] = wheel | {"scale": wheel["scale"] * part.steering_gain}
+    if not truth:
+        del mapping["truth"]
+    name = f"{part.log}{'-gnss' if receiver else ''}{'' if truth else '-without'}.toml"
+    file = write_toml(tool.work / "mappings" / name, mapping)
+    span = [text for name, value in (("--start", part.start), ("--end", part.end)) if value for text in (name, value)]
+    return [DRIVES / part.log, "--mapping", file, *span]
+
+
+def learn(tool: Tool, car: Path, parts: Sequence[TeachPart], name: str) -> tuple[Path, str]:
+    """Teach a car on parts, one after the other, as ``pdhef learn`` does; return it and its residual."""
+    by_span: dict[tuple[str | None, str | None], list[TeachPart]] = {}
+    for part in parts:
+        by_span.setdefault((part.start, part.end), []).append(part)
+    output = tool.work / "cars" / name
+    (same_span,) = by_span.values()  # one call has one slice
+    _, *options_of = inputs(tool, same_span[0])
+    tool.json("learn", *(DRIVES / part.log for part in same_span), *options_of, "--car", car, "-o", output, "--fresh")
+    taught = json.loads((output / "taught.json").read_text(encoding="utf-8"))
+    return output, (taught.get("residual") or {}).get("rung", "none")
+
+
+def learn_by_reference(tool: Tool, car: Path, part: TeachPart, name: str) -> Path | None:
+    """Teach a car on a drive of the V40 by the reference with its receiver; None if it does not teach."""
+    output = tool.work / "cars" / name
+    given = (*inputs(tool, part, receiver=True, truth=False), "--car", car, "-o", output, "--fresh")
+    try:
+        tool.json("learn", *given, "--set", "reference=on")
+    except RuntimeError as refused:
+        print(f"{name}: {refused}", file=sys.stderr)
+        return None
+    return output
+
+
+def scores(tool: Tool, part: TeachPart, car: Path, names: Sequence[str], *options_of: str) -> dict[str, Score]:
+    """Run estimators on a part, calibrated on its own sensors, and return their scores."""
+    run_name = f"{car.stem}-{part.name}{''.join(options_of)}".replace(" ", "-")
+    given = ("--car", car, "--keep", "estimates", "--estimators", ",".join(names), *options_of)
+    folder = tool.run(run_name, *inputs(tool, part), *given)
+    figures = pl.read_parquet(folder / "metrics.parquet").filter(signal="sideslip_rad", segment="all")
+    (file,) = folder.glob("logs/*/estimates.parquet")
+    tracks = pl.read_parquet(file)
+    found = {}
+    for name in names:
+        of = dict(figures.filter(estimator=name).select("metric", "value").iter_rows())
+        trust = tracks.filter(estimator=name)["network_trust"].fill_null(0.0).fill_nan(0.0)
+        constant = math.sqrt(max(of["rmse"] ** 2 - of["bias"] ** 2, 0.0))
+        degrees = math.degrees(of["rmse"]), math.degrees(constant)
+        found[name] = Score(*degrees, float((trust > 0.0).mean() or 0.0), of.get("coverage95"))
     return found
 
 
-def by_reference(drive: OpenedDrive, received: Signals | None = None) -> OpenedDrive:
-    """Return a drive that the reference teaches, of signals with a receiver, else with GNSS made from ground truth."""
-    truth, car = drive.truth, drive.drive.car
-    prior = prior_of(car, self_calibrate([drive.taught.driving], car.vehicle))
-    heading = np.cumsum(np.nan_to_num(truth.yaw_rate_rad_s) * np.gradient(truth.stamps_ns * 1e-9))
-    made = ScoredDrive(drive.whole.signals, prior, truth.vx_m_s, truth.vy_m_s, heading, np.zeros(len(truth)))
-    span = refer(with_gnss(made, RECEIVERS[MADE]) if received is None else received, prior)
-    track = independent(ReferenceEstimator(() if span.refused else (span,)).at(truth.stamps_ns))
-    return replace(drive, whole=replace(drive.whole, truth=track), taught=taught_driving(drive.taught.driving, track))
-
-
-def received(part: TeachPart, car: Car) -> Signals | None:
-    """Return the signals of a part with those of its receiver, None if it has none."""
-    if not part.log.startswith("v40_"):
-        return None
-    with read_drive(DRIVES / part.log, car, with_receiver(mapping_of(peer_of(part))), ReadOptions()) as drive:
-        return drive.whole().signals
-
-
-def score(
-    drive: OpenedDrive, car: Car, name: str, taught: Taught | None, least_speed_m_s: float, most_stamps: int = 0
-) -> Score:
-    """Calibrate a car on a drive and score an estimator, with its intervals up to ``most_stamps``."""
-    prior = () if taught is None else taught.parameters
-    calibration = self_calibrate([drive.taught.driving], car.vehicle, taught=prior)
-    wanted = len(drive.whole.signals) <= most_stamps
-    bare = replace(calibration, varied=())
-    if wanted:
-        d2_m_s = driven_d2([drive.whole.signals], self_calibrated(drive.drive, bare), calibration)
-        calibration = replace(calibration, driven_d2_m_s=d2_m_s)
-    calibrated = replace(self_calibrated(drive.drive, calibration if wanted else bare), taught=taught)
-    estimator = make_estimator(name, replace(calibrated, network=car.network))
-    track, _ = run_window(estimator, drive.whole.signals)
-    track = calibrator(calibrated, [estimator]).add(track, drive.whole.signals)
-    error = signal_error(track, drive.truth, "sideslip_rad", least_speed_m_s)
-    kept = np.isfinite(error)
-    degrees = np.degrees(error[kept])
-    covered = float(np.mean(np.abs(error[kept]) <= NORMAL_95 * track.sideslip_std_rad[kept])) if wanted else None
-    active = float(np.mean(track.network_trust[kept] > 0.0))
-    return Score(float(np.sqrt(np.mean(degrees**2))), float(np.std(degrees)), active, covered)
-
-
-def pairs_of(car: TeachCar) -> Iterator[PairResult]:
+def pairs_of(tool: Tool, car: TeachCar) -> Iterator[PairResult]:
     """Yield the results of a car's pairs."""
-    of_file = Car.of(vehicle_of(peer_of(car.parts[0])))
-    drives = [opened(part, of_file) for part in car.parts]
-    choices: list[tuple[tuple[int, ...], int]] = [((a,), b) for a, b in permutations(range(len(drives)), 2)]
+    parts = car.parts
+    file = write_toml(tool.work / "cars" / f"{car.name}.toml".replace(" ", "-").replace(":", "-"),
+                      vehicle_table(peer_of(parts[0])))  # fmt: skip
+    untaught = [scores(tool, part, file, ("physics", "kinematic")) for part in parts]
+    paper = [scores(tool, part, file, (PAPER,), "--network", "default")[PAPER] for part in parts]
+    choices: list[tuple[tuple[int, ...], int]] = [((a,), b) for a, b in permutations(range(len(parts)), 2)]
     if car.taught_on > 1:
-        choices = [(tuple(range(car.taught_on)), k) for k in range(car.taught_on, len(drives))]
-    names, least = [part.name for part in car.parts], peer_of(car.parts[0]).least_speed_m_s
-    references = [by_reference(d, received(part, of_file)) for d, part in zip(drives, car.parts, strict=True)]
-    yield from taught_pairs(car.name, of_file, names, (drives, references, drives), choices, least, MOST_STAMPS)
-
-
-def taught_pairs(
-    car_name: str, car: Car, names: Sequence[str], drives: tuple[Sequence[OpenedDrive], ...],
-    choices: Sequence[tuple[tuple[int, ...], int]], least: float, most_stamps: int = 0,
-) -> Iterator[PairResult]:  # fmt: skip
-    """Yield the results of pairs; ``drives`` : that ground truth and reference (or none) teach, and that score."""
-    *teaching, scored = drives
-    untaught = [score(d, car, "physics", None, least, most_stamps) for d in scored]
-    paper = replace(car, network=open_model(None))
-    kinematic = [score(d, car, "kinematic", None, least).rmse_deg for d in scored]
-    of_paper = [score(d, paper, PAPER, None, least).rmse_deg for d in scored]
-    learned: dict[tuple[int, ...], tuple[Taught, Taught | None]] = {}
+        choices = [(tuple(range(car.taught_on)), k) for k in range(car.taught_on, len(parts))]
+    learned: dict[tuple[int, ...], tuple[Path, str, Path | None]] = {}
     for teachers, k in choices:
+        taught_on = parts[teachers[0]].name if len(teachers) == 1 else f"{len(teachers)} runs"
         if teachers not in learned:
-            by_truth, referred = ([d[i] for i in teachers if d] for d in teaching)
-            enough = sum(d.seconds for d in referred) >= LEAST_S
-            learned[teachers] = learn_from(by_truth).part(car), learn_from(referred).part(car) if enough else None
-        taught, of_reference = learned[teachers]
-        reference = None if of_reference is None else score(scored[k], car, "pd-hef", of_reference, least)
-        prior, hybrid = (score(scored[k], car, n, taught, least, most_stamps) for n in ("physics", "pd-hef"))
-        taught_on = ", ".join(names[i] for i in teachers) if len(teachers) == 1 else f"{len(teachers)} runs"
-        rung = "none" if taught.residual is None else taught.residual.rung
-        others = (kinematic[k], of_paper[k], rung, reference)
-        yield PairResult(car_name, taught_on, names[k], untaught[k], prior, hybrid, *others)
-
-
-def simulated_pairs(seed: int) -> Iterator[PairResult]:
-    """Yield the results of the pairs of simulated cars."""
-    driven = list(simulated_drives(CARS_PER_SEED, seed, SIMULATED_DRIVES))
-    for index in range(CARS_PER_SEED):
-        of_car = [(simulated, drive) for simulated, drive, _ in driven if simulated.car == index]
-        car = Car.of(of_car[0][0].file.with_stiffness(*of_car[0][0].factors))
-        drives: dict[Literal["rtk", "perfect"], list[OpenedDrive]] = {"rtk": [], "perfect": []}
-        with tempfile.TemporaryDirectory() as folder:
-            for simulated, drive in of_car:
-                path = Path(folder) / f"{simulated.manoeuvre}.mcap"
-                write_drive(drive, path)
-                for source, found in drives.items():
-                    with read_drive(path, car, options=ReadOptions(friction=None, prefer_truth=source)) as read:
-                        drive_opened = open_drive(read, RunConfig())[1]
-                    assert drive_opened is not None
-                    found.append(drive_opened)
-        names = [simulated.manoeuvre for simulated, _ in of_car]
-        choices = [((a,), b) for a, b in permutations(range(len(names)), 2)]
-        both = (drives["rtk"], (), drives["perfect"])
-        yield from taught_pairs(f"{SIMULATED} {seed}-{index}", car, names, both, choices, LEAST_SPEED_M_S)
-
-
-def simulated_table(results: Sequence[PairResult]) -> str:
-    """Return a table of the simulated pairs by seed and the manoeuvre that teaches."""
-    names = [name for name, _, _ in SIMULATED_DRIVES]
-
-    def cell(ratios: Sequence[float], more: str = "") -> str:
-        return f"{geometric_mean(ratios)} ({max(ratios):.2f}{more})" if ratios else "–"
-
-    body = []
-    for seed in SEEDS:
-        of = {s: [r for r in results if r.car.startswith(f"{SIMULATED} {seed}-") and r.scored == s] for s in names}
-        for taught in names:
-            pairs = [[r for r in of[s] if r.taught == taught] for s in names]
-            cells = [cell([r.ratio for r in p], f"; {sum(r.worse for r in p)}") for p in pairs]
-            body.append([str(seed), taught, *cells])
-        of_paper = [cell([r.paper_deg / r.untaught.rmse_deg for r in of[s]]) for s in names]
-        body.append([str(seed), "(paper's network)", *of_paper])
-    return table(["seed", "taught on", *names], body, right_from=2)
+            name = f"{file.stem}-{teachers[0]}"
+            taught, rung = learn(tool, file, [parts[i] for i in teachers], name)
+            has_receiver = parts[teachers[0]].log.startswith("v40_")
+            by_reference = (
+                learn_by_reference(tool, file, parts[teachers[0]], f"{name}-reference") if has_receiver else None
+            )
+            learned[teachers] = taught, rung, by_reference
+        taught, rung, by_reference = learned[teachers]
+        after = scores(tool, parts[k], taught, ("physics", "pd-hef"))
+        referred = None if by_reference is None else scores(tool, parts[k], by_reference, ("pd-hef",))["pd-hef"]
+        of = untaught[k]
+        yield PairResult(
+            car.name, taught_on, parts[k].name, of["physics"], after["physics"], after["pd-hef"],
+            of["kinematic"].rmse_deg, paper[k].rmse_deg, rung, referred,
+        )  # fmt: skip
 
 
 def pair_table(results: Sequence[PairResult]) -> str:
@@ -372,7 +281,8 @@ def geometric_mean(ratios: Sequence[float]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the pairs and write the page."""
     parser = options("teaching", __doc__)
-    parser.add_argument("--cars", default=",".join((*(c.name for c in CARS), SIMULATED)))
+    parser.add_argument("--cars", default=",".join(c.name for c in CARS))
+    parser.add_argument("--work", type=Path, default=ROOT / "out" / "teaching")
     parser.add_argument("--out", type=Path, default=DOCS)
     parser.add_argument("--results", type=Path, default=RESULTS_FILE)
     parser.add_argument("--stored", action="store_true", help="write the page of the stored results")
@@ -384,17 +294,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("needs ../shared beside the repository (recorded drives that may not be redistributed); nothing is done")
         return 0
     wanted = given.cars.split(",")
-    if unknown := set(wanted) - {SIMULATED, *(c.name for c in CARS)}:
+    if unknown := set(wanted) - {c.name for c in CARS}:
         parser.error(f"--cars: expected names out of {', '.join(c.name for c in CARS)}, got {', '.join(unknown)}")
     results = []
-    studied = [pairs_of(c) for c in CARS if c.name in wanted]
-    if SIMULATED in wanted:
-        studied += map(simulated_pairs, SEEDS)
-    for pairs in studied:
-        for result in pairs:
+    for car in (c for c in CARS if c.name in wanted):
+        for result in pairs_of(Tool(ROOT, given.work.resolve()), car):
             results.append(result)
             print(pair_table([result]).splitlines()[-1], file=sys.stderr)
-    write_bytes(given.results, (json.dumps([asdict(r) for r in results], indent=1) + "\n").encode())
+    write(given.results, json.dumps([asdict(r) for r in results], indent=1) + "\n")
     write_page(given.out, results)
     return 0
 
@@ -408,9 +315,7 @@ def stored_results(file: Path) -> list[PairResult]:
 
 def write_page(folder: Path, results: Sequence[PairResult]) -> None:
     """Write the page of results."""
-    recorded = [r for r in results if not r.car.startswith(SIMULATED)]
-    parts = {"pairs": pair_table(recorded), "summary": summary(recorded), "simulated": simulated_table(results)}
-    write(folder / "teaching.md", PAGE.format(seed=SEEDS[0], least_s=LEAST_S, **parts))
+    write(folder / "teaching.md", PAGE.format(pairs=pair_table(results), summary=summary(results)))
 
 
 if __name__ == "__main__":

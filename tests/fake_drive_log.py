@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.recording_span import RecordingSpan
@@ -49,8 +48,8 @@ class FakeLog(DriveLog):
         return max((int(t.log_time_ns.max()) + 1 for t in self.contents.values() if len(t.log_time_ns)), default=0)
 
     @property
-    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        return ()
+    def size(self) -> int:
+        return 0
 
     @property
     def recording_span(self) -> RecordingSpan:

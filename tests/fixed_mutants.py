@@ -40,7 +40,7 @@ LIST = Path(__file__).with_suffix(".json")
 #: What tests and sources import: loaded once, where that is quicker.
 LIBRARIES = (
     "numpy", "numba", "numba.typed", "polars", "pyarrow.parquet", "scipy.optimize", "scipy.ndimage", "scipy.stats",
-    "pydantic", "rich.console", "typer", "jinja2", "tomlkit", "mcap.reader", "mcap.writer", "rosbags.rosbag1",
+    "pydantic", "rich.console", "typer", "jinja2", "mcap.reader", "mcap.writer", "rosbags.rosbag1",
     "rosbags.typesys", "google.protobuf.descriptor_pb2", "cantools", "fsspec", "safetensors.numpy", "torch", "rerun",
     "matplotlib.figure", "matplotlib.backends.backend_agg", "hypothesis.extra.numpy", "jsonschema",
 )  # fmt: skip

@@ -64,7 +64,6 @@ def test_car_load(sample_logs_dir: Path, kind: Any) -> None:
 @pytest.mark.parametrize("entry", FILES)
 def test_run_config_and_read_options(kind: Any, entry: str) -> None:
     assert getattr(pdhef.RunConfig(**{entry: kind("a/b.toml")}), entry) == Path("a/b.toml")
-    assert pdhef.RunConfig(cache=kind("a")).read_options.cache == "a" == pdhef.ReadOptions(cache=kind("a")).cache
 
 
 @pytest.mark.parametrize("kind", KINDS)

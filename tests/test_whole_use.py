@@ -46,7 +46,7 @@ def test_from_a_recording_to_a_network_and_back(kind: str, tmp_path: Path, capsy
     (drive / "report.html").unlink()
     pdhef("report", before)
     assert "drive" in (drive / "report.html").read_text()
-    events = said(capsys, "events", before, "--where", "abs(ay_m_s2) > 2 for 0.5s", "--clip")
+    events = said(capsys, "events", before, "--where", "abs(ay_m_s2) > 2", "--for", "0.5s", "--clip")
     assert len(events["events"]) == 1
     (clip,) = before.rglob("*clip*/*.mcap")
     with clip.open("rb") as file:

@@ -145,7 +145,7 @@ class Car:
         ----------
         path : a car's folder, a vehicle.toml, ``saloon`` (the shipped car); None: the default sedan.
         network : instead of the car's own: a shipped network's name, a folder, ``none``.
-        intervals : instead of the car's own: a file of ``pdhef learn --stages intervals``, ``unsure``, ``none``.
+        intervals : instead of the car's own: an ``intervals.json``, ``unsure``, ``none``.
         sensors : instead of the car's own: a profile's name, or a file with ``[sensors]``.
 
         Raises
@@ -178,9 +178,7 @@ class Car:
             )
         has_intervals_file = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
         if has_intervals_file and selected is not None and selected.physics_sha256 != car.physics_sha256:
-            stale.append(
-                f"{INTERVALS_FILE} was made with other physics; pdhef learn --stages intervals creates it again"
-            )
+            stale.append(f"{INTERVALS_FILE} was made with other physics")
         return replace(car, notes=tuple(stale))
 
     @property
@@ -358,7 +356,7 @@ def _with_parts(car: Car, folder: Path) -> Car:
     tuned = _part(folder / NOISE_FILE, Noise)
     noise: Mapping[str, FilterNoise] = {} if tuned is None else tuned.filter
     if stale := [n for n, of_filter in noise.items() if not car.owns_noise(n, of_filter)]:
-        notes.append(_stale(f"noise of {', '.join(stale)}", "it belongs to other physics", "noise"))
+        notes.append(f"noise of {', '.join(stale)} is not used: it belongs to other physics")
     noise = {**car.noise, **{n: of_filter for n, of_filter in noise.items() if n not in stale}}
     trust = _part(folder / NETWORK_FILE, Trust) or car.trust
     return replace(car, noise=noise, trust=trust, notes=tuple(notes))
@@ -416,7 +414,5 @@ def load_intervals(path: Path) -> Intervals:
         The file is missing or wrong.
     """
     file = path / INTERVALS_FILE if path.is_dir() else path
-    raw = read_json(file, "a file of pdhef learn --stages intervals", VehicleError)
-    return validated(
-        Intervals, raw, str(file), VehicleError, expected="the entries of a file of pdhef learn --stages intervals"
-    )
+    raw = read_json(file, "an intervals.json", VehicleError)
+    return validated(Intervals, raw, str(file), VehicleError, expected="the entries of an intervals.json")

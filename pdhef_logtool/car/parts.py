@@ -31,7 +31,7 @@ PHYSICS = "physics"
 #: Filters whose noise a car may contain, by the name of the estimator that it belongs to.
 NOISY_FILTERS = ("phy-ukf:tuned", PHYSICS)
 #: By what the process noise of v_y and yaw rate is multiplied where ``physics`` is smoothed, and nothing was found on
-#: ground truth: ``studies.defaults.tune_smoothing``, on simulated cars.
+#: ground truth: by a search on simulated cars.
 SMOOTHING = (0.5, 3.0)
 #: Measurements that ``r_std`` is about.
 MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
@@ -125,7 +125,7 @@ class FilterNoise(Record):
     r_std : by measurement; what is left out is the filter's own.
     limit_gain : growth of the process noise of the axle forces of ``physics`` beyond the linear range; 0: none.
     physics_sha256 : of the physics that it belongs to.
-    score_deg : in ``pdhef learn --stages noise``, lower is better; None where nothing was compared. trial : its number.
+    score_deg : objective of the noise search, lower is better; None without a search. trial : number of its trial.
     """
 
     q_std: Annotated[tuple[NonNegative, ...], Field(strict=False)] = ()
@@ -211,7 +211,7 @@ class Fit(Record):
 
 
 class Noise(Record):
-    """``noise.toml``, written by ``pdhef learn --stages noise``: filter noise by filter, and the search for it."""
+    """``noise.toml``: filter noise by filter, and the search for it."""
 
     format: Literal["pdhef-noise"] = "pdhef-noise"
     version: Literal[1] = 1
@@ -323,7 +323,7 @@ class IntervalEntry(Record):
 
 
 class Intervals(Record):
-    """``intervals.json``, written by ``pdhef learn --stages intervals``: 95 % intervals by resolved algorithm.
+    """``intervals.json``: 95 % intervals by resolved algorithm.
 
     ``spread`` is by how much friction and vehicle were made wrong too; 0: not at all.
     """

@@ -14,13 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.car.car import (
-    FIT_FILE,
     HISTORY_FILE,
-    INTERVALS_FILE,
-    NETWORK_FILE,
-    NETWORK_FOLDER,
-    NOISE_FILE,
-    TAUGHT_FILE,
     VEHICLE_FILE,
     Car,
 )
@@ -89,11 +83,10 @@ def vehicle_file(car: Car) -> bytes:
     return (car.source / VEHICLE_FILE if car.source.is_dir() else car.source).read_bytes()
 
 
-def update_car(source: Car, output: Path, change: Change, *, parts_from: Path | None = None) -> Path:
+def update_car(source: Car, output: Path, change: Change) -> Path:
     """Write a change into the car's folder ``output``; return the path of the part.
 
     A new folder contains the source's vehicle.toml and parts as well. ``output`` may be the source itself.
-    ``parts_from``: a car's folder whose parts and history take the place of those in ``output``.
 
     Raises
     ------
@@ -114,9 +107,6 @@ def update_car(source: Car, output: Path, change: Change, *, parts_from: Path | 
                 shutil.copytree(base, fresh, dirs_exist_ok=True, ignore=shutil.ignore_patterns(f"{LOCK_FILE}*"))
             else:
                 write_bytes(fresh / VEHICLE_FILE, vehicle_file(source))
-            if parts_from is not None:
-                _remove_parts(fresh)
-                shutil.copytree(parts_from, fresh, dirs_exist_ok=True)
             for name, folder in change.folders.items():
                 if (fresh / name).exists() and folder.resolve() != (output / name).resolve():
                     shutil.rmtree(fresh / name)
@@ -133,12 +123,6 @@ def update_car(source: Car, output: Path, change: Change, *, parts_from: Path | 
     finally:
         lock.release()
     return output / change.part
-
-
-def _remove_parts(folder: Path) -> None:
-    shutil.rmtree(folder / NETWORK_FOLDER, ignore_errors=True)
-    for name in (FIT_FILE, NOISE_FILE, NETWORK_FILE, INTERVALS_FILE, TAUGHT_FILE, HISTORY_FILE):
-        (folder / name).unlink(missing_ok=True)
 
 
 def _log(folder: Path, change: Change) -> None:

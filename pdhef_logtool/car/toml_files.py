@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +14,7 @@ from pdhef_logtool.car.parts import Trust
 from pdhef_logtool.car.vehicle import REMEDY, SENSOR_PROFILES, Record, Sensors, VehicleParameters
 from pdhef_logtool.records.errors import VehicleError
 from pdhef_logtool.storage.documents import read_toml, validated
+from pdhef_logtool.storage.toml_text import toml_text
 
 
 class _Network(Record):
@@ -94,61 +95,10 @@ def load_vehicle(path: Path) -> VehicleParameters:
 
 def part_toml(part: Record, head: str, comments: Mapping[str, str] | None = None) -> str:
     """Return a part of a car's folder as TOML with ``head`` above it and ``comments`` beside entries by dotted name."""
-    import tomlkit
-
-    document = tomlkit.document()
-    for line in head.splitlines():
-        document.add(tomlkit.comment(line))
     plain: dict[str, Any] = part.model_dump(mode="json", exclude_none=True)
-    _fill(document, {k: v for k, v in plain.items() if v not in ([], {})})
-    _comment(document, comments or {})
-    return tomlkit.dumps(document)
+    return toml_text({k: v for k, v in plain.items() if v not in ([], {})}, head, comments)
 
 
-def vehicle_toml(vehicle: VehicleParameters, head: str = "", comments: Mapping[str, str] | None = None) -> str:
+def vehicle_toml(vehicle: VehicleParameters, head: str = "") -> str:
     """Return vehicle.toml of physics and sensors; reading it back gives the same."""
-    return part_toml(vehicle, head, comments)
-
-
-def _fill(table: Any, entries: Mapping[str, Any]) -> None:
-    """Add entries to a TOML table in place; plain entries before lists and tables."""
-    import tomlkit
-
-    for key, value in sorted(entries.items(), key=lambda item: _rank(item[1])):
-        if isinstance(value, Mapping) and any(map(_rank, value.values())):
-            table[key] = tomlkit.table()
-            _fill(table[key], value)
-        else:
-            table[key] = _lines(value) if isinstance(value, list) and _rank(value) else value
-
-
-def _rank(value: Any) -> int:
-    """Return the position of an entry in a table: plain ones first, then lists with an item per line, then tables."""
-    if isinstance(value, Mapping):
-        return 2
-    return int(isinstance(value, list) and any(isinstance(item, Mapping | str) for item in value))
-
-
-def _lines(items: Sequence[Any]) -> Any:
-    """Return a list with an item per line."""
-    import tomlkit
-
-    array = tomlkit.array().multiline(True)
-    for item in items:
-        if isinstance(item, Mapping):
-            inline = tomlkit.inline_table()
-            inline.update(item)
-            item = inline
-        array.append(item)
-    return array
-
-
-def _comment(document: Any, comments: Mapping[str, str]) -> None:
-    """Write comments beside entries that exist, by dotted name; a table's name may contain no dot."""
-    for name, text in comments.items():
-        *tables, entry = name.split(".")
-        place: Any = document
-        for table in tables:
-            place = place.get(table, {})
-        if entry in place:
-            place[entry].comment(text).trivia.comment_ws = "  "
+    return part_toml(vehicle, head)

@@ -123,20 +123,22 @@ def _gate(
 
 @options.command(
     commands,
-    'pdhef events out --where "abs(sideslip_error_deg) > 2 for 0.5s"',
+    'pdhef events out --where "abs(sideslip_error_deg) > 2 and speed_m_s > 10" --for 0.5s',
     'pdhef events out --where "diverged or not valid" --json',
     'pdhef events out --where "abs(sideslip_deg) > 9" --clip --pad 3s',
     'pdhef events out --where "abs(ay_m_s2) > 6" --parquet events.parquet',
     panel=panels.READ,
-    notes="Columns: those of estimates.parquet, speed_m_s, and errors relative to ground truth: sideslip_error_rad, "
-    "vx_error_m_s, vy_error_m_s, yaw_rate_error_rad_s, ay_error_m_s2; _deg and _km_h instead of _rad and _m_s. They "
-    'refer to the selected estimate, or to the track before a dot: truth.vx_m_s, "pd-hef:gain=1".vx_m_s. Operators: '
-    "< <= > >= == !=, and or not, + - * /, abs(), (). for 0.5s at the end is the minimum duration.",
+    notes="EXPR is an expression in the SQL of Polars. Columns: those of estimates.parquet, speed_m_s, and errors "
+    "relative to ground truth: sideslip_error_rad, vx_error_m_s, vy_error_m_s, yaw_rate_error_rad_s, ay_error_m_s2; "
+    "_deg and _km_h instead of _rad and _m_s. They refer to the selected estimate, or to the track before a dot: "
+    'truth.vx_m_s, "pd-hef:gain=1".vx_m_s. A segment or manoeuvre is a column: slalom, "cornering-left". Names with '
+    "other characters than letters and digits need double quotes.",
 )
 def events(
     output: Annotated[str, Argument(metavar="OUTPUT", help="Output of a run: folder or URL.")],
     *,
     where: Annotated[str, Option(metavar="EXPR", help="Condition on columns; docs/compare.md describes it.")],
+    least: Annotated[str, Option("--for", metavar="TIME", help="Minimum duration of an event.")] = "0s",
     pad: Annotated[
         str | None,
         Option(
@@ -158,27 +160,27 @@ def events(
 ) -> None:
     """Find the times at which a condition is true, and cut clips there."""
     from pdhef_logtool.cli.event_tables import render_events
-    from pdhef_logtool.results.events import find_events, write_events
-    from pdhef_logtool.results.expression import parse_condition
+    from pdhef_logtool.results.events import event_condition, find_events, write_events
     from pdhef_logtool.results.opened_run import open_run
     from pdhef_logtool.storage.object_store import is_url
     from pdhef_logtool.storage.outputs import check_no_input
 
-    condition = parse_condition(where)
-    pad_s = (_CLIP_PAD_S if clip else _PAD_S) if pad is None else _seconds(pad)
+    condition = event_condition(where)
+    least_s = _seconds(least, "--for")
+    pad_s = (_CLIP_PAD_S if clip else _PAD_S) if pad is None else _seconds(pad, "--pad")
     if source is not None and not clip:
         raise UsageError(expected="--clip", got="--source alone", where="--source")
     if is_url(output) and clip:
         options.local_folder(output)
     check_no_input([] if is_url(output) else [Path(output)], [] if parquet is None else [parquet])
     run = open_run(output)
-    events_found = find_events(run, condition, estimator=estimator, pad_s=pad_s)
+    events_found = find_events(run, condition, estimator=estimator, least_s=least_s, pad_s=pad_s)
     for line in events_found.damaged:
         console.warn(line)
     if clip:
         from pdhef_logtool.results.clips import write_clips
 
-        named = {column.track for column in condition.columns() if column.track is not None}
+        named = {r.track for r in condition.references.values() if r.track is not None}
         named |= set() if estimator is None else {estimator}
         events_found = write_clips(run, events_found, pad_s=pad_s, named=named, source=source, tell=console.warn)
     if parquet is not None:
@@ -186,9 +188,9 @@ def events(
     console.finish(events_found, render_events, as_json)
 
 
-def _seconds(text: str) -> float:
+def _seconds(text: str, option: str) -> float:
     """Return the seconds of ``5s``, ``500ms`` or ``5``; raises UsageError."""
     match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(ms|s)?\s*", text, re.ASCII)
     if match is None or float(match[1]) > 1e6:
-        raise UsageError(expected="a time such as 5s", got=text, where="--pad")
+        raise UsageError(expected="a time such as 5s", got=text, where=option)
     return float(match[1]) * (1e-3 if match[2] == "ms" else 1.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,23 +21,16 @@ commands = typer.Typer()
     commands,
     "pdhef learn drives/ --car guess.toml -o mycar",
     "pdhef learn logs/ --car guess.toml -o mycar --without-truth",
-    "pdhef learn logs/ --car mycar -o mycar --stages noise",
     "pdhef learn lap.mcap --car mycar -o mycar --start 155 --stages gain",
-    "pdhef learn logs/ --car mycar -o mycar --stages intervals",
     panel=panels.LEARN,
     notes="""The default stage, teach, uses all driving with ground truth, from 20 s on: it learns the prior for the
 calibration of every later drive, and the residual that physics then lacks (taught.json in the car's folder). With
 --set reference=on the sideslip reference takes the place of ground truth where a log has none.
 
-Other stages, in the order in which they run: calibrate (the car by the sensors of several logs, as
---without-truth), noise (filter noise by search), gain (residual gain of the network), network (training of the
-network and its residual gain), intervals (95 % confidence intervals).
-
-Several stages share the drives: they are split into training, validation and test; a stage that raises the validation
-error is undone; the test part is scored once (learn.md in the car's folder). An interrupted call continues when it is
-repeated. One stage alone uses all drives and is not undone. Drives that a simulated set marks test or extrapolation are
-refused; for gain alone, those marked train or validation (docs/learn.md).""",
-    shared="cache sensors friction network",
+Stage calibrate calibrates the car by the sensors of several logs, as --without-truth does; stage gain finds the
+residual gain of a network (--network). Drives that a simulated set marks test or extrapolation are refused; for gain,
+those marked train or validation (docs/learn.md).""",
+    shared="sensors friction network",
     car="Car to start from (mass, geometry, sensor noise, priors)",
 )
 def learn(
@@ -48,51 +40,30 @@ def learn(
         Path, Option("--output", "-o", metavar="CAR", help="Folder of the car to write; may be that of --car.")
     ],
     config: RunConfig,
-    stages: Annotated[str | None, Option(help="Comma-separated stages. Default: teach.")] = None,
+    stages: Annotated[str, Option(help="Stage: teach, calibrate or gain.")] = "teach",
     without_truth: Annotated[
         bool, Option("--without-truth", help="Stage calibrate: the sensors of several logs; ground truth is not read.")
     ] = False,
-    estimators: Annotated[
-        str | None,
-        Option(
-            "--estimators",
-            "-e",
-            help="Estimators of the stages noise and intervals. Default: physics with its variants; for one stage "
-            "alone, all that the car can run.",
-        ),
-    ] = None,
-    holdout: Annotated[float, Option(help="Share of the driving that is only scored, once.")] = 0.15,
-    trials: Annotated[int, Option(help="Trials of the noise search, per estimator.")] = 64,
-    vary: Annotated[
-        float, Option(help="Spread of wrong friction and vehicle in two further runs of each interval drive.")
-    ] = 0.1,
-    seed: Annotated[int, Option(help="Seed of searches, bootstraps and --vary.")] = 0,
+    seed: Annotated[int, Option(help="Seed of the residual's random features and of bootstraps.")] = 0,
     split: options.Split = None,
     any_split: options.AnySplit = False,
-    fresh: Annotated[bool, Option("--fresh", help="Forget the results of an earlier call with this output.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Learn the prior and the residual of a car, or run stages that tune, train and calibrate it."""
+    """Learn the prior and the residual of a car, calibrate it, or find the residual gain of its network."""
     from pdhef_logtool.learning.drives import CALIBRATE, TEACH, LearnSettings
-    from pdhef_logtool.learning.engine import learn as run_stages
+    from pdhef_logtool.learning.engine import learn as run_stage
 
-    if estimators is not None:
-        config = replace(config, estimators=options.split_names(estimators))
-    names = (CALIBRATE if without_truth else TEACH,) if stages is None else options.split_names(stages)
-    if without_truth and names != (CALIBRATE,):
-        raise UsageError(expected=f"stage {CALIBRATE} alone", got=str(stages), where="--without-truth")
+    if without_truth and stages not in (TEACH, CALIBRATE):
+        raise UsageError(expected=f"stage {CALIBRATE}", got=stages, where="--without-truth")
     settings = LearnSettings(
         config=config,
-        stages=names,
-        holdout=holdout,
-        trials=trials,
-        spread=vary,
+        stage=CALIBRATE if without_truth else stages,
         seed=seed,
         split=split,
         any_split=any_split,
     )
     with console.reporter() as reporter:
-        result = run_stages(logs, output, settings, fresh=fresh, reporter=reporter)
+        result = run_stage(logs, output, settings, reporter=reporter)
     console.finish(result, learning_tables.render_learning, as_json)
 
 
@@ -108,7 +79,7 @@ def learn(
     "--split defines the split. Duplicates (drives with identical signals) are used once. Columns of --where: the "
     "features, truth_vx_m_s, truth_vy_m_s; _deg and _km_h instead of _rad and _m_s (docs/retrain.md). With --set "
     "reference=on the sideslip reference takes the place of ground truth where a log has none.",
-    shared="cache sensors friction",
+    shared="sensors friction",
     car="Nominal car (default: from the manifest of a simulated set)",
 )
 def extract(

@@ -10,7 +10,6 @@ from pdhef_logtool.cli.console import cell, table, three_lines
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
     from pdhef_logtool.learning.engine import LearnResult
     from pdhef_logtool.learning.network.baselines import BaselinesResult
@@ -20,51 +19,19 @@ if TYPE_CHECKING:
 
 #: Of more drives than these only those that gave nothing are listed.
 MOST_DRIVES = 40
-#: Lines of the test part that the result names.
-_SHOWN = ("zero", "physics, as given", "pd-hef, trained")
 
 
 def render_learning(result: LearnResult, console: Console) -> None:
-    """Print the tables of a stage that ran alone; of several their outcomes, the test part and what more is worth."""
-    console.print(_head(result))
-    console.print()
-    if not result.document:
-        (stage,) = result.stages
-        _RENDER[stage.name](stage.figures, console)
-        return
-    stages = table("stage", "outcome", ">validation RMSE °\nbefore", ">\nafter", "of")
-    for s in result.stages:
-        before, after = ("-" if x is None else f"{x[1]:.3f}" for x in (s.before, s.after))
-        stages.add_row(s.name, s.status, before, after, "" if s.after is None else s.after[0])
-    console.print(stages)
-    console.print()
-    scores = table("estimator", ">RMSE °", ">95 % CI", ">coverage %")
-    for line in result.document["test"]:
-        if "skipped" in line:
-            scores.add_row(line["name"], "-", "-", "-")
-            continue
-        value, low, high = line["rmse_deg"]
-        interval = "-" if low is None else f"{low:.3f} to {high:.3f}"
-        scores.add_row(line["name"], cell(value, digits=3), interval, cell(line["covered"], 100.0, 0))
-    if result.document["test"]:
-        console.print("sideslip RMSE on the test part, scored once")
-        console.print(scores)
-    for text in result.document["more"]:
-        console.print(f"  {text}")
-    console.print(f"car in {result.car}; evidence of each decision in learn.md there", soft_wrap=True)
-
-
-def _head(result: LearnResult) -> Table:
-    """Return result, assumptions and next step."""
-    stages = "; ".join(s.text if len(result.stages) == 1 else f"{s.name} {s.status}" for s in result.stages)
-    lines = [line for line in result.document.get("test", ()) if "skipped" not in line and line["name"] in _SHOWN]
-    errors = "; ".join(f"{line['name']} {line['rmse_deg'][0]:.3f}°" for line in lines)
+    """Print result, assumptions and next step, and the tables of the stage."""
     left = f", {len(result.left_out)} left out" if result.left_out else ""
-    return three_lines(
-        f"{stages}; sideslip RMSE on the test part: {errors}" if errors else stages,
+    head = three_lines(
+        result.text,
         f"{len(result.drives)} drive{'s' * (len(result.drives) != 1)}{left}; decisions by held-out driving",
         f"pdhef run LOG --car {result.car} -o OUT",
     )
+    console.print(head)
+    console.print()
+    _RENDER[result.stage](result.figures, console)
 
 
 def _calibration(figures: Mapping[str, Any], console: Console) -> None:
@@ -78,21 +45,6 @@ def _calibration(figures: Mapping[str, Any], console: Console) -> None:
     console.print(f"  {calibration['text']}")
 
 
-def _noise(figures: Mapping[str, Any], console: Console) -> None:
-    """Print the best noise of each estimator and its sideslip error; all had the same drives and trials."""
-    from pdhef_logtool.learning.noise.search import FACTORS
-
-    errors = (">\nobjective °", ">\nmedian °", ">\npooled °", ">car's own\nobjective °")
-    tuned = table("\nestimator", *(f">{f.name}\n{f.unit}" for f in FACTORS), *errors)
-    for name, t in figures["estimators"].items():
-        before = None if t["before"] is None else t["before"]["objective_deg"]
-        scores = (*(t["score"][key] for key in ("objective_deg", "median_deg", "pooled_deg")), before)
-        values = (f"{v:g}" for v in t["values"].values())
-        tuned.add_row(name, *values, *(cell(v, digits=4) for v in scores))
-    console.print(f"sideslip RMSE over drives, {t['trials']} trials of each estimator")
-    console.print(tuned)
-
-
 def _gain(figures: Mapping[str, Any], console: Console) -> None:
     """Print the sideslip error at each residual gain, its difference to gain 0 with bounds, and the limit."""
     errors = table(">residual\ngain", ">sideslip\nRMSE °", ">squared error minus\nthat at 0, deg²", ">\n95 % bounds")
@@ -104,21 +56,6 @@ def _gain(figures: Mapping[str, Any], console: Console) -> None:
     seconds = f"{figures['scored_s']:.0f} s scored, {figures['excited_s']:.0f} s of them excited"
     console.print(f"{figures['blocks']} blocks, {seconds}")
     console.print(f"residual gain limit {figures['trust_cap']:g}: {figures['reason']}")
-
-
-def _intervals(figures: Mapping[str, Any], console: Console) -> None:
-    """Print coverage and width of the 95 % intervals of sideslip, on drives that were not fitted to."""
-    widths = (">coverage %\nbefore", ">\nafter", ">width / normal\nbefore", ">\nafter")
-    intervals = table("\nestimator", "\ncar", "grip\nuse", ">\ndrives", ">RMSE\n°", *widths)
-    for name, rows in figures["coverage"].items():
-        for c in rows:
-            covered = (f"{100.0 * c[key]:.1f}" for key in ("covered_before", "covered_after"))
-            width = (f"{c[key]:.2f}" for key in ("width_before", "width_after"))
-            given = "made wrong" if c["wrong_vehicle"] else "as given"
-            rmse = cell(c["rmse_rad"], math.degrees(1.0), 4)
-            intervals.add_row(name, given, c["bin"], str(c["drives"]), rmse, *covered, *width)
-    console.print("95 % intervals of sideslip, each drive judged by a fit without it; width over 3.92 x RMSE")
-    console.print(intervals)
 
 
 def _teaching(figures: Mapping[str, Any], console: Console) -> None:
@@ -144,7 +81,7 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         console.print(f"  {text}")
 
 
-_RENDER = {"teach": _teaching, "calibrate": _calibration, "noise": _noise, "gain": _gain, "intervals": _intervals}
+_RENDER = {"teach": _teaching, "calibrate": _calibration, "gain": _gain}
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:

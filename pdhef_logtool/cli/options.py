@@ -84,14 +84,6 @@ _OPTIONS: dict[str, Any] = {
         _Text, Option(help="Start of the time slice: 12.5, +10s, end-5s, ns or RFC 3339.", rich_help_panel=INPUT)
     ],
     "end": Annotated[_Text, Option(help="End of the time slice, same formats as --start.", rich_help_panel=INPUT)],
-    "cache": Annotated[
-        _Text,
-        Option(
-            metavar="DIR|URL",
-            help="Folder of reduced logs: written at the first run, read instead of the log later.",
-            rich_help_panel=INPUT,
-        ),
-    ],
     "clock": Annotated[
         _Text,
         Option(
@@ -266,8 +258,3 @@ def run_config(options: dict[str, Any]) -> RunConfig:
     flags = {key: value for key, value in options.items() if value not in (None, [])}
     assigned = parse_assignments(flags.pop("assignments", ()))
     return load_config(flags.pop("config_file", None), assigned | flags)
-
-
-def split_names(text: str) -> tuple[str, ...]:
-    """Split a comma-separated list."""
-    return tuple(name.strip() for name in text.split(",") if name.strip())

@@ -48,14 +48,13 @@ def _list_estimators(show: bool) -> None:
     "pdhef run fleet/ -o out --only drive_0312",
     "pdhef run @list.txt -o /shared/out --ray auto --keep metrics",
     "pdhef run @list.txt -o s3://bucket/out --jobs 8 --keep metrics --resume",
-    "pdhef run @list.txt -o out --keep metrics --cache ~/reduced",
     "pdhef run logs/ -o out --set sensors=esp",
     panel=panels.RUN,
     notes="Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of "
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
     'cars.toml, with paths relative to it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
     '"mini.toml"; [metadata.vehicle_id] "WVW-1" = "cars/golf"; default = "saloon" above them.',
-    shared="cars estimators annotate keep cache clock setup setup_from_s friction plan network calibrate "
+    shared="cars estimators annotate keep clock setup setup_from_s friction plan network calibrate "
     "reference gnss no_position waived",
     car="Car of the logs (default: a sedan)",
 )

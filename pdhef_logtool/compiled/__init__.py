@@ -1,1 +1,1 @@
-"""Numba code: the cache of machine code, and kernels in LLVM vectors."""
+"""Numba code: where machine code is kept."""

@@ -1,20 +1,17 @@
 """The ``njit`` of the package: machine code is cached where this user can write, and a cache error never ends a run.
 
-Numba searches a cache folder when a function is decorated and raises an error if there is none; a truncated cache file
-or a full disk also ends the call. Here the code goes to the first folder that can be written: ``NUMBA_CACHE_DIR``, the
-installation, the user's cache, a private temporary folder; if there is none, every run compiles. Code that the
-installation contains is also used if the installation is read-only.
+Numba raises an error if no folder can be written, if a cache file is truncated and if the disk is full. Here the code
+goes to the first folder that can be written: ``NUMBA_CACHE_DIR``, the installation, the user's cache, a private
+temporary folder; if there is none, every run compiles. The code of a read-only installation is copied there.
 
-In each place the code lies in a folder that is named after the digest of all sources (:mod:`~.sources`). The
-first process that uses a new digest removes the folders of other sources of this same installation; those of other
-installations lie elsewhere, and those of other processors and versions of Python stay.
+In each place the code is in a folder that is named after the digest of all sources (:mod:`~.sources`). The
+first process that uses a new digest removes the folders of other sources of this installation.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import gc
 import hashlib
 import os
 import re
@@ -22,12 +19,12 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import caching, config, event
+from numba.core import caching, config
 from numba.extending import overload
 from numba.misc.appdirs import AppDirs
 from numba.np import arrayobj, linalg
@@ -79,33 +76,15 @@ def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:
     """Compile a function as ``numba.njit`` does; ``cache`` keeps its machine code as described above."""
     if function is None:
         return functools.partial(njit, cache=cache, **options)
-    options |= {"no_cfunc_wrapper": True}
-    compiled = numba.njit(function, **options)
+    compiled = numba.njit(function, no_cfunc_wrapper=True, **options)
     if cache and not config.DISABLE_JIT:
-        compiled._cache = _Cache(function)
-        _kept.append(compiled)
+        if (folder := kept_in()) is None:
+            announce()
+        else:
+            compiled._cache = _Cache(function, folder)
+            _kept.append(compiled)
     return compiled
 
-
-class _RareCollection(event.Listener):  # type: ignore[misc]
-    """Collects garbage less often while numba compiles: its objects live on, and to look at them takes a fifth more."""
-
-    def __init__(self) -> None:
-        self._depth, self._usual = 0, gc.get_threshold()
-
-    def on_start(self, _: Any) -> None:
-        if self._depth == 0:
-            self._usual = gc.get_threshold()
-            gc.set_threshold(100_000, 20, 100)
-        self._depth += 1
-
-    def on_end(self, _: Any) -> None:
-        self._depth -= 1
-        if self._depth == 0:
-            gc.set_threshold(*self._usual)
-
-
-event.register("numba:compile", _RareCollection())
 
 #: The functions of the modules imported so far whose machine code is kept.
 _kept: list[Any] = []
@@ -114,8 +93,7 @@ _kept: list[Any] = []
 def load_kept() -> bool:
     """Load all cached machine code, for the processes that are forked from this one; return whether there is any."""
     for function in _kept:
-        codegen = function.targetctx.codegen()
-        for signature in function._cache.signatures(codegen):
+        for signature in function._cache.signatures(function.targetctx.codegen()):
             function.compile(signature)
     return any(function.signatures for function in _kept)
 
@@ -142,21 +120,22 @@ def kept_in() -> Path | None:
     """Return the folder that keeps the machine code; None: nowhere."""
     for place in _places():
         folder = place / sources.compiled_digest()
-        new = not folder.is_dir()
+        is_new = not folder.is_dir()
         if _writable(folder):
-            if new:
-                _remove_stale({place, _installed().parent})
+            if is_new:
+                _remove_stale(place)
+                if _installed().is_dir() and folder != _installed():
+                    shutil.copytree(_installed(), folder, dirs_exist_ok=True)
             return folder
     return None
 
 
-def _remove_stale(places: Iterable[Path]) -> None:
-    """Remove, as far as it can be written, the code of other sources."""
+def _remove_stale(place: Path) -> None:
+    """Remove, as far as it can be written, the code of other sources in a place and in the installation."""
     digest = sources.compiled_digest().partition("-")[0]
-    with contextlib.suppress(OSError):
-        for folder in [f for place in places if place.is_dir() for f in place.iterdir()]:
-            if re.fullmatch("[0-9a-f]{16}-[0-9a-f]{8}", folder.name) and not folder.name.startswith(digest):
-                shutil.rmtree(folder, ignore_errors=True)
+    for folder in [*place.glob("*"), *_installed().parent.glob("*")]:
+        if re.fullmatch("[0-9a-f]{16}-[0-9a-f]{8}", folder.name) and not folder.name.startswith(digest):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _private_folder() -> Path | None:
@@ -185,108 +164,40 @@ def _writable(folder: Path) -> bool:
     return True
 
 
-class _Cache:
-    """Cache of a compiled function: machine code of the installation and of this user."""
+class _Cache(caching.FunctionCache):  # type: ignore[misc]
+    """Numba's cache of one function in a folder."""
 
-    def __init__(self, function: Any) -> None:
-        kept = kept_in()
-        installed = _installed()
-        self.cache_path = None if kept is None else str(kept)
-        self._kept = None if kept is None else _Place(function, kept)
-        self._places = [self._kept] if self._kept else []
-        if kept != installed and installed.is_dir():
-            self._places.insert(0, _Place(function, installed))
+    def __init__(self, function: Any, folder: Path) -> None:
+        usual, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+        try:
+            super().__init__(function)
+        finally:
+            config.CACHE_DIR = usual
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        for place in self._places:
-            try:
-                overload = place.load_overload(signature, context)
-            except Exception:  # noqa: BLE001 (any error of a pickle that was cut short)
-                with contextlib.suppress(OSError):
-                    place.flush()
-                continue
-            if overload is not None:
-                return overload
-        announce()
-        return None
+        overload = None
+        try:
+            overload = super().load_overload(signature, context)
+        except Exception:  # noqa: BLE001 (any error of a pickle that was cut short)
+            with contextlib.suppress(OSError):
+                self.flush()
+        if overload is None:
+            announce()
+        return overload
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        # Two processes could give one number to the code for different arguments: the name has the process, too.
+        self._cache_file._data_name_pattern = f"{self._impl.filename_base}.{os.getpid()}-{{number}}.nbc"
+        with contextlib.suppress(OSError):  # a full disk: the next run compiles again
+            super().save_overload(signature, result)
 
     def signatures(self, codegen: Any) -> list[Any]:
         """Return for which arguments there is code for this processor."""
-        return list(dict.fromkeys(s for place in self._places for s in place.signatures(codegen)))
-
-    def save_overload(self, signature: Any, result: Any) -> None:
-        with contextlib.suppress(OSError):  # a full disk: the next run compiles again
-            if self._kept is not None:
-                self._kept.save_overload(signature, result)
-
-    def flush(self) -> None:
-        if self._kept is not None:
-            self._kept.flush()
-
-
-class _Place(caching.FunctionCache):  # type: ignore[misc]
-    """Numba's cache of one function in one folder."""
-
-    def __init__(self, function: Any, folder: Path) -> None:
-        self._impl_class = functools.partial(_Code, folder=folder)
-        super().__init__(function)
-        locator = self._impl.locator
-        self._cache_file = _File(self._cache_path, self._impl.filename_base, locator.get_source_stamp())
-
-    def signatures(self, codegen: Any) -> list[Any]:
         try:
             index = self._cache_file._load_index()
         except Exception:  # noqa: BLE001 (any error of a pickle that was cut short)
             return []
         return [key[0] for key in index if key == self._index_key(key[0], codegen)]
-
-
-class _File(caching.IndexDataCacheFile):  # type: ignore[misc]
-    """Numba's files of one function, which several processes may write at once.
-
-    Numba numbers the files of machine code by the index that it has read: two processes could give one number to the
-    code for different arguments. Here the name depends on these; what one process misses in the index of another is
-    compiled again.
-    """
-
-    def save(self, key: Any, data: Any) -> None:
-        name = f"{Path(self._index_name).stem}.{hashlib.sha256(repr(key).encode()).hexdigest()[:12]}.nbc"
-        self._save_data(name, data)
-        self._save_index({**self._load_index(), key: name})
-
-
-class _Code(caching.CompileResultCacheImpl):  # type: ignore[misc]
-    def __init__(self, function: Any, folder: Path) -> None:
-        self._locator_classes = [_Locator(folder)]
-        super().__init__(function)
-
-
-class _Locator(caching._CacheLocator):  # type: ignore[misc]
-    """Gives numba the folder that was chosen above."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def from_function(self, function: Any, file: str) -> _Locator:
-        self._file, self._module, self._line = file, function.__module__, function.__code__.co_firstlineno
-        return self
-
-    def get_cache_path(self) -> str:
-        return str(self._folder)
-
-    def get_source_stamp(self) -> bytes:
-        return _stamp(self._file)
-
-    def get_disambiguator(self) -> str:
-        # Modules of one name may lie in several packages.
-        return f"{hashlib.sha256(self._module.encode()).hexdigest()[:8]}-{self._line}"
-
-
-@functools.cache
-def _stamp(file: str) -> bytes:
-    """Return the digest of a file that is not part of the digest in the folder's name."""
-    path = Path(file)
-    return b"" if path in sources.compiled_sources() else hashlib.sha256(path.read_bytes()).digest()
 
 
 #: Whether the note that compiling begins was printed.

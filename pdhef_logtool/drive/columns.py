@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
+from pdhef_logtool.records.student import student_quantile
 
 GRID_S = 0.05
 #: −3 dB at 1 Hz: noise and vibration go, manoeuvres stay.
@@ -99,9 +100,7 @@ def independent_samples(count: int) -> float:
 
 def student(blocks: int) -> float:
     """Return the factor of a standard error from so many blocks, at least two, whose ± 1.96 contains 95 %."""
-    from scipy.special import stdtrit
-
-    return float(stdtrit(blocks - 1, 0.975)) / 1.96
+    return student_quantile(0.975, blocks - 1) / 1.96
 
 
 def _on_grid(channel: Channel, start_ns: int, cells: int) -> FloatArray:

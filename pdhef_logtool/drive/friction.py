@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,10 +12,10 @@ from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 
 if TYPE_CHECKING:
-    from pdhef_logtool.drive.windows import DriveWindow
-    from pdhef_logtool.estimators.friction_bank import FrictionBank, FrictionState
+    from pdhef_logtool.estimators.friction_bank import FrictionBank, FrictionEstimate
 
 #: What may be asked for beside a number.
 CHOICES = ("auto", "file", "estimate")
@@ -48,7 +47,7 @@ def parse_friction(text: str | float) -> str | float:
 
 @dataclass(slots=True)
 class FrictionSource:
-    """Puts the friction of a run into its windows, and keeps count of what an estimate was worth.
+    """Puts the friction of a run into the signals, and keeps what an estimate was worth.
 
     Attributes
     ----------
@@ -58,7 +57,7 @@ class FrictionSource:
     bank : estimates it; None where nothing is estimated.
     factor : error made on purpose in the friction of topic or option, for training (docs/method.md#limits).
     model_std : 1-sigma of the estimate's error that comes of the vehicle file (:data:`MODEL_STD`).
-    of_truth : it is that of the ground truth of each window, for datasets: no estimator of a run is given it.
+    of_truth : it is that of the ground truth, for datasets: no estimator of a run is given it.
     """
 
     label: str
@@ -68,31 +67,21 @@ class FrictionSource:
     factor: float = 1.0
     model_std: float = 0.0
     of_truth: bool = False
-    _carry: FrictionState | None = None
-    _std: list[FloatArray] = field(default_factory=list)
-    _observable: list[BoolArray] = field(default_factory=list)
+    estimate: FrictionEstimate | None = None
+    _filled: tuple[Signals, Signals] | None = None
 
-    def afresh(self) -> FrictionSource:
-        """Return the same source at the start of a drive."""
-        return replace(self, _carry=None, _std=[], _observable=[])
-
-    def fill(self, signals: Signals) -> Signals:
-        """Return the next window's signals with their friction."""
+    def fill(self, signals: Signals, truth: StateTrack | None = None) -> Signals:
+        """Return the signals of a drive [N] with their friction; ``estimate`` is what came of an estimate."""
+        if self.of_truth and truth is not None:
+            signals = replace(signals, friction=truth.friction)
         if self.constant is not None:
             return replace(signals, friction=np.full(len(signals), self.constant))
         if self.bank is None:
             return signals if self.factor == 1.0 else replace(signals, friction=signals.friction * self.factor)
-        estimate, self._carry = self.bank.run(signals, self._carry)
-        self._std.append(estimate.std)
-        self._observable.append(estimate.observable)
-        return replace(signals, friction=estimate.friction)
-
-    def fill_windows(self, windows: Iterator[DriveWindow]) -> Iterator[DriveWindow]:
-        """Yield the windows of a drive with their friction."""
-        for window in windows:
-            if self.of_truth and window.truth is not None:
-                window = replace(window, signals=replace(window.signals, friction=window.truth.friction))
-            yield replace(window, signals=self.fill(window.signals))
+        if self._filled is None or self._filled[0] is not signals:
+            self.estimate, _ = self.bank.run(signals, None)
+            self._filled = signals, replace(signals, friction=self.estimate.friction)
+        return self._filled[1]
 
     @property
     def from_log(self) -> bool:
@@ -101,17 +90,17 @@ class FrictionSource:
 
     @property
     def std(self) -> FloatArray:
-        """1-sigma of the estimate at each stamp so far; of length 0 where nothing is estimated."""
-        return np.hypot(np.concatenate(self._std), self.model_std) if self._std else np.empty(0)
+        """1-sigma of the estimate at each stamp; of length 0 where nothing is estimated."""
+        return np.empty(0) if self.estimate is None else np.hypot(self.estimate.std, self.model_std)
 
     @property
     def observable(self) -> BoolArray:
-        """Whether the drive shows its friction, at each stamp so far; of length 0 where nothing is estimated."""
-        return np.concatenate(self._observable) if self._observable else np.zeros(0, dtype=np.bool_)
+        """Whether the drive shows its friction, at each stamp; of length 0 where nothing is estimated."""
+        return np.zeros(0, dtype=np.bool_) if self.estimate is None else self.estimate.observable
 
     @property
     def observable_share(self) -> float:
-        """Share of the stamps so far at which the drive shows its friction; NaN where nothing is estimated."""
+        """Share of the stamps at which the drive shows its friction; NaN where nothing is estimated."""
         return float(np.mean(self.observable)) if self.observable.size else math.nan
 
     @property

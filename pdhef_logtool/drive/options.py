@@ -13,8 +13,6 @@ from pdhef_logtool.records.errors import UsageError
 
 #: A bare integer from here on is nanoseconds, not seconds from the log's start.
 NANOSECONDS_FROM = 10**15
-#: Short enough that what is worked on stays in a processor's cache, long enough that a window's own cost is small.
-WINDOW_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,15 +25,12 @@ class ReadOptions:
     sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
     friction : of :func:`~pdhef_logtool.drive.friction.parse_friction`; None leaves what the log states, if anything.
     prefer_truth : which ground truth counts in a simulated log that has both.
-    window_s : length of the windows that the log is processed in; changes no number.
     clock : ``arrival`` takes samples as known when they arrived, as in a car; ``stamp`` by their stamps (not causal).
     budget : factor on what reading a log may cost.
     waived : names of checks that do not count.
     setup : file with what is decided once per drive; None decides it on the log. setup_from_s : decided on the first so
         many seconds of the slice; None = its first ten minutes, and clocks on all of it.
     msgs : folder with definitions of message types that a log does not define.
-    cache : folder or URL of reduced logs, which represent logs that were read before; changes no number.
-    cache_max_gb : what the cache may contain, in GB, if it is a folder; None = any.
     allow_private_redirects : whether a web server may redirect to other hosts of this machine and its network.
     """
 
@@ -44,22 +39,18 @@ class ReadOptions:
     sensors: Literal["full", "esp"] = "full"
     friction: str | float | None = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
-    window_s: float = WINDOW_S
     clock: Literal["arrival", "stamp"] = "arrival"
     budget: float = 1.0
     waived: tuple[str, ...] = ()
     setup: Path | None = None
     setup_from_s: float | None = None
     msgs: Path | None = None
-    cache: str | None = None
-    cache_max_gb: float | None = None
     allow_private_redirects: bool = False
 
     def __post_init__(self) -> None:
         """Take places as texts or paths."""
         object.__setattr__(self, "setup", None if self.setup is None else Path(self.setup))
         object.__setattr__(self, "msgs", None if self.msgs is None else Path(self.msgs))
-        object.__setattr__(self, "cache", None if self.cache is None else str(self.cache))
 
     @property
     def use_speed(self) -> bool:

@@ -1,8 +1,8 @@
-"""The one way to read a drive: a log opened for a car, mapped and planned, then read in windows or as a whole."""
+"""The one way to read a drive: a log opened for a car, mapped and planned, then read as a whole."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Self, cast
@@ -11,11 +11,11 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.friction import FrictionSource, friction_source
 from pdhef_logtool.drive.options import ReadOptions, time_slice
+from pdhef_logtool.drive.plan import DrivePlan, plan_drive, setup_of
+from pdhef_logtool.drive.recorded import Recorded, read_recorded
 from pdhef_logtool.drive.setup import CLOCK_START_S, LogUntil, Setup, is_device_clock, load_setup
-from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive, setup_of
-from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.container import Wanted
-from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
+from pdhef_logtool.logs.discovery import LogInput, check_unchanged, find_logs, identity_of, log_state
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -32,9 +32,9 @@ from pdhef_logtool.mapping import (
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
 from pdhef_logtool.records.ledger import SampleCount, damage
-from pdhef_logtool.records.signals import GNSS_POSITION, Loss, Signals, join_signals
+from pdhef_logtool.records.signals import GNSS_POSITION, Loss, Signals
 from pdhef_logtool.records.steps import MAX_PREDICTION_S
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.tracks import StateTrack
 
 Tell = Callable[[str], None]
 #: Makes the mapping that is read with from the log and the mapping in effect; may print a message.
@@ -55,10 +55,6 @@ class WholeDrive:
     signals: Signals
     truth: StateTrack | None
     log_start_ns: int
-
-    def windows(self) -> Iterator[DriveWindow]:
-        """Yield all of it as one window."""
-        yield DriveWindow(self.signals, self.truth, 1.0)
 
     @property
     def seconds(self) -> float:
@@ -85,7 +81,7 @@ class Drive:
     ----------
     name : of the log in tables and folders. chosen : the mapping as it was before anything was decided.
     plan : what was decided from the first minutes; another one may be put in its place before reading.
-    friction : what :meth:`windows` fills in; another one may be put in its place before reading.
+    friction : what :meth:`whole` fills in; another one may be put in its place before reading.
     notes : everything that was given of this drive: what may be wrong. remarks : what else is worth knowing.
     """
 
@@ -99,8 +95,9 @@ class Drive:
     friction: FrictionSource
     _tell: Tell
     remarks: list[str] = field(default_factory=list)
-    _reader: DriveReader | None = None
+    _recorded: Recorded | None = None
     _sha256: str = ""
+    _state: tuple[tuple[int, int, int], ...] = ()
 
     @property
     def path(self) -> LogPlace:
@@ -114,8 +111,8 @@ class Drive:
 
     @property
     def file(self) -> str:
-        """Name of the file or folder; of a reduced log that of the one that it represents."""
-        return self.path.name if self.log.reduced is None else self.log.reduced.record.file
+        """Name of the file or folder."""
+        return self.path.name
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -163,37 +160,28 @@ class Drive:
 
     @property
     def sha256(self) -> str:
-        """What the log is known by (:func:`identity_of`), computed when it is first asked for.
-
-        Of a reduced log it is that of the one that it represents.
-        """
-        if self.log.reduced is not None:
-            return self.log.reduced.record.identity
+        """Identity of the log (:func:`identity_of`), computed at the first access."""
         self._sha256 = self._sha256 or identity_of(LogInput(self.path, self.name))
+        check_unchanged(self.path, self._state)
         return self._sha256
 
     @property
     def signals_sha256(self) -> str | None:
-        """Hash of the mapped signals, None where there are none; complete once all windows were read."""
-        return None if self._reader is None else self._reader.hashes["signal"].hexdigest()
+        """Hash of the mapped signals, None where there are none, or before they were read."""
+        return None if self._recorded is None else self._recorded.signals_sha256
 
     @property
     def truth_sha256(self) -> str | None:
         """Hash of the mapped ground truth, as :attr:`signals_sha256`."""
-        return None if self._reader is None else self._reader.hashes["truth"].hexdigest()
+        return None if self._recorded is None else self._recorded.truth_sha256
 
     @property
     def losses(self) -> tuple[Loss, ...]:
-        """What could not be used; complete once all windows were read. Files are named without their folder."""
+        """What could not be used; complete once the drive was read. Files are named without their folder."""
         merged = merge_losses(
-            [self.log.lost, () if self._reader is None else self._reader.losses, damage(self.sample_ledger)]
+            [self.log.lost, () if self._recorded is None else self._recorded.losses, damage(self.sample_ledger)]
         )
         return tuple(replace(x, where=self.without_folder(x.where)) for x in merged)
-
-    @property
-    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Where the bytes of each file of the log went so far. Files are named without their folder."""
-        return tuple(replace(x, file=self.without_folder(x.file)) for x in self.log.byte_ledgers)
 
     def without_folder(self, where: str) -> str:
         """Return a place in the log without the folder that the log lies in."""
@@ -201,60 +189,47 @@ class Drive:
 
     @property
     def samples(self) -> dict[str, int]:
-        """Messages that were used so far, by source."""
-        return {} if self._reader is None else dict(self._reader.samples or {})
+        """Messages that were used, by source."""
+        return {} if self._recorded is None else self._recorded.samples
 
     @property
     def sample_ledger(self) -> tuple[SampleCount, ...]:
-        """What became of every sample of the mapped topics; complete once all windows were read."""
-        return () if self._reader is None else self._reader.ledger()
+        """What became of every sample of the mapped topics; empty before the drive was read."""
+        return () if self._recorded is None else self._recorded.ledger
 
     def tell(self, text: str) -> None:
         """Report a note to the user, and add it to the notes of this drive."""
         self.notes.append(text)
         self._tell(f"{self.name}: {text}")
 
-    def windows(self, *, fill_friction: bool = True, window_s: float | None = None) -> Iterator[DriveWindow]:
-        """Read the drive once from start to end; joined, the windows are bit-identical to one window over all.
-
-        Parameters
-        ----------
-        fill_friction : False leaves the friction that the log states. window_s : None: that of the options.
-        """
-        window_s = self.options.window_s if window_s is None else window_s
-        reader = self._reader
-        if reader is None or not reader.can_repeat or reader.plan is not self.plan or reader.window_s != window_s:
-            reader = self._reader = DriveReader(self.log, self.plan, window_s)
-        if not fill_friction:
-            return reader.windows()
-        self.friction = self.friction.afresh()
-        return self.friction.fill_windows(reader.windows())
-
     def whole(self, *, fill_friction: bool = True, max_bytes: int | None = None) -> WholeDrive:
-        """Read all of the drive into memory.
+        """Return all of the drive; it is read once for a plan.
 
         Parameters
         ----------
-        fill_friction : as for :meth:`windows`. max_bytes : that signals and ground truth may take; None = no bound.
+        fill_friction : False leaves the friction that the log states.
+        max_bytes : that signals and ground truth may take; None = no bound.
 
         Raises
         ------
         EstimatorError : The slice contains no stamp, or the drive takes more memory than it may.
         """
-        signals, truth, held = [], [], 0
-        for window in self.windows(fill_friction=fill_friction):
-            if not len(window.signals):
-                continue
-            signals.append(window.signals)
-            if window.truth is not None:
-                truth.append(window.truth)
-            held += _nbytes(window.signals) + (0 if window.truth is None else _nbytes(window.truth))
-            if max_bytes is not None and held > max_bytes:
-                raise too_big(self.name)
-        if not signals:
+        recorded = self.recorded()
+        signals, truth = recorded.signals, recorded.truth
+        if not len(signals):
             raise no_samples(self.path)
-        joined = concatenate(truth) if truth else None
-        return WholeDrive(self.name, self.path, self.plan, join_signals(signals), joined, self.log.start_ns)
+        if fill_friction:
+            signals = self.friction.fill(signals, truth)
+        whole = WholeDrive(self.name, self.path, self.plan, signals, truth, self.log.start_ns)
+        if max_bytes is not None and whole.nbytes > max_bytes:
+            raise too_big(self.name)
+        return whole
+
+    def recorded(self) -> Recorded:
+        """Return what the plan reads of the log, also where that is nothing."""
+        if self._recorded is None or self._recorded.plan is not self.plan:
+            self._recorded = read_recorded(self.log, self.plan)
+        return self._recorded
 
     def close(self) -> None:
         """Close the log."""
@@ -299,8 +274,8 @@ def read_drive(
     PdhefError : Nothing of the log can be read, the mapping names what it lacks, or the slice is outside of it.
 
     >>> with read_drive("sample_logs/dlc.mcap", Car.load("saloon")) as drive:
-    ...     [len(window.signals.stamps_ns) for window in drive.windows()], drive.losses
-    ([951], ())
+    ...     len(drive.whole().signals), drive.losses
+    (951, ())
     """
     car = car if isinstance(car, Car) else Car.load(car)
     mapping = mapping_of(mapping)
@@ -315,6 +290,7 @@ def read_drive(
         notes.append(text)
         tell(f"{log_input.stem}: {text}")
 
+    state = log_state(log_input.path)
     opened = open_log(log_input.path, options.limits, options.msgs, wanted=Wanted(frozenset()))
     try:
         undecided, prefer = _as_far_as_decided(opened, options), options.prefer_truth
@@ -322,8 +298,6 @@ def read_drive(
         for ambiguity in chosen.ambiguities:
             told(str(ambiguity))
         remarks += chosen.remarks
-        if opened.reduced is not None:
-            remarks.append(f"a reduced log replaces {opened.reduced.record.file}")
         used = chosen.mapping
         if adjust is not None:
             used = adjust(opened, used, told)
@@ -349,7 +323,7 @@ def read_drive(
         _name_damage(error, opened)
         opened.close()
         raise
-    return Drive(log_input.stem, opened, car, options, plan, chosen, notes, friction, tell, remarks)
+    return Drive(log_input.stem, opened, car, options, plan, chosen, notes, friction, tell, remarks, _state=state)
 
 
 def _setup_of(

@@ -20,6 +20,7 @@ from pdhef_logtool.mapping import ClockModel, Mapping, check_mapping, fit_clocks
 from pdhef_logtool.mapping.records import CanSettings, SignalSource
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.storage.documents import jsonable, read_toml
+from pdhef_logtool.storage.toml_text import toml_text
 
 #: The offset of a device clock changes between logs: it is estimated from the messages of this duration.
 CLOCK_START_S = 1.0
@@ -69,14 +70,7 @@ class LogUntil:
 
 def setup_toml(setup: Setup, head: str) -> str:
     """Return a set-up as TOML; reading it back gives the same."""
-    import tomlkit
-
-    document = tomlkit.document()
-    for line in head.splitlines():
-        document.add(tomlkit.comment(line))
-    for key, value in _plain(setup).items():
-        document[key] = value
-    return tomlkit.dumps(document)
+    return toml_text(_plain(setup), head)
 
 
 def load_setup(path: Path) -> Setup:

@@ -19,7 +19,7 @@ accelerometer or gyro are attributed to the estimate, except for missing and stu
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -62,22 +62,15 @@ class DivergenceState:
     waiting: FlagSteps
 
 
-@dataclass(slots=True)
-class DivergenceWatch:
-    """Monitor of the tracks of a drive, window by window and by name.
+def watched_track(track: StateTrack, signals: Signals, vehicle: VehicleParameters) -> StateTrack:
+    """Return a track [N] with ``diverged`` completed.
 
     Estimates without a covariance are not monitored: they make no claim about their accuracy.
     """
-
-    vehicle: VehicleParameters
-    _carries: dict[str, DivergenceState] = field(default_factory=dict)
-
-    def add(self, track: StateTrack, signals: Signals) -> StateTrack:
-        """Return the next window of a track with ``diverged`` updated."""
-        if track.covariance.shape[0] == 0:
-            return track
-        flags, self._carries[track.name] = wrong_branch(track, signals, self.vehicle, self._carries.get(track.name))
-        return replace(track, diverged=track.diverged | (flags & track.valid))
+    if track.covariance.shape[0] == 0:
+        return track
+    flags, _ = wrong_branch(track, signals, vehicle)
+    return replace(track, diverged=track.diverged | (flags & track.valid))
 
 
 def wrong_branch(

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,9 +29,6 @@ from pdhef_logtool.car.parts import (
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
-if TYPE_CHECKING:
-    from pdhef_logtool.estimators.error_features import FeatureState
-
 #: Terms of the sideslip's variance; terms of the yaw rate's, where ``filter`` is its standard deviation.
 SIDESLIP_TERMS = ("floor", "filter", "sideslip", "grip", "grip2", "kinematic", "yaw_rate", "cure", "bank")
 YAW_RATE_TERMS = ("floor", "filter", "yaw_rate")
@@ -42,7 +38,7 @@ GRIP_PLACES = (0.2, 0.45, 0.7)
 MAX_SIDESLIP_STD_RAD = 1.0
 
 
-#: Function of the next window of a track and its signals that returns the track with wider intervals.
+#: Function of a track and its signals that returns the track with wider intervals.
 Widening = Callable[[StateTrack, Signals], StateTrack]
 #: Note for intervals that contain the uncertainty of a car's parameters.
 POSTERIOR_NOTE = "intervals: own, parameters and sensors"
@@ -50,7 +46,7 @@ POSTERIOR_NOTE = "intervals: own, parameters and sensors"
 
 @dataclass(slots=True)
 class TrackCalibrator:
-    """Application of calibrated intervals to the tracks of a drive, window by window.
+    """Application of calibrated intervals to the tracks of a drive.
 
     Attributes
     ----------
@@ -66,24 +62,16 @@ class TrackCalibrator:
     fixed_notes: Mapping[str, str] = field(default_factory=dict)
     posterior: Mapping[str, Widening] = field(default_factory=dict)
     of_car: bool = True
-    _carries: dict[str, FeatureState] = field(default_factory=dict)
     _has_interval: set[str] = field(default_factory=set)
 
-    def add(self, track: StateTrack, signals: Signals) -> StateTrack:
-        """Return the next window of a track with calibrated intervals; unchanged without an entry."""
+    def apply(self, track: StateTrack, signals: Signals) -> StateTrack:
+        """Return a track [N] with calibrated intervals; unchanged without an entry."""
         if np.isfinite(track.sideslip_std_rad).any():
             self._has_interval.add(track.name)
         matched = self._found(track.name)
         if self.intervals is None or matched is None:
             return self.posterior[track.name](track, signals) if track.name in self.posterior else track
-        track, self._carries[track.name] = calibrated(
-            track,
-            signals,
-            matched[0].inflation,
-            self.intervals.roll_gradient_rad_per_m_s2,
-            self._carries.get(track.name),
-        )
-        return track
+        return calibrated(track, signals, matched[0].inflation, self.intervals.roll_gradient_rad_per_m_s2)
 
     def notes(self, name: str) -> tuple[str, ...]:
         """Return the report's notes on an estimator's intervals; empty without intervals."""
@@ -127,10 +115,7 @@ class TrackCalibrator:
         made = [e.algorithm.identity for e in self.intervals.entries if e.estimator == name]
         if not made:
             return ""
-        return (
-            f"the calibrated intervals of {name} are not applied: expected {made[0]}, got {ran[0].identity}; "
-            "run pdhef learn --stages intervals"
-        )
+        return f"the calibrated intervals of {name} are not applied: expected {made[0]}, got {ran[0].identity}"
 
     def _found(self, name: str) -> tuple[IntervalEntry, Algorithm] | None:
         """Return the entry for a name and the algorithm that it belongs to."""
@@ -146,19 +131,17 @@ def calibrated(
     signals: Signals,
     inflation: Inflation,
     roll_gradient_rad_per_m_s2: float,
-    state: FeatureState | None = None,
-) -> tuple[StateTrack, FeatureState]:
-    """Return a track with calibrated 1-sigmas and covariance; joined windows equal the whole bit for bit.
+) -> StateTrack:
+    """Return a track with calibrated 1-sigmas and covariance.
 
     Parameters
     ----------
     track, signals : [N] at the same stamps. roll_gradient_rad_per_m_s2 : of the car of the fit.
-    state : state after the previous window.
     """
     from pdhef_logtool.estimators.error_features import error_terms
 
-    terms, state = error_terms(track, signals, roll_gradient_rad_per_m_s2, state)
-    return inflated(track, terms, inflation), state
+    terms, _ = error_terms(track, signals, roll_gradient_rad_per_m_s2, None)
+    return inflated(track, terms, inflation)
 
 
 def inflated(track: StateTrack, terms: FloatArray, inflation: Inflation) -> StateTrack:
@@ -187,7 +170,6 @@ def scaled_covariance(covariance: FloatArray, of_vy: FloatArray, of_rate: FloatA
 
 def combined(terms: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
     """Return √ Σ (k_i t_i)² of terms [N, m], [N]."""
-    # Added term by term: a matrix product may round differently for a window and for the whole log.
     total = np.zeros(terms.shape[0])
     for i, k in enumerate(coefficients):
         total += (k * terms[:, i]) ** 2

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.estimators.presets import Options
 
 #: Time constant of the leak, s. A pure integrator drifts by bias · time (0.08 m/s² gives 24 m/s in five minutes).
-#: Tuned to ground truth of simulated drives by ``studies.defaults.tune_kinematic_leak``, which is to its advantage.
+#: Tuned to the ground truth of simulated drives, which is to its advantage.
 LEAK_S = 0.7
 #: What it takes of a sensor profile; the wheel-slip gate has the default noise.
 _PROFILE = ("speed_hold_s", "speed_zero_m_s", "speed_least_m_s")

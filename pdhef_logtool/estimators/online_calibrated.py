@@ -104,18 +104,18 @@ class OnlineBand:
     stages: Sequence[WithoutTruth]
     read_with: VehicleParameters
     _bands: dict[int, CalibratedBand] = field(default_factory=dict)
-    _window: Signals | None = None
+    _signals: Signals | None = None
     _parts: list[tuple[int, int, int, Signals]] = field(default_factory=list)
 
-    def add(self, track: StateTrack, signals: Signals) -> StateTrack:
-        """Return the next window of a track [N] with wider 1-sigmas of sideslip and v_y."""
+    def widen(self, track: StateTrack, signals: Signals) -> StateTrack:
+        """Return a track [N] with wider 1-sigmas of sideslip and v_y."""
         if not len(signals):
             return track
-        if signals is not self._window:  # tracks of one window share its parts, which identify it for the intervals
-            self._window, spans = signals, _spans(_stage_of(signals.stamps_ns, self.stages))
+        if signals is not self._signals:  # tracks share the parts, which identify them for the intervals
+            self._signals, spans = signals, _spans(_stage_of(signals.stamps_ns, self.stages))
             self._parts = [(number, first, last, signals.rows(first, last)) for number, first, last in spans]
         parts = []
         for number, first, last, part in self._parts:
             band = self._bands.setdefault(number, CalibratedBand(self.stages[number], self.read_with))
-            parts.append(band.add(track.rows(first, last), part))
+            parts.append(band.widen(track.rows(first, last), part))
         return replace(concatenate(parts), name=track.name)

@@ -2,7 +2,7 @@
 
 State [v_x, v_y, r, b_ax]; b_ax is a slow bias of the longitudinal accelerometer (grade, pitch). Measurements
 [a_y, r, v_x]; each may be missing at any step. Without options this is the paper's physics baseline and
-frozen: R at sensor level from the vehicle file, Q by innovation likelihood (``studies/defaults/tune_physics_q.py``).
+frozen: R at sensor level from the vehicle file, Q by innovation likelihood.
 Everything that is not the model is in :mod:`~.filter_base`.
 """
 
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 #: The variant with the noise of an identified car.
 TUNED = "phy-ukf:tuned"
 #: Process noise, 1-sigma per square root of second, of v_x, v_y, r and the a_x bias. Chosen by innovation likelihood
-#: over simulated drives (``studies/defaults/tune_physics_q.py``, its result beside it) and frozen: the drives were
+#: over simulated drives and frozen: the drives were
 #: those of the simulator's first, planar vehicle, and a baseline does not follow every change of the simulator.
 PHY_UKF_Q_STD = (0.089, 0.31, 0.062, 0.021)
 

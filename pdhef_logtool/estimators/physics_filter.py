@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,17 +26,6 @@ from pdhef_logtool.car.nominal_model import ModelParameters, dynamic_share, mode
 from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.compiled.vectors import (
-    LANES,
-    ROOM,
-    aligned,
-    first_half_twice,
-    inner_products,
-    load,
-    spread,
-    store,
-    total,
-)
 from pdhef_logtool.estimators import filter_base as base
 from pdhef_logtool.estimators.filter_base import LINK_WHOLE
 from pdhef_logtool.estimators.physics_model import (
@@ -68,15 +57,15 @@ from pdhef_logtool.estimators.physics_model import (
     spread_layout,
     step_count,
 )
-from pdhef_logtool.estimators.unscented import whiten, wide_root
-from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.estimators.unscented import partial_root, whiten
+from pdhef_logtool.records.signals import Signals
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
 
 #: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r] where the car has none of its own,
 #: and where identification searches it. By innovation likelihood over simulated drives, as that of ``phy-ukf``, with
-#: lag, load transfer and biases, and frozen: ``studies.defaults.tune_physics_q`` finds 0.078, 0.13, 0.01, 0.062, 0.39.
+#: lag, load transfer and biases, and frozen. The present simulator gives 0.078, 0.13, 0.01, 0.062, 0.39.
 PHYSICS_Q_STD = (0.085, 0.12, 0.012, 0.086, 0.41, 0.41)
 #: 1-sigma of the axles' forces over the mass at the start, and at a standstill, m/s².
 _FORCE_STD, _STANDSTILL_FORCE_STD = 0.5, 0.05
@@ -98,10 +87,11 @@ UNKNOWN_STEER_STD, MAX_STEER_STD, UNKNOWN_STEER_WALK = 0.1, 0.2, 0.2
 #: wheelbases: chosen on simulated cars with right and wrong files. More helps single manoeuvres and harms laps.
 LINEAR_SHARE, LIMIT_TIME_S, FILE_LAG = 0.36, 0.5, 1.1
 
-#: The column of a block of points that contains the centre.
-_CENTRE = AY_BIAS
-#: How many places there are behind the first whole vector.
-_REST = PLACES - LANES
+#: The columns of a block of points: one and the other side of the centre, of which the last of each half is the centre.
+_HALF = WIDTH // 2
+_CENTRE = _HALF - 1
+#: Rows of a block of points: those of the entries, and zeros up to a multiple of four.
+_ROWS = 16
 
 # No check of divisors, and sums in any order, so that the compiler can take several terms at a time.
 _compiled = njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
@@ -109,108 +99,96 @@ _compiled = njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc
 _inlined = njit(forceinline=True, error_model="numpy", fastmath={"contract", "reassoc"})
 
 # In the compiled code every part has its place in the state, whether or not a car has it (``spread_layout``); what it
-# lacks is 0 and has no variance. x has ROOM entries, P and the factor ROOM rows of ROOM.
-
-
-class _Constants(NamedTuple):
-    """Vectors that stay what they are: read as a whole, they need not wait for numbers that were just written."""
-
-    signs: FloatArray  # which of the columns 8 to 15 lie before and behind the centre
-    centre: FloatArray  # 1 where the centre is there, else 0
-    biases: FloatArray  # 1 for the sensors' biases among the entries 8 to 15, else 0
-    others: FloatArray  # the reverse
-    unit: FloatArray  # a single 1, ROOM numbers before and behind it
-
-
-@njit(cache=True)
-def _make_constants():  # type: ignore[no-untyped-def]
-    signs, centre, biases, others, unit = aligned(8), aligned(8), aligned(8), aligned(8), aligned(2 * ROOM + 1)
-    signs[:3], signs[4:7] = 1.0, -1.0
-    centre[_CENTRE - LANES] = 1.0
-    others[:] = 1.0
-    for i in (AY_BIAS, RATE_BIAS):
-        biases[i - LANES], others[i - LANES] = 1.0, 0.0
-    unit[ROOM] = 1.0
-    return _Constants(signs, centre, biases, others, unit)
+# lacks is 0 and has no variance. x has PLACES entries, P and the factor PLACES rows.
 
 
 @_inlined
-def _draw(x, L, scale, constants, points):  # type: ignore[no-untyped-def]
-    """Write a block of sigma points about x to points [PLACES · WIDTH]; L as of :func:`~.unscented.wide_root`.
+def _draw(x, L, scale, points):  # type: ignore[no-untyped-def]
+    """Write a block of sigma points about x to points [_ROWS · WIDTH]; L as of :func:`~.unscented.partial_root`.
 
-    Columns i and 16 + i, of the entries 8 to 10 columns i and 4 + i, differ from the centre along column i of the
-    factor; the rest are the centre. Points that differ in the sensors' biases alone move with their centre and are left
-    out; the rows of these biases contain what the other points differ from their centre.
+    Columns i and _HALF + i differ from the centre along column i of the factor. Points that differ in the sensors'
+    biases alone move with their centre and are left out; the rows of these biases contain what the other points differ
+    from their centre.
     """
-    root = spread(math.sqrt(scale))
+    root = math.sqrt(scale)
     for j in range(PLACES):
-        centre = spread(x[j] if j < AY_BIAS else 0.0)
-        low, high = root * load(L, j * ROOM), root * load(L, j * ROOM + LANES)
-        store(points, j * WIDTH, centre + low)
-        store(points, j * WIDTH + LANES, centre + load(constants.signs, 0) * first_half_twice(high))
-        store(points, j * WIDTH + 2 * LANES, centre - low)
+        centre = x[j] if j < AY_BIAS else 0.0
+        row = j * WIDTH
+        for i in range(_HALF):
+            away = root * L[j, i]
+            points[row + i] = centre + away
+            points[row + _HALF + i] = centre - away
+        points[row + _CENTRE] = points[row + _HALF + _CENTRE] = centre
 
 
 @_inlined
-def _moments(points, scale, q, constants, x, P, whole):  # type: ignore[no-untyped-def]
-    """Write mean and covariance of points that :func:`_draw` drew, with ``q`` [ROOM] added to the variances.
+def _four_products(left, right, a, b):  # type: ignore[no-untyped-def]
+    """Return the products of row a of one block with rows b to b + 3 of another; four at once become vectors."""
+    a, b = a * WIDTH, b * WIDTH
+    s0 = s1 = s2 = s3 = 0.0
+    for i in range(WIDTH):
+        number = left[a + i]
+        s0 += number * right[b + i]
+        s1 += number * right[b + WIDTH + i]
+        s2 += number * right[b + 2 * WIDTH + i]
+        s3 += number * right[b + 3 * WIDTH + i]
+    return s0, s1, s2, s3
 
-    Of the covariance only that of the motion, unless the ``whole`` is wanted. In place of the points is what they
-    differ from their centre, e. With δ the mean of e, the moments about the mean, the weight of the centre among them,
-    are Σ w e eᵀ + δ δᵀ: in the centre's place is δ / √w.
+
+@_inlined
+def _moments(points, scale, q, x, P, size):  # type: ignore[no-untyped-def]
+    """Write mean and covariance of points that :func:`_draw` drew, with ``q`` [PLACES] added to the variances.
+
+    Of the covariance only the first ``size`` rows and columns. In place of the points is what they differ from their
+    centre, e. With δ the mean of e, the moments about the mean, the weight of the centre among them, are
+    Σ w e eᵀ + δ δᵀ: in the centre's place is δ / √w.
     """
     weight = 0.5 / scale
     per_weight = 1.0 / math.sqrt(weight)
     for j in range(AY_BIAS):
         row = j * WIDTH
-        centre = points[row + _CENTRE]
-        about = spread(centre)
-        a, b, c = load(points, row) - about, load(points, row + LANES) - about, load(points, row + 2 * LANES) - about
-        moved = weight * total(a + b + c)
-        store(points, row, a)
-        store(points, row + LANES, b + spread(per_weight * moved) * load(constants.centre, 0))
-        store(points, row + 2 * LANES, c)
-        x[j] = centre + moved
-    share = spread(weight)
-    for i in range(PLACES if whole else base.MOTION):
-        row = i * ROOM
-        product = share * inner_products(points, WIDTH, i * WIDTH, 0, LANES)
-        store(P, row, product + spread(q[i]) * load(constants.unit, ROOM - i))
-        if whole:
-            product = share * inner_products(points, WIDTH, i * WIDTH, LANES * WIDTH, _REST)
-            if i >= AY_BIAS:  # no point shows the covariance of the sensors' biases with each other, and it stays
-                kept = load(constants.biases, 0) * load(P, row + LANES)
-                product = load(constants.others, 0) * product + kept
-            store(P, row + LANES, product + spread(q[i]) * load(constants.unit, ROOM - i + LANES))
+        centre, moved = points[row + _CENTRE], 0.0
+        for i in range(WIDTH):
+            points[row + i] -= centre
+            moved += points[row + i]
+        points[row + _CENTRE] = per_weight * weight * moved
+        x[j] = centre + weight * moved
+    bias, biases = P[AY_BIAS, AY_BIAS], P[RATE_BIAS, AY_BIAS]  # no point shows these: they stay
+    for a in range(size):
+        for b in range(0, min(a + 1, AY_BIAS), 4):
+            s0, s1, s2, s3 = _four_products(points, points, a, b)
+            P[a, b], P[a, b + 1], P[a, b + 2], P[a, b + 3] = weight * s0, weight * s1, weight * s2, weight * s3
+    P[AY_BIAS, AY_BIAS], P[RATE_BIAS, AY_BIAS] = bias, biases
+    for a in range(size):
+        P[a, a] += q[a]
+        for b in range(a):
+            P[b, a] = P[a, b]
 
 
 @_inlined
 def _keep_before(points, x, P, places, before, cross):  # type: ignore[no-untyped-def]
     """Write what drawn points differ from their centre x, and of the cross covariance [n, n] the sensors' biases."""
     for j in range(PLACES):
-        centre = spread(x[j] if j < AY_BIAS else 0.0)
-        for offset in range(j * WIDTH, (j + 1) * WIDTH, LANES):
-            store(before, offset, load(points, offset) - centre)
-    for a in range(places.shape[0]):
-        for b in range(places.shape[0]):
-            cross[a, b] = P[places[a], places[b]]
+        centre = x[j] if j < AY_BIAS else 0.0
+        for i in range(j * WIDTH, (j + 1) * WIDTH):
+            before[i] = points[i] - centre
+    _take_matrix(P, places, cross)
 
 
 @_inlined
-def _cross(before, points, scale, places, cross):  # type: ignore[no-untyped-def]
+def _cross(before, points, scale, places, products, cross):  # type: ignore[no-untyped-def]
     """Write the covariance [n, n] of points before a step, as :func:`_keep_before`, and after it, as :func:`_moments`.
 
-    That of the sensors' biases with each other, which no point that is left shows, stays.
+    That of the sensors' biases with each other, which no point that is left shows, stays. ``products`` is work space.
     """
-    weight = 0.5 / scale
+    for a in range(PLACES):
+        for b in range(0, PLACES, 4):
+            s0, s1, s2, s3 = _four_products(before, points, a, b)
+            products[a, b], products[a, b + 1], products[a, b + 2], products[a, b + 3] = s0, s1, s2, s3
     for i in range(places.shape[0]):
-        offset = places[i] * WIDTH
-        a, b, c = load(before, offset), load(before, offset + LANES), load(before, offset + 2 * LANES)
         for j in range(places.shape[0]):
-            to = places[j] * WIDTH
-            if places[i] < AY_BIAS or places[j] < AY_BIAS:
-                product = a * load(points, to) + b * load(points, to + LANES) + c * load(points, to + 2 * LANES)
-                cross[i, j] = weight * total(product)
+            if min(places[i], places[j]) < AY_BIAS:
+                cross[i, j] = 0.5 / scale * products[places[i], places[j]]
 
 
 @_compiled
@@ -232,7 +210,7 @@ def _push(points, half):  # type: ignore[no-untyped-def]
 @_compiled
 def _process_noise(q_std, ax_known, dt, layout, q):  # type: ignore[no-untyped-def]
     """Write the variance that ``dt`` s add to each entry, as ``phy-ukf`` does; the bank returns to 0."""
-    for i in range(ROOM):
+    for i in range(PLACES):
         q[i] = q_std[i] * q_std[i] * dt
     if not ax_known:
         q[VX] = base.NO_AX_Q_STD**2 * dt
@@ -256,8 +234,8 @@ def _yield_to_kinematics(x, friction, dt, limits, p, f, memory):  # type: ignore
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
 @_inlined
-def _predict(x, P, over, rate, dt, noise, layout, p, f, constants, points, whole):  # type: ignore[no-untyped-def]
-    """Move state and covariance, the ``whole`` or that of the motion, by ``dt`` s with drawn points.
+def _predict(x, P, over, rate, dt, noise, layout, p, f, points, size):  # type: ignore[no-untyped-def]
+    """Move the state and the first ``size`` rows of its covariance by ``dt`` s with drawn points.
 
     ``rate`` is the residual of v̇_y and ṙ; it counts where the model is dynamic.
     """
@@ -272,13 +250,13 @@ def _predict(x, P, over, rate, dt, noise, layout, p, f, constants, points, whole
     if given:
         _push(points, half)
     _process_noise(q_std, over.ax_known, dt, layout, q)
-    _moments(points, scale, q, constants, x, P, whole)
+    _moments(points, scale, q, x, P, size)
 
 
 # positional: as _predict.
 @_inlined
 def _measure(x, P, steer, rate_vy, layout, p, f, row, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
-    """Write what the sensors should read [3], its covariance without R [3, 3] and the cross covariance [3, ROOM].
+    """Write what the sensors should read [3], its covariance without R [3, 3] and the cross covariance [3, PLACES].
 
     ``rate_vy`` is the residual of v̇_y, which the accelerometer feels as it does the tyres' forces.
     """
@@ -290,17 +268,14 @@ def _measure(x, P, steer, rate_vy, layout, p, f, row, z_hat, S, Pxz):  # type: i
             row[FORCE_SCALE] = felt
     z_hat[base.Z_YAW_RATE] = x[YAW_RATE] + x[RATE_BIAS]
     z_hat[base.Z_SPEED] = x[VX]
-    low, high = spread(0.0), spread(0.0)
+    for i in range(PLACES):
+        Pxz[base.Z_AY, i] = 0.0
+        Pxz[base.Z_YAW_RATE, i] = P[YAW_RATE, i] + P[RATE_BIAS, i]
+        Pxz[base.Z_SPEED, i] = P[VX, i]
     for b in range(PLACES):
         if row[b] != 0.0:
-            low = low + spread(row[b]) * load(P, b * ROOM)
-            high = high + spread(row[b]) * load(P, b * ROOM + LANES)
-    store(Pxz, base.Z_AY * ROOM, low)
-    store(Pxz, base.Z_AY * ROOM + LANES, high)
-    for offset in (0, LANES):
-        rate = load(P, YAW_RATE * ROOM + offset) + load(P, RATE_BIAS * ROOM + offset)
-        store(Pxz, base.Z_YAW_RATE * ROOM + offset, rate)
-        store(Pxz, base.Z_SPEED * ROOM + offset, load(P, VX * ROOM + offset))
+            for i in range(PLACES):
+                Pxz[base.Z_AY, i] += row[b] * P[b, i]
     of_ay, of_rate, of_speed = 0.0, 0.0, 0.0
     for b in range(PLACES):
         if row[b] != 0.0:
@@ -318,25 +293,25 @@ def _measure(x, P, steer, rate_vy, layout, p, f, row, z_hat, S, Pxz):  # type: i
 # positional: as _predict.
 @_inlined
 def _update(x, P, nu, S, Pxz, use, index, root, w, gain):  # type: ignore[no-untyped-def]
-    """Do what :func:`~.unscented.kalman_update` does, but for the check of P; ``gain`` [3, ROOM] is work space."""
+    """Do what :func:`~.unscented.kalman_update` does, but for the check of P; ``gain`` [3, PLACES] is work space."""
     nis, used, log_likelihood = whiten(nu, S, use, index, root, w)
     if used == 0:
         return nis, used, log_likelihood
-    gain[:, :] = 0.0
-    w[used:] = 0.0
+    gain[used:, :] = 0.0
     for i in range(used):
-        for offset in (0, LANES):
-            of = load(Pxz, index[i] * ROOM + offset)
-            for j in range(i):
-                of = of - spread(root[i, j]) * load(gain, j * ROOM + offset)
-            store(gain, i * ROOM + offset, spread(1.0 / root[i, i]) * of)
-    for offset in (0, LANES):
-        a, b, c = load(gain, offset), load(gain, ROOM + offset), load(gain, 2 * ROOM + offset)
-        store(x, offset, load(x, offset) + spread(w[0]) * a + spread(w[1]) * b + spread(w[2]) * c)
-        for i in range(PLACES):
-            to = i * ROOM + offset
-            left = load(P, to) - spread(gain[0, i]) * a - spread(gain[1, i]) * b - spread(gain[2, i]) * c
-            store(P, to, left)
+        for a in range(PLACES):
+            gain[i, a] = Pxz[index[i], a]
+        for j in range(i):
+            for a in range(PLACES):
+                gain[i, a] -= root[i, j] * gain[j, a]
+        for a in range(PLACES):
+            gain[i, a] /= root[i, i]
+            x[a] += w[i] * gain[i, a]
+    for a in range(PLACES):
+        g0, g1, g2 = gain[0, a], gain[1, a], gain[2, a]
+        for b in range(a + 1):
+            left = P[a, b] - (g0 * gain[0, b] + g1 * gain[1, b] + g2 * gain[2, b])
+            P[a, b] = P[b, a] = left
     return nis, used, log_likelihood
 
 
@@ -351,8 +326,8 @@ def _finite(x, P):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _in_places(values, places, rest):  # type: ignore[no-untyped-def]
-    """Return values [n] where their entries have their places, [ROOM]."""
-    out = aligned(ROOM)
+    """Return values [n] where their entries have their places, [PLACES]."""
+    out = np.zeros(PLACES)
     out[:] = rest
     for i in range(places.shape[0]):
         out[places[i]] = values[i]
@@ -361,7 +336,7 @@ def _in_places(values, places, rest):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _matrix_in_places(P, places, out):  # type: ignore[no-untyped-def]
-    """Write P [n, n] where its entries have their places, [ROOM, ROOM]; the rest is left."""
+    """Write P [n, n] where its entries have their places, [PLACES, PLACES]; the rest is left."""
     for i in range(places.shape[0]):
         for j in range(places.shape[0]):
             out[places[i], places[j]] = P[i, j]
@@ -421,17 +396,18 @@ def _filter(window, tuning, limits, layout, p, f, estimate, out, links):  # type
     places = places_of(layout)
     layout = spread_layout(layout)
     x, there = _in_places(state_x, places, 0.0), _in_places(np.ones(places.shape[0]), places, 0.0) > 0.0
-    P, L = aligned(ROOM * ROOM).reshape((ROOM, ROOM)), aligned(ROOM * ROOM).reshape((ROOM, ROOM))
+    P, L = np.zeros((PLACES, PLACES)), np.zeros((PLACES, PLACES))
     _matrix_in_places(state_P, places, P)
     q_std, initial_std = _in_places(q_std, places, 0.0), _in_places(initial_std, places, 0.0)
     standstill_std = _in_places(standstill_std, places, math.nan)
-    points, before, row = aligned(PLACES * WIDTH), aligned(PLACES * WIDTH), aligned(ROOM)
-    Pxz, gain = aligned(3 * ROOM).reshape((3, ROOM)), aligned(3 * ROOM).reshape((3, ROOM))
+    points, before, row = np.zeros(_ROWS * WIDTH), np.zeros(_ROWS * WIDTH), np.zeros(PLACES)
+    products = np.empty((PLACES, _ROWS))
+    Pxz, gain = np.empty((3, PLACES)), np.empty((3, PLACES))
     _, _, _, z_hat, S, _, nu, at_gate, given, use = base.make_work(base.MEASUREMENTS)
     index, root, w = np.empty(base.MEASUREMENTS, np.int64), np.empty_like(S), np.empty_like(nu)
-    noise, constants = (q_std, aligned(ROOM), scale), _make_constants()
+    noise = (q_std, np.zeros(PLACES), scale)
     front_std, rear_std, steer_std = q_std[FRONT], q_std[REAR], q_std[STEER_BIAS]
-    hidden, row_of = layout.steer_bias < 0, memory[base.M_STEER_ROW :]
+    hidden, row_of = layout.steer_bias < 0, memory[base.M_STEER_ROW : base.M_STEER_ROW + PLACES]
     if hidden:
         P[STEER_BIAS, :] = row_of
         P[:, STEER_BIAS] = row_of
@@ -463,20 +439,20 @@ def _filter(window, tuning, limits, layout, p, f, estimate, out, links):  # type
             over = base.held_over_step(now, memory)
             rate = (memory[base.M_RATE_VY], memory[base.M_RATE_R])
             if not factored:
-                wide_root(P, places, there, L)
+                partial_root(P, places, there, L)
             factored = False
             if limits[0] > 0.0:
                 factor, f = _yield_to_kinematics(x, over.friction, now.dt, limits, p, f, memory)
                 q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             noise = (q_std, noise[1], scale + 1.0 if guessed and hidden else scale)
-            _draw(x, L, noise[2], constants, points)
+            _draw(x, L, noise[2], points)
             if linked:
                 _keep_before(points, x, P, places, before, out_cross[k])
-            _predict(x, P, over, rate, now.dt, noise, layout, p, f, constants, points, True)
+            _predict(x, P, over, rate, now.dt, noise, layout, p, f, points, PLACES)
             there[STEER_BIAS] = unknown or not hidden
             alive = _finite(x, P)
             if linked:
-                _cross(before, points, noise[2], places, out_cross[k])
+                _cross(before, points, noise[2], places, products, out_cross[k])
                 _take_matrix(P, places, out_predicted_P[k])
             _take(x, places, out_prior[k])
             if alive:
@@ -497,7 +473,7 @@ def _filter(window, tuning, limits, layout, p, f, estimate, out, links):  # type
                     base.open_gate(use, memory)
                 nis, dof, likelihood = _update(x, P, nu, S, Pxz, use, index, root, w, gain)
                 if dof > 0:
-                    wide_root(P, places, there, L)
+                    partial_root(P, places, there, L)
                     factored = True
                     out_nis[k] = nis
                     out_dof[k] = dof
@@ -533,10 +509,10 @@ def _predict_outputs(due, held, tuning, layout, p, f, predicted):  # type: ignor
     q_std, _, _, _, _, _, scale, _ = tuning
     places = places_of(layout)
     layout = spread_layout(layout)
-    x, there = aligned(ROOM), _in_places(np.ones(places.shape[0]), places, 0.0) > 0.0
-    P, L = aligned(ROOM * ROOM).reshape((ROOM, ROOM)), aligned(ROOM * ROOM).reshape((ROOM, ROOM))
-    noise, constants = (_in_places(q_std, places, 0.0), aligned(ROOM), scale), _make_constants()
-    points = aligned(PLACES * WIDTH)
+    x, there = np.zeros(PLACES), _in_places(np.ones(places.shape[0]), places, 0.0) > 0.0
+    P, L = np.zeros((PLACES, PLACES)), np.zeros((PLACES, PLACES))
+    noise = (_in_places(q_std, places, 0.0), np.zeros(PLACES), scale)
+    points = np.zeros(_ROWS * WIDTH)
     for m in range(step.shape[0]):
         k = step[m]
         if k < 0:
@@ -546,9 +522,9 @@ def _predict_outputs(due, held, tuning, layout, p, f, predicted):  # type: ignor
         _matrix_in_places(held_P[k], places, P)
         over, rate = base.held_inputs(inputs, k), (residual_rate[k, 0], residual_rate[k, 1])
         if horizon_s[m] > 0.0:
-            wide_root(P, places, there, L)
-            _draw(x, L, scale, constants, points)
-            _predict(x, P, over, rate, horizon_s[m], noise, layout, p, f, constants, points, False)
+            partial_root(P, places, there, L)
+            _draw(x, L, scale, points)
+            _predict(x, P, over, rate, horizon_s[m], noise, layout, p, f, points, base.MOTION)
         _write_prediction(m, x, P, over.steer, rate[0], places, p, predicted)
 
 

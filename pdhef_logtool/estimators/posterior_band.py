@@ -20,8 +20,8 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.adaptive_physics import CURES
 from pdhef_logtool.estimators.calibration.joint import prior_variations
-from pdhef_logtool.estimators.error_features import TERMS, FeatureState, error_terms
-from pdhef_logtool.estimators.latency_compensation import WindowState, run_window
+from pdhef_logtool.estimators.error_features import TERMS, error_terms
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter, of_car
 from pdhef_logtool.estimators.self_calibrated import widened
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -35,28 +35,21 @@ _KINEMATIC = TERMS.index("kinematic")
 
 @dataclass(slots=True)
 class PosteriorBand:
-    """The confidence interval of one car over one drive, window by window; windows change no bit.
+    """The confidence interval of one car over one drive.
 
-    ``filters`` : the physics filter on the car, then on it away from there. All tracks of a window share their runs.
+    ``filters`` : the physics filter on the car, then on it away from there. All tracks share their runs.
     """
 
     filters: tuple[PhysicsFilter, ...]
-    _window: Signals | None = None
+    _signals: Signals | None = None
     _vy: list[FloatArray] = field(default_factory=list)
-    _states: tuple[WindowState, ...] = ()
-    _features: dict[str, FeatureState] = field(default_factory=dict)
 
-    def add(self, track: StateTrack, signals: Signals) -> StateTrack:
-        """Return the next window of a track [N] with 1-sigmas as the head of this file has them."""
-        if signals is not self._window:
-            before = self._states or [None] * len(self.filters)
-            runs = [run_window(f, signals, b) for f, b in zip(self.filters, before, strict=True)]
-            self._window, self._vy = signals, [t.vy_m_s for t, _ in runs]
-            self._states = tuple(state for _, state in runs)
+    def widen(self, track: StateTrack, signals: Signals) -> StateTrack:
+        """Return a track [N] with 1-sigmas as the head of this file has them."""
+        if signals is not self._signals:
+            self._signals, self._vy = signals, [run_estimator(f, signals).vy_m_s for f in self.filters]
         vehicle = self.filters[0].vehicle
-        terms, self._features[track.name] = error_terms(
-            track, signals, vehicle.roll_gradient_rad_per_m_s2, self._features.get(track.name)
-        )
+        terms, _ = error_terms(track, signals, vehicle.roll_gradient_rad_per_m_s2, None)
         seen = terms[:, _KINEMATIC] * np.abs(track.vx_m_s)
         return widened(track, self._vy, seen, vehicle.low_speed_blend_m_s, own_share=OWN_SHARE)
 

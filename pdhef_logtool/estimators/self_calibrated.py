@@ -27,7 +27,7 @@ from pdhef_logtool.car.car import WithoutTruth
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, predict_track, run_steps
 from pdhef_logtool.estimators.intervals import MAX_SIDESLIP_STD_RAD, scaled_covariance
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack
@@ -45,22 +45,19 @@ D2_SHARE, CAR_STD_RAD = 0.7, math.radians(0.15)
 
 @dataclass(slots=True)
 class CalibratedBand:
-    """The interval above over one drive, window by window. All tracks of a window share the runs of its filters."""
+    """The interval above over one drive. All tracks share the runs of its filters."""
 
     calibration: WithoutTruth
     read_with: VehicleParameters
-    _window: Signals | None = None
+    _signals: Signals | None = None
     _vy: list[FloatArray] = field(default_factory=list)
-    _states: tuple[Any, ...] = ()
 
-    def add(self, track: StateTrack, signals: Signals) -> StateTrack:
-        """Return the next window of a track [N] with wider 1-sigmas of sideslip and v_y."""
+    def widen(self, track: StateTrack, signals: Signals) -> StateTrack:
+        """Return a track [N] with wider 1-sigmas of sideslip and v_y."""
         calibration = self.calibration
-        if signals is not self._window:
-            given, before = of_friction(signals, calibration), self._states or [None] * len(self._filters)
-            runs = [run_window(f, given, b) for f, b in zip(self._filters, before, strict=True)]
-            self._window, self._vy = signals, [t.vy_m_s for t, _ in runs]
-            self._states = tuple(state for _, state in runs)
+        if signals is not self._signals:
+            given = of_friction(signals, calibration)
+            self._signals, self._vy = signals, [run_estimator(f, given).vy_m_s for f in self._filters]
         d2, scale = calibration.driven_d2_m_s, calibration.error_scale
         contradicted = np.hypot(scale * CAR_STD_RAD * track.vx_m_s, D2_SHARE * d2 if math.isfinite(d2) else 0.0)
         contradicted = np.hypot(contradicted, calibration.cg_std_m * track.yaw_rate_rad_s)

@@ -34,7 +34,6 @@ from typing import TypeAlias
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.compiled.vectors import LANES, ROOM, aligned, load, spread, store
 from pdhef_logtool.estimators.adaptive_physics import (
     FORGET_S,
     AdaptivePhysics,
@@ -53,7 +52,7 @@ from pdhef_logtool.estimators.filter_base import (
     StepLinks,
 )
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
-from pdhef_logtool.estimators.unscented import wide_root
+from pdhef_logtool.estimators.unscented import covariance_root
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals, join_signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
 from pdhef_logtool.records.tracks import StateTrack
@@ -67,108 +66,70 @@ STEPS_AT_ONCE = 8192
 NOT_CAUSAL = "not causal: an estimate uses what was measured later; to be ranked apart from causal ones"
 
 
-# Matrices have ROOM for the entries of a state, rows of whole vectors, with zeros where there is no entry.
 _compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
 
 
 @_compiled
-def _make_work(n):  # type: ignore[no-untyped-def]
-    """Return the entries of a state [n], which of them count [ROOM], and four matrices [ROOM, ROOM]."""
-    a, b, c, d = aligned(ROOM * ROOM), aligned(ROOM * ROOM), aligned(ROOM * ROOM), aligned(ROOM * ROOM)
-    shape = (ROOM, ROOM)
-    return (
-        np.arange(n),
-        np.zeros(ROOM, np.bool_),
-        a.reshape(shape),
-        b.reshape(shape),
-        c.reshape(shape),
-        d.reshape(shape),
-    )
-
-
-@_compiled
-def _gain(cross, predicted_P, k, first, work):  # type: ignore[no-untyped-def]
-    """Write (C P⁻¹)ᵀ of step k to the third matrix of ``work``, over the later state's entries from ``first`` on."""
-    every, counts, A, L, gain, _ = work
-    n = every.shape[0]
+def _gain(cross, predicted_P, first, A, L, gain):  # type: ignore[no-untyped-def]
+    """Write (C P⁻¹)ᵀ of a step to ``gain`` [n, n], over the later state's entries from ``first`` on."""
+    n = gain.shape[0]
     for i in range(n):
-        counts[i] = i >= first
         for j in range(n):
-            A[i, j] = predicted_P[k, i, j] if i >= first and j >= first else 0.0
-            gain[i, j] = cross[k, j, i] if i >= first else 0.0
-    wide_root(A, every[first:], counts, L)
+            A[i, j] = predicted_P[i, j] if min(i, j) >= first else 1.0 * (i == j)
+            gain[i, j] = cross[j, i] if i >= first else 0.0
+    covariance_root(A, L)
     for i in range(first, n):  # forward, then backward substitution with P = L Lᵀ
-        offset = i * ROOM
-        low, high = load(gain, offset), load(gain, offset + LANES)
         for j in range(first, i):
-            share = spread(L[i, j])
-            low, high = low - share * load(gain, j * ROOM), high - share * load(gain, j * ROOM + LANES)
-        per = spread(1.0 / L[i, i])
-        store(gain, offset, per * low)
-        store(gain, offset + LANES, per * high)
+            for k in range(n):
+                gain[i, k] -= L[i, j] * gain[j, k]
+        for k in range(n):
+            gain[i, k] /= L[i, i]
     for i in range(n - 1, first - 1, -1):
-        offset = i * ROOM
-        low, high = load(gain, offset), load(gain, offset + LANES)
         for j in range(i + 1, n):
-            share = spread(L[j, i])
-            low, high = low - share * load(gain, j * ROOM), high - share * load(gain, j * ROOM + LANES)
-        per = spread(1.0 / L[i, i])
-        store(gain, offset, per * low)
-        store(gain, offset + LANES, per * high)
+            for k in range(n):
+                gain[i, k] -= L[j, i] * gain[j, k]
+        for k in range(n):
+            gain[i, k] /= L[i, i]
 
 
 # positional: arrays of steps with a place in them: a view for each would cost as much as the sums.
 @_compiled
 def _step_back(forward, k, links, following, xs, Ps, work):  # type: ignore[no-untyped-def]
-    """Take the smoothed state [ROOM] and covariance [ROOM, ROOM] from the step behind to step k of ``forward``.
+    """Take the smoothed state [n] and covariance [n, n] from the step behind to step k of ``forward``.
 
     ``links`` are by step the kind of link, predicted covariance, cross covariance and prior state; ``following`` is the
     step behind in them.
     """
     x, P, _ = forward
     kind, predicted_P, cross, prior = links
-    every, counts, change, L, gain, half = work
-    n = every.shape[0]
+    change, L, gain, half = work
+    n = x.shape[1]
     if kind[following] == LINK_NONE:
-        for i in range(n):
-            xs[i] = x[k, i]
-            for j in range(n):
-                Ps[i, j] = P[k, i, j]
+        xs[:], Ps[:, :] = x[k], P[k]
         return
-    overwritten = AX_BIAS if kind[following] == LINK_BIASES else 0
-    _gain(cross, predicted_P, following, overwritten, work)
+    _gain(cross[following], predicted_P[following], AX_BIAS if kind[following] == LINK_BIASES else 0, change, L, gain)
     for i in range(n):
+        xs[i] -= prior[following, i]
         for j in range(n):
             change[i, j] = Ps[i, j] - predicted_P[following, i, j]
-            Ps[i, j] = P[k, i, j]
-    low, high = spread(0.0), spread(0.0)
-    for i in range(n):
-        move = spread(xs[i] - prior[following, i])
-        low, high = low + move * load(gain, i * ROOM), high + move * load(gain, i * ROOM + LANES)
-        xs[i] = x[k, i]
-    store(xs, 0, load(xs, 0) + low)
-    store(xs, LANES, load(xs, LANES) + high)
+            half[i, j] = 0.0
     for j in range(n):
-        low, high = spread(0.0), spread(0.0)
         for i in range(n):
-            of = spread(change[i, j])
-            low, high = low + of * load(gain, i * ROOM), high + of * load(gain, i * ROOM + LANES)
-        store(half, j * ROOM, low)
-        store(half, j * ROOM + LANES, high)
+            for a in range(n):
+                half[j, a] += change[i, j] * gain[i, a]
     for a in range(n):
-        offset = a * ROOM
-        low, high = load(Ps, offset), load(Ps, offset + LANES)
+        moved = x[k, a]
         for j in range(n):
-            of = spread(gain[j, a])
-            low, high = low + of * load(half, j * ROOM), high + of * load(half, j * ROOM + LANES)
-        store(Ps, offset, low)
-        store(Ps, offset + LANES, high)
-    for a in range(n):
-        counts[a] = True
-        for b in range(a):
-            Ps[a, b] = 0.5 * (Ps[a, b] + Ps[b, a])
-            Ps[b, a] = Ps[a, b]
-    wide_root(Ps, every, counts, L)
+            moved += gain[j, a] * xs[j]
+        L[0, a] = moved
+        for b in range(a + 1):
+            s = 0.5 * (P[k, a, b] + P[k, b, a])
+            for j in range(n):
+                s += 0.5 * (gain[j, a] * half[j, b] + gain[j, b] * half[j, a])
+            Ps[a, b] = s
+            Ps[b, a] = s
+    xs[:] = L[0]
+    covariance_root(Ps, L)
 
 
 @_compiled
@@ -181,23 +142,16 @@ def _smooth(forward, links, tie, span, xs, Ps, out_x, out_P):  # type: ignore[no
     """
     x, P, _ = forward
     first, last, end = span
-    work = _make_work(x.shape[1])
-    n = x.shape[1]
-    wide_x, wide_P = aligned(ROOM), aligned(ROOM * ROOM).reshape((ROOM, ROOM))
-    wide_x[:n], wide_P[:n, :n] = xs, Ps
+    work = (np.empty_like(Ps), np.empty_like(Ps), np.empty_like(Ps), np.empty_like(Ps))
     for k in range(end, first - 1, -1):
         if k < end:
-            _step_back(forward, k, links, k + 1, wide_x, wide_P, work)
+            _step_back(forward, k, links, k + 1, xs, Ps, work)
         elif tie[0].shape[0] > 0:
-            _step_back(forward, k, tie, 0, wide_x, wide_P, work)
+            _step_back(forward, k, tie, 0, xs, Ps, work)
         else:
-            wide_x[:n], wide_P[:n, :n] = x[k], P[k]
+            xs[:], Ps[:, :] = x[k], P[k]
         if k <= last:
-            for i in range(n):
-                out_x[k, i] = wide_x[i]
-                for j in range(n):
-                    out_P[k, i, j] = wide_P[i, j]
-    xs[:], Ps[:, :] = wide_x[:n], wide_P[:n, :n]
+            out_x[k], out_P[k] = xs, Ps
 
 
 #: Smoothed states [K, n] and covariances [K, n, n].

@@ -47,7 +47,6 @@ class Spec:
     in_all : whether it is one of :data:`ALL_ESTIMATORS`.
     network : which part of a network bundle it needs; empty: none; ``optional``: it runs without as well.
     needs_noise : whether it cannot run without noise of its own in the car.
-    tunable : whether ``pdhef learn --stages noise`` searches its noise.
     """
 
     name: str
@@ -59,7 +58,6 @@ class Spec:
     in_all: bool = True
     network: Literal["", "optional", "residual", "paper", "pure_lstm", "linear_regression"] = ""
     needs_noise: bool = False
-    tunable: bool = False
     one_of: frozenset[str] = frozenset()
 
     def lacking(self, available: frozenset[str]) -> list[str]:
@@ -73,7 +71,7 @@ class Spec:
         if preset_of(self.name) in SELF_CALIBRATED:
             car = car.calibrated_car
         if self.needs_noise and self.name not in car.noise:
-            return f"the car has no noise for {self.name}; pdhef learn --stages noise finds it"
+            return f"the car has no noise for {self.name} in noise.toml"
         if self.network in ("", "optional"):
             return ""
         if car.network is None:
@@ -163,11 +161,11 @@ SPECS: tuple[Spec, ...] = (
     ),
     Spec(
         "physics", "the strongest filter on physics alone, with the parts that driving of the car gave evidence for",
-        "adaptive_physics:build", _SPEED, 0x44AA99, tunable=True, one_of=_LATERAL,
+        "adaptive_physics:build", _SPEED, 0x44AA99, one_of=_LATERAL,
     ),
     Spec(
         "phy-ukf:tuned", "phy-ukf with the noise of an identified car, corrected for body roll",
-        "phy_ukf:build", _INPUTS, 0x56B4E9, needs_noise=True, tunable=True,
+        "phy_ukf:build", _INPUTS, 0x56B4E9, needs_noise=True,
     ),
     Spec(
         "pure-lstm", "a network that outputs v_y itself, no filter (needs a network with baselines)",

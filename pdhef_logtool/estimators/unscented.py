@@ -12,7 +12,6 @@ import math
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.compiled.vectors import factor
 from pdhef_logtool.records.signals import FloatArray
 
 #: Smallest variance that a repaired covariance keeps on its diagonal.
@@ -78,12 +77,35 @@ def repair_covariance(P):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def wide_root(P, places, there, L):  # type: ignore[no-untyped-def]
-    """Write the factor of P (see :func:`~pdhef_logtool.compiled.vectors.factor`); P is repaired if needed.
+def _partial_root(P, there, L):  # type: ignore[no-untyped-def]
+    """Write the lower Cholesky factor of the entries of P [n, n] that are ``there`` [n]; the others get zeros.
 
-    ``places`` are the entries that are ``there``.
+    Returns False where these entries are not positive definite. L is zero above its diagonal and stays so.
     """
-    if factor(P, there, L):
+    n = P.shape[0]
+    for j in range(n):
+        if not there[j]:
+            L[j:, j] = 0.0
+            continue
+        s = P[j, j]
+        for k in range(j):
+            s -= L[j, k] * L[j, k]
+        if not s > 0.0:
+            return False
+        L[j, j] = math.sqrt(s)
+        per_root = 1.0 / L[j, j]
+        for i in range(j + 1, n):
+            s = P[i, j]
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            L[i, j] = s * per_root
+    return True
+
+
+@njit(cache=True)
+def partial_root(P, places, there, L):  # type: ignore[no-untyped-def]
+    """Write what :func:`_partial_root` does; P is repaired in ``places``, the entries that may be there, if needed."""
+    if _partial_root(P, there, L):
         return
     n = places.shape[0]
     dense = np.empty((n, n))
@@ -94,16 +116,22 @@ def wide_root(P, places, there, L):  # type: ignore[no-untyped-def]
     for i in range(n):
         for j in range(n):
             P[places[i], places[j]] = dense[i, j]
-    factor(P, there, L)
+    _partial_root(P, there, L)
+
+
+@njit(cache=True)
+def covariance_root(P, L):  # type: ignore[no-untyped-def]
+    """Write the lower Cholesky factor of P [n, n] to L; P is repaired if needed."""
+    if not cholesky_lower(P, L):
+        repair_covariance(P)
+        cholesky_lower(P, L)
 
 
 @njit(cache=True)
 def draw_sigma_points(x, P, scale, L, chi):  # type: ignore[no-untyped-def]
     """Write the 2n+1 sigma points of (x, P) to chi [2n+1, n]; L [n, n] is work space. P is repaired if needed."""
     n = x.shape[0]
-    if not cholesky_lower(P, L):
-        repair_covariance(P)
-        cholesky_lower(P, L)
+    covariance_root(P, L)
     root = math.sqrt(scale)
     for j in range(n):
         chi[0, j] = x[j]

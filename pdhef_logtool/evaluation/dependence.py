@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.student import student_quantile
 
 #: Metadata keys that name a route, the first one that a log has.
 ROUTE_KEYS = ("route", "track", "course")
@@ -63,9 +64,11 @@ class Dependence:
 
 def deviate(share: float, freedom: float) -> float:
     """Return a quantile of Student's t, or of the normal distribution with infinite degrees of freedom."""
-    from scipy.special import ndtri, stdtrit  # scipy.stats takes half a second longer to load
+    if math.isinf(freedom) or float(freedom).is_integer():
+        return student_quantile(share, freedom)
+    from scipy.special import stdtrit
 
-    return float(ndtri(share) if math.isinf(freedom) else stdtrit(freedom, share))
+    return float(stdtrit(freedom, share))
 
 
 def numbered(values: Sequence[object]) -> IntArray:

@@ -15,6 +15,7 @@ import numpy as np
 
 from pdhef_logtool.evaluation.dependence import Dependence, Factors, dependence, deviate
 from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.student import student_quantile
 
 #: Fewer drives: blocks within them are drawn instead. Fewer blocks: no bounds.
 LEAST_DRIVES, LEAST_BLOCKS = 5, 6
@@ -80,8 +81,6 @@ def _studentised(
     top: FloatArray, below: FloatArray, power: float, tail: float, effect: Dependence, *, log: bool
 ) -> tuple[float, float]:
     """Return the distances from the statistic, or its logarithm, to its lower and upper bound."""
-    from scipy.special import stdtrit
-
     n = len(top)
     if n > _MOST_UNITS:  # neighbours are drawn together
         groups = np.arange(n) * _MOST_UNITS // n
@@ -91,7 +90,7 @@ def _studentised(
         return 0.0, 0.0
     ratio = float(top.sum() / below.sum())
     deviations = _deviations(top, below, power, math.log(ratio) * power if log else ratio, log=log)
-    most_deviation = _MOST_DEVIATION * float(stdtrit(len(top) - 1, 1.0 - tail))
+    most_deviation = _MOST_DEVIATION * student_quantile(1.0 - tail, len(top) - 1)
     least, most = np.clip(np.quantile(deviations, [tail, 1.0 - tail]), -most_deviation, most_deviation)
     if effect.by:  # few days: their number limits what is known of the spread
         reach = deviate(1.0 - tail, effect.freedom)
@@ -102,13 +101,13 @@ def _studentised(
 
 def _lognormal_excess(values: FloatArray, power: float, tail: float) -> float:
     """Return ln(upper bound / estimate) of exp(μ + ``power`` σ²) of lognormal values [N]; 0 of too few or too many."""
-    from scipy.special import chdtri, stdtrit
+    from scipy.special import chdtri
 
     n = len(values)
     if not LEAST_DRIVES <= n < _LOGNORMAL or not (values > 0.0).all():
         return 0.0
     variance = float(np.var(np.log(values), ddof=1))
-    of_mean = float(stdtrit(n - 1, 1.0 - tail)) * math.sqrt(variance / n)
+    of_mean = student_quantile(1.0 - tail, n - 1) * math.sqrt(variance / n)
     return math.hypot(of_mean, power * variance * ((n - 1) / float(chdtri(n - 1, 1.0 - tail)) - 1.0))
 
 

@@ -6,7 +6,7 @@ import json
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,97 +15,68 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import LearntOn
-from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import MAX_BYTES, Drive, Tell, WholeDrive, lost_texts
-from pdhef_logtool.drive.windows import DrivePlan
-from pdhef_logtool.learning.noise.search import MIN_TRIALS, scorable_stamps
-from pdhef_logtool.learning.variation import MAX_VARIATION
+from pdhef_logtool.drive.plan import DrivePlan
+from pdhef_logtool.drive.reading import MAX_BYTES, Drive, Tell, WholeDrive, lost_texts, read_drive
+from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
-from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.signals import BoolArray, Loss
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
 
-#: Stages of ``pdhef learn`` in the order in which they run.
-CALIBRATE, NOISE, GAIN, NETWORK, INTERVALS = STAGES = ("calibrate", "noise", "gain", "network", "intervals")
-#: Stage by itself, the default: prior of the calibration and residual of a car, from all drives with ground truth.
-TEACH = "teach"
+#: Stages of ``pdhef learn``. ``teach``, the default: prior of the calibration and residual of a car, from all drives
+#: with ground truth. ``calibrate``: the car by its sensors alone. ``gain``: residual gain of a network.
+TEACH, CALIBRATE, GAIN = STAGES = ("teach", "calibrate", "gain")
 #: Splits of a simulated set that results are reported on, and those that a network is trained on and chosen by.
 HELD_OUT, SEEN = ("test", "extrapolation"), ("train", "validation")
 #: Entries of the configuration that decide what is learned.
 _SETTINGS = (
     "car", "mapping", "network", "start", "end", "sensors", "friction", "prefer_truth", "reference", "gnss",
-    "estimators",
 )  # fmt: skip
 #: Drives that are named in an error.
 _NAMED = 3
-MAX_HOLDOUT = 0.5
-#: A stage of former versions, and what does its work.
-REMOVED, INSTEAD = "identify", "pdhef learn without --stages, or --without-truth"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LearnSettings:
-    """What decides what ``learn`` learns, beside the logs.
+    """Settings that, together with the logs, determine the result of ``learn``.
 
     Attributes
     ----------
-    config : car, network, mapping, slice, sensors, truth channel; estimators of the stages noise and intervals.
-    stages : :data:`TEACH` alone, or names out of :data:`STAGES`, in any order.
-    holdout : share of the driving that is only scored, once.
-    trials : of the noise search, per estimator.
-    spread : of the random errors of friction and vehicle in further runs of each interval drive; 0 = no such runs.
+    config : car, network, mapping, slice, sensors, truth channel.
+    stage : one of :data:`STAGES`.
     seed : of every random draw.
     split : only drives that their set's manifest assigns to this split.
-    any_split : accept drives of the splits that the stages otherwise refuse.
+    any_split : accept drives of the splits that the stage otherwise refuses.
     """
 
     config: RunConfig
-    stages: tuple[str, ...] = (TEACH,)
-    holdout: float = 0.15
-    trials: int = 64
-    spread: float = 0.1
+    stage: str = TEACH
     seed: int = 0
     split: str | None = None
     any_split: bool = False
 
     def __post_init__(self) -> None:
         """Check the values; raises UsageError."""
-        checks = (
-            (self.seed >= 0, "a seed of at least 0", self.seed, "--seed"),
-            (0.0 <= self.holdout <= MAX_HOLDOUT, f"a share from 0 to {MAX_HOLDOUT:g}", self.holdout, "--holdout"),
-            (self.trials >= MIN_TRIALS, f"at least {MIN_TRIALS} trials", self.trials, "--trials"),
-            (0.0 <= self.spread <= MAX_VARIATION, f"a spread of 0 to {MAX_VARIATION:g}", self.spread, "--vary"),
-            (
-                self.stages == (TEACH,) or (self.stages and set(self.stages) <= set(STAGES)),
-                f"{TEACH} alone, or stages out of {', '.join(STAGES)}",
-                ", ".join(self.stages) or "none",
-                "--stages",
-            ),
-        )
-        remedy = f"{REMOVED} was removed; use: {INSTEAD}" if REMOVED in self.stages else ""
-        for holds, expected, got, where in checks:
-            if not holds:
-                raise UsageError(expected=expected, got=str(got), where=where, remedy=remedy)
-
-    @property
-    def order(self) -> tuple[str, ...]:
-        """The stages in the order in which they run."""
-        return tuple(name for name in (TEACH, *STAGES) if name in self.stages)
+        if self.seed < 0:
+            raise UsageError(expected="a seed of at least 0", got=str(self.seed), where="--seed")
+        if self.stage not in STAGES:
+            raise UsageError(expected=f"one of {', '.join(STAGES)}", got=self.stage or "none", where="--stages")
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON-able values; files by name only."""
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "config"}
-        return {**config_document(self.config), **values, "stages": list(self.order)}
+        values = {"stages": [self.stage], "seed": self.seed, "split": self.split, "any_split": self.any_split}
+        return {**config_document(self.config), **values}
 
 
 def config_document(config: RunConfig) -> dict[str, Any]:
     """Return the entries of a configuration that decide what is learned, as JSON-able values; files by name only."""
     document = config.to_dict()
-    return {k: document[k] for k in _SETTINGS if k != "estimators" or document[k] is not None}
+    return {k: document[k] for k in _SETTINGS}
 
 
 def open_car(config: RunConfig, warn: Tell) -> Car:
@@ -160,9 +131,9 @@ def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInp
                 got=f"drives of {there}" if there else "drives without a set's manifest beside them",
                 where="--split",
             )
-    gain_only = settings.order == (GAIN,)
+    gain_only = settings.stage == GAIN
     refused = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in (SEEN if gain_only else HELD_OUT)]
-    if refused and not settings.any_split and settings.order != (CALIBRATE,):
+    if refused and not settings.any_split and settings.stage != CALIBRATE:
         more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
         raise UsageError(
             expected="drives that no network was trained on" if gain_only else "drives that no result is reported on",
@@ -199,7 +170,7 @@ class DriveRecord:
     ----------
     seconds : from first to last stamp. span_s : these two, in seconds from the log's start.
     truth : sources of the ground truth. friction_from : in the words of the report. notes : of the reading.
-    counts : what a command counts of it, by name. bytes_held : memory that it takes in the command.
+    counts : what a command counts of it, by name.
     """
 
     name: str
@@ -214,7 +185,6 @@ class DriveRecord:
     notes: tuple[str, ...] = ()
     left_out: str = ""
     counts: Mapping[str, int] = field(default_factory=dict)
-    bytes_held: int = 0
 
     @property
     def learnt_on(self) -> LearntOn:
@@ -230,7 +200,7 @@ class DriveRecord:
     def to_dict(self) -> dict[str, Any]:
         """Return the record as JSON-able values."""
         document = asdict(self)
-        for key in ("counts", "bytes_held", "left_out"):
+        for key in ("counts", "left_out"):
             del document[key]
         if self.left_out:
             document["reason"] = self.left_out
@@ -258,7 +228,6 @@ def record_of(
         losses=drive.losses,
         notes=(*drive.notes, *drive.remarks),
         left_out=left_out,
-        bytes_held=0 if whole is None else whole.nbytes,
     )
 
 
@@ -305,17 +274,21 @@ def no_true_sideslip(plan: DrivePlan) -> str:
     return ""
 
 
+def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
+    """Return where [N] the sideslip of the ground truth is available above the low-speed limit."""
+    finite: BoolArray = np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))
+    return finite
+
+
 def load_drive(
     log_input: LogInput,
     car: Car,
     mapping: SignalMapping | None,
     options: ReadOptions,
     *,
-    split: str | None = None,
     refuse: Callable[[Drive], str] = lambda _drive: "",
     fill_friction: bool = True,
     least_scored: int = 0,
-    max_bytes: int = MAX_BYTES,
 ) -> tuple[DriveRecord, WholeDrive | None]:
     """Read a drive with a true sideslip into memory; None with the reason in the record if it cannot be used.
 
@@ -327,17 +300,17 @@ def load_drive(
     Raises
     ------
     PdhefError
-        The log cannot be read, or takes more than ``max_bytes``.
+        The log cannot be read, or is too large for the memory.
     """
-    with read_cached(log_input, car, mapping, options) as drive:
+    with read_drive(log_input, car, mapping, options) as drive:
         left_out = no_true_sideslip(drive.plan) or refuse(drive)
         if left_out:
-            return record_of(drive, split=split, left_out=left_out), None
-        whole = drive.whole(fill_friction=fill_friction, max_bytes=max_bytes)
+            return record_of(drive, left_out=left_out), None
+        whole = drive.whole(fill_friction=fill_friction, max_bytes=MAX_BYTES)
         assert whole.truth is not None
         slow = car.vehicle.low_speed_blend_m_s
         scored = int(np.count_nonzero(scorable_stamps(whole.truth, slow)))
         if scored < least_scored or not np.isfinite(whole.truth.sideslip_rad).any():
             left_out = f"{scored} stamps with a true sideslip above {slow:g} m/s"
-            return record_of(drive, split=split, left_out=left_out), None
-        return replace(record_of(drive, split=split, whole=whole), counts={"scored_stamps": scored}), whole
+            return record_of(drive, left_out=left_out), None
+        return replace(record_of(drive, whole=whole), counts={"scored_stamps": scored}), whole

@@ -6,6 +6,7 @@ not end this process. Bytes that were read stay valid after the file is closed.
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from abc import ABC, abstractmethod
@@ -34,6 +35,19 @@ class SourceError(LogError):
 
 class ChangedError(SourceError):
     """A log has changed since it was opened."""
+
+
+#: Errors of a disk or a file server, which may pass: they are no damage of the log.
+_OF_THE_SOURCE = (errno.EIO, errno.ESTALE, errno.ENOENT, errno.ENODEV, errno.ENOTCONN, errno.ETIMEDOUT)
+
+
+def raise_source_error(error: BaseException, where: str = "the log") -> None:
+    """Raise a SourceError if the disk or the server of a log has failed."""
+    if isinstance(error, SourceError):
+        raise error
+    if isinstance(error, OSError) and error.errno in _OF_THE_SOURCE:
+        got, remedy = error.strerror or str(error), "check the disk or the connection"
+        raise SourceError(expected="a readable file", got=got, where=where, remedy=remedy) from error
 
 
 class ByteSource(ABC):

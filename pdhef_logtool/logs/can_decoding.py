@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import MappingFileError
@@ -29,9 +30,9 @@ CAN_TYPE = "can/msg/Frame"
 _MAX_DBC_BYTES = 32 << 20
 #: Bits of a signal that become a number.
 _MOST_BITS = 64
-ID_BITS = (1 << 29) - 1
-#: J1939: source address of any sender in a DBC, and first PDU format without a destination address.
-_NULL_ADDRESS, _BROADCAST = 0xFE, 0xF0
+_CAN = CONSTANTS["can"]
+ID_BITS = _CAN["id_bits"]
+_BYTE = 0xFF
 #: Names of raw values without a measurement, in signals of at least 8 bits; shorter ones are states.
 _NO_VALUE = re.compile(r"(?<![a-z])(?<!no[ _-])(?:sna|invalid|error|fehler|(?:not|un|n)[ _-]?available)", re.I)
 #: Maximum number of distinct values outside of a correct range, and their share of all distinct values.
@@ -91,7 +92,7 @@ class Frames:
         """Return the rows of data frames by their source."""
         ids = self.parts["id"].astype(np.int64)
         zero = np.zeros(len(ids), np.int64)
-        bus, extended = self.parts.get("bus", zero), self.parts.get("is_extended", ids >= 1 << 11)
+        bus, extended = self.parts.get("bus", zero), self.parts.get("is_extended", ids > _CAN["base_id_bits"])
         rows = np.flatnonzero((self.parts.get("is_error", zero) == 0) & (self.parts.get("is_remote", zero) == 0))
         keys = (2 * bus.astype(np.int64) + (extended > 0) << 32) + (ids & ID_BITS)
         keys, inverse, counts = np.unique(keys[rows], return_inverse=True, return_counts=True)
@@ -142,7 +143,7 @@ class Decoder:
             message = described[max(able, key=lambda number: fits[number, source.bus])][source]
             if has_j1939_identifier(message) or source.identifier != message.frame_id:
                 addressed.add(id(message))
-            sender = source.bus, source.identifier & 0xFF
+            sender = source.bus, source.identifier & _BYTE
             senders.setdefault(id(message), {}).setdefault(sender, []).append(its)
         for number, message in ((n, m) for n, (_, database) in enumerate(self.databases) for m in database.messages):
             parts = {sender: np.sort(np.concatenate(its)) for sender, its in senders.get(id(message), {}).items()}
@@ -215,13 +216,19 @@ class Decoder:
 
 def has_j1939_identifier(message: Message) -> bool:
     """Return whether the DBC states J1939 for a message, by its frame format or the null address in its identifier."""
-    return message.is_extended_frame and (message.protocol == "j1939" or message.frame_id & 0xFF == _NULL_ADDRESS)
+    is_null_address = message.frame_id & _BYTE == _CAN["null_address"]
+    return message.is_extended_frame and (message.protocol == "j1939" or is_null_address)
 
 
 def parameter_group(identifier: int) -> int:
     """Return the PGN of a 29-bit identifier, without the destination address where it contains one."""
-    group = identifier >> 8 & 0x3FFFF
-    return group if group >> 8 & 0xFF >= _BROADCAST else group & ~0xFF
+    group: int = identifier >> 8 & _CAN["pgn_bits"]
+    return group if _is_broadcast(identifier) else group & ~_BYTE
+
+
+def _is_broadcast(identifier: int) -> bool:
+    """Return whether the PDU format of a 29-bit identifier has no destination address."""
+    return identifier >> 16 & _BYTE >= int(_CAN["broadcast"])
 
 
 def described_sources(database: Database, sources: Iterable[Source]) -> dict[Source, Message]:
@@ -235,8 +242,7 @@ def described_sources(database: Database, sources: Iterable[Source]) -> dict[Sou
     groups = {
         parameter_group(m.frame_id): m
         for m in reversed(database.messages)
-        if has_j1939_identifier(m)
-        or (m.is_extended_frame and m.frame_id not in sent and m.frame_id >> 16 & 0xFF >= _BROADCAST)
+        if has_j1939_identifier(m) or (m.is_extended_frame and m.frame_id not in sent and _is_broadcast(m.frame_id))
     }
     by_group = {s: groups.get(parameter_group(s.identifier)) if s.is_extended else None for s in sources}
     matches = {s: exact.get((s.is_extended, s.identifier), by_group[s]) for s in sources}

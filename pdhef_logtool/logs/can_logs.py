@@ -10,12 +10,14 @@ import re
 import struct
 import zlib
 from array import array
+from collections.abc import Mapping
 from mmap import ACCESS_READ, mmap
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.can_decoding import ID_BITS, Frames
+from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_clocks import placed
 from pdhef_logtool.logs.table_file import TableFile, Tables
@@ -23,8 +25,10 @@ from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray, Loss
 
 _PARTS = ("id", "length", "is_extended", "bus", "is_error", "is_remote")
+#: Bytes of the numbers of a frame: its time and parts.
+_ROW_BYTES = np.dtype([("stamp", np.int64), ("parts", np.int32, len(_PARTS))]).itemsize
 #: Maximum data length of CAN FD.
-_MOST_BYTES = 64
+_MOST_BYTES = CONSTANTS["can"]["bytes_of_code"][-1]
 
 
 def _tables(
@@ -35,7 +39,7 @@ def _tables(
         got = f"none that can be read{''.join(f'; {loss.what}' for loss in lost[:1])}"
         raise LogError(expected="CAN frames", got=got, where=file.name)
     widest = max(1, int(numbers[:, 1].max()))
-    file.limits.check_table(len(stamps) * (8 + 4 * len(_PARTS) + widest), file.size, f"{len(stamps)} frames")
+    file.limits.check_table(len(stamps) * (_ROW_BYTES + widest), file.size, f"{len(stamps)} frames")
     rows = np.zeros((len(stamps), widest), np.uint8)
     rows[np.arange(widest) < numbers[:, 1:2]] = data
     order = np.argsort(stamps, kind="stable")
@@ -54,34 +58,24 @@ def _start_ns(year: int, month: int, day: int, hour: int, minute: int, second: i
 
 # BLF: objects "LOBJ", most of them in compressed containers. An object may continue in the next container.
 _SIGNATURE = b"LOBJ"
-_CONTAINER, _CONTAINER_HEAD = 10, 32
-#: Bytes of an object's header without its time.
-_HEAD = 16
-#: Maximum bytes of padding behind an object, and of an object of another kind.
-_PADDING, _LONGEST = 8, 16 << 20
+_BLF = CONSTANTS["blf"]
+_CONTAINER, _CONTAINER_HEAD = _BLF["container"], _BLF["container_head"]
+_HEAD, _PADDING, _LONGEST = _BLF["head"], _BLF["padding"], _BLF["longest"]
 _FILE_HEAD = struct.Struct("<4xI8xQ16x8H")
 _OBJECT_HEAD = struct.Struct("<4xHHII")
-_TIME = np.dtype({"names": ["unit", "time"], "formats": ["<u4", "<i8"], "offsets": [16, 24], "itemsize": 32})
 #: Maximum number of losses; further ones are counted.
 _MOST_NAMED = 20
 
 
-def _layout(**parts: tuple[str, int]) -> np.dtype[np.void]:
+def _layout(parts: Mapping[str, tuple[str, int]]) -> np.dtype[np.void]:
     formats, offsets = zip(*parts.values(), strict=True)
     return np.dtype({"names": [*parts], "formats": [*formats], "offsets": [*offsets]})
 
 
-_CAN = _layout(bus=("<u2", 0), flags=("u1", 2), length=("u1", 3), id=("<u4", 4), data=("(8,)u1", 8))
-_ERROR = _layout(bus=("<u2", 0), flags=("<u4", 4), length=("u1", 10), id=("<u4", 16), data=("(8,)u1", 24))
-_FD = _layout(bus=("<u2", 0), flags=("u1", 2), length=("u1", 14), id=("<u4", 4), data=("(64,)u1", 20))
-_FD_64 = _layout(
-    bus=("u1", 0), length=("u1", 2), id=("<u4", 4), flags=("<u4", 12), extension=("u1", 35), data=("(64,)u1", 40)
-)
-#: Kinds of frames: layout behind the header, minimum and maximum bytes of it, flag of a remote frame.
-_FRAMES = {
-    1: (_CAN, 16, 40, 0x80), 86: (_CAN, 16, 40, 0x80), 73: (_ERROR, 32, 56, 0), 100: (_FD, 84, 108, 0x80),
-    101: (_FD_64, 40, 168, 0x10),
-}  # fmt: skip
+_LAYOUTS = {name: _layout(parts) for name, parts in _BLF["layouts"].items()}
+_TIME = _LAYOUTS["time"]
+#: Kinds of frames: name of the layout, minimum and maximum bytes of it, flag of a remote frame.
+_FRAMES: dict[int, tuple[str, int, int, int]] = numbered(_BLF["frames"])
 
 
 def open_blf(file: TableFile) -> Tables:
@@ -188,7 +182,8 @@ class _Blf:
 
     def _decode(self, data: bytes | mmap, objects: list[tuple[int, int, int, int]]) -> None:
         """Add the frames among objects."""
-        for kind, (layout, fewest, _, remote) in _FRAMES.items():
+        for kind, (name, fewest, _, remote) in _FRAMES.items():
+            layout = _LAYOUTS[name]
             chosen = np.array([o[:3] for o in objects if o[3] == kind], np.int64)
             if not len(chosen):
                 continue
@@ -203,10 +198,10 @@ class _Blf:
             is_remote = (part["flags"] & remote) > 0
             count = np.where(is_remote, 0, np.minimum(part["length"], content.shape[1]))
             number, bus = part["id"].astype(np.int64), part["bus"].astype(np.int64) - 1
-            is_error = np.full(len(number), layout is _ERROR)
+            is_error = np.full(len(number), name == "error")
             numbers = np.stack((number & ID_BITS, count, number >> 31, bus, is_error, is_remote), axis=1)
-            unit = np.where(times["unit"] == 1, 10_000, 1)
-            most = 2**61 // unit  # no sum overflows
+            unit = np.where(times["unit"] == 1, _BLF["time_unit_ns"], 1)
+            most = np.iinfo(np.int64).max // 2 // unit  # no sum overflows
             stamps = self._start_ns + np.clip(times["time"], -most, most) * unit
             there = np.arange(content.shape[1]) < count[:, np.newaxis]
             self._blocks.append((stamps, numbers.astype(np.int32), content[there].astype(np.uint8)))
@@ -215,7 +210,7 @@ class _Blf:
 def _is_sound(head: int, version: int, length: int, kind: int) -> bool:
     """Return whether an object may have this header, length and kind."""
     if kind not in _FRAMES:
-        return length >= _CONTAINER_HEAD if kind == _CONTAINER else _HEAD <= length <= _LONGEST
+        return bool(length >= _CONTAINER_HEAD if kind == _CONTAINER else _HEAD <= length <= _LONGEST)
     _, fewest, most, _ = _FRAMES[kind]
     return version in (1, 2) and _TIME.itemsize <= head and fewest <= length - head < most
 
@@ -233,11 +228,7 @@ def _unpacked(stored: bytes, size: int, *, is_cut: bool) -> bytes:
 _BASE = re.compile(r"\s*base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?", re.I)
 _BEGIN = re.compile(r"\s*(?:date|begin\s+triggerblock)\b\s*(.*)", re.I)
 _DATE = re.compile(r"\S+\s+(\S+)\s+(\d+)\.?\s+(\d+):(\d+):(\d+)(?:\.(\d+))?\s*([ap]m)?\s+(\d{4})", re.I)
-#: English and German months, without the letters that are not ASCII.
-_MONTHS = {
-    "jan": 1, "feb": 2, "mar": 3, "mr": 3, "mrz": 3, "apr": 4, "may": 5, "mai": 5, "jun": 6, "jul": 7, "aug": 8,
-    "sep": 9, "oct": 10, "okt": 10, "nov": 11, "dec": 12, "dez": 12,
-}  # fmt: skip
+_MONTHS = {name: number for number, names in enumerate(CONSTANTS["asc"]["months"], 1) for name in names.split()}
 _EVENT = re.compile(rb"\s*(\d{1,9}(?:\.\d{1,12})?)\s+(.*)", re.S)
 #: Bus, then an error frame, or identifier, remote frame, length and data.
 _CLASSIC = re.compile(

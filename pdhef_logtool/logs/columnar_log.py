@@ -13,7 +13,6 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.compression import decompress_messages
 from pdhef_logtool.logs.container import UNVERIFIED, Block, ChannelRecord, Container, Span, count_text, describe_damage
@@ -44,9 +43,11 @@ from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 from pdhef_logtool.storage.files import scratch_folder, write_bytes
 
-#: Neighbouring windows share the span at their border: this many loaded spans are kept for the next window, and of a
-#: short log all that fit into this many bytes, as it is surveyed several times before it is read.
-_KEPT_SPANS, _KEPT_BYTES = 2, 8 << 20
+#: Loaded spans are kept up to this size, without payloads above ``_LARGE_BYTES`` (images, point clouds): the samples
+#: that recognition reads, and all of a short log, are decompressed once.
+_KEPT_BYTES, _LARGE_BYTES = 16 << 20, 16 << 10
+#: Columns of expected fields are kept up to this size.
+_COLUMN_BYTES = 64 << 20
 #: A message in the text of a DBC file.
 _DBC = re.compile(r"^BO_ \d+ \w+ *:", re.MULTILINE)
 
@@ -100,6 +101,9 @@ class ColumnarLog(DriveLog):
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
         self._kept_bytes = 0
+        self._expected: dict[str, _Plan] = {}  # by topic
+        self._columns: dict[tuple[int, int], dict[int, Columns]] = {}  # of expected topics, by span and channel
+        self._column_bytes = 0
         self._recording_span: RecordingSpan | None = None
         self._databases: tuple[Path, ...] | None = None
         self._extracted: tempfile.TemporaryDirectory[str] | None = None
@@ -158,11 +162,6 @@ class ColumnarLog(DriveLog):
                     what = f"its messages cannot be decoded: {schema}"
                     losses.append(Loss("bad-schema", what, container.channels[channel].topic))
         return tuple(losses)
-
-    @property
-    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Byte ledger of each file so far."""
-        return tuple(c.account.ledger(str(c.path)) for c in self.containers)
 
     def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
         counts: Counter[int] = Counter()
@@ -230,7 +229,7 @@ class ColumnarLog(DriveLog):
     @property
     def size(self) -> int:
         """Bytes of all files."""
-        return sum(container.account.size for container in self.containers)
+        return sum(container.size for container in self.containers)
 
     @property
     def chunks_read(self) -> tuple[int, int]:
@@ -332,6 +331,7 @@ class ColumnarLog(DriveLog):
     ) -> dict[str, Columns]:
         """Read fields of messages; see :class:`~pdhef_logtool.logs.drive_log.DriveLog`."""
         plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
+        self.expect({topic: paths for topic, paths in requests.items() if topic in self._expected})
         if not quiet:
             wanted = {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
             self._asked |= wanted
@@ -339,34 +339,47 @@ class ColumnarLog(DriveLog):
         times = {topic: _Plan((), {}) for topic in stamps if topic not in plans}
         return self._collect(plans | times, start_ns, end_ns)
 
+    def expect(self, requests: Mapping[str, Sequence[str]]) -> None:
+        """See :class:`~pdhef_logtool.logs.drive_log.DriveLog`."""
+        for topic, paths in requests.items():
+            before = self._expected[topic].paths if topic in self._expected else ()
+            if topic not in self._expected or not set(paths) <= set(before):
+                self._expected[topic] = self._plan(topic, tuple(dict.fromkeys([*before, *paths])))
+
     def close(self) -> None:
         """Release the files."""
         self._kept.clear()
-        self._kept_bytes = 0
+        self._columns.clear()
         for container in self.containers:
             container.close()
         if self._extracted is not None:
             self._extracted.cleanup()
 
-    def load(self, c: int, span: Span, want: frozenset[int] | None = None) -> Block | None:
+    def load(
+        self, c: int, span: Span, want: frozenset[int] | None = None, payloads: frozenset[int] | None = None
+    ) -> Block | None:
         """Read a span of the c-th container; None and a recorded loss if it is damaged.
 
         Any error of a container's load is a loss of the span.
+
+        Parameters
+        ----------
+        want : channels whose messages are needed. payloads : those of them whose payloads are needed. None: all.
         """
+        payloads = want if payloads is None else payloads
         container = self.containers[c]
         want = want if container.selective else None
         key = (c, span.index)
         if key in self._damaged:
             return None
         kept = self._kept.get((*key, want))
-        if kept is not None:
+        if kept is not None and (not kept.dropped if payloads is None else kept.dropped.isdisjoint(payloads)):
             return kept
         extent = container.extent(span)
         try:
             container.meter.check()
         except LimitError:
             self._late.setdefault(c, {})[span.index] = span
-            container.account.lose(*extent)
             return None
         try:
             with container.meter.running(extent[1] - extent[0]):
@@ -378,16 +391,13 @@ class ColumnarLog(DriveLog):
             count = sum(span.counts.values()) or None
             what = f"{count_text(count)} lost at byte {extent[0]}: {text}"
             self._damaged[key] = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
-            container.account.lose(*extent)
             return None
         if (*key, want) not in self._seen:
             self._seen.add((*key, want))
-            container.account.decode(*extent)
             self._correct_span(c, span, block, want)
-        self._kept[(*key, want)] = block
-        self._kept_bytes += block.nbytes
-        while len(self._kept) > _KEPT_SPANS and self._kept_bytes > _KEPT_BYTES:
-            self._kept_bytes -= self._kept.pop(next(iter(self._kept))).nbytes
+        if kept is None and self._kept_bytes < _KEPT_BYTES:
+            self._kept[(*key, want)] = small = block.without_large(_LARGE_BYTES)
+            self._kept_bytes += small.nbytes
         return block
 
     def _correct_span(self, c: int, span: Span, block: Block, want: frozenset[int] | None) -> None:
@@ -406,7 +416,7 @@ class ColumnarLog(DriveLog):
         others = {id_: n for id_, n in span.counts.items() if id_ not in claimed}
         container.spans[span.index] = replace(span, counts=others | declared)
         missing = sum(max(n - declared.get(id_, 0), 0) for id_, n in claimed.items())
-        start, end = container.extent(span)
+        start, _ = container.extent(span)
         for kind, count, text in (
             ("missing-messages", missing, "that the index names are not there"),
             ("unknown-channel", undeclared, "are on channels that no readable record declares"),
@@ -416,7 +426,6 @@ class ColumnarLog(DriveLog):
                 what = f"{count} messages {text}, at byte {start}"
                 loss = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
                 self._partial[c, span.index, (kind, want)] = loss
-                container.account.lose_share((start, end), count / (len(block) + missing))
 
     def schema_of(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
         """Return the schema of a channel of the c-th container, or why there is none."""
@@ -457,7 +466,7 @@ class ColumnarLog(DriveLog):
             return None
         for span in self.containers[c].spans:
             if channel.id in span.counts:
-                block = self.load(c, span)
+                block = self.load(c, span, frozenset({channel.id}))
                 if block is not None and channel.id in block.rows:
                     return block.message(block.rows[channel.id][0])
         return None
@@ -495,12 +504,13 @@ class ColumnarLog(DriveLog):
 
     def _collect(self, plans: Mapping[str, _Plan], start_ns: int | None, end_ns: int | None) -> dict[str, Columns]:
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
+        expected = self._expected if self._column_bytes < _COLUMN_BYTES else {}
         for c, container in enumerate(self.containers):
             container.prefetch(self._to_read(plans, container, start_ns, end_ns))
             with container.meter.running():
                 for span in container.spans:
                     if span.overlaps(start_ns, end_ns):
-                        self._collect_span(plans, c, span, (start_ns, end_ns), parts)
+                        self._collect_span(plans, expected, c, span, (start_ns, end_ns), parts)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
 
     @staticmethod
@@ -515,30 +525,64 @@ class ColumnarLog(DriveLog):
     def _collect_span(
         self,
         plans: Mapping[str, _Plan],
+        expected: Mapping[str, _Plan],
         c: int,
         span: Span,
         window_ns: tuple[int | None, int | None],
         parts: Mapping[str, list[Columns]],
     ) -> None:
-        """Add the columns of the requested topics in a span."""
+        """Add the columns of the requested topics in a span; if it has to be opened, keep those of expected topics."""
         channels = self.containers[c].channels
-        want = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
-        block = self.load(c, span, want) if want else None
-        if block is None:
+        requested = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
+        if not requested:
             return
+        stored = self._columns.get((c, span.index), {})
+        if not all(id_ in stored and plans[channels[id_].topic].is_in(stored[id_]) for id_ in requested):
+            later = frozenset(id_ for id_ in span.counts if channels[id_].topic in expected and id_ not in stored)
+            used = {**plans, **expected}
+            payloads = frozenset(id_ for id_ in requested | later if used[channels[id_].topic].selections)
+            block = self.load(c, span, requested | later, payloads)
+            if block is None:
+                return
+            stored = stored | self._decode_span(used, expected, c, span, window_ns, block)
+        for id_ in sorted(stored, key=lambda id_: self._rank[c].get(id_, -1)):
+            columns = stored[id_]
+            if columns.topic in plans:
+                keep = in_window(columns.log_time_ns, *window_ns)
+                parts[columns.topic].append(columns if keep is None else columns.rows(keep))
+
+    def _decode_span(
+        self,
+        plans: Mapping[str, _Plan],
+        expected: Mapping[str, _Plan],
+        c: int,
+        span: Span,
+        window_ns: tuple[int | None, int | None],
+        block: Block,
+    ) -> dict[int, Columns]:
+        """Return the columns of a block by channel, within the window or of an expected topic; keep the latter."""
+        channels = self.containers[c].channels
+        decoded: dict[int, Columns] = {}
         keep = in_window(block.log_time_ns, *window_ns)
         # By the channels of the block: the counts of the span can be from a wrong index.
-        for id_ in sorted(block.rows, key=lambda id_: self._rank[c].get(id_, -1)):
+        for id_, rows in block.rows.items():
             topic = channels[id_].topic if id_ in channels else ""
-            rows = block.rows[id_]
+            if topic not in plans:
+                continue
             if self.recording_span.left_out:
                 unused = self.recording_span.unused(topic, c, span, block.log_time_ns[rows])
                 rows = rows if unused is None else rows[~unused]
-            rows = rows if keep is None else rows[keep[rows]]
-            if topic in plans and rows.size:
-                columns = self._decode(topic, plans[topic], c, span, id_, block, rows)
-                if columns is not None:
-                    parts[topic].append(columns)
+            if topic not in expected and keep is not None:
+                rows = rows[keep[rows]]
+            columns = self._decode(topic, plans[topic], c, span, id_, block, rows) if rows.size else None
+            if columns is not None:
+                decoded[id_] = columns
+            elif topic in expected:
+                decoded[id_] = _join(topic, plans[topic], ())
+        kept = {id_: columns for id_, columns in decoded.items() if columns.topic in expected}
+        self._columns.setdefault((c, span.index), {}).update(kept)
+        self._column_bytes += sum(columns.nbytes for columns in kept.values())
+        return decoded
 
     def _decode(
         self, topic: str, plan: _Plan, c: int, span: Span, id_: int, block: Block, rows: IntArray
@@ -571,6 +615,15 @@ class _Plan:
 
     selections: tuple[Selection, ...]
     decoders: Mapping[tuple[int, int], ChannelDecoder]
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """The paths that are read."""
+        return tuple(selection.path for selection in self.selections)
+
+    def is_in(self, columns: Columns) -> bool:
+        """Return whether columns have all paths of this plan."""
+        return columns.fields.keys() >= set(self.paths)
 
 
 def _out_of_time(container: Container, spans: Sequence[Span]) -> Loss:

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from mcap.records import Metadata
 
-from pdhef_logtool.logs.byte_account import ByteAccount
-from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, SourceError
+from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, raise_source_error
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.records.errors import LogError, PdhefError
@@ -83,6 +82,7 @@ class Block:
     buffer : bytes that contain all payloads.
     channel, log_time_ns, publish_time_ns, sequence, offset, length : int64 [N]; message i is
         ``buffer[offset[i]:offset[i] + length[i]]``.
+    dropped : channels of which payloads are left out.
     """
 
     buffer: bytes | memoryview
@@ -92,10 +92,29 @@ class Block:
     sequence: IntArray
     offset: IntArray
     length: IntArray
+    dropped: frozenset[int] = field(default=frozenset(), kw_only=True)
 
     def __len__(self) -> int:
         """Return the number of messages."""
         return int(self.channel.shape[0])
+
+    def without_large(self, most: int) -> Block:
+        """Return the block without payloads above ``most`` bytes."""
+        large = self.length > most
+        if not large.any() or (np.diff(self.offset) < 0).any():
+            return self
+        # Copy each run of messages between two large ones as a whole.
+        small = np.flatnonzero(~large)
+        first = small[np.diff(small, prepend=-2) > 1]
+        last = small[np.diff(small, append=len(self) + 1) > 1]
+        begin, end = self.offset[first], self.offset[last] + self.length[last]
+        view = memoryview(self.buffer)
+        buffer = b"".join([view[a:b] for a, b in zip(begin.tolist(), end.tolist(), strict=True)])
+        offset, length = np.zeros_like(self.offset), np.where(large, 0, self.length)
+        moved = begin - (np.cumsum(end - begin) - (end - begin))
+        offset[small] = self.offset[small] - np.repeat(moved, last - first + 1)
+        dropped = frozenset(np.unique(self.channel[large]).tolist())
+        return replace(self, buffer=buffer, offset=offset, length=length, dropped=dropped)
 
     def message(self, row: int) -> bytes:
         """Return the payload of a message."""
@@ -201,10 +220,9 @@ class SpanDamageError(Exception):
 def describe_damage(error: Exception) -> tuple[str, str]:
     """Return kind and text of the loss that an error causes.
 
-    A log that cannot be reached is not damaged: a :class:`SourceError` is raised again.
+    A log that cannot be reached is not damaged: it raises a :class:`~.byte_source.SourceError`.
     """
-    if isinstance(error, SourceError):
-        raise error
+    raise_source_error(error)
     if isinstance(error, LimitError):
         return "over-budget", f"expected {error.expected}, got {error.got} ({error.where}); {error.remedy}"
     if isinstance(error, LogError):
@@ -226,7 +244,7 @@ class Container(ABC):
     path : the file as the user named it.
     channels : by their id in this file. spans : in file order. lost : damage found while the file was opened.
     undeclared : messages by span that are not in its counts, as no record declares their channels.
-    meter : resource limits. account : byte ledger of the file; its user adds the spans that it loads.
+    size : bytes of the file. cut : whether the file ends before its time. meter : resource limits.
     form : ``mcap``, ``rosbag1`` or ``sqlite3``.
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
@@ -252,7 +270,8 @@ class Container(ABC):
         self.lost: list[Loss] = []
         self.undeclared: dict[int, int] = {}
         self.meter = meter or Meter()
-        self.account = ByteAccount(size)
+        self.size = size
+        self.cut = False
         self._closing = ExitStack()
         self._losses: dict[str, int] = {}  # how many of a kind
         self._folded: dict[str, int] = {}  # index in ``lost`` of the loss that sums up further ones
@@ -263,7 +282,7 @@ class Container(ABC):
 
     @abstractmethod
     def extent(self, span: Span) -> tuple[int, int]:
-        """Return the bytes [start, end) of a span, by which :attr:`account` counts it."""
+        """Return the bytes [start, end) of a span."""
 
     def times(self, span: Span) -> tuple[IntArray, IntArray]:
         """Return channels and log times of a span's messages [N], each channel's in file order.
@@ -341,7 +360,6 @@ class Container(ABC):
                 ids = f"{sorted(unknown)[:_IDS_TOLD]}{' and more' if len(unknown) > _IDS_TOLD else ''}"
                 what = f"{count} messages on {called.format(ids)} that no readable record declares"
                 self.lose("unknown-channel", what, span.start_ns, span.end_ns, count)
-                self.account.lose_share(self.extent(span), count / sum(span.counts.values()))
                 self.undeclared[i] = count
                 declared = {c: n for c, n in span.counts.items() if c not in unknown}
                 self.spans[i] = replace(span, counts=declared)
@@ -375,7 +393,6 @@ class FileContainer(Container):
         try:
             if self.source.size < self.position or self.source.read(0, self.position) != self.magic:
                 raise self.no_log(self.magic_text, "other content")
-            self.account.decode(0, self.position)
             with self.meter.running(self.source.size):
                 self._open()
         except BaseException:
@@ -396,8 +413,7 @@ class FileContainer(Container):
                 raise
             kind, text = describe_damage(error)
             self.lose(kind, f"what follows byte {self.position} of {self.source.size} is lost: {text}", self.last_ns())
-            self.account.lose(self.position, self.source.size)
-            self.account.cut = True
+            self.cut = True
         self._finish()
 
     def last_ns(self) -> int | None:
@@ -409,14 +425,12 @@ class FileContainer(Container):
         self.chunks.append(chunk)
         self.spans.append(replace(span, index=len(self.spans)))
 
-    def add_content(
-        self, chunk: Any, extent: tuple[int, int], claimed: Span | None, read: Callable[[], Block]
-    ) -> Block | None:
+    def add_content(self, chunk: Any, claimed: Span | None, read: Callable[[], Block]) -> Block | None:
         """Add a chunk by its content; return None if it is damaged, which is a loss.
 
         Parameters
         ----------
-        chunk : with ``start`` and ``end`` of its bytes. extent : bytes that are lost with it. read : decodes it.
+        chunk : with ``start`` and ``end`` of its bytes. read : decodes it.
         claimed : times and counts by its header and index, if these are known.
         """
         try:
@@ -427,28 +441,23 @@ class FileContainer(Container):
             what = f"{count_text(count)} lost in the chunk at byte {chunk.start}: {text}"
             start_ns, end_ns = (claimed.start_ns, claimed.end_ns) if claimed else (self.last_ns(), None)
             self.lose(kind, what, start_ns, end_ns, count)
-            self.account.lose(*extent)
             return None
         if len(block):
             first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
             self.add_span(chunk, Span(0, first, last + 1, block.counts, block.ordered))
-        else:
-            self.account.decode(chunk.start, chunk.end)
         return block
 
     def lose_end(self, offset: int) -> None:
         """Note that the file ends inside a record."""
         what = f"the file ends inside a record at byte {offset} of {self.source.size}; what follows is gone"
         self.lose("truncated", what, self.last_ns())
-        self.account.lose(offset, self.source.size)
-        self.account.cut = True
+        self.cut = True
 
-    def lose_record(self, start: int, end: int, error: Exception) -> None:
-        """Note that the record in bytes [start, end) cannot be read: the boundary of the walk."""
+    def lose_record(self, start: int, error: Exception) -> None:
+        """Note that the record at byte ``start`` cannot be read: the boundary of the walk."""
         kind, text = describe_damage(error)
         kind = "bad-record" if kind == "bad-chunk" else kind
         self.lose(kind, f"the record at byte {start} is malformed: {text}")
-        self.account.lose(start, end)
 
     @abstractmethod
     def _walk(self) -> None:

@@ -14,7 +14,7 @@ from itertools import chain, takewhile
 from pathlib import Path
 from typing import TypeAlias
 
-from pdhef_logtool.logs.byte_source import require_regular
+from pdhef_logtool.logs.byte_source import ChangedError, require_regular
 from pdhef_logtool.logs.formats import COMPRESSED_SUFFIXES, ROSBAG2_METADATA, log_suffixes, without_general
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.records.errors import LogError, UsageError
@@ -170,6 +170,25 @@ def hash_log(path: Path) -> str:
         with file_path.open("rb") as file:
             total.update(hashlib.file_digest(file, "sha256").digest())
     return total.hexdigest()
+
+
+def log_state(path: LogPlace) -> tuple[tuple[int, int, int], ...]:
+    """Return what differs after a file of a local log was replaced or written: file number, size, time of change."""
+    if isinstance(path, RemotePlace):
+        return ()  # each request names the version of the object
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    return tuple((s.st_ino, s.st_size, s.st_mtime_ns) for s in (f.stat() for f in files if f.exists()))
+
+
+def check_unchanged(path: LogPlace, state: tuple[tuple[int, int, int], ...]) -> None:
+    """Raise a ChangedError if a log is not in this :func:`log_state` any more."""
+    if log_state(path) != state:
+        raise ChangedError(
+            expected="the same file until its end",
+            got="one that was changed while it was read",
+            where=str(path),
+            remedy="run it again when it is complete",
+        )
 
 
 def _expand(argument: str, private_redirects: bool) -> Iterator[LogPlace]:

@@ -16,16 +16,14 @@ from typing import TYPE_CHECKING
 
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import MappingError
-from pdhef_logtool.records.signals import IntArray, Loss
+from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.columnar_log import ColumnarLog
-    from pdhef_logtool.logs.reduced_log import ReducedLog
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +57,16 @@ class Columns:
         """Return the number of messages."""
         return int(self.log_time_ns.shape[0])
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the columns."""
+        return sum(c.nbytes for c in (self.log_time_ns, self.publish_time_ns, *self.fields.values()))
+
+    def rows(self, keep: BoolArray) -> Columns:
+        """Return the messages at which a mask [N] is true."""
+        fields = {path: column[keep] for path, column in self.fields.items()}
+        return Columns(self.topic, self.log_time_ns[keep], self.publish_time_ns[keep], fields)
+
 
 class DriveLog(ABC):
     """A readable log. Instances come from :func:`pdhef_logtool.logs.open_log.open_log`.
@@ -91,8 +99,8 @@ class DriveLog(ABC):
 
     @property
     @abstractmethod
-    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """Byte ledger of each file so far."""
+    def size(self) -> int:
+        """Bytes of all files."""
 
     @abstractmethod
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
@@ -121,6 +129,15 @@ class DriveLog(ABC):
         MappingError : the log has no such topic, no such field, or cannot decode the topic.
         """
 
+    def expect(self, requests: Mapping[str, Sequence[str]]) -> None:
+        """Announce the fields that later reads request, so that one pass over the file can serve them.
+
+        Raises
+        ------
+        MappingError : as for :meth:`read`.
+        """
+        del requests
+
     @abstractmethod
     def close(self) -> None:
         """Release the files."""
@@ -143,11 +160,6 @@ class DriveLog(ABC):
     @property
     def index(self) -> ColumnarLog | None:
         """The log's index; None if there is none, or an inconsistent one."""
-        return None
-
-    @property
-    def reduced(self) -> ReducedLog | None:
-        """The log as a reduced log, with the record of its source; None if it is a complete log."""
         return None
 
     def metadata(self) -> dict[str, str]:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_file import TableFile
 from pdhef_logtool.records.extras import required
@@ -23,15 +24,13 @@ HDF5_MAT = b"MATLAB 7.3"
 #: Structs inside one another.
 DEEPEST = 8
 
-#: Head of a MAT file, and the types of its elements: a matrix, and a compressed element.
-_MAT_HEAD, _MATRIX, _COMPRESSED = 128, 14, 15
+_MAT = CONSTANTS["mat"]
+#: Tag of an element: type and size.
+_TAG_BYTES = struct.calcsize("II")
 #: NumPy types of elements, and of classes of numeric arrays.
-_ELEMENTS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-_NUMBERS = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
-_CELL, _STRUCT, _OBJECT, _CHARACTERS = 1, 2, 3, 4
-_UNUSABLE = {5: "a sparse matrix", 16: "a function handle", 17: "an object"}
-_COMPLEX, _LOGICAL = 0x800, 0x200
-_ENCODINGS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
+_ELEMENTS, _NUMBERS = numbered(_MAT["elements"]), numbered(_MAT["numbers"])
+_CELL, _STRUCT, _OBJECT, _CHARACTERS = range(1, 5)
+_UNUSABLE, _ENCODINGS = numbered(_MAT["unusable"]), numbered(_MAT["encodings"])
 #: Filters of HDF5 that are a part of it: deflate, shuffle, checksum.
 _FILTERS = frozenset({1, 2, 3})
 
@@ -43,17 +42,18 @@ class _UnusableError(Exception):
 def mat5_variables(file: TableFile, losses: list[Loss]) -> Iterator[tuple[str, Any]]:
     """Yield name and value of the variables of a MAT file of version 5; a damaged one is a loss."""
     data = memoryview(file.stream.read())
-    order = ">" if bytes(data[126:128]) == b"MI" else "<"
+    order = ">" if bytes(data[: _MAT["head"]]).endswith(b"MI") else "<"
     reader = _Matrices(file, order, losses)
-    offset = _MAT_HEAD
-    while offset + 8 <= len(data):
+    offset = _MAT["head"]
+    while offset + _TAG_BYTES <= len(data):
         kind, size = struct.unpack_from(f"{order}II", data, offset)
-        element = data[offset : offset + 8 + size]
-        offset += 8 + size + (0 if kind == _COMPRESSED else -size % 8)
+        is_compressed = kind == _MAT["compressed"]
+        element = data[offset : offset + _TAG_BYTES + size]
+        offset += _TAG_BYTES + size + (0 if is_compressed else -size % _TAG_BYTES)
         try:
-            if len(element) < 8 + size:
+            if len(element) < _TAG_BYTES + size:
                 raise ValueError("the file ends inside of it")
-            ((_, matrix),) = reader.elements(reader.inflated(element[8:]) if kind == _COMPRESSED else element)
+            ((_, matrix),) = reader.elements(reader.inflated(element[_TAG_BYTES:]) if is_compressed else element)
             name, value = reader.matrix(matrix, "")
         except Exception as error:  # noqa: BLE001  any error of a damaged element
             what = f"a variable cannot be read: {describe_damage(error)[1]}"
@@ -80,30 +80,33 @@ class _Matrices:
     def elements(self, data: memoryview) -> Iterator[tuple[int, memoryview]]:
         """Yield type and contents of the elements in data."""
         offset = 0
-        while offset + 8 <= len(data):
+        while offset + _TAG_BYTES <= len(data):
             kind, size = struct.unpack_from(f"{self._order}II", data, offset)
-            start = offset + 8
-            if kind >> 16:  # an element inside of its tag
-                kind, size, start = kind & 0xFFFF, kind >> 16, offset + 4
+            start = offset + _TAG_BYTES
+            size_in_tag, kind_in_tag = divmod(kind, 1 << 16)
+            if size_in_tag:  # the element is in the second half of its tag
+                kind, size, start = kind_in_tag, size_in_tag, offset + _TAG_BYTES // 2
             end = start + size
-            if end > len(data) or (start == offset + 4 and size > 4):
+            following = offset + _TAG_BYTES if size_in_tag else end + -size % _TAG_BYTES
+            if end > len(data) or (size_in_tag and end > following):
                 raise ValueError("an element of it has no valid type or size")
             yield kind, data[start:end]
-            offset = offset + 8 if start == offset + 4 else end + -size % 8
+            offset = following
 
     def matrix(self, data: memoryview, path: str) -> tuple[str, Any]:
         """Return name and value of a matrix; None for one without usable values."""
         self._matrices += 1
         self._file.limits.check("schema_leaves", self._matrices, self._file.name)
         parts = self.elements(data)
-        flags = int(self._numbers(next(parts, (6, memoryview(bytes(8)))))[0])
-        kind = flags & 0xFF
+        first = next(parts, None)
+        flags = 0 if first is None else int(self._numbers(first)[0])
+        kind = flags % 256
         if not kind:
             return "", None
-        shape = [] if kind == 17 else self._numbers(next(parts)).tolist()
+        shape = [] if _UNUSABLE.get(kind) == "an object" else self._numbers(next(parts)).tolist()
         name = bytes(next(parts)[1]).decode("latin-1")
         path = path or name
-        if kind in _UNUSABLE or flags & _COMPLEX or path.count("/") > DEEPEST:
+        if kind in _UNUSABLE or flags & _MAT["complex"] or path.count("/") > DEEPEST:
             what = f"{path} is not used: {_UNUSABLE.get(kind, 'complex numbers, or too deep inside of structs')}"
             self._losses.append(Loss("bad-variable", what, self._file.name, severity="note"))
             return name, None
@@ -113,13 +116,13 @@ class _Matrices:
             return name, [self.matrix(part, f"{path}/{{}}")[1] for _, part in parts]
         element, contents = next(parts)
         if kind == _CHARACTERS:
-            suffix = {"<": "-le", ">": "-be"}[self._order] if element in (4, 17, 18) else ""
-            return name, bytes(contents).decode(_ENCODINGS[element] + suffix, errors="replace")
+            encoding = _ENCODINGS[element].format({"<": "le", ">": "be"}[self._order])
+            return name, bytes(contents).decode(encoding, errors="replace")
         values = self._numbers((element, contents))
         if min(shape, default=0) < 0 or math.prod(shape) != len(values):
             raise ValueError(f"{path} has {len(values)} values for the dimensions {shape}")
         self._budget.claim(len(values))
-        values = values.astype(np.bool_ if flags & _LOGICAL else _NUMBERS[kind])
+        values = values.astype(np.bool_ if flags & _MAT["logical"] else _NUMBERS[kind])
         return name, values.item() if len(values) == 1 else values.reshape(shape, order="F").squeeze()
 
     def _structs(self, parts: Iterator[tuple[int, memoryview]], kind: int, path: str) -> Any:

@@ -7,12 +7,12 @@ file's statistics, and if its times are those of a sound recording; otherwise th
 from __future__ import annotations
 
 import struct
-import zlib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 
 from pdhef_logtool.logs.byte_source import ByteSource, CutError
@@ -79,7 +79,7 @@ def _summary(source: ByteSource) -> tuple[bytes, int] | None:
         return None
     source.prefetch([(start, size)])
     summary = source.read(start, foot - start)
-    if crc and zlib.crc32(end[: FOOTER.size - 4], zlib.crc32(summary)) != crc:
+    if crc and crc32(end[: FOOTER.size - 4], crc32(summary)) != crc:
         return None
     return summary, start
 

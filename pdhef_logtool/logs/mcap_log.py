@@ -8,7 +8,6 @@ remote file, chunks that are not wanted are taken from the index, if it is consi
 from __future__ import annotations
 
 import struct
-import zlib
 from array import array
 from bisect import bisect_right
 from collections import Counter
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -135,7 +135,6 @@ class McapContainer(FileContainer):
                 self.position = walk.add_indexed(skippable[offset])
                 continue
             if size - offset == len(MCAP_MAGIC) and source.read(offset, len(MCAP_MAGIC)) == MCAP_MAGIC:
-                self.account.decode(offset, size)
                 walk.closed = True
                 return
             opcode, length = RECORD.unpack(source.read(offset, 9)) if offset + 9 <= size else (0, 0)
@@ -161,7 +160,7 @@ class McapContainer(FileContainer):
                 try:
                     walk.record(opcode, offset, end)
                 except Exception as error:  # noqa: BLE001 (the next record is read in any case)
-                    self.lose_record(offset, end, error)
+                    self.lose_record(offset, error)
             self.position = end
         if not header_seen:
             raise self.no_log("a header record after the magic bytes", "none")
@@ -211,7 +210,6 @@ class McapContainer(FileContainer):
             raise self.no_log("a header record with profile and library", "a malformed one") from error
         if 8 + n + m > length:
             raise self.no_log("a header record with profile and library", "a draft of the format before 1.0")
-        self.account.decode(offset, offset + 9 + length)
 
     def _next_indexed_chunk(self, after: int) -> int | None:
         """Return the first chunk behind a damaged place that the summary names, or None."""
@@ -290,8 +288,6 @@ class McapContainer(FileContainer):
             return self._scan(self.source.read(extent.start, extent.end - extent.start))
         record = self.source.read(extent.start, extent.index_end - extent.start)
         content = self.chunk_content(record, extent.end - extent.start)
-        if _chunk_head(record, extent.end - extent.start)[1]:  # its message indexes are held against its content
-            self.account.verify(extent.start, extent.index_end)
         block = _indexed_messages(content, record, extent.end - extent.start)
         block = self._scan(content) if block is None else block
         limits.check_messages(len(block), extent.end - extent.start)
@@ -301,7 +297,7 @@ class McapContainer(FileContainer):
         """Decompress the chunk record that is the first ``end`` bytes, and check its CRC."""
         size, crc, compression, start, stored = _chunk_head(record, end)
         content = decompress(compression, memoryview(record)[start : start + stored], size, self.meter.limits)
-        if crc and zlib.crc32(content) != crc:
+        if crc and crc32(content) != crc:
             raise SpanDamageError("its CRC does not match")
         return content
 
@@ -356,7 +352,7 @@ class McapContainer(FileContainer):
             compression=compression,
             stored=record[start : start + length],
             size=size,
-            crc=crc or zlib.crc32(content),
+            crc=crc or crc32(content),
             channel=block.channel,
             log_time_ns=block.log_time_ns,
             offset=head,
@@ -390,7 +386,7 @@ class McapContainer(FileContainer):
         """Return the CRC-32 of bytes [start, end)."""
         crc: int = 0
         for offset in range(start, end, _CRC_BLOCK_BYTES):
-            crc = zlib.crc32(self.source.read(offset, min(_CRC_BLOCK_BYTES, end - offset)), crc)
+            crc = crc32(self.source.read(offset, min(_CRC_BLOCK_BYTES, end - offset)), crc)
         return crc
 
     def attachments(self) -> Iterator[Attachment]:
@@ -407,9 +403,8 @@ class McapContainer(FileContainer):
             try:
                 record = kind.read(ReadDataStream(BytesIO(self.source.read(start + 9, end - start - 9))))
             except Exception as error:  # noqa: BLE001 (the boundary)
-                self.lose_record(start, end, error)
+                self.lose_record(start, error)
                 continue
-            self.account.decode(start, end)
             yield record
 
     def note_attachment(self, start: int, end: int) -> None:
@@ -431,10 +426,7 @@ class McapContainer(FileContainer):
         (crc,) = _U32.unpack(source.read(place, 4))
         if crc and self.crc(start + 9, place) != crc:
             self.lose("bad-attachment", f"attachment {name!r} has a wrong CRC", count=1)
-            self.account.lose(start, end)
             return
-        if crc:
-            self.account.verify(start, end)
         self.add_attachment(start, end)
 
     def add_attachment(self, start: int, end: int) -> None:
@@ -461,7 +453,7 @@ class McapContainer(FileContainer):
             self.meter.limits.check_messages(len(block), len(record))
             return block
 
-        block = self.add_content(extent, (extent.start, extent.index_end), claimed, read)
+        block = self.add_content(extent, claimed, read)
         if block is None:
             return
         held = block.counts
@@ -469,7 +461,6 @@ class McapContainer(FileContainer):
         if missing:
             what = f"{missing} messages that the index names are not in the chunk at byte {extent.start}"
             self.lose("missing-messages", what, claimed.start_ns, claimed.end_ns, missing)
-            self.account.lose(extent.end, extent.index_end)
         if len(block):
             self._index_wrong |= self.spans[-1] != replace(claimed, index=len(self.spans) - 1, ordered=block.ordered)
 
@@ -496,7 +487,6 @@ class McapContainer(FileContainer):
         if held < total and not self.lost:
             what = f"the file's statistics name {total} messages, {held} of them are there"
             self.lose("missing-messages", what, count=total - held)
-            self.account.lose(*self._walked.statistics_at)
 
 
 class _Walk:
@@ -520,7 +510,6 @@ class _Walk:
         self.index_at: list[tuple[int, int]] = []  # extents of the pairs of time and offset in each message index
         self.index_sound = True
         self.statistics: tuple[int, dict[int, int]] | None = None
-        self.statistics_at = (0, 0)
 
     def record(self, opcode: int, start: int, end: int) -> None:
         """Handle one complete record that is no message."""
@@ -536,7 +525,6 @@ class _Walk:
             # Stay inside a run: writers interleave declarations with the messages.
             of.meter.limits.check("metadata_bytes", end - start, "a declaration")
             (of.add_schema if opcode == _OP_SCHEMA else of.add_channel)(source.read(start + 9, end - start - 9))
-            of.account.decode(start, end)
             return
         self._end_run()
         if opcode == _OP_CHUNK:
@@ -610,7 +598,7 @@ class _Walk:
         if place == first:  # not even the first one is a message
             end = offset + 9 + int(RECORD.unpack(of.source.read(offset, 9))[1])
             self._end_run()
-            of.lose_record(offset, end, SpanDamageError("a message record is too short"))
+            of.lose_record(offset, SpanDamageError("a message record is too short"))
             return end
         self.run, self.run_times = (start, base + place), (first_ns, last_ns)
         if base + place - start >= _UNCHUNKED_RUN_BYTES:
@@ -633,7 +621,6 @@ class _Walk:
             self.index_counts[channel] = n // 16
             self.index_at.append((start + 15, start + 15 + n))
         self.index_sound = sound
-        of.account.decode(start, end)
 
     def _index_agrees(self) -> tuple[bool, bool]:
         """Return whether the chunk's indexes are consistent, and whether no channel steps back in time."""
@@ -659,7 +646,6 @@ class _Walk:
         """Note the CRC of the data section."""
         self.data_end = (start, end)
         (self.data_crc,) = _U32.unpack(self.of.source.read(start + 9, 4))
-        self.of.account.decode(start, end)
 
     def _check_data(self) -> None:
         """Check the CRC of the data section if no other checksum or count protects the messages.
@@ -675,28 +661,23 @@ class _Walk:
         if of._index_used:
             what = "the CRC of the data section was not verified, as not all of the log was read"
             of.lost.append(Loss(UNVERIFIED, what, str(of.path), severity="note"))
-        elif of.crc(0, self.data_end[0]) == self.data_crc:
-            of.account.verify(0, self.data_end[1])
-        else:
+        elif of.crc(0, self.data_end[0]) != self.data_crc:
             what = (
                 "the CRC of the data section does not match: some messages are damaged or missing, and it is "
                 "unknown which; the messages that decode are used"
             )
             of.lose("bad-data-crc", what)
-            of.account.lose(*self.data_end)
 
     def _check_summary(self) -> None:
         """Check the CRC of the summary, from which no message is read: damage of it is a note."""
         of = self.of
         if self.data_end is None or self.footer is None or of.lost:
             return
-        footer_start, end = self.footer
+        footer_start, _ = self.footer
         _, _, start, _, crc = FOOTER.unpack(of.source.read(footer_start, FOOTER.size))
         if not crc or not self.data_end[1] <= start <= footer_start:
             return
-        if of.crc(start, footer_start + FOOTER.size - 4) == crc:
-            of.account.verify(start, end)
-        else:
+        if of.crc(start, footer_start + FOOTER.size - 4) != crc:
             what = "the CRC of the summary does not match: its index is damaged, from which no message was read"
             of.lost.append(Loss("bad-summary-crc", what, str(of.path), severity="note"))
 
@@ -706,7 +687,7 @@ class _Walk:
         (total,), (n,) = _U64.unpack_from(payload, 0), _U32.unpack_from(payload, 42)
         entries = np.frombuffer(payload, dtype=np.dtype([("id", "<u2"), ("n", "<u8")]), count=n // 10, offset=46)
         counts = {c: k for c, k in zip(entries["id"].tolist(), entries["n"].tolist(), strict=True) if k}
-        self.statistics, self.statistics_at = (total, counts), (start, end)
+        self.statistics = (total, counts)
 
     def _end_run(self) -> None:
         if self.run is None:
@@ -744,7 +725,6 @@ class _Walk:
         self._end_run()
         what = f"bytes {start} to {resume} contain no readable record; reading resumes at the next chunk"
         of.lose("bad-record", what, of.last_ns())
-        of.account.lose(start, resume)
 
     def finish(self) -> None:
         """Finish open records and check the file as a whole."""
@@ -755,10 +735,9 @@ class _Walk:
             if not of.spans and all(loss.kind == "bad-record" for loss in of.lost):
                 raise of.no_log("an MCAP 1.0 file", "a draft of the format before 1.0")
             of.lose("bad-record", "the data end record is missing")
-            of.account.cut = True
-        if not self.closed and not of.account.cut:
+            of.cut = True
+        if not self.closed and not of.cut:
             of.lose("truncated", "the file ends without its closing magic bytes", of.last_ns())
-            of.account.cut = True
         of.resolve_channels()
         self._check_data()
         if self.statistics is not None:

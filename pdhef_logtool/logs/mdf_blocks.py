@@ -6,16 +6,15 @@ import struct
 from collections import Counter
 from collections.abc import Mapping
 
+from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.table_file import TableFile
 from pdhef_logtool.records.errors import LogError
 
 _FIRST = 64
 #: Places of the links that are followed, by kind of block; empty: all links of a list of data.
-_FOLLOWED: Mapping[bytes, tuple[int, ...]] = {
-    b"HD": (0, 1, 3, 4), b"DG": (0, 1, 2), b"CG": (0, 1), b"CN": (0, 1, 5), b"CA": (0,), b"HL": (0,),
-    b"FH": (0,), b"AT": (0,), b"EV": (0,), b"DL": (), b"LD": (),
-}  # fmt: skip
-_FOLLOWED_3: Mapping[bytes, tuple[int, ...]] = {b"HD": (0,), b"DG": (0, 1), b"CG": (0, 1), b"CN": (0,)}
+_FOLLOWED, _FOLLOWED_3 = (
+    {kind.encode(): places for kind, places in CONSTANTS["mdf"][name].items()} for name in ("followed", "followed_3")
+)
 #: Links that lead to blocks of one kind only.
 _CHAINS: Mapping[tuple[bytes, int], bytes] = {
     (b"", 0): b"HD", (b"HD", 0): b"DG", (b"DG", 0): b"DG", (b"DG", 1): b"CG", (b"CG", 0): b"CG", (b"CG", 1): b"CN",

@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.records.signals import FloatArray
 
 #: Returns physical values [N] of raw numbers [N].
@@ -30,14 +31,8 @@ _FUNCTIONS: dict[str, np.ufunc] = {name: getattr(np, name) for name in _NAMES.sp
     "ln": np.log, "pow": np.power, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "atan2": np.arctan2,
 }  # fmt: skip
 
-_LINEAR = "{0.a}*x+{0.b}"
-_RATIONAL = "({0.P1}*x*x+{0.P2}*x+{0.P3})/({0.P4}*x*x+{0.P5}*x+{0.P6})"
 #: Conversions that are formulas of their parameters, by version and type.
-_FORMULAS = {
-    (4, 0): "x", (4, 1): _LINEAR, (4, 2): _RATIONAL, (4, 3): "{0.formula}", (4, 11): "x",
-    (3, 0): _LINEAR, (3, 9): _RATIONAL, (3, 10): "{0.formula}", (3, 11): "x", (3, 65535): "x",
-    (3, 6): "({0.P2}-{0.P4}*(x-{0.P5}-{0.P6}))/({0.P3}*(x-{0.P5}-{0.P6})-{0.P1})",
-}  # fmt: skip
+_FORMULAS: dict[int, dict[int, str]] = {v: numbered(f) for v, f in numbered(CONSTANTS["mdf"]["formulas"]).items()}
 
 
 def conversion_rule(block: Any, version: int) -> Rule:
@@ -46,8 +41,8 @@ def conversion_rule(block: Any, version: int) -> Rule:
         return _floats
     kind = (4 if version >= 4 else 3), block.conversion_type
     try:
-        if kind in _FORMULAS:
-            return formula_rule(_FORMULAS[kind].format(block))
+        if formula := _FORMULAS[kind[0]].get(kind[1]):
+            return formula_rule(formula.format(block))
         match kind:
             case (4, 4 | 5) | (3, 1 | 2):
                 return _table(block, interpolates=kind[1] in (1, 4))

@@ -19,11 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.can_decoding import Frames
+from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import SpanDamageError, describe_damage
 from pdhef_logtool.logs.mdf_blocks import is_unfinished, survey_blocks
 from pdhef_logtool.logs.mdf_conversions import conversion_rule
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.table_clocks import NO_TIME, ascending_rows, placed
+from pdhef_logtool.logs.table_clocks import NO_TIME, TIME_UNITS_NS, ascending_rows, placed
 from pdhef_logtool.logs.table_columns import field_name, unique
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.logs.table_log import Table
@@ -32,22 +33,19 @@ from pdhef_logtool.records.extras import required
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 
 _FRAMES = "CAN_DataFrame"
-#: Bytes of a frame by its data length code, and the codes that are no lengths.
-_LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
-_ONLY_CODES = (9, 10, 11, 13, 14, 15)
+_MDF, _CAN = CONSTANTS["mdf"], CONSTANTS["can"]
+#: Bytes of a frame by its data length code.
+_LENGTHS = np.array(_CAN["bytes_of_code"])
 _DATA_BLOCK = re.compile(rb"##(?:DT|SD|DV)\0{4}")
 _LONGEST_NAME = 40
-#: Times from the start of a recording beyond this are damaged, as are starts after this date, in 2100.
-_LONGEST_S, _LAST_DATE_NS = 4e9, 4_102_444_800 * 10**9
-#: Types of channels of MDF 4: values of variable length, and virtual channels (raw values are row numbers).
-_VARIABLE, _VIRTUAL = (1, 5, 7), (3, 6)
+_VARIABLE, _VIRTUAL = _MDF["variable"], _MDF["virtual"]
 #: Types of masters by version.
-_MASTERS = {4: (2, 3), 3: (1,)}
+_MASTERS = numbered(_MDF["masters"])
 #: Flags of channels and of the start.
 _ALL_INVALID, _SOME_INVALID = 1, 2
 _LOCAL, _WITH_OFFSETS = 1, 2
 #: Quantities of masters other than time, by type of synchronisation.
-_NO_TIMES = {2: "an angle", 3: "a distance", 4: "an index"}
+_NO_TIMES = numbered(_MDF["no_times"])
 
 
 def open_mdf(file: TableFile) -> Tables:
@@ -112,13 +110,13 @@ def _start(header: Any) -> tuple[int, bool]:
     """Return the start of a recording in ns since 1970, 0 without a date, and whether it is a local time."""
     start, flags = int(getattr(header, "abs_time", 0)), getattr(header, "time_flags", 0)
     if flags == _LOCAL | _WITH_OFFSETS:
-        start -= (header.tz_offset + header.daylight_save_time) * 60 * 10**9
+        start -= (header.tz_offset + header.daylight_save_time) * TIME_UNITS_NS["minutes"]
     elif not start and hasattr(header, "date"):
         text = b" ".join((header.date, header.time)).decode("latin-1").strip(" \0")
         with suppress(ValueError):
             date = dt.datetime.strptime(f"{text} +0000", "%d:%m:%Y %H:%M:%S %z")
-            start, flags = round(date.timestamp()) * 10**9, _LOCAL
-    return (start, flags == _LOCAL) if 0 < start < _LAST_DATE_NS else (0, False)
+            start, flags = round(date.timestamp()) * TIME_UNITS_NS["seconds"], _LOCAL
+    return (start, flags == _LOCAL) if 0 < start < _MDF["last_date_ns"] else (0, False)
 
 
 class Groups:
@@ -226,7 +224,7 @@ class Groups:
         self._rows[number] = len(seconds)
         if missing := self._groups[number].channel_group.cycles_nr - len(seconds):
             losses.append(Loss("truncated", f"the file ends after {len(seconds)} rows", name, count=missing))
-        finite = np.abs(seconds) < _LONGEST_S
+        finite = np.abs(seconds) < _MDF["longest_s"]
         stamps = np.round(np.where(finite, seconds, 0.0) * 1e9).astype(np.int64) + self._start_ns
         stamps = placed(np.where(finite, stamps, NO_TIME))
         # Frames of several buses are buffered before they are written; rows of channels are in order.
@@ -278,11 +276,11 @@ class Groups:
             and (self._conversions[number, i] or not self._is(number, i, _VIRTUAL))
         }
         data = self._bytes(number, names.index("DataBytes"))[rows]
-        identifier = parts["ID"] & 0x1FFF_FFFF
+        identifier = parts["ID"] & _CAN["id_bits"]
         length = parts.get("DataLength", parts.get("DLC", np.full(len(stamps), data.shape[1])))
-        if np.isin(length, _ONLY_CODES).any() or ("DLC" in parts and "DataLength" not in parts):
-            length = _LENGTHS[length.clip(0, 15)]
-        extended = (parts["ID"] >> 31 & 1) | (identifier > 0x7FF) | (parts.get("IDE", np.zeros(1)) > 0)
+        if np.isin(length, _CAN["only_codes"]).any() or ("DLC" in parts and "DataLength" not in parts):
+            length = _LENGTHS[length.clip(0, len(_LENGTHS) - 1)]
+        extended = (parts["ID"] >> 31 & 1) | (identifier > _CAN["base_id_bits"]) | (parts.get("IDE", np.zeros(1)) > 0)
         frames = {"id": identifier, "length": length.clip(0, data.shape[1]), "is_extended": extended}
         return Frames(stamps, frames | ({"bus": parts["BusChannel"]} if "BusChannel" in parts else {}), data)
 

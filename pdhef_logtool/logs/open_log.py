@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pdhef_logtool.logs.byte_source import require_regular
+from pdhef_logtool.logs.byte_source import raise_source_error, require_regular
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.compression import decompress_file
 from pdhef_logtool.logs.container import EVERYTHING, MCAP_MAGIC, Container, Wanted, describe_damage
@@ -25,7 +25,6 @@ from pdhef_logtool.logs.formats import (
     without_general,
 )
 from pdhef_logtool.logs.log_file import LogFile
-from pdhef_logtool.logs.reduced_log import ReducedLog, reduced_record
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter, ResourceLimits
 from pdhef_logtool.logs.table_log import TableLog
@@ -52,7 +51,7 @@ def open_log(
 
     A file of one of the :mod:`~pdhef_logtool.logs.formats`, each also zstd-compressed; a rosbag2 folder with its
     ``metadata.yaml`` (split files are one log), or a folder with exactly one such file. Each file also by its URL
-    (``https://``, ``s3://``). A reduced log (:mod:`~pdhef_logtool.logs.reduced_log`) reads like its source.
+    (``https://``, ``s3://``).
 
     Parameters
     ----------
@@ -92,6 +91,7 @@ def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> DriveLog:
         else:
             opened = _open_file(path, meter)
     except OSError as error:
+        raise_source_error(error, str(path))
         raise LogError(
             expected="a readable file",
             got=error.strerror or str(error),
@@ -106,13 +106,6 @@ def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> DriveLog:
         ) from error
     if isinstance(opened, DriveLog):
         return opened
-    try:
-        record = reduced_record(opened)
-    except BaseException:
-        opened.close()
-        raise
-    if record is not None:
-        return ReducedLog(path, opened, record)
     return ColumnarLog(path, _KINDS[opened.form], [opened], distro=opened.distro)
 
 
@@ -192,7 +185,6 @@ def _open_plain(file: LogFile) -> Container | DriveLog:
         opened.on_close(file.release)
         if file.cut:
             opened.lose("truncated", file.cut)
-            opened.account.cut = True
     return opened
 
 

@@ -10,19 +10,16 @@ reader that dies costs its file, or the column that it was reading.
 from __future__ import annotations
 
 import atexit
-import importlib.util
-import itertools
 import json
-import math
 import os
 import pkgutil
 import signal
-import socket
-import struct
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -30,25 +27,25 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.container import SpanDamageError, describe_damage
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.resource_limits import RAISE_LIMIT, LimitError, ResourceLimits
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.logs.table_log import Table, TableLog
-from pdhef_logtool.records.errors import LogError, PdhefError, UsageError
+from pdhef_logtool.records.errors import LogError, PdhefError, UsageError, WorkerError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.storage.files import scratch_folder
 from pdhef_logtool.workers.confinement import allow_processor_time, confine
-from pdhef_logtool.workers.fork_server import exactly, receive, send
-from pdhef_logtool.workers.supervisor import ForkServer, can_fork
+from pdhef_logtool.workers.forking import Child, ForkServer, can_fork
 
-_HEAD = struct.Struct("<q")
-_ERRORS: Mapping[str, type[PdhefError]] = {e.__name__: e for e in (LogError, LimitError, UsageError)}
+_ERRORS: Mapping[str, type[PdhefError]] = {e.__name__: e for e in (LogError, LimitError, SourceError, UsageError)}
 #: Timeout of a request: the allowed processor time by this factor, and a constant part.
 _PATIENCE, _PATIENCE_S = 10.0, 60.0
 #: Restarts of a reader that died while it loaded a column: the other columns can still be read.
 _RESTARTS = 1
+_SERVER_STARTS = 2
 _REMEDY = "give the recording itself"
 
 
@@ -79,31 +76,12 @@ def open_tables(file: LogFile, reader: str, libraries: Sequence[str] = ()) -> Ta
             raise
 
 
-def _closing(file: LogFile, close: Callable[[], None]) -> LogFile:
+def _closing(file: LogFile, close: Callable[[], object]) -> LogFile:
     def release() -> None:
         close()
         file.release()
 
     return LogFile(file.path, file.place, file.meter, release, file.cut)
-
-
-@dataclass(slots=True, eq=False)
-class _Process:
-    """A reader with the open file."""
-
-    channel: socket.socket
-    server: ForkServer
-    pid: int
-    resources: ExitStack
-
-    def end(self) -> int | None:
-        """End it and return its exit code, below zero a signal."""
-        self.channel.close()
-        with suppress(ProcessLookupError):
-            os.kill(self.pid, signal.SIGKILL)
-        code = self.server.status(self.pid)
-        self.resources.close()
-        return code
 
 
 class _Session:
@@ -115,7 +93,8 @@ class _Session:
         self._seconds = limits.seconds + limits.seconds_per_mib * size / 2**20
         most = 2 * (limits.table_bytes + limits.table_ratio * size)
         self._bytes = min(most, psutil.virtual_memory().available)
-        self._process: _Process | None = None
+        self._child: Child | None = None
+        self._resources = ExitStack()
         self._starts = 1 + _RESTARTS
 
     def open(self) -> Tables:
@@ -130,53 +109,44 @@ class _Session:
 
     def load(self, number: int, path: str, rows: slice) -> NDArray[Any]:
         """Return rows of a column of a table, by the table's number."""
-        if self._process is None:
+        if self._child is None:
             self._start()
             self._ask("open")
         return self._ask("load", number, path, rows.start, rows.stop)[1][0]
 
-    def close(self) -> None:
-        """End the reader."""
-        if self._process is not None:
-            self._process.end()
-            self._process = None
+    def close(self) -> int | None:
+        """End the reader and return its exit code, below zero a signal."""
+        child, self._child = self._child, None
+        code = None if child is None else child.end()
+        self._resources.close()
+        return code
 
     def _start(self) -> None:
         if not self._starts:
             raise SpanDamageError("its reader died")
         self._starts -= 1
-        server = _server(self._reader, *self._libraries)
-        ours, theirs = socket.socketpair()
-        with ExitStack() as resources, self._file.path.open("rb") as stream:
-            folder = resources.enter_context(scratch_folder())
-            send(ours, f"{__name__}:serve_tables")
-            with theirs:
-                server.fork(next(_numbers), theirs)
-            socket.send_fds(ours, [b"f"], [stream.fileno()])
-            ours.settimeout(_PATIENCE_S + _PATIENCE * self._seconds)
-            order = _Order(
-                self._reader, self._where, self._size, self._file.meter.limits, folder, self._bytes, self._seconds
-            )
-            send(ours, order)
-            (pid,) = _HEAD.unpack(exactly(ours, _HEAD.size))
-            self._process = _Process(ours, server, pid, resources.pop_all())
+        folder = self._resources.enter_context(scratch_folder())
+        limits, timeout_s = self._file.meter.limits, _PATIENCE_S + _PATIENCE * self._seconds
+        with self._file.path.open("rb") as stream:
+            self._child = _fork(self._reader, self._libraries, stream.fileno(), timeout_s)
+        order = _Order(self._reader, self._where, self._size, limits, folder, self._bytes, self._seconds)
+        with suppress(OSError):  # the next request notices the end of the reader
+            self._child.connection.send(order)
 
     def _ask(self, *request: Any) -> tuple[dict[str, Any], list[NDArray[Any]]]:
-        process = self._process
-        assert process is not None
+        assert self._child is not None
         try:
-            send(process.channel, request)
-            head, arrays = _answer(process.channel, self._file.meter.limits.metadata_bytes, self._bytes)
-        except (OSError, EOFError, ValueError) as error:
-            self._process = None
-            raise self._death(process.end(), error) from None
+            self._child.connection.send(request)
+            head, arrays = _answer(self._child.connection, self._file.meter.limits.metadata_bytes, self._bytes)
+        except (OSError, EOFError, ValueError, TypeError, KeyError) as error:
+            raise self._death(self.close(), error) from None
         if "error" not in head:
             return head, arrays
         kind = _ERRORS.get(head["error"])
         raise SpanDamageError(head["text"]) if kind is None else kind(**head["parts"])
 
     def _death(self, code: int | None, error: Exception) -> LogError:
-        if code == -signal.SIGXCPU or isinstance(error, TimeoutError):
+        if code == -signal.SIGXCPU or isinstance(error, BlockingIOError):
             return _over("processor time", f"{self._seconds:.3g} s", self._where)
         how = "an unknown cause" if code is None else f"exit code {code}" if code >= 0 else signal.Signals(-code).name
         got = f"one that ends its reader ({how})"
@@ -198,17 +168,21 @@ class _Order:
 
 #: Fork servers, which have imported the libraries of a reader, by process and reader; kept until this process ends.
 SERVERS: dict[tuple[int, str], ForkServer] = {}
-_numbers = itertools.count(1)
+_lock = threading.Lock()
 
 
-def _server(reader: str, *libraries: str) -> ForkServer:
-    key = os.getpid(), reader
-    if key not in SERVERS or SERVERS[key].is_dead():
-        here = [name for name in libraries if importlib.util.find_spec(name.partition(".")[0])]
-        server = ForkServer([reader.partition(":")[0], *here])
-        server.start()
-        SERVERS[key] = server
-    return SERVERS[key]
+def _fork(reader: str, libraries: Sequence[str], file: int, timeout_s: float) -> Child:
+    """Return a reader process with an open file; a server that died is restarted once."""
+    key, preload = (os.getpid(), reader), [reader.partition(":")[0], *libraries]
+    with _lock:
+        for _ in range(_SERVER_STARTS):
+            if key not in SERVERS:
+                SERVERS[key] = ForkServer(preload)
+            try:
+                return SERVERS[key].fork(f"{__name__}:serve_tables", file, timeout_s=timeout_s)
+            except EOFError:
+                SERVERS.pop(key).end()
+    raise WorkerError(expected="a process that reads the file", got="a fork server that died", where=reader)
 
 
 @atexit.register
@@ -219,17 +193,15 @@ def _end_servers() -> None:
     SERVERS.clear()
 
 
-def serve_tables(channel: socket.socket) -> None:
-    """Run a reader: receive the file and the order, then answer requests until the other side closes."""
-    _, descriptors, _, _ = socket.recv_fds(channel, 1, 1)
-    order: _Order = receive(channel)
-    channel.sendall(_HEAD.pack(os.getpid()))
+def serve_tables(connection: Connection, descriptor: int) -> None:
+    """Run a reader of an open file: receive the order, then answer requests until the other side closes."""
+    order: _Order = connection.recv()
     confine(Path(order.folder), order.more_bytes)
-    stream = os.fdopen(descriptors[0], "rb")
+    stream = os.fdopen(descriptor, "rb")
     tables = Tables("", [])
     with suppress(EOFError):
         while True:
-            name, *arguments = receive(channel)
+            name, *arguments = connection.recv()
             allow_processor_time(order.seconds)
             try:
                 if name == "open":
@@ -243,7 +215,7 @@ def serve_tables(channel: socket.socket) -> None:
                 head, arrays = _failure(_over("memory", f"{order.more_bytes / 1e6:.0f} MB", order.name)), []
             except Exception as error:  # noqa: BLE001  any error of a library
                 head, arrays = _failure(error), []
-            _reply(channel, head, arrays)
+            _reply(connection, head, arrays)
 
 
 def _contents(tables: Tables) -> dict[str, Any]:
@@ -255,7 +227,10 @@ def _failure(error: Exception) -> dict[str, Any]:
     if isinstance(error, PdhefError):
         parts = {name: getattr(error, name) for name in ("expected", "got", "where", "remedy")}
         return {"error": type(error).__name__, "parts": parts, "text": str(error)}
-    return {"error": "damage", "text": describe_damage(error)[1]}
+    try:
+        return {"error": "damage", "text": describe_damage(error)[1]}
+    except SourceError as source_error:
+        return _failure(source_error)
 
 
 def _over(what: str, most: str, where: str) -> LimitError:
@@ -264,24 +239,20 @@ def _over(what: str, most: str, where: str) -> LimitError:
     )
 
 
-def _reply(channel: socket.socket, head: dict[str, Any], arrays: Sequence[NDArray[Any]]) -> None:
+def _reply(connection: Connection, head: dict[str, Any], arrays: Sequence[NDArray[Any]]) -> None:
     described = [{"dtype": a.dtype.str, "shape": a.shape} for a in arrays]
-    data = json.dumps([head, described], default=int).encode()
-    channel.sendall(_HEAD.pack(len(data)) + data)
+    connection.send_bytes(json.dumps([head, described], default=int).encode())
     for array in arrays:
-        channel.sendall(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
+        connection.send_bytes(np.ascontiguousarray(array).data.cast("B") if array.size else b"")
 
 
-def _answer(channel: socket.socket, most_head: int, most: int) -> tuple[dict[str, Any], list[NDArray[Any]]]:
-    """Receive a reply of at most this size; ValueError for one that no sound reader gives."""
-    (length,) = _HEAD.unpack(exactly(channel, _HEAD.size))
-    if not 0 <= length <= most_head:
-        raise ValueError(length)
-    head, described = json.loads(exactly(channel, length))
+def _answer(connection: Connection, most_head: int, most: int) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Receive a reply of at most this size, which is never unpickled; ValueError for one that no sound reader gives."""
+    head, described = json.loads(connection.recv_bytes(most_head))
     arrays = []
     for array in described:
-        dtype, shape = np.dtype(array["dtype"]), tuple(map(int, array["shape"]))
-        if dtype.kind not in "biuf" or min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > most:
+        dtype = np.dtype(array["dtype"])
+        if dtype.kind not in "biuf":
             raise ValueError(array)
-        arrays.append(np.frombuffer(exactly(channel, math.prod(shape) * dtype.itemsize), dtype).reshape(shape))
+        arrays.append(np.frombuffer(connection.recv_bytes(most), dtype).reshape(array["shape"]))
     return head, arrays

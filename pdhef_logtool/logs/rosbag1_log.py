@@ -90,7 +90,7 @@ class Rosbag1Container(FileContainer):
             try:
                 self._take(fields, offset, start, end)
             except Exception as error:  # noqa: BLE001 (the next record is read in any case)
-                self.lose_record(offset, end, error)
+                self.lose_record(offset, error)
             self.position = end
 
     def _take(self, fields: Mapping[str, bytes], offset: int, start: int, end: int) -> None:
@@ -100,7 +100,6 @@ class Rosbag1Container(FileContainer):
         if op == _OP_INDEX and self._pending is not None:
             limits.check("metadata_bytes", end - start, "an index record")
             self._index_record(self._pending, fields, self.source.read(start, end - start))
-            self.account.decode(offset, end)
             return
         self._close_chunk()
         if op == _OP_CHUNK:
@@ -120,12 +119,11 @@ class Rosbag1Container(FileContainer):
             return
         else:
             raise SpanDamageError(f"no record of kind {op} is allowed here")
-        self.account.decode(offset, end)
 
     def _finish(self) -> None:
         if self._header is None:
             raise self.no_log("a bag header record", "none")
-        self._close_chunk(complete=not self.account.cut)
+        self._close_chunk(complete=not self.cut)
         index_at, chunks = self._header
         if index_at and not self.lost:
             self._check_infos(chunks)
@@ -133,7 +131,6 @@ class Rosbag1Container(FileContainer):
         if not index_at and not self.lost:
             what = "the bag has no index (it was not closed); its complete chunks were read by a scan"
             self.lose("unindexed", what, self.last_ns())
-            self.account.cut = True
         self.drop_undeclared("connections")
 
     def _check_infos(self, chunks: int) -> None:
@@ -149,7 +146,6 @@ class Rosbag1Container(FileContainer):
                 self._open_chunk(chunk)
         if missing > 0 and not self.lost:
             self.lose("missing-messages", f"the bag's header names {chunks} chunks, {missing} of them are not there")
-            self.account.lose(0, len(self.magic))
 
     def _is_zero(self, start: int, end: int) -> bool:
         return all(
@@ -212,7 +208,7 @@ class Rosbag1Container(FileContainer):
 
     def _open_chunk(self, chunk: _Chunk) -> None:
         """Add a chunk by its content; a damaged chunk is a loss."""
-        self.add_content(chunk, (chunk.start, chunk.end), None, lambda: self._decode(chunk, declare=True))
+        self.add_content(chunk, None, lambda: self._decode(chunk, declare=True))
 
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes of the chunk's record."""

@@ -70,7 +70,7 @@ class SqliteContainer(Container):
             self._db.set_progress_handler(self._out_of_time, _STEPS_A_CHECK)
             for pragma in ("trusted_schema = OFF", "mmap_size = 0", "cell_size_check = ON"):
                 self._db.execute(f"PRAGMA {pragma}")
-            with self.meter.running(self.account.size):
+            with self.meter.running(self.size):
                 self._read_topics()
                 self._read_pages()
         except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
@@ -169,13 +169,10 @@ class SqliteContainer(Container):
         except sqlite3.Error as error:
             what = f"the rows after id {last} cannot be read: {describe_damage(self._late or error)[1]}"
             self.lose("over-budget" if self._late else "truncated", what, max(times) + 1 if times else None)
-            self.account.lose(total, self.account.size)
-            self.account.cut = True
         close_page()
         if unknown:
             what = f"{unknown} messages of topics that the database does not name, or without a time or data"
             self.lose("unknown-channel", what, count=unknown)
-            self.account.lose(total, total + round(self.account.size * unknown / row_count))
         if not self.lost:
             self._check_indexes(row_count)
 
@@ -192,13 +189,10 @@ class SqliteContainer(Container):
             if self._late:
                 raise
             self.lose("bad-index", f"the index of the messages cannot be read: {error}")
-            self.account.lose(self.account.size - 1, self.account.size)
         missing = max(counts) - row_count
         if missing > 0:
             what = f"the index of the messages names {max(counts)} rows, {row_count} of them are there"
             self.lose("missing-messages", what, count=missing)
-            end = self._ends[-1] if self._ends else 0
-            self.account.lose(end, end + round(self.account.size * missing / max(counts)))
 
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes of the page's rows, as if the data of all rows lay one behind the other."""

@@ -227,7 +227,7 @@ class _Cursor:
         rows = rows[np.argsort(block.log_time_ns[rows], kind="stable")]
         self.taken = 0
         self._buffer = block.buffer
-        columns = (getattr(block, f.name) for f in fields(block) if f.name != "buffer")
+        columns = (getattr(block, f.name) for f in fields(block) if f.name not in ("buffer", "dropped"))
         self._rows = list(zip(*(column[rows].tolist() for column in columns), strict=True))
 
     @property

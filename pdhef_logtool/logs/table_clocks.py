@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.recording_span import (
     BREAK_NS,
     NOTED_SHARE,
@@ -32,53 +33,18 @@ if TYPE_CHECKING:
 
 #: Stamp of a row without a time.
 NO_TIME = np.iinfo(np.int64).min
-_DAY_NS = 86_400 * 10**9
+_CLOCKS, _GPS = CONSTANTS["clocks"], CONSTANTS["gps"]
+#: Spellings of units by their nanoseconds; nanoseconds by spelling, in lower case.
+_UNITS: dict[int, list[str]] = {ns: spellings.split() for ns, spellings in numbered(_CLOCKS["units"]).items()}
+TIME_UNITS_NS = {spelling: ns for ns, spellings in _UNITS.items() for spelling in spellings}
+_DAY_NS, _HOUR_NS, _MINUTE_NS, _SECONDS = (TIME_UNITS_NS[name] for name in ("days", "hours", "minutes", "seconds"))
+_DAY_S = _DAY_NS / _SECONDS
+_SUBUNITS = tuple(ns for ns in _UNITS if ns <= _SECONDS)
 #: Times that count from the start of a recording follow this instant, 1970-01-02, so that none is negative.
 RELATIVE_NS = _DAY_NS
-#: 1973; earlier times count from the start of a recording.
-_FIRST_DATE_NS = 10**17
-#: Stamps beyond this do not fit into int64.
-_LAST_NS = 9e18
-
-#: Nanoseconds of a unit by its spellings in lower case.
-TIME_UNITS_NS = {
-    spelling: factor
-    for factor, spellings in (
-        (_DAY_NS, "d day days"),
-        (3600 * 10**9, "h hr hrs hour hours"),
-        (60 * 10**9, "min mins minute minutes"),
-        (10**9, "s sec secs second seconds sek"),
-        (10**6, "ms msec millis milliseconds"),
-        (10**3, "us µs μs usec micros microseconds"),
-        (1, "ns nsec nanos nanoseconds"),
-    )
-    for spelling in spellings.split()
-}
-_SECONDS, _SUBUNITS = 10**9, (10**9, 10**6, 10**3, 1)
-_UNIT_NAMES = dict(
-    zip((_DAY_NS, *_SUBUNITS), ("days", "seconds", "milliseconds", "microseconds", "nanoseconds"), strict=True)
-)
 #: 1970-01-01 in the days of Excel, and of MATLAB's ``datenum``.
-_DAYS_TO_1970 = {25_569: "days of Excel", 719_529: "days of MATLAB (datenum)"}
-#: Dates are from 1990 to 2100, in s since 1970, and such clocks have steps of 10 µs to a minute.
-_DATES_S = (631_152_000, 4_102_444_800)
-_DATE_STEPS_S = (1e-5, 60.0)
-#: Usual recordings: steps and durations in s. A reading is rated by the decades outside of these ranges.
-_USUAL_STEP_S = (0.5e-3, 1.0)
-_USUAL_LENGTH_S = (10.0, 14_400.0)
-#: Clocks of one recording have lengths below this ratio.
-_UNLIKE = 1000.0
-#: Clocks with fewer rows are not compared.
-_FEW_ROWS = 10
-
-_GPS_EPOCH_NS = 315_964_800 * 10**9
-_WEEK_S = 604_800
-#: 10-bit weeks are read as dates from 2015 to 2034.
-_FIRST_WEEK, _WEEKS_OF_10_BITS = 1826, 1024
-#: A clock of GPS time that is read as Unix time is before 2018, in s since 1970; logs of cars are younger.
-_GPS_AS_UNIX_S = (1_104_537_600, 1_514_764_800)
-#: GPS time minus UTC in s, from a time in s since 1970 on.
-_LEAP_SECONDS = ((1136073600, 14), (1230768000, 15), (1341100800, 16), (1435708800, 17), (1483228800, 18))
+_DAYS_TO_1970: dict[int, str] = numbered(_CLOCKS["days_to_1970"])
+_GPS_EPOCH_NS, _WEEK_S = _GPS["epoch_s"] * _SECONDS, _GPS["week_s"]
 
 #: A date, a time of day (of 12 hours with AM or PM) or ``minutes:seconds``, and an offset from UTC.
 _TIME_TEXT = (
@@ -109,7 +75,7 @@ class Clock:
     def length_s(self) -> float:
         """Duration in s by the usual step; 0 without times."""
         step, count = _steps(self.stamps_ns[self.stamps_ns != NO_TIME])
-        return step * 1e-9 * count
+        return step / _SECONDS * count
 
     @property
     def is_dated(self) -> bool:
@@ -146,7 +112,7 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock]) -> tupl
     lengths = [length for clock in others if (length := clock.length_s) > 0.0]
 
     def fits(factor: int) -> bool:
-        return step == 0.0 or _DATE_STEPS_S[0] <= step * factor / _SECONDS <= _DATE_STEPS_S[1]
+        return step == 0.0 or _is_within(step * factor / _SECONDS, _CLOCKS["date_steps_s"])
 
     def decades_off(reading: tuple[int, int]) -> float:
         step_s = step * reading[0] / _SECONDS
@@ -154,13 +120,13 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock]) -> tupl
         if length_s <= 0.0:
             return 0.0
         apart = min((abs(math.log10(length_s / length)) for length in lengths), default=0.0)
-        return _outside(step_s, _USUAL_STEP_S) + _outside(length_s, _USUAL_LENGTH_S) + apart
+        return _outside(step_s, _CLOCKS["usual_step_s"]) + _outside(length_s, _CLOCKS["usual_length_s"]) + apart
 
     dates = [(factor, 0) for factor in _SUBUNITS if _is_date(middle * factor / _SECONDS)]
-    days = [(_DAY_NS, epoch) for epoch in _DAYS_TO_1970 if _is_date((middle - epoch) * 86_400.0)]
+    days = [(_DAY_NS, epoch) for epoch in _DAYS_TO_1970 if _is_date((middle - epoch) * _DAY_S)]
     if stated:
         as_stated = next((r for r in (*dates, *days) if r[0] == stated), (stated, 0))
-        is_sound = fits(stated) and abs(middle) * stated < _LAST_NS
+        is_sound = fits(stated) and abs(middle) * stated < _CLOCKS["last_ns"]
         better = as_stated if is_sound else next((r for r in (*dates, *days) if fits(r[0])), as_stated)
         changed = better[0] != stated
         return *better, f"the unit makes no plausible times, read as {_named(*better)}" if changed else ""
@@ -173,7 +139,7 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock]) -> tupl
 def _of_gps(clock: Clock, name: str, others: Sequence[Clock]) -> Clock:
     """Return a clock of Unix time, or of GPS time if another clock of the file or the name shows this."""
     unix_s = clock.middle_ns / _SECONDS
-    if not _GPS_AS_UNIX_S[0] <= unix_s < _GPS_AS_UNIX_S[1]:
+    if not _is_within(unix_s, _GPS["as_unix_s"]):
         return clock
     gps_ns = clock.middle_ns + _GPS_EPOCH_NS
     dated = next((other.middle_ns for other in others if other.is_dated), None)
@@ -183,25 +149,29 @@ def _of_gps(clock: Clock, name: str, others: Sequence[Clock]) -> Clock:
         return replace(clock, stamps_ns=stamps, notes=(*clock.notes, f"{name}: read as GPS time (seconds since 1980)"))
     if dated is not None:
         return clock
-    year = dt.datetime.fromtimestamp(unix_s, dt.UTC).year
-    note = f"{name}: read as Unix time, {year}; as GPS time it would be {year + 10}"
+    years = [dt.datetime.fromtimestamp(s, dt.UTC).year for s in (unix_s, gps_ns / _SECONDS)]
+    note = f"{name}: read as Unix time, {years[0]}; as GPS time it would be {years[1]}"
     return replace(clock, notes=(*clock.notes, note))
 
 
 def _named(factor: int, epoch: int) -> str:
-    return _DAYS_TO_1970.get(epoch, _UNIT_NAMES[factor])
+    return _DAYS_TO_1970.get(epoch, _UNITS[factor][-1])
 
 
 def _is_date(unix_s: float) -> bool:
-    return _DATES_S[0] <= unix_s <= _DATES_S[1]
+    return _is_within(unix_s, _CLOCKS["dates_s"])
+
+
+def _is_within(value: float, limits: Sequence[float]) -> bool:
+    return limits[0] <= value <= limits[1]
 
 
 def _is_dated(stamps: IntArray) -> bool:
     has = stamps != NO_TIME
-    return bool(has.any()) and float(np.median(stamps[has])) >= _FIRST_DATE_NS
+    return bool(has.any()) and float(np.median(stamps[has])) >= _CLOCKS["first_date_ns"]
 
 
-def _outside(value: float, usual: tuple[float, float]) -> float:
+def _outside(value: float, usual: Sequence[float]) -> float:
     """Return the decades by which a value is outside of a range."""
     return max(0.0, math.log10(usual[0] / value), math.log10(value / usual[1]))
 
@@ -216,7 +186,9 @@ def _steps(values: NDArray[Any]) -> tuple[float, int]:
 def _scaled(values: NDArray[Any], factor: int, epoch: int, has_time: BoolArray) -> IntArray:
     """Return values [N] since an epoch in ns; those that do not fit into int64 have no time."""
     stamps = np.full(values.shape, NO_TIME, np.int64)
-    has_time = has_time & (np.abs(np.where(has_time, values, 0).astype(np.float64) - epoch) < _LAST_NS / factor)
+    has_time = has_time & (
+        np.abs(np.where(has_time, values, 0).astype(np.float64) - epoch) < _CLOCKS["last_ns"] / factor
+    )
     given = values[has_time]
     # The fraction apart: a product would lose the last digits of a date.
     whole = given if given.dtype.kind in "iu" else np.floor(given)
@@ -235,25 +207,28 @@ def placed(stamps: IntArray) -> IntArray:
 
 def week_clock(week: FloatArray, seconds: FloatArray) -> Clock:
     """Return the clock of GPS weeks [N] and their seconds (or milliseconds) [N]; 10-bit weeks are of 2015 to 2034."""
+    per_second = TIME_UNITS_NS["seconds"] // TIME_UNITS_NS["milliseconds"]
     has_time = np.isfinite(week) & np.isfinite(seconds)
-    has_time &= (np.abs(np.where(has_time, week, -1.0) - 5000.0) <= 5000.0) & (np.abs(seconds) <= 2e3 * _WEEK_S)
+    has_time &= (week >= 0.0) & (week <= _GPS["most_weeks"]) & (np.abs(seconds) <= 2 * per_second * _WEEK_S)
     given, within = week[has_time].astype(np.int64), seconds[has_time]
     notes: tuple[str, ...] = ()
-    if given.size and given.max() < _WEEKS_OF_10_BITS:
-        added = _WEEKS_OF_10_BITS * math.ceil((_FIRST_WEEK - float(np.median(given))) / _WEEKS_OF_10_BITS)
+    if given.size and given.max() < (period := _GPS["weeks_of_10_bits"]):
+        added = period * math.ceil((_GPS["first_week"] - float(np.median(given))) / period)
         notes = (f"GPS weeks have 10 bits: {added} weeks are added, so that they are of 2015 to 2034",)
         given = given + added
-    within = within / 1e3 if within.max(initial=0.0) > _WEEK_S else within
+    within = within / per_second if within.max(initial=0.0) > _WEEK_S else within
     stamps = np.full(week.shape, NO_TIME, np.int64)
-    stamps[has_time] = _GPS_EPOCH_NS + given * (_WEEK_S * _SECONDS) + np.round(within * 1e9).astype(np.int64)
+    stamps[has_time] = (
+        _GPS_EPOCH_NS + given * (_WEEK_S * _SECONDS) + np.round(within * float(_SECONDS)).astype(np.int64)
+    )
     return Clock(_to_utc(stamps, has_time), notes)
 
 
 def _to_utc(stamps: IntArray, has_time: BoolArray) -> IntArray:
     """Return UTC of GPS times [N], both in ns since 1970."""
-    leap = [0] + [s for _, s in _LEAP_SECONDS]
-    after = np.searchsorted([since for since, _ in _LEAP_SECONDS], stamps // _SECONDS, side="right")
-    return np.where(has_time, stamps - np.asarray(leap, np.int64)[after] * _SECONDS, NO_TIME)
+    since, leap = np.array(_GPS["leap_seconds"], np.int64).T
+    after = np.maximum(np.searchsorted(since, stamps // _SECONDS, side="right") - 1, 0)
+    return np.where(has_time, stamps - leap[after] * _SECONDS, NO_TIME)
 
 
 # ---- texts ----
@@ -279,17 +254,17 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
     hour = np.where(half == "", hour, hour % 12 + 12 * (half == "p"))
     has_time = (second <= 60) & ((minute < 60) | short & ~is_dated) & ((hour < 24) | ~is_dated)
     fraction = parts["fraction"].fill_null("").str.pad_end(9, "0").cast(int).to_numpy()
-    of_day = ((hour * 60 + minute) * 60 + second) * _SECONDS + fraction
+    of_day = hour * _HOUR_NS + minute * _MINUTE_NS + second * _SECONDS + fraction
     if not is_dated.any():
         has_time &= number["second"] >= 0
-        period = 3600 * _SECONDS if short[has_time].all() else _DAY_NS
+        period = _HOUR_NS if short[has_time].all() else _DAY_NS
         stamps = np.full(len(texts), NO_TIME, np.int64)
         stamps[has_time] = unwrapped(of_day[has_time], period)
         return Clock(placed(stamps))
     days, is_day, note = _days(number["a"], number["b"], number["c"], parts["mark"].fill_null("").to_numpy())
-    zone = np.maximum(number["zone_hour"], 0) * 60 + np.maximum(number["zone_minute"], 0)
+    zone = np.maximum(number["zone_hour"], 0) * _HOUR_NS + np.maximum(number["zone_minute"], 0) * _MINUTE_NS
     zone = np.where(parts["sign"].fill_null("").to_numpy() == "-", -zone, zone)
-    stamps = days * _DAY_NS + of_day - zone * 60 * _SECONDS
+    stamps = days * _DAY_NS + of_day - zone
     return Clock(np.where(has_time & is_dated & is_day, stamps, NO_TIME), (note,) if note else ())
 
 
@@ -316,14 +291,16 @@ def _spread(values: IntArray) -> int:
 
 def _civil(year: IntArray, month: IntArray, day: IntArray) -> tuple[IntArray, BoolArray]:
     """Return days since 1970 [N], and whether these are days of the calendar from 1900 to 2261."""
-    is_day = (year >= 1900) & (year < 2262) & (month >= 1) & (month <= 12) & (day >= 1)
-    months = np.where(is_day, (year - 1970) * 12 + month - 1, 0).astype("datetime64[M]")
+    first, last = _CLOCKS["years"]
+    is_day = (year >= first) & (year <= last) & (month >= 1) & (month <= 12) & (day >= 1)
+    years = np.where(is_day, year - 1970, 0).astype("datetime64[Y]")
+    months = years.astype("datetime64[M]") + np.where(is_day, month - 1, 0)
     days = months.astype("datetime64[D]") + np.where(is_day, day - 1, 0)
     is_day &= days.astype("datetime64[M]") == months
     return days.astype(np.int64), is_day
 
 
-def unwrapped(times: NDArray[Any], period: float = 86_400.0) -> NDArray[Any]:
+def unwrapped(times: NDArray[Any], period: float = _DAY_S) -> NDArray[Any]:
     """Return times since midnight [N] that continue behind midnight; ``period`` is a day in their unit."""
     steps = np.diff(times, prepend=times[:1])
     wraps = np.cumsum((steps < -period / 2).astype(np.int64) - (steps > period / 2))
@@ -332,7 +309,7 @@ def unwrapped(times: NDArray[Any], period: float = 86_400.0) -> NDArray[Any]:
 
 def whole_days(date: dt.date) -> int:
     """Return the ns of a date's midnight."""
-    return (date - dt.date(1970, 1, 1)).days * _DAY_NS
+    return int(np.datetime64(date).astype(int)) * _DAY_NS
 
 
 # ---- rows in the order of time ----
@@ -380,7 +357,9 @@ def ascending_rows(stamps: IntArray, where: str) -> tuple[IntArray, list[Loss]]:
 
 def unlike_lengths(stamps: Mapping[str, IntArray], where: str) -> list[Loss]:
     """Return a loss if the lengths of the clocks [N] of a file, by table, contradict each other."""
-    compared = [(int(s[-1] - s[0]) * 1e-9, n) for n, s in stamps.items() if len(s) >= _FEW_ROWS and s[-1] > s[0]]
+    compared = [
+        (int(s[-1] - s[0]) / _SECONDS, n) for n, s in stamps.items() if len(s) >= _CLOCKS["few_rows"] and s[-1] > s[0]
+    ]
     (short_s, short), (long_s, long) = (min(compared), max(compared)) if compared else ((1.0, ""), (1.0, ""))
     what = f"clocks of one recording differ: {short} lasts {short_s:.4g} s, {long} {long_s:.4g} s"
-    return [Loss("clock-lengths", what, where)] if long_s >= _UNLIKE * short_s else []
+    return [Loss("clock-lengths", what, where)] if long_s >= _CLOCKS["unlike"] * short_s else []

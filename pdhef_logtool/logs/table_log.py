@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, nearest
 from pdhef_logtool.logs.log_file import LogFile
@@ -59,7 +58,7 @@ class Table:
 
 
 class TableLog(DriveLog):
-    """Tables as a log. It has no messages to copy, and one ledger entry: the file was read.
+    """Tables as a log. It has no messages to copy.
 
     Parameters
     ----------
@@ -121,9 +120,9 @@ class TableLog(DriveLog):
         return tuple(self._lost)
 
     @property
-    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
-        """The whole file as read."""
-        return (ByteLedger(str(self.path), self._size, self._size, 0, 0, bool(self._file.cut), checksummed=0),)
+    def size(self) -> int:
+        """Bytes of the file."""
+        return self._size
 
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
         """Return the columns of a table."""

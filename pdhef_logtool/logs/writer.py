@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import struct
-import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
+from isal.isal_zlib import crc32
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -387,7 +387,7 @@ class McapLogWriter:
 
             self._compressor = zstandard.ZstdCompressor(level=self._level)
         stored = self._compressor.compress(records)
-        self._emit_chunk(RawChunk("zstd", stored, len(records), zlib.crc32(records), channel, log_time_ns, offset))
+        self._emit_chunk(RawChunk("zstd", stored, len(records), crc32(records), channel, log_time_ns, offset))
 
     def _emit_chunk(self, chunk: RawChunk) -> None:
         channel, log_time, offset, stored = chunk.channel, chunk.log_time_ns, chunk.offset, chunk.stored
@@ -517,7 +517,7 @@ class McapLogWriter:
             Footer(
                 summary_start=start,
                 summary_offset_start=offset_start,
-                summary_crc=zlib.crc32(head, zlib.crc32(summary)),
+                summary_crc=crc32(head, crc32(summary)),
             )
         )
         self._emit(MCAP_MAGIC)
@@ -529,7 +529,7 @@ class McapLogWriter:
         except BaseException:
             self.abort()
             raise
-        self._crc = zlib.crc32(data, self._crc)
+        self._crc = crc32(data, self._crc)
         self._at += len(data)
 
     def _emit_record(self, record: McapRecord) -> tuple[int, int]:

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.can_decoding import (
     CAN_TYPE,
     ID_BITS,
@@ -279,9 +278,9 @@ class CanSignalLog(DriveLog):
         return matches
 
     @property
-    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
+    def size(self) -> int:
         """Where the bytes of each file went."""
-        return self._log.byte_ledgers
+        return self._log.size
 
     def close(self) -> None:
         """Release the files."""

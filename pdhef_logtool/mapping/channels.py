@@ -12,7 +12,7 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.mapping.can_frames import CanSignalLog, with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping
-from pdhef_logtool.mapping.clocks import ClockModel, clock_key, stamp_request, stamps_on_log_clock
+from pdhef_logtool.mapping.clocks import ClockModel, clock_key, request_source, stamps_on_log_clock
 from pdhef_logtool.mapping.evidence import LARGEST
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.records.ledger import Role
@@ -211,12 +211,6 @@ def merge_losses(parts: Iterable[Iterable[Loss]]) -> tuple[Loss, ...]:
             count=(old.count or 0) + (loss.count or 0) if counted else None,
         )
     return tuple(merged.values())
-
-
-def request_source(log: DriveLog, source: SignalSource, requests: dict[str, list[str]]) -> None:
-    """Add the paths of a source and of its stamp to the requests of a read, by topic."""
-    paths = requests.setdefault(source.read_topic, [])
-    paths += [p for p in (*stamp_request(log, source), *source.paths) if p not in paths]
 
 
 def dropped(kind: str, where: str, log_time_ns: IntArray) -> Loss:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.logs.reduced_log import ReducedLog
 from pdhef_logtool.mapping.checking import check_mapping
-from pdhef_logtool.mapping.recognition import Ambiguity, AutoMapping, auto_map
+from pdhef_logtool.mapping.recognition import Ambiguity, auto_map
 from pdhef_logtool.mapping.records import Mapping
-from pdhef_logtool.records.errors import LogError, MappingError
+from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
-from pdhef_logtool.storage.documents import jsonable
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,67 +20,12 @@ class ChosenMapping:
     Attributes
     ----------
     missing : signals that it lacks. ambiguities : what may be wrong. remarks : what else is worth knowing.
-    prefer_truth : which ground truth of a simulated log was to count.
     """
 
     mapping: Mapping
     missing: tuple[str, ...]
-    prefer_truth: Literal["perfect", "rtk"]
     ambiguities: tuple[Ambiguity, ...] = ()
     remarks: tuple[str, ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON-able values, from which :func:`recorded_mapping` makes it again; DBC files by name."""
-        document: dict[str, Any] = jsonable(self)
-        if self.mapping.can is not None:
-            document["mapping"]["can"]["dbc"] = list(self.dbc_names)
-        return document
-
-    @property
-    def dbc_names(self) -> tuple[str, ...]:
-        """What the DBC files of the mapping are called in a reduced log."""
-        dbc = () if self.mapping.can is None else self.mapping.can.dbc
-        return tuple(f"dbc-{number}-{path.name}" for number, path in enumerate(dbc))
-
-
-def recorded_mapping(log: ReducedLog, prefer_truth: Literal["perfect", "rtk"]) -> ChosenMapping:
-    """Return the mapping of a reduced log.
-
-    Raises
-    ------
-    LogError : its record contains none that is one. MappingError : it was made for another ground truth.
-    """
-    from pydantic import TypeAdapter, ValidationError
-
-    try:
-        chosen = TypeAdapter(ChosenMapping).validate_python(log.record.mapped)
-    except ValidationError as error:
-        raise LogError(
-            expected="the mapping of a reduced log",
-            got="; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:3]),
-            where=str(log.path),
-            remedy="delete it; pdhef run LOG --cache DIR writes it again",
-        ) from error
-    mapping = chosen.mapping
-    if chosen.prefer_truth != prefer_truth and mapping.truth:
-        raise MappingError(
-            expected=f"prefer_truth = {chosen.prefer_truth}, which this reduced log was made with",
-            got=prefer_truth,
-            where=str(log.path),
-            remedy="read the source log",
-        )
-    if mapping.can is not None:
-        dbc = tuple(log.attached(path.name) for path in mapping.can.dbc)
-        mapping = replace(mapping, can=replace(mapping.can, dbc=dbc))
-    return replace(chosen, mapping=mapping)
-
-
-def recognise(log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"]) -> AutoMapping:
-    """Return what :func:`auto_map` recognises, or for a reduced log what it was made with."""
-    if log.reduced is None:
-        return auto_map(log, prefer_truth=prefer_truth)
-    recorded = recorded_mapping(log.reduced, prefer_truth)
-    return AutoMapping(recorded.mapping, recorded.ambiguities, recorded.missing)
 
 
 def choose_mapping(
@@ -97,12 +40,10 @@ def choose_mapping(
     if mapping is not None:
         mapping = mapping_for_recorder(log, mapping)
         if mapping.fill_recognised:
-            mapping = _filled(mapping, recognise(log, prefer_truth=prefer_truth).mapping)
+            mapping = _filled(mapping, auto_map(log, prefer_truth=prefer_truth).mapping)
         check_mapping(mapping, log)
         missing = tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
-        return ChosenMapping(mapping, missing, prefer_truth, (), (*mapping.notes, *_borrowed(log, mapping)))
-    if log.reduced is not None:
-        return recorded_mapping(log.reduced, prefer_truth)
+        return ChosenMapping(mapping, missing, (), (*mapping.notes, *_borrowed(log, mapping)))
     auto = auto_map(log, prefer_truth=prefer_truth)
     if require_signals and not auto.mapping.signals:
         raise MappingError(
@@ -112,7 +53,7 @@ def choose_mapping(
             remedy="pdhef inspect LOG --fields shows every number, pdhef map LOG helps to write a mapping.toml",
         )
     remarks = (*auto.mapping.notes, *_borrowed(log, auto.mapping))
-    return ChosenMapping(auto.mapping, auto.missing, prefer_truth, auto.ambiguities, remarks)
+    return ChosenMapping(auto.mapping, auto.missing, auto.ambiguities, remarks)
 
 
 def mapping_for_recorder(log: DriveLog, mapping: Mapping) -> Mapping:

@@ -154,6 +154,10 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
     MappingError : A device clock has no usable stamp in the span.
     """
     resolved = resolve_mapping(log, mapping)
+    expected: dict[str, list[str]] = {}
+    for source in (s for s in resolved.sources() if s.can_signal is None):
+        request_source(log, source, expected)
+    log.expect(expected)
     log = with_can_signals(log, resolved)
     wanted = sources_by_clock(resolved)
     requests: dict[str, list[str]] = {}
@@ -361,6 +365,12 @@ def stamp_request(log: DriveLog, source: SignalSource) -> tuple[str, ...]:
             if pair is not None:
                 return pair
     return (source.stamp,)
+
+
+def request_source(log: DriveLog, source: SignalSource, requests: dict[str, list[str]]) -> None:
+    """Add the paths of a source and of its stamp to the requests of a read, by topic."""
+    paths = requests.setdefault(source.read_topic, [])
+    paths += [p for p in (*stamp_request(log, source), *source.paths) if p not in paths]
 
 
 def raw_stamps(log: DriveLog, columns: Columns, source: SignalSource) -> tuple[IntArray, NDArray[np.bool_]]:

@@ -85,7 +85,12 @@ class SimulationError(PdhefError):
 
 
 class OutputError(PdhefError):
-    """An output cannot be written, or an output folder cannot be read back."""
+    """An output cannot be written, or an output folder cannot be read back.
+
+    ``ends_run``: no other output can be written either, because a disk is full or read-only.
+    """
+
+    ends_run = False
 
 
 class WorkerError(PdhefError):

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from pdhef_logtool.evaluation.units import AY_NOTE, LABELS
-from pdhef_logtool.logs.byte_account import checksum_text
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.reports.drive_figures import DriveFigures, Roles, drive_figures
@@ -107,9 +106,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         estimators=_estimators(report),
         checks=sorted(report.get("checks") or (), key=lambda c: ("failed", "undecided", "passed").index(c["verdict"])),
         losses=(report.get("losses") or ())[:_MOST_ROWS],
-        checksum=checksum_text(report["ledger"].get("checksummed_share")),
         samples=[s for s in report["ledger"]["samples"] if s["dropped"]][:_MOST_ROWS],
-        budget=report.get("error_budget"),
         faults=report.get("faults"),
         metadata=report.get("metadata") or {},
         ay_note=AY_NOTE,

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pdhef_logtool.logs.schema_files import schema_file
 
 if TYPE_CHECKING:
@@ -47,3 +49,18 @@ def arrow_schema(name: str) -> pa.Schema:
             "missing": document["missing"],
         },
     )
+
+
+def arrow_array(values: Any, kind: pa.DataType) -> pa.Array:
+    """Return numbers or strings [N] as ``pa.array`` does, NaN as null; that imports pandas where it is installed."""
+    import pyarrow as pa
+
+    if pa.types.is_string(kind):
+        texts = [str(v).encode() for v in values]
+        offsets = np.cumsum([0, *map(len, texts)], dtype=np.int32)
+        return pa.Array.from_buffers(kind, len(texts), [None, pa.py_buffer(offsets), pa.py_buffer(b"".join(texts))])
+    values = np.ascontiguousarray(values, dtype=kind.to_pandas_dtype())
+    is_there = ~np.isnan(values)
+    validity = None if is_there.all() else pa.py_buffer(np.packbits(is_there, bitorder="little"))
+    data = np.packbits(values, bitorder="little") if values.dtype == np.bool_ else values
+    return pa.Array.from_buffers(kind, len(values), [validity, pa.py_buffer(data)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,16 +11,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.smoothing import RUN_GAP_S
+from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
-from pdhef_logtool.results.expression import ERRORS, FLAGS, OPERATIONS, SPEED, Column, Condition, Node, Number, Within
+from pdhef_logtool.records.tracks import TRACK_COLUMNS
+from pdhef_logtool.results.condition import Condition, Reference, parse_condition
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
 if TYPE_CHECKING:
     import polars as pl
+
+SPEED = "speed_m_s"
+#: Stored columns that are true or false.
+FLAGS = frozenset({"valid", "diverged"})
+#: Errors against ground truth: the signal of each.
+ERRORS = {re.sub(r"_(rad|rad_s|m_s|m_s2)$", r"_error_\1", s): s for s in SCORED_SIGNALS}
+_NUMBERS = (*(c for c in TRACK_COLUMNS if c != "stamp_ns" and c not in FLAGS), SPEED, *ERRORS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,14 +93,24 @@ class FoundEvents:
         }
 
 
+def event_condition(text: str) -> Condition:
+    """Read a condition on the columns of tracks; a segment is a column that is true within it. Raises UsageError."""
+    condition = parse_condition(text, _NUMBERS, flags=(*sorted(FLAGS), *SEGMENTS))
+    for name, reference in condition.references.items():
+        if reference.track == TRUTH and reference.column in ERRORS:
+            raise UsageError(expected="an estimator before an error", got=name, where="--where")
+    return condition
+
+
 def find_events(
-    run: OpenedRun, condition: Condition, *, estimator: str | None = None, pad_s: float = 0.0
+    run: OpenedRun, condition: Condition, *, estimator: str | None = None, least_s: float = 0.0, pad_s: float = 0.0
 ) -> FoundEvents:
-    """Search all drives of a run, one at a time, reading only the columns that the condition has.
+    """Search all drives of a run, one at a time, reading only the columns of the condition.
 
     Parameters
     ----------
     estimator : what columns without a prefix are of; None: each drive's selected estimate.
+    least_s : minimum duration of an event.
     pad_s : events closer than twice this become one.
 
     Raises
@@ -105,7 +126,7 @@ def find_events(
             with log.reading():
                 reason = _unfit(log, condition, estimator)
                 if reason is None:
-                    events += _events_of(log, condition, estimator or log.main(), pad_s)
+                    events += _events_of(log, condition, estimator or log.main(), least_s, pad_s)
                     searched += 1
         except OutputError as error:
             reason = error.got
@@ -117,7 +138,7 @@ def find_events(
         _check_tracks([log for log in run.logs if log.label not in damaged], condition, estimator)
     lines = tuple(damaged.values())
     return FoundEvents(
-        condition.text,
+        condition.text + (f" for {least_s:g} s" if least_s else ""),
         searched,
         tuple(events),
         left_out,
@@ -168,13 +189,14 @@ def _check_tracks(logs: Sequence[OpenedLog], condition: Condition, estimator: st
             got="none named, and none that is selected",
             where="--estimator",
         )
-    asked = {c.track for c in condition.columns() if c.track is not None} | ({estimator} if estimator else set())
+    asked = {r.track for r in condition.references.values() if r.track is not None} | (
+        {estimator} if estimator else set()
+    )
     for name in sorted(asked - estimators - {TRUTH, None}, key=str):
         raise UsageError(
             expected=f"an estimator of this run: {', '.join(sorted(estimators))}",
             got=str(name),
             where="--where" if name != estimator else "--estimator",
-            remedy="a minus between columns needs spaces" if "-" in str(name) else "",
         )
 
 
@@ -188,11 +210,12 @@ def _tracks(log: OpenedLog) -> frozenset[str]:
 
 def _needed(condition: Condition, main: str) -> set[str]:
     """Return the tracks that a condition reads."""
-    errors = {TRUTH for c in condition.columns() if c.name in ERRORS}
-    return {main} | {c.track or main for c in condition.columns()} | errors
+    columns = condition.references.values()
+    errors = {TRUTH for r in columns if r.column in ERRORS}
+    return {main} | {r.track or main for r in columns} | errors
 
 
-def _events_of(log: OpenedLog, condition: Condition, main: str, pad_s: float) -> list[FoundEvent]:
+def _events_of(log: OpenedLog, condition: Condition, main: str, least_s: float, pad_s: float) -> list[FoundEvent]:
     """Return the events of one drive."""
     import polars as pl
 
@@ -202,14 +225,16 @@ def _events_of(log: OpenedLog, condition: Condition, main: str, pad_s: float) ->
     low_speed = (report.get("vehicle") or {}).get("low_speed_blend_m_s")
     segments = report.get("segments", [])
     builder = _Builder(main, 0.0 if low_speed is None else float(low_speed), segments)
-    holds = builder.expression(condition.node).fill_null(value=False)
-    peak = pl.lit(None, pl.Float64) if condition.peak is None else builder.expression(condition.peak)
-    rows = _joined(frame, builder.columns, main).select("stamp_ns", holds=holds, peak=peak.cast(pl.Float64)).collect()
+    named = [builder.column(reference).alias(name) for name, reference in condition.references.items()]
+    peak = pl.lit(None) if condition.peak is None else condition.peak
+    holds = condition.expression.fill_null(value=False)
+    columns = _joined(frame, builder.columns, main).select("stamp_ns", *named)
+    rows = columns.select("stamp_ns", holds=holds, peak=peak.cast(pl.Float64)).collect()
     stamps, mask = rows["stamp_ns"].to_numpy(), rows["holds"].to_numpy()
     values = rows["peak"].fill_null(math.nan).to_numpy()
     log_start_ns = int((report.get("log") or {}).get("start_ns", stamps[0] if len(stamps) else 0))
     events = []
-    for first, last in _spans(stamps, mask, condition.least_s, pad_s):
+    for first, last in _spans(stamps, mask, least_s, pad_s):
         peak_row = _peak_at(values[first:last], condition.falls)
         start_ns, end_ns = int(stamps[first]), int(stamps[last - 1]) + 1
         events.append(
@@ -265,31 +290,22 @@ def _joined(frame: pl.LazyFrame, columns: Mapping[str, set[str]], main: str) -> 
 
 
 class _Builder:
-    """Turns a condition into an expression of polars; ``columns`` collects what it reads, by track."""
+    """Makes the columns of a condition; ``columns`` collects the stored columns that they need, by track."""
 
     def __init__(self, main: str, low_speed_m_s: float, segments: Sequence[Mapping[str, Any]]) -> None:
         self._main, self._segments = main, segments
         self._low_speed_m_s = low_speed_m_s
         self.columns: dict[str, set[str]] = {main: set()}
 
-    def expression(self, node: Node) -> pl.Expr:
-        import polars as pl
-
-        if isinstance(node, Number):
-            return pl.lit(node.value)
-        if isinstance(node, Within):
-            return self._within(node.segment)
-        if isinstance(node, Column):
-            column = self._column(node)
-            return column if node.factor == 1.0 else column * node.factor
-        applied: pl.Expr = OPERATIONS[node.of](*(self.expression(operand) for operand in node.operands))
-        return applied
-
-    def _column(self, column: Column) -> pl.Expr:
-        track = column.track or self._main
-        if column.name in ERRORS:
-            return self._error(track, ERRORS[column.name])
-        return self._speed(track) if column.name == SPEED else self._read(track, column.name)
+    def column(self, reference: Reference) -> pl.Expr:
+        track, name = reference.track or self._main, reference.column
+        if name in SEGMENTS:
+            return self._within(name)
+        if name in ERRORS:
+            column = self._error(track, ERRORS[name])
+        else:
+            column = self._speed(track) if name == SPEED else self._read(track, name)
+        return column if reference.factor == 1.0 else column * reference.factor
 
     def _within(self, segment: str) -> pl.Expr:
         """Return where a stamp lies in a segment's intervals, which do not overlap."""

@@ -17,7 +17,7 @@ from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, diagonal_covariance, make_track
-from pdhef_logtool.results.arrow_schema import arrow_schema
+from pdhef_logtool.results.arrow_schema import arrow_array, arrow_schema
 from pdhef_logtool.results.sink import TRUTH, Event, Sink, rounded
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
@@ -204,11 +204,11 @@ def track_table(track: StateTrack, *, as_written: bool = False, causal: BoolArra
         columns = {n: rounded(n, values) if values.dtype == np.float64 else values for n, values in columns.items()}
     if causal is not None:
         columns["causal"] = causal
-    columns["estimator"] = pa.DictionaryArray.from_arrays(np.zeros(len(track), dtype=np.int32), [track.name])
+    estimator = (arrow_array(np.zeros(len(track)), pa.int32()), arrow_array([track.name], pa.string()))
     arrays = [
-        pa.array(columns[f.name], type=f.type, from_pandas=True) if f.name in columns else pa.nulls(len(track), f.type)
-        for f in schema
+        arrow_array(columns[f.name], f.type) if f.name in columns else pa.nulls(len(track), f.type) for f in schema
     ]
+    arrays[schema.get_field_index("estimator")] = pa.DictionaryArray.from_arrays(*estimator)
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
@@ -367,7 +367,7 @@ def check_parquet(path: Path, kind: str) -> None:
 def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
     """Write metrics.parquet, rows in the order given; NaN becomes null; raises OutputError."""
     schema = arrow_schema("metrics.parquet.json")
-    arrays = [pa.array([getattr(r, f.name) for r in rows], type=f.type, from_pandas=True) for f in schema]
+    arrays = [arrow_array([getattr(r, f.name) for r in rows], f.type) for f in schema]
     with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
         pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
 

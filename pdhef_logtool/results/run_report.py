@@ -21,7 +21,6 @@ from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.operating_space import OperatingSpace
 from pdhef_logtool.evaluation.reasons import ReasonFacts, SensorFault
 from pdhef_logtool.evaluation.standing import Standing
-from pdhef_logtool.logs.byte_account import ByteLedger, checksummed_share
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.signals import Loss
@@ -140,13 +139,11 @@ class DriveDetails:
 
     ``faults`` of the sensors, None where no estimator detects them.
     ``standings`` of the selected estimate, empty without ground truth.
-    ``error_budget`` has a reason where there is none.
     ``metadata`` : what the log states of itself.
     """
 
     faults: Sequence[SensorFault] | None
     standings: Sequence[Standing]
-    error_budget: Any
     metadata: Mapping[str, str]
     path_drift: PathDrift | None = None
 
@@ -170,7 +167,7 @@ class ReportFacts:
     ``warnings``: what may be wrong; ``remarks``: what else is worth knowing.
     ``calibration``: what the drive stated of its car without ground truth, None where it was not asked.
     ``reference``: what came of the sideslip reference, None where it was not asked for.
-    ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
+    ``samples``: what became of the samples of each mapped source.
     ``checks``: plausibility of signals, ground truth and vehicle file. ``details``: None where nothing was estimated.
     ``requirements``: None where there is nothing to judge. ``space``: where the drive went.
     ``largest_errors``: of sideslip, the largest first.
@@ -196,7 +193,6 @@ class ReportFacts:
     metrics: Sequence[MetricRow] = ()
     segments: Sequence[Event] = ()
     losses: Sequence[Loss] = ()
-    file_bytes: Sequence[ByteLedger] = ()
     samples: Sequence[SampleCount] = ()
     warnings: Sequence[str] = ()
     remarks: Sequence[str] = ()
@@ -313,8 +309,6 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         "segments": list(facts.segments),
         "losses": list(facts.losses),
         "ledger": {
-            "bytes": list(facts.file_bytes),
-            "checksummed_share": checksummed_share(facts.file_bytes),
             "samples": list(facts.samples),
         },
         "warnings": list(facts.warnings),
@@ -359,7 +353,6 @@ def _detailed(details: DriveDetails) -> dict[str, Any]:
     """Return the keys that only a run writes."""
     values = {
         "faults": details.faults,
-        "error_budget": details.error_budget,
         "path_drift": details.path_drift,
         "metadata": dict(details.metadata),
     }
@@ -378,15 +371,13 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
     if space := report.get("operating_space"):
         first["operating_space"] = {**space, "cells": [*map(_rounded, space["cells"])]}
     return {
-        **{key: value for key, value in report.items() if key not in ("error_budget", "plan")},
+        **{key: value for key, value in report.items() if key != "plan"},
         **first,
         "log": {**report["log"], "topics": [t for t in report["log"]["topics"] if t["mapped"]]},
         "estimators": [_brief_estimator(e, names) for e in report["estimators"]],
         "metrics": [m for m in report["metrics"] if m["estimator"] in names and _is_shown(m, answer["main"])],
         "segments": [s for s in report["segments"] if s["name"] in {f"{n} diverged" for n in names}][:_MOST_LISTED],
         "ledger": {
-            **report["ledger"],
-            "bytes": report["ledger"]["bytes"][:_MOST_LISTED],
             "samples": _with_drops(report),
         },
         "checks": [c for c in report["checks"] if c["verdict"] != "passed"],

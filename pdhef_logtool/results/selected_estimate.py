@@ -289,7 +289,6 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
         steps.append("give your car: --car vehicle.toml with mass, geometry and tyres (docs/car.md)")
     elif main.distrusted:
         steps.append("check the vehicle file: mass, wheelbase, tyres, steering ratio")
-    share = figures.get((main.name, "sideslip_rad", "coverage95"))
     if vehicle["file"] is not None and not (vehicle["proven"] or vehicle.get("taught")):
         given = f"--car {vehicle['file']} -o mycar"
         steps.append(
@@ -297,8 +296,6 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
             if _error(figures, main.name) is not None
             else f"calibrate the car with several logs: pdhef learn LOGS {given} --without-truth"
         )
-    if vehicle["proven"] and share is not None and share < NEARLY_HOLDS:
-        steps.append("recalibrate the intervals: pdhef learn LOGS --car CAR -o mycar --stages intervals")
     friction = report["friction"]
     if friction is not None and friction["estimated"] and (friction["observable_share"] or 0.0) < _FRICTION_SHOWN:
         steps.append("give the friction if it is known: --friction 0.8")

@@ -14,10 +14,8 @@ from pydantic import Field
 
 from pdhef_logtool.car.car import SHIPPED_CARS, Car
 from pdhef_logtool.car.vehicle import Record
-from pdhef_logtool.drive.cached import cached
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.open_log import log_metadata
-from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.journal import digest_of
@@ -130,9 +128,7 @@ class RunCars:
         by_folder = self._by_folder(log)
         matches = {} if by_folder is None else {f"folder {by_folder[0]}": by_folder[1]}
         if table.metadata:
-            mapping = mapping_of(self.config.mapping)
-            with cached(log, mapping, self.config.read_options, self.warn) as (read_from, _):
-                has = log_metadata(read_from.path, self.config.read_options.limits)
+            has = log_metadata(log.path, self.config.read_options.limits)
             matches |= {f"{k} {has[k]}": cars[has[k]] for k, cars in table.metadata.items() if has.get(k) in cars}
         cars = {self._place(car) for car in matches.values()}
         if len(cars) > 1:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import tomllib
 from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,17 +16,16 @@ from pydantic.dataclasses import dataclass
 from pdhef_logtool.car.car import NO_INTERVALS, SHIPPED_CARS, UNSURE
 from pdhef_logtool.car.vehicle import SENSOR_PROFILES
 from pdhef_logtool.drive.friction import parse_friction
-from pdhef_logtool.drive.options import WINDOW_S, ReadOptions, parse_time
+from pdhef_logtool.drive.options import ReadOptions, parse_time
 from pdhef_logtool.estimators.presets import split_names
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
 from pdhef_logtool.storage.documents import read_toml, validated
-from pdhef_logtool.storage.object_store import is_url
 
 _FILES = ("car", "cars", "mapping", "msgs", "plan", "network", "intervals", "setup", "sensor_profile")
 #: Settings that change no result.
-_NO_RESULT = ("cache", "cache_max_gb", "allow_private_redirects", "log_timeout_s", "max_memory_mb", "full_worst")
+_NO_RESULT = ("allow_private_redirects", "log_timeout_s", "max_memory_mb", "full_worst")
 #: What may be in place of a file.
 _KEYWORDS = {
     "car": tuple(SHIPPED_CARS),
@@ -68,7 +67,7 @@ class RunConfig:
     start : start of the time slice (:func:`~pdhef_logtool.drive.options.parse_time`); None = that of the log.
     end : end of the time slice; None = that of the log.
     annotate : content of annotated.mcap: ``full`` (copy of the log with the estimates), ``sidecar`` (estimates only) or
-        ``none``; None = ``full`` if ``keep`` is ``full`` (``sidecar`` with ``cache``), otherwise ``none``.
+        ``none``; None = ``full`` if ``keep`` is ``full``, otherwise ``none``.
     keep : files per log: ``metrics`` (report and metrics), ``estimates`` (and the tracks) or ``full``; None = ``full``,
         for more than 50 logs ``metrics``.
     sensors : ``full``, or ``esp`` (sensor set of the paper: the speed sensor only initialises the filters).
@@ -77,7 +76,6 @@ class RunConfig:
     friction : ``auto`` (from the log, else the car, else estimated; for ``extract`` first from the ground truth),
         ``file``, ``estimate``, or a number.
     prefer_truth : ground truth of a simulated log that has both: ``perfect`` or ``rtk``.
-    window_s : length of the windows in which a log is processed, in s. Results do not depend on it.
     clock : ``arrival`` (a sample is available from its arrival on) or ``stamp`` (from its stamp on; not causal).
     budget : factor on the limits of memory and time for reading a log.
     msgs : folder, zip file or wheel with .msg files of types that a log does not define; or a DBC file, or a folder of
@@ -93,14 +91,12 @@ class RunConfig:
     gnss : ``auto`` (``physics``, ``pd-hef`` and the reference use GNSS velocity where the log has it) or ``off``.
     no_position : keep latitude, longitude and all other positions and headings out of the outputs. Topics are copied
         if each of their fields is known not to be a position; attachments, metadata and names of log files are left
-        out, and no reduced logs (``cache``) are written.
+        out.
     waived : names of checks whose failure is ignored.
     setup : setup.toml of another run of the same car and recorder, from which mounting, units, delays and clocks are
         taken; None = decided on the log.
     setup_from_s : decide these on the first so many seconds of the slice; None = on its first ten minutes (clocks on
         all of it).
-    cache : folder or URL of reduced logs, which replace logs that were read before. Results do not depend on it.
-    cache_max_gb : maximum cache size in GB; least recently used entries are evicted.
     allow_private_redirects : follow redirects of web servers to hosts of this machine or its network.
     log_timeout_s : abort a log after this time without progress, in s.
     max_memory_mb : abort a log whose worker process exceeds this much memory, in MB.
@@ -119,7 +115,6 @@ class RunConfig:
     sensor_profile: File | None = None
     friction: Literal["auto", "file", "estimate"] | Friction = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
-    window_s: Annotated[float, Field(ge=1, le=1e9)] = WINDOW_S
     clock: Literal["arrival", "stamp"] = "arrival"
     budget: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     msgs: File | None = None
@@ -133,8 +128,6 @@ class RunConfig:
     waived: Names = ()
     setup: File | None = None
     setup_from_s: Annotated[float, Field(ge=1)] | None = None
-    cache: Annotated[str, BeforeValidator(lambda v: str(v) if isinstance(v, Path) else v)] | None = None
-    cache_max_gb: Annotated[float, Field(gt=0)] | None = None
     allow_private_redirects: bool = False
     log_timeout_s: Annotated[float, Field(ge=1)] | None = None
     max_memory_mb: Annotated[int, Field(ge=1)] | None = None
@@ -143,8 +136,7 @@ class RunConfig:
     @property
     def read_options(self) -> ReadOptions:
         """What of it decides how a log is read."""
-        options = ReadOptions(**{f.name: getattr(self, f.name) for f in fields(ReadOptions)})
-        return replace(options, cache=None) if self.no_position else options
+        return ReadOptions(**{f.name: getattr(self, f.name) for f in fields(ReadOptions)})
 
     @property
     def kept(self) -> Keep:
@@ -154,8 +146,7 @@ class RunConfig:
     @property
     def annotation(self) -> Literal["full", "sidecar", "none"]:
         """What annotated.mcap contains; what was asked for is never left out."""
-        whole: Literal["full", "sidecar"] = "full" if self.cache is None else "sidecar"
-        return self.annotate or (whole if self.kept == "full" else "none")
+        return self.annotate or ("full" if self.kept == "full" else "none")
 
     @property
     def files(self) -> list[Path]:
@@ -200,7 +191,6 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         from pdhef_logtool.estimators.table import check_names  # inspect takes none, and no compiler
 
         check_names(config.estimators)
-    _check_cache(config)
     if config.setup is not None and config.setup_from_s is not None:
         raise UsageError(expected="--setup or --setup-from", got="both", where="--setup")
     # Times are understood without a log, so that a typing error is given before the first log is opened.
@@ -208,25 +198,6 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         if text is not None:
             parse_time(text, 0, 0, option=name)
     return config
-
-
-def _check_cache(config: RunConfig) -> None:
-    if config.cache is not None and config.annotate == "full":
-        raise UsageError(
-            expected="--annotate sidecar or none with --cache",
-            got="full",
-            where="--annotate",
-            remedy="a full copy reads all of each log: leave out --cache",
-        )
-    if config.cache is not None and config.no_position:
-        raise UsageError(
-            expected="--cache or --no-position",
-            got="both",
-            where="--cache",
-            remedy="reduced logs contain the positions of their logs: leave out --cache",
-        )
-    if config.cache_max_gb is not None and (config.cache is None or is_url(config.cache)):
-        raise UsageError(expected="--cache DIR", got=config.cache or "none", where="cache_max_gb")
 
 
 def parse_assignments(texts: Sequence[str]) -> dict[str, Any]:
@@ -264,8 +235,6 @@ def _toml_value(text: str) -> Any:
 
 def _read_file(path: Path) -> dict[str, Any]:
     raw = read_toml(path, "a configuration TOML file", UsageError)
-    if isinstance(raw.get("cache"), str) and "://" not in raw["cache"]:
-        raw["cache"] = str(path.parent / raw["cache"])
     for key in _FILES:
         value = raw.get(key)
         if isinstance(value, str):

@@ -11,21 +11,15 @@ from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
-from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
 from pdhef_logtool.evaluation.standing import standings
 from pdhef_logtool.records.printable import printable
-from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.run_report import DriveDetails
 from pdhef_logtool.results.sink import TRUTH
-from pdhef_logtool.runs.drive_sample import sample_drive
-from pdhef_logtool.runs.error_budget import ErrorBudget, error_budget, no_budget
 
 #: Entries of a log's metadata that a report keeps, and signs of each.
 _MOST_METADATA, _MOST_SIGNS = 64, 200
-
-_LEFT_OUT = "it is left out where not everything of a drive is kept"
 
 _Read = Callable[[str], StateTrack | None]
 
@@ -35,9 +29,7 @@ def drive_details(
     ready: Sequence[Estimator],
     main: str,
     read: _Read,
-    signals: Signals,
     *,
-    brief: bool = False,
     metadata: bool = True,
 ) -> DriveDetails:
     """Return the details of a drive.
@@ -45,8 +37,6 @@ def drive_details(
     Parameters
     ----------
     ready : the estimators that ran. main : name of the selected estimate. read : returns the track of a name.
-    signals : what the estimators saw.
-    brief : without error decomposition, for which estimators run once more.
     metadata : with the metadata of the log.
     """
     truth, slow = read(TRUTH), drive.car.vehicle.low_speed_blend_m_s
@@ -57,7 +47,6 @@ def drive_details(
     return DriveDetails(
         faults=next((f for e in asked if (f := _faults(read, e.name)) is not None), None),
         standings=[] if truth is None else standings(main, _rivals(ready, by_name[main], read), read, truth, slow),
-        error_budget=no_budget(_LEFT_OUT) if brief else _budget(drive, by_name.get(PHYSICS), read, signals),
         path_drift=None if truth is None else path_drift(answer, truth),
         metadata=_metadata(drive) if metadata else {},
     )
@@ -85,24 +74,6 @@ def _is_same(track: StateTrack | None, main: StateTrack | None) -> bool:
     if track is None or main is None or len(track) != len(main):
         return False
     return np.array_equal(track.sideslip_rad, main.sideslip_rad, equal_nan=True)
-
-
-def _budget(drive: Drive, physics: Estimator | None, read: _Read, signals: Signals) -> ErrorBudget:
-    truth, slow = read(TRUTH), drive.car.vehicle.low_speed_blend_m_s
-    if truth is None:
-        return no_budget("the log has no ground truth")
-    if physics is None:
-        return no_budget(f"{PHYSICS} did not run")
-    if "sideslip_rad" in drive.plan.dependent:
-        return no_budget("the ground truth of sideslip is an input or an estimate, and no independent one")
-    track = read(PHYSICS)
-    assert track is not None
-    sample = sample_drive(signals, truth, _squared_error(track, truth, slow))  # where there is most to explain
-    return no_budget("nothing is scored") if sample is None else error_budget(physics, sample, slow)
-
-
-def _squared_error(track: StateTrack, truth: StateTrack, low_speed_m_s: float) -> FloatArray:
-    return signal_error(track, truth, "sideslip_rad", low_speed_m_s) ** 2
 
 
 def _metadata(drive: Drive) -> dict[str, str]:

@@ -1,35 +1,35 @@
-"""The one way to estimate: estimators over the windows of a drive, with divergence, intervals and poses."""
+"""The one way to estimate: estimators over a drive, with divergence, intervals and poses."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.drive.reading import Drive, WholeDrive, no_samples
+from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.drive.truth import valid_as_a_whole
-from pdhef_logtool.drive.windows import with_look_ahead
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.base import Estimator, look_ahead_of
+from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.intervals import TrackCalibrator
-from pdhef_logtool.estimators.latency_compensation import WindowState, run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.online_calibrated import OnlineBand, OnlineCalibrated
 from pdhef_logtool.estimators.presets import preset_of
 from pdhef_logtool.estimators.self_calibrated import SELF_CALIBRATED, CalibratedBand
 from pdhef_logtool.records.errors import EstimatorError
-from pdhef_logtool.records.geometry import DeadReckoner
+from pdhef_logtool.records.geometry import dead_reckon
 from pdhef_logtool.records.readings import without_impossible_states
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
+from pdhef_logtool.results.sink import TRUTH
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimated:
-    """One window with the tracks of all estimators, in their order.
+    """A drive with the tracks of all estimators by name, in their order.
 
     ``truth`` is what they are scored against, ``drawn_truth`` is what is written: the same with a pose, and valid where
     all of it is known; None if the log has none.
@@ -38,70 +38,60 @@ class Estimated:
     signals: Signals
     truth: StateTrack | None
     drawn_truth: StateTrack | None
-    tracks: tuple[StateTrack, ...]
-    share_done: float
+    tracks: dict[str, StateTrack]
+
+    def read(self, name: str) -> StateTrack | None:
+        """Return the track of a name, :data:`TRUTH` is the ground truth; None if there is none."""
+        return self.truth if name == TRUTH else self.tracks.get(name)
 
 
-def estimate_windows(
-    drive: Drive | WholeDrive,
+def estimate_drive(
+    drive: WholeDrive,
     estimators: Sequence[Estimator],
     *,
     watched: bool = True,
     drawn: bool = True,
     intervals: TrackCalibrator | None = None,
     causality: CausalityCheck | None = None,
-) -> Iterator[Estimated]:
-    """Run estimators over a drive window by window; joined, the windows give the same bits as one over all.
+    progress: Callable[[float], None] = lambda _share: None,
+) -> Estimated:
+    """Run estimators over a drive.
 
     Parameters
     ----------
     watched : complete ``diverged`` by the monitor of wrong branches. drawn : dead-reckon poses.
     intervals : calibrates them; None leaves them as the estimators give them.
-    causality : collects the estimators that fail, or declare themselves causal and look ahead: they have no further
-        tracks. None does not check, and a failure is raised.
-
-    Raises
-    ------
-    EstimatorError
-        The drive contains no stamp.
+    causality : collects the estimators that fail, or declare themselves causal and look ahead: they have no track.
+        None does not check, and a failure is raised.
+    progress : called with the share of the estimators that is done.
     """
-    from pdhef_logtool.estimators.divergence import DivergenceWatch
+    from pdhef_logtool.estimators.divergence import watched_track
 
-    watch = DivergenceWatch(drive.plan.vehicle) if watched else None
-    states: dict[str, WindowState] = {}
-    poses = {e.name: DeadReckoning() for e in estimators}
-    truth_pose = DeadReckoning()
-    start: tuple[float, float, float] | None = None
-    look_ahead_s = max(map(look_ahead_of, estimators), default=0.0)
-    for window, ahead in with_look_ahead(drive.windows(), look_ahead_s):
-        signals, truth = window.signals, window.truth
-        if start is None:
-            start = first_pose(truth)
-        drawn_truth = truth
-        if drawn and drawn_truth is not None:
-            if not drive.plan.has_truth_pose:
-                drawn_truth = truth_pose.add(drawn_truth, start)
-            drawn_truth = valid_as_a_whole(drawn_truth, drive.plan.derivation, drive.plan.vehicle.standstill_m_s)
-        tracks = []
-        for estimator in estimators:
-            before = states.get(estimator.name)
-            try:
-                if causality is not None and estimator.name in causality.failed:
-                    continue
-                track, states[estimator.name] = run_window(estimator, signals, before, ahead, causality)
-            except EstimatorError as error:
-                if causality is None:
-                    raise
-                causality.failed[estimator.name] = f"failed: {error}"
-                continue
-            track = without_impossible_states(track)
-            track = track if watch is None else watch.add(track, signals)
-            track = track if intervals is None else intervals.add(track, signals)
-            track = track.without_sideslip_below(drive.plan.vehicle.standstill_m_s)
-            tracks.append(poses[estimator.name].add(track, start) if drawn else track)
-        yield Estimated(signals, truth, drawn_truth, tuple(tracks), window.share_done)
-    if start is None:
-        raise no_samples(drive.path)
+    signals, truth, vehicle = drive.signals, drive.truth, drive.plan.vehicle
+    start = first_pose(truth)
+    drawn_truth = truth
+    if drawn and drawn_truth is not None:
+        if not drive.plan.has_truth_pose:
+            drawn_truth = dead_reckoned(drawn_truth, start)
+        drawn_truth = valid_as_a_whole(drawn_truth, drive.plan.derivation, vehicle.standstill_m_s)
+    tracks = {}
+    for number, estimator in enumerate(estimators):
+        progress(number / len(estimators))
+        try:
+            track = run_estimator(estimator, signals, causality)
+        except EstimatorError as error:
+            if causality is None:
+                raise
+            causality.failed[estimator.name] = f"failed: {error}"
+            continue
+        if causality is not None and estimator.name in causality.failed:
+            continue
+        track = without_impossible_states(track)
+        track = watched_track(track, signals, vehicle) if watched else track
+        track = track if intervals is None else intervals.apply(track, signals)
+        track = track.without_sideslip_below(vehicle.standstill_m_s)
+        tracks[track.name] = dead_reckoned(track, start) if drawn else track
+    return Estimated(signals, truth, drawn_truth, tracks)
 
 
 def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
@@ -123,31 +113,22 @@ def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
                 continue
             applies = online if isinstance(estimator, OnlineCalibrated) else calibrated
             if applies is not None:
-                posterior[estimator.name] = applies.add
+                posterior[estimator.name] = applies.widen
             continue
         other = getattr(estimator, "calibrated_as", None)
         algorithms[estimator.name] = [resolve(e) for e in (estimator, other) if e is not None]
         if band is not None and preset_of(estimator.name) in banded:
-            posterior[estimator.name] = band.add
+            posterior[estimator.name] = band.widen
     of_car = car.intervals is not None and car.intervals.physics_sha256 == car.physics_sha256
     return TrackCalibrator(car.intervals, algorithms, fixed_notes, posterior, of_car=of_car)
 
 
-class DeadReckoning:
-    """Dead-reckons one track from window to window, from the true pose at the start where there is one."""
-
-    def __init__(self) -> None:
-        self._reckoner: DeadReckoner | None = None
-
-    def add(self, track: StateTrack, start: tuple[float, float, float]) -> StateTrack:
-        """Return the next window of the track with its pose; ``start`` is where the first window begins."""
-        if len(track) == 0:
-            return track
-        vx, vy = track.vx_m_s, track.vy_m_s
-        if not np.isfinite(vy).any():
-            vy = np.where(np.isfinite(vx), 0.0, np.nan)  # no claim on v_y: drawn along the heading
-        self._reckoner = self._reckoner or DeadReckoner(start)
-        return track.with_pose(*self._reckoner.add(track.stamps_ns, vx, vy, track.yaw_rate_rad_s))
+def dead_reckoned(track: StateTrack, start: tuple[float, float, float]) -> StateTrack:
+    """Return a track with its pose, dead-reckoned from ``start``."""
+    vx, vy = track.vx_m_s, track.vy_m_s
+    if not np.isfinite(vy).any():
+        vy = np.where(np.isfinite(vx), 0.0, np.nan)  # no claim on v_y: drawn along the heading
+    return track.with_pose(*dead_reckon(track.stamps_ns, vx, vy, track.yaw_rate_rad_s, start))
 
 
 def first_pose(truth: StateTrack | None) -> tuple[float, float, float]:

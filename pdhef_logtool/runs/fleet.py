@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pdhef_logtool.estimators.table import FILTERS
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput, Logs, find_logs
@@ -38,16 +38,15 @@ from pdhef_logtool.runs.pipeline import (
     write_run,
     write_verdicts,
 )
-from pdhef_logtool.runs.planning import Plan, PlannedLog, calibrate_pools, plan_logs, settings_of
-from pdhef_logtool.runs.reporting import FleetProgress, collect, remove_part, sweep_parts, write_run_pages
+from pdhef_logtool.runs.planning import Plan, PlannedLog, calibrate_pools, plan_logs, settings_of, sweep_parts
+from pdhef_logtool.runs.reporting import FleetProgress, collect, write_run_pages
 from pdhef_logtool.runs.self_calibrating import calibrate_pool
 from pdhef_logtool.runs.stored_output import StoredEnd, StoredOutput, stored_drive
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work, failed_outcome, log_identity, run_drive, run_on_node
-from pdhef_logtool.storage.files import writing
 from pdhef_logtool.storage.object_store import is_url
 from pdhef_logtool.storage.outputs import OutputFolder
 from pdhef_logtool.workers.ray_supervisor import supervise_on_ray
-from pdhef_logtool.workers.supervisor import Ended, Limits, Tell, supervise
+from pdhef_logtool.workers.supervisor import Ended, Limits, supervise
 
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
@@ -60,9 +59,6 @@ FULL_WORST = 5
 SILENCE_S = 600.0
 #: Modules that workers have loaded; polars starts threads at its first query, and none of these makes one.
 _PRELOAD = ("pdhef_logtool.runs.*", "pdhef_logtool.logs.*", "pdhef_logtool.results.parquet_sink", *FILTERS)
-_CONTINUE = "; --resume goes on"
-#: Start of the name of the file by which nodes recognise the output folder.
-_MARK = ".nodes-"
 #: Numbers the runs of this process.
 _RUNS = itertools.count()
 
@@ -247,7 +243,8 @@ def _prepare(
     planned = plan_logs(inputs, journal, twice=config.cars is not None, neutral=config.no_position, reporter=reporter)
     _check_names([p.log for p in planned], output, job, reporter)
     pools = calibrate_pools(planned, job.cars, job.mapping, job.config)
-    plan = Plan.of(output, journal, planned, settings_of(job.config, pools), job.cars, schedule.only)
+    plan = Plan(output, journal, planned, settings_of(job.config, pools), job.cars, stored is not None)
+    plan.check_only(schedule.only)
     return _Fleet(job, plan, pools, schedule, limits, full_worst, work, reporter, stored)
 
 
@@ -294,7 +291,7 @@ class _Fleet:
             if verdicts is not None:
                 write_verdicts(self.job.junit, verdicts, results)
             failed = {e.label for p in self.plan.logs if (e := self.plan.entry(p)) is not None and e.failed}
-            pages = failed if self.job.config.kept == "full" else ()
+            pages = failed | self.plan.damaged_pages() if self.job.config.kept == "full" else ()
             write_run_pages(output, self.job.report, pages, self.reporter)
             if self.stored is not None:
                 self.stored.publish()
@@ -302,9 +299,11 @@ class _Fleet:
 
     def _save(self, stop: BaseException) -> None:
         """Write the files of the drives that are done when a run is interrupted."""
-        if done := self.plan.done:
-            stop.add_note("--resume goes on")
-        stop.add_note(f"{done} of {len(self.plan.logs)} logs are done")
+        notes = [f"{self.plan.done} of {len(self.plan.logs)} logs are done", "--resume goes on"]
+        if isinstance(stop, OutputError | WorkerError):
+            stop.remedy = "; ".join(filter(None, [stop.remedy, *notes]))
+        else:
+            stop.__notes__ = notes[::-1]
         sweep_parts(self.plan.journal, self.plan.output)
         with suppress(PdhefError):
             collect(self.plan, self.job.config, self.job.validation)
@@ -335,43 +334,24 @@ class _Fleet:
     ) -> Iterator[Ended[DriveTask, DriveEnd]]:
         """Yield how the tasks end, on this machine or on a cluster."""
         work = self.work if self.stored is None else partial(stored_drive, self.stored.objects, self.work)
-        if self.schedule.ray is None:
+        schedule, limits = self.schedule, self.limits
+        if schedule.ray is None:
             ends = supervise(
-                work, tasks, jobs=self.schedule.jobs, limits=self.limits, preload=_PRELOAD, progress=update,
+                work, tasks, jobs=schedule.jobs, limits=limits, preload=_PRELOAD, progress=update,
                 warn=self.reporter.warn,
             )  # fmt: skip
         else:
-            ends = self._on_cluster(work, tasks, self.schedule.ray)
+            on_node = partial(run_on_node, work, Path.cwd(), self.stored is None)
+            ends = supervise_on_ray(on_node, tasks, address=schedule.ray, limits=limits, preload=_PRELOAD)
         with closing(ends):
-            try:
-                for ended in ends:
-                    result = ended.result
-                    if isinstance(result, OutputError):
-                        if self.stored is not None:
-                            result.remedy += _CONTINUE
-                        raise result
-                    if isinstance(result, StoredEnd):
-                        assert self.stored is not None
-                        result = self.stored.take(result)
-                    yield Ended(ended.number, ended.item, result, ended.failure)
-            except WorkerError as error:
-                error.remedy += _CONTINUE
-                raise
-
-    def _on_cluster(
-        self, work: Callable[[DriveTask, Tell], Any], tasks: Iterator[DriveTask], address: str
-    ) -> Generator[Ended[DriveTask, Any], None, None]:
-        """Yield how the tasks end on the nodes of a cluster, which must see the output folder unless it is a URL."""
-        mark = None if self.stored is not None else self.plan.output.resolve() / f"{_MARK}{self._name}"
-        on_node = partial(run_on_node, work, Path.cwd(), mark)
-        if mark is not None:
-            with writing(mark):
-                mark.touch()
-        try:
-            yield from supervise_on_ray(on_node, tasks, address=address, limits=self.limits, preload=_PRELOAD)
-        finally:
-            if mark is not None:
-                mark.unlink(missing_ok=True)
+            for ended in ends:
+                result = ended.result
+                if isinstance(result, OutputError):
+                    raise result
+                if isinstance(result, StoredEnd):
+                    assert self.stored is not None
+                    result = self.stored.take(result)
+                yield Ended(ended.number, ended.item, result, ended.failure)
 
     def _task(self, planned: PlannedLog, keep: Keep) -> DriveTask:
         label = planned.log.stem
@@ -403,18 +383,13 @@ class _Fleet:
         return DriveEnd(failed_outcome(log, f"{failure.reason}{tries}{last}", self.job.config), None, again=True)
 
     def _record(self, log: PlannedLog, end: DriveEnd, keep: str, *, quarantined: bool) -> None:
-        """Write how a drive ended into the journal, then remove its former figures."""
         car = None if end.car is None else self.plan.add_car(end.car)
-        journal = self.plan.journal
-        before = journal.entries.get(log.log.stem)
         failed = end.outcome.failed is not None and end.part is None
         entry = Entry(
-            log.log.stem, log.place, end.identity or log.identity, self.plan.setting, car, keep, end.part, end.outputs,
+            log.log.stem, log.place, end.identity or log.identity, self.plan.setting, car, keep, end.part,
             end.failed_checks, end.error_rad, failed, end.again, quarantined,
         )  # fmt: skip
-        journal.add(entry, end.outcome)
-        if before is not None and before.part not in (None, end.part):
-            remove_part(self.plan.output, str(before.part))
+        self.plan.add(entry, end)
 
     def _warn(self, line: str) -> None:
         """Print a warning once; with many drives, only their reports contain it."""

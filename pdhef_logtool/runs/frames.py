@@ -11,10 +11,10 @@ from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.table import Options, Skipped, runnable
-from pdhef_logtool.records.signals import Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH
-from pdhef_logtool.runs.estimating import calibrator, estimate_windows
+from pdhef_logtool.runs.estimating import calibrator, estimate_drive
 from pdhef_logtool.runs.selection import default_names
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def choose(drive: Drive, names: Sequence[str] | None = None) -> tuple[list[Estim
 
 
 def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
-    """Run estimators over a drive and keep all of it in memory; long logs: :func:`~.estimating.estimate_windows`.
+    """Run estimators over a drive.
 
     Parameters
     ----------
@@ -74,18 +74,13 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     (['truth', 'zero', 'phy-ukf'], 'physics-ukf', 2853)
     """
     estimators, skipped = choose(drive, names)
-    parts: dict[str, list[StateTrack]] = {}
-    signals: list[Signals] = []
     intervals = calibrator(drive.car, estimators)
     if intervals.warning and intervals.warning not in drive.notes:
         drive.tell(intervals.warning)
-    for window in estimate_windows(drive, estimators, intervals=intervals):
-        signals.append(window.signals)
-        for track in (*((window.drawn_truth,) if window.drawn_truth is not None else ()), *window.tracks):
-            parts.setdefault(track.name, []).append(track)
+    estimated = estimate_drive(drive.whole(), estimators, intervals=intervals)
+    truth = {} if estimated.drawn_truth is None else {TRUTH: estimated.drawn_truth}
     algorithms = {e.name: resolve(e) for e in estimators}
-    tracks = {name: concatenate(of_name) for name, of_name in parts.items()}
-    return Estimates(drive, tracks, join_signals(signals), algorithms, tuple(skipped))
+    return Estimates(drive, truth | estimated.tracks, estimated.signals, algorithms, tuple(skipped))
 
 
 def score(estimates: Estimates) -> pl.DataFrame:

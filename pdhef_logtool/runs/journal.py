@@ -11,25 +11,23 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.opened_run import JOURNAL_FILE
 from pdhef_logtool.results.run_report import CarFacts, LogOutcome
-from pdhef_logtool.storage.documents import digest, jsonable
+from pdhef_logtool.storage.documents import digest, file_sha256, jsonable
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
-_FORMAT = {"format": "pdhef.journal", "version": 2}
+_FORMAT = {"format": "pdhef.journal", "version": 3}
 #: Part of what a checksum is of, so that lines of another version of the format are left out as damaged ones are.
-_VERSION = b"pdhef.journal 2"
-#: Takes the place of a damaged line.
-_LEFT_OUT = {"left_out": "a damaged line"}
+_VERSION = b"pdhef.journal 3"
 _DIGITS = 16
 #: Bytes of the last entry of a line: the checksum of what is before it.
 _SUM_BYTES = len(b',"sum":""}\n') + _DIGITS
@@ -83,7 +81,6 @@ class Entry:
     identity : what the log is known by, None where nobody could read it. setting, car : digests of what it was run
         with; car None where it has none. keep : what was written.
     part : the file of its figures below the run's folder, None without. failed_checks : those that count.
-    outputs : :func:`outputs_digest` of what it left, None where that is not known.
     error_rad : RMSE of the selected sideslip, None where it is not scored against independent ground truth.
     failed : whether nothing came out. again : whether that may be otherwise next time, as on a full disk.
     quarantined : whether it took its worker along.
@@ -97,7 +94,6 @@ class Entry:
     car: str | None
     keep: str
     part: str | None = None
-    outputs: str | None = None
     failed_checks: int = 0
     error_rad: float | None = None
     failed: bool = False
@@ -112,14 +108,13 @@ class Journal:
 
     Attributes
     ----------
-    entries : the last of each label. settings, cars : by digest, in words what a drive was run with.
+    entries : the last of each label. described : settings and cars by digest.
     damaged : lines that were left out when it was read.
     """
 
     path: Path
     entries: dict[str, Entry] = field(default_factory=dict)
-    settings: dict[str, dict[str, str]] = field(default_factory=dict)
-    cars: dict[str, dict[str, Any]] = field(default_factory=dict)
+    described: dict[str, dict[str, dict[str, Any]]] = field(default_factory=lambda: {"setting": {}, "car": {}})
     damaged: int = 0
     _places: dict[str, tuple[Place, str | None, str]] = field(default_factory=dict)
     _labels: dict[str, list[str]] = field(default_factory=dict)
@@ -142,11 +137,19 @@ class Journal:
         """
         journal = cls.of(folder)
         for line in journal._lines():
-            document = _document(line)
-            journal.damaged += document is None
-            journal._take(_LEFT_OUT if document is None else document, journal._end)
+            if (document := _document(line)) is None:
+                journal.damaged += 1
+            else:
+                journal._take(document, journal._end)
             journal._end += len(line)
+        journal._repeat_failures()
         return journal
+
+    def _repeat_failures(self) -> None:
+        """Repeat failed drives if a line is damaged: it may have recorded that a drive has not failed since."""
+        for label, entry in self.entries.items():
+            if self.damaged and entry.failed:
+                self.entries[label] = replace(entry, again=True, quarantined=False)
 
     def _lines(self) -> Iterator[bytes]:
         try:
@@ -159,17 +162,17 @@ class Journal:
             raise OutputError(expected="a readable journal", got=got, where=str(self.path)) from error
 
     def begin(self) -> None:
-        """Make it a whole file: a new one in place of an old one, or the old one with a mark for each damaged line."""
+        """Make it a complete file: a new one in place of an old one, or the old one without damaged lines."""
         if self._end and not self.damaged:
             return
         with writing(self.path), PendingFile(self.path) as pending, open_new(pending.path) as new:
             had, self._end = self._end, new.write(_line(_FORMAT))
             for line in self._lines() if had else ():
-                if (document := _document(line)) is None:
-                    document, line = _LEFT_OUT, _line(_LEFT_OUT)
-                if "format" not in document:
+                document = _document(line)
+                if document is not None and "format" not in document:
                     self._take(document, self._end)
                     self._end += new.write(line)
+        self._repeat_failures()
 
     def known(self, place: Place) -> tuple[str, str | None] | None:
         """Return label and identity of the log that lies there, if it lay there before and has not been changed."""
@@ -191,6 +194,16 @@ class Journal:
 
     def outcome(self, entry: Entry) -> LogOutcome:
         """Return how a drive ended; raises OutputError where its line was damaged since it was read."""
+        outcome = self._document_of(entry)["outcome"]
+        car = None if outcome["car"] is None else CarFacts(**outcome["car"])
+        return LogOutcome(**{**outcome, "car": car, "lost": tuple(outcome["lost"])})
+
+    def outputs(self, entry: Entry) -> dict[str, str]:
+        """Return the :func:`states_of` a drive's files; raises OutputError as :meth:`outcome` does."""
+        outputs: dict[str, str] = self._document_of(entry)["outputs"]
+        return outputs
+
+    def _document_of(self, entry: Entry) -> dict[str, Any]:
         with self.path.open("rb") as file:
             file.seek(entry.offset)
             document = _document(file.readline())
@@ -201,33 +214,27 @@ class Journal:
                 where=str(self.path),
                 remedy="--resume runs it again",
             )
-        outcome = document["outcome"]
-        car = None if outcome["car"] is None else CarFacts(**outcome["car"])
-        return LogOutcome(**{**outcome, "car": car, "lost": tuple(outcome["lost"])})
+        return document
 
-    def add(self, entry: Entry, outcome: LogOutcome) -> None:
-        """Write down how a drive ended; raises OutputError."""
+    def add(self, entry: Entry, outcome: LogOutcome, outputs: Mapping[str, str]) -> Entry:
+        """Write how a drive ended and return the entry with its offset; raises OutputError."""
         document = asdict(entry)
         del document["offset"]
-        offset = self._append({**document, "outcome": jsonable(outcome)})
-        self._keep(replace(entry, offset=offset))
+        offset = self._append({**document, "outcome": jsonable(outcome), "outputs": dict(outputs)})
+        entry = replace(entry, offset=offset)
+        self._keep(entry)
+        return entry
 
     def add_place(self, label: str, place: Place, identity: str) -> None:
         """Write down that a known log lies there too."""
         self._append({"label": label, "place": asdict(place), "identity": identity, "moved": True})
         self._places[place.key] = place, identity, label
 
-    def add_setting(self, digest: str, description: Mapping[str, str]) -> None:
-        """Write down what a setting is, once."""
-        if digest not in self.settings:
-            self._append({"setting": digest, "is": dict(description)})
-            self.settings[digest] = dict(description)
-
-    def add_car(self, digest: str, description: Mapping[str, Any]) -> None:
-        """Write down what a car is, once."""
-        if digest not in self.cars:
-            self._append({"car": digest, "is": dict(description)})
-            self.cars[digest] = dict(description)
+    def describe(self, kind: Literal["setting", "car"], digest: str, description: Mapping[str, Any]) -> None:
+        """Record the values of a setting or a car once."""
+        if digest not in (known := self.described[kind]):
+            self._append({kind: digest, "is": dict(description)})
+            known[digest] = dict(description)
 
     def _append(self, document: Mapping[str, Any]) -> int:
         offset, data = self._end, _line(document)
@@ -240,18 +247,13 @@ class Journal:
 
     def _take(self, document: dict[str, Any], offset: int) -> None:
         if "is" in document:
-            kind, descriptions = ("setting", self.settings) if "setting" in document else ("car", self.cars)
-            descriptions[document[kind]] = document["is"]
+            kind = "setting" if "setting" in document else "car"
+            self.described[kind][document[kind]] = document["is"]
         elif "moved" in document:
             place = Place(**document["place"])
             self._places[place.key] = place, document["identity"], document["label"]
-        elif document == _LEFT_OUT:
-            # The line may have stated that a drive that failed before has not failed since.
-            for label, entry in self.entries.items():
-                if entry.failed:
-                    self.entries[label] = replace(entry, again=True, quarantined=False)
         elif "label" in document:
-            content = {k: v for k, v in document.items() if k != "outcome"}
+            content = {k: v for k, v in document.items() if k not in ("outcome", "outputs")}
             self._keep(Entry(**{**content, "place": Place(**content["place"])}, offset=offset))
 
     def _keep(self, entry: Entry) -> None:
@@ -283,12 +285,21 @@ def _sum(data: bytes) -> bytes:
     return b',"sum":"%s"}\n' % text.encode()
 
 
-def outputs_digest(*paths: Path) -> str:
-    """Return a digest of the files by which a drive counts as done; raises OSError."""
-    total = hashlib.sha256()
-    for path in paths:
-        total.update(hashlib.sha256(path.read_bytes()).digest())
-    return total.hexdigest()[:_DIGITS]
+def states_of(output: Path, names: Iterable[str]) -> dict[str, str]:
+    """Return size and digest of the files below an output that exist, by name."""
+    return {name: _state_of(output / name) for name in names if (output / name).is_file()}
+
+
+def is_unchanged(path: Path, state: str) -> bool:
+    """Return whether a file has this size and digest."""
+    try:
+        return state.startswith(f"{path.stat().st_size} ") and state == _state_of(path)
+    except OSError:
+        return False
+
+
+def _state_of(path: Path) -> str:
+    return f"{path.stat().st_size} {file_sha256(path)[:_DIGITS]}"
 
 
 def digest_of(content: Any) -> str:

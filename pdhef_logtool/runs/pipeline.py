@@ -8,16 +8,18 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from hashlib import sha256
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
 from pdhef_logtool.car.parts import PHYSICS
-from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.friction import FrictionSource
-from pdhef_logtool.drive.reading import Drive, lost_texts
+from pdhef_logtool.drive.plan import DrivePlan, setup_of
+from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
 from pdhef_logtool.drive.setup import setup_toml
-from pdhef_logtool.drive.windows import DrivePlan, setup_of
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
@@ -73,13 +75,12 @@ from pdhef_logtool.results.run_report import (
 )
 from pdhef_logtool.results.sink import TRUTH, Event, Shown, Sink
 from pdhef_logtool.runs.config import Keep, RunConfig
-from pdhef_logtool.runs.estimating import calibrator, estimate_windows
+from pdhef_logtool.runs.estimating import Estimated, calibrator, estimate_drive
 from pdhef_logtool.runs.reference_audit import audit_truth
 from pdhef_logtool.runs.referencing import DriveReference, reference_of
 from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
 from pdhef_logtool.runs.selection import choose_main, choose_over_time, contradiction, default_names
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
-from pdhef_logtool.runs.track_store import TrackStore
 from pdhef_logtool.storage.documents import digest, file_sha256, jsonable
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder, check_no_input
@@ -115,6 +116,8 @@ STALE_FILES = (SETUP_FILE, PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FI
 
 #: Blocks of a requirement in a brief report.
 _BRIEF_BLOCKS = 12
+#: Outputs are written in pieces of this duration, so that their buffers stay small.
+_PIECE_NS = 60_000_000_000
 _SILENT = "{} has no valid row although the car moves"
 _NO_COPY = "annotated.mcap contains the tool's topics only: a log of kind {} has no messages to copy"
 _ALL_SILENT = "no estimator has a valid row although the car moves"
@@ -297,7 +300,7 @@ def run_log(
         Nothing of the log can be used; nothing is then left under a final name.
     """
     reporter.progress(log_input.stem, 0.0)
-    with read_cached(log_input, car, mapping, config.read_options, reporter.warn) as drive:
+    with read_drive(log_input, car, mapping, config.read_options, tell=reporter.warn) as drive:
         calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
         car = self_calibrated(drive, calibration)
         ready, skipped, requested = _choose_estimators(drive, config, car)
@@ -336,27 +339,27 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
     drive, car = job.drive, job.car
     intervals = calibrator(car, job.ready)
     with outputs.begin(log_place(drive.name), stale=STALE_FILES) as change, ExitStack() as opened:
-        store = opened.enter_context(TrackStore(change.scratch / "tracks"))
         causality = CausalityCheck()
         causality.failed |= {s.name: s.reason for s in job.skipped if s.is_error}
-        signals = _estimate(drive, job.ready, intervals, store, reporter, causality)
+        estimated = _estimate(drive, job.ready, intervals, reporter, causality)
         job = replace(job, ready=_without_failed(drive, job.ready, causality.failed))
-        scored = _score(job, store, signals)
+        scored = _score(job, estimated)
         main = choose_main(job.ready, scored.rows, proven=drive.car.has_evidence, named=config.estimators is not None)
         if config.calibrate == "online" and job.calibration is not None and not drive.car.has_evidence:
-            over_time = choose_over_time(job.ready, job.calibration, store.read, signals, job.sensors)
+            over_time = choose_over_time(job.ready, job.calibration, estimated.read, estimated.signals, job.sensors)
             main = replace(main, over_time=over_time, name=over_time[-1][1])
         left_out = frozenset(e.name for e in job.ready) - job.requested - {name for _, name in main.spans}
         job, scored, main = _without(left_out, job, scored, main)
         shown = _shown(main, [e.name for e in job.ready])
-        sinks = opened.enter_context(_open_sinks(change, job, config, shown, main.spans, outputs.path, len(signals)))
-        _write(store, sinks, left_out | frozenset(causality.failed))
+        rows = len(estimated.signals)
+        sinks = opened.enter_context(_open_sinks(change, job, config, shown, main.spans, outputs.path, rows))
+        _write(estimated, sinks, left_out)
         if intervals.warning:
             drive.tell(intervals.warning)
         if not scored.moves:
             drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
         losses = merge_losses([drive.losses, *(s.lost for s in sinks), *_losses(drive, scored, causality.failed)])
-        facts = _facts(job, config, main, scored, (store, signals), (intervals, causality.failed), losses)
+        facts = _facts(job, config, main, scored, estimated, (intervals, causality.failed), losses)
         report = build_report(facts)
         if config.no_position:
             report = without_names(report, drive.path, drive.name)
@@ -375,23 +378,23 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
     return LogResult(outcome, change.target, report, tuple(facts.metrics), failed_checks=failed_checks)
 
 
-def _score(job: _Job, store: TrackStore, signals: Signals) -> Evaluation:
-    """Score the stored tracks; add the events of an estimated friction and a contradiction as a note of the drive."""
+def _score(job: _Job, estimated: Estimated) -> Evaluation:
+    """Score the tracks; add the events of an estimated friction and a contradiction as a note of the drive."""
     drive = job.drive
     sensors = job.sensors(job.calibration)
-    scored = evaluate(drive, [e.name for e in job.ready], store.read, signals, sensors)
+    scored = evaluate(drive, [e.name for e in job.ready], estimated.read, estimated.signals, sensors)
     if drive.friction.bank is not None:
-        observable = friction_events(drive.friction, signals)
+        observable = friction_events(drive.friction, estimated.signals)
         scored = replace(scored, events=sorted([*scored.events, *observable], key=in_time))
-    _audit(job, store)
+    _audit(job, estimated)
     if against := contradiction(scored.rows):
         drive.notes.append(f"WARNING: {against.text}")  # the selected estimate's text gives the consequence
     return scored
 
 
-def _audit(job: _Job, store: TrackStore) -> None:
+def _audit(job: _Job, estimated: Estimated) -> None:
     """Compare the ground truth of sideslip with the reference, and note where they contradict each other."""
-    truth, reference = store.read(TRUTH), store.read(REFERENCE)
+    truth, reference = estimated.truth, estimated.read(REFERENCE)
     if truth is None or reference is None or job.reference is None:
         return
     contradictions = audit_truth(truth, reference, job.drive.car.vehicle.low_speed_blend_m_s)
@@ -426,7 +429,7 @@ def _facts(
     config: RunConfig,
     main: MainFacts,
     scored: Evaluation,
-    estimates: tuple[TrackStore, Signals],
+    estimated: Estimated,
     ran: tuple[TrackCalibrator, dict[str, str]],
     losses: Sequence[Loss],
 ) -> ReportFacts:
@@ -435,7 +438,7 @@ def _facts(
     from pdhef_logtool.results.error_places import largest_errors
     from pdhef_logtool.runs.drive_details import drive_details
 
-    drive, (store, signals), (intervals, failed) = job.drive, estimates, ran
+    drive, signals, (intervals, failed) = job.drive, estimated.signals, ran
     algorithms = {e.name: resolve(e) for e in job.ready}
     estimators = [
         EstimatorFacts(
@@ -454,12 +457,10 @@ def _facts(
     estimators += [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in skipped]
     digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
     rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows]
-    truth, selected, vehicle = store.read(TRUTH), store.read(main.name), job.car.vehicle
+    truth, selected, vehicle = estimated.truth, estimated.read(main.name), job.car.vehicle
     space = operating_space(signals, truth, selected, vehicle)
-    details = drive_details(
-        drive, job.ready, main.name, store.read, signals, brief=config.kept != "full", metadata=not config.no_position
-    )
-    others = [t for n in (REFERENCE, PHYSICS, *algorithms) if n != main.name and (t := store.read(n)) is not None]
+    details = drive_details(drive, job.ready, main.name, estimated.read, metadata=not config.no_position)
+    others = [t for n in (REFERENCE, PHYSICS, *algorithms) if n != main.name and (t := estimated.read(n)) is not None]
     return replace(
         report_facts(drive, job.car, estimators, rows, scored.events, losses),
         friction=friction_facts(drive.friction),
@@ -469,12 +470,12 @@ def _facts(
         space=space,
         largest_errors=[] if selected is None else largest_errors(selected, truth, others, vehicle.low_speed_blend_m_s),
         details=details,
-        requirements=_requirements(job, main.name, scored, store, space, brief=config.kept == "metrics"),
+        requirements=_requirements(job, main.name, scored, estimated, space, brief=config.kept == "metrics"),
     )
 
 
 def _requirements(
-    job: _Job, main: str, scored: Evaluation, store: TrackStore, space: OperatingSpace, *, brief: bool
+    job: _Job, main: str, scored: Evaluation, estimated: Estimated, space: OperatingSpace, *, brief: bool
 ) -> RequirementFacts:
     """Return the blocks of the plan's requirements in this drive, and the verdicts on the drive alone."""
     from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS, ScoredDrive, requirement_blocks
@@ -482,8 +483,8 @@ def _requirements(
     blocks: list[RequirementBlocks] = []
     slow, dependent = job.car.vehicle.low_speed_blend_m_s, frozenset(job.drive.plan.dependent)
     for name in (TRUTH, REFERENCE):  # the reference where ground truth scores nothing
-        if (base := store.read(name)) is not None:
-            tracks = ScoredDrive(store.read, base, scored.masks, slow, dependent, estimated=name == REFERENCE)
+        if (base := estimated.read(name)) is not None:
+            tracks = ScoredDrive(estimated.read, base, scored.masks, slow, dependent, estimated=name == REFERENCE)
             left = [r for r in job.validation.requirements if all(b.of != r.measured for b in blocks)]
             blocks += requirement_blocks(left, main, tracks, _BRIEF_BLOCKS if brief else MOST_BLOCKS)
     return judged_alone(job.validation, job.drive, main, scored.rows, blocks, space)
@@ -623,7 +624,7 @@ def _open_sinks(
             first = frozenset({shown.main, TRUTH})
             is_named = bool(config.estimators) and config.estimators != (ALL_ESTIMATORS,)
             step_ns = thinned_step_ns(
-                sum(ledger.size for ledger in drive.byte_ledgers),
+                drive.log.size,
                 rows=rows,
                 others=len(job.ready) - 1,
                 span_ns=drive.plan.end_ns - drive.plan.start_ns,
@@ -696,25 +697,21 @@ def _estimate(
     drive: Drive,
     estimators: Sequence[Estimator],
     intervals: TrackCalibrator,
-    store: TrackStore,
     reporter: Reporter,
     causality: CausalityCheck,
-) -> Signals:
-    """Run all estimators over the drive into the store; return the drive's signals for segments."""
+) -> Estimated:
+    """Run all estimators over the drive."""
     plug_ins = ", ".join(filter(None, map(package_of, estimators)))
     label = f"{drive.name} (plug-ins: {plug_ins})" if plug_ins else drive.name
-    reporter.progress(label, 0.0)
-    for window in estimate_windows(drive, estimators, intervals=intervals, causality=causality):
-        store.append_signals(window.signals)
-        if window.truth is not None:
-            store.append(window.truth)
-            assert window.drawn_truth is not None
-            store.append_drawn(window.drawn_truth)
-        for track in window.tracks:
-            store.append(track, drawn=True)
-        reporter.progress(label, 0.8 * window.share_done)
+    estimated = estimate_drive(
+        drive.whole(),
+        estimators,
+        intervals=intervals,
+        causality=causality,
+        progress=lambda share: reporter.progress(label, 0.8 * share),
+    )
     reporter.progress(drive.name, 0.8)
-    return store.signals()
+    return estimated
 
 
 def _without_failed(drive: Drive, ready: Sequence[Estimator], failed: dict[str, str]) -> Sequence[Estimator]:
@@ -730,14 +727,18 @@ def _without_failed(drive: Drive, ready: Sequence[Estimator], failed: dict[str, 
     return left
 
 
-def _write(store: TrackStore, sinks: Sequence[Sink], left_out: frozenset[str]) -> None:
-    """Write the stored windows to the outputs, without the tracks of ``left_out`` estimators."""
-    for signals, tracks in store.windows():
+def _write(estimated: Estimated, sinks: Sequence[Sink], left_out: frozenset[str]) -> None:
+    """Write signals and tracks to the outputs a minute at a time, without the tracks of ``left_out`` estimators."""
+    signals, truth = estimated.signals, estimated.drawn_truth
+    tracks = [track for name, track in estimated.tracks.items() if name not in left_out]
+    tracks = tracks if truth is None else [truth, *tracks]
+    edges_ns = np.arange(signals.stamps_ns[0], signals.stamps_ns[-1] + 1, _PIECE_NS)
+    edges = [*np.searchsorted(signals.stamps_ns, edges_ns).tolist(), len(signals)]
+    for first, last in pairwise(edges):
         for sink in sinks:
-            sink.append_signals(signals)
+            sink.append_signals(signals.rows(first, last))
             for track in tracks:
-                if track.name not in left_out:
-                    sink.append(track)
+                sink.append(track.rows(first, last))
 
 
 def friction_events(friction: FrictionSource, signals: Signals) -> list[Event]:
@@ -800,7 +801,6 @@ def report_facts(
         metrics=rows,
         segments=events,
         losses=losses,
-        file_bytes=drive.byte_ledgers,
         samples=drive.sample_ledger if ledger is None else ledger,
         warnings=drive.notes,
         remarks=drive.remarks,

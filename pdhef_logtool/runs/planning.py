@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.logs.discovery import LogInput, as_taken, hash_log, with_free_stem
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.errors import PdhefError, UsageError
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.no_position import neutral_stem
-from pdhef_logtool.results.opened_run import REPORT_FILE
+from pdhef_logtool.results.opened_run import PAGE_FILE, PARTS, REPORT_FILE
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.config import Keep, RunConfig
-from pdhef_logtool.runs.journal import Entry, Journal, Place, changes, digest_of, outputs_digest
-from pdhef_logtool.runs.pipeline import log_place
+from pdhef_logtool.runs.journal import Entry, Journal, Place, changes, digest_of, is_unchanged
 from pdhef_logtool.runs.self_calibrating import calibrate_pool
-from pdhef_logtool.runs.working import log_identity
+from pdhef_logtool.runs.working import DriveEnd, log_identity
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -35,10 +35,7 @@ _NO_SETTING = frozenset(
     {
         "keep",
         "annotate",
-        "cache",
-        "cache_max_gb",
         "allow_private_redirects",
-        "window_s",
         "car",
         "cars",
         "network",
@@ -49,6 +46,7 @@ _FILES = ("mapping", "msgs", "plan", "cars", "setup", "sensor_profile")
 _READERS = 16
 _REPEATED = "they are tried again"
 _DAMAGED = "their outputs are damaged"
+_GONE = "their outputs are gone"
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,35 +169,28 @@ def settings_of(config: RunConfig, pools: dict[str, SelfCalibration | None]) -> 
 
 @dataclass(slots=True, eq=False)
 class Plan:
-    """The logs of a run, their settings, and what the journal in the output folder has of them."""
+    """The logs of a run, their settings, and what the journal in the output folder has of them.
+
+    ``is_remote``: of the outputs only reports and figures are in the folder.
+    """
 
     output: Path
     journal: Journal
     logs: Sequence[PlannedLog]
     settings: dict[str, str]
     cars: RunCars
+    is_remote: bool = False
     _current_cars: dict[str, dict[str, Any]] | None = None
-    _sound: dict[int, bool] = field(default_factory=dict)
+    _damages: dict[int, str | None] = field(default_factory=dict)
     setting: str = field(init=False)
 
     def __post_init__(self) -> None:
         self.setting = digest_of(self.settings)
 
-    @classmethod
-    def of(
-        cls, output: Path, journal: Journal, logs: Sequence[PlannedLog], settings: dict[str, str], cars: RunCars,
-        only: Sequence[str],
-    ) -> Self:  # fmt: skip
-        """Return a plan; raises UsageError if ``only`` names no log or the settings differ from the folder's run."""
-        plan = cls(output, journal, logs, settings, cars)
-        if only:
-            plan._check_only(only)
-        return plan
-
     def begin(self) -> None:
         """Begin the journal with the settings and the new places of logs."""
         self.journal.begin()
-        self.journal.add_setting(self.setting, self.settings)
+        self.journal.describe("setting", self.setting, self.settings)
         for log in self.logs:
             if log.moved:
                 self.journal.add_place(log.log.stem, log.place, log.identity or "")
@@ -234,7 +225,7 @@ class Plan:
     def add_car(self, record: dict[str, Any]) -> str:
         """Write a car's record into the journal; return its digest."""
         digest: str = record["digest"]
-        self.journal.add_car(digest, record)
+        self.journal.describe("car", digest, record)
         self.cars_of_run()[digest] = record
         return digest
 
@@ -248,13 +239,14 @@ class Plan:
                     self._current_cars[digest_of(record["parts"])] = record
         return self._current_cars
 
-    def _check_only(self, names: Sequence[str]) -> None:
+    def check_only(self, names: Sequence[str]) -> None:
+        """Check the names of ``--only``; raises UsageError if one names no log or the settings of the run differ."""
         labels = {p.log.stem for p in self.logs}
         if missing := [name for name in names if name not in labels]:
             near = ", ".join(sorted(labels)[:10]) + (" and more" if len(labels) > 10 else "")
             raise UsageError(expected=f"the name of a log ({near})", got=missing[0], where="--only")
-        for log in self.logs:
-            entry = self.journal.entries.get(log.log.stem)
+        entries = (self.journal.entries.get(p.log.stem) for p in self.logs if names)
+        for entry in entries:
             if entry is not None and (why := [*self._changes(entry)]):
                 raise UsageError(
                     expected="the settings of the run in the folder",
@@ -278,29 +270,37 @@ class Plan:
             return _REPEATED if retry or entry.again else None
         if _KEPT.index(entry.keep) < _KEPT.index(keep):
             return f"{keep} is to be kept of them"
-        folder = self.output / log_place(entry.label)
-        if not (folder / REPORT_FILE).is_file() or entry.part is None or not (self.output / entry.part).is_file():
-            return "their outputs are gone"
-        return None if self._is_sound(entry) else _DAMAGED
+        if entry.offset not in self._damages:
+            changed = self._changed_outputs(entry, pages=False)
+            gone = any(not (self.output / name).is_file() for name in changed)
+            self._damages[entry.offset] = _GONE if gone else _DAMAGED if changed else None
+        return self._damages[entry.offset]
 
-    def _is_sound(self, entry: Entry) -> bool:
-        """Return whether report and figures of a drive are unchanged; read once per line of the journal."""
-        if entry.outputs is None:
-            return True
-        if entry.offset not in self._sound:
-            paths = self.output / log_place(entry.label) / REPORT_FILE, self.output / str(entry.part)
-            try:
-                self._sound[entry.offset] = outputs_digest(*paths) == entry.outputs
-            except OSError:
-                self._sound[entry.offset] = False
-        return self._sound[entry.offset]
+    def _changed_outputs(self, entry: Entry, *, pages: bool) -> list[str]:
+        """Return the pages or other files of a drive that are not as they were written, as far as they are here."""
+        files = {n: s for n, s in self.journal.outputs(entry).items() if n.endswith(f"/{PAGE_FILE}") == pages}
+        if self.is_remote:
+            files = {n: s for n, s in files.items() if n == entry.part or n.endswith(f"/{REPORT_FILE}")}
+        return [name for name, state in files.items() if not is_unchanged(self.output / name, state)]
+
+    def damaged_pages(self) -> set[str]:
+        """Return the labels of drives whose pages are not as they were written."""
+        entries = (entry for p in self.logs if (entry := self.entry(p)) is not None)
+        return {e.label for e in entries if self._changed_outputs(e, pages=True)}
+
+    def add(self, entry: Entry, end: DriveEnd) -> None:
+        """Write how a drive ended into the journal, then remove its former figures."""
+        before = self.journal.entries.get(entry.label)
+        self._damages[self.journal.add(entry, end.outcome, end.outputs).offset] = None
+        if before is not None and before.part not in (None, entry.part):
+            remove_part(self.output, str(before.part))
 
     def _changes(self, entry: Entry) -> Iterator[str]:
         """Yield as texts which settings and car of a drive have changed."""
         if entry.setting != self.setting:
-            yield from changes(self.journal.settings.get(entry.setting, {}), self.settings)
+            yield from changes(self.journal.described["setting"].get(entry.setting, {}), self.settings)
         if entry.car is not None and entry.car not in self.cars_of_run():
-            old = self.journal.cars.get(entry.car, {})
+            old = self.journal.described["car"].get(entry.car, {})
             new = next((c for c in self.cars_of_run().values() if c["name"] == old.get("name")), {})
             yield from [*changes(old.get("parts", {}), new.get("parts", {}))] if new else ["another car"]
 
@@ -316,3 +316,20 @@ class Plan:
             reporter.note(
                 f"{other} drives in the output are of logs that are not named now: they are left out of the run"
             )
+
+
+def sweep_parts(journal: Journal, output: Path) -> None:
+    """Remove figure files that no drive of the journal has, and the remains of killed workers."""
+    kept = {entry.part for entry in journal.entries.values()}
+    root = output / PARTS
+    for path in list(itertools.chain(root.rglob("*.parquet"), root.rglob(".*.partial"))):
+        if path.relative_to(output).as_posix() not in kept:
+            remove_part(output, path.relative_to(output).as_posix())
+
+
+def remove_part(output: Path, part: str) -> None:
+    """Remove a file of figures and the folders that this leaves empty."""
+    with suppress(OSError):
+        (output / part).unlink(missing_ok=True)
+        for folder in itertools.islice((output / part).parents, 3):
+            folder.rmdir()

@@ -17,7 +17,9 @@ import numpy as np
 from pdhef_logtool.car.car import NO_INTERVALS, Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.interpolation import Bracket
+from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
+from pdhef_logtool.drive.recorded import sample_ledger
 from pdhef_logtool.drive.truth import (
     SAME_SHARE,
     TruthTrack,
@@ -27,7 +29,6 @@ from pdhef_logtool.drive.truth import (
     truth_at,
     valid_as_a_whole,
 )
-from pdhef_logtool.drive.windows import DrivePlan, sample_ledger
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -48,7 +49,6 @@ from pdhef_logtool.records.signals import (
     IntArray,
     Loss,
     Signals,
-    join_signals,
 )
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
@@ -57,7 +57,7 @@ from pdhef_logtool.results.run_report import EstimatorFacts, build_report, write
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
-from pdhef_logtool.runs.estimating import DeadReckoning, first_pose
+from pdhef_logtool.runs.estimating import dead_reckoned, first_pose
 from pdhef_logtool.runs.pipeline import (
     LogResult,
     RunResult,
@@ -370,8 +370,8 @@ def _read_sensors(drive: Drive) -> Signals | None:
         drive.tell("no IMU in the mapping: segments come from the ground truth alone")
         return None
     drive.plan = replace(drive.plan, truth=None, mapping=replace(drive.mapping, truth={}, quality=None))
-    seen = [w.signals for w in drive.windows() if len(w.signals)]
-    return join_signals(seen) if seen else None
+    signals = drive.recorded().signals
+    return drive.friction.fill(signals) if len(signals) else None
 
 
 def _same_column(estimate: FloatArray, truth: FloatArray) -> bool:
@@ -393,7 +393,7 @@ def _write(
     try:
         for track in tracks:
             has_pose = track.name == TRUTH and plan.has_truth_pose
-            sink.append(track if has_pose else DeadReckoning().add(track, start))
+            sink.append(track if has_pose else dead_reckoned(track, start))
         sink.finish(report)
     except BaseException:
         sink.abort()

@@ -10,7 +10,6 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.records.signals import Signals, join_signals
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
@@ -99,24 +98,20 @@ def _spans(drive: Drive, prior: ReferencePrior, *, use_gnss: bool) -> Iterator[S
     """Yield the reference of a drive span by span; of two that overlap the earlier one ends in the middle."""
     from pdhef_logtool.estimators.reference.drive import refer
 
-    tail: Signals | None = None
-    for window in drive.windows(fill_friction=False, window_s=SPAN_S):
-        signals = window.signals if tail is None else join_signals([tail, window.signals])
-        if len(signals) < 2:
+    signals = drive.whole(fill_friction=False).signals
+    starts_ns = np.arange(signals.stamps_ns[0], signals.stamps_ns[-1] + 1, round(SPAN_S * 1e9))
+    edges = [*np.searchsorted(signals.stamps_ns, starts_ns).tolist(), len(signals)]
+    margin_ns = round(MARGIN_S * 1e9)
+    for number, end in enumerate(edges[1:]):
+        before_ns = int(signals.stamps_ns[edges[number] - 1]) - 2 * margin_ns if number else None
+        lead = 0 if before_ns is None else int(np.searchsorted(signals.stamps_ns, before_ns))
+        part = signals.rows(lead, end)
+        if len(part) < 2:
             continue
-        span = refer(signals, prior, use_gnss=use_gnss)
-        end_ns = int(signals.stamps_ns[-1])
-        more = int(drive.plan.end_ns) - end_ns > round(MARGIN_S * 1e9)
-        yield span.between(
-            None if tail is None else _in_s(signals, MARGIN_S), _in_s(signals, -MARGIN_S) if more else None
+        yield refer(part, prior, use_gnss=use_gnss).between(
+            None if before_ns is None else int(part.stamps_ns[0]) + margin_ns,
+            int(part.stamps_ns[-1]) - margin_ns if end < len(signals) else None,
         )
-        first = int(np.searchsorted(signals.stamps_ns, end_ns - round(2.0 * MARGIN_S * 1e9)))
-        tail = signals.rows(first, len(signals))
-
-
-def _in_s(signals: Signals, seconds: float) -> int:
-    """Return the time a number of seconds after the first stamp, or before the last one where it is negative."""
-    return int(signals.stamps_ns[0 if seconds > 0 else -1]) + round(seconds * 1e9)
 
 
 def _document(spans: Sequence[SideslipReference], refused: str) -> dict[str, Any]:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Callable, Collection
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.logs.discovery import RUN_FILE, folders_of
 from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.results.opened_run import METRICS_FILE, PAGE_FILE, PARTS, open_run
+from pdhef_logtool.results.opened_run import METRICS_FILE, PAGE_FILE, open_run
 from pdhef_logtool.results.run_report import build_run, run_versions, write_json
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.journal import Entry, Journal
+from pdhef_logtool.runs.journal import Entry
 from pdhef_logtool.runs.pipeline import FEW_LOGS, LogResult, judge, log_place
 from pdhef_logtool.runs.planning import Plan
 from pdhef_logtool.storage.documents import file_sha256
@@ -43,7 +41,7 @@ def collect(
     results = [_result(plan, entry, folder) for entry, folder in entries]
     metrics = output / METRICS_FILE
     join_metrics(metrics, [r.figures_file for r in results if r.figures_file is not None])
-    cars = plan.journal.cars | plan.cars_of_run()  # the journal's line of a car may be damaged
+    cars = plan.journal.described["car"] | plan.cars_of_run()  # the journal's line of a car may be damaged
     networks = {
         None if (network := cars[e.car]["network"]) is None else (network[0], network[1])
         for e, _ in entries
@@ -94,35 +92,18 @@ class FleetProgress:
     def update(self, number: int, text: str, share: float) -> None:
         """Take the progress of one log."""
         self._shares[number] = min(share, 1.0)
-        done = (self.ended + sum(self._shares.values())) / self.count
-        if self.count <= FEW_LOGS:
-            self.progress(text, done)
-            return
-        rate = self.ended / max(time.monotonic() - self._since, 1e-9)
-        failed = f", {self.failed} failed" if self.failed else ""
-        speed = f", {rate:.1f}/s" if self.ended else ""
-        self.progress(f"{self.ended} of {self.count}{failed}{speed}", done)
+        self._show(text)
 
     def end(self, number: int) -> None:
         """Take the end of one log."""
         self._shares.pop(number, None)
         self.ended += 1
         if self.count > FEW_LOGS:
-            self.update(number, "", 0.0)
+            self._show("")
 
-
-def sweep_parts(journal: Journal, output: Path) -> None:
-    """Remove figure files that no drive of the journal has, and the remains of killed workers."""
-    kept = {entry.part for entry in journal.entries.values()}
-    root = output / PARTS
-    for path in list(itertools.chain(root.rglob("*.parquet"), root.rglob(".*.partial"))):
-        if path.relative_to(output).as_posix() not in kept:
-            remove_part(output, path.relative_to(output).as_posix())
-
-
-def remove_part(output: Path, part: str) -> None:
-    """Remove a file of figures and the folders that this leaves empty."""
-    with suppress(OSError):
-        (output / part).unlink(missing_ok=True)
-        for folder in itertools.islice((output / part).parents, 3):
-            folder.rmdir()
+    def _show(self, text: str) -> None:
+        if self.count > FEW_LOGS:
+            rate = self.ended / max(time.monotonic() - self._since, 1e-9)
+            failed = f", {self.failed} failed" if self.failed else ""
+            text = f"{self.ended} of {self.count}{failed}, {rate:.1f}/s"
+        self.progress(text, (self.ended + sum(self._shares.values())) / self.count)

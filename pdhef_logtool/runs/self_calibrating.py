@@ -5,7 +5,7 @@ See docs/method.md#self-calibration.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -13,9 +13,8 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.drive.cached import read_cached
-from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.drive.reading import Drive, read_drive
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.estimators.calibration.driving import Driving
     from pdhef_logtool.evaluation.metrics.metric import SensorErrors
 
-#: Squares are summed window by window, over spans that no window cuts: another length would be another figure.
-_WINDOW_S = 600.0
 _NEEDS = ("steer_rad", "yaw_rate_rad_s", "speed_m_s")
 
 
@@ -57,7 +54,7 @@ def calibrate_pool(
     drivings = []
     for log_input in inputs:
         try:
-            with read_cached(log_input, car, mapping, config.read_options) as drive:
+            with read_drive(log_input, car, mapping, config.read_options) as drive:
                 if not lacking(drive):
                     drivings.append(read_driving(drive))
         except PdhefError:
@@ -71,13 +68,14 @@ def lacking(drive: Drive) -> list[str]:
 
 
 def read_driving(drive: Drive) -> Driving:
-    """Return the driving of a drive that can be calibrated on; its ground truth is not looked at."""
-    from pdhef_logtool.estimators.calibration.driving import DrivingReader
+    """Return the driving of a drive that can be calibrated on; its ground truth is not looked at.
 
-    reader = DrivingReader(drive.car.vehicle)
-    for window in drive.windows(fill_friction=_told(drive)):
-        reader.add(_without_log_friction(drive, window.signals))
-    return reader.finish()
+    Raises EstimatorError without a stamp.
+    """
+    from pdhef_logtool.estimators.calibration.driving import driving_of
+
+    signals = drive.whole(fill_friction=_told(drive)).signals
+    return driving_of(_without_log_friction(drive, signals), drive.car.vehicle)
 
 
 def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibration | None:
@@ -85,28 +83,20 @@ def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibratio
     if calibration is None or calibration.refused or calibration.earlier:
         return calibration
     alone = self_calibrated(drive, replace(calibration, varied=()))  # lateral kinematic consistency needs no interval
-    # Windows of a fixed length, so that the length of the run's windows does not change it.
-    windows = drive.windows(fill_friction=_told(drive), window_s=_WINDOW_S)
-    signals = (_without_log_friction(drive, window.signals) for window in windows)
+    signals = _without_log_friction(drive, drive.whole(fill_friction=_told(drive)).signals)
     return replace(calibration, driven_d2_m_s=driven_d2(signals, alone, calibration))
 
 
-def driven_d2(windows: Iterable[Signals], car: Car, calibration: SelfCalibration) -> float:
+def driven_d2(signals: Signals, car: Car, calibration: SelfCalibration) -> float:
     """Return the part of ``d2`` of ``physics`` that correlates with the driving, in m/s; NaN if unknown.
 
-    ``windows`` : of a drive, read with the vehicle of the car, which has the calibration.
+    ``signals`` : of a drive, read with the vehicle of the car, which has the calibration.
     """
     from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency, driving_products
 
-    estimator, sensors = make_estimator("physics", car), log_sensors(car.vehicle, calibration)
-    slow, carry = car.vehicle.low_speed_blend_m_s, None
-    products, seconds = np.zeros((4, 4)), 0.0
-    for signals in windows:
-        track, carry = run_window(estimator, signals, carry, None)
-        more, lasted = driving_products(track, signals, low_speed_m_s=slow, sensors=sensors)
-        products += more
-        seconds += lasted
-    return driven_consistency(products, seconds)
+    track = run_estimator(make_estimator("physics", car), signals)
+    slow, sensors = car.vehicle.low_speed_blend_m_s, log_sensors(car.vehicle, calibration)
+    return driven_consistency(*driving_products(track, signals, low_speed_m_s=slow, sensors=sensors))
 
 
 def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:

@@ -44,6 +44,8 @@ def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell)
         folder = Path(scratch) / task.output.name
         folder.mkdir()
         end = work(replace(task, output=folder), tell)
+        if isinstance(end, OutputError):
+            return end
         files = (p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
         # The report is last: it states that the drive is done.
         names = sorted((n for n in files if "/." not in f"/{n}"), key=lambda n: (n.endswith(f"/{REPORT_FILE}"), n))

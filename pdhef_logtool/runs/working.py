@@ -5,24 +5,27 @@ from __future__ import annotations
 import math
 import os
 import platform
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.parts import car_folder
+from pdhef_logtool.logs.byte_source import ChangedError, SourceError
 from pdhef_logtool.logs.discovery import LogInput, identity_of
-from pdhef_logtool.mapping import Mapping, mapping_of
+from pdhef_logtool.mapping import Mapping as LogMapping
+from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.no_position import without_names
-from pdhef_logtool.results.opened_run import PARTS, REPORT_FILE, OpenedLog
+from pdhef_logtool.results.opened_run import JOURNAL_FILE, PARTS, OpenedLog
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.journal import digest_of, outputs_digest
-from pdhef_logtool.runs.pipeline import LogResult, log_place, run_log
+from pdhef_logtool.runs.journal import digest_of, states_of
+from pdhef_logtool.runs.pipeline import LOG_FILES, LogResult, log_place, run_log
 from pdhef_logtool.storage.outputs import OutputFolder
 from pdhef_logtool.workers.supervisor import Tell
 
@@ -60,8 +63,9 @@ class DriveEnd:
 
     Attributes
     ----------
-    identity : identity of the log's content. car : :func:`~.cars.car_record`. part, error_rad : as in the journal.
-    warned : lines for users. again : whether a failed drive may succeed next time. outputs : as in the journal.
+    identity : of the log's content. car : :func:`~.cars.car_record`. part, error_rad : as in the journal.
+    warned : lines for users. again : whether a failed drive may succeed next time.
+    outputs : size and digest of its files.
     """
 
     outcome: LogOutcome
@@ -72,25 +76,39 @@ class DriveEnd:
     error_rad: float | None = None
     warned: tuple[str, ...] = ()
     again: bool = False
-    outputs: str | None = None
+    outputs: Mapping[str, str] = field(default_factory=dict)
 
 
-Work = Callable[[DriveTask, Tell], DriveEnd]
+Work = Callable[[DriveTask, Tell], DriveEnd | OutputError]
+#: Waits before a log that cannot be reached is read again.
+_WAITS_S = (0.5, 2.0)
 
 
-def run_drive(task: DriveTask, tell: Tell) -> DriveEnd:
-    """Run one drive, write its files, and return how it ended; raises only what ends the process."""
-    warned: list[str] = []
-    try:
-        return _run_drive(task, tell, warned)
-    except MemoryError:
-        raise  # the supervisor reports it
-    except Exception as error:  # noqa: BLE001 (one bad log never stops the others, for any error)
-        expected = isinstance(error, PdhefError)
-        reason = str(error) if expected else f"internal error, {type(error).__name__}: {error}"
-        outcome = failed_outcome(task.log, reason, task.config)
-        again = not expected or isinstance(error, OutputError)
-        return DriveEnd(outcome, log_identity(task.log), warned=tuple(warned), again=again)
+def run_drive(task: DriveTask, tell: Tell) -> DriveEnd | OutputError:
+    """Run one drive, write its files, and return how it ended; raises only what ends the process.
+
+    An error that all drives would meet, such as a full disk, is returned: it ends the run.
+    """
+    for wait_s in (*_WAITS_S, None):
+        warned: list[str] = []
+        try:
+            return _run_drive(task, tell, warned)
+        except MemoryError:
+            raise  # the supervisor reports it
+        except Exception as error:  # noqa: BLE001 (one bad log never stops the others, for any error)
+            if isinstance(error, OutputError) and error.ends_run:
+                return error
+            unreachable = isinstance(error, SourceError) or (isinstance(error, PdhefError) and error.missing)
+            if unreachable and wait_s is not None and not isinstance(error, ChangedError):
+                tell(f"{task.log.stem}: waits for the log", 0.0)
+                time.sleep(wait_s)
+                continue
+            expected = isinstance(error, PdhefError)
+            reason = str(error) if expected else f"internal error, {type(error).__name__}: {error}"
+            outcome = failed_outcome(task.log, reason, task.config)
+            again = not expected or unreachable or isinstance(error, OutputError)
+            return DriveEnd(outcome, log_identity(task.log), warned=tuple(warned), again=again)
+    raise AssertionError
 
 
 def failed_outcome(log: LogInput, reason: str, config: RunConfig) -> LogOutcome:
@@ -100,22 +118,20 @@ def failed_outcome(log: LogInput, reason: str, config: RunConfig) -> LogOutcome:
     return LogOutcome(log=log.stem, sha256=None, **texts)
 
 
-def run_on_node(
-    work: Callable[[DriveTask, Tell], Any], here: Path, mark: Path | None, task: DriveTask, tell: Tell
-) -> Any:
+def run_on_node(work: Callable[[DriveTask, Tell], Any], here: Path, shared: bool, task: DriveTask, tell: Tell) -> Any:
     """Process a drive on a node of a cluster, in the folder that the run was started in if the node has it.
 
-    ``mark``: a file by which the node recognises the output folder; None if it does not need to see the folder.
+    ``shared``: the output is a folder that the node must see; it contains the journal of the run.
     """
-    if mark is not None and not mark.is_file():
+    with suppress(OSError):
+        os.chdir(here)
+    if shared and not (task.output / JOURNAL_FILE).is_file():
         return OutputError(
             expected="a folder that all nodes of the cluster see under this path",
             got=f"another one, or none, on {platform.node()}",
-            where=str(mark.parent),
+            where=str(task.output),
             remedy="choose one on a shared file system, or a URL, with -o",
         )
-    with suppress(OSError):
-        os.chdir(here)
     return work(task, tell)
 
 
@@ -156,7 +172,7 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
         result.failed_checks,
         _sideslip_error_rad(result),
         tuple(warned),
-        outputs=outputs_digest(task.output / log_place(task.log.stem) / REPORT_FILE, task.output / part),
+        outputs=states_of(task.output, [part, *(f"{log_place(task.log.stem)}/{name}" for name in LOG_FILES)]),
     )
 
 
@@ -178,10 +194,10 @@ def _write_page(output: Path, outcome: LogOutcome) -> list[str]:
 
 
 #: Cars and mapping of the run that this process works for, by the run's name.
-_opened: dict[str, tuple[RunCars, Mapping | None]] = {}
+_opened: dict[str, tuple[RunCars, LogMapping | None]] = {}
 
 
-def _cars_and_mapping(task: DriveTask) -> tuple[RunCars, Mapping | None]:
+def _cars_and_mapping(task: DriveTask) -> tuple[RunCars, LogMapping | None]:
     """Return cars and mapping of a task, read once per run."""
     if task.run not in _opened:
         _opened.clear()

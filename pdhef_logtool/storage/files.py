@@ -26,6 +26,7 @@ _swept: set[Path] = set()
 
 #: Errors that only writing can cause.
 OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+_OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE)
 _REMEDIES = {
     errno.ENOSPC: "free some space or choose another place",
     errno.EDQUOT: "free some space within the quota or choose another place",
@@ -116,12 +117,14 @@ def writing(target: Path) -> Iterator[None]:
 
 def cannot_write(target: Path, error: OSError) -> OutputError:
     """Return the error for a place that cannot be written."""
-    return OutputError(
+    made = OutputError(
         expected="a place to write to",
         got=error.strerror or str(error) or type(error).__name__,
         where=str(target),
         remedy=_REMEDIES.get(error.errno or 0, "choose another place"),
     )
+    made.ends_run = error.errno in _OF_THE_DISK
+    return made
 
 
 def sync(path: Path) -> None:

@@ -243,9 +243,9 @@ class FolderLock:
 
     def _try_file(self) -> bool:
         """Create the lock file, complete with its content; that of a dead process is removed first."""
-        file, prepared = self._folder / LOCK_FILE, self._folder / f"{LOCK_FILE}.{process_name()}"
+        file, prepared = self._folder / LOCK_FILE, self._folder / f"{LOCK_FILE}.{process_name()}.partial"
         if (holder := _holder(file)) is not None and is_alive(holder) is False:
-            stale = self._folder / f"{LOCK_FILE}.{process_name()}.stale"
+            stale = self._folder / f"{LOCK_FILE}.stale.{process_name()}.partial"
             with contextlib.suppress(FileNotFoundError):
                 file.rename(stale)
                 if _holder(stale) != holder:  # another took it in the meantime: it is theirs

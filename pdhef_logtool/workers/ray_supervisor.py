@@ -18,11 +18,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.errors import UsageError, WorkerError
 from pdhef_logtool.records.extras import required
 from pdhef_logtool.records.processes import process_name
-from pdhef_logtool.workers.fork_server import describe_error
-from pdhef_logtool.workers.supervisor import Crew, Ended, Failure, Limits, Tell
+from pdhef_logtool.workers.supervisor import Crew, Ended, Failure, Limits, Tell, describe_error
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -65,38 +64,42 @@ def supervise_on_ray(
     Raises
     ------
     UsageError : Ray is not installed, or there is no cluster.
+    WorkerError : the cluster is lost, or its nodes cannot run workers.
     """
     orders = _Orders(f"{process_name()}-{next(_RUNS)}", work, limits, tuple(preload))
     with _connected(address) as ray:
-        task = ray.remote(num_cpus=1, max_retries=MAX_RETRIES, retry_exceptions=False)(_end_on_node)
-        waiting = enumerate(items)
-        under_way: dict[Any, tuple[int, T]] = {}
-        room, looked = 0, -_LOOK_S
-        while True:
-            if time.monotonic() - looked > _LOOK_S:
-                looked = time.monotonic()
-                room = _AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
-            for number, item in itertools.islice(waiting, max(0, room - len(under_way))):
-                under_way[task.remote(orders, item)] = number, item
-            if not under_way:
-                return
-            done, _ = ray.wait(list(under_way), num_returns=1, timeout=_LOOK_S)
-            for reference in done:
-                number, item = under_way.pop(reference)
-                yield _ended(ray, reference, number, item)
-            del done
+        try:
+            yield from _submitted(ray, orders, items)
+        except (ray.exceptions.RayError, ConnectionError) as error:
+            raise WorkerError(
+                expected="a Ray cluster that keeps running",
+                got=describe_error(error).partition(". ")[0],
+                where="--ray",
+                remedy="check the cluster with ray status",
+            ) from None
 
 
 _RUNS = itertools.count()
 
 
-def _ended(ray: Any, reference: Any, number: int, item: T) -> Ended[T, Any]:
-    try:
-        result, failure = ray.get(reference)
-    except ray.exceptions.RayError as error:
-        reason = f"Ray lost it: {type(error).__name__}"
-        return Ended(number, item, failure=Failure(reason, tries=MAX_RETRIES + 1))
-    return Ended(number, item, result, failure)
+def _submitted(ray: Any, orders: _Orders, items: Iterable[T]) -> Iterator[Ended[T, Any]]:
+    task = ray.remote(num_cpus=1, max_retries=MAX_RETRIES, retry_exceptions=False)(_end_on_node)
+    waiting = enumerate(items)
+    under_way: dict[Any, tuple[int, T]] = {}
+    room, looked = 0, -_LOOK_S
+    while True:
+        if time.monotonic() - looked > _LOOK_S:
+            looked = time.monotonic()
+            room = _AHEAD * max(1, int(ray.cluster_resources().get("CPU", 1)))
+        for number, item in itertools.islice(waiting, max(0, room - len(under_way))):
+            under_way[task.remote(orders, item)] = number, item
+        if not under_way:
+            return
+        done, _ = ray.wait(list(under_way), num_returns=1, timeout=_LOOK_S)
+        for reference in done:
+            result, failure = ray.get(reference)
+            yield Ended(*under_way.pop(reference), result, failure)
+        del done
 
 
 @contextmanager
@@ -142,22 +145,14 @@ _crews: dict[str, Crew[Any, Any]] = {}
 
 def _end_on_node(orders: _Orders, item: Any) -> tuple[Any, Failure | None]:
     """Do the work on an item in a worker process, which is kept for further tasks of the run."""
-    try:
-        for ended in _crew(orders).each([item]):
-            return ended.result, ended.failure
-    except Exception as error:  # noqa: BLE001 (what a task raises, Ray would take for its own)
-        return None, Failure(f"raised {describe_error(error)}")
-    raise AssertionError("an item ends")
-
-
-def _crew(orders: _Orders) -> Crew[Any, Any]:
     if orders.run not in _crews:
         _dismiss()
         _crews[orders.run] = Crew(orders.work, jobs=1, limits=orders.limits, preload=orders.preload)
-        atexit.register(_dismiss)
-    return _crews[orders.run]
+    (ended,) = _crews[orders.run].each([item])
+    return ended.result, ended.failure
 
 
+@atexit.register
 def _dismiss() -> None:
     while _crews:
-        _crews.popitem()[1].__exit__(None, None, None)
+        _crews.popitem()[1].__exit__()

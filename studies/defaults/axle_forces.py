@@ -6,6 +6,7 @@ true velocity (Eq 3, 4). The fit is least squares with the priors of docs/method
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -14,7 +15,6 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters, correct_signals
 from pdhef_logtool.estimators.filter_base import PosteriorSteps
 from pdhef_logtool.evaluation.smoothing import smooth
-from pdhef_logtool.learning.engine import usable_stamps
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -32,6 +32,9 @@ SHAPE = 1.35
 PEAK_OVER_SEEN = 1.1
 #: Friction demand scatters about the curve by this share of its own size and floor.
 FORCE_STD_N_PER_KG = 0.35
+
+#: Usable where the true speed is above this multiple of the low-speed limit, and where the car does not spin or drift.
+SPEED_FACTOR, MAX_SIDESLIP_RAD = 2.0, math.radians(8.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +68,15 @@ class AxleCurve:
         """Return D sin(C atan(B α)) with B = stiffness/(C D)."""
         b = self.stiffness_n_per_rad / (self.shape * self.peak_n)
         return self.peak_n * np.sin(self.shape * np.arctan(b * slip_rad))
+
+
+def usable_stamps(signals: Signals, truth: StateTrack, vehicle: VehicleParameters) -> BoolArray:
+    """Return where ground truth and signals can be learned from, [N]."""
+    is_complete = truth.valid & np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s)
+    moving = truth.vx_m_s > SPEED_FACTOR * vehicle.low_speed_blend_m_s
+    tame = np.abs(truth.sideslip_rad) < MAX_SIDESLIP_RAD
+    use: BoolArray = is_complete & moving & tame & np.isfinite(signals.steer_rad)
+    return use
 
 
 def period_s(drive: FitDrive) -> float:

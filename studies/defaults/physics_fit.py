@@ -29,7 +29,6 @@ from pdhef_logtool.estimators.calibration.calibration import VARIED
 from pdhef_logtool.estimators.calibration.joint import varied_parameters
 from pdhef_logtool.estimators.filter_base import PosteriorSteps
 from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD, physics_filter
-from pdhef_logtool.learning.engine import usable_stamps
 from pdhef_logtool.records.signals import FloatArray
 from studies.defaults.axle_forces import (
     PEAK_LOG_STD,
@@ -46,6 +45,7 @@ from studies.defaults.axle_forces import (
     sampled_errors,
     signals_of,
     usable_seconds,
+    usable_stamps,
 )
 from studies.defaults.prior import Prior
 

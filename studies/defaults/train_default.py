@@ -32,13 +32,20 @@ from pdhef_logtool.car.car import (
     UNSURE_FILE,
     VEHICLE_FILE,
 )
+from pdhef_logtool.car.store import update_car
 from pdhef_logtool.car.toml_files import load_vehicle, vehicle_toml
+from pdhef_logtool.learning.drives import LearnSettings, choose_drives, open_car, open_mapping
 from pdhef_logtool.learning.network.fit import Recipe
 from pdhef_logtool.learning.network.train_command import dataset_for, train_on
+from pdhef_logtool.learning.stages.task import Task
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import MODELS, NOMINAL_MODEL, PAPER_FOLDER, PHYSICS_MODEL, SHIPPED
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
+from pdhef_logtool.runs.config import RunConfig
 from studies.defaults import fit_physics
+from studies.defaults.intervals import fit_intervals
+from studies.defaults.noise import tune
 from studies.pages import SAMPLE_VEHICLE, options
 
 HOME = SHIPPED_CARS["saloon"]
@@ -94,10 +101,17 @@ class Training:
         """The same with the network: the shipped one by its name, wherever the package is."""
         return *self.of_car, "--network", SHIPPED if self.is_shipped else self.network
 
-    @property
-    def validation(self) -> tuple[object, ...]:
-        """The validation drives, with car and network."""
-        return self.work / "one_car", "--split", "validation", *self.with_network
+    def validation_task(self) -> Task:
+        """Return the validation drives with car and network."""
+        network = Path(SHIPPED) if self.is_shipped else self.network
+        config = RunConfig(car=self.car, mapping=self.work / "mapping.toml", network=network)
+        settings = LearnSettings(config=config, split="validation")
+        inputs, splits = choose_drives([str(self.work / "one_car")], settings)
+        reporter = Reporter(warn=print)
+        car, mapping = open_car(config, print), open_mapping(config)
+        return Task(
+            car=car, settings=settings, logs=tuple(inputs), mapping=mapping, set_splits=splits, reporter=reporter
+        )
 
 
 def simulate(t: Training) -> None:
@@ -147,8 +161,9 @@ def train(t: Training) -> None:
 
 
 def noise(t: Training) -> None:
-    """Tune the noise of all tuned estimators alike, on validation drives."""
-    pdhef("learn", *t.validation, "--stages", "noise", "--trials", t.trials, "-o", t.car)
+    """Tune the noise of all tuned filters alike, on validation drives."""
+    task = t.validation_task()
+    update_car(task.car, t.car, tune(task, t.trials))
 
 
 def gain(t: Training) -> None:
@@ -158,8 +173,9 @@ def gain(t: Training) -> None:
 
 def intervals(t: Training) -> None:
     """Calibrate the intervals: for a car that is nearly as in its file, and for a car that may have changed."""
+    task = t.validation_task()
     for spread, place in ((USUAL_SPREAD, t.car), (UNSURE_SPREAD, t.work / "unsure")):
-        pdhef("learn", *t.validation, "--stages", "intervals", "--vary", spread, "-o", place)
+        update_car(task.car, place, fit_intervals(task, spread))
     shutil.copyfile(t.work / "unsure" / INTERVALS_FILE, t.car / UNSURE_FILE)
 
 

@@ -21,7 +21,7 @@ from pdhef_logtool.evaluation.metrics import MetricRow, score_track
 from pdhef_logtool.evaluation.segments import segment_masks
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.runs.estimating import estimate_windows
+from pdhef_logtool.runs.estimating import estimate_drive
 from studies.condition_drives import as_logged
 from studies.paper.schemes import SCHEMES
 from truthsim.drive import simulate_drive
@@ -166,8 +166,8 @@ def read_simulated(scenario: Scenario, noise_seed: int, car: Car) -> ReadDrive:
 
 def track_of(estimator: Estimator, drive: ReadDrive) -> StateTrack:
     """Run an estimator over a drive."""
-    (window,) = estimate_windows(drive.whole, [estimator], watched=False, drawn=False)
-    return window.tracks[0]
+    window = estimate_drive(drive.whole, [estimator], watched=False, drawn=False)
+    return next(iter(window.tracks.values()))
 
 
 def figures_of(track: StateTrack, drive: ReadDrive) -> dict[str, float]:

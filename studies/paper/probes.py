@@ -9,7 +9,7 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.evaluation.metrics.lag import lag_s
-from pdhef_logtool.learning.network.residuals import join_rows, residual_windows
+from pdhef_logtool.learning.network.residuals import residual_rows
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.service import NetworkService
 from studies.paper.experiment import GRAVITY_M_S2, Experiment, ReadDrive
@@ -58,7 +58,7 @@ def residual_fit(drive: ReadDrive, car: Car) -> ResidualFit:
     whole = drive.whole
     assert car.network is not None
     parallel, period_s = filter_of(car, car.network.model), whole.plan.alignment.grid_period_s
-    rows = join_rows(residual_windows(whole.windows(), parallel, period_s=period_s))
+    rows = residual_rows(whole.signals, whole.truth, parallel, period_s=period_s)
     starts = np.concatenate([[True], np.diff(rows.segment) != 0])
     output, _ = NetworkService(car.network).run(rows.features, starts, None)
     use = rows.weight > 0.0

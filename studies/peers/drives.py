@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import tomllib
 from collections.abc import Mapping as Table
 from dataclasses import dataclass
@@ -10,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.toml_files import load_vehicle, vehicle_of_entries
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
-from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
-from studies.pages import DRIVES, ROOT
+from pdhef_logtool.mapping import Mapping, load_mapping
+from studies.pages import DRIVES, ROOT, write_toml
 
 REFERENCE = ROOT / "tests" / "reference"
 #: Groups of the page: full-size cars on roads, small or off-road cars, and drives whose ground truth has an offset.
@@ -30,6 +30,16 @@ _SIGNALS = {
 _TRUTH = {"longitudinal_velocity": "vx_m_s", "lateral_velocity": "vy_m_s", "yaw_rate": "yaw_rate_rad_s"}
 #: Entries of the ``.vehicle.toml`` files beside the drives with another name here.
 _VEHICLE = {"lf_m": "cg_to_front_axle_m", "lr_m": "cg_to_rear_axle_m"}
+_ENTRIES = ("name", "mass_kg", "yaw_inertia_kg_m2", "cg_to_front_axle_m", "cg_to_rear_axle_m", "track_m", "cg_height_m",
+            "wheel_radius_m", "steering_ratio")  # fmt: skip
+#: Velocity of the V40's GNSS receiver, and roll and pitch rate, which correct it for the height of the antenna.
+RECEIVER = {
+    f"gnss_velocity_{to}_m_s": {"topic": "/gnss/velocity", "field": f"twist.linear.{axis}", "stamp": "header.stamp"}
+    for to, axis in (("east", "x"), ("north", "y"))
+} | {
+    f"{to}_rate_rad_s": {"topic": "/imu/data", "field": f"angular_velocity.{axis}", "stamp": "header.stamp"}
+    for to, axis in (("roll", "x"), ("pitch", "y"))
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,52 +88,70 @@ PEER_DRIVES = (
 )
 
 
-def mapping_of(drive: PeerDrive, folder: Path = DRIVES) -> Mapping:
-    """Return the mapping of a drive."""
+def mapping_table(drive: PeerDrive, folder: Path = DRIVES, *, receiver: bool = False) -> dict[str, Any]:
+    """Return the mapping file of a drive as a document; ``receiver``: the GNSS velocity of a V40 replaces its speed."""
     if drive.log.startswith("v40_"):
-        return load_mapping(Path(__file__).with_name("v40_gnss.toml"))
+        document = _document(Path(__file__).with_name("v40_gnss.toml"))
+        if receiver:
+            del document["signals"]["speed_m_s"]
+            document["signals"] |= RECEIVER
+        return document
     if drive.files:
-        return load_mapping(REFERENCE / "mappings" / f"{drive.files}.toml")
-    return beside_mapping(tomllib.loads((folder / f"{drive.log}.signals.toml").read_text(encoding="utf-8")))
+        return _document(REFERENCE / "mappings" / f"{drive.files}.toml")
+    return beside_mapping(_document(folder / f"{drive.log}.signals.toml"))
 
 
-def beside_mapping(document: Table[str, Any]) -> Mapping:
-    """Return the mapping of a ``.signals.toml`` document."""
-    sides: dict[str, dict[str, SignalSource]] = {"sensor": {}, "truth": {}}
+def beside_mapping(document: Table[str, Any]) -> dict[str, Any]:
+    """Return the mapping file of a ``.signals.toml`` document."""
+    sides: dict[str, dict[str, Any]] = {"signals": {}, "truth": {}}
     for entry in document["signal"]:
-        names = _SIGNALS if entry["role"] == "sensor" else _TRUTH
-        if entry["role"] in sides and entry["signal"] in names:
-            name = names[entry["signal"]]
-            place = entry["topic"], entry["field"], entry["stamp"]
-            sides[entry["role"]][name] = SignalSource(name, *place, scale=entry["scale"], offset=entry["offset"])
-    return Mapping(sides["sensor"], sides["truth"])
+        side, names = ("signals", _SIGNALS) if entry["role"] == "sensor" else ("truth", _TRUTH)
+        if entry["role"] in ("sensor", "truth") and entry["signal"] in names:
+            source = {key: entry[key] for key in ("topic", "field", "stamp", "scale", "offset")}
+            sides[side][names[entry["signal"]]] = source
+    return sides
+
+
+def vehicle_table(drive: PeerDrive, folder: Path = DRIVES) -> dict[str, Any]:
+    """Return the published vehicle file of a drive as a document."""
+    if not drive.files:
+        return beside_vehicle(_document(folder / f"{drive.log}.vehicle.toml"))
+    name = "comma2k19_rav4" if drive.files == "comma2k19" else drive.files
+    vehicle = _document(REFERENCE / "vehicles" / f"{name}.toml")
+    # The accelerometer position in the TT-S file was regressed on ground truth.
+    return vehicle | {"imu_position_m": [0.0, 0.0, 0.0]} if name == "tts_kk" else vehicle
+
+
+def beside_vehicle(document: Table[str, Any]) -> dict[str, Any]:
+    """Return the vehicle file of a ``.vehicle.toml`` document; friction is the mean of the axles."""
+    given = document["vehicle"]
+    raw = {_VEHICLE.get(name, name): value for name, value in given.items() if _VEHICLE.get(name, name) in _ENTRIES}
+    if "friction_front" in given:
+        raw["friction"] = 0.5 * (given["friction_front"] + given["friction_rear"])
+    if "reference_point_x_from_cg_m" in given:
+        raw["truth_position_m"] = [given["reference_point_x_from_cg_m"], 0.0, 0.0]
+    if given["name"].startswith("Polaris"):
+        raw["imu_position_m"] = raw["truth_position_m"]  # one instrument
+    stiffness = {
+        axle: {"cornering_stiffness_n_per_rad": given[f"c{axle[0]}_axle_n_per_rad"]} for axle in ("front", "rear")
+    }
+    return raw | {"tyres": stiffness}
+
+
+def _document(path: Path) -> dict[str, Any]:
+    return tomllib.loads(path.read_text(encoding="utf-8"))
+
+
+def mapping_of(drive: PeerDrive, folder: Path = DRIVES, *, receiver: bool = False) -> Mapping:
+    """Return the mapping of a drive, as :func:`mapping_table`."""
+    with tempfile.TemporaryDirectory() as work:
+        return load_mapping(write_toml(Path(work) / "mapping.toml", mapping_table(drive, folder, receiver=receiver)))
 
 
 def vehicle_of(drive: PeerDrive, folder: Path = DRIVES) -> VehicleParameters:
     """Return the published vehicle of a drive."""
-    if not drive.files:
-        return beside_vehicle(tomllib.loads((folder / f"{drive.log}.vehicle.toml").read_text(encoding="utf-8")))
-    name = "comma2k19_rav4" if drive.files == "comma2k19" else drive.files
-    vehicle = load_vehicle(REFERENCE / "vehicles" / f"{name}.toml")
-    # The accelerometer position in the TT-S file was regressed on ground truth.
-    return vehicle.model_copy(update={"imu_position_m": (0.0, 0.0, 0.0)}) if name == "tts_kk" else vehicle
-
-
-def beside_vehicle(document: Table[str, Any]) -> VehicleParameters:
-    """Return the vehicle of a ``.vehicle.toml`` document; friction is the mean of the axles."""
-    given = document["vehicle"]
-    renamed = {_VEHICLE.get(name, name): value for name, value in given.items()}
-    raw = {name: value for name, value in renamed.items() if name in VehicleParameters.model_fields}
-    raw["tyres"] = {
-        axle: {"cornering_stiffness_n_per_rad": given[f"c{axle[0]}_axle_n_per_rad"]} for axle in ("front", "rear")
-    }
-    if "friction_front" in given:
-        raw["friction"] = 0.5 * (given["friction_front"] + given["friction_rear"])
-    if "reference_point_x_from_cg_m" in given:
-        raw["truth_position_m"] = (given["reference_point_x_from_cg_m"], 0.0, 0.0)
-    if given["name"].startswith("Polaris"):
-        raw["imu_position_m"] = raw["truth_position_m"]  # one instrument
-    return vehicle_of_entries(raw, where=given["name"]).vehicle
+    with tempfile.TemporaryDirectory() as work:
+        return Car.load(write_toml(Path(work) / "vehicle.toml", vehicle_table(drive, folder))).vehicle
 
 
 def read_peer_drive(log: Path, vehicle: VehicleParameters, mapping: Mapping) -> WholeDrive:

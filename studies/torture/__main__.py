@@ -1,6 +1,6 @@
 """Fuzz and fault-injection tests, counted: ``docs/reliability.md``.
 
-    python -m studies.torture [--work out/torture] [--seed 1] [--logs 200000] [--configs 20000] [--kills 200]
+    python -m studies.torture [--work out/torture] [--seed 1] [--logs 200000] [--kills 200]
                               [--count 500] [--format blf ...] [--hours 10] [--jobs 2] [--only mutations ...]
                               [--out docs/reliability.md]
 
@@ -23,23 +23,20 @@ from typing import Any
 from pdhef_logtool.workers.supervisor import Limits
 from studies.pages import DOCS, ROOT, fill, options, table, write
 from studies.torture.bombs import BOMBS, former_cases, judge_bomb
-from studies.torture.configs import config_judge
 from studies.torture.formats import HANG_S, format_judge
+from studies.torture.hours import write_hours
 from studies.torture.killing import contents, faults, kill_many, kill_run, leftovers
 from studies.torture.logs import log_judge
-from studies.torture.numerics import odd_drives, write_hours
 from studies.torture.outside import measured
-from studies.torture.places import PLACES
 from studies.torture.table_seeds import FORMATS
 from studies.torture.workers import NO_VERDICT, Verdict, run_cases
 
 _THREE = ("--estimators", "zero,kinematic,phy-ukf")
 
 
-def mutations(work: Path, seed: int, jobs: int, logs: int, configs: int) -> dict[str, Any]:
-    """Judge mutated logs and configurations."""
-    counts = (("logs", log_judge, logs), ("configurations", config_judge, configs))
-    return {name: _judged(work, name, make(work, seed), seed, count, jobs) for name, make, count in counts}
+def mutations(work: Path, seed: int, jobs: int, logs: int) -> dict[str, Any]:
+    """Judge mutated logs."""
+    return {"logs": _judged(work, "logs", log_judge(work, seed), seed, logs, jobs)}
 
 
 def formats(work: Path, seed: int, jobs: int, count: int, names: Iterable[str]) -> dict[str, Any]:
@@ -145,7 +142,7 @@ def _say(text: str) -> None:
 
 def blocks(results: dict[str, Any]) -> dict[str, str]:
     """Return the tables of the page by name."""
-    lists = [name for name in ("bombs", "numerics", "places", "shared") if results.get(name)]
+    lists = [name for name in ("bombs", "shared") if results.get(name)]
     texts: dict[str, str] = {name: _list(results[name]) for name in lists}
     texts |= {name: _mutations(results[name]) for name in ("mutations", "formats") if results.get(name)}
     if done := results.get("kills"):
@@ -199,7 +196,6 @@ def main() -> int:
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "torture")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--logs", type=int, default=200_000)
-    parser.add_argument("--configs", type=int, default=20_000)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--hours", type=float, default=10.0)
     parser.add_argument("--jobs", type=int, default=2)
@@ -213,9 +209,7 @@ def main() -> int:
     todo: dict[str, Callable[[], Any]] = {
         "bombs": lambda: one_by_one("bombs", work, {b.name: partial(judge_bomb, b) for b in BOMBS}),
         "shared": lambda: one_by_one("shared", work, {bomb.name: partial(judge_bomb, bomb) for bomb in former_cases()}),
-        "places": lambda: one_by_one("places", work, PLACES),
-        "numerics": lambda: one_by_one("numerics", work, odd_drives()),
-        "mutations": lambda: mutations(work, given.seed, given.jobs, given.logs, given.configs),
+        "mutations": lambda: mutations(work, given.seed, given.jobs, given.logs),
         "formats": lambda: formats(work, given.seed, given.jobs, given.count, given.format or FORMATS),
         "kills": lambda: kills(work, given.seed, given.kills),
         "hours": lambda: hours(work, given.hours),
@@ -234,7 +228,7 @@ def main() -> int:
         if kept.is_file():
             results[name] = json.loads(kept.read_text())
     if given.out.is_file():
-        counts = f"--logs {given.logs} --configs {given.configs} --count {given.count} --kills {given.kills}"
+        counts = f"--logs {given.logs} --count {given.count} --kills {given.kills}"
         counts += f" --hours {given.hours:g}"
         asked = {"command": f"The figures below: `python -m studies.torture --seed {given.seed} {counts}`."}
         write(given.out, fill(given.out.read_text(), blocks(results) | asked, str(given.out)))

@@ -285,7 +285,7 @@ def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, ol
     assert car.learnt_on == ()
     assert car.notes == (
         "fit.toml is not used: vehicle.toml has changed since; pdhef learn --stages calibrate creates it again",
-        "noise of physics is not used: it belongs to other physics; pdhef learn --stages noise creates it again",
+        "noise of physics is not used: it belongs to other physics",
         "network.toml allows no residual gain: it was fitted with other physics; "
         "pdhef learn --stages gain creates it again",
     )
@@ -373,10 +373,7 @@ def test_trust_changes_no_physics_so_that_intervals_stay_those_of_the_car(folder
     assert after.intervals is not None and after.intervals.physics_sha256 == after.physics_sha256
     assert after.notes == ()
     edit(folder, "mass_kg = 1440.0 ", "mass_kg = 1450.0 ")
-    assert (
-        "intervals.json was made with other physics; pdhef learn --stages intervals creates it again"
-        in Car.load(folder).notes
-    )
+    assert "intervals.json was made with other physics" in Car.load(folder).notes
     assert not any("intervals" in note for note in load(folder).notes)  # they are not in force
 
 
@@ -442,7 +439,7 @@ def test_tables_of_parts_have_no_place_in_vehicle_toml(tmp_path: Path) -> None:
 
 
 def noise_change(noise: dict[str, FilterNoise], **more: Any) -> Change:
-    data = part_toml(Noise(filter=noise), "Written by pdhef learn --stages noise.").encode()
+    data = part_toml(Noise(filter=noise), "Written by hand.").encode()
     return Change("tune", NOISE_FILE, {NOISE_FILE: data}, settings={"trials": 8}, drives=DRIVES, **more)
 
 
@@ -639,9 +636,7 @@ def test_noise_of_physics_belongs_to_the_values_that_were_found_through_it(folde
     write_part(folder / NOISE_FILE, Noise(filter={OURS: tuned.model_copy(update={"physics_sha256": "ab" * 32})}))
     car = load(folder)
     assert car.noise[OURS] == found.noise
-    assert car.notes == (
-        "noise of physics is not used: it belongs to other physics; pdhef learn --stages noise creates it again",
-    )
+    assert car.notes == ("noise of physics is not used: it belongs to other physics",)
 
 
 def test_the_folder_of_a_cars_drives_is_short_and_portable() -> None:

@@ -182,7 +182,7 @@ def test_usage_errors_are_one_line_and_exit_code_2(
         (("simulate", "suite", "--cuont", "3"), "pdhef simulate suite: No such option: --cuont"),
         (("insepct", "x"), "inspect"),
         (("fly",), "pdhef --help"),
-        (("learn", "x", "-o", "y", "--trials", "many"), "--trials"),
+        (("learn", "x", "-o", "y", "--seed", "many"), "--seed"),
     ],
 )
 def test_misspelt_words_are_one_line_and_exit_code_2(arguments: tuple[str, ...], said: str) -> None:

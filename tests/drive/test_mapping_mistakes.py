@@ -2,56 +2,48 @@
 
 from __future__ import annotations
 
-import re
+import tomllib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool import PdhefError, ReadOptions, RunConfig, read_drive, run
+from pdhef_logtool.cli.app import app
 from pdhef_logtool.drive.checks import check_drive
 from pdhef_logtool.drive.checks.running import misread_channels
-from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import Mapping, auto_map, mapping_to_toml
-from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import Channel
-from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import run_logs
-from studies.mapping_mistakes import KINDS, mistaken, outcomes, subjects
+from studies.mapping_mistakes import look_at, mistaken, outcomes, subjects
+from studies.pages import write_toml
 from tests.drive.test_checks import drive
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
 
-def mapping_of(path: Path) -> Mapping:
-    log = open_log(path)
-    try:
-        return auto_map(log).mapping
-    finally:
-        log.close()
+@pytest.fixture(scope="module")
+def mapping_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], dict[str, Any]]:
+    """Return the mapping file that is recognised of a log."""
+
+    def recognise(path: Path) -> dict[str, Any]:
+        file = tmp_path_factory.mktemp("mapping") / "m.toml"
+        assert CliRunner().invoke(app, ["inspect", str(path), "--write-mapping", str(file)]).exit_code == 0
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+
+    return recognise
 
 
-def test_every_mistake_in_a_double_lane_change_is_named(sample_logs_dir: Path) -> None:
-    """64 of 64; a mistake that the drive does not excite may stay open, and none may pass."""
+def test_every_mistake_in_a_double_lane_change_is_named(sample_logs_dir: Path, tmp_path: Path, mapping_of: Any) -> None:
+    """A wrong unit, sign and axis of each signal; the speed and the tyres of the default car may leave one open."""
     path = sample_logs_dir / "dlc.mcap"
-    found = list(outcomes(path, Car.load(sample_logs_dir / "vehicle.toml").vehicle))
-    assert len(found) == len(KINDS) * len(subjects(mapping_of(path)))
-    bad = {f"{o.signal} {o.kind}": o.verdict for o in found if o.verdict not in ("named", "refused")}
-    assert not bad
-
-
-@pytest.mark.slow
-def test_mistakes_are_named_or_not_checkable(sample_logs_dir: Path) -> None:
-    """At least 95 % over a spin, a sweep and a road; by drive it is 94 to 100 %."""
-    decided = []
-    for log, car in (("fishhook", "vehicle"), ("sweep", "vehicle_mu03"), ("road", "vehicle")):
-        found = outcomes(sample_logs_dir / f"{log}.mcap", Car.load(sample_logs_dir / f"{car}.toml").vehicle)
-        decided += [o for o in found if o.verdict not in ("open", "not checkable")]
-    assert sum(o.verdict in ("named", "refused") for o in decided) >= 0.95 * len(decided)
-    assert sum(o.verdict == "silent" for o in decided) <= 1
+    mapping = mapping_of(path)
+    kinds = [(subject, kind) for subject in subjects(mapping) for kind in ("x57.3", "sign", "axis")]
+    found = list(outcomes(look_at, path, mapping, tmp_path, kinds))
+    assert len(found) == len(kinds)
+    assert not {f"{o.signal} {o.kind}": o.verdict for o in found if o.verdict not in ("named", "refused")}
 
 
 @pytest.mark.parametrize(
@@ -80,42 +72,35 @@ def test_a_model_car_that_spins_is_possible() -> None:
     assert not [c for c in check_drive(channels) if c.verdict == "failed"]
 
 
-def run_with(path: Path, mapping: Mapping, out: Path) -> int:
-    file = out.with_suffix(".toml")
-    file.write_text(mapping_to_toml(mapping), encoding="utf-8")
-    config = RunConfig(car=path.parent / "vehicle.toml", mapping=file, annotate="none", keep="metrics")
-    return run_logs([str(path)], out, config).exit_code
+def run_with(path: Path, mapping: Path, out: Path) -> int:
+    config = RunConfig(car=path.parent / "vehicle.toml", mapping=mapping, annotate="none", keep="metrics")
+    return run([str(path)], out, config).exit_code
 
 
-@pytest.mark.parametrize(("subject", "kind", "code"), [("steer_rad", "x57.3", 3), ("wheel_speeds", "/57.3", 1)])
+@pytest.mark.parametrize(("subject", "kind", "code"), [("steer_rad", "x57.3", 3), ("wheel_speed", "/57.3", 1)])
 def test_what_uses_a_signal_with_a_wrong_unit_is_stopped(
-    sample_logs_dir: Path, tmp_path: Path, subject: str, kind: str, code: int
+    sample_logs_dir: Path, tmp_path: Path, mapping_of: Any, subject: str, kind: str, code: int
 ) -> None:
     path = sample_logs_dir / "fishhook.mcap"
-    wrong = mistaken(mapping_of(path), subject, kind)
-    assert wrong is not None
-    with read_drive(path, sample_logs_dir / "vehicle.toml", wrong) as found:
-        assert found.plan.refused
-        assert subject not in found.available or subject == "wheel_speeds"
-        assert all(re.search(r"scale = (1|0\.9999)", text) for text in found.plan.refused.values())
+    wrong = write_toml(tmp_path / "wrong.toml", mistaken(mapping_of(path), subject, kind))
     if code == 1:
-        with pytest.raises(EstimatorError, match=r"multiply its scale in the mapping by 57\.2958"):
+        with pytest.raises(PdhefError, match=r"multiply its scale in the mapping by 57\.2958"):
             run_with(path, wrong, tmp_path / "out")
     else:
         assert run_with(path, wrong, tmp_path / "out") == code
 
 
-def test_a_waived_check_stops_nothing(sample_logs_dir: Path) -> None:
+def test_a_waived_check_stops_nothing(sample_logs_dir: Path, tmp_path: Path, mapping_of: Any) -> None:
     path = sample_logs_dir / "fishhook.mcap"
-    wrong = mistaken(mapping_of(path), "steer_rad", "x57.3")
-    with read_drive(path, sample_logs_dir / "vehicle.toml", wrong, ReadOptions(waived=("steer_rad.unit",))) as found:
-        assert "steer_rad" in found.available
-        assert not found.plan.refused
+    wrong = write_toml(tmp_path / "wrong.toml", mistaken(mapping_of(path), "steer_rad", "x57.3"))
+    car = sample_logs_dir / "vehicle.toml"
+    for waived in ((), ("steer_rad.unit",)):
+        with read_drive(path, car, wrong, ReadOptions(waived=waived)) as drive:
+            assert ("steer_rad" in drive.available) == bool(waived)
 
 
-def test_ground_truth_with_a_wrong_sign_scores_nothing(sample_logs_dir: Path) -> None:
+def test_ground_truth_with_a_wrong_sign_scores_nothing(sample_logs_dir: Path, tmp_path: Path, mapping_of: Any) -> None:
     path = sample_logs_dir / "dlc.mcap"
-    wrong = mistaken(mapping_of(path), "truth.vy_m_s", "sign")
-    with read_drive(path, sample_logs_dir / "vehicle.toml", wrong) as found:
-        assert "truth.vy_m_s" in found.plan.refused
-        assert "vy_m_s" not in found.mapping.truth
+    wrong = write_toml(tmp_path / "wrong.toml", mistaken(mapping_of(path), "truth.vy_m_s", "sign"))
+    with read_drive(path, sample_logs_dir / "vehicle.toml", wrong) as drive:
+        assert "vy_m_s" not in drive.mapping.truth

@@ -13,11 +13,12 @@ from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.frames import angles_deg
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.mounting import Mounting, find_mounting, survey_log
-from pdhef_logtool.drive.windows import DrivePlan, DriveReader, plan_drive
+from pdhef_logtool.drive.plan import DrivePlan, plan_drive
+from pdhef_logtool.drive.recorded import read_recorded
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map, fit_clocks, load_mapping, read_signals, resolve_mapping
 from pdhef_logtool.mapping.triads import ACCELERATIONS, RATES, find_triads
-from pdhef_logtool.records.signals import Signals, join_signals
+from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.runs.inspection.report import inspect_drive_log, write_mapping
 from tests.turned_log import TurnedLog, rotation
 
@@ -38,9 +39,8 @@ def planned(log, mapping=None) -> DrivePlan:
     return plan_drive(log, mapping, default_vehicle(), log.start_ns, log.end_ns)
 
 
-def signals_of(log, plan: DrivePlan, window_s: float = 600.0) -> Signals:
-    windows = DriveReader(log, plan, window_s).windows()
-    return join_signals([w.signals for w in windows if len(w.signals)])
+def signals_of(log, plan: DrivePlan) -> Signals:
+    return read_recorded(log, plan).signals
 
 
 def difference(a: Signals, b: Signals) -> float:
@@ -98,14 +98,6 @@ def test_a_mounting_askew_is_found_to_two_degrees(log, angles: tuple[float, floa
     rest = difference(signals_of(turned, plan), signals_of(log, planned(log)))
     assert rest < 0.5, "2 deg of gravity are 0.34 m/s^2"
     assert all(c.name.endswith(".corrected") for c in plan.checks if c.verdict == "failed")
-
-
-def test_windows_of_a_summed_signal_join_bit_for_bit(log) -> None:
-    turned = TurnedLog(log, rotation(3, -6, 40))
-    plan = planned(turned)
-    assert isinstance(plan.mapping.signals["ay_m_s2"].field, tuple)
-    whole, joined = signals_of(turned, plan), signals_of(turned, plan, window_s=7.0)
-    assert all(np.array_equal(getattr(whole, n), getattr(joined, n), equal_nan=True) for n in IMU)
 
 
 @pytest.mark.slow

@@ -11,8 +11,8 @@ import pytest
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.mounting import Survey, survey_log
+from pdhef_logtool.drive.plan import plan_drive, with_gyro_delay
 from pdhef_logtool.drive.proposals import mapping_proposals
-from pdhef_logtool.drive.windows import plan_drive, with_gyro_delay
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, auto_map, fit_clocks, load_mapping
 from pdhef_logtool.runs.inspection.report import inspect_drive_log, write_mapping

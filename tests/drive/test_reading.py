@@ -1,4 +1,4 @@
-"""The one way to read a drive and the one way to estimate: windows are the whole, and logs are closed."""
+"""The one way to read a drive and the one way to estimate: a drive is read once, and logs are closed."""
 
 from __future__ import annotations
 
@@ -9,20 +9,18 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.drive import reading
-from pdhef_logtool.drive import windows as windows_module
+from pdhef_logtool.drive import reading, recorded
 from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
-from pdhef_logtool.drive.windows import DriveWindow
+from pdhef_logtool.drive.reading import Tell, one_log, read_drive
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.resource_limits import ResourceLimits
 from pdhef_logtool.mapping import Mapping, SignalSource, read_signals
 from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
-from pdhef_logtool.records.signals import Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
-from pdhef_logtool.runs.estimating import estimate_windows
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.runs.estimating import estimate_drive
 
 
 @pytest.fixture
@@ -37,59 +35,40 @@ def _assert_equal(a: Signals | StateTrack, b: Signals | StateTrack) -> None:
             assert x.tobytes() == y.tobytes(), f.name
 
 
-def _windows(drive: Drive) -> list[DriveWindow]:
-    return [w for w in drive.windows() if len(w.signals)]
-
-
-def test_windows_are_the_whole_and_a_second_pass_is_the_first(sample_logs_dir: Path, car: Car) -> None:
-    # Friction is estimated here: the source has a memory, which no pass may take over from another.
-    options = ReadOptions(friction="estimate", window_s=1.7)
-    with read_drive(sample_logs_dir / "dlc.mcap", car, options=options) as drive:
-        first, second = _windows(drive), _windows(drive)
-        share = drive.friction.observable_share
-        whole = drive.whole()
-        assert drive.friction.observable_share == share > 0.0
-        assert drive.sha256 == hash_log(drive.path)
-        assert drive.losses == ()
-        assert drive.samples["/imu/data.angular_velocity.z"] > len(whole.signals) - 3
-    assert len(first) == 3
-    for windows in (first, second):
-        _assert_equal(join_signals([w.signals for w in windows]), whole.signals)
-        assert whole.truth is not None
-        _assert_equal(concatenate([w.truth for w in windows if w.truth is not None]), whole.truth)
-    assert whole.seconds == pytest.approx(9.5, abs=0.1)
-    assert whole.nbytes > 100 * len(whole.signals)
-
-
-def test_a_drive_of_one_window_is_read_once_and_says_the_same_again(
+def test_a_drive_is_read_once_and_says_the_same_again(
     sample_logs_dir: Path, car: Car, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reads: list[object] = []
-    monkeypatch.setattr(windows_module, "read_signals", lambda *a: reads.append(a) or read_signals(*a))
+    monkeypatch.setattr(recorded, "read_signals", lambda *a: reads.append(a) or read_signals(*a))
     with read_drive(sample_logs_dir / "dlc.mcap", car, options=ReadOptions(friction="estimate")) as drive:
-        (first,) = _windows(drive)
+        first = drive.whole()
         said = drive.samples, drive.sample_ledger, drive.signals_sha256, drive.truth_sha256, drive.losses
-        (second,) = _windows(drive)
+        share = drive.friction.observable_share
+        second, bare = drive.whole(), drive.whole(fill_friction=False)
         assert said == (drive.samples, drive.sample_ledger, drive.signals_sha256, drive.truth_sha256, drive.losses)
-        assert len(reads) == 1
-        _assert_equal(first.signals, second.signals)
-        assert sum(len(w.signals) for w in drive.windows(window_s=2.0)) == len(first.signals)
-        assert len(reads) > 2  # windows of another length are read anew
+        assert drive.friction.observable_share == share > 0.0
+        assert drive.sha256 == hash_log(drive.path)
+        assert drive.losses == ()
+        assert drive.samples["/imu/data.angular_velocity.z"] > len(first.signals) - 3
+    assert len(reads) == 1
+    _assert_equal(first.signals, second.signals)
+    assert not np.isfinite(bare.signals.friction).any()
+    assert first.seconds == pytest.approx(9.5, abs=0.1)
+    assert first.nbytes > 100 * len(first.signals)
 
 
-def test_estimates_of_windows_are_those_of_the_whole(sample_logs_dir: Path, car: Car) -> None:
+def test_the_monitor_and_poses_change_no_estimate(sample_logs_dir: Path, car: Car) -> None:
     estimators = [make_estimator(name, car) for name in ("zero", "kinematic", "phy-ukf")]
-    with read_drive(sample_logs_dir / "dlc.mcap", car, options=ReadOptions(window_s=1.7)) as drive:
-        parts = list(estimate_windows(drive, estimators))
-        (whole,) = estimate_windows(drive.whole(), estimators)
-        (plain,) = estimate_windows(drive.whole(), estimators, watched=False, drawn=False)
-    assert parts[-1].share_done == 1.0
-    for i, track in enumerate(whole.tracks):
-        assert track.name == estimators[i].name
-        _assert_equal(concatenate([p.tracks[i] for p in parts]), track)
+    shares: list[float] = []
+    with read_drive(sample_logs_dir / "dlc.mcap", car) as drive:
+        full = estimate_drive(drive.whole(), estimators, progress=shares.append)
+        plain = estimate_drive(drive.whole(), estimators, watched=False, drawn=False)
+    assert shares == [0.0, 1 / 3, 2 / 3]
+    assert list(full.tracks) == ["zero", "kinematic", "phy-ukf"]
+    for name, track in full.tracks.items():
         assert np.isfinite(track.x_m).any()
-        assert not np.isfinite(plain.tracks[i].x_m).any()
-        _assert_equal(replace(plain.tracks[i], x_m=track.x_m, y_m=track.y_m, yaw_rad=track.yaw_rad), track)
+        assert not np.isfinite(plain.tracks[name].x_m).any()
+        _assert_equal(replace(plain.tracks[name], x_m=track.x_m, y_m=track.y_m, yaw_rad=track.yaw_rad), track)
 
 
 def test_what_is_told_is_noted_and_named(sample_logs_dir: Path, car: Car) -> None:
@@ -142,10 +121,10 @@ def test_bounds_and_ends(sample_logs_dir: Path, car: Car, monkeypatch: pytest.Mo
         assert drive.whole(max_bytes=size).nbytes == size
         with pytest.raises(EstimatorError, match="--start and --end"):
             drive.whole(max_bytes=size - 1)
-        monkeypatch.setattr(reading.DriveReader, "windows", lambda _self: iter(()))
-        for read in (lambda: drive.whole(), lambda: list(estimate_windows(drive, []))):
-            with pytest.raises(EstimatorError, match="IMU samples in the chosen slice"):
-                read()
+        nothing = replace(drive.recorded(), signals=drive.recorded().signals.rows(0, 0))
+        drive._recorded = nothing
+        with pytest.raises(EstimatorError, match="IMU samples in the chosen slice"):
+            drive.whole()
     monkeypatch.setattr(reading, "open_log", watched_log)
     with pytest.raises(UsageError, match="a slice inside"):
         read_drive(log, car, options=ReadOptions(start="99"))

@@ -12,9 +12,9 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive import reading
 from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.plan import setup_of
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.setup import LogUntil, Setup, load_setup, setup_toml
-from pdhef_logtool.drive.windows import setup_of
 from pdhef_logtool.estimators.table import spec_of
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import Signals

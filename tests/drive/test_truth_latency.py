@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.drive.plan import DrivePlan, plan_drive
+from pdhef_logtool.drive.recorded import read_recorded
 from pdhef_logtool.drive.truth import LatencyEstimate
-from pdhef_logtool.drive.windows import DrivePlan, DriveReader, plan_drive
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping.choosing import auto_map
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.tracks import StateTrack
 
 ERROR_S = 0.002
 
@@ -49,8 +50,9 @@ def test_a_latency_that_nobody_could_measure_is_not_applied(planned):
 
 
 def truth_of(log: DriveLog, plan: DrivePlan) -> StateTrack:
-    parts = [w.truth for w in DriveReader(log, plan, 600.0).windows()]
-    return concatenate([p for p in parts if p is not None])
+    truth = read_recorded(log, plan).truth
+    assert truth is not None
+    return truth
 
 
 def test_the_rule_decides_what_the_estimates_are_compared_with(planned):

@@ -22,13 +22,14 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.toml_files import load_vehicle
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
 from pdhef_logtool.cli.run_tables import render_run
-from pdhef_logtool.drive.windows import DriveReader, plan_drive
+from pdhef_logtool.drive.plan import plan_drive
+from pdhef_logtool.drive.recorded import read_recorded
 from pdhef_logtool.estimators.divergence import DivergenceState, DivergenceWatch, wrong_branch
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map
-from pdhef_logtool.records.signals import Signals, join_signals
+from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
 from pdhef_logtool.results.run_report import diverged_line, report_markdown
 from pdhef_logtool.runs.config import RunConfig
@@ -283,7 +284,7 @@ def test_the_filter_itself_sees_it_later(sweep: Path, sample_logs_dir: Path) -> 
 def read_signals(path: Path, vehicle: VehicleParameters) -> Signals:
     with closing(open_log(path)) as log:
         plan = plan_drive(log, auto_map(log).mapping, vehicle, log.start_ns, log.end_ns)
-        return join_signals([w.signals for w in DriveReader(log, plan, 600.0).windows()])
+        return read_recorded(log, plan).signals
 
 
 def _cut_track(track: StateTrack, first: int, end: int) -> StateTrack:

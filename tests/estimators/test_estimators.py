@@ -427,7 +427,7 @@ def test_what_cannot_run_is_skipped_with_the_reason():
     assert runnable(NAMES, car_of(), frozenset(ALIGNED_SIGNALS))[1] == []
     skipped = runnable(NAMES, Car.of(VEHICLE), frozenset(ALIGNED_SIGNALS))[1]
     assert [s.name for s in skipped] == ["phy-ukf:tuned"]
-    assert all(f"no noise for {s.name}; pdhef learn --stages noise" in s.reason for s in skipped)
+    assert all(f"no noise for {s.name} in noise.toml" in s.reason for s in skipped)
 
 
 def test_the_tuned_filter_takes_its_noise_from_the_car():

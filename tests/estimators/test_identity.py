@@ -101,7 +101,7 @@ def test_intervals_that_do_not_apply_are_named_on_stderr_and_in_the_report(
     pdhef("run", log, "-o", tmp_path / "out", *arguments)
     message = (
         "the calibrated intervals of phy-ukf are not applied: expected physics-ukf 1 (standstill=False), "
-        "got physics-ukf 1; run pdhef learn --stages intervals"
+        "got physics-ukf 1"
     )
     assert "".join(capsys.readouterr().err.split()).count("".join(message.split())) == 1
     report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())

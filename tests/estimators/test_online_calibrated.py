@@ -14,7 +14,7 @@ from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.vehicle import Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, calibrate_online
-from pdhef_logtool.estimators.calibration.driving import DrivingReader
+from pdhef_logtool.estimators.calibration.driving import driving_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
@@ -43,9 +43,7 @@ def driven() -> tuple[Signals, np.ndarray]:
 
 
 def calibrated(signals: Signals) -> SelfCalibration:
-    reader = DrivingReader(wrong())
-    reader.add(signals)
-    return calibrate_online(reader.finish(), wrong())
+    return calibrate_online(driving_of(signals, wrong()), wrong())
 
 
 def car_of(found: SelfCalibration) -> Car:
@@ -121,7 +119,7 @@ def test_each_stage_has_its_interval() -> None:
     signals, _ = driven()
     car = car_of(calibrated(signals))
     track, _ = run_window(online(), signals)
-    banded = calibrator(car, [online()]).add(track, signals)
+    banded = calibrator(car, [online()]).apply(track, signals)
     assert len(banded) == len(track)
     inside = slice(900, None)
     assert (banded.sideslip_std_rad[inside] >= track.sideslip_std_rad[inside]).all()
@@ -146,6 +144,6 @@ def test_tracks_of_one_window_share_the_runs_of_the_interval() -> None:
     estimators = [make_estimator(name, car) for name in ("physics", "pd-hef")]
     tracks = [run_window(e, signals)[0] for e in estimators]
     together, alone = calibrator(car, estimators), calibrator(car, estimators[1:])
-    first, second = (together.add(t, signals) for t in tracks)
-    np.testing.assert_array_equal(second.sideslip_std_rad, alone.add(tracks[1], signals).sideslip_std_rad)
+    first, second = (together.apply(t, signals) for t in tracks)
+    np.testing.assert_array_equal(second.sideslip_std_rad, alone.apply(tracks[1], signals).sideslip_std_rad)
     np.testing.assert_array_equal(first.sideslip_std_rad, second.sideslip_std_rad)

@@ -40,7 +40,6 @@ from pdhef_logtool.estimators.physics_filter import (
     PHYSICS_Q_STD,
     PhysicsFilter,
     _draw,
-    _make_constants,
     _moments,
     of_car,
     physics_filter,
@@ -60,7 +59,7 @@ from pdhef_logtool.estimators.physics_model import (
     step_count,
 )
 from pdhef_logtool.estimators.table import Options, all_names, make_estimator
-from pdhef_logtool.estimators.unscented import wide_root
+from pdhef_logtool.estimators.unscented import partial_root
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import concatenate
 
@@ -304,18 +303,17 @@ def spread(layout, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def drawn(layout, x: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What _draw writes, [PLACES, WIDTH], and the places of the state's entries."""
-    places, wide = places_of(layout), np.zeros(16)
-    P_wide, L, points = np.zeros((16, 16)), np.zeros((16, 16)), np.full(PLACES * WIDTH, np.nan)
+    """What _draw writes, [16, WIDTH], and the places of the state's entries."""
+    places, wide = places_of(layout), np.zeros(PLACES)
+    P_wide, L, points = np.zeros((PLACES, PLACES)), np.zeros((PLACES, PLACES)), np.zeros((16, WIDTH))
     wide[places], P_wide[np.ix_(places, places)] = x, P
-    there = np.isin(np.arange(16), places)
-    wide_root(P_wide, places, there, L)
-    root = np.zeros((16, 16))
+    partial_root(P_wide, places, np.isin(np.arange(PLACES), places), L)
+    root = np.zeros((PLACES, PLACES))
     root[np.ix_(places, places)] = np.linalg.cholesky(P)
     np.testing.assert_allclose(L, root, rtol=1e-12, atol=1e-14)
     np.testing.assert_array_equal(L, np.tril(L))
-    _draw(wide, L, float(layout.size), _make_constants(), points)
-    return points.reshape(PLACES, WIDTH), places
+    _draw(wide, L, float(layout.size), points.ravel())
+    return points, places
 
 
 @pytest.mark.parametrize("names", [(), ("roll",), ("bank", "biases"), ALL_PARTS], ids="+".join)
@@ -329,10 +327,10 @@ def test_sigma_points_are_those_of_numpy_and_give_their_moments_back(names):
     root = np.linalg.cholesky(n * P)
     centre = points[body, 11]
     np.testing.assert_array_equal(centre, x[:moving])
-    mirrored = np.where(body < 8, body + 16, body + 4)
+    mirrored = body + WIDTH // 2
     for i, column in enumerate(body):
         for at, sign in ((column, 1.0), (mirrored[i], -1.0)):
-            apart = points[:, at] - np.where(np.arange(PLACES) < 11, points[:, 11], 0.0)
+            apart = points[:PLACES, at] - points[:PLACES, 11]
             np.testing.assert_allclose(apart[places], sign * root[:, i], rtol=1e-12, atol=1e-12)
     rest = np.setdiff1d(np.arange(WIDTH), [*body, *mirrored])
     np.testing.assert_array_equal(points[body][:, rest], np.repeat(centre[:, None], len(rest), axis=1))
@@ -347,13 +345,13 @@ def test_sigma_points_are_those_of_numpy_and_give_their_moments_back(names):
     weights = np.array([2.0, *([0.5 / n] * (2 * n))])
     moved = points.copy()
     moved[:11] = np.sin(points[:11]) + 0.1 * points[:11] ** 2
-    mean, covariance = np.zeros(16), np.zeros((16, 16))
+    mean, covariance = np.zeros(PLACES), np.zeros((PLACES, PLACES))
     mean[places], covariance[np.ix_(places, places)] = x, P
-    first_mean, first, constants = mean.copy(), np.zeros((16, 16)), _make_constants()
-    q = np.zeros(16)
+    first_mean, first = mean.copy(), np.zeros((PLACES, PLACES))
+    q = np.zeros(PLACES)
     q[places] = np.linspace(0.1, 0.4, n)
-    _moments(moved.ravel().copy(), float(n), q, constants, first_mean, first, False)
-    _moments(moved.ravel(), float(n), q, constants, mean, covariance, True)
+    _moments(moved.ravel().copy(), float(n), q, first_mean, first, 3)
+    _moments(moved.ravel(), float(n), q, mean, covariance, PLACES)
     np.testing.assert_allclose(mean[places], want, rtol=1e-12)
     want = (weights * apart) @ apart.T + np.diag(q[places])
     np.testing.assert_array_equal(covariance, covariance.T)

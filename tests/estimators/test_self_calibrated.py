@@ -70,7 +70,7 @@ def tracks(name: str, car: Car, *parts: Signals) -> list[StateTrack]:
     intervals = calibrator(car, [estimator])
     for part in parts:
         track, state = run_window(estimator, part, state)
-        found.append(intervals.add(track, part))
+        found.append(intervals.apply(track, part))
     return found
 
 
@@ -127,13 +127,6 @@ def test_windows_change_no_bit(name: str, signals: Signals) -> None:
     np.testing.assert_array_equal(np.concatenate([p.vy_m_s for p in parts]), whole.vy_m_s)
 
 
-def test_windows_change_no_bit_of_the_band(signals: Signals) -> None:
-    (whole,) = tracks("physics", with_band(), signals)
-    parts = tracks("physics", with_band(), *(cut(signals, a, b) for a, b in ((0, 1), (1, 111), (111, len(signals)))))
-    for column in ("vy_m_s", "sideslip_std_rad", "covariance"):
-        np.testing.assert_array_equal(np.concatenate([getattr(p, column) for p in parts]), getattr(whole, column))
-
-
 def test_estimators_of_a_run_share_what_their_bands_compare(signals: Signals, monkeypatch: pytest.MonkeyPatch) -> None:
     car, names, half = with_band(), ("physics", "pd-hef"), len(signals) // 2
     windows = cut(signals, 0, half), cut(signals, half, len(signals))
@@ -145,7 +138,7 @@ def test_estimators_of_a_run_share_what_their_bands_compare(signals: Signals, mo
     for number, window in enumerate(windows):
         for i, estimator in enumerate(estimators):
             track, states[i] = run_window(estimator, window, states[i])
-            track, expected = intervals.add(track, window), alone[names[i]][number]
+            track, expected = intervals.apply(track, window), alone[names[i]][number]
             np.testing.assert_array_equal(track.sideslip_std_rad, expected.sideslip_std_rad)
             np.testing.assert_array_equal(track.vy_m_s, expected.vy_m_s)
     own = len(names)  # each estimator is one filter
@@ -200,8 +193,8 @@ def test_intervals_of_other_driving_are_not_taken(signals: Signals) -> None:
     intervals = Intervals(car="c", physics_sha256="ab" * 32, roll_gradient_rad_per_m_s2=0.0, entries=entries)
     track, _ = run_window(estimator, signals)
     applied = calibrator(replace(with_band(), intervals=intervals), [estimator])
-    without = calibrator(with_band(), [estimator]).add(track, signals)
-    np.testing.assert_array_equal(applied.add(track, signals).sideslip_std_rad, without.sideslip_std_rad)
+    without = calibrator(with_band(), [estimator]).apply(track, signals)
+    np.testing.assert_array_equal(applied.apply(track, signals).sideslip_std_rad, without.sideslip_std_rad)
     assert (without.sideslip_std_rad != track.sideslip_std_rad).any()
     assert applied.notes(estimator.name) == ("intervals: own, parameters and d2",)
 

@@ -18,7 +18,7 @@ from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.calibration import calibration as rules
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
-from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving, DrivingReader
+from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving, driving_of
 from pdhef_logtool.estimators.calibration.joint import LIKE, REAR_STIFFNESS, like_drives, parameters_of, with_taught
 from pdhef_logtool.records.signals import Signals
 
@@ -47,9 +47,7 @@ def wide() -> Drive:
 
 
 def driving(signals: Signals, vehicle: VehicleParameters) -> Driving:
-    reader = DrivingReader(vehicle)
-    reader.add(signals)
-    return reader.finish()
+    return driving_of(signals, vehicle)
 
 
 def found(signals: Signals, vehicle: VehicleParameters) -> SelfCalibration:
@@ -212,17 +210,6 @@ def test_the_calibrated_vehicle_reads_its_signals_with_what_was_found() -> None:
     assert calibration.vehicle.physics.names == ("lag", "roll", "bank")
     assert calibration.vehicle.mass_kg == RIGHT.mass_kg
     assert calibration.vehicle_file is RIGHT
-
-
-def test_windows_change_no_bit() -> None:
-    signals = with_noise(wide().signals, 6)
-    whole = driving(signals, RIGHT)
-    reader = DrivingReader(RIGHT)
-    for a, b in ((0, 1), (1, 1), (1, 777), (777, 778), (778, 4003), (4003, len(signals))):
-        reader.add(cut(signals, a, b))
-    parts = reader.finish()
-    np.testing.assert_array_equal(parts.columns, whole.columns)
-    np.testing.assert_array_equal(parts.stretches, whole.stretches)
 
 
 def test_a_pause_of_a_day_costs_no_memory() -> None:

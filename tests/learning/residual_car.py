@@ -12,7 +12,6 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
-from pdhef_logtool.drive.windows import DriveWindow
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
@@ -107,8 +106,16 @@ def drive(seconds: float = 20.0, lateral: Wave = NONE, yaw: Wave = NONE, speed: 
     return Motion(t, state, steer, ax, ay, residual)
 
 
-def window(motion: Motion, seed: int | None = None) -> DriveWindow:
-    """The whole drive as one window: sensors (noisy with a seed) and the perfect truth."""
+@dataclass(frozen=True)
+class Measured:
+    """Signals and ground truth at the same stamps."""
+
+    signals: Signals
+    truth: StateTrack | None
+
+
+def window(motion: Motion, seed: int | None = None) -> Measured:
+    """The whole drive: sensors (noisy with a seed) and the perfect truth."""
     n = len(motion.t)
     rng = np.random.default_rng(seed)
     scale = 0.0 if seed is None else 1.0
@@ -129,7 +136,7 @@ def window(motion: Motion, seed: int | None = None) -> DriveWindow:
         wheel_speed_m_s=np.full((n, 4), np.nan),
         available=frozenset({"steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"}),
     )
-    return DriveWindow(signals, truth_of(stamps, motion.state), 1.0)
+    return Measured(signals, truth_of(stamps, motion.state))
 
 
 def truth_of(stamps: np.ndarray, state: np.ndarray) -> StateTrack:
@@ -143,8 +150,8 @@ def truth_of(stamps: np.ndarray, state: np.ndarray) -> StateTrack:
     )
 
 
-def pick(whole: DriveWindow, index: np.ndarray | slice) -> DriveWindow:
-    """Only some rows of a window: a part, or what a recorder that lost the others would have."""
+def pick(whole: Measured, index: np.ndarray | slice) -> Measured:
+    """Only some rows of a drive: a part, or what a recorder that lost the others would have."""
     signals = replace(
         whole.signals,
         **{f.name: getattr(whole.signals, f.name)[index] for f in fields(Signals) if f.name != "available"},
@@ -152,4 +159,4 @@ def pick(whole: DriveWindow, index: np.ndarray | slice) -> DriveWindow:
     truth = whole.truth
     assert truth is not None
     state = np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)[index]
-    return DriveWindow(signals, truth_of(signals.stamps_ns, state), 1.0)
+    return Measured(signals, truth_of(signals.stamps_ns, state))

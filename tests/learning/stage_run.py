@@ -22,4 +22,4 @@ def run_stage(
     **settings: Any,
 ) -> LearnResult:
     """Run one stage on logs and write the car to ``output``."""
-    return learn(logs, output, LearnSettings(config=config, stages=(stage,), **settings), reporter=reporter)
+    return learn(logs, output, LearnSettings(config=config, stage=stage, **settings), reporter=reporter)

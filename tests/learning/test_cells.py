@@ -86,7 +86,7 @@ def test_conditions_are_on_the_columns_of_a_row() -> None:
     holds = Picking(condition_of("abs(ay_m_s2) > 0.5 and not vx_km_h < 1.8 or truth_vx_m_s < 0")).of(rows).chosen
     np.testing.assert_array_equal(holds, (np.abs(ay) > 0.5) & ~(vx * 3.6 < 1.8))
     assert Picking().of(rows).chosen.all() and not Picking(condition_of("not 1 < 2")).of(rows).chosen.any()
-    for wrong in ("sideslip_rad > 1", "truth.vx_m_s > 1", "vx_m_s > 1 for 2s", "vx_m_s", "friction > 1 and"):
+    for wrong in ("sideslip_rad > 1", "truth.vx_m_s > 1", "vx_m_s > 1 and (select 1)", "vx_m_s", "friction > 1 and"):
         with pytest.raises(UsageError, match="--where"):
             condition_of(wrong)
 

@@ -196,15 +196,6 @@ def test_a_drive_below_the_low_speed_limit_gives_rows_and_is_told(
     assert one.record.seconds == pytest.approx(3.99) and result.exit_code == 0
 
 
-@pytest.mark.slow
-def test_windows_of_reading_change_no_byte(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    hashes = set()
-    for window_s in (3.0, 7.3, 600.0):
-        result = _extract(tmp_path, monkeypatch, _log(motion, sigma=0.01), window_s=window_s)
-        hashes.add(result.manifest["sha256"])
-    assert len(hashes) == 1
-
-
 # ---- files ----
 
 

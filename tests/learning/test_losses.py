@@ -22,24 +22,16 @@ pytestmark = pytest.mark.slow
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 
 
-def _losses_by_command(
-    log: Path, others: list[Path], out: Path, config: RunConfig
-) -> dict[str, tuple[list[dict[str, Any]], list[str]]]:
-    """Run every command on a damaged log, intervals with others beside it; return by command its losses and warnings.
+def _losses_by_command(log: Path, out: Path, config: RunConfig) -> dict[str, tuple[list[dict[str, Any]], list[str]]]:
+    """Run every command on a damaged log; return by command its losses and warnings.
 
     Every one must end with exit code 3.
     """
     logs, found = [str(log)], {}
     physics = replace(config, network=Path("none"), estimators=("phy-ukf",))
-
-    tuned = replace(physics, estimators=("phy-ukf:tuned",))
     commands = {
         "extract": lambda tell: extract(logs, out / "2", ExtractSettings(physics), reporter=Reporter(warn=tell)),
-        "noise": lambda tell: run_stage("noise", logs, out / "3", tuned, trials=4, reporter=Reporter(warn=tell)),
         "gain": lambda tell: run_stage("gain", logs, out / "4", config, reporter=Reporter(warn=tell)),
-        "intervals": lambda tell: run_stage(
-            "intervals", [*logs, *map(str, others)], out / "5", physics, spread=0.0, reporter=Reporter(warn=tell)
-        ),
         "run": lambda tell: run_logs(logs, out / "6", replace(physics, annotate="none"), reporter=Reporter(warn=tell)),
     }
     for name, command in commands.items():
@@ -69,15 +61,13 @@ def test_a_truncated_simulated_log(sample_logs_dir: Path, tmp_path: Path) -> Non
     data = (sample_logs_dir / "road.mcap").read_bytes()
     log = tmp_path / "cut.mcap"
     log.write_bytes(data[: len(data) * 6 // 10])
-    # Beside it: drives of one name in two folders would get longer names.
-    others = [Path(shutil.copy(sample_logs_dir / f"{n}.mcap", tmp_path)) for n in ("dlc", "step", "fishhook", "sweep")]
     config = RunConfig(car=sample_logs_dir / "vehicle.toml", end="34")
-    _check(_losses_by_command(log, others, tmp_path / "out", config), "cut")
+    _check(_losses_by_command(log, tmp_path / "out", config), "cut")
 
 
 def test_the_truncated_drive_of_the_250_lm(shared_dir: Path, tmp_path: Path) -> None:
     source = shared_dir / "data/drives/faulty/revs_250lm_a_truncated60.mcap"
-    log, *others = [Path(shutil.copyfile(source, tmp_path / f"cut_{number}.mcap")) for number in range(5)]
+    log = Path(shutil.copyfile(source, tmp_path / "cut.mcap"))
     vehicle, mapping = REFERENCE / "vehicles/revs_250lm.toml", REFERENCE / "mappings/revs_250lm.toml"
     config = RunConfig(car=vehicle, mapping=mapping, end="40")
-    _check(_losses_by_command(log, others, tmp_path / "out", config), "cut_0")
+    _check(_losses_by_command(log, tmp_path / "out", config), "cut")

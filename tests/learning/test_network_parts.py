@@ -37,8 +37,7 @@ from pdhef_logtool.learning.network.fit import CHECKPOINT, Epoch, FeatureSequenc
 from pdhef_logtool.learning.network.residuals import (
     ResidualRows,
     difference_noise,
-    join_rows,
-    residual_windows,
+    residual_rows,
     smooth_increments,
 )
 from pdhef_logtool.learning.network.train_command import gap_free_runs, make_recipe, mean_square, train_on
@@ -61,16 +60,12 @@ TINY = Recipe(FEATURES[:2], hidden=3, layers=1, head=(2,), epochs=9, batch=2, pa
 
 def test_without_truth_there_are_features_and_no_targets() -> None:
     whole = window(drive(2.0))
-    rows = join_rows(residual_windows([replace(whole, truth=None)], PhysicsFilter(CAR), period_s=0.01))
-    with_truth = join_rows(residual_windows([whole], PhysicsFilter(CAR), period_s=0.01))
+    rows = residual_rows(whole.signals, None, PhysicsFilter(CAR), period_s=0.01)
+    with_truth = residual_rows(whole.signals, whole.truth, PhysicsFilter(CAR), period_s=0.01)
     np.testing.assert_array_equal(rows.features, with_truth.features)
     assert np.isnan(rows.targets).all() and np.isnan(rows.truth_velocity).all() and not rows.weight.any()
     np.testing.assert_allclose(rows.step_s[:-1], 0.01)
     assert math.isnan(rows.step_s[-1])
-    # A window without a stamp changes nothing.
-    signals = replace(whole.signals, stamps_ns=whole.signals.stamps_ns[:0])
-    same = join_rows(residual_windows([replace(whole, signals=signals), whole], PhysicsFilter(CAR), period_s=0.01))
-    np.testing.assert_array_equal(same.targets, with_truth.targets)
 
 
 def test_noise_of_differences_needs_eight_stamps_without_gaps() -> None:
@@ -100,7 +95,7 @@ def test_a_window_as_long_as_the_data_still_gives_its_middle() -> None:
 # ---- the dataset ----
 
 
-def residual_rows(count: int = 120, **changes: Any) -> ResidualRows:
+def made_rows(count: int = 120, **changes: Any) -> ResidualRows:
     rng = np.random.default_rng(count)
     stamps = START_NS + np.cumsum(np.full(count, 10_000_000))
     weight = np.ones(count)
@@ -149,14 +144,14 @@ def write_dataset(folder: Path, **drives: tuple[str, ResidualRows]) -> None:
 
 
 def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
-    rows = residual_rows()
+    rows = made_rows()
     features, targets, weight = rows.features.copy(), rows.targets.copy(), rows.weight.copy()
     features[5] = np.nan  # the filter has no state
     targets[9] = np.nan
     weight[[5, 9]] = 0.0
     segment = np.where(np.arange(120) < 60, 0, 1)
     rows = replace(rows, features=features, targets=targets, weight=weight, segment=segment)
-    other = residual_rows(40)
+    other = made_rows(40)
     write_dataset(tmp_path, z=("train", rows), b=("train", other), c=("extra", other))
     document = json.loads((tmp_path / "manifest.json").read_text())
     assert len(document.pop("digest")) == 64
@@ -207,7 +202,7 @@ def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
 
 
 def test_parts_of_rows_change_no_byte_and_a_dropped_file_is_gone(tmp_path: Path) -> None:
-    rows = residual_rows(170)
+    rows = made_rows(170)
     files = []
     for size in (7, 50, 170):
         path = tmp_path / f"{size}.parquet"
@@ -323,7 +318,7 @@ def test_counts_are_sums_over_the_usable_rows() -> None:
     picked = Picked(np.array([True, True, False, True]), np.array([2, 2, 2, 2], dtype=np.int16), np.zeros(4, "f4"))
     for first, value in ((0, 0.03), (4, 0.04)):
         counts.add(
-            residual_rows(
+            made_rows(
                 4,
                 stamps_ns=START_NS + (first + np.arange(4)) * 10_000_000,
                 targets=np.tile([value, 0.01], (4, 1)),
@@ -415,7 +410,7 @@ def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch
 
     def one(job: Any, _progress: Any) -> Any:
         assert not (job.output / "manifest.json").exists()  # while drives are written, the old one is not true
-        rows, split = residual_rows(60), "train" if job.log_input.stem == "a" else "test"
+        rows, split = made_rows(60), "train" if job.log_input.stem == "a" else "test"
         entry = {**entry_of(job.log_input.stem, split, rows), "vehicle_sha256": job.physics[0]}
         writer = DriveWriter(drive_file(job.output, entry))
         writer.append(rows)
@@ -647,7 +642,7 @@ def test_fine_tuning_takes_shape_weights_and_normalisation_of_the_other(
 
 
 def arrays(count: int = 200, **changes: Any) -> DriveArrays:
-    rows = residual_rows(count)
+    rows = made_rows(count)
     columns: dict[str, Any] = {
         "stamps_ns": rows.stamps_ns,
         "features": rows.features.astype(np.float32),

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-from itertools import pairwise
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,17 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from physics_oracle import Oracle, parts
 from reference_car import Drive
-from residual_car import CAR, FRICTION, START_NS, Motion, Wave, drive, pick, truth_of, window
+from residual_car import CAR, FRICTION, START_NS, Measured, Motion, Wave, drive, pick, truth_of, window
 
-from pdhef_logtool.drive.windows import DriveWindow
 from pdhef_logtool.estimators.parallel_physics import parallel_filter
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.learning.network.dataset import DriveArrays
 from pdhef_logtool.learning.network.residuals import (
     ResidualRows,
     difference_noise,
-    join_rows,
-    residual_windows,
+    residual_rows,
     smooth_increments,
 )
 from pdhef_logtool.learning.network.train_command import steering_offset
@@ -36,22 +33,22 @@ def motion() -> Motion:
 
 
 @pytest.fixture(scope="module")
-def noisy(motion: Motion) -> DriveWindow:
+def noisy(motion: Motion) -> Measured:
     """With noise, a lost stretch of 0.8 s, single lost stamps, and truth and steering that fail for a while."""
     whole = window(motion, seed=3)
     steer = whole.signals.steer_rad.copy()
     steer[900:905] = np.nan
     truth = motion.state.copy()
     truth[700:720] = np.nan
-    whole = DriveWindow(replace(whole.signals, steer_rad=steer), truth_of(motion.stamps_ns, truth), 1.0)
+    whole = Measured(replace(whole.signals, steer_rad=steer), truth_of(motion.stamps_ns, truth))
     kept = np.ones(len(motion.t), dtype=bool)
     kept[300:380] = kept[500] = kept[1203] = False
     return pick(whole, np.flatnonzero(kept))
 
 
-def rows_of(*windows: DriveWindow, half_window: int = 0, **changes: float) -> ResidualRows:
+def rows_of(made: Measured, half_window: int = 0, **changes: float) -> ResidualRows:
     car = CAR.model_copy(update=changes)
-    return join_rows(residual_windows(windows, parallel_filter(car), period_s=0.01, half_window=half_window))
+    return residual_rows(made.signals, made.truth, parallel_filter(car), period_s=0.01, half_window=half_window)
 
 
 def rates(rows: ResidualRows) -> np.ndarray:
@@ -119,28 +116,7 @@ def test_smoothed_targets_of_a_noisy_truth_are_unbiased(motion: Motion) -> None:
     assert mean[0] < 0.01 and mean[1] < 0.004
 
 
-@pytest.mark.slow
-@settings(max_examples=25, deadline=None, derandomize=True)
-@given(cuts=st.lists(st.integers(1, 1900), max_size=8), half_window=st.sampled_from([0, 1, 15]))
-def test_windows_change_no_bit(noisy: DriveWindow, cuts: list[int], half_window: int) -> None:
-    n = len(noisy.signals)
-    edges = sorted({0, n, *(c for c in cuts if c < n)})
-    parts = [pick(noisy, slice(a, b)) for a, b in pairwise(edges)]
-    whole, joined = rows_of(noisy, half_window=half_window), rows_of(*parts, half_window=half_window)
-    assert len(whole) == n
-    for f in fields(ResidualRows):
-        np.testing.assert_array_equal(getattr(joined, f.name), getattr(whole, f.name), err_msg=f.name)
-
-
-def test_one_stamp_a_window_changes_no_bit(noisy: DriveWindow) -> None:
-    part = pick(noisy, slice(0, 420))
-    single = [pick(part, slice(i, i + 1)) for i in range(420)]
-    whole, joined = rows_of(part, half_window=3), rows_of(*single, half_window=3)
-    for f in fields(ResidualRows):
-        np.testing.assert_array_equal(getattr(joined, f.name), getattr(whole, f.name), err_msg=f.name)
-
-
-def test_no_target_across_gaps_or_without_truth_or_steering(noisy: DriveWindow) -> None:
+def test_no_target_across_gaps_or_without_truth_or_steering(noisy: Measured) -> None:
     rows = rows_of(noisy)
     index = np.round((rows.stamps_ns - START_NS) / 1e7).astype(int)
     gone = set(index[np.isnan(rows.targets).any(axis=1)].tolist())
@@ -149,7 +125,7 @@ def test_no_target_across_gaps_or_without_truth_or_steering(noisy: DriveWindow) 
     assert not rows.weight[np.isin(index, list(expected))].any()
 
 
-def test_smoothing_reaches_over_no_gap(noisy: DriveWindow) -> None:
+def test_smoothing_reaches_over_no_gap(noisy: Measured) -> None:
     h = 15
     plain, smooth = rows_of(noisy), rows_of(noisy, half_window=h)
     missing = np.flatnonzero(np.isnan(plain.targets[:-1]).any(axis=1))
@@ -160,7 +136,7 @@ def test_smoothing_reaches_over_no_gap(noisy: DriveWindow) -> None:
     np.testing.assert_array_equal(np.isnan(smooth.targets).any(axis=1), near)
 
 
-def test_segments_begin_where_the_filter_does(noisy: DriveWindow) -> None:
+def test_segments_begin_where_the_filter_does(noisy: Measured) -> None:
     rows = rows_of(noisy)
     index = np.round((rows.stamps_ns - START_NS) / 1e7).astype(int)
     assert rows.segment[0] == 0
@@ -195,7 +171,7 @@ def test_slow_and_spinning_cars_weigh_nothing() -> None:
     np.testing.assert_array_equal(rows.weight > 0, expected)
 
 
-def test_features_do_not_see_the_truth(noisy: DriveWindow) -> None:
+def test_features_do_not_see_the_truth(noisy: Measured) -> None:
     truth = noisy.truth
     assert truth is not None
     state = np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)
@@ -243,10 +219,10 @@ def test_staircase_truth_is_noise() -> None:
 # --- what physics lacks ----------------------------------------------------------------------------------------------
 
 
-def oracle_window(oracle: Oracle, made: Drive, **signals: np.ndarray) -> DriveWindow:
+def oracle_window(oracle: Oracle, made: Drive, **signals: np.ndarray) -> Measured:
     state = np.stack([made.vx, made.vy, made.r], axis=1)
     whole = replace(made.signals, friction=np.full(len(made.signals), reference_car.FRICTION), **signals)
-    return DriveWindow(whole, truth_of(whole.stamps_ns, state), 1.0)
+    return Measured(whole, truth_of(whole.stamps_ns, state))
 
 
 @pytest.mark.slow
@@ -256,28 +232,15 @@ def test_physics_of_the_car_lacks_nothing_and_a_force_that_it_does_not_know_come
     oracle = Oracle(parts(*names))
     made = oracle.drive(lambda t: 0.03 * np.sin(3.0 * t), 6.0)
     physics = PhysicsFilter(oracle.as_vehicle())
-    right = rates(join_rows(residual_windows([oracle_window(oracle, made)], physics, period_s=0.01)))
+    window_ = oracle_window(oracle, made)
+    right = rates(residual_rows(window_.signals, window_.truth, physics, period_s=0.01))
     late = slice(100, -1)
     assert np.abs(right[late]).max() < 0.02
     slippery = np.full(len(made.signals), 0.9 * reference_car.FRICTION)
-    window_ = oracle_window(oracle, made)
-    told = replace(window_, signals=replace(window_.signals, friction=slippery))
-    lacks = rates(join_rows(residual_windows([told], physics, period_s=0.01)))[late, 0]
+    told = replace(window_.signals, friction=slippery)
+    lacks = rates(residual_rows(told, window_.truth, physics, period_s=0.01))[late, 0]
     slope = float(made.ay[late] @ lacks / (made.ay[late] @ made.ay[late]))
     assert 0.04 < slope < 0.15
-
-
-def test_windows_change_no_bit_of_what_physics_lacks() -> None:
-    oracle = Oracle(parts("lag", "roll", "biases"))
-    whole = oracle_window(oracle, oracle.drive(lambda t: 0.03 * np.sin(3.0 * t), 3.0))
-    physics = PhysicsFilter(oracle.as_vehicle())
-    n = len(whole.signals)
-    once = join_rows(residual_windows([whole], physics, period_s=0.01, half_window=3))
-    edges = (0, 1, 2, 77, 78, 200, n)
-    cuts = [pick(whole, slice(a, b)) for a, b in pairwise(edges)]
-    joined = join_rows(residual_windows(cuts, physics, period_s=0.01, half_window=3))
-    for f in fields(ResidualRows):
-        np.testing.assert_array_equal(getattr(joined, f.name), getattr(once, f.name), err_msg=f.name)
 
 
 @pytest.mark.slow
@@ -286,11 +249,8 @@ def test_an_offset_of_the_steering_angle_is_no_residual() -> None:
     oracle = Oracle(parts("lag"))
     made = oracle.drive(lambda t: 0.02 * np.sin(3.0 * t), 12.0)
     off = made.signals.steer_rad + 0.002
-    rows = join_rows(
-        residual_windows(
-            [oracle_window(oracle, made, steer_rad=off)], PhysicsFilter(oracle.as_vehicle()), period_s=0.01
-        )
-    )
+    whole = oracle_window(oracle, made, steer_rad=off)
+    rows = residual_rows(whole.signals, whole.truth, PhysicsFilter(oracle.as_vehicle()), period_s=0.01)
     use = rows.weight > 0
     arrays = DriveArrays(
         rows.stamps_ns[use],

@@ -23,7 +23,7 @@ from pdhef_logtool.learning.car.taught_prior import TYRES, taught_parameters
 from pdhef_logtool.learning.drives import TEACH, LearnSettings
 from pdhef_logtool.learning.engine import LearnResult, learn
 from pdhef_logtool.learning.stages.teach import OpenedDrive, _folds, _support, learn_from, open_drive
-from pdhef_logtool.records.errors import EstimatorError, UsageError, VehicleError
+from pdhef_logtool.records.errors import EstimatorError, VehicleError
 from pdhef_logtool.runs.config import RunConfig
 
 SPAN = {"start": "60", "end": "130"}
@@ -182,6 +182,4 @@ def test_what_cannot_be_taught_is_refused(sample_logs_dir: Path, bare: Path, tmp
         learn(road, tmp_path / "car", short)
     with pytest.raises(EstimatorError, match="at least one drive"):
         learn([str(sample_logs_dir / "no_truth.mcap")], tmp_path / "car", LearnSettings(config=RunConfig(car=bare)))
-    with pytest.raises(UsageError, match="teach alone"):
-        LearnSettings(config=RunConfig(car=bare), stages=("teach", "noise"))
     assert not (tmp_path / "car").exists()

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import io
-import json
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import said
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
-from rich.console import Console
 
 from pdhef_logtool.cli.app import app
-from pdhef_logtool.logs.byte_account import ByteAccount, checksummed_share
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
-from pdhef_logtool.runs.inspection import inspect_log, render_inspection
 
 T0 = 1_700_000_000_000_000_000
 N = 400
@@ -58,14 +52,6 @@ def _exit_code(path: Path) -> int:
     return int(ended.value.code or 0)
 
 
-def _share(path: Path) -> float | None:
-    log = open_log(path)
-    log.read({}, stamps=[t.name for t in log.topics])
-    found = checksummed_share(log.byte_ledgers)
-    log.close()
-    return found
-
-
 @pytest.mark.parametrize("message", range(0, N, N // 12))
 def test_a_flipped_bit_that_only_the_crc_of_the_data_shows_is_a_loss(tmp_path: Path, message: int) -> None:
     path = _log(tmp_path / "log.mcap", chunk_crcs=False, data_crc=True)
@@ -77,9 +63,6 @@ def test_a_flipped_bit_that_only_the_crc_of_the_data_shows_is_a_loss(tmp_path: P
     assert [(loss.kind, loss.severity) for loss in log.lost] == [("bad-data-crc", "lost")]
     assert "it is unknown which" in log.lost[0].what
     np.testing.assert_array_equal(values["b"], 0.5 * np.arange(N))  # what can be read is read
-    (ledger,) = log.byte_ledgers
-    assert ledger.lost > 0
-    assert ledger.checksummed == 0
     log.close()
     assert _exit_code(path) == EXIT_PARTIAL
 
@@ -91,38 +74,6 @@ def test_a_sound_log_whose_data_has_a_crc_is_covered_by_it(tmp_path: Path, chunk
     assert log.lost == ()
     log.close()
     assert _exit_code(path) == EXIT_OK
-    assert _share(path) == pytest.approx(1.0, abs=0.01)
-
-
-def test_the_share_of_the_bytes_under_a_checksum_is_told(tmp_path: Path, sample_logs_dir: Path) -> None:
-    assert _share(_log(tmp_path / "crc.mcap", chunk_crcs=True, data_crc=False)) == pytest.approx(1.0, abs=0.02)
-    assert _share(_log(tmp_path / "none.mcap", chunk_crcs=False, data_crc=False)) == 0.0
-    for name, text in (("crc", "A checksum of the file covers 9"), ("none", "No checksum of the file covers")):
-        found = inspect_log(tmp_path / f"{name}.mcap")
-        assert found.to_dict()["checksummed_share"] == pytest.approx(_share(tmp_path / f"{name}.mcap"), abs=0.01)
-        out = io.StringIO()
-        render_inspection(found, Console(file=out, width=120))
-        assert text in out.getvalue()
-    assert 0.95 < (inspect_log(sample_logs_dir / "road.mcap").checksummed_share or 0.0) < 1.0
-
-
-def test_bags_and_databases_have_no_checksums(shared_dir: Path) -> None:
-    drives = shared_dir / "data/drives"
-    for suffix in ("*.bag", "*.db3"):
-        path = min((p for p in drives.rglob(suffix) if "faulty" not in p.parts), key=lambda p: p.stat().st_size)
-        assert _share(path) == 0.0
-
-
-def test_a_run_reports_the_share(sample_logs_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = ("run", sample_logs_dir / "dlc.mcap", "-o", tmp_path / "out", "-e", "zero", "--annotate", "none")
-    (log,) = said(capsys, *run)["logs"]
-    ledger = log["report"]["ledger"]
-    assert 0.95 < ledger["checksummed_share"] < 1.0
-    assert ledger["checksummed_share"] == ledger["bytes"][0]["checksummed"] / ledger["bytes"][0]["decoded"]
-    page = (Path(log["output"]) / "report.html").read_text()
-    assert "A checksum of the file covers 9" in page
-    kept = json.loads((Path(log["output"]) / "report.json").read_text())
-    assert kept["ledger"] == ledger
 
 
 def test_a_log_that_is_read_in_part_from_a_server_says_what_was_not_verified(tmp_path: Path) -> None:
@@ -146,12 +97,10 @@ def test_a_log_that_is_read_in_part_from_a_server_says_what_was_not_verified(tmp
         assert [(loss.kind, loss.severity) for loss in log.lost] == [("unverified", "note")]
         assert log.index is not None
         assert len(log.read({"/a": ["a"]})["/a"]) == N
-        assert checksummed_share(log.byte_ledgers) == 0.0
         log.close()
         log = open_log(place)  # all of it
         log.read({"/a": ["a"], "/b": ["a"]})
         assert log.lost == ()
-        assert checksummed_share(log.byte_ledgers) == pytest.approx(1.0, abs=0.01)
         log.close()
 
 
@@ -169,16 +118,3 @@ def test_damage_of_a_summary_is_a_note(tmp_path: Path) -> None:
     assert [(loss.kind, loss.severity) for loss in log.lost] == [("bad-summary-crc", "note")]
     log.close()
     assert _exit_code(path) == EXIT_OK
-
-
-def test_bytes_count_as_covered_where_they_were_read_and_are_not_lost() -> None:
-    account = ByteAccount(100)
-    account.decode(0, 50)
-    account.decode(60, 70)
-    account.verify(40, 65)
-    account.lose(45, 50)
-    ledger = account.ledger("x")
-    assert (ledger.decoded, ledger.lost, ledger.unwanted) == (55, 5, 40)
-    assert ledger.checksummed == 10
-    assert checksummed_share([ledger]) == 10 / 55
-    assert checksummed_share([]) is None

@@ -64,9 +64,6 @@ def _outcome(path: Path, budget: ResourceLimits = DEFAULT_LIMITS) -> tuple[int, 
     log = open_log(path, budget)
     try:
         read = sum(len(c) for c in log.read({}, stamps=[t.name for t in log.topics]).values())
-        (ledger,) = log.byte_ledgers
-        assert ledger.size == ledger.decoded + ledger.unwanted + ledger.lost
-        assert (ledger.lost > 0 or ledger.cut) == any(loss.severity == "lost" for loss in log.lost)
         return read, log.lost, sum(t.messages for t in log.topics)
     finally:
         log.close()
@@ -257,8 +254,6 @@ def test_a_log_that_takes_too_long_loses_its_rest(tmp_path: Path, monkeypatch: p
     (loss,) = log.lost
     assert (loss.kind, loss.count) == ("over-budget", sum(sum(s.counts.values()) for s in container.spans[3:]))
     assert "--set budget" in loss.what
-    (ledger,) = log.byte_ledgers
-    assert ledger.lost == sum(end - at for at, end in map(container.extent, container.spans[3:]))
     log.close()
 
 
@@ -285,7 +280,6 @@ def test_a_file_that_is_cut_while_it_is_open_is_a_loss(tmp_path: Path, chunked: 
     assert sum(len(c) for c in log.read({}, stamps=[t.name for t in log.topics]).values()) < N
     assert all(loss.kind == "bad-chunk" and loss.severity == "lost" for loss in log.lost)
     assert log.lost
-    assert log.byte_ledgers[0].lost > 0
     log.close()
 
 

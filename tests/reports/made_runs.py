@@ -102,7 +102,7 @@ def report_of(tracks: list[StateTrack], label: str = "drive", **changes: Any) ->
             {"name": "straight", "start_ns": int(stamps[0]), "end_ns": int(stamps[len(stamps) // 3]), "text": ""}
         ],
         "losses": [],
-        "ledger": {"bytes": [], "samples": []},
+        "ledger": {"samples": []},
         "warnings": [],
         "remarks": [],
         "checks": [],

@@ -63,8 +63,6 @@ def known(document: Any, start_ns: int) -> tuple[list[float], str]:
             texts.extend(value)
             for name, entry in value.items():
                 walk(entry, name) if name != "requirement_blocks" else None
-            if isinstance(value.get("causes"), list) and value.get("rmse_rad"):  # shares of the error decomposition
-                numbers.extend(1 - (c["rmse_left_rad"] or 0.0) / value["rmse_rad"] for c in value["causes"])
         elif isinstance(value, list):
             numbers.append(float(len(value)))
             for entry in value:

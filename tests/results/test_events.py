@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.results.clips import write_clips
-from pdhef_logtool.results.events import FoundEvents, find_events, write_events
-from pdhef_logtool.results.expression import parse_condition
+from pdhef_logtool.results.events import FoundEvents, event_condition, find_events, write_events
 from pdhef_logtool.results.opened_run import open_run
 from tests.results import source_log
 from tests.results.made_run import START_NS, entry, write_estimates, write_run
@@ -25,7 +26,7 @@ N = 600
 
 
 def _find(folder: Path, where: str, **options: Any) -> FoundEvents:
-    return find_events(open_run(folder), parse_condition(where), **options)
+    return find_events(open_run(folder), event_condition(where), **options)
 
 
 def _report(folder: Path, label: str, **vehicle: Any) -> None:
@@ -86,8 +87,9 @@ def test_room_around_events_joins_them(run: Path) -> None:
 
 
 def test_what_holds_too_short_is_none(run: Path) -> None:
-    assert len(_find(run, "abs(sideslip_error_deg) > 1.5 and speed_m_s > 10 for 0.1s").events) == 1
-    assert not _find(run, "abs(sideslip_error_deg) > 1.5 and speed_m_s > 10 for 0.2s").events
+    where = "abs(sideslip_error_deg) > 1.5 and speed_m_s > 10"
+    assert len(_find(run, where, least_s=0.1).events) == 1
+    assert not _find(run, where, least_s=0.2).events
 
 
 def test_an_error_is_known_only_where_it_is_scored(run: Path) -> None:
@@ -112,8 +114,6 @@ def test_other_tracks_are_read_at_the_same_stamps(run: Path, tmp_path: Path) -> 
     with pytest.raises(UsageError, match="an estimator of this run: esc, got none named"):
         _find(scored, "vx_m_s > 0")
     assert len(_find(scored, "vx_m_s > 0", estimator="esc").events) == 1
-    with pytest.raises(UsageError, match="a minus between columns needs spaces"):
-        _find(run, "vx_m_s-truth.vx_m_s > 1")
 
 
 def test_a_peak_of_what_falls_is_its_smallest(run: Path) -> None:
@@ -189,20 +189,75 @@ def test_a_segment_bounds_what_is_found(run: Path) -> None:
         for a, b in ends
     ]
     path.write_text(json.dumps(document))
-    found = _find(run, 'segment == "slalom"')
+    found = _find(run, "slalom")
     assert [(e.start_ns, e.end_ns) for e in found.events] == [
         (START_NS + round(a * 1e9), START_NS + round((b - 0.01) * 1e9) + 1) for a, b in ends
     ]
-    [late] = _find(run, 'segment == "slalom" and abs(sideslip_error_deg) > 3.5').events
+    [late] = _find(run, 'slalom AND abs("pd-hef".sideslip_error_deg) > 3.5').events
     assert late.start_ns == START_NS + 1_320_000_000
-    assert all(
-        e.end_ns <= START_NS + 1_000_000_000 for e in _find(run, 'not segment == "slalom" and speed_m_s < 10').events
-    )
+    assert all(e.end_ns <= START_NS + 1_000_000_000 for e in _find(run, "NOT slalom AND speed_m_s < 10").events)
 
 
 @pytest.mark.parametrize(
-    "where", ['segment == "slalon"', 'segment > "slalom"', "segment == 3", 'segment == "all" == 3']
+    ("where", "expected", "got"),
+    [
+        ("abs(sidslip_error_deg) > 2", "one of the columns vx_m_s, vy_m_s,", "sidslip_error_deg"),
+        ("stamp_ns > 1", "one of the columns", "stamp_ns"),
+        ("speed_m_s > 2 and", "a condition in the SQL of Polars", "unable to parse"),
+        ("speed_m_s", "a condition, such as a comparison", "speed_m_s"),
+        ("max(speed_m_s) > 1", "one of the columns", "max"),
+        ("truth.sideslip_error_rad > 1", "an estimator before an error", "truth.sideslip_error_rad"),
+        ("speed_m_s > 1 -- valid", "columns, numbers and operators", "-"),
+        ("valid = 'true'", "columns, numbers and operators", "''"),
+        ("valid or " * 300 + "valid", "columns, numbers and operators in at most 2000 characters", "2705 characters"),
+    ],
 )
-def test_a_segment_is_compared_with_its_name_only(run: Path, where: str) -> None:
+def test_a_wrong_condition_is_one_line_with_the_names(where: str, expected: str, got: str) -> None:
+    with pytest.raises(UsageError) as error:
+        event_condition(where)
+    assert f"--where: expected {expected}" in str(error.value)
+    assert f"got {got}" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        "valid AND 1 = (SELECT 1 FROM read_csv('{file}'))",
+        'valid AND 1 = (SELECT 1 FROM "read_csv"/**/("{file}"))',
+        "EXISTS (TABLE x)",
+        "read_csv('{file}')",
+    ],
+)
+def test_a_condition_reads_no_file(where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file.csv").write_text("a\n1\n")
+    monkeypatch.setattr(pl, "sql_expr", lambda _: pytest.fail("Polars executes subqueries"))
     with pytest.raises(UsageError, match="--where"):
-        _find(run, where)
+        event_condition(where.format(file=tmp_path / "file.csv"))
+
+
+WORDS = [
+    "speed_m_s",
+    "valid",
+    "truth.vx_km_h",
+    "abs(",
+    "(",
+    ")",
+    "and",
+    "or",
+    "not",
+    "in",
+    "0.5",
+    "case",
+    "<",
+    "-",
+    "*",
+]
+
+
+@given(st.one_of(st.text(max_size=60), st.lists(st.sampled_from(WORDS), max_size=12).map(" ".join)))
+def test_any_text_is_a_condition_or_one_line(text: str) -> None:
+    try:
+        event_condition(text)
+    except UsageError as error:
+        assert "\n" not in str(error)

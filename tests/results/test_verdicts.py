@@ -17,7 +17,6 @@ from pdhef_logtool.evaluation.reasons import SensorFault
 from pdhef_logtool.evaluation.standing import Standing
 from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.results.run_report import DriveDetails, TruthFacts, tool_versions
-from pdhef_logtool.runs.error_budget import no_budget
 
 NAN = float("nan")
 METRICS = errors_deg(pd_hef=0.1, physics=0.12, zero=1.0)
@@ -34,7 +33,7 @@ def standing(difference: Interval | None, rival: str | None = "physics", own: In
 
 
 def details(*standings: Standing, **changes: Any) -> DriveDetails:
-    empty = DriveDetails([], standings, no_budget("the log contains no ground truth"), {})
+    empty = DriveDetails([], standings, {})
     return replace(empty, **changes)
 
 

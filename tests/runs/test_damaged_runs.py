@@ -55,15 +55,36 @@ def of_drive(out: Path, kind: str, label: str) -> Path:
     return out / "logs" / label / kind
 
 
-@pytest.mark.parametrize("kind", ["report.json", "part"])
-def test_a_drive_whose_outputs_are_damaged_is_run_again_and_that_is_said(tmp_path: Path, kind: str) -> None:
+@pytest.mark.parametrize("kind", ["report.json", "metrics.parquet", "part"])
+@pytest.mark.parametrize("deed", [flip, Path.unlink])
+def test_a_drive_whose_outputs_are_damaged_or_gone_is_run_again_and_that_is_said(
+    tmp_path: Path, kind: str, deed: Callable[[Path], None]
+) -> None:
     logs, out, said, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", list[str](), Counted()
     run(logs, out)
     before = contents(out)
-    flip(of_drive(out, kind, "b"))
+    deed(of_drive(out, kind, "b"))
     run(logs, out, resume=True, say=said.append, work=work)
-    assert (work.asked, said) == (["b"], ["1 of 2 drives are run again: their outputs are damaged"])
+    how = "damaged" if deed is flip else "gone"
+    assert (work.asked, said) == (["b"], [f"1 of 2 drives are run again: their outputs are {how}"])
     assert contents(out) == before
+
+
+@pytest.mark.slow
+def test_every_file_of_a_drive_is_regenerated_and_a_page_alone(
+    out: Path, sample_logs_dir: Path, tmp_path: Path
+) -> None:
+    logs, keep = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")], ("--keep", "full")
+    options = [o for o in OPTIONS if o not in ("--keep", "estimates", "--no-report")]
+    assert command("run", *logs, "-o", str(out), *options, *keep).code == 0
+    files = {p.name: p.read_bytes() for p in (out / "logs/dlc").iterdir() if p.is_file()}
+    assert {"setup.toml", "recording.rrd", "annotated.mcap", "report.html"} <= set(files)
+    for name in sorted(files):
+        flip(out / "logs/dlc" / name)
+        ended = command("run", *logs, "-o", str(out), *options, *keep, "--resume")
+        assert ended.code == 0
+        assert ("1 of 2 drives are run again: their outputs are damaged" in ended.err) is (name != "report.html")
+        assert name.endswith(".rrd") or (out / "logs/dlc" / name).read_bytes() == files[name]
 
 
 def test_a_column_that_was_changed_without_a_trace_is_noticed(tmp_path: Path) -> None:

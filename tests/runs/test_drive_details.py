@@ -39,7 +39,6 @@ def test_a_drive_with_truth_has_all_of_it(sample_logs_dir: Path, tmp_path: Path)
     largest = report["largest_errors"][0]
     assert abs(largest["error_rad"]) == pytest.approx(figure["pd-hef", "sideslip_rad", "max_abs", "all"])
     assert largest["estimate_rad"] - largest["truth_rad"] == pytest.approx(largest["error_rad"])
-    assert report["error_budget"]["reason"] == "" and len(report["error_budget"]["causes"]) == 5
     seconds = sum(c["seconds"] for c in report["operating_space"]["cells"])
     assert seconds == pytest.approx(report["log"]["duration_s"], rel=0.05)
     assert report["metadata"]
@@ -48,7 +47,6 @@ def test_a_drive_with_truth_has_all_of_it(sample_logs_dir: Path, tmp_path: Path)
 def test_without_truth_there_is_a_reason_and_no_verdict(sample_logs_dir: Path, tmp_path: Path) -> None:
     report = run("no_truth", sample_logs_dir, tmp_path / "out")
     assert {v["outcome"] for v in report["verdicts"]} == {"none"}
-    assert report["error_budget"]["reason"] == "the log has no ground truth"
     assert report["operating_space"]["cells"]
 
 

@@ -8,7 +8,7 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
 import pytest
 
@@ -71,8 +71,10 @@ def test_a_fleet_on_three_nodes_one_of_which_goes_equals_one_here(
     run(output=Path("here"), work=stub_drive)
     assert files_of(Path("out")) == files_of(Path("here"))
     assert METRICS_FILE in files_of(Path("out"))
-    again: dict[str, Any] = {"resume": True, "ray": "127.0.0.1:1", "work": work}
-    assert run(output=Path("out"), **again).exit_code == 0, "nothing is left to do: no cluster is asked for"
+    again = Schedule(ray="127.0.0.1:1", resume=True)
+    assert run(output=Path("out"), schedule=again, work=work).exit_code == 0, (
+        "nothing is left to do: no cluster is asked for"
+    )
 
 
 @pytest.mark.fleet
@@ -92,8 +94,10 @@ def test_a_fleet_on_a_cluster_whose_output_is_in_a_store_equals_one_here(
     assert {name: data for name, data in found.items() if name not in timed} == files_of(tmp_path / "out")
 
 
-def test_an_output_that_a_node_does_not_see_is_told(tmp_path: Path) -> None:
-    told = run_on_node(stub_drive, tmp_path, tmp_path / ".nodes-x", None, lambda *_: None)  # type: ignore[arg-type]
+def test_an_output_that_a_node_does_not_see_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    task = SimpleNamespace(output=Path("out"))
+    told = run_on_node(stub_drive, tmp_path, True, task, lambda *_: None)  # type: ignore[arg-type]
     assert isinstance(told, OutputError)
     assert "a folder that all nodes of the cluster see" in str(told)
 
@@ -108,4 +112,3 @@ def test_without_ray_or_a_cluster_there_is_one_line(tmp_path: Path) -> None:
             schedule=Schedule(ray="127.0.0.1:1", limits=Limits()),
             work=stub_drive,
         )
-    assert not list((tmp_path / "out").glob(".nodes-*"))

@@ -127,7 +127,7 @@ def test_what_is_run_anew_is_said_and_why(tmp_path: Path, sample_logs_dir: Path)
     car.write_text(text.replace("1440.0", "1450.0"))
     run(logs, out, RunConfig(car=car), work=work, resume=True, say=said.append)
     run(logs, out, RunConfig(car=car, friction=0.4), work=work, resume=True, say=said.append)
-    run(logs, out, RunConfig(car=car, friction=0.4, window_s=60.0), work=work, resume=True, say=said.append)
+    run(logs, out, RunConfig(car=car, friction=0.4), work=work, resume=True, say=said.append)
     assert said == [
         "2 of 2 drives are run again: the car's physics changed",
         "2 of 2 drives are run again: --friction auto → 0.4",

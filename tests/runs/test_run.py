@@ -158,19 +158,6 @@ def test_physics_filter_beats_its_trivial_rivals_on_the_lane_change(dlc_run: Pat
     assert rmse["phy-ukf"] < min(rmse["zero"], rmse["kinematic"])
 
 
-def test_windows_change_no_number(sample_logs_dir: Path, tmp_path: Path) -> None:
-    frames = []
-    for name, window_s in (("whole", 600.0), ("cut", 1.7)):
-        out = tmp_path / name
-        run_logs(
-            [str(sample_logs_dir / "dlc.mcap")], out, _config(sample_logs_dir, window_s=window_s, estimators=("all",))
-        )
-        estimates = pl.read_parquet(out / "logs/dlc/estimates.parquet").sort("estimator", "stamp_ns")
-        frames.append((estimates, pl.read_parquet(out / "metrics.parquet")))
-    for whole, cut in zip(*frames, strict=True):
-        assert whole.equals(cut, null_equal=True)
-
-
 def test_same_input_gives_the_same_bytes(sample_logs_dir: Path, tmp_path: Path, dlc_run: Path) -> None:
     run_logs(
         [str(sample_logs_dir / "dlc.mcap")], tmp_path, _config(sample_logs_dir, annotate="full", estimators=("all",))

@@ -50,7 +50,6 @@ def stuck_run(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -
         network=folder / "model",
         estimators=("phy-ukf", "pd-hef"),
         annotate="none",
-        window_s=3.0,  # the fault reaches over a cut
     )
     return run_logs([str(folder / "stuck.mcap")], folder / "out", config), folder / "out" / "logs" / "stuck"
 

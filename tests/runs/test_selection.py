@@ -16,7 +16,7 @@ from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.calibration.calibration import calibrate_online
-from pdhef_logtool.estimators.calibration.driving import DrivingReader
+from pdhef_logtool.estimators.calibration.driving import driving_of
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
@@ -165,9 +165,7 @@ def test_a_choice_on_line_depends_on_nothing_that_follows(sample_logs_dir: Path)
     )
     chosen, figures = [], []
     for sensed in (signals, spoilt):
-        reader = DrivingReader(car.vehicle)
-        reader.add(sensed)
-        calibration = calibrate_online(reader.finish(), car.vehicle)
+        calibration = calibrate_online(driving_of(sensed, car.vehicle), car.vehicle)
         estimators = [make_estimator(name, car) for name in ("zero", "open-loop", "phy-ukf", "physics")]
         tracks = {e.name: run_window(e, sensed)[0] for e in estimators}
         looked: list[tuple[int, ...]] = []

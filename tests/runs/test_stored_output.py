@@ -153,7 +153,7 @@ def test_a_store_that_fails_ends_the_run_and_what_is_put_counts(
     with monkeypatch.context() as patch, pytest.raises(OutputError) as raised:
         patch.setattr(type(memory), "put_file", failing)
         run(logs, URL, work=work)
-    assert "\n" not in str(raised.value) and f"{URL}/logs/b/report.json" in str(raised.value)
+    assert "\n" not in str(raised.value) and f"{URL}/logs/b/metrics.parquet" in str(raised.value)
     assert str(raised.value).endswith("--resume goes on")
     assert (raised.value.exit_code, work.asked) == (1, ["a", "b"]), "the third is not worked on for nothing"
     run(logs, URL, work=work, resume=True)

@@ -31,7 +31,6 @@ VALID_CONFIG = {
     "start": 3,
     "end": "end-2s",
     "friction": 0.5,
-    "window_s": 60.0,
     "network": "none",
     "annotate": "full",
 }
@@ -264,7 +263,7 @@ def test_the_nearest_name_is_told() -> None:
     ("loader", "line", "said"),
     [
         (LOADERS[0], 'estimater = ["zero"]', "estimater: unknown, did you mean estimators?"),
-        (LOADERS[0], "windows_s = 3", "windows_s: unknown, did you mean window_s?"),
+        (LOADERS[0], "frictions = 3", "frictions: unknown, did you mean friction?"),
         (LOADERS[1], "fill_recognized = true", "fill_recognized: unknown, did you mean fill_recognised?"),
         (LOADERS[1], "truth_quallity = {}", "truth_quallity: unknown, did you mean truth_quality?"),
         (

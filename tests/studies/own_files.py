@@ -16,7 +16,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from studies.pages import ROOT
-from studies.torture.configs import damage_document
 from studies.torture.mutating import damage_bytes
 from studies.torture.workers import Ended, Verdict, command, judge
 
@@ -109,7 +108,7 @@ def _damage(run: Path, number: int, rng: random.Random) -> bool:
     elif path.suffix == ".parquet":
         _damage_table(path, rng)
     else:
-        path.write_bytes(damage_document(path.name, content, rng))
+        path.write_bytes(damage_bytes(content, rng))
     if way % 2:
         _unseal(run / "run.json")
     return False

@@ -11,9 +11,8 @@ import pytest
 from reference_car import drive, slalom
 
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, default_vehicle
-from pdhef_logtool.learning.engine import usable_stamps
 from pdhef_logtool.records.tracks import make_track
-from studies.defaults.axle_forces import AxleCurve, FitDrive, axle_samples, fit_axle
+from studies.defaults.axle_forces import AxleCurve, FitDrive, axle_samples, fit_axle, usable_stamps
 from studies.defaults.prior import Prior
 
 CAR = default_vehicle().model_copy(

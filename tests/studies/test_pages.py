@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import re
 from importlib.util import find_spec
-from pathlib import Path
 
-import pytest
-
-from studies import condition_runs
 from studies.pages import DOCS, ROOT, fill, number, table
 
 DOCUMENTS = [*DOCS.glob("*.md"), *ROOT.glob("*.md"), ROOT / "Makefile", *ROOT.glob("sample_logs/*.toml")]
@@ -22,19 +18,6 @@ def test_every_command_and_file_that_a_document_names_is_there() -> None:
     files = {(p, f) for p, t in TEXTS.items() for f in re.findall(r"(?:benchmarks|studies)/[\w/]+\.py", t)}
     assert files
     assert not {(p, f) for p, f in files if not (ROOT / f).is_file()}
-
-
-def test_every_source_of_the_condition_table_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert all(list((ROOT / s).rglob("*.py")) for s in condition_runs._SOURCES)
-    monkeypatch.setattr(condition_runs, "ROOT", tmp_path)
-    digests = {condition_runs.source_digest.__wrapped__()}
-    for place in condition_runs._SOURCES:
-        file = tmp_path / place / "deep" / "one.py"
-        file.parent.mkdir(parents=True)
-        for text in ("a = 1", "a = 2"):
-            file.write_text(text)
-            digests.add(condition_runs.source_digest.__wrapped__())
-    assert len(digests) == 1 + 2 * len(condition_runs._SOURCES)
 
 
 def test_a_filled_block_replaces_the_former_one() -> None:

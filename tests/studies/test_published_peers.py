@@ -14,7 +14,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.estimators.calibration.driving import DrivingReader
+from pdhef_logtool.estimators.calibration.driving import driving_of
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 from studies.pages import DOCS, RESULTS
@@ -143,13 +143,13 @@ def test_files_beside_a_drive_become_mapping_and_vehicle():
     ]
     place = {"topic": "/t", "field": "f", "stamp": "header.stamp", "offset": 0.5}
     mapping = beside_mapping({"signal": [entry | place for entry in entries]})
-    assert (mapping.signals.keys(), mapping.truth.keys()) == ({"ay_m_s2"}, {"vy_m_s"})
-    assert (mapping.signals["ay_m_s2"].scale, mapping.signals["ay_m_s2"].offset) == (-1.0, 0.5)
+    assert (mapping["signals"].keys(), mapping["truth"].keys()) == ({"ay_m_s2"}, {"vy_m_s"})
+    assert mapping["signals"]["ay_m_s2"] == place | {"scale": -1.0}
     given = {"name": "car", "mass_kg": 1500.0, "yaw_inertia_kg_m2": 2500.0, "lf_m": 1.2, "lr_m": 1.4}
     given |= {"cf_axle_n_per_rad": 9e4, "cr_axle_n_per_rad": 1.1e5, "friction_front": 0.9, "friction_rear": 0.94}
     vehicle = beside_vehicle({"vehicle": given})
-    assert (vehicle.cg_to_rear_axle_m, vehicle.friction) == (1.4, pytest.approx(0.92))
-    assert vehicle.tyres.rear.cornering_stiffness_n_per_rad == 1.1e5
+    assert (vehicle["cg_to_rear_axle_m"], vehicle["friction"]) == (1.4, pytest.approx(0.92))
+    assert vehicle["tyres"]["rear"] == {"cornering_stiffness_n_per_rad": 1.1e5}
 
 
 def test_without_the_drives_it_writes_nothing_and_ends_with_0(monkeypatch, tmp_path: Path, capsys):
@@ -207,10 +207,9 @@ def test_ground_truth_shows_steering_and_grip_without_a_calibration(gain: float)
     vx, vy, rate = 15.0 + 5.0 * np.sin(0.3 * t), 0.5 * np.sin(0.9 * t), 0.3 * np.sin(0.7 * t)
     ay = 0.45 * np.cos(0.9 * t) + vx * rate
     steer = gain * (np.arctan2(vy + vehicle.cg_to_front_axle_m * rate, vx) + ay / 100.0)
-    reader = DrivingReader(vehicle)
-    reader.add(replace(signals, steer_rad=steer, speed_m_s=vx, yaw_rate_rad_s=rate, ay_m_s2=ay))
+    driven = replace(signals, steer_rad=steer, speed_m_s=vx, yaw_rate_rad_s=rate, ay_m_s2=ay)
     truth = make_track("truth", signals.stamps_ns, vx_m_s=vx, vy_m_s=vy, yaw_rate_rad_s=rate)
-    shown = shown_by_truth(reader.finish(), truth, vehicle)
+    shown = shown_by_truth(driving_of(driven, vehicle), truth, vehicle)
     assert shown[STEERING][0] == pytest.approx(np.log(gain), abs=0.01)
     assert shown[PEAK][0] == pytest.approx(np.log(np.quantile(np.abs(ay), 0.99)), abs=0.01)
     assert shown[STEERING][1] < 0.01

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from studies.table_maths import (
-    interval_score,
     median_ratio,
     percentiles,
     pooled_mean,
@@ -56,11 +54,3 @@ def test_verdicts(ratio, word):
 
 def test_verdict_is_open_when_the_drives_disagree():
     assert verdict(median_ratio(np.array([0.5, 2.0, 0.4, 2.5, 1.0]), np.ones(5))) == "open"
-
-
-def test_interval_score_of_a_gaussian_is_least_for_the_true_sigma_and_as_in_theory():
-    error = np.random.default_rng(4).standard_normal(400_000)
-    at = {s: float(np.mean(interval_score(error, np.full_like(error, s)))) for s in (0.7, 1.0, 1.4)}
-    # E[S] = 2 φ(z) · 2 / α for the true quantiles.
-    assert at[1.0] == pytest.approx(2.0 * norm.pdf(1.959963984540054) * 2.0 / 0.05, rel=0.01)
-    assert at[1.0] < min(at[0.7], at[1.4])

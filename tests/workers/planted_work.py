@@ -22,11 +22,6 @@ def note_call() -> None:
     called.append(os.getpid())
 
 
-def cold() -> bool:
-    """Tell the fork server that there is no compiled code yet."""
-    return False
-
-
 #: Names the file to which :func:`die_at_start` notes how often it killed the fork server, and how often it does so.
 DEATHS, MOST_DEATHS = "PDHEF_TEST_DEATHS", "PDHEF_TEST_MOST_DEATHS"
 
@@ -80,9 +75,10 @@ def _kill_once(value: str, tell: Tell) -> str:
     return value
 
 
-def _kill_server(_value: str, _tell: Tell) -> None:
-    os.kill(os.getppid(), signal.SIGKILL)
-    os.kill(os.getpid(), signal.SIGKILL)
+def _kill_server_once(value: str, tell: Tell) -> str:
+    if not Path(value).exists():
+        os.kill(os.getppid(), signal.SIGKILL)
+    return _kill_once(value, tell)
 
 
 def _hang(_value: str, _tell: Tell) -> None:
@@ -126,7 +122,7 @@ def _cut(_value: str, _tell: Tell) -> None:
     """Write half a message and then nothing, as when it is stopped while it writes."""
     files = [f for f in Path("/proc/self/fd").iterdir() if int(f.name) > 2 and f.is_socket()]
     for file in files:
-        os.write(int(file.name), (1000).to_bytes(8, "little") + b"half")
+        os.write(int(file.name), (1000).to_bytes(4, "big") + b"half")
     time.sleep(600)
 
 
@@ -153,7 +149,7 @@ def _alone(value: str, tell: Tell) -> int:
 _FAULTS = {
     "kill": _kill,
     "kill once": _kill_once,
-    "kill server": _kill_server,
+    "kill server once": _kill_server_once,
     "exit": lambda _value, _tell: os._exit(5),
     "hang": _hang,
     "stop": _stop,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,11 +21,14 @@ def cluster_of_one() -> Iterator[Any]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("PYTHONBREAKPOINT", "0")  # Ray sets it
+        terminated = signal.getsignal(signal.SIGTERM)
         made = Cluster(initialize_head=True, head_node_args={**_NODE, "include_dashboard": False})
         try:
             yield made
         finally:
             made.shutdown()
+            signal.signal(signal.SIGTERM, terminated)
 
 
 def grow(cluster: Any) -> list[Any]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.errors import UsageError, WorkerError
 from pdhef_logtool.workers.ray_supervisor import supervise_on_ray
 from pdhef_logtool.workers.supervisor import Failure, Limits
 from tests.workers.planted_work import Item, planted
@@ -39,7 +39,7 @@ def test_faults_end_on_a_node_as_they_do_here(cluster: Any) -> None:
         ("x", None),
         (None, Failure("the worker was killed (signal 9)", "at kill", 2)),
         (None, Failure("raised ValueError: two lines", "at raise", 1)),
-        (None, Failure("nothing heard for 1 s", "at hang", 2)),
+        (None, Failure("nothing heard for 3 s", "at hang", 2)),
     ]
 
 
@@ -77,6 +77,25 @@ def test_a_node_that_is_lost_while_its_task_runs_costs_no_item(cluster: Any, tmp
     assert len(begun.read_text().split()) == 2, "it was begun again on another node"
     assert sorted(p.read_text() for p in tmp_path.glob("*.done")) == sorted(value for _, value in items)
     assert not list(tmp_path.glob(".*")), "no file is left half-written"
+
+
+def test_a_cluster_that_is_lost_is_one_error_and_no_failure_of_its_items(tmp_path: Path) -> None:
+    with cluster_of_one() as cluster:
+        ends = supervise_on_ray(
+            planted, [("wait", f"{tmp_path}/0")] * 3, address=cluster.address, limits=Limits(), preload=PRELOAD
+        )
+
+        def kill() -> None:
+            while not list(tmp_path.glob("*.begun")):
+                time.sleep(0.05)
+            for pid in processes_of(cluster.head_node):
+                os.kill(pid, signal.SIGKILL)
+
+        killer = threading.Thread(target=kill)
+        killer.start()
+        with pytest.raises(WorkerError, match="--ray: expected a Ray cluster that keeps running"):
+            list(ends)
+        killer.join()
 
 
 def test_where_there_is_no_cluster_that_is_told() -> None:

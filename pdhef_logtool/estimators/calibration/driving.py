@@ -8,12 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.calibration.single_track import AY, FRICTION, SPEED, STEER, YAW_RATE
-from pdhef_logtool.estimators.speed_slip import SlipState, believable
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
+from pdhef_logtool.estimators.speed_slip import believable
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 
 #: Step of the grid. The model follows 4 Hz, and the lag of a tyre at 40 m/s is 12 ms, which its step takes exactly.
 STEP_S = 0.02
@@ -57,76 +56,43 @@ class Driving:
         return replace(self, columns=self.columns[:, :count], stamps_ns=self.stamps_ns[:count], stretches=stretches)
 
 
-class DrivingReader:
-    """Thins the windows of one drive to :class:`Driving`; a cell of the grid has the mean of its samples."""
-
-    def __init__(self, vehicle: VehicleParameters) -> None:
-        self._vehicle = vehicle
-        self._slip: SlipState | None = None
-        self._start_ns: int | None = None
-        self._open: Signals | None = None  # samples of a cell that the next window may add to
-        self._cells: list[NDArray[np.int64]] = []
-        self._means: list[FloatArray] = []
-
-    def add(self, signals: Signals) -> None:
-        """Take the next window."""
-        if not len(signals):
-            return
-        signals, self._slip = believable(signals, self._vehicle.sensors, self._slip, gate=True)
-        if self._open is not None:
-            signals = join_signals([self._open, signals])
-        if self._start_ns is None:
-            self._start_ns = int(signals.stamps_ns[0])
-        cell = (signals.stamps_ns - self._start_ns) // round(STEP_S * 1e9)
-        done = int(np.searchsorted(cell, cell[-1]))
-        self._open = signals.rows(done, len(signals))
-        self._take(signals.rows(0, done), cell[:done])
-
-    def finish(self) -> Driving:
-        """Return all of it."""
-        if self._open is not None and self._start_ns is not None:
-            self._take(self._open, (self._open.stamps_ns - self._start_ns) // round(STEP_S * 1e9))
-            self._open = None
-        if not self._cells:
-            none = np.empty(0, dtype=np.int64)
-            return Driving(np.empty((_COLUMNS, 0)), none, none.reshape(0, 2), self._vehicle)
-        assert self._start_ns is not None
-        cells, means = np.concatenate(self._cells), np.concatenate(self._means, axis=1)
-        ends_ns = self._start_ns + (cells + 1) * round(STEP_S * 1e9)
-        # A pause, however long, is a gap: it takes no more room than that.
-        cells = np.concatenate([[0], np.cumsum(np.minimum(np.diff(cells), _PAUSE_CELLS))])
-        columns = np.full((_COLUMNS, int(cells[-1]) + 1), np.nan)
-        columns[:, cells] = means
-        stamps_ns = np.zeros(columns.shape[1], dtype=np.int64)
-        stamps_ns[cells] = ends_ns
-        stamps_ns = np.maximum.accumulate(stamps_ns)
-        columns[FRICTION] = np.where(np.isfinite(columns[FRICTION]), columns[FRICTION], self._vehicle.assumed_friction)
-        for row, bridged_s in ((STEER, BRIDGED_S), (YAW_RATE, BRIDGED_S), (AY, BRIDGED_S), (SPEED, SPEED_BRIDGED_S)):
-            columns[row] = _bridged(columns[row], round(bridged_s / STEP_S))
-        if not (has_ay := bool(np.isfinite(columns[AY]).any())):
-            columns[AY] = columns[SPEED] * columns[YAW_RATE]
-        stretches = _stretches(columns, self._vehicle.low_speed_blend_m_s)
-        return Driving(columns, stamps_ns, stretches, self._vehicle, has_ay)
-
-    def _take(self, signals: Signals, cell: NDArray[np.int64]) -> None:
-        if not len(signals):
-            return
-        cells, place = np.unique(cell, return_inverse=True)
-        means = np.full((_COLUMNS, cells.size), np.nan)
-        sources = {
-            STEER: signals.steer_rad,
-            SPEED: signals.speed_m_s,
-            YAW_RATE: signals.yaw_rate_rad_s,
-            AY: signals.ay_m_s2,
-            FRICTION: signals.friction,
-        }
-        for row, values in sources.items():
-            is_finite = np.isfinite(values)
-            count = np.bincount(place, is_finite, cells.size)
-            total = np.bincount(place, np.where(is_finite, values, 0.0), cells.size)
-            means[row] = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
-        self._cells.append(cells)
-        self._means.append(means)
+def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
+    """Thin the signals of a drive [N] to a grid, whose cells have the mean of their samples."""
+    if not len(signals):
+        none = np.empty(0, dtype=np.int64)
+        return Driving(np.empty((_COLUMNS, 0)), none, none.reshape(0, 2), vehicle)
+    signals, _ = believable(signals, vehicle.sensors, None, gate=True)
+    start_ns = int(signals.stamps_ns[0])
+    cell = (signals.stamps_ns - start_ns) // round(STEP_S * 1e9)
+    cells, place = np.unique(cell, return_inverse=True)
+    means = np.full((_COLUMNS, cells.size), np.nan)
+    sources = {
+        STEER: signals.steer_rad,
+        SPEED: signals.speed_m_s,
+        YAW_RATE: signals.yaw_rate_rad_s,
+        AY: signals.ay_m_s2,
+        FRICTION: signals.friction,
+    }
+    for row, values in sources.items():
+        is_finite = np.isfinite(values)
+        count = np.bincount(place, is_finite, cells.size)
+        total = np.bincount(place, np.where(is_finite, values, 0.0), cells.size)
+        means[row] = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
+    ends_ns = start_ns + (cells + 1) * round(STEP_S * 1e9)
+    # A pause, however long, is a gap: it takes no more room than that.
+    cells = np.concatenate([[0], np.cumsum(np.minimum(np.diff(cells), _PAUSE_CELLS))])
+    columns = np.full((_COLUMNS, int(cells[-1]) + 1), np.nan)
+    columns[:, cells] = means
+    stamps_ns = np.zeros(columns.shape[1], dtype=np.int64)
+    stamps_ns[cells] = ends_ns
+    stamps_ns = np.maximum.accumulate(stamps_ns)
+    columns[FRICTION] = np.where(np.isfinite(columns[FRICTION]), columns[FRICTION], vehicle.assumed_friction)
+    for row, bridged_s in ((STEER, BRIDGED_S), (YAW_RATE, BRIDGED_S), (AY, BRIDGED_S), (SPEED, SPEED_BRIDGED_S)):
+        columns[row] = _bridged(columns[row], round(bridged_s / STEP_S))
+    if not (has_ay := bool(np.isfinite(columns[AY]).any())):
+        columns[AY] = columns[SPEED] * columns[YAW_RATE]
+    stretches = _stretches(columns, vehicle.low_speed_blend_m_s)
+    return Driving(columns, stamps_ns, stretches, vehicle, has_ay)
 
 
 def _bridged(values: FloatArray, most: int) -> FloatArray:

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.learning.network.residuals import ResidualRows
-from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.results.expression import Condition, parse_condition, where_holds
+from pdhef_logtool.results.condition import Condition, parse_condition
 
 #: Lower ends of the bins; the last of each has no upper end.
 SPEED_M_S, AY_M_S2, FRICTION = (0.0, 10.0, 20.0, 30.0), (0.0, 2.0, 4.0, 6.0), (0.0, 0.35, 0.65)
@@ -33,16 +32,13 @@ NO_CELL = -1
 _STEP = 2.0**-24
 
 
-#: What a condition of ``--where`` may ask of a row; ground truth is never an input, but may select training data.
+#: Columns of a condition of ``--where``; ground truth is never an input, but may select training data.
 COLUMNS = (*FEATURES, "truth_vx_m_s", "truth_vy_m_s")
 
 
 def condition_of(text: str) -> Condition:
     """Read the condition of ``--where``; raises UsageError."""
-    condition = parse_condition(text, COLUMNS, "docs/retrain.md")
-    if condition.least_s:
-        raise UsageError(expected="a condition on single rows", got=f"for {condition.least_s:g} s", where="--where")
-    return condition
+    return parse_condition(text, COLUMNS, of_tracks=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +53,7 @@ class Picking:
         chosen = np.ones(len(rows), dtype=np.bool_)
         if self.condition is not None:
             columns = dict(zip(COLUMNS, [*rows.features.T, *rows.truth_velocity.T], strict=True))
-            chosen = where_holds(self.condition, columns)
+            chosen = self.condition.is_true(columns)
         return Picked(chosen, cell_of(rows.features), draw_of(rows.stamps_ns, self.key))
 
 

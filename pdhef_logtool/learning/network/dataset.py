@@ -32,7 +32,7 @@ from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.results.arrow_schema import arrow_schema
+from pdhef_logtool.results.arrow_schema import arrow_array, arrow_schema
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
 from pdhef_logtool.results.parquet_sink import RowGroups
 from pdhef_logtool.results.run_report import tool_versions, write_json
@@ -101,11 +101,7 @@ def _table(rows: ResidualRows, picked: Picked, truth_source: str, schema: pa.Sch
     columns |= {"truth_std_rad": rows.truth_std_rad, "region": rows.region}
     columns |= {"truth_source": np.full(len(rows), truth_source)}
     columns |= {"chosen": picked.chosen, "cell": picked.cell, "draw": picked.draw}
-    arrays = []
-    for f in schema:
-        values = np.asarray(columns[f.name])
-        values = values.astype(np.float32) if f.type == pa.float32() else values
-        arrays.append(pa.array(values, type=f.type, from_pandas=True))
+    arrays = [arrow_array(columns[f.name], f.type) for f in schema]
     return pa.Table.from_arrays(arrays, schema=schema)
 
 

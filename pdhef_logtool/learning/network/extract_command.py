@@ -18,11 +18,10 @@ from pdhef_logtool.car.car import NO_INTERVALS, VEHICLE_FILE, Car
 from pdhef_logtool.car.parts import PHYSICS, physics_sha256
 from pdhef_logtool.car.taught import ESTIMATED
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
-from pdhef_logtool.drive.reading import Drive, Tell, friction_of, no_samples
+from pdhef_logtool.drive.plan import DrivePlan
+from pdhef_logtool.drive.reading import Drive, Tell, friction_of, no_samples, read_drive
 from pdhef_logtool.drive.truth import derive_truth
-from pdhef_logtool.drive.windows import DrivePlan, DriveWindow
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.corrected import CorrectedPhysics
@@ -61,7 +60,7 @@ from pdhef_logtool.learning.network.residuals import (
     SMOOTHING_HALF_S,
     ResidualRows,
     difference_noise,
-    residual_windows,
+    residual_rows,
 )
 from pdhef_logtool.learning.truth import TruthAt, teaching_reference
 from pdhef_logtool.learning.variation import MAX_VARIATION, vary
@@ -234,7 +233,6 @@ def extract(
     *,
     jobs: int = 1,
     resume: bool = False,
-    splits: Mapping[str, str] | None = None,
     reporter: Reporter = SILENT,
 ) -> ExtractResult:
     """Write the residual dataset of logs with ground truth to a folder.
@@ -245,7 +243,6 @@ def extract(
     ----------
     arguments : logs, folders, glob patterns. jobs : processes at work; changes nothing that is written.
     resume : keep drives whose log and settings are as they were.
-    splits : of each log by its stem, instead of what the manifests of sets state.
 
     Raises
     ------
@@ -260,8 +257,6 @@ def extract(
     inputs = find_logs(arguments, private_redirects=settings.config.allow_private_redirects)
     mapping = open_mapping(settings.config)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, reporter.warn))
-    if splits is not None:
-        work = [replace(job, listed_split=splits[job.log_input.stem]) for job in work]
     before = _earlier(output, settings)
     names = {settings.name_of(i.stem) for i in inputs}
     read = [*(i.local for i in inputs), *settings.config.files, *(j.car.source for j in work)]
@@ -285,7 +280,7 @@ def extract(
         with writing(output):
             remove_unnamed(output, manifest)
     empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
-    if empty and manifest["drives"] and splits is None and settings.split is None:
+    if empty and manifest["drives"] and settings.split is None:
         reporter.warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
     return ExtractResult(output, manifest, results)
 
@@ -473,7 +468,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
     fingerprint, target = _fingerprint(job, split), job.target(split)
     if job.resume and (kept := _kept(job, target, source, split, fingerprint)) is not None:
         return kept
-    with read_cached(job.log_input, job.car, job.mapping, settings.config.read_options) as drive:
+    with read_drive(job.log_input, job.car, job.mapping, settings.config.read_options) as drive:
         drive.plan = plan = _strict_truth(drive.plan)
         reference, _ = teaching_reference(drive, settings.config)
         _check_plan(plan, job, estimated=reference is not None)
@@ -574,28 +569,25 @@ def _counted(
     progress: Callable[[float], None],
 ) -> _Counts:
     """Write the residuals of a drive and return their sums."""
-
-    def windows() -> Iterator[DriveWindow]:
-        for window in drive.windows():
-            truth = window.truth if reference is None else reference(window.signals.stamps_ns)
-            yield replace(window, signals=service.read(window.signals), truth=truth)
-            progress(window.share_done)
-
+    whole = drive.whole()
+    truth = whole.truth if reference is None else reference(whole.signals.stamps_ns)
     counts, period_s = _Counts(), drive.plan.alignment.grid_period_s
     half_window = round(smoothing.half_s / period_s)
     taught = None
     if service.model is not None and isinstance(physics, PhysicsFilter):
         taught = CorrectedPhysics(AdaptivePhysics(physics), service.model)
     noise = smoothing.noise[0] * period_s / math.sqrt(2.0)  # of v_y itself
-    for rows in residual_windows(
-        windows(),
+    rows = residual_rows(
+        service.read(whole.signals),
+        truth,
         physics,
         period_s=period_s,
         half_window=half_window,
         truth_std_m_s=noise if math.isfinite(noise) else 0.0,
         taught=taught,
-    ):
-        counts.add(rows, writer.append(rows))
+    )
+    counts.add(rows, writer.append(rows))
+    progress(1.0)
     return counts
 
 

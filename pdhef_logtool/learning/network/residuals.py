@@ -21,16 +21,14 @@ and ± 0.2 s. No target where the window contains a gap.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.drive.windows import DriveWindow
-from pdhef_logtool.estimators.corrected import CorrectedPhysics, CorrectedState
-from pdhef_logtool.estimators.filter_base import U_AX, U_FRICTION, U_STEER, FilterState, HeldInputs, PosteriorSteps
+from pdhef_logtool.estimators.corrected import CorrectedPhysics
+from pdhef_logtool.estimators.filter_base import U_AX, U_FRICTION, U_STEER, HeldInputs
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
@@ -47,8 +45,8 @@ from pdhef_logtool.estimators.physics_model import (
 )
 from pdhef_logtool.learning.truth import weight_of
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
-from pdhef_logtool.records.steps import StepColumns
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 
 #: A step of more than this many periods is a gap: no increment is taken across it.
 GAP_PERIODS = 1.5
@@ -100,14 +98,8 @@ class ResidualRows:
         return int(self.stamps_ns.shape[0])
 
 
-def join_rows(parts: Iterable[ResidualRows]) -> ResidualRows:
-    """Join consecutive rows of one drive."""
-    parts = list(parts)
-    return ResidualRows(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ResidualRows)))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class ModelSteps(StepColumns):
+class ModelSteps:
     """What a model is asked with: states of the parallel filter [N, n] and inputs [N, 5] of its steps.
 
     The steering of ``inputs`` is NaN where it was not measured: the filter's guess of it must not become a residual.
@@ -198,13 +190,11 @@ def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  #
             run[3], run[4] = points[layout.roll, 0], points[layout.roll + 1, 0]
 
 
-# positional: as of residual_increments, and what a run keeps.
 def physics_increments(
     stamps_ns: IntArray,
     state: FloatArray,
     model: ModelSteps,
     physics: PhysicsFilter,
-    run: FloatArray,
     *,
     max_step_s: float,
 ) -> FloatArray:
@@ -213,8 +203,7 @@ def physics_increments(
     Parameters
     ----------
     stamps_ns : int64 [N]. state : true [v_x, v_y, r], [N, 3]; NaN where it must not be used.
-    model : of the parallel filter. run : [5], what the model's run keeps, moved in place; zeros at its start.
-    max_step_s : longer steps are gaps.
+    model : of the parallel filter. max_step_s : longer steps are gaps.
 
     Returns
     -------
@@ -226,7 +215,7 @@ def physics_increments(
     states[:, :3] = np.where(good[:, None], state, 1.0)
     states[:, AX_BIAS] = np.where(good, model.x[:, AX_BIAS], 0.0)
     moved = np.empty((max(len(stamps_ns) - 1, 0), 2))
-    _run_model(stamps_ns, states, model.inputs, good, max_step_s, (layout, p, f), run, moved)
+    _run_model(stamps_ns, states, model.inputs, good, max_step_s, (layout, p, f), np.zeros(_RUN), moved)
     increments: FloatArray = np.diff(state[:, 1:3], axis=0) - moved
     return increments
 
@@ -291,124 +280,64 @@ def difference_noise(stamps_ns: IntArray, values: FloatArray) -> float:
     return math.sqrt(2.0) * sigma / (period_ns * 1e-9)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Steps(StepColumns):
-    """What the targets are computed from, with the features, on the IMU's stamps."""
-
-    stamps_ns: IntArray
-    state: FloatArray
-    model: ModelSteps
-    features: FloatArray
-    segment: IntArray
-    truth_std_rad: FloatArray
-    region: FloatArray
-
-
-def residual_windows(
-    windows: Iterable[DriveWindow],
+def residual_rows(
+    signals: Signals,
+    truth: StateTrack | None,
     physics: PhysicsFilter | PhysicsUkf,
     *,
     period_s: float,
     half_window: int = 0,
     truth_std_m_s: float = 0.0,
     taught: CorrectedPhysics | None = None,
-) -> Iterator[ResidualRows]:
-    """Turn the windows of a drive into residual rows; how the drive is cut into windows changes no bit of them.
+) -> ResidualRows:
+    """Turn a drive into residual rows, one per stamp.
 
     Parameters
     ----------
-    windows : signals and ground truth at the same stamps, less biases of the vehicle file; targets need ground truth.
+    signals, truth : at the same stamps [N], less biases of the vehicle file; targets need ground truth.
     physics : the parallel filter as it shall run in service; its model is what the residual is of.
     period_s : of the IMU. half_window : steps on each side that a target is smoothed over.
     truth_std_m_s : 1-sigma of the true v_y where ground truth has none of its own. taught : the car's taught residual.
-
-    Yields
-    ------
-    The rows of all stamps; a window's last rows come with the next one, since their targets look ahead. Memory is
-    bounded by one window.
     """
-    carry: FilterState | None = None
-    taught_state: CorrectedState | None = None
-    waiting: _Steps | None = None
-    increments, run = np.empty((0, 2)), np.zeros(_RUN)
-    emitted = 0  # rows at the head of ``waiting`` that are there for smoothing only
-    running, segment = False, -1
-    max_step_s = GAP_PERIODS * period_s
-
-    def emit(steps: _Steps, first: int, end: int) -> ResidualRows:
-        n = len(steps.stamps_ns)
-        targets, step_s = np.full((n, 2), np.nan), np.full(n, np.nan)
-        targets[: n - 1] = smooth_increments(steps.stamps_ns, increments, half_window)
-        step_s[: n - 1] = np.diff(steps.stamps_ns) * 1e-9
-        part = slice(first, end)
-        complete = _complete(steps.features)
-        usable = _complete(targets) & complete
-        # Where the next row starts again, in service nothing is carried over to it either.
-        usable[: n - 1] &= complete[1:] & (steps.segment[1:] == steps.segment[:-1])
-        return ResidualRows(
-            stamps_ns=steps.stamps_ns[part],
-            features=steps.features[part],
-            targets=targets[part],
-            step_s=step_s[part],
-            weight=np.where(usable[part], weight_of(steps.truth_std_rad[part]), 0.0),
-            segment=steps.segment[part],
-            truth_velocity=steps.state[part, :2],
-            truth_std_rad=steps.truth_std_rad[part],
-            region=steps.region[part],
-        )
-
-    for window in windows:
-        if len(window.signals) == 0:
-            continue
-        features, filtered, carry = run_features(physics, window.signals, carry)
-        whole = _complete(features)
-        fresh: BoolArray = whole & ~(np.concatenate([[running], whole[:-1]]) & np.isfinite(filtered.prior[:, 0]))
-        numbers = segment + np.cumsum(fresh)
-        running, segment = bool(whole[-1]), int(numbers[-1])
-        region = np.full(len(window.signals), np.nan)
-        if taught is not None:
-            corrected, taught_state = taught.run(window.signals, taught_state)
-            region = np.where(corrected.valid, corrected.gain, np.nan)
-        new = _steps_of(window, features, filtered, np.maximum(numbers, 0), truth_std_m_s, region)
-        chain = new if waiting is None else waiting.since(len(waiting.stamps_ns) - 1).joined(new)
-        increments = np.concatenate([increments, _increments(chain, physics, run, max_step_s)])
-        waiting = new if waiting is None else waiting.joined(new)
-        decided = len(waiting.stamps_ns) - 1 - half_window
-        if decided > emitted:
-            yield emit(waiting, emitted, decided)
-            keep = max(0, decided - half_window)
-            waiting, emitted, increments = waiting.since(keep), decided - keep, increments[keep:]
-    if waiting is not None and emitted < len(waiting.stamps_ns):
-        yield emit(waiting, emitted, len(waiting.stamps_ns))
-
-
-def _steps_of(
-    window: DriveWindow,
-    features: FloatArray,
-    filtered: PosteriorSteps,
-    segment: IntArray,
-    truth_std_m_s: float,
-    region: FloatArray,
-) -> _Steps:  # positional: what a window gives, column by column
-    """Return what the targets of a window are computed from."""
-    inputs, state = filtered.inputs.copy(), _true_state(window)
-    inputs[~np.isfinite(without_impossible(window.signals).steer_rad), U_STEER] = np.nan
-    return _Steps(
-        stamps_ns=window.signals.stamps_ns,
-        state=state,
-        model=ModelSteps(filtered.x, inputs),
+    count = len(signals)
+    features, filtered, _ = run_features(physics, signals, None)
+    complete = _complete(features)
+    fresh: BoolArray = complete & ~(np.concatenate([[False], complete[:-1]]) & np.isfinite(filtered.prior[:, 0]))
+    segment = np.maximum(np.cumsum(fresh) - 1, 0)
+    region = np.full(count, np.nan)
+    if taught is not None:
+        corrected, _ = taught.run(signals, None)
+        region = np.where(corrected.valid, corrected.gain, np.nan)
+    inputs, state = filtered.inputs.copy(), _true_state(truth, count)
+    inputs[~np.isfinite(without_impossible(signals).steer_rad), U_STEER] = np.nan
+    model = ModelSteps(filtered.x, inputs)
+    increments = _increments(signals.stamps_ns, state, model, physics, GAP_PERIODS * period_s)
+    targets, step_s = np.full((count, 2), np.nan), np.full(count, np.nan)
+    targets[:-1] = smooth_increments(signals.stamps_ns, increments, half_window)
+    step_s[:-1] = np.diff(signals.stamps_ns) * 1e-9
+    usable = _complete(targets) & complete
+    # Where the next row starts again, in service nothing is carried over to it either.
+    usable[:-1] &= complete[1:] & (segment[1:] == segment[:-1])
+    truth_std = _truth_std(truth, state, truth_std_m_s)
+    return ResidualRows(
+        stamps_ns=signals.stamps_ns,
         features=features,
+        targets=targets,
+        step_s=step_s,
+        weight=np.where(usable, weight_of(truth_std), 0.0),
         segment=segment,
-        truth_std_rad=_truth_std(window, state, truth_std_m_s),
+        truth_velocity=state[:, :2],
+        truth_std_rad=truth_std,
         region=region,
     )
 
 
-def _increments(steps: _Steps, physics: PhysicsFilter | PhysicsUkf, run: FloatArray, max_step_s: float) -> FloatArray:
+def _increments(
+    stamps_ns: IntArray, state: FloatArray, model: ModelSteps, physics: PhysicsFilter | PhysicsUkf, max_step_s: float
+) -> FloatArray:
     """Return what the parallel filter's model misses from each step to the next, [N − 1, 2]."""
-    stamps_ns, state, model = steps.stamps_ns, steps.state, steps.model
     if isinstance(physics, PhysicsFilter):
-        return physics_increments(stamps_ns, state, model, physics, run, max_step_s=max_step_s)
+        return physics_increments(stamps_ns, state, model, physics, max_step_s=max_step_s)
     parameters, inputs = model_parameters(physics.vehicle), model.inputs
     return residual_increments(
         stamps_ns, state, inputs[:, U_STEER], inputs[:, U_FRICTION], parameters, max_step_s=max_step_s
@@ -419,17 +348,15 @@ def _complete(values: FloatArray) -> BoolArray:
     return np.asarray(np.isfinite(values).all(axis=1), dtype=np.bool_)
 
 
-def _truth_std(window: DriveWindow, state: FloatArray, std_m_s: float) -> FloatArray:
+def _truth_std(truth: StateTrack | None, state: FloatArray, std_m_s: float) -> FloatArray:
     """Return the 1-sigma of the true sideslip [N] in rad: that of the ground truth's track, else of its v_y."""
     of_noise = std_m_s / np.maximum(np.abs(state[:, 0]), 1.0)
-    of_track = of_noise if window.truth is None else window.truth.sideslip_std_rad
+    of_track = of_noise if truth is None else truth.sideslip_std_rad
     return np.where(np.isfinite(of_track), of_track, of_noise)
 
 
-def _true_state(window: DriveWindow) -> FloatArray:
-    truth = window.truth
+def _true_state(truth: StateTrack | None, count: int) -> FloatArray:
     if truth is None:
-        return np.full((len(window.signals), 3), np.nan)
+        return np.full((count, 3), np.nan)
     state = np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)
-    valid: BoolArray = truth.valid
-    return np.where(valid[:, None], state, np.nan)
+    return np.where(truth.valid[:, None], state, np.nan)

@@ -13,11 +13,10 @@ from pdhef_logtool.car.car import FIT_FILE, Car
 from pdhef_logtool.car.parts import Fit, FittedPhysics, FittedValues, LearntOn, physics_sha256
 from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.toml_files import part_toml
-from pdhef_logtool.drive.cached import read_cached
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import Driving
 from pdhef_logtool.learning.drives import CALIBRATE, DriveRecord, record_of
-from pdhef_logtool.learning.split import TRAINING
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError
@@ -39,7 +38,7 @@ def calibrate(task: Task) -> StageOutput:
     car = Car.of(start)
 
     def read(log: LogInput) -> tuple[DriveRecord, Driving | None]:
-        with read_cached(log, car, task.mapping, task.options) as drive:
+        with read_drive(log, car, task.mapping, task.options) as drive:
             if missing := lacking(drive):
                 return record_of(drive, left_out=f"the log has no {', '.join(missing)}"), None
             driving = read_driving(drive)
@@ -48,7 +47,7 @@ def calibrate(task: Task) -> StageOutput:
             start_s, end_s = ((t - drive.log.start_ns) * 1e-9 for t in (drive.plan.start_ns, drive.plan.end_ns))
             return replace(record, seconds=end_s - start_s, span_s=(start_s, end_s)), driving if usable else None
 
-    records, drives = task.read(task.split.parts[TRAINING], read, 0.8)
+    records, drives = task.read(read, 0.8)
     if len(drives) < LEAST_LOGS:
         raise _refused(f"{len(drives)} of them", "logs of one car, for the result of one log need not apply to another")
     calibration = self_calibrate(

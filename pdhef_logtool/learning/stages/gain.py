@@ -33,8 +33,6 @@ from pdhef_logtool.learning.evidence.trust import (
     decide_cap,
     join_blocks,
 )
-from pdhef_logtool.learning.noise.bench import MIN_SCORED_STAMPS
-from pdhef_logtool.learning.split import VALIDATION
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import UsageError
@@ -45,12 +43,14 @@ from pdhef_logtool.results.run_report import json_bytes
 
 FORMAT = "pdhef-trust"
 FORMAT_VERSION = 2
+#: A drive with fewer scored stamps does not count.
+MIN_SCORED_STAMPS = 100
 #: Two slices that meet share a sample or two.
 EDGE_S = 0.05
 
 
 def find_gain(task: Task) -> StageOutput:
-    """Run the filter at several residual gains on the validation drives; return the limit with its evidence.
+    """Run the filter at several residual gains on the drives; return the limit with its evidence.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def find_gain(task: Task) -> StageOutput:
         record, drive = load_drive(log, car, task.mapping, task.options, refuse=lacking, least_scored=MIN_SCORED_STAMPS)
         return record, None if drive is None else errors_by_trust(car, drive, use_speed=task.options.use_speed)
 
-    records, scored = task.read(task.split.parts[VALIDATION], read)
+    records, scored = task.read(read)
     drives = tuple(r for r in records if not r.left_out)
     if not drives:
         raise no_drive("a true sideslip and the signals of pd-hef", GAIN)

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, TypeVar
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.store import Change
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.learning.drives import DriveRecord, LearnSettings, tell_drive
-from pdhef_logtool.learning.split import Split
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.reporter import SILENT, Reporter
 
 _Read = TypeVar("_Read")
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -26,20 +23,16 @@ class Task:
 
     Attributes
     ----------
-    car : with the parts of the stages before.
+    car : car to start from.
     settings : their configuration names this car and the network to start from.
-    split : the slices of drives by their use. set_splits : by log, the split of its simulated set.
-    estimators : whose noise is searched or whose intervals are fitted; None = the stage's default.
-    work : folder for files that nobody needs afterwards.
+    logs : drives of the stage. set_splits : by log name, the split that its simulated set assigns to it.
     """
 
     car: Car
     settings: LearnSettings
-    split: Split
+    logs: tuple[LogInput, ...]
     mapping: SignalMapping | None = None
     set_splits: Mapping[str, str] = field(default_factory=dict)
-    estimators: tuple[str, ...] | None = None
-    work: Path = Path()
     reporter: Reporter = SILENT
 
     @property
@@ -48,15 +41,15 @@ class Task:
         return self.settings.config.read_options
 
     def read(
-        self, logs: Sequence[LogInput], read: Callable[[LogInput], tuple[DriveRecord, _Read | None]], share: float = 1.0
+        self, read: Callable[[LogInput], tuple[DriveRecord, _Read | None]], share: float = 1.0
     ) -> tuple[tuple[DriveRecord, ...], list[_Read]]:
-        """Read logs in order; return a record of each and the content of those that can be used.
+        """Read the logs in order; return a record of each and the content of those that can be used.
 
         ``share`` : of the stage's progress that reading takes.
         """
         records, drives = [], list[_Read]()
-        for number, log in enumerate(logs):
-            self.reporter.progress(f"reading {log.stem}", share * number / len(logs))
+        for number, log in enumerate(self.logs):
+            self.reporter.progress(f"reading {log.stem}", share * number / len(self.logs))
             record, drive = read(log)
             records.append(replace(record, split=self.set_splits.get(log.stem)))
             tell_drive(records[-1], self.reporter.warn)

@@ -19,8 +19,7 @@ from pdhef_logtool.car.car import TAUGHT_FILE, Car
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.taught import ESTIMATED, GROUND_TRUTH, Taught, TaughtParameter
-from pdhef_logtool.drive.cached import read_cached
-from pdhef_logtool.drive.reading import Drive, WholeDrive
+from pdhef_logtool.drive.reading import Drive, WholeDrive, read_drive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import STEP_S
@@ -30,16 +29,15 @@ from pdhef_logtool.estimators.latency_compensation import compensate
 from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
 from pdhef_logtool.estimators.table import FEATURES, make_estimator
 from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference
-from pdhef_logtool.evaluation.comparison import end_to_end
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
+from pdhef_logtool.evaluation.requirement_blocks import BLOCK_S
 from pdhef_logtool.learning.car.taught_prior import TaughtDriving, taught_driving, taught_parameters
 from pdhef_logtool.learning.drives import TEACH, DriveRecord, no_drive, record_of
-from pdhef_logtool.learning.split import TRAINING
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.learning.truth import teaching_reference, weight_of
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.records.steps import release
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.ladder import NONE
@@ -142,10 +140,10 @@ def teach(task: Task) -> StageOutput:
     car = Car.of(task.car.datasheet)
 
     def read(log: LogInput) -> tuple[DriveRecord, OpenedDrive | None]:
-        with read_cached(log, car, task.mapping, task.options) as drive:
+        with read_drive(log, car, task.mapping, task.options) as drive:
             return open_drive(drive, task.settings.config)
 
-    records, drives = task.read(task.split.parts[TRAINING], read, 0.3)
+    records, drives = task.read(read, 0.3)
     if not drives:
         raise no_drive("a true sideslip and the signals of a calibration", TEACH)
     seconds = math.fsum(d.seconds for d in drives)
@@ -285,7 +283,17 @@ def _prior_test(drives: Sequence[OpenedDrive], progress: Any) -> Interval | None
     if not folds:
         return None
     with_prior, without = (np.concatenate(column) for column in errors)
-    return block_bootstrap_difference(with_prior, without, end_to_end(stamps), block_s=TEST_BLOCK_S)
+    return block_bootstrap_difference(with_prior, without, _end_to_end(stamps), block_s=TEST_BLOCK_S)
+
+
+def _end_to_end(stamps_ns: Sequence[IntArray]) -> IntArray:
+    """Return the stamps of several slices, each shifted behind the previous one: no block contains two slices."""
+    moved: list[IntArray] = []
+    begin = 0
+    for stamps in (s for s in stamps_ns if s.size):
+        moved.append(stamps - stamps[0] + begin)
+        begin = int(moved[-1][-1]) + round(BLOCK_S * 1e9)
+    return np.concatenate(moved)
 
 
 def _support(test: Interval | None) -> float:

@@ -9,7 +9,6 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from pdhef_logtool.logs.byte_account import checksum_text
 from pdhef_logtool.logs.recording_span import shown_time
 from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
@@ -33,8 +32,6 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
         f"{inspection.kind}, {inspection.duration_s:.1f} s from {shown_time(inspection.start_ns)}, {messages} messages "
         f"on {len(inspection.topics)} topics"
     )
-    if text := checksum_text(inspection.checksummed_share):
-        console.print(text)
     if inspection.sample is not None:
         console.print(Text(str(inspection.sample), "cyan"))
     if inspection.topics:

@@ -15,7 +15,6 @@ import numpy as np
 
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
-from pdhef_logtool.logs.byte_account import checksummed_share
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
@@ -30,13 +29,13 @@ from pdhef_logtool.mapping import (
     Mapping,
     QualityGate,
     SignalSource,
+    auto_map,
     clock_key,
     fit_clocks,
     mapping_of,
     mapping_to_toml,
     merge_losses,
     read_signals,
-    recognise,
     resolve_mapping,
 )
 from pdhef_logtool.mapping.candidates import Candidate
@@ -164,7 +163,6 @@ class Inspection:
     ambiguities, notes : of the mapping. candidates : fields that were weighed for it.
     checks : what physics states of signals and ground truth. proposals : corrections of the mapping that are certain.
     lost : every loss and note of reading. sample : what was looked at; None: everything.
-    checksummed_share : which share of the bytes that were read a verified checksum covers; None where none was read.
     lines : extremes in equal parts of the log [C] by section and signal, no part of the JSON.
     refused : by channel why a run computes nothing from it.
     """
@@ -186,7 +184,6 @@ class Inspection:
     lost: tuple[Loss, ...]
     candidates: tuple[Candidate, ...] = ()
     sample: Sample | None = None
-    checksummed_share: float | None = None
     lines: MappingABC[tuple[str, str], tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     refused: MappingABC[str, str] = field(default_factory=dict)
 
@@ -228,7 +225,6 @@ class Inspection:
             "checks": self.checks,
             "proposals": [{"subject": p.subject, "evidence": p.evidence} for p in self.proposals],
             "lost": self.lost,
-            "checksummed_share": self.checksummed_share,
             "candidates": self.candidates,
             **self.uses,
         }
@@ -248,7 +244,7 @@ def inspect_log(
 
     Of a large MCAP whose index agrees with itself values are looked at in a part of the chunks (``sample``), unless
     ``whole``; if anything is wrong in them, or little is left, all of it is read. Memory is bounded by windows of ten
-    minutes, regardless of the log's length. ``prefer_truth`` is the choice of :func:`pdhef_logtool.mapping.recognise`;
+    minutes, regardless of the log's length. ``prefer_truth`` is the choice of :func:`pdhef_logtool.mapping.auto_map`;
     ``budget`` is what reading may cost, ``msgs`` a folder with definitions of types that the log does not define.
 
     Raises
@@ -284,7 +280,7 @@ def inspect_drive_log(
     ambiguities: tuple[Ambiguity, ...] = ()
     candidates: tuple[Candidate, ...] = ()
     if given is None:
-        auto = recognise(log, prefer_truth=prefer_truth)
+        auto = auto_map(log, prefer_truth=prefer_truth)
         mapping, ambiguities, candidates = auto.mapping, auto.ambiguities, auto.candidates
     else:
         mapping = choose_mapping(log, given, prefer_truth=prefer_truth, require_signals=False).mapping
@@ -292,6 +288,7 @@ def inspect_drive_log(
     head = (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS))
     whole = _Look(windows(log.start_ns, log.end_ns, WINDOW_NS, log.recording_span), tuple(t.name for t in log.topics))
     look = whole if index is None else _sample_look(log, index, mapping, head)
+    log.expect(dict.fromkeys(look.stamps, ()))
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     looked_at = survey_log(log, mapping, clocks, head)
     mapping = looked_at.mapping
@@ -319,7 +316,6 @@ def inspect_drive_log(
         lost=merge_losses([log.lost, reading]),
         candidates=candidates,
         sample=None if look.sample is None else look.sample(),
-        checksummed_share=checksummed_share(log.byte_ledgers),
         lines={key: (entry.line.low, entry.line.high) for key, entry in gathered.items()},
         refused=looked_at.refused(),
     )

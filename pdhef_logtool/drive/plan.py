@@ -1,0 +1,159 @@
+"""What is decided once per log, from its first ten minutes: clocks, alignment, ground truth and checks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as Mapped
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.drive.alignment import SURVEY_S, AlignmentPlan, Clock, has_imu, no_alignment, plan_alignment
+from pdhef_logtool.drive.mounting import survey_log
+from pdhef_logtool.drive.setup import Setup, clocks_of
+from pdhef_logtool.drive.truth import LatencyEstimate, TruthPlan, dependent_signals
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.mapping import ClockModel, Mapping, clock_key, fit_clocks
+from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import Channel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivePlan:
+    """What is decided from the first ten minutes of a log and applies to all of it.
+
+    Attributes
+    ----------
+    survey_truth : channels of the ground truth that it was decided on.
+    latency : of the ground truth against the sensors; None without ground truth yaw rate or gyro.
+    dependent : ground truth quantities that are an input of the estimators, with the reason.
+    derivation : by ground truth quantity, how it is derived.
+    decided_s : seconds of the log, or of that of the set-up, that the sensors' part was decided on.
+    checks : of signals, ground truth and vehicle file.
+    refused : mapped channels, those of ground truth with ``truth.``, that nothing is computed from, with the reason.
+    """
+
+    mapping: Mapping
+    vehicle: VehicleParameters
+    clocks: dict[str, ClockModel]
+    alignment: AlignmentPlan
+    truth: TruthPlan | None
+    latency: LatencyEstimate | None
+    dependent: dict[str, str]
+    derivation: dict[str, str]
+    survey_truth: dict[str, Channel]
+    start_ns: int
+    end_ns: int
+    decided_s: float
+    checks: tuple[Check, ...] = ()
+    refused: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def truth_latency_s(self) -> float:
+        """Latency that all estimators' comparison with ground truth uses; 0 unless it is out of its own uncertainty."""
+        is_significant = self.latency is not None and abs(self.latency.latency_s) > 2.0 * self.latency.std_error_s
+        return self.latency.latency_s if is_significant and self.latency is not None else 0.0
+
+    @property
+    def has_truth_pose(self) -> bool:
+        """Whether the ground truth has position and heading."""
+        return {"position_m", "yaw_rad"} <= self.derivation.keys()
+
+
+def plan_drive(
+    log: DriveLog,
+    mapping: Mapping,
+    vehicle: VehicleParameters,
+    start_ns: int,
+    end_ns: int,
+    *,
+    require_imu: bool = True,
+    clock: Clock = "arrival",
+    setup: Setup | None = None,
+    waived: Sequence[str] = (),
+) -> DrivePlan:
+    """Read at most ten minutes of the slice [start_ns, end_ns) and decide clocks, alignment and ground truth.
+
+    Parameters
+    ----------
+    require_imu : False gives a plan with no alignment (``alignment.channels`` empty) where there is no IMU.
+    clock : as for :func:`~.alignment.plan_alignment`. setup : the sensors' part of the plan; None decides it here.
+    waived : names of checks whose failure does not stop the use of a channel.
+
+    Raises
+    ------
+    MappingError : The log lacks what is mapped, or there is no IMU to set the stamps.
+    """
+    mapping = with_gyro_delay(mapping, vehicle)
+    if setup is not None:
+        mapping = setup.applied_to(mapping)
+    clocks = fit_clocks(log, mapping, start_ns, end_ns)
+    if setup is not None:
+        clocks |= clocks_of(setup, log, mapping, start_ns)
+    span_ns = (start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
+    looked_at = survey_log(log, mapping, clocks, span_ns, vehicle)
+    mapping, survey = looked_at.mapping, looked_at.channels
+    if setup is not None:
+        alignment = setup.alignment
+    elif require_imu or has_imu(survey.signals):
+        alignment = plan_alignment(
+            survey.signals,
+            steering_ratio=vehicle.steering_ratio,
+            wheel_radius_m=vehicle.wheel_radius_m,
+            clock=clock,
+        )
+    else:
+        alignment = no_alignment(survey.signals)
+    # What a set-up reads must not depend on later samples.
+    refused = looked_at.refused(waived, is_causal=setup is not None)
+    mapping, sound = without_refused_truth(mapping, refused), looked_at
+    if mapping is not looked_at.mapping:
+        sound = survey_log(log, mapping, clocks, span_ns, vehicle, rescale=False)
+    truth, derived = sound.truth_plan, sound.truth
+    derivation = {} if derived is None else dict(derived.derivation)
+    return DrivePlan(
+        mapping=mapping,
+        vehicle=vehicle,
+        clocks=clocks,
+        alignment=alignment.without(refused),
+        truth=truth,
+        latency=sound.latency,
+        dependent=dependent_signals(survey.signals, sound.channels.truth) if truth else {},
+        derivation=derivation,
+        survey_truth=sound.channels.truth,
+        start_ns=start_ns,
+        end_ns=end_ns,
+        decided_s=(end_ns - start_ns) * 1e-9 if setup is None else setup.decided_s,
+        checks=looked_at.checks,
+        refused=refused,
+    )
+
+
+def without_refused_truth(mapping: Mapping, refused: Mapped[str, str]) -> Mapping:
+    """Return the mapping without refused ground truth; without any if a quantity that is derived is refused."""
+    names = {n.removeprefix("truth.") for n in refused if n.startswith("truth.")}
+    if not names:
+        return mapping
+    kept = {n: s for n, s in mapping.truth.items() if n not in names}
+    return replace(mapping, truth=kept if names <= mapping.truth.keys() else {})
+
+
+def setup_of(plan: DrivePlan) -> Setup:
+    """Return what of a plan can be frozen: mapping, clocks and alignment of the sensors."""
+    keys = {clock_key(source) for source in plan.mapping.signals.values()}
+    return Setup(
+        signals=plan.mapping.signals,
+        clocks={key: clock for key, clock in plan.clocks.items() if key in keys},
+        alignment=plan.alignment,
+        decided_s=plan.decided_s,
+        can=plan.mapping.can,
+    )
+
+
+def with_gyro_delay(mapping: Mapping, vehicle: VehicleParameters) -> Mapping:
+    """Return the mapping with the gyro's delay that the car has: all of it, in place of the mapping's own."""
+    delay_s, gyro = vehicle.sensors.yaw_rate_delay_s, mapping.signals.get("yaw_rate_rad_s")
+    if delay_s == 0.0 or gyro is None or gyro.latency_s == delay_s:
+        return mapping
+    note = f"the car's gyro is {delay_s * 1e3:.1f} ms late, in place of latency_s = {gyro.latency_s:g} of the mapping"
+    signals = {**mapping.signals, gyro.name: replace(gyro, latency_s=delay_s)}
+    return replace(mapping, signals=signals, notes=(*mapping.notes, note))

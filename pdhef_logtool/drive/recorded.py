@@ -1,0 +1,151 @@
+"""A whole drive in memory: the log's channels as its plan reads them, aligned, with ground truth at the same stamps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping as Mapped
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import correct_signals
+from pdhef_logtool.drive.alignment import align, count_late
+from pdhef_logtool.drive.channel_hash import channels_sha256
+from pdhef_logtool.drive.plan import DrivePlan
+from pdhef_logtool.drive.truth import derive_truth, truth_at
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.mapping import ClockModel, clock_key, merge_losses, read_signals
+from pdhef_logtool.records.ledger import Role, SampleCount
+from pdhef_logtool.records.readings import impossible_readings
+from pdhef_logtool.records.signals import Channel, FloatArray, Loss, Signals
+from pdhef_logtool.records.steps import last_known
+from pdhef_logtool.records.tracks import StateTrack
+
+#: A silence of a channel is reported from this time on, and from this many of its periods.
+TOLD_GAP_S = 1.0
+TOLD_GAP_PERIODS = 10.0
+#: Why a signal's samples are not used although nothing is wrong with them.
+_NOT_NEEDED = "not-needed"
+_IMPOSSIBLE = "readings that no vehicle can have were taken as missing by the estimators"
+_LATE = "samples arrived much later than their neighbours: they were not waited for and count as missing"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """What a plan reads of a log.
+
+    Attributes
+    ----------
+    signals, truth : [N] at the same stamps; N may be 0, and ``truth`` is None without ground truth.
+    samples : messages that were used, by source. ledger : what became of every sample of the mapped topics.
+    signals_sha256, truth_sha256 : of the channels' content, None where there is none.
+    """
+
+    plan: DrivePlan
+    signals: Signals
+    truth: StateTrack | None
+    losses: tuple[Loss, ...]
+    samples: dict[str, int]
+    ledger: tuple[SampleCount, ...]
+    signals_sha256: str | None
+    truth_sha256: str | None
+
+
+def read_recorded(log: DriveLog, plan: DrivePlan) -> Recorded:
+    """Read the slice of a plan once, align it and derive the ground truth."""
+    part = read_signals(log, plan.mapping, plan.clocks, plan.start_ns, plan.end_ns)
+    channels = [*part.signals.values(), *part.truth.values()]
+    samples: Counter[str] = Counter()
+    for channel in channels:
+        samples[channel.source] += len(channel)
+    stamps = [c.stamps_ns for c in part.signals.values() if len(c)]
+    start_ns, end_ns = (min(int(s[0]) for s in stamps), max(int(s[-1]) for s in stamps) + 1) if stamps else (0, 0)
+    signals = correct_signals(align(part.signals, plan.alignment, start_ns, end_ns), plan.vehicle)
+    late = []
+    for name, count in count_late(part.signals, plan.alignment, start_ns, end_ns).items():
+        part.counts["signal", name]["late"] += count
+        late.append(Loss("late", _LATE, part.signals[name].source, start_ns, end_ns, count, "note"))
+    losses = merge_losses([part.losses, *map(_gaps, channels), late, _impossible(signals)])
+    truth = None
+    if plan.truth is not None:
+        at_stamps = truth_at(
+            derive_truth(part.truth, plan=plan.truth),
+            signals.stamps_ns,
+            plan.truth_latency_s,
+            standstill_m_s=plan.vehicle.standstill_m_s,
+        )
+        truth = replace(at_stamps, measured_speed_m_s=_measured_speed(signals))
+    mapping = plan.mapping
+    return Recorded(
+        plan=plan,
+        signals=signals,
+        truth=truth,
+        losses=losses,
+        samples=dict(samples),
+        ledger=sample_ledger(log, plan, part.counts),
+        signals_sha256=channels_sha256(part.signals, mapping.signals),
+        truth_sha256=channels_sha256(part.truth, mapping.truth),
+    )
+
+
+def _measured_speed(signals: Signals) -> FloatArray:
+    """Return the last known speed [N], of GNSS where no other sensor measures it."""
+    of_gnss = np.hypot(*signals.gnss_velocity_m_s.T)
+    speed = np.where(np.isfinite(signals.speed_m_s), signals.speed_m_s, of_gnss)
+    return last_known(signals.stamps_ns, speed)
+
+
+def sample_ledger(
+    log: DriveLog, plan: DrivePlan, counts: Mapped[tuple[Role, str], Counter[str]]
+) -> tuple[SampleCount, ...]:
+    """Return what became of every sample of the mapped topics, of the counts of a plan's slice."""
+    messages = {t.name: t.messages for t in log.topics}
+    whole = plan.start_ns <= log.start_ns and plan.end_ns >= log.end_ns
+    aligned = {c.name for c in plan.alignment.channels}
+    samples = []
+    for (role, name), count in counts.items():
+        source = (plan.mapping.signals if role == "signal" else plan.mapping.truth)[name]
+        dropped = Counter({reason: n for reason, n in count.items() if reason != "read"})
+        total = count["read"]
+        if source.read_topic in messages:  # a signal of raw CAN frames is read of some of its topic's messages
+            left_out = log.recording_span.left_out.get(source.topic, {})
+            rest = messages[source.topic] - total - sum(left_out.values())
+            total = messages[source.topic]
+            dropped.update({**left_out, ("not-read" if whole else "outside-slice"): rest})
+        used = total - sum(dropped.values())
+        if role == "signal" and name not in aligned:
+            dropped[_NOT_NEEDED], used = used, 0
+        clock = plan.clocks.get(clock_key(source), ClockModel())
+        reasons = {reason: n for reason, n in sorted(dropped.items()) if n}
+        stamp = "log_time" if clock.unusable else source.stamp
+        samples.append(SampleCount(role, name, source.label, stamp, total, used, reasons))
+    return tuple(samples)
+
+
+def _impossible(signals: Signals) -> list[Loss]:
+    losses = []
+    for name, mask in impossible_readings(signals).items():
+        stamps = signals.stamps_ns[mask]
+        losses.append(Loss("impossible", _IMPOSSIBLE, name, int(stamps[0]), int(stamps[-1]) + 1, len(stamps), "note"))
+    return losses
+
+
+def _gaps(channel: Channel) -> list[Loss]:
+    """Return the silences within a channel."""
+    stamps = channel.stamps_ns
+    if stamps.shape[0] < 3:
+        return []
+    steps = np.diff(stamps)
+    least = max(TOLD_GAP_S * 1e9, TOLD_GAP_PERIODS * float(np.median(steps)))
+    return [
+        Loss(
+            "gap",
+            f"no samples for {steps[i] * 1e-9:.2f} s",
+            channel.source,
+            int(stamps[i]),
+            int(stamps[i + 1]),
+            1,
+            "note",
+        )
+        for i in np.flatnonzero(steps > least)
+    ]

@@ -1,0 +1,15 @@
+"""Numbers of file formats and clocks: ``constants.toml``."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+CONSTANTS: Mapping[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+
+
+def numbered(table: Mapping[str, Any]) -> dict[int, Any]:
+    """Return a table by its numbers, which are texts in TOML."""
+    return {int(number): entry for number, entry in table.items()}

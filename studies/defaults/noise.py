@@ -1,0 +1,180 @@
+"""Noise of the tuned filters of the shipped car, by one search for all (docs/method.md#noise): ``noise.toml``.
+
+A trial is a point of the space. The first half of the trials is a scrambled Sobol sequence, the same points for all
+filters. The rest are Gaussian steps from each filter's best point so far, in the logarithms of the factors, with a
+width that shrinks on the same schedule and with the same random numbers for all.
+
+The objective is the mean over drives of ln √(RMSE² + floor²) of the sideslip, reported as its exponential, a geometric
+mean in degrees: every drive counts by its relative error. The floor limits the effect of drives that hardly turn.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from pdhef_logtool.car.car import NOISE_FILE, Car
+from pdhef_logtool.car.parts import FilterNoise, Noise
+from pdhef_logtool.car.store import Change
+from pdhef_logtool.car.toml_files import part_toml
+from pdhef_logtool.drive.reading import Drive, WholeDrive
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD
+from pdhef_logtool.estimators.table import FEATURES, Options, spec_of
+from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.learning.drives import DriveRecord, load_drive, no_drive, scorable_stamps
+from pdhef_logtool.learning.stages.task import Task
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.tracks import StateTrack
+
+#: Filters whose noise is searched; that of ``physics`` is identified together with its values.
+TUNED = ("phy-ukf:tuned",)
+#: Added to each drive's RMSE as squares.
+FLOOR_RAD = math.radians(0.05)
+#: Drives with fewer scored stamps are left out.
+MIN_SCORED_STAMPS = 100
+#: If an estimate is missing at more of the scored stamps, its error is at least that of sideslip 0 on that drive.
+MIN_AVAILABILITY = 0.9
+#: Share of the trials that explore the whole space.
+EXPLORING_SHARE = 0.5
+#: 1-sigma of the local steps, from first to last, as a share of each factor's logarithmic range.
+STEP_FIRST, STEP_LAST = 0.15, 0.02
+#: Ranges of the factors, log-uniform: q of v_y (m/s/√s), q of the yaw rate (rad/s/√s), r of a_y (m/s²), r of the yaw
+#: rate (rad/s). The other noises remain unchanged.
+LOW = np.array([0.002, 0.001, 0.02, 0.0002])
+HIGH = np.array([2.0, 1.0, 5.0, 0.05])
+OBJECTIVE = "geometric mean over drives of the sideslip RMSE, each with the floor added as squares"
+HEAD = "Written by python -m studies.defaults.train_default. For the physics of this car only."
+
+#: A point of the space, four significant digits each.
+Point = tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One point and its objective in degrees."""
+
+    number: int
+    values: Point
+    objective_deg: float
+
+
+def tune(task: Task, trials: int) -> Change:
+    """Return the noise of the tuned filters by the best of so many trials each.
+
+    Raises
+    ------
+    EstimatorError
+        No drive can be scored.
+    """
+    options, slow = task.options, task.car.vehicle.low_speed_blend_m_s
+
+    def lacking(drive: Drive) -> str:
+        missing = sorted(FEATURES - drive.available)
+        return f"the filters need {', '.join(missing)}" if missing else ""
+
+    def read(log: LogInput) -> tuple[DriveRecord, WholeDrive | None]:
+        return load_drive(log, task.car, task.mapping, options, refuse=lacking, least_scored=MIN_SCORED_STAMPS)
+
+    records, drives = task.read(read)
+    if not drives:
+        raise no_drive("a true sideslip and the signals of the filters", "noise")
+
+    def objective(name: str, values: Point) -> float:
+        car = task.car.with_noise(name, filter_noise(values))
+        estimator = spec_of(name).make(car, Options(options.use_speed))
+        return objective_deg(
+            [error_rad(run_window(estimator, d.signals)[0], d.truth, slow) for d in drives if d.truth is not None]
+        )
+
+    best = {}
+    for name in TUNED:
+        best[name] = min(search(partial(objective, name), trials, task.settings.seed), key=_order)
+        print(f"{name}: trial {best[name].number} of {trials}, {best[name].objective_deg:.4f}°", flush=True)
+    return _change(task, best, trials, [r for r in records if not r.left_out])
+
+
+def _order(trial: Trial) -> tuple[float, int]:
+    return trial.objective_deg, trial.number
+
+
+def _change(task: Task, best: dict[str, Trial], trials: int, records: Sequence[DriveRecord]) -> Change:
+    together = hashlib.sha256("".join(sorted(r.sha256 for r in records)).encode()).hexdigest()
+    search_of = {"trials": trials, "seed": task.settings.seed, "objective": OBJECTIVE, "drives_sha256": together}
+    part = Noise(
+        filter={name: _part(trial, task.car, name) for name, trial in best.items()},
+        search=search_of,
+        drives=tuple(r.learnt_on for r in records),
+    )
+    text = part_toml(part, HEAD, {f"filter.{n}.q_std": "v_x, v_y, yaw rate" for n in best})
+    return Change(
+        "studies.defaults.train_default noise",
+        NOISE_FILE,
+        {NOISE_FILE: text.encode()},
+        settings={**task.settings.to_dict(), "trials": trials},
+        drives=part.drives,
+    )
+
+
+def _part(trial: Trial, car: Car, name: str) -> FilterNoise:
+    """Return the noise of a trial with the physics that it belongs to."""
+    belongs = {"physics_sha256": car.physics_of(name), "score_deg": round(trial.objective_deg, 4)}
+    return filter_noise(trial.values).model_copy(update={**belongs, "trial": trial.number})
+
+
+def filter_noise(values: Point) -> FilterNoise:
+    """Return the noise of a point."""
+    q_vy, q_yaw_rate, r_ay, r_yaw_rate = values
+    return FilterNoise(
+        q_std=(PHY_UKF_Q_STD[0], q_vy, q_yaw_rate), r_std={"ay_m_s2": r_ay, "yaw_rate_rad_s": r_yaw_rate}
+    )
+
+
+def error_rad(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -> float:
+    """Return the sideslip RMSE of a drive as ``pdhef run`` scores it.
+
+    It is at least that of sideslip 0 if too much of the estimate is missing.
+    """
+    error = signal_error(estimate, truth, "sideslip_rad", low_speed_m_s)
+    error = error[np.isfinite(error)]
+    scorable = truth.sideslip_rad[scorable_stamps(truth, low_speed_m_s)]
+    rms, zero = (float(np.sqrt(np.mean(x**2))) if x.size else math.nan for x in (error, scorable))
+    if error.size == 0:
+        return zero
+    return rms if error.size >= MIN_AVAILABILITY * scorable.size else max(rms, zero)
+
+
+def objective_deg(errors_rad: Sequence[float]) -> float:
+    """Return the objective over drives."""
+    return math.degrees(math.exp(float(np.mean(np.log(np.hypot(errors_rad, FLOOR_RAD))))))
+
+
+def point(shares: FloatArray) -> Point:
+    """Return the point at shares [4] in [0, 1] of the logarithmic ranges."""
+    return tuple(float(f"{value:.4g}") for value in LOW * (HIGH / LOW) ** shares)
+
+
+def search(objective: Callable[[Point], float], trials: int, seed: int) -> list[Trial]:
+    """Return all trials; ``seed`` determines the Sobol scrambling and the local steps."""
+    from scipy.stats import qmc
+
+    exploring = max(1, round(EXPLORING_SHARE * trials))
+    sobol = qmc.Sobol(len(LOW), scramble=True, seed=seed).random_base2(max(0, (exploring - 1).bit_length()))
+    width = np.geomspace(STEP_FIRST, STEP_LAST, trials - exploring) if trials > exploring else np.empty(0)
+    steps = width[:, None] * np.random.default_rng([seed, len(LOW)]).standard_normal((trials - exploring, len(LOW)))
+    done: list[Trial] = []
+    for number in range(trials):
+        if number < exploring:
+            shares = sobol[number]
+        else:
+            centre = np.log(np.array(min(done, key=_order).values) / LOW) / np.log(HIGH / LOW)
+            shares = np.clip(centre + steps[number - exploring], 0.0, 1.0)
+        values = point(shares)
+        done.append(Trial(number, values, objective(values)))
+    return done

@@ -1,0 +1,456 @@
+"""The rows of the gates: each measures figures of the tool by its command line and its files."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import threading
+import tomllib
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from studies.calibration import errors_over_sd, true_values, wrong_file
+from studies.conditions import row_inputs, row_logs
+from studies.gates.tool import (
+    Tool,
+    commands_and_options,
+    coverage_percent,
+    reports,
+    sideslip_rmse_deg,
+)
+from studies.mapping_mistakes import VERDICTS, outcomes
+from studies.pages import DRIVES, write_toml
+from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
+from studies.torture.mutating import mutant
+from studies.torture.seeds import write_seeds
+from truthsim.batch import DriveSpec
+from truthsim.conditions import ROWS
+from truthsim.drive import write_drive
+from truthsim.sensors import SensorNoise
+
+SAMPLES = Path(__file__).resolve().parents[2] / "sample_logs"
+ESTIMATORS = "zero,kinematic,open-loop,linear-regression,phy-ukf,physics,pure-lstm,pd-hef-paper,pd-hef,pd-hef-smoothed"
+QUICK, FULL = "quick", "full"
+
+
+class Figure(NamedTuple):
+    """A measured value, its unit, and its tolerance: relative, but at least absolute."""
+
+    value: float
+    unit: str
+    relative: float = 0.03
+    absolute: float = 0.0
+
+
+Figures = dict[str, Figure]
+
+
+@dataclass(frozen=True, slots=True)
+class GateRow:
+    """One row: ``measure`` returns its figures by name, ``sets`` are the sets of rows that contain it."""
+
+    gate: str
+    name: str
+    sets: tuple[str, ...]
+    measure: Callable[[Tool], Figures]
+
+
+class SkippedRowError(Exception):
+    """The row cannot be measured here."""
+
+
+def rmse_figures(run: Path, absolute_deg: float, coverage_of: str | None = None) -> Figures:
+    """Return the sideslip RMSE of every estimator of a run, and the coverage of the 95 % interval of one."""
+    figures = {
+        f"RMSE {name}": Figure(value, "deg", absolute=absolute_deg)
+        for name, value in sideslip_rmse_deg(run).items()
+        if math.isfinite(value)
+    }
+    if coverage_of and math.isfinite(share := coverage_percent(run, coverage_of)):
+        figures[f"coverage95 {coverage_of}"] = Figure(share, "%", absolute=1.0)
+    return figures
+
+
+def present(names: set[str] | list[str]) -> Figures:
+    """Return a figure for each name that must exist."""
+    return {name: Figure(1.0, "present", 0.0) for name in sorted(names)}
+
+
+# ------------------------------------------------------------------------------------------------ condition table
+
+_SIMULATING = threading.Lock()
+
+
+def condition(row: str, drives: int, tool: Tool) -> Figures:
+    """Run the estimators on the drives of a row of the condition table."""
+    with _SIMULATING:
+        logs, assume = row_logs(tool.work, row, drives)
+    given = ("--car", "saloon", "--keep", "metrics", "--estimators", ESTIMATORS)
+    run = tool.run(f"condition-{row}-{drives}", *logs, *given, *row_inputs(tool, row, logs[0], assume))
+    return rmse_figures(run, 0.003, "pd-hef")
+
+
+def conditions() -> Iterator[GateRow]:
+    """Yield the rows of the condition table."""
+    for row in ROWS:
+        yield GateRow("conditions", row.name, (FULL,), partial(condition, row.name, 10))
+    for name in ("in-domain", "gyro-stuck"):
+        yield GateRow("conditions", f"{name}, 2 drives", (QUICK, FULL), partial(condition, name, 2))
+
+
+# ------------------------------------------------------------------------------------------------ recorded drives
+
+
+def recorded(drive: PeerDrive, receiver: bool, tool: Tool) -> Figures:
+    """Run the estimators and the reference on a recorded drive with its published vehicle file."""
+    log = DRIVES / drive.log
+    if not log.exists():
+        raise SkippedRowError("needs ../shared/data beside the repository")
+    name = f"{drive.log.partition('.')[0]}{'-gnss' if receiver else ''}"
+    mapping = write_toml(tool.work / "mappings" / f"{name}.toml", mapping_table(drive, receiver=receiver))
+    car = write_toml(tool.work / "cars" / f"{name}.toml", vehicle_table(drive))
+    names = "zero,kinematic,open-loop,phy-ukf,physics,pd-hef"
+    given = ("--car", car, "--mapping", mapping, "--keep", "estimates", "--reference", "on", "--estimators", names)
+    run = tool.run(f"recorded-{name}", log, *given)
+    figures = rmse_figures(run, 0.01, "physics")
+    (report,) = reports(run).values()
+    return figures | parameter_figures(report)
+
+
+def parameter_figures(report: dict[str, Any]) -> Figures:
+    """Return the calibrated parameters of a report and their standard deviations, in shares of the value."""
+    calibration = report["self_calibration"] or {}
+    return {
+        f"{name} {p['name']}": Figure(float(p[key]), p.get("unit", "1"), absolute=0.03 * abs(float(p["sd"])))
+        for p in calibration.get("parameters", ())
+        for name, key in (("calibrated", "value"), ("±", "sd"))
+    }
+
+
+#: Recorded drives of the quick gates: each has another car or container.
+QUICK_DRIVES = ("gti_pole_aa.mcap", "v40_slalom.mcap", "f1tenth_xray_0.bag")
+
+
+def recorded_rows() -> Iterator[GateRow]:
+    """Yield the recorded drives; those of the V40 also with their GNSS receiver."""
+    for drive in PEER_DRIVES:
+        sets = (QUICK, FULL) if drive.log in QUICK_DRIVES else (FULL,)
+        yield GateRow("recorded drives", drive.log, sets, partial(recorded, drive, False))
+        if drive.log.startswith("v40_"):
+            yield GateRow("recorded drives", f"{drive.log}, GNSS velocity", (FULL,), partial(recorded, drive, True))
+
+
+# ------------------------------------------------------------------------------------------------ simulated reference
+
+#: Manoeuvre, km/h, friction, longest duration (s) of the drives of the reference.
+REFERENCE_DRIVES: dict[str, tuple[str, float, float, float | None]] = {
+    "step steer": ("step-steer", 100.0, 0.85, None),
+    "sine with dwell": ("sine-with-dwell", 80.0, 0.85, None),
+    "sine sweep": ("sine-sweep", 100.0, 0.85, None),
+    "double lane change": ("dlc", 100.0, 0.85, None),
+    "fishhook": ("fishhook", 70.0, 0.85, None),
+    "banked road": ("banked-road", 80.0, 0.85, 40.0),
+    "stop and go": ("stop-and-go", 50.0, 0.85, 40.0),
+    "road": ("road", 80.0, 0.85, 300.0),
+}
+
+
+def simulated_log(
+    tool: Tool, name: str, spec: tuple[str, float, float, float | None], seed: int, *, steering_wheel: bool = False
+) -> Path:
+    """Simulate a drive of the saloon and return its log; ``steering_wheel``: the log has this angle."""
+    log = tool.work / "simulated" / f"{name.replace(' ', '-')}-{seed}.mcap"
+    if not log.is_file():
+        log.parent.mkdir(parents=True, exist_ok=True)
+        manoeuvre, speed, friction, duration_s = spec
+        write_drive(
+            DriveSpec(manoeuvre, speed, friction, seed, duration_s, amplitude=1.0).simulate(),
+            log,
+            steering_wheel=steering_wheel,
+        )
+    return log
+
+
+def bare_vehicle() -> dict[str, Any]:
+    """Return the vehicle file of the saloon without what was validated for it."""
+    document = tomllib.loads((SAMPLES / "vehicle.toml").read_text(encoding="utf-8"))
+    return {name: value for name, value in document.items() if name != "network"}
+
+
+def reference(name: str, tool: Tool) -> Figures:
+    """Run the reference and the filters on a simulated drive."""
+    log = simulated_log(tool, name, REFERENCE_DRIVES[name], 3)
+    car = write_toml(tool.work / "cars" / "saloon.toml", bare_vehicle())
+    names = "zero,kinematic,open-loop,phy-ukf,physics"
+    run = tool.run(f"reference-{log.stem}", log, "--car", car, "--reference", "on", "--estimators", names)
+    return rmse_figures(run, 0.003, "reference")
+
+
+def reference_rows() -> Iterator[GateRow]:
+    """Yield the simulated drives of the reference."""
+    for name in REFERENCE_DRIVES:
+        sets = (QUICK, FULL) if name == "double lane change" else (FULL,)
+        yield GateRow("reference", name, sets, partial(reference, name))
+
+
+# ------------------------------------------------------------------------------------------------ ±
+
+_PRINTED = re.compile(r"(-?[\d.]+) \+- ([\d.]+)")
+PLUS_MINUS_DRIVES = (
+    ("sine-sweep-wide", 90.0, 0.85, None),
+    ("road", 100.0, 0.85, 120.0),
+    ("dlc", 80.0, 0.85, None),
+    ("sine-with-dwell", 80.0, 0.85, None),
+    ("road", 60.0, 0.85, 60.0),
+)
+
+
+def plus_minus(seeds: range, tool: Tool) -> Figures:
+    """Return RMS of error over standard deviation of what the tool estimates of the saloon with wrong vehicle files."""
+    right, noise, scores = bare_vehicle(), SensorNoise(), dict[str, list[float]]()
+    true = true_values(right, noise.imu_x_m, noise.rtk_x_m, noise.rtk_heading_offset_rad)
+    for seed in seeds:
+        log = simulated_log(
+            tool, "plus-minus", PLUS_MINUS_DRIVES[seed % len(PLUS_MINUS_DRIVES)], seed, steering_wheel=True
+        )
+        car = write_toml(tool.work / "cars" / f"wrong-{seed}.toml", wrong_file(right, np.random.default_rng(seed)))
+        run = tool.run(f"plus-minus-{seed}", log, "--car", car, "--keep", "estimates", "--estimators", "zero,physics")
+        (report,) = reports(run).values()
+        for name, score in errors_over_sd(report, true):
+            scores.setdefault(name, []).append(score)
+    figures = {
+        f"RMS error / sd, {name}": Figure(float(np.sqrt(np.mean(np.square(values)))), "1", absolute=0.03)
+        for name, values in sorted(scores.items())
+    }
+    everything = np.abs(np.concatenate(list(scores.values())))
+    share = Figure(100.0 * float(np.mean(everything <= 1.96)), "%", absolute=1.0)
+    return figures | {"within ± 1.96 sd": share, "values": Figure(float(len(everything)), "count", 0.0)}
+
+
+def plus_minus_rows() -> Iterator[GateRow]:
+    """Yield the coverage of the standard deviations."""
+    yield GateRow("plus-minus", "20 cars", (FULL,), partial(plus_minus, range(20)))
+    yield GateRow("plus-minus", "1 car", (QUICK, FULL), partial(plus_minus, range(2, 3)))
+
+
+# ------------------------------------------------------------------------------------------------ mapping mistakes
+
+
+def mistakes(log: str, kinds: tuple[tuple[str, str], ...], tool: Tool) -> Figures:
+    """Count what the checks of ``inspect`` state of mistakes in a mapping."""
+    path, folder = SAMPLES / log, tool.work / "mappings"
+
+    def look(log: Path, mapping: Path) -> list[dict[str, Any]]:
+        checks: list[dict[str, Any]] = tool.json("inspect", log, "--mapping", mapping)["checks"]
+        return checks
+
+    found = outcomes(look, path, tool.mapping(path), folder / f"mistakes-{len(kinds)}", kinds)
+    counts = Counter(outcome.verdict for outcome in found)
+    return {name: Figure(float(counts[name]), "count", 0.0) for name in VERDICTS}
+
+
+def mistake_rows() -> Iterator[GateRow]:
+    """Yield the mistakes in mappings of sample logs."""
+    for log in ("dlc.mcap", "road.mcap"):
+        yield GateRow("mapping mistakes", log, (FULL,), partial(mistakes, log, ()))
+    few = (("steer_rad", "sign"), ("yaw_rate_rad_s", "x57.3"), ("ay_m_s2", "/9.81"), ("wheel_speed", "x3.6"),
+           ("ax_m_s2", "axis"), ("truth.vy_m_s", "sign"))  # fmt: skip
+    yield GateRow("mapping mistakes", "dlc.mcap, 6 mistakes", (QUICK, FULL), partial(mistakes, "dlc.mcap", few))
+
+
+# ------------------------------------------------------------------------------------------------ third-party logs
+
+
+def strangers(only: tuple[str, ...], tool: Tool) -> Figures:
+    """Count what becomes of the signals of logs of unknown layout."""
+    name = f"strangers-{len(only)}"
+    kept = tool.work / f"{name}.json"
+    chosen = ("--only", *only) if only else ()
+    done = tool.python("studies.strangers", "--held-out", "--work", tool.work / name, "--keep", kept,
+                       "--out", tool.work / f"{name}.md", *chosen)  # fmt: skip
+    if not kept.is_file():
+        raise RuntimeError(done.stderr[-2000:])
+    logs = json.loads(kept.read_text(encoding="utf-8"))
+    counts = Counter(outcome for log in logs.values() for outcome in log["items"].values())
+    share = 100.0 * counts["right"] / counts.total()
+    silent = Figure(float(counts["wrong, not reported"]), "count", 0.0)
+    return {"wrong, not reported": silent, "recognised": Figure(share, "%", 0.0, 0.5)}
+
+
+def stranger_rows() -> Iterator[GateRow]:
+    """Yield the third-party logs."""
+    yield GateRow("third-party logs", "all", (FULL,), partial(strangers, ()))
+    few = ("csv-german", "can-mdf", "vbo-file", "z-down", "steering-deg", "kart-parquet", "electric-blf")
+    yield GateRow("third-party logs", "7 layouts", (QUICK, FULL), partial(strangers, few))
+
+
+# ------------------------------------------------------------------------------------------------ fuzz
+
+
+def fuzz(part: str, options: tuple[str, ...], tool: Tool) -> Figures:
+    """Count how commands end on mutated files."""
+    work = tool.work / "-".join(("fuzz", part, *(o.strip("-") for o in options)))
+    done = tool.python("studies.torture", "--work", work, "--only", part, "--jobs", "1", *options,
+                       "--out", work / "none.md")  # fmt: skip
+    file = work / f"{part}.json"
+    if not file.is_file():
+        raise RuntimeError(done.stderr[-2000:])
+    figures: Figures = {}
+    for name, judged in json.loads(file.read_text(encoding="utf-8")).items():
+        figures[f"{name}: problems"] = Figure(float(len(judged["problems"])), "count", 0.0)
+        for end in ("exit 0", "exit 1", "exit 3"):
+            count = sum(n for text, n in judged["ends"].items() if text.partition(",")[0] == end)
+            figures[f"{name}: {end}"] = Figure(float(count), "count", 0.03, 1.0)
+    return figures
+
+
+def mutants(suffix: str, count: int, tool: Tool) -> Figures:
+    """Count how ``inspect`` ends on mutated recordings; a problem is a traceback or another exit code."""
+    seeds = write_seeds(tool.work / "seeds")
+    names = sorted(name for name in seeds if name.endswith(suffix))
+    ends: Counter[str] = Counter()
+    for i in range(count):
+        name = names[i % len(names)]
+        path = tool.work / f"mutant-{count}-{i}{suffix}"
+        path.write_bytes(mutant(name, seeds[name], 1, i)[1])
+        done = tool.pdhef("inspect", path, "--json")
+        sound = done.returncode in (0, 1, 3) and "Traceback" not in done.stderr
+        ends[f"exit {done.returncode}" if sound else "problems"] += 1
+    figures = {end: Figure(float(ends[end]), "count", 0.03, 1.0) for end in ("exit 0", "exit 1", "exit 3")}
+    return figures | {"problems": Figure(float(ends["problems"]), "count", 0.0)}
+
+
+def fuzz_rows() -> Iterator[GateRow]:
+    """Yield the mutants of each format."""
+    for name in ("csv", "vbo", "parquet", "mat5", "mat73", "mdf3", "mdf4", "blf", "asc"):
+        few = ((QUICK, FULL), f"{name}, 3 mutants", "3")
+        for sets, text, count in (((FULL,), name, "50"), *([few] if name in ("csv", "blf") else [])):
+            yield GateRow("fuzz", text, sets, partial(fuzz, "formats", ("--format", name, "--count", count)))
+    for suffix in ("mcap", "bag", "db3"):
+        yield GateRow("fuzz", suffix, (FULL,), partial(mutants, f".{suffix}", 50))
+        yield GateRow("fuzz", f"{suffix}, 3 mutants", (QUICK, FULL), partial(mutants, f".{suffix}", 3))
+
+
+# ------------------------------------------------------------------------------------------------ contract
+
+
+def exit_codes(tool: Tool) -> Figures:
+    """Return the exit codes of commands that end well and badly."""
+    folder = tool.work / "contract"
+    folder.mkdir(parents=True, exist_ok=True)
+    sample = SAMPLES / "dlc.mcap"
+    content = sample.read_bytes()
+    (folder / "cut.mcap").write_bytes(content[: len(content) // 2])
+    (folder / "noise.mcap").write_bytes(bytes(range(256)) * 40)
+    strict = folder / "plan.toml"
+    strict.write_text(
+        '[[requirement]]\nid = "a"\ntitle = "a"\nsignal = "sideslip_rad"\nmetric = "rmse"\nlimit_deg = 0.0001\n'
+    )
+    quiet = ("--annotate", "none", "--no-report", "--car", "saloon", "--estimators", "zero")
+    cases: dict[str, tuple[str | Path, ...]] = {
+        "run": ("run", sample, "-o", folder / "ok", *quiet),
+        "run, log cut in half": ("run", folder / "cut.mcap", "-o", folder / "cut", *quiet),
+        "run, all logs unreadable": ("run", folder / "noise.mcap", "-o", folder / "noise", *quiet),
+        "run, one of two logs unreadable": ("run", sample, folder / "noise.mcap", "-o", folder / "two", *quiet),
+        "run, requirement not met": (
+            "run",
+            sample,
+            "-o",
+            folder / "plan",
+            "--plan",
+            strict,
+            *quiet[:-1],
+            "zero,physics",
+        ),
+        "run, no output given": ("run", sample),
+        "run, unknown option": ("run", sample, "-o", folder / "x", "--nonsense"),
+        "run, unknown estimator": ("run", sample, "-o", folder / "x", "--estimators", "nonsense"),
+        "run, no such log": ("run", folder / "absent.mcap", "-o", folder / "x"),
+        "inspect": ("inspect", sample),
+        "inspect, log cut in half": ("inspect", folder / "cut.mcap"),
+        "inspect, unreadable": ("inspect", folder / "noise.mcap"),
+        "compare": ("compare", folder / "ok", folder / "plan"),
+        "plan init": ("plan", "init", "-o", folder / "new-plan.toml"),
+        "simulate": ("simulate", "dlc", "-o", folder / "simulated.mcap"),
+        "convert": ("convert", sample, "-o", folder / "converted.mcap"),
+        "events": ("events", folder / "ok", "--where", "nonsense ==="),
+        "unknown command": ("nonsense",),
+    }
+    for name in ("new-plan.toml", "simulated.mcap", "converted.mcap"):
+        (folder / name).unlink(missing_ok=True)
+    return {name: Figure(float(tool.pdhef(*words).returncode), "exit code", 0.0) for name, words in cases.items()}
+
+
+def options(tool: Tool) -> Figures:
+    """Return the commands and their options."""
+    return present([f"{c} {o}".strip() for c, names in commands_and_options(tool).items() for o in ("", *names)])
+
+
+def files_and_keys(tool: Tool) -> Figures:
+    """Return the files of a run, the columns of its tables, and the keys of its documents."""
+    import polars as pl
+
+    output = tool.work / "runs" / "files"
+    tool.json("run", SAMPLES / "dlc.mcap", "-o", output, "--car", "saloon", "--estimators", "zero,physics")
+    names = {str(f.relative_to(output)) for f in output.rglob("*") if f.is_file() and "metrics/" not in str(f)}
+    log = output / "logs" / "dlc"
+    for table in (output / "metrics.parquet", log / "estimates.parquet"):
+        names |= {f"{table.name} {column}" for column in pl.read_parquet_schema(table)}
+    for file, depth in ((output / "run.json", 1), (log / "report.json", 2)):
+        names |= {f"{file.name} {key}" for key in keys(json.loads(file.read_text(encoding="utf-8")), depth)}
+    inspected = tool.json("inspect", SAMPLES / "dlc.mcap")
+    names |= {f"inspect --json {key}" for key in keys(inspected, 1)}
+    names |= {f"inspect --json topics[].{key}" for key in inspected["topics"][0]}
+    return present(names)
+
+
+def keys(document: dict[str, Any], depth: int) -> Iterator[str]:
+    """Yield the paths of the keys of a document down to a depth; of a list, those of its first entry."""
+    for name, value in document.items():
+        yield name
+        inner = value[0] if isinstance(value, list) and value else value
+        if depth > 1 and isinstance(inner, dict):
+            yield from (f"{name}.{key}" for key in keys(inner, depth - 1))
+
+
+def contract_rows() -> Iterator[GateRow]:
+    """Yield the contract of the command line and of the files."""
+    for name, measure in (("exit codes", exit_codes), ("options", options), ("files and keys", files_and_keys)):
+        yield GateRow("contract", name, (QUICK, FULL), measure)
+
+
+# ------------------------------------------------------------------------------------------------ speed
+
+
+def speed(benchmark: str, tool: Tool) -> Figures:
+    """Return how many times as long each peer takes, as the benchmarks measure it in one run."""
+    done = tool.python("benchmarks.performance", benchmark)
+    if done.returncode:
+        raise RuntimeError(done.stderr[-2000:])
+    figures: Figures = {}
+    lines = [line for line in done.stdout.splitlines() if line.startswith("| ")][2:]
+    for i, line in enumerate(lines):
+        for peer, ratio in re.findall(r"([\w.+-][\w .+-]*?) ([\d.]+) x", line.split("|")[-2]):
+            figures[f"{i + 1} {peer}"] = Figure(float(ratio), "times", 0.35)
+    return figures
+
+
+def speed_rows() -> Iterator[GateRow]:
+    """Yield the ratios of speed to peers."""
+    for name in ("filtering", "reading", "reading_mdf", "writing"):
+        sets = (QUICK, FULL) if name == "filtering" else (FULL,)
+        yield GateRow("speed", name, sets, partial(speed, name))
+
+
+def all_rows() -> list[GateRow]:
+    """Return all rows in the order of the file; the fuzz tests, which take longest, are last."""
+    makers = (contract_rows, reference_rows, recorded_rows, conditions, speed_rows, stranger_rows,
+              plus_minus_rows, mistake_rows, fuzz_rows)  # fmt: skip
+    return [row for make in makers for row in make()]

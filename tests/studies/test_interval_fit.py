@@ -1,0 +1,243 @@
+"""Fit of the 95 % intervals of the shipped car."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.car.parts import Inflation
+from pdhef_logtool.estimators.error_features import grip_share
+from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS, YAW_RATE_TERMS, combined, grip_factor
+from pdhef_logtool.records.signals import FloatArray
+from studies.defaults.interval_fit import (
+    FOLDS,
+    Samples,
+    bin_numbers,
+    bin_weights,
+    coverage_rows,
+    covering_factor,
+    fit_coefficients,
+    fit_inflation,
+    folds,
+    grip_factors,
+)
+
+pytestmark = pytest.mark.slow
+
+
+def _sideslip(inflation: Inflation) -> tuple[float, ...]:
+    return tuple(getattr(inflation.sideslip, term) for term in SIDESLIP_TERMS)
+
+
+def _yaw_rate(inflation: Inflation) -> tuple[float, ...]:
+    return tuple(getattr(inflation.yaw_rate, term) for term in YAW_RATE_TERMS)
+
+
+def _samples(rng: np.random.Generator, std: FloatArray, terms: FloatArray, drives: int = 30) -> Samples:
+    """Samples of drives whose errors have a size of their own, [n], as those of real drives have."""
+    n = std.shape[0]
+    drive = np.arange(n) * drives // n
+    size = np.exp(rng.normal(0.0, 0.2, drives))[drive]
+    error = std * size * rng.standard_t(6.0, n)
+    return Samples(
+        terms=terms,
+        yaw_rate_terms=terms[:, [0, 1, 6]],
+        vy_per_sideslip=np.full(n, 20.0),
+        sideslip_error=error,
+        vy_error=20.0 * error,
+        yaw_rate_error=2.0 * terms[:, 1] * rng.standard_normal(n),
+        own_std=terms[:, 1],
+        bin=np.asarray(rng.integers(0, 3, n)),
+        drive=drive,
+        wrong=drive % 3 == 0,
+    )
+
+
+def _terms(rng: np.random.Generator, n: int) -> FloatArray:
+    terms = rng.lognormal(-6.0, 0.7, (n, len(SIDESLIP_TERMS)))
+    terms[:, 0] = 1e-4
+    terms[:, 3] = 3e-3 * rng.uniform(0.0, 0.9, n)
+    return terms
+
+
+def test_two_causes_are_told_apart() -> None:
+    rng = np.random.default_rng(2)
+    n = 40_000
+    terms = _terms(rng, n)
+    std = np.hypot(1.5 * terms[:, 1], 0.6 * terms[:, 5])
+    k = fit_coefficients(terms, std * rng.standard_normal(n), np.full(n, 1.0 / n))
+    assert k[1] == pytest.approx(1.5, rel=0.1)
+    assert k[5] == pytest.approx(0.6, rel=0.2)
+    assert max(k[i] for i in (2, 3, 4, 6)) < 0.25
+
+
+def test_new_drives_are_covered_where_errors_are_small_and_where_they_are_large() -> None:
+    rng = np.random.default_rng(3)
+    terms = _terms(rng, 30_000)
+    std = np.hypot(1.5 * terms[:, 1], 0.6 * terms[:, 2])
+    fitted = fit_inflation(_samples(rng, std, terms, drives=300))
+    fresh_terms = _terms(rng, 60_000)
+    fresh_std = np.hypot(1.5 * fresh_terms[:, 1], 0.6 * fresh_terms[:, 2])
+    fresh = _samples(rng, fresh_std, fresh_terms, drives=200)
+    interval = 1.96 * combined(fresh_terms, _sideslip(fitted.inflation))
+    interval *= grip_factor(grip_share(fresh_terms), fitted.inflation.grip_factors)
+    order = np.argsort(fresh_std)
+    for part in np.array_split(order, 4):
+        covered = np.mean(np.abs(fresh.sideslip_error[part]) <= interval[part])
+        assert covered == pytest.approx(0.95, abs=0.015)
+    # Before, a single drive in the least favourable part was covered far less.
+    assert np.mean(np.abs(fresh.sideslip_error) <= 1.96 * fresh.own_std) < 0.8
+    rate = combined(fresh.yaw_rate_terms, _yaw_rate(fitted.inflation))
+    assert np.mean(np.abs(fresh.yaw_rate_error) <= 1.96 * rate) == pytest.approx(0.95, abs=0.01)
+    assert fitted.inflation.vy_factor == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_wrong_vehicle_widens_by_what_it_asks_for() -> None:
+    """Its errors grow with the sideslip; with the file as given they do not, and the filter's 1-sigma says it all."""
+    rng = np.random.default_rng(7)
+
+    def drives(n: int, count: int) -> Samples:
+        terms = _terms(rng, n)
+        samples = _samples(rng, 1.5 * terms[:, 1], terms, count)
+        extra = 3.0 * terms[:, 2] * rng.standard_normal(n)
+        return replace(samples, sideslip_error=samples.sideslip_error + np.where(samples.wrong, extra, 0.0))
+
+    samples = drives(60_000, 400)
+    fitted = fit_inflation(samples)
+    narrow = fit_inflation(samples.where(~samples.wrong))
+    fresh = drives(60_000, 300)
+    covered = {}
+    for name, one in (("both", fitted), ("given", narrow)):
+        inside = np.abs(fresh.sideslip_error) <= 1.96 * combined(fresh.terms, _sideslip(one.inflation))
+        covered[name] = [np.mean(inside[fresh.wrong == wrong]) for wrong in (False, True)]
+    assert covered["given"][0] == pytest.approx(0.95, abs=0.015)
+    assert covered["given"][1] < 0.7
+    assert np.mean(covered["both"]) == pytest.approx(0.95, abs=0.02)
+    assert 0.9 < covered["both"][1] < covered["both"][0]
+    k, given = np.array(_sideslip(fitted.inflation)), np.array(_sideslip(narrow.inflation))
+    assert int(np.argmax(k - given)) == 2
+
+
+def test_unseen_drives_decide_the_factor() -> None:
+    """Terms that know each drive's own error size by chance fit it, and mean nothing on another drive."""
+    rng = np.random.default_rng(4)
+    drives, each = 10, 200
+    drive = np.repeat(np.arange(drives), each)
+    kind = drive % FOLDS  # the drives of a fold have a size and a term that no other has
+    n = drives * each
+    terms = np.full((n, len(SIDESLIP_TERMS)), 1e-6)
+    terms[np.arange(n), 1 + kind] = 1e-3
+    samples = replace(
+        _samples(rng, np.full(n, 1e-3), terms, drives),
+        drive=drive,
+        sideslip_error=1e-3 * 2.0**kind * rng.standard_normal(n),
+        bin=np.zeros(n, dtype=np.int64),
+        wrong=np.zeros(n, dtype=np.bool_),
+    )
+    weight = np.full(n, 1.0 / n)
+    seen = combined(terms, fit_coefficients(terms, samples.sideslip_error, weight))
+    assert covering_factor(samples.sideslip_error, seen, weight) == pytest.approx(1.0, abs=0.02)
+    assert fit_inflation(samples).unseen_factor > 3.0
+
+
+def test_a_drive_that_is_lost_near_the_limit_widens_nothing_elsewhere() -> None:
+    """With the drive that is lost above 0.6 of the grip, the factor there grows, and no other."""
+    rng = np.random.default_rng(11)
+    n, drives = 20_000, 20
+    terms = _terms(rng, n)
+    share = terms[:, 3] / 3e-3
+    samples = replace(_samples(rng, 1.5 * terms[:, 1], terms, drives), bin=bin_numbers(share))
+    lost = (samples.drive == 3) & (share > 0.6)
+    worse = replace(samples, sideslip_error=np.where(lost, 0.3, samples.sideslip_error))
+    weight = np.full(n, 1.0 / n)
+    calm, wild = (grip_factors(s, share, 1.5 * terms[:, 1], weight) for s in (samples, worse))
+    assert wild[:2] == calm[:2]
+    assert wild[2] > 1.3 * calm[2]
+    few = samples.where((share < 0.6) | (samples.drive < 2))
+    _, middle, high = grip_factors(few, few.terms[:, 3] / 3e-3, 1.5 * few.terms[:, 1], np.ones(len(few)))
+    assert high >= middle, "two drives near the limit say nothing"
+
+
+def test_the_covering_factor_is_the_least_that_covers_whatever_the_weights_add_up_to() -> None:
+    rng = np.random.default_rng(8)
+    error, std = 3.0 * rng.standard_normal(400), rng.uniform(0.5, 1.5, 400)
+    for scale in (1.0, 7.0, 1e-3):
+        weight = scale * rng.uniform(0.1, 1.0, 400)
+        for covered in (0.5, 0.85):
+            factor = covering_factor(error, std, weight, covered)
+
+            def share(g: float, weight: FloatArray = weight) -> float:
+                inside = np.abs(error) <= 1.959963984540054 * g * std
+                return float(np.sum(weight[inside]) / np.sum(weight))
+
+            assert share(factor * (1 - 1e-9)) < covered <= share(factor * (1 + 1e-9))
+
+
+def test_the_fit_minimises_the_pinball_loss_of_the_files_head() -> None:
+    rng = np.random.default_rng(9)
+    terms = rng.uniform(0.5, 2.0, (500, 2))
+    error = np.hypot(2.0 * terms[:, 0], 1.0) * rng.standard_normal(500)
+    error[0] = 0.0
+    weight = rng.uniform(0.5, 1.5, 500)
+    k = np.array(fit_coefficients(terms, error, weight, 0.85))
+
+    def loss(k: FloatArray) -> float:
+        s = np.sqrt(np.square(terms) @ np.square(k))
+        r = np.log(np.maximum(np.abs(error), 1e-6)) - np.log(1.959963984540054 * s)
+        return float(np.sum(weight * np.where(r > 0.0, 0.85 * r, -0.15 * r)))
+
+    assert k[0] > 0.5
+    for i, factor in ((i, f) for i in range(2) for f in (0.9, 1.1)):
+        aside = np.maximum(k, 0.05)
+        aside[i] *= factor
+        assert loss(aside) > loss(k)
+
+
+def test_drives_of_a_bin_count_alike_but_for_those_that_hardly_see_it() -> None:
+    drive = np.repeat([4, 7, 9], [600, 60, 5])
+    weight = bin_weights(np.zeros(665, dtype=np.int64), drive)
+    shares = [weight[drive == d].sum() for d in (4, 7, 9)]
+    assert shares[0] == pytest.approx(shares[1])
+    assert shares[2] == pytest.approx(shares[1] * 5 / 20)
+
+
+def test_a_drive_is_never_on_both_sides() -> None:
+    drive = np.random.default_rng(0).permutation(np.repeat([3, 8, 9, 20, 21, 40, 41], 5))
+    held = np.zeros(drive.size, dtype=int)
+    for seen, out in folds(drive):
+        assert not set(drive[seen]) & set(drive[out])
+        held += out
+    assert np.all(held == 1)
+
+
+def test_bins_and_coverage() -> None:
+    assert bin_numbers(np.array([0.0, 0.29, 0.3, 0.6, 2.0, np.nan])).tolist() == [0, 0, 1, 2, 2, -1]
+    rng = np.random.default_rng(5)
+    n = 50_000
+    samples = replace(_samples(rng, np.ones(n), np.ones((n, 9))), sideslip_error=rng.standard_normal(n))
+    for row in coverage_rows(samples, np.full(n, 2.0)):
+        assert row.covered_before == pytest.approx(0.95, abs=0.01)
+        assert row.covered_after > 0.999
+        assert (row.width_before, row.width_after) == pytest.approx((1.0, 2.0), rel=0.03)
+    hand = replace(
+        samples.where(np.arange(n) < 4),
+        sideslip_error=np.array([1.0, -3.0, 0.1, 0.0]),
+        own_std=np.array([1.0, 1.0, 2.0, 2.0]),
+        bin=np.array([0, 0, 2, 1]),
+        drive=np.array([3, 4, 3, 3]),
+        wrong=np.array([False, False, False, True]),
+    )
+    low, high, middle = coverage_rows(hand, np.array([1.0, 2.0, 0.01, 1.0]))
+    assert (low.bin, low.wrong_vehicle, low.drives, low.samples) == ("low", False, 2, 2)
+    assert (low.covered_before, low.covered_after, low.rmse_rad) == (0.5, 1.0, pytest.approx(5.0**0.5))
+    assert (low.width_before, low.width_after) == pytest.approx((5.0**-0.5, 1.5 * 5.0**-0.5))
+    assert (high.bin, high.covered_before, high.covered_after) == ("high", 1.0, 0.0)
+    assert (middle.bin, middle.wrong_vehicle, middle.width_before) == ("middle", True, pytest.approx(2e6))
+
+
+def test_few_drives_are_refused() -> None:
+    rng = np.random.default_rng(6)
+    with pytest.raises(ValueError, match="5 drives"):
+        fit_inflation(_samples(rng, np.ones(400), np.ones((400, 9)), drives=4))
