@@ -13,8 +13,8 @@ from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import SignalSource, clock_key, fit_clocks, resolve_mapping
 from pdhef_logtool.mapping.can_frames import with_can_signals
-from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, request_source, si_values
-from pdhef_logtool.mapping.clocks import stamps_on_log_clock
+from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, si_values
+from pdhef_logtool.mapping.clocks import request_source, stamps_on_log_clock
 from pdhef_logtool.mapping.estimates import BASE_ORDER, STDS, CovarianceSource, EstimateSource
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.geometry import wrap_angle
