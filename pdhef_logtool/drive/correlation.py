@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.drive.columns import student
 from pdhef_logtool.drive.interpolation import Bracket
@@ -78,7 +79,10 @@ def _without_trend(values: FloatArray) -> FloatArray:
     finite, n = np.flatnonzero(np.isfinite(values)), values.shape[0]
     if finite.size < 2:
         return values
-    slope, offset = np.polyfit(finite / n, values[finite], 1)
+    time = finite / n
+    finite_values, centred = values if finite.size == n else values[finite], time - time.mean()
+    slope = float(centred @ finite_values) / float(centred @ centred)
+    offset = float(finite_values.mean()) - slope * float(time.mean())
     return np.asarray(values - offset - slope * (np.arange(n) / n), dtype=np.float64)
 
 
@@ -165,18 +169,30 @@ def parabolic_peak(before: float, middle: float, after: float) -> float:
 def _rough_correlations(a: FloatArray, b: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:
     """Return :func:`_correlation` at all shifts within ± ``reach`` and how far it may be off; NaN where it is unsure.
 
-    From sums of products at all shifts, by Fourier transforms.
+    From sums of products at all shifts: by Fourier transforms, or by cumulative sums where the other factor is 1.
     """
-    size = 1 << (a.shape[0] + reach).bit_length()
-    spectra = []
+    n, shifts = a.shape[0], np.arange(-reach, reach + 1)
+    size = min(base << max(-(-(n + reach) // base) - 1, 0).bit_length() for base in (1, 3, 5, 9, 15))
+    powers = []  # 0, 1 and 2 of each signal, 0 where it is not known
     for values in (_unit_power(a), _unit_power(b)):
         finite = np.isfinite(values)
         values = np.where(finite, values, 0.0)
         with np.errstate(over="ignore", invalid="ignore"):
-            spectra.append(np.fft.rfft([finite, values, values * values], size))
+            powers.append((finite.astype(np.float64), values, values * values))
+    whole = reach < n and all(finite.all() for finite, *_ in powers)
+    spectra: dict[tuple[int, int], NDArray[np.complexfloating]] = {}
+
+    def spectrum(side: int, power: int) -> NDArray[np.complexfloating]:
+        if (side, power) not in spectra:
+            spectra[side, power] = np.fft.rfft(powers[side][power], size)
+        return spectra[side, power]
 
     def sums(of_a: int, of_b: int) -> FloatArray:
-        every = np.fft.irfft(np.conj(spectra[0][of_a]) * spectra[1][of_b], size)
+        if whole and 0 in (of_a, of_b):
+            values, way = (powers[0][of_a], shifts) if of_b == 0 else (powers[1][of_b], -shifts)
+            total = np.concatenate([[0.0], np.cumsum(values)])
+            return np.asarray(total[n - np.maximum(way, 0)] - total[np.maximum(-way, 0)], dtype=np.float64)
+        every = np.fft.irfft(np.conj(spectrum(0, of_a)) * spectrum(1, of_b), size)
         return np.concatenate([every[size - reach :], every[: reach + 1]])
 
     count = np.rint(sums(0, 0))

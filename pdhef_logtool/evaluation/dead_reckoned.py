@@ -110,5 +110,4 @@ def _dead_reckon(
     track: StateTrack, start: tuple[float, float, float], first: int = 0
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     vx = np.where(track.valid, track.vx_m_s, np.nan)
-    columns = (c[first:] for c in (track.stamps_ns, vx, track.vy_m_s, track.yaw_rate_rad_s))
-    return dead_reckon(*columns, start)
+    return dead_reckon(track.stamps_ns[first:], vx[first:], track.vy_m_s[first:], track.yaw_rate_rad_s[first:], start)

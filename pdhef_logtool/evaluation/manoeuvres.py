@@ -163,8 +163,8 @@ def find_manoeuvres(signals: Signals, vehicle: VehicleParameters, rules: Manoeuv
     """Return the manoeuvres of a drive in order of time; no two overlap."""
     wheelbase_m = vehicle.cg_to_front_axle_m + vehicle.cg_to_rear_axle_m
     zeros = _zeros(signals, wheelbase_m, rules)
-    found = [m for run in _runs_of(signals, wheelbase_m, zeros, rules) for m in _manoeuvres_of(run, rules)]
-    return sorted(found, key=lambda m: m.start_ns)
+    manoeuvres = [m for run in _runs_of(signals, wheelbase_m, zeros, rules) for m in _manoeuvres_of(run, rules)]
+    return sorted(manoeuvres, key=lambda m: m.start_ns)
 
 
 def manoeuvre_masks(stamps_ns: IntArray, manoeuvres: Sequence[Manoeuvre]) -> dict[str, BoolArray]:

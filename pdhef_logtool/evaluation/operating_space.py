@@ -73,12 +73,12 @@ def operating_space(
     j = np.searchsorted(AY_EDGES_M_S2, ay[finite], side="right") - 1
     cell = np.maximum(i, 0) * shape[1] + j
     seconds = np.bincount(cell, weights=steps[finite], minlength=size)
-    counts, squares = np.zeros(size), np.zeros(size)
+    counts, squares = np.zeros(size, dtype=np.int64), np.zeros(size)
     if truth is not None and estimate is not None:
         error = signal_error(estimate, truth, "sideslip_rad", vehicle.low_speed_blend_m_s)[finite]
         scored = np.isfinite(error)
         counts = np.bincount(cell[scored], minlength=size)
-        squares = np.bincount(cell[scored], weights=error[scored] ** 2, minlength=size)
+        squares += np.bincount(cell[scored], weights=error[scored] ** 2, minlength=size)
     with np.errstate(invalid="ignore"):
         errors = squares / counts
     cells = [

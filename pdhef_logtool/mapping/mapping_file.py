@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 ALTERNATIVES = 3
 _STEERING = ("steer_rad", "steering_wheel_rad")
 #: Names in the tables that are no estimator's.
-RESERVED_NAMES = ("truth", "sensors")
+RESERVED_NAMES = ("truth", "sensors", "reference")
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1)]

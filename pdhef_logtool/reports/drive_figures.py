@@ -13,6 +13,7 @@ from pdhef_logtool.evaluation.dead_reckoned import aligned_path
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.reports.charts import (
     Band,
     Charts,
@@ -27,7 +28,7 @@ from pdhef_logtool.reports.charts import (
     joined,
 )
 from pdhef_logtool.reports.colours import FAULT, NOTE, PLAIN, colour
-from pdhef_logtool.reports.drive_series import DriveSeries, Points, Reference, SideslipTrack, Tracks, gather
+from pdhef_logtool.reports.drive_series import DriveSeries, Reference, Tracks, gather, thinned
 from pdhef_logtool.reports.encoding import grid_of
 from pdhef_logtool.results.error_places import ErrorPlace
 from pdhef_logtool.results.sink import TRUTH
@@ -116,10 +117,13 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveF
         The file is damaged.
     """
     tracks = Tracks(path, report["vehicle"]["low_speed_blend_m_s"])
-    if roles.main not in tracks.names or not len(stamps := tracks.stamps(roles.main)):
+    if roles.main not in tracks.names:
+        return None
+    answer = tracks.read(roles.main)
+    stamps = answer.stamps_ns
+    if not len(stamps):
         return None
     grid, origin_ns = grid_of(stamps), int(report["log"]["start_ns"])
-    answer = tracks.sideslip(roles.main)
     peaks = _peaks(report)
     reference = _reference(tracks, peaks)
     scored = reference is not None and reference.scored
@@ -131,7 +135,7 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveF
             error_of = None if name == TRUTH else against
             series[name] = gather(name, tracks, grid, error_of, dof, whole=name in (TRUTH, roles.main))
     charts = Charts(grid, origin_ns)
-    moves = bool(np.isfinite(series[roles.main].sideslip.values).any())
+    moves = bool(np.isfinite(series[roles.main].sideslip).any())
     _add_sideslip(charts, series, roles)
     _add_error(charts, series, roles, peaks, scored=scored)
     _add_filter(charts, series, roles)
@@ -148,7 +152,7 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveF
 def _reference(tracks: Tracks, peaks: Sequence[Peak]) -> Reference | None:
     """Return what the largest errors of the report are against; None where it has none."""
     against = peaks[0].against if peaks else ""
-    return Reference(tracks.sideslip(against), against == TRUTH, tracks) if against in tracks.names else None
+    return Reference(tracks.read(against), against == TRUTH, tracks) if against in tracks.names else None
 
 
 def _degrees_of_freedom(report: Mapping[str, Any]) -> dict[str, float]:
@@ -174,9 +178,8 @@ def _lines(series: Mapping[str, DriveSeries], roles: Roles, values: str, names: 
     lines = []
     for name in sorted(names, key=lambda n: n != roles.main):
         if name in series:
-            data = getattr(series[name], values)
-            drawn = data.largest if values in ("error", "r_scale") else data.values
-            if np.isfinite(drawn).any():
+            drawn = getattr(series[name], values)
+            if drawn is not None and np.isfinite(drawn).any():
                 lines.append(roles.series(name, drawn))
     return lines
 
@@ -185,12 +188,10 @@ def _add_sideslip(charts: Charts, series: Mapping[str, DriveSeries], roles: Role
     lines = _lines(series, roles, "sideslip", (TRUTH, *roles.names))
     if not lines:
         return
-    low, high = series[roles.main].band_low.least, series[roles.main].band_high.largest
-    bands = (
-        [Band(f"{roles.main}, 95 % confidence interval", colour(roles.main), low, high)]
-        if np.isfinite(low).any()
-        else []
-    )
+    band = series[roles.main].band
+    bands = []
+    if band is not None and np.isfinite(band[0]).any():
+        bands = [Band(f"{roles.main}, 95 % confidence interval", colour(roles.main), *band)]
     charts.figures["sideslip"] = TimeFigure(
         "Sideslip", "°", lines, bands, level=0.0, resolution=_DEGREES_SEEN, height=260
     )
@@ -247,12 +248,12 @@ def _rows(
     longest = max(_GAP_S * 1e9, _GAP_STEPS * float(np.median(steps)) if steps.size else 0.0)
     losses = [x for x in report["losses"] if x.get("start_ns") is not None]
     rows = [
-        Row("no estimate", FAULT, spans(np.concatenate(series[roles.main].invalid), f"{roles.main} is not valid")),
+        Row("no estimate", FAULT, spans(series[roles.main].invalid, f"{roles.main} is not valid")),
         Row("gap in the log", FAULT, [span(stamps[i], stamps[i + 1], "") for i in np.flatnonzero(steps > longest)]),
         Row("lost", FAULT, [span(x["start_ns"], x.get("end_ns") or x["start_ns"], x["what"]) for x in losses]),
     ]
-    seer = next((n for n in roles.names if n in series and series[n].reason), None)
-    if seer is not None and len(reason := np.concatenate(series[seer].reason)) == len(stamps):
+    seer = next((n for n in roles.names if n in series and len(series[n].reason)), None)
+    if seer is not None and len(reason := series[seer].reason) == len(stamps):
         rows += [Row(r.text, NOTE, spans((reason & r.bit) != 0, f"seen by {seer}")) for r in REASONS]
     by_name: dict[str, list[Span]] = {}
     for s in report["segments"]:
@@ -270,8 +271,8 @@ def _add_planes(charts: Charts, series: Sequence[DriveSeries]) -> None:
             charts.figures[key] = PointsFigure(title, x_label, y_label, clouds)
 
 
-def _cloud(name: str, points: Points, origin_ns: int) -> Cloud | None:
-    at_ns, x, y = points.thinned(_MOST_POINTS)
+def _cloud(name: str, points: FloatArray | None, origin_ns: int) -> Cloud | None:
+    at_ns, x, y = thinned(points, _MOST_POINTS)
     if len(x) < 2:
         return None
     at_s = np.asarray((at_ns - float(origin_ns)) * 1e-9, dtype=np.float64)
@@ -279,7 +280,7 @@ def _cloud(name: str, points: Points, origin_ns: int) -> Cloud | None:
 
 
 def _add_worst(
-    charts: Charts, answer: SideslipTrack, reference: Reference | None, peaks: Sequence[Peak], origin_ns: int
+    charts: Charts, answer: StateTrack, reference: Reference | None, peaks: Sequence[Peak], origin_ns: int
 ) -> None:
     """Add the sideslip around the largest error: the one figure of the first screen."""
     if reference is None or not peaks:
@@ -304,7 +305,7 @@ def _add_path(
     charts: Charts, series: Mapping[str, DriveSeries], roles: Roles, drift: Mapping[str, float] | None
 ) -> str:
     """Add the dead-reckoned path, aligned with that of the ground truth; return its drift in words."""
-    truth, estimate = (series[n].path.thinned(_MOST_POINTS) for n in (TRUTH, roles.main))
+    truth, estimate = (thinned(series[n].path, _MOST_POINTS) for n in (TRUTH, roles.main))
     if truth.shape[1] < 2 or max(np.ptp(truth[1]), np.ptp(truth[2])) < _LEAST_PATH_M:
         return ""
     common, at_truth, at_own = np.intersect1d(truth[0], estimate[0], return_indices=True)
@@ -330,7 +331,7 @@ def _add_path(
 def _by_error(aligned: FloatArray, at_ns: FloatArray, estimate: DriveSeries, charts: Charts) -> list[Cloud]:
     """Return the path [2, K] in three classes of the absolute sideslip error."""
     assert charts.grid is not None
-    largest = estimate.error.largest
+    largest = np.zeros(charts.grid.cells) if estimate.error is None else estimate.error
     cell = np.clip((at_ns - charts.grid.start_ns) // charts.grid.cell_ns, 0, len(largest) - 1).astype(np.int64)
     error = np.nan_to_num(largest[cell], nan=0.0)
     if not (error > 0.0).any():

@@ -1,12 +1,10 @@
-"""The series of one drive, read from its estimates.parquet block by block: memory grows by cells, not by stamps.
-
-Of the selected estimate and of what it is held against, the sideslip is kept at every stamp, for the largest errors.
-"""
+"""The series of one drive from its estimates.parquet, one track after the other, as a page draws them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +13,8 @@ from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.reports.encoding import Envelope, FirstKnown, Grid, Means
-from pdhef_logtool.results.parquet_sink import list_estimators, read_blocks
+from pdhef_logtool.reports.encoding import Grid, envelope, first_known, means
+from pdhef_logtool.results.parquet_sink import list_estimators, read_track
 from pdhef_logtool.results.sink import TRUTH
 
 #: NIS is shown as its mean over so long.
@@ -25,7 +23,7 @@ _NIS_S = 1.0
 _COLUMNS = ("vx_m_s", "vy_m_s", "sideslip_rad", "network_trust", "r_scale", "nis", "valid", "reason")
 _MORE_COLUMNS = ("yaw_rate_rad_s", "ay_m_s2", "x_m", "y_m", "sideslip_std_rad")
 #: What errors and gaps of sideslip are given from.
-_OF_SIDESLIP = ("vx_m_s", "vy_m_s", "sideslip_rad", "valid")
+OF_SIDESLIP = ("vx_m_s", "vy_m_s", "sideslip_rad", "valid")
 
 
 class Tracks:
@@ -35,20 +33,10 @@ class Tracks:
         self._path, self.low_speed_m_s = path, low_speed_m_s
         self.names = list_estimators(path)
 
-    def blocks(self, name: str, columns: tuple[str, ...] = _COLUMNS) -> Iterator[StateTrack]:
-        """Yield a track block by block; nothing where the file has none of the name."""
-        for block in read_blocks(self._path, name, columns):
-            yield replace(block, valid=np.ones(len(block), dtype=np.bool_)) if name == TRUTH else block
-
-    def stamps(self, name: str) -> IntArray:
-        """Return the stamps of a track [N]."""
-        parts = [b.stamps_ns for b in self.blocks(name, ())]
-        return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)
-
-    def sideslip(self, name: str) -> SideslipTrack:
-        """Return what the sideslip of a whole track is judged by."""
-        parts = [(b.stamps_ns, b.vx_m_s, b.vy_m_s, b.sideslip_rad, b.valid) for b in self.blocks(name, _OF_SIDESLIP)]
-        return SideslipTrack(name, *(np.concatenate(column) for column in zip(*parts, strict=True)))
+    def read(self, name: str, columns: tuple[str, ...] = OF_SIDESLIP) -> StateTrack:
+        """Read columns of a track; the others are NaN."""
+        track = read_track(self._path, name, columns)
+        return replace(track, valid=np.ones(len(track), dtype=np.bool_)) if name == TRUTH else track
 
     def drawn(self, track: StateTrack) -> StateTrack:
         """Return it with its sideslip unknown where it is not valid, or too slow for a direction."""
@@ -58,76 +46,52 @@ class Tracks:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SideslipTrack:
-    """The sideslip of a whole track, and what it is judged by; [N] each, which is all of a drive that is kept."""
-
-    name: str
-    stamps_ns: IntArray
-    vx_m_s: FloatArray
-    vy_m_s: FloatArray
-    sideslip_rad: FloatArray
-    valid: BoolArray
-
-    def at(self, rows: IntArray) -> StateTrack:
-        """Return rows [M] of it as a track."""
-        columns = {c: getattr(self, c)[rows] for c in _OF_SIDESLIP}
-        return make_track(self.name, self.stamps_ns[rows], **columns)
-
-
-@dataclass(slots=True, eq=False)
-class Points:
-    """Points of one plane: instants in s from the log's start, x and y."""
-
-    picked: FirstKnown
-    parts: list[FloatArray] = field(default_factory=list)
-
-    def add(self, stamps_ns: IntArray, x: FloatArray, y: FloatArray) -> None:
-        """Take the next points [M], one a cell."""
-        rows = self.picked.rows(stamps_ns, np.isfinite(x) & np.isfinite(y))
-        self.parts.append(np.stack([stamps_ns[rows].astype(np.float64), x[rows], y[rows]]))
-
-    def thinned(self, most: int) -> FloatArray:
-        """Return at most so many points [3, K]."""
-        joined = np.concatenate(self.parts, axis=1) if self.parts else np.empty((3, 0))
-        return joined[:, :: max(1, -(-joined.shape[1] // most))]
-
-
 class DriveSeries:
-    """What is drawn of one track; angles in degrees. ``error``: absolute, against what the page compares with.
+    """What is drawn of one track; angles in degrees.
 
-    Confidence interval, speed, a_y and the planes are empty but for the ground truth and the selected estimate.
+    Envelopes [cells, 2] of sideslip, residual gain, speed and a_y; largest values [cells] of the absolute ``error`` and
+    of ``r_scale``; NIS, mean over 1 s [cells]; the 95 % CI [cells]; points [3, K] in the planes: stamp, x and y.
+    ``invalid``, ``reason`` at each stamp [N]. Confidence interval, speed, a_y and planes are None but for the ground
+    truth and the selected estimate.
     """
 
-    def __init__(self, name: str, grid: Grid) -> None:
-        self.name = name
-        self.sideslip, self.band_low, self.band_high, self.error = (Envelope(grid) for _ in range(4))
-        self.trust, self.r_scale, self.speed, self.ay = (Envelope(grid) for _ in range(4))
-        self.nis = Means(grid, _NIS_S)
-        self.path, self.ay_sideslip, self.phase = (Points(FirstKnown(grid)) for _ in range(3))
-        self.invalid: list[BoolArray] = []
-        self.reason: list[IntArray] = []
+    name: str
+    sideslip: FloatArray
+    error: FloatArray | None
+    trust: FloatArray
+    r_scale: FloatArray
+    nis: FloatArray
+    invalid: BoolArray
+    reason: IntArray
+    band: tuple[FloatArray, FloatArray] | None = None
+    speed: FloatArray | None = None
+    ay: FloatArray | None = None
+    path: FloatArray | None = None
+    ay_sideslip: FloatArray | None = None
+    phase: FloatArray | None = None
+
+
+def thinned(points: FloatArray | None, most: int) -> FloatArray:
+    """Return at most so many points [3, K]."""
+    return np.empty((3, 0)) if points is None else points[:, :: max(1, -(-points.shape[1] // most))]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
     """Reference of errors: ground truth as the figures have it (``scored``), or another estimate as drawn."""
 
-    track: SideslipTrack
+    track: StateTrack
     scored: bool
     tracks: Tracks
 
-    def rows(self, stamps_ns: IntArray) -> IntArray | None:
-        """Return the rows of the reference at these stamps, None where it is not at the same ones."""
-        track_stamps = self.track.stamps_ns
-        rows = np.minimum(np.searchsorted(track_stamps, stamps_ns), max(len(track_stamps) - 1, 0))
-        return rows if len(track_stamps) and np.array_equal(track_stamps[rows], stamps_ns) else None
-
     def error(self, track: StateTrack) -> FloatArray:
-        """Return track − reference [M] in rad; NaN where it is not known."""
-        rows = self.rows(track.stamps_ns)
-        if rows is None:
+        """Return track − reference [N] in rad; NaN where it is not known, or without the stamps of the track."""
+        known_ns, stamps_ns = self.track.stamps_ns, track.stamps_ns
+        rows = np.minimum(np.searchsorted(known_ns, stamps_ns), max(len(known_ns) - 1, 0))
+        if not len(known_ns) or not np.array_equal(known_ns[rows], stamps_ns):
             return np.full(len(track), np.nan)
-        other = self.track.at(rows)
+        columns = {c: getattr(self.track, c)[rows] for c in OF_SIDESLIP}
+        other = make_track(self.track.name, stamps_ns, **columns)
         if self.scored:
             return signal_error(track, other, "sideslip_rad", self.tracks.low_speed_m_s)
         ours, theirs = (self.tracks.drawn(t).sideslip_rad for t in (track, other))
@@ -143,41 +107,46 @@ def gather(
     *,
     whole: bool,
 ) -> DriveSeries:
-    """Return the series of one track, read block by block.
+    """Return the series of one track.
 
     Parameters
     ----------
     reference : what its errors are given against; None: none are. nis_dof : mean degrees of freedom by estimator.
     whole : whether confidence interval, motion and planes are drawn of it too.
     """
-    made = DriveSeries(name, grid)
-    for track in tracks.blocks(name, (*_COLUMNS, *_MORE_COLUMNS) if whole else _COLUMNS):
-        drawn, stamps = tracks.drawn(track), track.stamps_ns
-        beta = drawn.sideslip_rad * DEGREES
-        made.sideslip.add(stamps, beta)
-        if reference is not None:
-            made.error.add(stamps, np.abs(reference.error(track)) * DEGREES)
-        made.trust.add(stamps, track.network_trust)
-        made.r_scale.add(stamps, track.r_scale)
-        made.nis.add(stamps, track.nis / nis_dof.get(name, np.nan))
-        made.invalid.append(~track.valid)
-        if len(track.reason) == len(track):
-            made.reason.append(track.reason)
-        if whole:
-            _add_whole(made, track, drawn)
-    return made
-
-
-def _add_whole(made: DriveSeries, track: StateTrack, drawn: StateTrack) -> None:
-    stamps, beta = track.stamps_ns, drawn.sideslip_rad * DEGREES
+    track = tracks.read(name, (*_COLUMNS, *_MORE_COLUMNS) if whole else _COLUMNS)
+    drawn, stamps = tracks.drawn(track), track.stamps_ns
+    beta = drawn.sideslip_rad * DEGREES
+    in_cells = partial(envelope, grid, stamps)
+    error = None if reference is None else in_cells(np.abs(reference.error(track)) * DEGREES).max(axis=1)
+    made = DriveSeries(
+        name,
+        in_cells(beta),
+        error,
+        in_cells(track.network_trust),
+        in_cells(track.r_scale).max(axis=1),
+        means(grid, stamps, track.nis / nis_dof.get(name, np.nan), _NIS_S),
+        ~track.valid,
+        track.reason,
+    )
+    if not whole:
+        return made
     half = NORMAL_95 * drawn.sideslip_std_rad * DEGREES
-    made.band_low.add(stamps, beta - half)
-    made.band_high.add(stamps, beta + half)
-    made.speed.add(stamps, track.vx_m_s)
-    made.ay.add(stamps, track.ay_m_s2)
-    made.path.add(stamps, track.x_m, track.y_m)
-    made.ay_sideslip.add(stamps, np.abs(track.ay_m_s2), beta)
-    made.phase.add(stamps, beta, np.where(np.isfinite(beta), sideslip_rate(track), np.nan) * DEGREES)
+    rate = np.where(np.isfinite(beta), sideslip_rate(track), np.nan) * DEGREES
+
+    def points(x: FloatArray, y: FloatArray) -> FloatArray:
+        rows = first_known(grid, stamps, np.isfinite(x) & np.isfinite(y))
+        return np.stack([stamps[rows].astype(np.float64), x[rows], y[rows]])
+
+    return replace(
+        made,
+        band=(in_cells(beta - half).min(axis=1), in_cells(beta + half).max(axis=1)),
+        speed=in_cells(track.vx_m_s),
+        ay=in_cells(track.ay_m_s2),
+        path=points(track.x_m, track.y_m),
+        ay_sideslip=points(np.abs(track.ay_m_s2), beta),
+        phase=points(beta, rate),
+    )
 
 
 def sideslip_rate(track: StateTrack) -> FloatArray:

@@ -10,9 +10,8 @@ import zlib
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 #: Width of a cell: 10 Hz, finer for a drive below ten minutes, coarser for one above an hour.
 CELL_NS = 100_000_000
@@ -53,91 +52,60 @@ def grid_of(stamps_ns: IntArray) -> Grid:
     return Grid(start, cell, duration // cell + 1)
 
 
-class Envelope:
-    """The least and the largest value of each cell in the order in which they came: ``values`` [cells, 2].
+def envelope(grid: Grid, stamps_ns: IntArray, values: FloatArray) -> FloatArray:
+    """Return the least and the largest of the values [N] in each cell, in the order in which they occur, [cells, 2].
 
-    A cell without a known value is NaN; unknown ones beside known ones do not count. Values come block by block.
+    A cell without a finite value is NaN.
     """
-
-    def __init__(self, grid: Grid) -> None:
-        self._grid = grid
-        self.values: FloatArray = np.full((grid.cells, 2), np.nan)
-
-    def add(self, stamps_ns: IntArray, values: FloatArray) -> None:
-        """Take the next values [M] in order of time."""
-        cell = (stamps_ns - self._grid.start_ns) // self._grid.cell_ns
-        usable = np.isfinite(values) & (cell >= 0) & (cell < self._grid.cells)
-        if not usable.any():
-            return
-        cell, values = cell[usable], values[usable]
-        before = self.values[cell[0]]
-        if np.isfinite(before[0]):  # what came in the block before of the cell that both share
-            cell, values = np.concatenate([[cell[0]] * 2, cell]), np.concatenate([before, values])
-        begins = np.flatnonzero(np.diff(cell, prepend=-1))
-        sizes = np.diff(begins, append=len(values))
-        low, high = (f.reduceat(values, begins) for f in (np.minimum, np.maximum))
-        first_low, first_high = (_first(values == np.repeat(extreme, sizes), begins) for extreme in (low, high))
-        falls = first_high < first_low
-        self.values[cell[begins]] = np.stack([np.where(falls, high, low), np.where(falls, low, high)], axis=1)
-
-    @property
-    def largest(self) -> FloatArray:
-        """The largest value of each cell [cells]."""
-        return np.asarray(np.max(self.values, axis=1), dtype=np.float64)
-
-    @property
-    def least(self) -> FloatArray:
-        """The least value of each cell [cells]."""
-        return np.asarray(np.min(self.values, axis=1), dtype=np.float64)
-
-
-def _first(hit: NDArray[np.bool_], begins: IntArray) -> IntArray:
-    """Return the place of the first hit of each group; each has one."""
-    places = np.flatnonzero(hit)
-    result: IntArray = places[np.searchsorted(places, begins)]
+    result: FloatArray = np.full((grid.cells, 2), np.nan)
+    cell, inside = _cells(grid, stamps_ns, np.isfinite(values))
+    if not len(cell):
+        return result
+    values = values[inside]
+    begins = np.flatnonzero(np.diff(cell, prepend=-1))
+    sizes = np.diff(begins, append=len(values))
+    low, high = (f.reduceat(values, begins) for f in (np.minimum, np.maximum))
+    first_low, first_high = (_first(values == np.repeat(extreme, sizes), begins) for extreme in (low, high))
+    falls = first_high < first_low
+    result[cell[begins]] = np.stack([np.where(falls, high, low), np.where(falls, low, high)], axis=1)
     return result
 
 
-class FirstKnown:
-    """Picks the first stamp of each cell at which all is known, block by block."""
-
-    def __init__(self, grid: Grid) -> None:
-        self._grid, self._last = grid, -1
-
-    def rows(self, stamps_ns: IntArray, is_known: NDArray[np.bool_]) -> IntArray:
-        """Return the rows of the next block [M], at most one a cell."""
-        cell = (stamps_ns - self._grid.start_ns) // self._grid.cell_ns
-        rows = np.flatnonzero(is_known & (cell > self._last) & (cell < self._grid.cells))
-        if not len(rows):
-            return rows
-        self._last = int(cell[rows[-1]])
-        return rows[np.flatnonzero(np.diff(cell[rows], prepend=-1))]
+def first_known(grid: Grid, stamps_ns: IntArray, is_known: BoolArray) -> IntArray:
+    """Return the rows of the first known stamp of each cell."""
+    cell, rows = _cells(grid, stamps_ns, is_known)
+    return rows[np.flatnonzero(np.diff(cell, prepend=-1))]
 
 
-class Means:
-    """Means over spans of equal length from the grid's start, block by block."""
+def means(grid: Grid, stamps_ns: IntArray, values: FloatArray, span_s: float) -> FloatArray:
+    """Return at each cell the mean of the values [N] over its span of ``span_s`` from the grid's start, [cells].
 
-    def __init__(self, grid: Grid, span_s: float) -> None:
-        self._grid, self._span_ns = grid, int(span_s * 1e9)
-        self._sums = np.zeros(grid.cells * grid.cell_ns // self._span_ns + 1)
-        self._counts = np.zeros_like(self._sums)
+    NaN where less than half of the usual number of values of a span is finite.
+    """
+    span_ns = int(span_s * 1e9)
+    finite = np.isfinite(values)
+    spans = grid.cells * grid.cell_ns // span_ns + 1
+    span = np.clip((stamps_ns[finite] - grid.start_ns) // span_ns, 0, spans - 1)
+    counts, sums = np.bincount(span, minlength=spans), np.bincount(span, values[finite], spans)
+    mean = np.full(spans, np.nan)
+    if counts.any():
+        enough = counts > 0.5 * np.median(counts[counts > 0])
+        mean[enough] = sums[enough] / counts[enough]
+    middle = np.arange(grid.cells) * grid.cell_ns + grid.cell_ns // 2
+    return mean[middle // span_ns]
 
-    def add(self, stamps_ns: IntArray, values: FloatArray) -> None:
-        """Take the next values [M]; unknown ones do not count."""
-        is_finite = np.isfinite(values)
-        span = np.clip((stamps_ns[is_finite] - self._grid.start_ns) // self._span_ns, 0, len(self._sums) - 1)
-        self._sums += np.bincount(span, weights=values[is_finite], minlength=len(self._sums))
-        self._counts += np.bincount(span, minlength=len(self._sums))
 
-    @property
-    def values(self) -> FloatArray:
-        """The mean at each cell [cells]; NaN where less than half of what a span usually has is known."""
-        made = np.full(len(self._sums), np.nan)
-        if self._counts.any():
-            enough = self._counts > 0.5 * np.median(self._counts[self._counts > 0])
-            made[enough] = self._sums[enough] / self._counts[enough]
-        middle = np.arange(self._grid.cells) * self._grid.cell_ns + self._grid.cell_ns // 2
-        return np.asarray(made[middle // self._span_ns], dtype=np.float64)
+def _cells(grid: Grid, stamps_ns: IntArray, is_known: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return the cells of the known stamps inside the grid, and their rows."""
+    cell = (stamps_ns - grid.start_ns) // grid.cell_ns
+    rows = np.flatnonzero(is_known & (cell >= 0) & (cell < grid.cells))
+    return cell[rows], rows
+
+
+def _first(hit: BoolArray, begins: IntArray) -> IntArray:
+    """Return the place of the first hit of each group; each has one."""
+    places = np.flatnonzero(hit)
+    return places[np.searchsorted(places, begins)]
 
 
 @dataclass(frozen=True, slots=True)

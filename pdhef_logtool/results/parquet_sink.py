@@ -245,19 +245,6 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
     return _track_from_table(estimator, pa.concat_tables(tables))
 
 
-def read_blocks(path: Path, estimator: str, columns: Iterable[str]) -> Iterator[StateTrack]:
-    """Yield one track of an estimates.parquet in order of time, a row group at once; none if it is not in the file.
-
-    As :func:`read_track` states.
-
-    Raises
-    ------
-    OutputError : When the file is no estimates.parquet or damaged.
-    """
-    for table in _tables(path, estimator, set(columns)):
-        yield _track_from_table(estimator, table)
-
-
 def _tables(path: Path, estimator: str, columns: set[str] | None) -> Iterator[pa.Table]:
     """Yield the row groups of an estimator with the given columns; None: all."""
     wanted = [c for c in TRACK_COLUMNS if c == "stamp_ns" or columns is None or c in columns]
@@ -283,7 +270,7 @@ def _tables(path: Path, estimator: str, columns: set[str] | None) -> Iterator[pa
 def _track_from_table(name: str, table: pa.Table) -> StateTrack:
     def numbers(column: str) -> FloatArray:
         if column not in table.column_names:
-            return np.full(table.num_rows, np.nan)
+            return np.broadcast_to(np.nan, table.num_rows)
         return np.asarray(table[column].to_numpy(), dtype=np.float64)
 
     floats = {c: numbers(c) for c in TRACK_COLUMNS if c not in ("stamp_ns", *_FLAGS, *_STD_COLUMNS, *OPTIONAL_COLUMNS)}

@@ -13,8 +13,8 @@ from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import SignalSource, clock_key, fit_clocks, resolve_mapping
 from pdhef_logtool.mapping.can_frames import with_can_signals
-from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, request_source, si_values
-from pdhef_logtool.mapping.clocks import stamps_on_log_clock
+from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, si_values
+from pdhef_logtool.mapping.clocks import request_source, stamps_on_log_clock
 from pdhef_logtool.mapping.estimates import BASE_ORDER, STDS, CovarianceSource, EstimateSource
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.geometry import wrap_angle
@@ -23,7 +23,6 @@ from pdhef_logtool.records.tracks import StateTrack, diagonal_covariance, make_t
 
 #: Nothing is interpolated across a step of more than this many of its median periods.
 GAP_PERIODS = 3.0
-_NO_SAMPLES = (np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +67,9 @@ def read_estimate(
     for name, s in mapping.signals.items():
         topic = columns.get(s.read_topic)
         if topic is None or len(topic) == 0:
-            channels[name] = Channel(name, ESTIMATE_UNITS[name], s.label, *_NO_SAMPLES)
+            channels[name] = Channel(
+                name, ESTIMATE_UNITS[name], s.label, *2 * (np.empty(0, dtype=np.int64),), np.empty(0)
+            )
             continue
         stamps, usable = stamps_on_log_clock(log, topic, s, clocks[clock_key(s)])
         stamps = stamps - np.int64(round(s.latency_s * 1e9))

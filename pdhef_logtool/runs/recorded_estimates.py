@@ -248,7 +248,8 @@ class _Scoring:
             samples |= estimate.samples
             same = dependent_signals(estimate.channels, plan.survey_truth, role=f"estimate {source.name}'s")
             dependent |= {name: why for name, why in same.items() if name not in dependent}
-        truth, ledger = None, ()
+        truth: TruthTrack | None = None
+        ledger: tuple[SampleCount, ...] = ()
         if drive.mapping.truth:
             part = read_signals(drive.log, replace(plan.mapping, signals={}), plan.clocks, plan.start_ns, plan.end_ns)
             truth = _truth_of(part.truth, drive)
@@ -292,22 +293,27 @@ class _Scoring:
         alone = len(log.recorded) == 1
         for r in log.recorded:
             track, name = r.track, r.track.name
-            at, _ = log.at(track.stamps_ns)
+            scored, _ = log.at(track.stamps_ns)
             same = {
                 signal: f"the ground truth's {signal} equals that of the estimate {name}"
                 for signal in SCORED_SIGNALS
-                if at.truth is not None and _same_column(getattr(track, signal), getattr(at.truth, signal))
+                if scored.truth is not None and _same_column(getattr(track, signal), getattr(scored.truth, signal))
             }
             tainted = frozenset({**drive.plan.dependent, **same})
             equal |= same
             asked = [q for q in self.validation.requirements if q.estimator in (name, None if alone else name)]
-            for base in (b for b in (at.truth, at.tracks.get(REFERENCE)) if b is not None):
-                scored = ScoredDrive(
-                    {name: track}.get, base, at.masks, at.low_speed_m_s, tainted, estimated=base is not at.truth
+            for base in (b for b in (scored.truth, scored.tracks.get(REFERENCE)) if b is not None):
+                blocked = ScoredDrive(
+                    {name: track}.get,
+                    base,
+                    scored.masks,
+                    scored.low_speed_m_s,
+                    tainted,
+                    estimated=base is not scored.truth,
                 )
-                for block in requirement_blocks(asked, name if alone else None, scored):
+                for block in requirement_blocks(asked, name if alone else None, blocked):
                     blocks.setdefault((block.of, block.estimator), block)
-            figures = evaluate_drive(replace(at, tracks={name: track, **at.tracks}, dependent=tainted))
+            figures = evaluate_drive(replace(scored, tracks={name: track, **scored.tracks}, dependent=tainted))
             figures = [row for row in figures if row.estimator == name]
             if not any(row.metric in ("rmse", "reference_rms") for row in figures):
                 drive.tell(f"{name}: nowhere are estimate and ground truth known together, so there are no errors")

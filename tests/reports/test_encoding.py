@@ -1,18 +1,11 @@
 import numpy as np
 import pytest
 
-from pdhef_logtool.reports.encoding import MOST_CELLS, Envelope, FirstKnown, Means, decode, encode, grid_of
+from pdhef_logtool.reports.encoding import MOST_CELLS, decode, encode, envelope, first_known, grid_of, means
 
 
 def stamps(n, step_ns=10_000_000, start=1_700_000_000_000_000_000):
     return start + np.arange(n, dtype=np.int64) * step_ns
-
-
-def envelope(grid, at, values, block=None):
-    made = Envelope(grid)
-    for a in range(0, len(at), block or len(at)):
-        made.add(at[a : a + (block or len(at))], values[a : a + (block or len(at))])
-    return made
 
 
 def test_what_is_encoded_is_decoded_to_a_level_and_gaps_stay_gaps():
@@ -38,15 +31,13 @@ def test_what_nobody_sees_is_not_stored():
     assert np.abs(decode(encode(values, 0.01)) - values).max() <= 0.005 + 1e-9
 
 
-@pytest.mark.parametrize("block", [None, 1, 7, 333])
-def test_an_envelope_has_the_extremes_of_each_cell_in_the_order_in_which_they_came(block):
+def test_an_envelope_has_the_extremes_of_each_cell_in_the_order_in_which_they_came():
     at = stamps(1000)
     values = np.random.default_rng(1).normal(size=1000)
     values[300:420] = np.nan
     values[505] = np.nan
     grid = grid_of(at)
-    found = envelope(grid, at, values, block)
-    made = found.values
+    made = envelope(grid, at, values)
     cell = (at - grid.start_ns) // grid.cell_ns
     for i in range(grid.cells):
         inside = values[(cell == i)]
@@ -57,8 +48,6 @@ def test_an_envelope_has_the_extremes_of_each_cell_in_the_order_in_which_they_ca
         low, high = known.min(), known.max()
         falls = np.flatnonzero(inside == high)[0] < np.flatnonzero(inside == low)[0]
         assert made[i].tolist() == ([high, low] if falls else [low, high])
-    assert np.array_equal(found.largest, np.max(made, axis=1), equal_nan=True)
-    assert np.array_equal(found.least, np.min(made, axis=1), equal_nan=True)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +59,7 @@ def test_cells_are_a_tenth_of_a_second_finer_for_short_drives_and_never_emptied_
     grid = grid_of(at)
     assert grid.cell_s == pytest.approx(cell_s, rel=0.02)
     assert grid.cells <= MOST_CELLS
-    assert np.isfinite(envelope(grid, at, np.ones(n)).values).all()
+    assert np.isfinite(envelope(grid, at, np.ones(n))).all()
 
 
 def test_ten_hours_have_no_more_cells_than_one():
@@ -80,30 +69,26 @@ def test_ten_hours_have_no_more_cells_than_one():
 
 def test_one_stamp_is_one_cell():
     at = stamps(1)
-    assert envelope(grid_of(at), at, np.array([2.0])).values.tolist() == [[2.0, 2.0]]
+    assert envelope(grid_of(at), at, np.array([2.0])).tolist() == [[2.0, 2.0]]
 
 
-@pytest.mark.parametrize("block", [100, 3])
-def test_points_are_the_first_known_stamp_of_each_cell(block):
+def test_points_are_the_first_known_stamp_of_each_cell():
     at = stamps(100)
     grid = grid_of(at)
     known = np.ones(100, dtype=bool)
     known[:7] = False
-    picked = FirstKnown(grid)
-    rows = np.concatenate([a + picked.rows(at[a : a + block], known[a : a + block]) for a in range(0, 100, block)])
+    rows = first_known(grid, at, known)
     assert rows[0] == 7
     cells = (at[rows] - at[0]) // grid.cell_ns
     assert len(np.unique(cells)) == len(rows) == len(np.unique((at[known] - at[0]) // grid.cell_ns))
 
 
-def test_means_are_those_of_each_second_whatever_the_blocks():
+def test_means_are_those_of_each_second():
     at = stamps(1050)
     values = np.arange(1050.0)
     values[500:600] = np.nan
     grid = grid_of(at)
-    made = Means(grid, 1.0)
-    for a in range(0, 1050, 64):
-        made.add(at[a : a + 64], values[a : a + 64])
+    made = means(grid, at, values, 1.0)
     second = ((np.arange(grid.cells) + 0.5) * grid.cell_s).astype(int)
-    assert made.values[second == 3] == pytest.approx(349.5)
-    assert np.isnan(made.values[second == 5]).all()
+    assert made[second == 3] == pytest.approx(349.5)
+    assert np.isnan(made[second == 5]).all()

@@ -29,24 +29,26 @@ def errors_of_drive(drive: EvaluatedDrive) -> Iterator[Columns]:
     since_start_ns = truth.stamps_ns - truth.stamps_ns[:1]
     has_pose = bool(pose_known(truth).any())
     for track in drive.tracks.values():
-        for signal, known in at_truth.items():
-            yield _errors(track, truth, signal, known, since_start_ns)
+        for signal, has_truth in at_truth.items():
+            yield _errors(track, truth, signal, has_truth, since_start_ns)
         if has_pose:
             lateral = lateral_errors(track, truth)
             yield Columns(track.name, "position_m", {"error": position_error(track, truth)}, whole=True)
             yield Columns(track.name, "lateral_1s_m", {"error": lateral, "signed": lateral}, whole=True)
 
 
-def _errors(track: StateTrack, truth: StateTrack, signal: str, known: BoolArray, since_start_ns: IntArray) -> Columns:
+def _errors(
+    track: StateTrack, truth: StateTrack, signal: str, has_truth: BoolArray, since_start_ns: IntArray
+) -> Columns:
     """Return ``available`` (0 or 1 where ground truth is known) and, where the estimate is scored, the other columns.
 
     ``std`` is the 1-sigma of the error; it is absent where the estimate has none.
     """
     error = raw_error(track, truth, signal)
-    scored = track.valid & known & np.isfinite(error)
+    scored = track.valid & has_truth & np.isfinite(error)
     error = np.where(scored, error, np.nan)
     values = {
-        "available": np.where(known, scored, np.nan),
+        "available": np.where(has_truth, scored, np.nan),
         "error": error,
         "signed": error,
         "truth": getattr(truth, signal),

@@ -14,10 +14,12 @@ NOT_INDEPENDENT = "not_independent"
 
 
 def _marks(drive: EvaluatedDrive) -> Iterator[Columns]:
-    for signal in sorted(SCORED_SIGNALS.keys() & drive.dependent) if drive.truth is not None else ():
-        known = scorable(drive.truth, signal, drive.low_speed_m_s)
+    if drive.truth is None:
+        return
+    for signal in sorted({*SCORED_SIGNALS} & {*drive.dependent}):
+        has_truth = scorable(drive.truth, signal, drive.low_speed_m_s)
         for name in drive.tracks:
-            yield Columns(name, signal, {NOT_INDEPENDENT: np.where(known, 1.0, np.nan)})
+            yield Columns(name, signal, {NOT_INDEPENDENT: np.where(has_truth, 1.0, np.nan)})
 
 
 METRICS = (

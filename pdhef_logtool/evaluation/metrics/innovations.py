@@ -16,7 +16,9 @@ LEAST_PAIRS = 10
 
 
 def _errors(drive: EvaluatedDrive) -> Iterator[Columns]:
-    for track in () if drive.truth is None else drive.tracks.values():
+    if drive.truth is None:
+        return
+    for track in drive.tracks.values():
         if track.covariance.shape[0]:
             yield Columns(track.name, "state", {"nees": _nees_of(track, drive.truth)})
 

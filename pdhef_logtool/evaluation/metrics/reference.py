@@ -47,8 +47,9 @@ def _has_region(track: StateTrack) -> bool:
 
 
 def _against_reference(drive: EvaluatedDrive) -> Iterator[Columns]:
-    reference = drive.tracks.get(REFERENCE)
-    for name, track in () if reference is None else drive.tracks.items():
+    if (reference := drive.tracks.get(REFERENCE)) is None:
+        return
+    for name, track in drive.tracks.items():
         if name == REFERENCE:
             continue
         used = track.valid & reference.valid
@@ -68,8 +69,9 @@ def _ranked(drive: EvaluatedDrive) -> Iterator[Columns]:
     An error of the reference δ changes the difference of the squares Σ (β_a − β_c)² − (β_b − β_c)² by
     2 Σ (β_a − β_b) δ; δ is its standard deviation, of one sign within ``BLOCK_S`` and independent between.
     """
-    c = drive.tracks.get(REFERENCE)
-    for name, a, b in () if c is None else _pairs(drive):
+    if (c := drive.tracks.get(REFERENCE)) is None:
+        return
+    for name, a, b in _pairs(drive):
         used = a.valid & b.valid & c.valid & (c.vx_m_s > drive.low_speed_m_s)
         of_a, of_b = (wrap_angle(t.sideslip_rad - c.sideslip_rad) ** 2 for t in (a, b))
         std = 2.0 * np.abs(wrap_angle(a.sideslip_rad - b.sideslip_rad)) * c.sideslip_std_rad
