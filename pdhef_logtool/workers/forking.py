@@ -1,8 +1,8 @@
 """Child processes that are forked from a server with imported modules (Linux).
 
 The server does no other work: it has one thread and no open query, so that each fork is a complete process. Unlike
-the fork server of multiprocessing, it does not import ``__main__``, so that scripts need no guard, and creates no file.
-It works in threads and daemonic processes, and a process can have several servers.
+the fork server of multiprocessing, it does not import ``__main__``, so that scripts can start it at module level, and
+creates no file. It works in threads and daemonic processes, and a process can have several servers.
 """
 
 from __future__ import annotations

@@ -101,7 +101,8 @@ def lose_cluster(folder: Path) -> None:
 
 
 def test_a_cluster_that_is_lost_is_one_error_and_no_failure_of_its_items(tmp_path: Path) -> None:
-    script = f"from pathlib import Path; from {__name__} import lose_cluster; lose_cluster(Path({str(tmp_path)!r}))"
+    start = "from pathlib import Path; from tests.workers.test_ray_supervisor import lose_cluster"
+    script = f"{start}; lose_cluster(Path({str(tmp_path)!r}))"
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=False)
     assert "--ray: expected a Ray cluster that keeps running, got " in ended.stdout, ended.stderr
 
