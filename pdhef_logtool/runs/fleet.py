@@ -74,7 +74,7 @@ class Schedule:
         and the files of the configuration must have the same path on every node.
     resume : keep the drives that the output's journal has with these settings. retry : the same, but repeat failures.
     only : labels of logs to run now with all their files; the rest of the folder's run is kept.
-    limits : of one log; None: those of the configuration, else :data:`SILENCE_S` for several jobs or many logs.
+    limits : of one log; None: from the configuration, else :data:`SILENCE_S` for several jobs or many logs.
     """
 
     jobs: int = 1
@@ -97,7 +97,7 @@ class Schedule:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Job:
-    """What all logs of a run share."""
+    """Inputs that all logs of a run share."""
 
     config: RunConfig
     cars: RunCars
@@ -133,7 +133,7 @@ def run_logs(
     arguments : logs, folders, glob patterns.
     output : a folder, or the URL of one in an object store.
     junit : file for the verdicts of the validation plan as JUnit XML. strict : INCONCLUSIVE fails as FAIL does.
-    report : whether pages are written (:mod:`pdhef_logtool.reports`); without, those of an earlier run are removed.
+    report : whether pages are written (:mod:`pdhef_logtool.reports`); without, pages of an earlier run are removed.
     work : processes one drive.
 
     Raises
@@ -182,7 +182,7 @@ def _given_limits(config: RunConfig) -> Limits | None:
 
 
 def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> RunResult:
-    """Run one log in this process; its error is that of the run."""
+    """Run one log in this process; its error ends the run."""
     config, car = job.config, job.cars.of_log(log)
     log = replace(log, stem=neutral_stem(log_identity(log))) if config.no_position else log
     _check_names([log], output, job, reporter)

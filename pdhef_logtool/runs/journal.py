@@ -1,9 +1,9 @@
-"""journal.jsonl: what a run of several logs has done, a line a drive, from which a run that was ended goes on.
+"""journal.jsonl: one line per drive of a run of several logs. An interrupted run continues from it.
 
-A line is on the disk before the next drive counts as done, and ends with a checksum: one that is not as it was written
-is left out, so that its drive is run again. A log is known by what it contains; its label was given when it was first
-seen. Where it lies is as a digest, so that nobody's folders get out, with size and time of change:
-a log with the same ones is not read to be known again.
+A line is on the disk before the next drive counts as done, and ends with a checksum. A damaged line is ignored, so that
+its drive is run again. A log is identified by its content and keeps the label of its first run. Its location is stored
+as a digest, so that no folder names are published, with size and time of change: a log with equal values is not read
+again to identify it.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from pdhef_logtool.storage.documents import digest, file_sha256, jsonable
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
 _FORMAT = {"format": "pdhef.journal", "version": 3}
-#: Part of what a checksum is of, so that lines of another version of the format are left out as damaged ones are.
+#: Included in each checksum, so that lines of other versions of the format are ignored as damaged lines are.
 _VERSION = b"pdhef.journal 3"
 _DIGITS = 16
-#: Bytes of the last entry of a line: the checksum of what is before it.
+#: Bytes of the last entry of a line: the checksum of all bytes before it.
 _SUM_BYTES = len(b',"sum":""}\n') + _DIGITS
 #: Bytes of a log on a server, which nobody has asked for.
 _ELSEWHERE = -1
@@ -37,9 +37,9 @@ _ELSEWHERE = -1
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a log lies: digest of path and slice, size in bytes and time of change; of a folder those of its files.
+    """Location of a log: digest of path and slice, size in bytes and time of change (of a folder: of its files).
 
-    Of a log on a server the digest is the URL's, and its identity alone, which is asked for, states whether it changed.
+    For a log on a server, the digest of the URL; only the identity, which the server states, shows a change.
     """
 
     key: str
@@ -74,15 +74,15 @@ def _key(path: str, span_s: tuple[float, float] | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What the journal states of a drive; its outcome is read when it is asked for.
+    """The journal's record of a drive; its outcome is read on demand.
 
     Attributes
     ----------
-    identity : what the log is known by, None where nobody could read it. setting, car : digests of what it was run
-        with; car None where it has none. keep : what was written.
+    identity : of the log's content, None if it cannot be read. setting, car : digests of settings and car (None: no
+        car). keep : kept files.
     part : the file of its figures below the run's folder, None without. failed_checks : those that count.
-    error_rad : RMSE of the selected sideslip, None where it is not scored against independent ground truth.
-    failed : whether nothing came out. again : whether that may be otherwise next time, as on a full disk.
+    error_rad : RMSE of the selected sideslip, None without independent ground truth.
+    failed : whether there is no result. again : whether a repetition may succeed, as after a full disk.
     quarantined : whether it took its worker along.
     offset : bytes into the journal.
     """
@@ -128,7 +128,7 @@ class Journal:
 
     @classmethod
     def read(cls, folder: Path) -> Journal:
-        """Return the journal of a folder, empty where it has none; damaged lines are left out and counted.
+        """Return the journal of a folder, empty if there is none; damaged lines are ignored and counted.
 
         Raises
         ------
@@ -232,9 +232,9 @@ class Journal:
 
     def describe(self, kind: Literal["setting", "car"], digest: str, description: Mapping[str, Any]) -> None:
         """Record the values of a setting or a car once."""
-        if digest not in (known := self.described[kind]):
+        if digest not in self.described[kind]:
             self._append({kind: digest, "is": dict(description)})
-            known[digest] = dict(description)
+            self.described[kind][digest] = dict(description)
 
     def _append(self, document: Mapping[str, Any]) -> int:
         offset, data = self._end, _line(document)
@@ -271,7 +271,7 @@ def _line(document: Mapping[str, Any]) -> bytes:
 
 
 def _document(line: bytes) -> dict[str, Any] | None:
-    """Return what a line states, None if it is not as it was written."""
+    """Return the content of a line, None if the line is damaged."""
     if line[-_SUM_BYTES:] != _sum(line[:-_SUM_BYTES]):
         return None
     document: dict[str, Any] = json.loads(line)
@@ -280,7 +280,7 @@ def _document(line: bytes) -> dict[str, Any] | None:
 
 
 def _sum(data: bytes) -> bytes:
-    """Return the end of a line: the checksum of what is before it."""
+    """Return the end of a line: the checksum of all bytes before it."""
     text = hashlib.sha256(_VERSION + data).hexdigest()[:_DIGITS]
     return b',"sum":"%s"}\n' % text.encode()
 
@@ -308,7 +308,7 @@ def digest_of(content: Any) -> str:
 
 
 def changes(old: Mapping[str, str], new: Mapping[str, str]) -> Iterator[str]:
-    """Yield in words what differs between two settings or cars."""
+    """Yield the differences between two settings or cars as texts."""
     for name in sorted({*old, *new}):
         before, after = old.get(name, "none"), new.get(name, "none")
         if before != after:

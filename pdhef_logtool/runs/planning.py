@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 #: Each choice keeps the files of the choices before it, too.
 _KEPT = ("metrics", "estimates", "full")
-#: Settings that change no result and no kept file, or that are compared by themselves.
+#: Settings that change no result and no kept file, or that are compared separately.
 _NO_SETTING = frozenset(
     {
         "keep",
@@ -66,7 +66,7 @@ def plan_logs(
 
     ``neutral`` labels are made from the content, not from the name.
 
-    A log whose path, size and time are in the journal is not read; a new one only if another log has its size.
+    A log is not read if the journal has its path, size and time; a new one only if another log has its size.
     """
     places = [Place.of(log) for log in inputs]
     sizes = Counter(place.bytes for place in places)
@@ -91,7 +91,7 @@ def plan_logs(
 
 @dataclass(slots=True)
 class _Labels:
-    """Labels of logs while they are assigned: those of the journal stay with their content, else with their path."""
+    """Labels of logs while they are assigned: labels of the journal stay with their content, else with their path."""
 
     journal: Journal
     neutral: bool
@@ -150,7 +150,7 @@ def calibrate_pools(
 
 
 def settings_of(config: RunConfig, pools: dict[str, SelfCalibration | None]) -> dict[str, str]:
-    """Return, as texts, what decides the content of a drive's files, beside the log and its car."""
+    """Return, as texts, the settings that a drive's files depend on, besides the log and its car."""
     settings = {
         f"--{key.replace('_', '-')}": ",".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
         for key, value in asdict(config).items()
@@ -169,7 +169,7 @@ def settings_of(config: RunConfig, pools: dict[str, SelfCalibration | None]) -> 
 
 @dataclass(slots=True, eq=False)
 class Plan:
-    """The logs of a run, their settings, and what the journal in the output folder has of them.
+    """The logs of a run, their settings, and the journal in the output folder.
 
     ``is_remote``: of the outputs only reports and figures are in the folder.
     """
@@ -218,7 +218,7 @@ class Plan:
         return [p for p in chosen if reasons[p.log.stem] is not None]
 
     def worst(self, count: int) -> list[str]:
-        """Return the labels of the scored drives whose selected estimates have the largest sideslip errors."""
+        """Return the labels of the scored drives with the largest sideslip errors of the selected estimate."""
         entries = [e for p in self.logs if (e := self.entry(p)) is not None and e.error_rad is not None]
         return [e.label for e in sorted(entries, key=lambda e: (-(e.error_rad or 0.0), e.label))[:count]]
 
@@ -284,7 +284,7 @@ class Plan:
         return [name for name, state in files.items() if not is_unchanged(self.output / name, state)]
 
     def damaged_pages(self) -> set[str]:
-        """Return the labels of drives whose pages are not as they were written."""
+        """Return the labels of drives with changed pages."""
         entries = (entry for p in self.logs if (entry := self.entry(p)) is not None)
         return {e.label for e in entries if self._changed_outputs(e, pages=True)}
 

@@ -66,7 +66,7 @@ def _result(plan: Plan, entry: Entry, folder: str) -> LogResult:
 
 
 def write_run_pages(output: Path, report: bool, labels: Collection[str] | None, reporter: Reporter) -> None:
-    """Write the page of the run and those of the named logs (None: all); without ``report``, remove all pages."""
+    """Write the page of the run and the pages of the named logs (None: all); without ``report``, remove all pages."""
     from pdhef_logtool.reports.pages import remove_pages, write_pages
 
     run = open_run(output)

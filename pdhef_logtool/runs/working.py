@@ -87,7 +87,7 @@ _WAITS_S = (0.5, 2.0)
 
 
 def run_drive(task: DriveTask, tell: Tell) -> DriveEnd | OutputError:
-    """Run one drive, write its files, and return how it ended; raises only what ends the process.
+    """Run one drive, write its files, and return how it ended; raises only errors that end the process.
 
     An error that all drives would meet, such as a full disk, is returned: it ends the run.
     """
@@ -114,7 +114,7 @@ def run_drive(task: DriveTask, tell: Tell) -> DriveEnd | OutputError:
 
 
 def failed_outcome(log: LogInput, reason: str, config: RunConfig) -> LogOutcome:
-    """Return how a log that nothing came out of is recorded in run.json."""
+    """Return the record of a failed log in run.json."""
     texts: dict[str, Any] = {"file": log.path.name, "failed": reason}
     texts = without_names(texts, log.path, log.stem) if config.no_position else texts
     return LogOutcome(log=log.stem, sha256=None, **texts)

@@ -1,8 +1,8 @@
 """Child processes that are forked from a server with imported modules (Linux).
 
 The server does no other work: it has one thread and no open query, so that each fork is a complete process. Unlike
-the standard library's fork server, it leaves ``__main__`` alone, so that scripts need no guard, and no file behind. It
-works in threads and daemonic processes, and a process can have several servers.
+the fork server of multiprocessing, it does not import ``__main__``, so that scripts can start it at module level, and
+creates no file. It works in threads and daemonic processes, and a process can have several servers.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class ForkServer:
     def fork(self, function: str, *files: int, timeout_s: float) -> Child:
         """Start a child that calls ``package.module:function`` with its connection and copies of open files.
 
-        A message of which a part is missing for ``timeout_s`` raises BlockingIOError.
+        Reading raises BlockingIOError if a message is incomplete for ``timeout_s``.
 
         Raises
         ------

@@ -26,7 +26,7 @@ from pdhef_logtool.workers.supervisor import Crew, Ended, Failure, Limits, Tell,
 T = TypeVar("T")
 R = TypeVar("R")
 
-#: Nodes that an item may lose: machines that are taken away at any time count as such.
+#: Nodes that an item may lose, for example preemptible machines.
 MAX_RETRIES = 1000
 #: Items submitted to Ray per processor, so that no processor waits for the next one.
 _AHEAD = 2
@@ -54,8 +54,8 @@ def supervise_on_ray(
 ) -> Generator[Ended[T, R], None, None]:
     """Do the work on every item, one for each processor of a cluster at a time, and yield how each ended.
 
-    Arguments and results are those of :func:`~.supervisor.supervise`; the nodes have this package and the work's module
-    installed. An item that is lost is tried once more alone in its place, beside what other places do.
+    Arguments and results as for :func:`~.supervisor.supervise`; the nodes have this package and the work's module
+    installed. A lost item is tried once more alone on its processor, beside the items of other processors.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ _RESERVED_BYTES = 2 << 30
 _TRIES = 2
 #: Most restarts of the fork server per list of items.
 _RESTARTS = 3
-#: Longest time for the rest of a message of which the beginning has arrived.
+#: Timeout for the rest of a message after its first bytes.
 _MESSAGE_S = 3.0
 #: Unchanged progress is reported again after this many seconds at the earliest.
 _TELL_EVERY_S = 0.1
@@ -328,7 +328,7 @@ class Crew(Generic[T, R]):
     def _lose(self, worker: _Worker[T], reason: str = "") -> Ended[T, R] | None:
         """End a worker; its item is tried again, or has failed for a reason or for how the process ended.
 
-        A worker that died with its server says nothing about its item, which is tried next.
+        If the fork server died with the worker, the item is not the cause: it is tried next.
         """
         attempt = worker.attempt
         assert attempt is not None

@@ -171,65 +171,6 @@ def test_killed_twice_and_resumed_is_undisturbed(
     assert [name for name, data in alike.items() if killed[name] != data] == []
 
 
-def test_a_folder_added_later_computes_only_what_is_new(drives: Path, logs: Path, tmp_path: Path) -> None:
-    first, later = tmp_path / "first", tmp_path / "later"
-    for folder, part in ((first, slice(0, 6)), (later, slice(6, 9))):
-        folder.mkdir()
-        for path in sorted(drives.glob("*.mcap"))[part]:
-            shutil.copy(path, folder)
-    output = tmp_path / "out"
-    finished([str(first)], output)
-    finished([str(first), str(later)], output, "--resume")
-    names = [name for *_, name in measures(output)]
-    assert len(names) == len(set(names)) == 9
-    assert len(open_run(output).logs) == 9
-
-
-def test_two_jobs_are_nearly_twice_as_fast(drives: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "logs"
-    folder.mkdir()
-    paths = sorted(drives.glob("*.mcap"))
-    for path in paths:
-        shutil.copy(path, folder)
-    cores = cores_at_once()
-    found = {jobs: finished([str(folder)], tmp_path / f"out{jobs}", "--jobs", str(jobs)) for jobs in (1, 2)}
-    cores = min(cores, cores_at_once())
-    workers = {jobs: worker_seconds(tmp_path / f"out{jobs}") for jobs in (1, 2)}
-    # What no second job shortens is the parent's; the rest is halved if two take no more than one does, but for what
-    # any two processes hinder each other on this machine.
-    alone = found[1]["cpu_s"] + workers[1]
-    shared = found[2]["cpu_s"] + max(workers[1], workers[2] * min(cores, 2.0) / 2.0) / 2.0
-    note(
-        jobs_cpu_ratio=alone / shared,
-        jobs_wall_ratio=found[1]["wall_s"] / found[2]["wall_s"],
-        cores_at_once=cores,
-        drives_per_cpu_second=len(paths) / alone,
-        parent_cpu_s=found[2]["cpu_s"],
-        workers_cpu_s=workers[2],
-    )
-    assert alone / shared >= 1.8
-    assert cores < 1.9 or found[1]["wall_s"] / found[2]["wall_s"] >= 1.8
-
-
-def cores_at_once() -> float:
-    """Return how many cores two processes find to be theirs, in time on the wall: 2 on an idle machine."""
-
-    def wall_s(count: int) -> float:
-        since = time.monotonic()
-        spin = [sys.executable, "-c", "sum(i * i % 7 for i in range(15_000_000))"]
-        for process in [subprocess.Popen(spin) for _ in range(count)]:
-            assert process.wait() == 0
-        return time.monotonic() - since
-
-    return 2.0 * wall_s(1) / wall_s(2)
-
-
-def worker_seconds(output: Path) -> float:
-    """Return the processor seconds of all workers."""
-    last = {pid: seconds for pid, seconds, *_ in measures(output)}
-    return sum(last.values())
-
-
 def test_a_worker_takes_no_more_memory_after_300_drives_than_after_30(undisturbed: tuple[Path, dict[str, Any]]) -> None:
     simulated = [m for m in measures(undisturbed[0]) if m[3].startswith("drive_")]
     early = statistics.median(rss for _, _, rss, _ in simulated[20:40])

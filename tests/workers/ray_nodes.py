@@ -21,7 +21,6 @@ def cluster_of_one() -> Iterator[Any]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        patch.setenv("PYTHONBREAKPOINT", "0")  # Ray sets it
         terminated = signal.getsignal(signal.SIGTERM)
         made = Cluster(initialize_head=True, head_node_args={**_NODE, "include_dashboard": False})
         try:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections import Counter
@@ -16,6 +18,7 @@ import pytest
 from pdhef_logtool.records.errors import UsageError, WorkerError
 from pdhef_logtool.workers.ray_supervisor import supervise_on_ray
 from pdhef_logtool.workers.supervisor import Failure, Limits
+from tests.conftest import ROOT
 from tests.workers.planted_work import Item, planted
 from tests.workers.ray_nodes import START_S, cluster_of_one, grow, processes_of
 
@@ -24,7 +27,7 @@ pytestmark = pytest.mark.fleet
 PRELOAD = ["tests.workers.planted_work"]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def cluster() -> Iterator[Any]:
     with cluster_of_one() as made:
         yield made
@@ -79,23 +82,29 @@ def test_a_node_that_is_lost_while_its_task_runs_costs_no_item(cluster: Any, tmp
     assert not list(tmp_path.glob(".*")), "no file is left half-written"
 
 
-def test_a_cluster_that_is_lost_is_one_error_and_no_failure_of_its_items(tmp_path: Path) -> None:
+def lose_cluster(folder: Path) -> None:
+    """Kill the only node of a cluster while it works; its death sends signals to the process that started it."""
     with cluster_of_one() as cluster:
-        ends = supervise_on_ray(
-            planted, [("wait", f"{tmp_path}/0")] * 3, address=cluster.address, limits=Limits(), preload=PRELOAD
-        )
 
         def kill() -> None:
-            while not list(tmp_path.glob("*.begun")):
+            while not list(folder.glob("*.begun")):
                 time.sleep(0.05)
             for pid in processes_of(cluster.head_node):
                 os.kill(pid, signal.SIGKILL)
 
-        killer = threading.Thread(target=kill)
-        killer.start()
-        with pytest.raises(WorkerError, match="--ray: expected a Ray cluster that keeps running"):
-            list(ends)
-        killer.join()
+        threading.Thread(target=kill, daemon=True).start()
+        items: list[Item] = [("wait", f"{folder}/0")] * 3
+        try:
+            list(supervise_on_ray(planted, items, address=cluster.address, limits=Limits(), preload=PRELOAD))
+        except WorkerError as error:
+            print(error, flush=True)
+
+
+def test_a_cluster_that_is_lost_is_one_error_and_no_failure_of_its_items(tmp_path: Path) -> None:
+    start = "from pathlib import Path; from tests.workers.test_ray_supervisor import lose_cluster"
+    script = f"{start}; lose_cluster(Path({str(tmp_path)!r}))"
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert "--ray: expected a Ray cluster that keeps running, got " in ended.stdout, ended.stderr
 
 
 def test_where_there_is_no_cluster_that_is_told() -> None:
