@@ -2,9 +2,9 @@
 
     python -m studies.reference [--cases NAME,...] [--work out/reference] [--out docs] [--results DIR]
 
-Each case is a run of ``pdhef run --reference on`` (docs/method.md#reference). Recorded drives are those of
+Each case is a run of ``pdhef run --reference on`` (docs/method.md#reference). Recorded drives are in
 ``../shared``, which may not be redistributed: without them, their stored figures stay. GNSS of most of them is made
-from ground truth and marked so. A case whose inputs have not changed since the last run is not computed again.
+from ground truth and marked so. Only cases with changed inputs are recomputed.
 Recorded drives were seen while constants were chosen: their figures are development figures.
 """
 
@@ -72,7 +72,7 @@ NONE, REAL = "none", "recorded"
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One row: a recorded drive (``log``) or a simulated one (``spec``), its GNSS, and what is wrong with it.
+    """One row: a recorded drive (``log``) or a simulated one (``spec``), its GNSS and its fault.
 
     ``fault``: a name of ``FAULTS``. ``target_deg``: RMSE that the reference must reach, None: only reported.
     """
@@ -168,7 +168,7 @@ OUTAGE, MULTIPATH = "no GNSS from 20 to 40 s", "multipath of 0.5 m/s from 20 to 
 BIASED = "a_y + 0.5 m/s², yaw rate + 0.005 rad/s and 1 %"
 FAULTS = (OUTAGE, MULTIPATH, BIASED)
 WRONG_AXLE = "l_r wrong by 0.15 m"
-#: Of simulated drives: nothing states where the accelerometer is.
+#: Of simulated drives: the position of the accelerometer is not stated.
 MOVED_IMU, REAR_IMU = "accelerometer at the rear axle", (("imu_x_m", -1.71),)
 #: Of recorded drives with a receiver: ground truth is taken to be the velocity of the antenna, whose position the
 #: smoother estimates, in place of that of the point that the vehicle file states.
@@ -195,7 +195,7 @@ SIMULATED = {
     "road, 300 s": _simulated("road", 80.0, 0.85, seed=3, duration_s=300.0),
     "road, 1200 s": _simulated("road", 80.0, 0.85, seed=4, duration_s=1200.0),
 }
-#: Cars that nothing was chosen with, each with a vehicle file fitted to its ramp steer.
+#: Cars that no constant was chosen with, each with a vehicle file fitted to its ramp steer.
 OTHER_CARS = {
     f"{manoeuvre} {speed} km/h, {car}": _simulated(
         manoeuvre, speed, 0.85, seed=900 + speed, vehicle=f"{car}~{900 + speed}", duration_s=duration_s
@@ -493,7 +493,7 @@ def page(results: dict[str, Figures]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compute the cases that are not stored yet, and write the page."""
     parser = options("reference", __doc__)
-    parser.add_argument("--cases", default="", help="only those whose name contains one of these, comma-separated")
+    parser.add_argument("--cases", default="", help="parts of names of cases, comma-separated")
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "reference")
     parser.add_argument("--out", type=Path, default=DOCS)
     parser.add_argument("--results", type=Path, default=RESULTS / "reference")

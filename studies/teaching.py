@@ -5,7 +5,7 @@
 ``pdhef learn`` teaches; ``pdhef run`` calibrates the car on the sensors of the scored drive, without ground truth.
 Columns: ``physics`` of the untaught car, of the taught car, and ``pd-hef`` of the taught car with its residual, also of
 a car that the sideslip reference taught, where it is independent, in place of ground truth. The drives are in
-``../shared`` and may not be redistributed. Without them, the command ends with 0 and writes nothing.
+``../shared`` and may not be redistributed. Without them, the command ends with 0 and writes no file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_
 RESULTS_FILE = RESULTS / "teaching.json"
 #: No pair may be worse than untaught by more than the larger of this share and this many degrees.
 WORSE_SHARE, WORSE_DEG = 0.05, 0.03
-#: Driving counts as alike where the residual is active on so much of it.
+#: Driving counts as alike where the residual is active on this share of it.
 ALIKE = 0.5
 #: The paper's network, trained in simulation, in the sigma points of the paper's filter.
 PAPER = "pd-hef-paper"
@@ -52,7 +52,7 @@ class TeachPart:
 
 @dataclass(frozen=True, slots=True)
 class TeachCar:
-    """A car: its parts; pairs of them, in which one or several teach; the drive whose vehicle file all have."""
+    """A car: its parts; pairs of them, in which one or several teach."""
 
     name: str
     parts: tuple[TeachPart, ...]
@@ -131,7 +131,7 @@ class PairResult:
 
     @property
     def ratio(self) -> float:
-        """RMSE of ``pd-hef`` of the taught car over that of untaught ``physics``."""
+        """RMSE of ``pd-hef`` of the taught car over the RMSE of untaught ``physics``."""
         return self.hybrid.rmse_deg / self.untaught.rmse_deg
 
     @property
