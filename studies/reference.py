@@ -156,7 +156,7 @@ def add_gnss(log: Path, output: Path, stamps_ns: NDArray[np.int64], velocity_m_s
         for stamp, (east, north) in zip(stamps_ns.tolist(), velocity_m_s.tolist(), strict=True):
             payload = json.dumps({"east": east, "north": north}).encode()
             writer.add_message(topic, stamp + round(1e9 * LATE_S), payload, stamp)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     return output
 
 
@@ -326,8 +326,8 @@ def run(
     case: Case, tool: Tool, name: str, log: Path, mapping: dict[str, Any], vehicle: dict[str, Any], *more: str
 ) -> Path:
     """Run the reference on a drive; return the output folder."""
-    files = ("--mapping", write_toml(tool.work / "mappings" / f"{name}.toml", mapping))
-    files = (*files, "--car", write_toml(tool.work / "cars" / f"{name}.toml", vehicle))
+    file = write_toml(tool.work / "mappings" / f"{name}.toml", mapping)
+    files = ("--mapping", file, "--car", write_toml(tool.work / "cars" / f"{name}.toml", vehicle))
     waived = [word for check in SPIN_CHECKS for word in ("--waive", check)] if "spin" in case.title else []
     given = more or ("--estimators", "zero,physics")
     return tool.run(name, log, *files, "--keep", "estimates", "--reference", "on", *waived, *given)

@@ -30,9 +30,8 @@ from studies.pages import DRIVES, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 from studies.torture.mutating import mutant
 from studies.torture.seeds import write_seeds
-from truthsim.batch import DriveSpec
 from truthsim.conditions import ROWS
-from truthsim.drive import write_drive
+from truthsim.drive import simulate_drive, write_drive
 from truthsim.sensors import SensorNoise
 
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_logs"
@@ -170,11 +169,8 @@ def simulated_log(
     if not log.is_file():
         log.parent.mkdir(parents=True, exist_ok=True)
         manoeuvre, speed, friction, duration_s = spec
-        write_drive(
-            DriveSpec(manoeuvre, speed, friction, seed, duration_s, amplitude=1.0).simulate(),
-            log,
-            steering_wheel=steering_wheel,
-        )
+        drive = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration_s)
+        write_drive(drive, log, steering_wheel=steering_wheel)
     return log
 
 
