@@ -2,7 +2,7 @@
 
     python -m studies.calibration [--cars 30] [--work out/calibration] [--out docs]
 
-Each simulated car has sensors of its own and a right vehicle file, fitted to a ramp steer, and a wrong one: a stiffness
+Each simulated car has random sensors and a right vehicle file, fitted to a ramp steer, and a wrong one: a stiffness
 error of a factor 0.5 to 2 at each axle; inertia, roll gradient, IMU position and steering ratio are as wrong as the
 prior of the calibration expects. All drives run by ``pdhef run`` with both files, with and without calibration.
 """
@@ -104,7 +104,7 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class StudiedCar:
-    """A drawn car with its vehicle files, and the true values of what the tool estimates, by name."""
+    """A drawn car with its vehicle files, and the true values of the estimated parameters by name."""
 
     drawn: DrawnCar
     friction: float
@@ -119,8 +119,7 @@ def studied_car(rng: np.random.Generator) -> StudiedCar:
     vehicle = drawn.vehicle.model_copy(update={"friction": friction})
     right = vehicle.model_dump(mode="json", exclude_none=True)
     wrong = wrong_file(right, rng)
-    noise = dict(drawn.sensors)
-    true = true_values(right, noise["imu_x_m"], noise["rtk_x_m"], noise["rtk_heading_offset_rad"])
+    true = true_values(right, dict(drawn.sensors)["imu_x_m"])
     return StudiedCar(drawn, friction, {RIGHT: right, WRONG_FILE: wrong}, true)
 
 
@@ -138,8 +137,11 @@ def wrong_file(right: Mapping[str, Any], rng: np.random.Generator) -> dict[str, 
     return wrong
 
 
-def true_values(right: Mapping[str, Any], imu_x_m: float, rtk_x_m: float, heading_rad: float) -> dict[str, float]:
-    """Return the true values of calibrated parameters, and of the figures in checks, by name."""
+def true_values(right: Mapping[str, Any], imu_x_m: float) -> dict[str, float]:
+    """Return the true values of calibrated parameters, and of the figures in checks, by name.
+
+    The ground truth of the runs is the state of the simulator at the CG.
+    """
     gain = 1.0 + GRAVITY_M_S2 * right["roll_gradient_rad_per_m_s2"]
     return {
         **{f"{axle} cornering stiffness": t["B"] * t["C"] * t["D_n"] for axle, t in right["tyres"].items()},
@@ -147,8 +149,8 @@ def true_values(right: Mapping[str, Any], imu_x_m: float, rtk_x_m: float, headin
         "steering ratio": right["steering_ratio"],
         "lever of a_y": imu_x_m,
         "roll gain": gain,
-        "truth.sideslip_rad.offset": -math.degrees(heading_rad),
-        "ay_m_s2.place": imu_x_m - rtk_x_m,
+        "truth.sideslip_rad.offset": 0.0,
+        "ay_m_s2.place": imu_x_m,
         "ay_m_s2.gain": gain,
         "ay_m_s2.delay": 0.0,
         "yaw_rate_rad_s.gain": 1.0,
@@ -201,7 +203,7 @@ def outcomes(tool: Tool, index: int) -> Iterator[Outcome]:
 def runs_of(
     tool: Tool, name: str, vehicle: Mapping[str, Any], logs: Sequence[Path], is_calibrated: bool
 ) -> dict[str, Run]:
-    """Run the estimators on the drives of a car; return what came of each by log."""
+    """Run the estimators on the drives of a car; return the results by log."""
     file = write_toml(tool.work / "cars" / f"{name}.toml", vehicle)
     mode = "log" if is_calibrated else "off"
     given = (
@@ -275,7 +277,7 @@ def interval_table(done: Sequence[Outcome]) -> str:
 
 
 def d2_table(done: Sequence[Outcome]) -> str:
-    """Return how much worse an estimate is whose d2 is larger than the least of the others."""
+    """Return the RMSE ratio of an estimate to the estimate with the lowest d2."""
     pairs = []
     for o in done:
         runs = (o.runs[WRONG_FILE, False], o.runs[WRONG_FILE, True])

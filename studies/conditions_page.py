@@ -79,7 +79,7 @@ class Figures:
         return pairs[:, 0], pairs[:, 1]
 
     def ratio(self, row: str, reference: str) -> Bound:
-        """Return the ratio of the median RMSE of the subject to that of a reference on the drives that both have."""
+        """Return the ratio of the median RMSE of subject and reference on their common drives."""
         a, b = (self._by.get((row, name, "rmse", "all"), {}) for name in (SUBJECT, reference))
         both = sorted(a.keys() & b.keys())
         return median_ratio(np.array([a[d][0] for d in both]), np.array([b[d][0] for d in both]))
@@ -166,7 +166,7 @@ def plot(
     path: Path, rows: Sequence[str], spans: Mapping[str, FloatArray], label: str, *,
     medians: Mapping[str, FloatArray] = MappingProxyType({}), limits: Mapping[float, str] = MappingProxyType({}),
 ) -> None:  # fmt: skip
-    """Draw low, middle and high [rows, 3] of every name in a lane of its own in each row, and medians in grey."""
+    """Draw low, middle and high [rows, 3] of every name in a lane per row, and medians in grey."""
     fig, grid = subplots(1, 1, 9.0, 1.5 + 0.36 * len(rows), {"font.size": 9})
     axes = grid[0, 0]
     for row in range(0, len(rows), 2):

@@ -68,7 +68,7 @@ def subjects(mapping: dict[str, Any]) -> list[str]:
 
 
 def mistaken(mapping: dict[str, Any], subject: str, kind: str) -> dict[str, Any] | None:
-    """Return a mapping file with a mistake; None where the log lacks the axis, or nothing changes."""
+    """Return a mapping file with a mistake; None if the log lacks the axis or the mistake has no effect."""
     wrong: dict[str, Any] = json.loads(json.dumps(mapping))
     table, prefix = _place(subject)
     for name in [n for n in wrong[table] if n.startswith(prefix)]:
@@ -88,7 +88,7 @@ def mistaken(mapping: dict[str, Any], subject: str, kind: str) -> dict[str, Any]
 
 
 def verdict(checks: Sequence[dict[str, Any]], subject: str, kind: str) -> str:
-    """Return what checks state of a mistake, as in the module."""
+    """Return the verdict of checks on a mistake, as in the module."""
     related = (subject, "truth.sideslip_rad") if subject == "truth.vy_m_s" else (subject,)
     mine = [c for c in checks if c["subject"].startswith(related)]
     failed = [c for c in mine if c["verdict"] == "failed"]
@@ -111,7 +111,7 @@ Look = Callable[[Path, Path], Sequence[dict[str, Any]]]
 def outcomes(
     look: Look, log: Path, mapping: dict[str, Any], folder: Path, wanted: Sequence[tuple[str, str]] = ()
 ) -> Iterator[Outcome]:
-    """Yield what the checks state of mistakes in the mapping of a log: signal and kind, or all of them.
+    """Yield the outcomes of mistakes (signal and kind, default all) in the mapping of a log.
 
     ``folder`` takes the mapping files.
     """
@@ -138,7 +138,7 @@ def look_at(log: Path, mapping: Path) -> Sequence[dict[str, Any]]:
 
 
 def recognised(log: Path, folder: Path) -> dict[str, Any]:
-    """Return the mapping file of a log: of a recorded drive that of the studies, else the recognised one."""
+    """Return the mapping file of a log: the known one of a recorded drive, else the recognised one."""
     peer = next((drive for drive in PEER_DRIVES if drive.log == log.name), None)
     return Tool(ROOT, folder).mapping(log) if peer is None else mapping_table(peer)
 

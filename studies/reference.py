@@ -1,55 +1,43 @@
 """The sideslip reference against ground truth: recorded and simulated drives, with and without GNSS.
 
-    python -m studies.reference [--cases NAME,...] [--out docs] [--results DIR]
+    python -m studies.reference [--cases NAME,...] [--work out/reference] [--out docs] [--results DIR]
 
-Each case reads a drive as ``pdhef run`` does and smooths it (docs/method.md#reference). Recorded drives are those of
+Each case is a run of ``pdhef run --reference on`` (docs/method.md#reference). Recorded drives are in
 ``../shared``, which may not be redistributed: without them, their stored figures stay. GNSS of most of them is made
-from ground truth and marked so. A case whose inputs have not changed since the last run is not computed again.
+from ground truth and marked so. Only cases with changed inputs are recomputed.
 Recorded drives were seen while constants were chosen: their figures are development figures.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import sys
-import tempfile
-import time
-from collections.abc import Callable, Iterator, Sequence
+import tomllib
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import polars as pl
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from numpy.typing import NDArray
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.estimators.calibration.joint import IMU_X_REACH
-from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.presets import Options
-from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference, refer, sideslip_std
-from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator, steps_at
-from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
-from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.records.tracks import REFERENCE, StateTrack
-from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.referencing import prior_of
-from pdhef_logtool.runs.self_calibrating import calibrate_drive
-from pdhef_logtool.storage.documents import digest
-from pdhef_logtool.storage.files import write_bytes
+from pdhef_logtool import Car
 from studies.drawn_cars import FIT_FRICTION, fit_vehicle
-from studies.pages import DOCS, DRIVES, RESULTS, ROOT, number, options, table, write
-from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_of, vehicle_of
+from studies.gates.tool import Tool, reports, sideslip_rmse_deg
+from studies.pages import DOCS, DRIVES, RESULTS, ROOT, SAMPLE_VEHICLE, number, options, table, write, write_toml
+from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 from studies.recalibrate import input_digest
 from truthsim.batch import DriveSpec
 from truthsim.drive import DEFAULT_VEHICLE, write_drive
 from truthsim.vehicle_choice import choose_vehicle
 
+FloatArray = NDArray[np.float64]
 STORED = "cases.json"
 #: Checks that a spin fails: its course does not turn as the car does.
 SPIN_CHECKS = ("yaw_rate_rad_s.unit", "truth.yaw_rate_rad_s.unit", "truth.sideslip_rad.frame")
@@ -84,7 +72,7 @@ NONE, REAL = "none", "recorded"
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One row: a recorded drive (``log``) or a simulated one (``spec``), its GNSS, and what is wrong with it.
+    """One row: a recorded drive (``log``) or a simulated one (``spec``), its GNSS and its fault.
 
     ``fault``: a name of ``FAULTS``. ``target_deg``: RMSE that the reference must reach, None: only reported.
     """
@@ -103,80 +91,30 @@ class Case:
         return ", ".join(text for text in (self.title, f"GNSS {self.gnss}", self.fault) if text)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ScoredDrive:
-    """What the reference gets of a drive, and ground truth [N] at the same stamps; ``heading_rad`` up to a constant.
+class Motion(NamedTuple):
+    """Ground truth [N] that GNSS is made from; heading up to a constant."""
 
-    ``estimates``: those of the vehicle file as it is, without GNSS, that rankings compare.
-    """
-
-    signals: Signals
-    prior: ReferencePrior
+    stamps_ns: NDArray[np.int64]
     vx_m_s: FloatArray
     vy_m_s: FloatArray
     heading_rad: FloatArray
     roll_rate_rad_s: FloatArray
-    car: Car | None = None
-    estimates: tuple[StateTrack, ...] = ()
-
-    def error_rad(self, track: StateTrack, least_speed_m_s: float) -> FloatArray:
-        """Return the sideslip error of an estimate where it is scored."""
-        scored = track.valid & (self.vx_m_s > least_speed_m_s)
-        error = wrap_angle(track.sideslip_rad - np.arctan2(self.vy_m_s, self.vx_m_s))[scored]
-        return np.asarray(error[np.isfinite(error)])
 
 
-def recorded_drive(drive: PeerDrive) -> ScoredDrive:
-    """Read a recorded drive as ``pdhef run`` does; a receiver's velocity is mapped where the log has one."""
-    mapping = mapping_of(drive, receiver=drive.log.startswith("v40_"))
-    car = Car.of(vehicle_of(drive))
-    with read_drive(DRIVES / drive.log, car, mapping, ReadOptions()) as opened:
-        prior = prior_of(car, calibrate_drive(opened, RunConfig()))
-        whole = opened.whole()
-    assert whole.truth is not None
-    truth = whole.truth
-    heading = np.cumsum(np.nan_to_num(truth.yaw_rate_rad_s) * np.gradient(truth.stamps_ns * 1e-9))
-    columns = (truth.vx_m_s, truth.vy_m_s, heading, np.zeros(len(truth)))
-    return ScoredDrive(whole.signals, prior, *columns, car=car, estimates=_estimates(car, whole.signals))
-
-
-def _estimates(car: Car, signals: Signals) -> tuple[StateTrack, ...]:
-    return tuple(run_window(make_estimator(name, car), signals)[0] for name in RANKED)
-
-
-def simulated_drive(spec: DriveSpec, vehicle: VehicleParameters | None = None) -> ScoredDrive:
-    """Simulate a drive and read its log, with the vehicle file of the car and without tyre identification."""
-    drive = spec.simulate()
-    car = Car.load(ROOT / "sample_logs" / "vehicle.toml") if vehicle is None else Car.of(vehicle)
-    if spec.vehicle != DEFAULT_VEHICLE:
-        car = Car.of(fit_vehicle(choose_vehicle(spec.vehicle), FIT_FRICTION, car.vehicle))
-    with tempfile.TemporaryDirectory() as folder:
-        log = Path(folder) / "drive.mcap"
-        write_drive(drive, log)
-        with read_drive(log, car, None, ReadOptions(waived=SPIN_CHECKS)) as opened:
-            prior = prior_of(car, calibrate_drive(opened, RunConfig()))
-            signals = opened.whole().signals
-    t = (signals.stamps_ns - drive.start_ns) * 1e-9
-    names = ("vx_m_s", "vy_m_s", "yaw_rad", "roll_rate_rad_s")
-    vx, vy, heading, roll_rate = (np.interp(t, drive.times_s, drive.truth[name]) for name in names)
-    bare = Car.of(car.vehicle)
-    return ScoredDrive(signals, prior, vx, vy, heading, roll_rate, bare, _estimates(bare, signals))
-
-
-def with_gnss(drive: ScoredDrive, receiver: Receiver, seed: int = 7) -> Signals:
-    """Return the signals with the velocity to the east and north that a receiver would show."""
+def made_gnss(
+    motion: Motion, receiver: Receiver, fault: str = "", seed: int = 7
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return the stamps [M] and the velocities [M, 2] to the east and north that a receiver would show."""
     rng = np.random.default_rng(seed)
-    signals = drive.signals
-    t = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
+    t = (motion.stamps_ns - motion.stamps_ns[0]) * 1e-9
     sampled = np.arange(0.0, t[-1], 1.0 / receiver.rate_hz)
-    rate = np.gradient(np.unwrap(drive.heading_rad), t)
-    forward = drive.vx_m_s - ANTENNA_M[1] * rate
-    left = drive.vy_m_s + ANTENNA_M[0] * rate - ANTENNA_HEIGHT_M * drive.roll_rate_rad_s
-    cos, sin = np.cos(drive.heading_rad + 0.7), np.sin(drive.heading_rad + 0.7)
+    rate = np.gradient(np.unwrap(motion.heading_rad), t)
+    forward = motion.vx_m_s - ANTENNA_M[1] * rate
+    left = motion.vy_m_s + ANTENNA_M[0] * rate - ANTENNA_HEIGHT_M * motion.roll_rate_rad_s
+    cos, sin = np.cos(motion.heading_rad + 0.7), np.sin(motion.heading_rad + 0.7)
     keep = math.exp(-1.0 / (receiver.rate_hz * receiver.correlated_s))
-    velocity = np.full((len(t), 2), np.nan)
-    at = np.minimum(np.searchsorted(t, sampled), len(t) - 1)
-    for column, component in enumerate((cos * forward - sin * left, sin * forward + cos * left)):
+    columns = []
+    for component in (cos * forward - sin * left, sin * forward + cos * left):
         correlated = np.empty(len(sampled))
         value = rng.standard_normal()
         for i in range(len(sampled)):
@@ -184,52 +122,53 @@ def with_gnss(drive: ScoredDrive, receiver: Receiver, seed: int = 7) -> Signals:
             value = keep * value + math.sqrt(1.0 - keep**2) * rng.standard_normal()
         good = np.isfinite(component)
         made = np.interp(sampled - receiver.delay_s, t[good], component[good])
-        made += receiver.correlated_m_s * correlated + receiver.white_m_s * rng.standard_normal(len(sampled))
-        velocity[at, column] = made
-    late_s = np.where(np.isfinite(velocity[:, 0]), LATE_S, np.nan)
-    return replace(signals, gnss_velocity_m_s=velocity, gnss_late_s=late_s)
+        columns.append(
+            made + receiver.correlated_m_s * correlated + receiver.white_m_s * rng.standard_normal(len(made))
+        )
+    velocity = np.stack(columns, axis=1)
+    stamps = motion.stamps_ns[0] + np.rint(sampled * 1e9).astype(np.int64)
+    if fault == OUTAGE:
+        there = (sampled < 20.0) | (sampled >= 40.0)
+        return stamps[there], velocity[there]
+    if fault == MULTIPATH:
+        velocity[(sampled >= 20.0) & (sampled < 25.0)] += 0.5 / math.sqrt(2.0)
+    return stamps, velocity
 
 
-def _outage(signals: Signals) -> Signals:
-    return replace(signals, gnss_velocity_m_s=_within(signals, 20.0, 40.0, np.nan))
+def add_gnss(log: Path, output: Path, stamps_ns: NDArray[np.int64], velocity_m_s: FloatArray) -> Path:
+    """Copy an MCAP log and add a topic with GNSS velocity as JSON; it arrives ``LATE_S`` after its stamp."""
+    schema = {"type": "object", "properties": {name: {"type": "number"} for name in ("east", "north")}}
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("rb") as source, output.open("wb") as target:
+        writer = Writer(target)
+        writer.start()
+        schemas: dict[int, int] = {}
+        channels: dict[int, int] = {}
+        for kind, channel, message in make_reader(source).iter_messages(log_time_order=False):
+            if channel.id not in channels:
+                if kind is not None and kind.id not in schemas:
+                    schemas[kind.id] = writer.register_schema(kind.name, kind.encoding, kind.data)
+                of = 0 if kind is None else schemas[kind.id]
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, of)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        added = writer.register_schema("Velocity", "jsonschema", json.dumps(schema).encode())
+        topic = writer.register_channel(GNSS_TOPIC, "json", added)
+        for stamp, (east, north) in zip(stamps_ns.tolist(), velocity_m_s.tolist(), strict=True):
+            payload = json.dumps({"east": east, "north": north}).encode()
+            writer.add_message(topic, stamp + round(1e9 * LATE_S), payload, stamp)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return output
 
 
-def _multipath(signals: Signals) -> Signals:
-    return replace(signals, gnss_velocity_m_s=_within(signals, 20.0, 25.0, 0.5))
-
-
-def _within(signals: Signals, start_s: float, end_s: float, added: float) -> FloatArray:
-    """Return GNSS velocity with something added between two times, to the east and north."""
-    t = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
-    velocity = signals.gnss_velocity_m_s.copy()
-    velocity[(t >= start_s) & (t < end_s)] += added / math.sqrt(2.0)
-    return velocity
-
-
-def _biased(signals: Signals) -> Signals:
-    return replace(signals, ay_m_s2=signals.ay_m_s2 + 0.5, yaw_rate_rad_s=signals.yaw_rate_rad_s * 1.01 + 0.005)
-
-
-def _tilted(signals: Signals) -> Signals:
-    """Turn the IMU by 2 degrees about its vertical axis, and tilt it by 2 degrees to the side."""
-    angle = math.radians(2.0)
-    ax, ay = signals.ax_m_s2, signals.ay_m_s2
-    return replace(
-        signals,
-        ax_m_s2=math.cos(angle) * ax + math.sin(angle) * ay,
-        ay_m_s2=math.cos(angle) * ay - math.sin(angle) * ax + 9.81 * math.sin(angle),
-    )
-
-
-#: What is done to the signals of a simulated drive.
-FAULTS: dict[str, Callable[[Signals], Signals]] = {
-    "no GNSS from 20 to 40 s": _outage,
-    "multipath of 0.5 m/s from 20 to 25 s": _multipath,
-    "a_y + 0.5 m/s², yaw rate + 0.005 rad/s and 1 %": _biased,
-    "IMU turned and tilted by 2°": _tilted,
+GNSS_TOPIC = "/made/gnss_velocity"
+MADE_SOURCES = {
+    f"gnss_velocity_{to}_m_s": {"topic": GNSS_TOPIC, "field": to, "stamp": "publish_time"} for to in ("east", "north")
 }
+OUTAGE, MULTIPATH = "no GNSS from 20 to 40 s", "multipath of 0.5 m/s from 20 to 25 s"
+BIASED = "a_y + 0.5 m/s², yaw rate + 0.005 rad/s and 1 %"
+FAULTS = (OUTAGE, MULTIPATH, BIASED)
 WRONG_AXLE = "l_r wrong by 0.15 m"
-#: Of simulated drives: nothing states where the accelerometer is.
+#: Of simulated drives: the position of the accelerometer is not stated.
 MOVED_IMU, REAR_IMU = "accelerometer at the rear axle", (("imu_x_m", -1.71),)
 #: Of recorded drives with a receiver: ground truth is taken to be the velocity of the antenna, whose position the
 #: smoother estimates, in place of that of the point that the vehicle file states.
@@ -256,7 +195,7 @@ SIMULATED = {
     "road, 300 s": _simulated("road", 80.0, 0.85, seed=3, duration_s=300.0),
     "road, 1200 s": _simulated("road", 80.0, 0.85, seed=4, duration_s=1200.0),
 }
-#: Cars that nothing was chosen with, each with a vehicle file fitted to its ramp steer.
+#: Cars that no constant was chosen with, each with a vehicle file fitted to its ramp steer.
 OTHER_CARS = {
     f"{manoeuvre} {speed} km/h, {car}": _simulated(
         manoeuvre, speed, 0.85, seed=900 + speed, vehicle=f"{car}~{900 + speed}", duration_s=duration_s
@@ -304,10 +243,9 @@ def cases() -> Iterator[Case]:
             yield Case(title, gnss, spec=spec)
     for fault in (*FAULTS, WRONG_AXLE):
         for gnss in (NONE, MADE):
-            if gnss == NONE and fault.startswith(("no GNSS", "multipath")):
+            if gnss == NONE and fault in (OUTAGE, MULTIPATH):
                 continue
             yield Case("road, 60 s", gnss, spec=_ROAD, fault=fault)
-    yield Case("fishhook, 70 km/h", MADE, spec=SIMULATED["fishhook, 70 km/h"], fault="IMU turned and tilted by 2°")
     for title in ("sine with dwell, 80 km/h", "fishhook, 70 km/h", "double lane change, 100 km/h"):
         yield Case(title, MADE, spec=replace(SIMULATED[title], sensors=REAR_IMU), fault=MOVED_IMU)
 
@@ -328,90 +266,121 @@ class Figures:
     valid_rmse: float
     used_gnss: bool
     refused: str
-    seconds: float
     physics: float = math.nan
     aided: float = math.nan
     pairs: tuple[int, int, int, int] = (0, 0, 0, 0)
 
 
-def figures(case: Case, drive: ScoredDrive) -> Figures:
-    """Smooth a drive and compare it with its ground truth at all stamps above the least speed."""
-    made = case.gnss in RECEIVERS
-    signals = with_gnss(drive, RECEIVERS[case.gnss]) if made else drive.signals
-    prior = drive.prior
+def figures(case: Case, tool: Tool, *, with_filters: bool = True) -> Figures:
+    """Run a case and compare its reference with the ground truth at all stamps above the least speed.
+
+    ``with_filters``: also run the estimators that the reference ranks, with and without GNSS.
+    """
+    name = "".join(c if c.isalnum() else "-" for c in case.name)
+    log, mapping, vehicle, motion = drive_of(case, tool, name)
+    if case.gnss in RECEIVERS:
+        if motion is None:
+            motion = motion_of(run(case, tool, f"{name}-without", log, mapping, vehicle))
+        log = add_gnss(log, tool.work / "logs" / f"{name}.mcap", *made_gnss(motion, RECEIVERS[case.gnss], case.fault))
+        mapping["signals"] |= MADE_SOURCES
     if case.fault == WRONG_AXLE:
-        prior = replace(prior, rear_m=prior.rear_m + 0.15)
+        vehicle["cg_to_rear_axle_m"] += 0.15
     elif case.fault == MOVED_IMU:
-        prior = replace(prior, unknown_imu_x_m=IMU_X_REACH * prior.wheelbase_m)
-    elif case.fault in FAULTS:
-        signals = FAULTS[case.fault](signals)
-    start = time.process_time()
-    found = refer(signals, prior, use_gnss=case.gnss != NONE)
-    seconds = time.process_time() - start
-    if case.fault == AT_ANTENNA:
-        drive = _at_antenna(drive, found)
-    scored = _scored(found, drive, case.least_speed_m_s, seconds)
-    if drive.car is None or not np.isfinite(signals.gnss_velocity_m_s).any() or case.gnss == NONE:
+        vehicle.pop("imu_position_m", None)
+    elif case.fault == BIASED:
+        yaw_rate = mapping["signals"]["yaw_rate_rad_s"]
+        mapping["signals"]["ay_m_s2"]["offset"] = 0.5
+        mapping["signals"]["yaw_rate_rad_s"] = yaw_rate | {"scale": 1.01 * yaw_rate.get("scale", 1.0), "offset": 0.005}
+    scored = scored_run(run(case, tool, name, log, mapping, vehicle), case, vehicle)
+    if case.gnss == NONE or not scored.used_gnss or not with_filters:
         return scored
-
-    car = drive.car
-
-    def rmse(*, gnss: bool) -> float:
-        track, _ = run_window(make_estimator("physics", car, Options(gnss=gnss)), signals)
-        return _rms_deg(drive.error_rad(track, case.least_speed_m_s))
-
-    pairs = (0, 0, 0, 0) if found.refused else _pairs(found, drive, case.least_speed_m_s)
-    return replace(scored, physics=rmse(gnss=False), aided=rmse(gnss=True), pairs=pairs)
+    bare = ("--calibrate", "off", "--estimators", ",".join(RANKED))
+    without, aided = (
+        run(case, tool, f"{name}-{gnss}", log, mapping, vehicle, *bare, "--gnss", gnss) for gnss in ("off", "auto")
+    )
+    errors = sideslip_rmse_deg(without)
+    pairs = (0, 0, 0, 0) if scored.refused else rankings(aided, errors)
+    return replace(scored, physics=errors["physics"], aided=sideslip_rmse_deg(aided)["physics"], pairs=pairs)
 
 
-def _at_antenna(drive: ScoredDrive, found: SideslipReference) -> ScoredDrive:
-    """Return a drive whose ground truth was not measured where its file states, but at the antenna."""
-    assert drive.car is not None
-    (antenna,) = (p.value for p in found.parameters if p.name == "antenna x")
-    moved = drive.car.vehicle.truth_position_m[0] - antenna
-    return replace(drive, vy_m_s=drive.vy_m_s + moved * drive.signals.yaw_rate_rad_s)
+def drive_of(case: Case, tool: Tool, name: str) -> tuple[Path, dict[str, Any], dict[str, Any], Motion | None]:
+    """Return the log of a case, its mapping and vehicle file, and the motion of a simulated drive."""
+    if case.spec is None:
+        peer = _peer(case.log)
+        mapping = mapping_table(peer, receiver=case.gnss == REAL)
+        return DRIVES / case.log, mapping, vehicle_table(peer), None
+    drive, log = case.spec.simulate(), tool.work / "logs" / f"{name}-simulated.mcap"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    log.unlink(missing_ok=True)
+    write_drive(drive, log)
+    vehicle = tomllib.loads(SAMPLE_VEHICLE.read_text(encoding="utf-8"))
+    if case.spec.vehicle != DEFAULT_VEHICLE:
+        fitted = fit_vehicle(choose_vehicle(case.spec.vehicle), FIT_FRICTION, Car.load(SAMPLE_VEHICLE).vehicle)
+        vehicle = fitted.model_dump(mode="json", exclude_none=True)
+    stamps = drive.start_ns + np.rint(drive.times_s * 1e9).astype(np.int64)
+    columns = (drive.truth[n] for n in ("vx_m_s", "vy_m_s", "yaw_rad", "roll_rate_rad_s"))
+    return log, tool.mapping(log), vehicle, Motion(stamps, *columns)
 
 
-def _rms_deg(values_rad: FloatArray) -> float:
-    return float(np.degrees(np.sqrt(np.mean(values_rad**2)))) if values_rad.size else math.nan
+def run(
+    case: Case, tool: Tool, name: str, log: Path, mapping: dict[str, Any], vehicle: dict[str, Any], *more: str
+) -> Path:
+    """Run the reference on a drive; return the output folder."""
+    file = write_toml(tool.work / "mappings" / f"{name}.toml", mapping)
+    files = ("--mapping", file, "--car", write_toml(tool.work / "cars" / f"{name}.toml", vehicle))
+    waived = [word for check in SPIN_CHECKS for word in ("--waive", check)] if "spin" in case.title else []
+    given = more or ("--estimators", "zero,physics")
+    return tool.run(name, log, *files, "--keep", "estimates", "--reference", "on", *waived, *given)
 
 
-def _pairs(found: SideslipReference, drive: ScoredDrive, least_speed_m_s: float) -> tuple[int, int, int, int]:
-    """Return ``pairs`` of :class:`Figures`."""
-    reference = ReferenceEstimator((found,)).at(drive.signals.stamps_ns)
-    tracks = {t.name: t for t in drive.estimates} | {REFERENCE: reference}
-    rows = evaluate_drive(EvaluatedDrive("", tracks, None, None, {}, least_speed_m_s), ("reference_further",))
-    claims = {row.estimator: row.value for row in rows}
-    errors = {t.name: _rms_deg(drive.error_rad(t, least_speed_m_s)) for t in drive.estimates}
-    further = {f"{a}~{b}": errors[a] - errors[b] for a, b in combinations(errors, 2)}
-    agreed = sum(claim * further[pair] > 0.0 for pair, claim in claims.items())
-    clear = [pair for pair, value in further.items() if abs(value) > CLEAR_DEG]
-    return len(claims), agreed, len(clear), sum(pair in claims for pair in clear)
+def tracks_of(folder: Path) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Return ground truth and reference of a run at the stamps that both have."""
+    (file,) = folder.glob("logs/*/estimates.parquet")
+    tracks = pl.read_parquet(file)
+    truth, reference = (tracks.filter(estimator=name).sort("stamp_ns") for name in ("truth", "reference"))
+    return truth.join(reference, on="stamp_ns", how="semi"), reference.join(truth, on="stamp_ns", how="semi")
 
 
-def _scored(found: SideslipReference, drive: ScoredDrive, least_speed_m_s: float, seconds: float) -> Figures:
-    steps = steps_at([found], drive.signals.stamps_ns)
-    vx, vy = steps.values[:, 0], steps.values[:, 1]
-    beta = np.arctan2(drive.vy_m_s, drive.vx_m_s)
-    error = np.degrees(np.angle(np.exp(1j * (np.arctan2(vy, vx) - beta))))
-    std = np.degrees(sideslip_std(vx, vy, steps.covariance))
-    used = (drive.vx_m_s > least_speed_m_s) & np.isfinite(error)
-    valid = used & steps.valid
+def motion_of(folder: Path) -> Motion:
+    """Return the motion of a recorded drive from the ground truth of a run."""
+    (file,) = folder.glob("logs/*/estimates.parquet")
+    truth = pl.read_parquet(file).filter(estimator="truth").sort("stamp_ns")
+    stamps = truth["stamp_ns"].to_numpy()
+    vx, vy, rate = (truth[n].to_numpy() for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
+    return Motion(stamps, vx, vy, np.cumsum(np.nan_to_num(rate) * np.gradient(stamps * 1e-9)), np.zeros(len(stamps)))
+
+
+def scored_run(folder: Path, case: Case, vehicle: dict[str, Any]) -> Figures:
+    """Return the figures of the reference of a run."""
+    (report,) = (r["reference"] for r in reports(folder).values())
+    truth, reference = tracks_of(folder)
+    vx, vy = (truth[n].to_numpy() for n in ("vx_m_s", "vy_m_s"))
+    if case.fault == AT_ANTENNA:
+        (antenna,) = (p["value"] for p in report["parameters"] if p["name"] == "antenna x")
+        vy = vy + (vehicle.get("truth_position_m", (0.0,))[0] - antenna) * truth["yaw_rate_rad_s"].to_numpy()
+    beta = np.degrees(np.arctan2(vy, vx))
+    error = (np.degrees(reference["sideslip_rad"].to_numpy()) - beta + 180.0) % 360.0 - 180.0
+    std = np.degrees(reference["sideslip_std_rad"].to_numpy())
+    used = (vx > case.least_speed_m_s) & np.isfinite(error)
+    valid = used & reference["valid"].to_numpy()
 
     def rms(values: FloatArray) -> float:
         return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
 
-    return Figures(
-        truth=rms(np.degrees(beta[used])),
-        rmse=rms(error[used]),
-        std=rms(std[used]),
-        coverage=float(np.mean(np.abs(error[used]) < NORMAL_95 * std[used])),
-        valid_share=float(valid.sum() / used.sum()),
-        valid_rmse=rms(error[valid]),
-        used_gnss=found.with_gnss,
-        refused=found.refused,
-        seconds=seconds,
-    )
+    covered = float(np.mean(np.abs(error[used]) < NORMAL_95 * std[used]))
+    of_valid = float(valid.sum() / max(used.sum(), 1)), rms(error[valid])
+    refused = str(report["refused"] or "")
+    return Figures(rms(beta[used]), rms(error[used]), rms(std[used]), covered, *of_valid, report["gnss"], refused)
+
+
+def rankings(folder: Path, errors: dict[str, float]) -> tuple[int, int, int, int]:
+    """Return ``pairs`` of :class:`Figures`; ``errors``: RMSE against ground truth by estimator."""
+    rows = pl.read_parquet(folder / "metrics.parquet").filter(metric="reference_further", segment="all")
+    ranked = {f"{a}~{b}": errors[a] - errors[b] for a, b in combinations([n for n in RANKED if n in errors], 2)}
+    claims = {pair: value for pair, value in rows.select("estimator", "value").iter_rows() if pair in ranked}
+    agreed = sum(claim * ranked[pair] > 0.0 for pair, claim in claims.items())
+    clear = [pair for pair, value in ranked.items() if abs(value) > CLEAR_DEG]
+    return len(claims), agreed, len(clear), sum(pair in claims for pair in clear)
 
 
 PAGE = """# Sideslip reference against ground truth
@@ -453,7 +422,6 @@ Pairs of {ranked} on the drives above with GNSS, ranked by the reference where i
 ## Targets
 {targets}
 
-An hour of driving takes {hour} s of processor time with GNSS, {hour_alone} s without ({basis} s per simulated 300 s).
 `studies/results/reference/cases.json` contains all figures.
 """
 _HEAD = ("drive", "GNSS", "true RMS", "RMSE", "±", "coverage", "valid", "RMSE there", "refused")
@@ -495,8 +463,6 @@ def page(results: dict[str, Figures]) -> str:
         for c, f in done
         if c.target_deg is not None
     ]
-    hour = {c.gnss: 12.0 * f.seconds for c, f in done if c.title == "road, 300 s"}
-    with_doppler, alone = hour.get(MADE, math.nan), hour.get(NONE, math.nan)
     return PAGE.format(
         made=MADE,
         late=1e3 * LATE_S,
@@ -521,16 +487,14 @@ def page(results: dict[str, Figures]) -> str:
         simulated=table(_HEAD, simulated),
         faults=table(("fault", *_HEAD), faults),
         targets=table(("drive", "target", "RMSE", "reached"), targets),
-        hour=number(with_doppler, 0),
-        hour_alone=number(alone, 0),
-        basis=number(with_doppler / 12.0, 1),
     )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compute the cases that are not stored yet, and write the page."""
     parser = options("reference", __doc__)
-    parser.add_argument("--cases", default="", help="only those whose name contains one of these, comma-separated")
+    parser.add_argument("--cases", default="", help="parts of names of cases, comma-separated")
+    parser.add_argument("--work", type=Path, default=ROOT / "out" / "reference")
     parser.add_argument("--out", type=Path, default=DOCS)
     parser.add_argument("--results", type=Path, default=RESULTS / "reference")
     given = parser.parse_args(arguments)
@@ -538,20 +502,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stored: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     wanted = given.cases.split(",")
     source = input_digest(ROOT, [f"{folder}/**/*.py" for folder in ("pdhef_logtool", "truthsim", "studies")])
-    drives: dict[str, ScoredDrive] = {}
+    tool = Tool(ROOT, given.work.resolve())
     for case in cases():
-        key = digest([repr(case), source, Path(__file__).read_text(encoding="utf-8")])
+        key = hashlib.sha256(f"{case!r} {source}".encode()).hexdigest()
         if not any(w in case.name for w in wanted) or stored.get(case.name, {}).get("key") == key:
             continue
         if case.log and not (DRIVES / case.log).exists():
             continue
-        if (drive := drives.get(case.log or repr(case.spec))) is None:
-            drive = recorded_drive(_peer(case.log)) if case.spec is None else simulated_drive(case.spec)
-            drives = {case.log or repr(case.spec): drive}
         print(case.name, file=sys.stderr)
-        stored[case.name] = {"key": key, **asdict(figures(case, drive))}
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(file, (json.dumps(stored, indent=1) + "\n").encode())
+        stored[case.name] = {"key": key, **asdict(figures(case, tool))}
+        write(file, json.dumps(stored, indent=1) + "\n")
     names = {case.name for case in cases()}
     results = {n: Figures(**{k: v for k, v in s.items() if k != "key"}) for n, s in stored.items() if n in names}
     write(given.out / "reference.md", page(results))

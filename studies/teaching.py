@@ -5,7 +5,7 @@
 ``pdhef learn`` teaches; ``pdhef run`` calibrates the car on the sensors of the scored drive, without ground truth.
 Columns: ``physics`` of the untaught car, of the taught car, and ``pd-hef`` of the taught car with its residual, also of
 a car that the sideslip reference taught, where it is independent, in place of ground truth. The drives are in
-``../shared`` and may not be redistributed. Without them, the command ends with 0 and writes nothing.
+``../shared`` and may not be redistributed. Without them, the command ends with 0 and writes no file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_
 RESULTS_FILE = RESULTS / "teaching.json"
 #: No pair may be worse than untaught by more than the larger of this share and this many degrees.
 WORSE_SHARE, WORSE_DEG = 0.05, 0.03
-#: Driving counts as alike where the residual is active on so much of it.
+#: Driving counts as alike where the residual is active on this share of it.
 ALIKE = 0.5
 #: The paper's network, trained in simulation, in the sigma points of the paper's filter.
 PAPER = "pd-hef-paper"
@@ -52,7 +52,7 @@ class TeachPart:
 
 @dataclass(frozen=True, slots=True)
 class TeachCar:
-    """A car: its parts; pairs of them, in which one or several teach; the drive whose vehicle file all have."""
+    """A car: its parts; pairs of them, in which one or several teach."""
 
     name: str
     parts: tuple[TeachPart, ...]
@@ -131,7 +131,7 @@ class PairResult:
 
     @property
     def ratio(self) -> float:
-        """RMSE of ``pd-hef`` of the taught car over that of untaught ``physics``."""
+        """RMSE of ``pd-hef`` of the taught car over the RMSE of untaught ``physics``."""
         return self.hybrid.rmse_deg / self.untaught.rmse_deg
 
     @property
@@ -160,14 +160,10 @@ def inputs(tool: Tool, part: TeachPart, *, receiver: bool = False, truth: bool =
 
 
 def learn(tool: Tool, car: Path, parts: Sequence[TeachPart], name: str) -> tuple[Path, str]:
-    """Teach a car on parts, one after the other, as ``pdhef learn`` does; return it and its residual."""
-    by_span: dict[tuple[str | None, str | None], list[TeachPart]] = {}
-    for part in parts:
-        by_span.setdefault((part.start, part.end), []).append(part)
+    """Teach a car on parts; return it and the name of its residual."""
     output = tool.work / "cars" / name
-    (same_span,) = by_span.values()  # one call has one slice
-    _, *options_of = inputs(tool, same_span[0])
-    tool.json("learn", *(DRIVES / part.log for part in same_span), *options_of, "--car", car, "-o", output, "--fresh")
+    _, *options_of = inputs(tool, parts[0])  # parts that teach together have the same mapping and slice
+    tool.json("learn", *(DRIVES / part.log for part in parts), *options_of, "--car", car, "-o", output, "--fresh")
     taught = json.loads((output / "taught.json").read_text(encoding="utf-8"))
     return output, (taught.get("residual") or {}).get("rung", "none")
 
@@ -187,18 +183,18 @@ def learn_by_reference(tool: Tool, car: Path, part: TeachPart, name: str) -> Pat
 def scores(tool: Tool, part: TeachPart, car: Path, names: Sequence[str], *options_of: str) -> dict[str, Score]:
     """Run estimators on a part, calibrated on its own sensors, and return their scores."""
     run_name = f"{car.stem}-{part.name}{''.join(options_of)}".replace(" ", "-")
-    given = ("--car", car, "--keep", "estimates", "--estimators", ",".join(names), *options_of)
-    folder = tool.run(run_name, *inputs(tool, part), *given)
+    given = ["--keep", "estimates", "--estimators", ",".join(names), *options_of]
+    folder = tool.run(run_name, *inputs(tool, part), "--car", car, *given)
     figures = pl.read_parquet(folder / "metrics.parquet").filter(signal="sideslip_rad", segment="all")
     (file,) = folder.glob("logs/*/estimates.parquet")
     tracks = pl.read_parquet(file)
     found = {}
     for name in names:
         of = dict(figures.filter(estimator=name).select("metric", "value").iter_rows())
-        trust = tracks.filter(estimator=name)["network_trust"].fill_null(0.0).fill_nan(0.0)
+        trust = tracks.filter(estimator=name)["network_trust"].to_numpy()
         constant = math.sqrt(max(of["rmse"] ** 2 - of["bias"] ** 2, 0.0))
         degrees = math.degrees(of["rmse"]), math.degrees(constant)
-        found[name] = Score(*degrees, float((trust > 0.0).mean() or 0.0), of.get("coverage95"))
+        found[name] = Score(*degrees, float(np.mean(trust > 0.0)), of.get("coverage95"))
     return found
 
 

@@ -120,7 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class Session:
-    """One call: the tool, the frozen figures, and what was measured."""
+    """One call: the tool, the frozen and the measured figures."""
 
     def __init__(self, tool: Tool, frozen: dict[Key, Frozen], commit: str | None) -> None:
         self.tool, self.frozen, self.commit = tool, frozen, commit

@@ -30,9 +30,8 @@ from studies.pages import DRIVES, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 from studies.torture.mutating import mutant
 from studies.torture.seeds import write_seeds
-from truthsim.batch import DriveSpec
 from truthsim.conditions import ROWS
-from truthsim.drive import write_drive
+from truthsim.drive import simulate_drive, write_drive
 from truthsim.sensors import SensorNoise
 
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_logs"
@@ -139,7 +138,7 @@ QUICK_DRIVES = ("gti_pole_aa.mcap", "v40_slalom.mcap", "f1tenth_xray_0.bag")
 
 
 def recorded_rows() -> Iterator[GateRow]:
-    """Yield the recorded drives; those of the V40 also with their GNSS receiver."""
+    """Yield the recorded drives, and the drives of the V40 again with their GNSS receiver."""
     for drive in PEER_DRIVES:
         sets = (QUICK, FULL) if drive.log in QUICK_DRIVES else (FULL,)
         yield GateRow("recorded drives", drive.log, sets, partial(recorded, drive, False))
@@ -170,16 +169,13 @@ def simulated_log(
     if not log.is_file():
         log.parent.mkdir(parents=True, exist_ok=True)
         manoeuvre, speed, friction, duration_s = spec
-        write_drive(
-            DriveSpec(manoeuvre, speed, friction, seed, duration_s, amplitude=1.0).simulate(),
-            log,
-            steering_wheel=steering_wheel,
-        )
+        drive = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration_s)
+        write_drive(drive, log, steering_wheel=steering_wheel)
     return log
 
 
 def bare_vehicle() -> dict[str, Any]:
-    """Return the vehicle file of the saloon without what was validated for it."""
+    """Return the vehicle file of the saloon without its validation data."""
     document = tomllib.loads((SAMPLES / "vehicle.toml").read_text(encoding="utf-8"))
     return {name: value for name, value in document.items() if name != "network"}
 
@@ -213,9 +209,9 @@ PLUS_MINUS_DRIVES = (
 
 
 def plus_minus(seeds: range, tool: Tool) -> Figures:
-    """Return RMS of error over standard deviation of what the tool estimates of the saloon with wrong vehicle files."""
-    right, noise, scores = bare_vehicle(), SensorNoise(), dict[str, list[float]]()
-    true = true_values(right, noise.imu_x_m, noise.rtk_x_m, noise.rtk_heading_offset_rad)
+    """Return the RMS normalized error of the estimated parameters of the saloon with wrong vehicle files."""
+    right, scores = bare_vehicle(), dict[str, list[float]]()
+    true = true_values(right, SensorNoise().imu_x_m)
     for seed in seeds:
         log = simulated_log(
             tool, "plus-minus", PLUS_MINUS_DRIVES[seed % len(PLUS_MINUS_DRIVES)], seed, steering_wheel=True
@@ -244,7 +240,7 @@ def plus_minus_rows() -> Iterator[GateRow]:
 
 
 def mistakes(log: str, kinds: tuple[tuple[str, str], ...], tool: Tool) -> Figures:
-    """Count what the checks of ``inspect`` state of mistakes in a mapping."""
+    """Count the verdicts of the checks of ``inspect`` on mistakes in a mapping."""
     path, folder = SAMPLES / log, tool.work / "mappings"
 
     def look(log: Path, mapping: Path) -> list[dict[str, Any]]:
@@ -269,7 +265,7 @@ def mistake_rows() -> Iterator[GateRow]:
 
 
 def strangers(only: tuple[str, ...], tool: Tool) -> Figures:
-    """Count what becomes of the signals of logs of unknown layout."""
+    """Count the recognised and the wrong signals of logs of unknown layout."""
     name = f"strangers-{len(only)}"
     kept = tool.work / f"{name}.json"
     chosen = ("--only", *only) if only else ()
@@ -412,7 +408,7 @@ def files_and_keys(tool: Tool) -> Figures:
 
 
 def keys(document: dict[str, Any], depth: int) -> Iterator[str]:
-    """Yield the paths of the keys of a document down to a depth; of a list, those of its first entry."""
+    """Yield the paths of the keys of a document down to a depth, and of the first entry of a list."""
     for name, value in document.items():
         yield name
         inner = value[0] if isinstance(value, list) and value else value

@@ -84,7 +84,7 @@ def coverage_percent(run: Path, estimator: str) -> float:
         & (pl.col("metric") == "coverage95")
         & (pl.col("estimator") == estimator)
     )
-    return 100.0 * float((rows["value"] * rows["n"]).sum() / rows["n"].sum()) if len(rows) else float("nan")
+    return 100.0 * float(np.average(rows["value"], weights=rows["n"])) if len(rows) else float("nan")
 
 
 def reports(run: Path) -> dict[str, dict[str, Any]]:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pdhef_logtool.estimators.reference.drive import ReferencePrior
-from pdhef_logtool.records.signals import Signals
+from pdhef_logtool import inspect_log
 from studies import reference as study
 from studies.pages import DOCS, RESULTS
 
@@ -17,13 +16,9 @@ N = 6000
 T = np.arange(N) * 0.01
 
 
-def _drive():
-    nan = np.full(N, np.nan)
+def motion() -> study.Motion:
     stamps = np.rint(T * 1e9).astype(np.int64)
-    signals = Signals(
-        stamps, stamps, nan, np.zeros(N), 0.2 * np.sin(T), np.full(N, 0.1), nan, nan, np.full((N, 4), np.nan)
-    )
-    return study.ScoredDrive(signals, ReferencePrior(1.5, 2.7), np.full(N, 20.0), np.full(N, 0.4), 0.1 * T, np.zeros(N))
+    return study.Motion(stamps, np.full(N, 20.0), np.full(N, 0.4), 0.1 * T, np.zeros(N))
 
 
 def test_names_of_cases_are_unique_and_all_are_stored_and_on_the_page():
@@ -36,27 +31,29 @@ def test_names_of_cases_are_unique_and_all_are_stored_and_on_the_page():
 
 
 def test_a_made_receiver_has_its_rate_and_error_and_the_velocity_of_the_antenna():
-    drive = _drive()
-    receiver = study.Receiver(10.0, 0.05, 0.02, 5.0)
-    made = study.with_gnss(drive, receiver).gnss_velocity_m_s
-    sampled = np.isfinite(made).all(axis=1)
-    assert sampled.sum() == pytest.approx(N / 10, abs=1)
+    stamps, made = study.made_gnss(motion(), study.Receiver(10.0, 0.05, 0.02, 5.0))
+    assert len(stamps) == pytest.approx(N / 10, abs=1)
     rate = 0.1
     forward = 20.0 - study.ANTENNA_M[1] * rate
     left = 0.4 + study.ANTENNA_M[0] * rate
-    error = np.hypot(*made[sampled].T) - np.hypot(forward, left)
+    error = np.hypot(*made.T) - np.hypot(forward, left)
     assert abs(error.mean()) < 0.02
     assert 0.03 < error.std() < 0.08
 
 
-def test_faults_change_gnss_or_the_imu_where_they_say():
-    signals = study.with_gnss(_drive(), study.RECEIVERS[study.MADE])
-    outage = study.FAULTS["no GNSS from 20 to 40 s"](signals).gnss_velocity_m_s
-    inside = (T >= 20.0) & (T < 40.0)
-    assert np.isnan(outage[inside]).all()
-    np.testing.assert_array_equal(outage[~inside], signals.gnss_velocity_m_s[~inside])
-    jumped = study.FAULTS["multipath of 0.5 m/s from 20 to 25 s"](signals).gnss_velocity_m_s
-    difference = np.hypot(*(jumped - signals.gnss_velocity_m_s).T)
-    assert np.nanmax(difference) == pytest.approx(0.5)
-    level = replace(signals, ax_m_s2=np.zeros(N), ay_m_s2=np.zeros(N))
-    assert study.FAULTS["IMU turned and tilted by 2°"](level).ay_m_s2 == pytest.approx(0.342, abs=1e-3)
+def test_faults_change_gnss_where_they_say():
+    stamps, sound = study.made_gnss(motion(), study.RECEIVERS[study.MADE])
+    with_outage, _ = study.made_gnss(motion(), study.RECEIVERS[study.MADE], study.OUTAGE)
+    absent = np.setdiff1d(stamps, with_outage) * 1e-9
+    assert (absent.min(), absent.max()) == (pytest.approx(20.0, abs=0.11), pytest.approx(39.9, abs=0.11))
+    _, jumped = study.made_gnss(motion(), study.RECEIVERS[study.MADE], study.MULTIPATH)
+    assert np.hypot(*(jumped - sound).T).max() == pytest.approx(0.5)
+
+
+def test_added_gnss_is_read_as_a_topic_of_the_log(sample_logs_dir: Path, tmp_path: Path) -> None:
+    log = sample_logs_dir / "step.mcap"
+    start = inspect_log(log).to_dict()["start_ns"]
+    stamps = start + np.arange(20, dtype=np.int64) * 100_000_000
+    copy = study.add_gnss(log, tmp_path / "copy.mcap", stamps, np.full((20, 2), 3.0))
+    before, after = ({t["name"]: t["messages"] for t in inspect_log(p).to_dict()["topics"]} for p in (log, copy))
+    assert after == before | {study.GNSS_TOPIC: 20}
