@@ -125,6 +125,6 @@ def test_train(tmp_path: Path) -> None:
 def test_every_name_of_the_api_is_tested_or_takes_no_file() -> None:
     tested = {"read_drive", "inspect_log", "load_mapping", "Car", "RunConfig", "ReadOptions", "run", "train"}
     tested |= {"learn", "extract"}
-    of_drives = {"choose", "estimate", "estimate_windows", "score", "Drive"}
+    of_drives = {"choose", "estimate", "score", "Drive"}
     settings = {name for name in pdhef.__all__ if name.endswith("Settings")}
     assert set(pdhef.__all__) == tested | of_drives | settings | {"PdhefError", "Reporter", "Schedule", "__version__"}
