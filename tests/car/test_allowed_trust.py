@@ -7,16 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+from made_models import random_network
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FilterNoise, Fit, FittedValues, Trust
 from pdhef_logtool.car.toml_files import load_vehicle, part_toml, vehicle_toml
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
-from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.results.parquet_sink import read_track
 from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.runs.config import RunConfig
@@ -25,20 +23,12 @@ from pdhef_logtool.runs.fleet import run_logs
 EVIDENCE = "a gain on one drive: 0.41° at trust 0, 0.33° at 0.5"
 
 
-def _bundle(seed: int = 0) -> ModelBundle:
-    torch.manual_seed(seed)
-    n = len(FEATURES)
-    network = ResidualNetwork(Architecture(n, 8, 1, (4,)))
-    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
-    return ModelBundle(FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * n, (10.0,) * n, (1.0, 1.0)), weights)
-
-
 def _car(bundle: ModelBundle | None = None, **entries: object) -> Car:
-    return Car.of(default_vehicle(), network=bundle or _bundle(), trust=Trust(**entries))  # type: ignore[arg-type]
+    return Car.of(default_vehicle(), network=bundle or random_network(), trust=Trust(**entries))  # type: ignore[arg-type]
 
 
 def test_a_car_without_evidence_gets_none() -> None:
-    bare = Car.of(default_vehicle(), network=_bundle())
+    bare = Car.of(default_vehicle(), network=random_network())
     for car in (bare, _car(trust_cap=1.0), _car(trust_cap=0.5, evidence=" None ")):
         allowed = car.allowed_trust
         assert allowed.cap == 0.0
@@ -48,18 +38,18 @@ def test_a_car_without_evidence_gets_none() -> None:
 
 @pytest.mark.parametrize("cap", [0.0, 0.25, 0.5, 1.0])
 def test_evidence_counts_for_its_network(cap: float) -> None:
-    allowed = _car(trust_cap=cap, evidence=EVIDENCE, network_sha256=_bundle().sha256).allowed_trust
+    allowed = _car(trust_cap=cap, evidence=EVIDENCE, network_sha256=random_network().sha256).allowed_trust
     assert (allowed.cap, allowed.reason) == (cap, EVIDENCE)
     assert allowed.note == f"residual gain {cap:g}: {EVIDENCE}"
-    for bundle in (_bundle(), _bundle(1)):  # by hand
+    for bundle in (random_network(), random_network(1)):  # by hand
         assert _car(bundle, trust_cap=cap, evidence=EVIDENCE).allowed_trust.cap == cap
 
 
 def test_another_network_needs_evidence_of_its_own() -> None:
-    other = _bundle(1)
-    allowed = _car(other, trust_cap=1.0, evidence=EVIDENCE, network_sha256=_bundle().sha256).allowed_trust
+    other = random_network(1)
+    allowed = _car(other, trust_cap=1.0, evidence=EVIDENCE, network_sha256=random_network().sha256).allowed_trust
     assert allowed.cap == 0.0
-    assert _bundle().sha256[:12] in allowed.reason
+    assert random_network().sha256[:12] in allowed.reason
     assert other.sha256[:12] in allowed.reason
     assert EVIDENCE not in allowed.reason
 
@@ -67,7 +57,7 @@ def test_another_network_needs_evidence_of_its_own() -> None:
 def test_other_physics_or_noise_need_evidence_of_their_own() -> None:
     car = _car()
     found = dict(zip(("physics_sha256", "noise_sha256"), car.tried_with, strict=True))
-    tried = _car(trust_cap=1.0, evidence=EVIDENCE, network_sha256=_bundle().sha256, **found)
+    tried = _car(trust_cap=1.0, evidence=EVIDENCE, network_sha256=random_network().sha256, **found)
     assert tried.allowed_trust.cap == 1.0
     fit = Fit(physics_sha256=car.physics_sha256, values=FittedValues(friction=0.5))
     assert "no evidence" in tried.with_fit(fit).allowed_trust.reason
@@ -90,7 +80,7 @@ def test_the_entries_survive_the_part(tmp_path: Path) -> None:
 
 
 def test_only_pd_hef_heeds_the_cap() -> None:
-    model = _bundle()
+    model = random_network()
     for car in (_car(), _car(trust_cap=0.25, evidence=EVIDENCE, network_sha256=model.sha256)):
         assert make_estimator("pd-hef:gain=1", car).trust == 1.0  # type: ignore[attr-defined]
         assert make_estimator("pd-hef:fixed-r", car).trust == 1.0  # type: ignore[attr-defined]
@@ -106,7 +96,7 @@ def test_the_report_says_the_cap_and_why(
 
     from pdhef_logtool.cli.run_tables import render_run
 
-    model = _bundle()
+    model = random_network()
     model.save(tmp_path / "model")
     text = vehicle_toml(load_vehicle(sample_logs_dir / "vehicle.toml"))
     tried = Trust(trust_cap=0.25, evidence=EVIDENCE, network_sha256=model.sha256)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_models import random_network
 from reference_car import cut, drive, slalom, tanh_tyre, with_noise
 
 from pdhef_logtool.car.car import Car
@@ -21,10 +20,7 @@ from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.table import Options, make_estimator
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
-from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
-from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.residual_model.service import NetworkService
 
 pytestmark = pytest.mark.slow
@@ -35,20 +31,8 @@ COMPARED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2", "co
 ADAPTIVE = (*COMPARED, "mixture_weight", "reason")
 
 
-def _bundle(output: tuple[float, float] | None = None) -> ModelBundle:
-    torch.manual_seed(0)
-    network = ResidualNetwork(Architecture(len(FEATURES), 8, 1, (4,)))
-    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
-    if output is not None:
-        last = max(k for k in weights if k.startswith("head") and k.endswith("bias"))
-        weights[last.replace("bias", "weight")][:] = 0.0
-        weights[last][:] = output
-    n = len(FEATURES)
-    return ModelBundle(FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * n, (10.0,) * n, (1.0, 1.0)), weights)
-
-
-NETWORK = NetworkService(_bundle())
-SILENT = NetworkService(_bundle((0.0, 0.0)))
+NETWORK = NetworkService(random_network())
+SILENT = NetworkService(random_network(constant=(0.0, 0.0)))
 
 
 #: As a car that was identified: a single track with the cures and the noise that it was found with.
@@ -268,7 +252,7 @@ def test_the_mixture_has_the_moments_of_its_samples():
 
 
 def test_trust_scales_the_network_in_all_filters(made):
-    wrong = NetworkService(_bundle((0.5, 0.2)))
+    wrong = NetworkService(random_network(constant=(0.5, 0.2)))
     signals = noisy(made)
     a, _ = run_window(adaptive(wrong, trust=0.0), signals)
     b, _ = run_window(adaptive(SILENT, trust=1.0), signals)
@@ -288,20 +272,6 @@ def test_its_noise_comes_from_the_car():
 
 
 # --- windows, causality, symmetry ------------------------------------------------------------------------------------
-
-
-@settings(derandomize=True, deadline=None, max_examples=15)
-@given(st.lists(st.integers(0, 701), max_size=8))
-def test_windows_of_any_cut_join_bit_for_bit(rough, inner):
-    estimator = adaptive(NETWORK)
-    whole, _ = run_window(estimator, rough)
-    parts, carry = [], None
-    for first, end in pairwise([0, *sorted(inner), len(rough)]):
-        track, carry = run_window(estimator, cut(rough, first, end), carry)
-        parts.append(track)
-    assert same(concatenate(parts), whole, ADAPTIVE)
-    assert whole.reason.any()
-    assert len(whole.mixture_weight) == len(whole)
 
 
 @settings(derandomize=True, deadline=None, max_examples=15)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from pdhef_logtool.estimators.calibration.joint import FRONT_STIFFNESS, REAR_STI
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator, runnable
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.frames import estimate, score
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, read_driving, self_calibrated
@@ -107,18 +106,6 @@ def test_without_steering_a_y_and_yaw_rate_there_is_no_estimate(road: WholeDrive
     track, within = physics_of(drive), np.flatnonzero(gap)
     assert not track.valid[within[-1] - 500 : within[-1]].any()
     assert track.valid[within[-1] + 100 :].all()
-
-
-def test_windows_change_no_bit_while_the_steering_is_unknown(road: WholeDrive) -> None:
-    drive, gap = with_gap(road, "steer_rad")
-    estimator, state, parts = make_estimator("physics", Car.of(default_vehicle())), None, []
-    cuts = [0, *(np.flatnonzero(gap)[0] + np.array([3, 500, 1200])), np.flatnonzero(gap)[-1] + 2, len(drive.signals)]
-    for first, last in pairwise(cuts):
-        track, state = run_window(estimator, drive.signals.rows(int(first), int(last)), state)
-        parts.append(track)
-    joined, whole = concatenate(parts), run_window(estimator, drive.signals)[0]
-    np.testing.assert_array_equal(joined.sideslip_rad, whole.sideslip_rad)
-    np.testing.assert_array_equal(joined.sideslip_std_rad, whole.sideslip_std_rad)
 
 
 def test_a_log_without_steering_keeps_the_prior_of_its_car(sample_logs_dir: Path) -> None:

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference_car import cut, drive, slalom, with_noise
+from made_models import linear_residual
+from reference_car import drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.parts import FilterNoise
@@ -23,26 +24,8 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.ladder import SPEED_NONE, LadderModel
-from pdhef_logtool.residual_model.slow_features import EVEN_COUNT, ODD_COUNT
 
 SEDAN = default_vehicle()
-
-
-def model(weight: float = 0.01, fastest_m_s: float = 40.0) -> LadderModel:
-    """Return a residual of the low-passed yaw rate over 0.3, valid up to a speed."""
-    weights = [0.0] * ODD_COUNT
-    weights[5] = weight
-    return LadderModel(
-        rung="linear",
-        scale=(0.3,) * ODD_COUNT,
-        even_mean=(20.0,) * EVEN_COUNT,
-        even_scale=(5.0,) * EVEN_COUNT,
-        weights=tuple(weights),
-        factor=tuple((0.001,) for _ in range(ODD_COUNT)),
-        whitening=tuple(tuple(map(float, 1e-4 * row)) for row in np.eye(ODD_COUNT)),
-        speed_m_s=(5.0, fastest_m_s),
-        largest_rad=0.1,
-    )
 
 
 def taught_car(residual: LadderModel | None, *, calibrated: bool = False) -> Car:
@@ -65,7 +48,9 @@ def track_of(name: str, car: Car, *parts: Signals) -> list[StateTrack]:
 
 
 def test_a_residual_of_zero_is_physics_bit_for_bit(signals: Signals) -> None:
-    (physics,), (hybrid,) = (track_of(name, taught_car(model(0.0)), signals) for name in ("physics", "pd-hef"))
+    (physics,), (hybrid,) = (
+        track_of(name, taught_car(linear_residual(0.0)), signals) for name in ("physics", "pd-hef")
+    )
     assert np.array_equal(hybrid.vx_m_s, physics.vx_m_s, equal_nan=True)
     assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
     assert np.allclose(hybrid.vy_m_s, physics.vy_m_s, atol=1e-12, equal_nan=True)
@@ -73,12 +58,12 @@ def test_a_residual_of_zero_is_physics_bit_for_bit(signals: Signals) -> None:
 
 
 def test_a_smoother_takes_the_prior_and_says_why_not_the_residual() -> None:
-    assert FILTER_ALONE in make_estimator("pd-hef-smoothed", taught_car(model())).notes
+    assert FILTER_ALONE in make_estimator("pd-hef-smoothed", taught_car(linear_residual())).notes
     assert FILTER_ALONE not in make_estimator("pd-hef-smoothed", taught_car(None)).notes
 
 
 def test_the_residual_is_added_and_widens_the_interval(signals: Signals) -> None:
-    (physics,), (hybrid,) = (track_of(name, taught_car(model()), signals) for name in ("physics", "pd-hef"))
+    (physics,), (hybrid,) = (track_of(name, taught_car(linear_residual()), signals) for name in ("physics", "pd-hef"))
     added = hybrid.sideslip_rad - physics.sideslip_rad
     late = slice(200, None)
     assert np.nanmax(np.abs(added[late])) > 0.003
@@ -89,18 +74,8 @@ def test_the_residual_is_added_and_widens_the_interval(signals: Signals) -> None
     assert np.array_equal(hybrid.yaw_rate_rad_s, physics.yaw_rate_rad_s, equal_nan=True)
 
 
-@pytest.mark.parametrize("at", [1, 250, 401])
-def test_windows_do_not_change_a_bit(signals: Signals, at: int) -> None:
-    car = taught_car(model())
-    (whole,) = track_of("pd-hef", car, signals)
-    parts = track_of("pd-hef", car, cut(signals, 0, at), cut(signals, at, len(signals)))
-    for name in ("vy_m_s", "sideslip_rad", "sideslip_std_rad", "network_trust"):
-        joined = np.concatenate([getattr(part, name) for part in parts])
-        assert np.array_equal(joined, getattr(whole, name), equal_nan=True)
-
-
 def test_it_is_causal(signals: Signals) -> None:
-    estimator, check = make_estimator("pd-hef", taught_car(model())), CausalityCheck()
+    estimator, check = make_estimator("pd-hef", taught_car(linear_residual())), CausalityCheck()
     assert isinstance(estimator, CorrectedPhysics) and estimator.causal
     run_window(estimator, signals, causality=check)
     later = replace(signals, yaw_rate_rad_s=np.where(np.arange(len(signals)) > 300, 0.0, signals.yaw_rate_rad_s))
@@ -109,7 +84,7 @@ def test_it_is_causal(signals: Signals) -> None:
 
 
 def test_beyond_the_taught_speed_it_is_physics(signals: Signals) -> None:
-    car = taught_car(model(fastest_m_s=10.0))
+    car = taught_car(linear_residual(fastest_m_s=10.0))
     (physics,), (hybrid,) = (track_of(name, car, signals) for name in ("physics", "pd-hef"))
     assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
     assert np.nanmax(hybrid.network_trust) == 0.0
@@ -120,7 +95,7 @@ def test_two_seconds_after_the_taught_region_it_is_physics_again(signals: Signal
     step_ns = int(signals.stamps_ns[-1] - signals.stamps_ns[0]) + 10_000_000
     moved = {name: getattr(fast, name) + step_ns for name in ("stamps_ns", "ready_ns")}
     fast = replace(fast, friction=np.full(len(fast), 0.85), **moved)
-    car = taught_car(model(fastest_m_s=21.0))
+    car = taught_car(linear_residual(fastest_m_s=21.0))
     inside, outside = track_of("pd-hef", car, signals, fast)
     _, physics = track_of("physics", car, signals, fast)
     assert np.nanmean(inside.network_trust > 0.0) > 0.5
@@ -132,20 +107,22 @@ def test_two_seconds_after_the_taught_region_it_is_physics_again(signals: Signal
 def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(signals: Signals) -> None:
     calibration = WithoutTruth(SEDAN, FilterNoise(r_std={"ay_m_s2": 1.0}), True, "calibrated")
     for calibrated in (False, True):
-        car = taught_car(model(), calibrated=calibrated)
+        car = taught_car(linear_residual(), calibrated=calibrated)
         plain, of_log = (make_estimator("pd-hef", c) for c in (car, replace(car, self_calibrated=calibration)))
         assert isinstance(of_log, SelfCalibrated)
         assert isinstance(plain, CorrectedPhysics) is not calibrated
         assert isinstance(of_log.estimator, CorrectedPhysics) is calibrated
         without = of_log.estimator if not calibrated else plain
         assert any("residual gain 0" in note for note in without.notes)  # type: ignore[attr-defined]
-    (track,) = track_of("pd-hef", replace(taught_car(model(), calibrated=True), self_calibrated=calibration), signals)
+    (track,) = track_of(
+        "pd-hef", replace(taught_car(linear_residual(), calibrated=True), self_calibrated=calibration), signals
+    )
     assert np.nanmax(track.network_trust) == 1.0
 
 
 def test_a_car_without_a_residual_or_with_a_named_gain_does_not_take_it() -> None:
     assert not isinstance(make_estimator("pd-hef", taught_car(None)), CorrectedPhysics)
-    assert not isinstance(make_estimator("pd-hef", taught_car(model()), Options(trust=0.0)), CorrectedPhysics)
+    assert not isinstance(make_estimator("pd-hef", taught_car(linear_residual()), Options(trust=0.0)), CorrectedPhysics)
 
 
 def test_a_taught_prior_moves_mean_and_width_of_the_calibration() -> None:

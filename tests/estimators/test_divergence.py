@@ -7,7 +7,6 @@ import json
 import math
 from contextlib import closing
 from dataclasses import fields, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +23,13 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_v
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive.plan import plan_drive
 from pdhef_logtool.drive.recorded import read_recorded
-from pdhef_logtool.estimators.divergence import DivergenceState, DivergenceWatch, wrong_branch
+from pdhef_logtool.estimators.divergence import watched_track, wrong_branch
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
+from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.results.run_report import diverged_line, report_markdown
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
@@ -183,39 +182,20 @@ def test_what_comes_later_changes_no_flag() -> None:
     np.testing.assert_array_equal(part, whole[:end])
 
 
-@settings(deadline=None, max_examples=20)
-@given(borders=st.lists(st.integers(0, 1200), max_size=6), delay_ms=st.integers(0, 300))
-def test_windows_change_no_bit(borders: list[int], delay_ms: int) -> None:
-    signals, truth = motion(delay_ns=delay_ms * 1_000_000)
-    wrong = off_by(truth, 9.0, 5.0, 8.0)
-    whole, last = wrong_branch(wrong, signals, VEHICLE)
-    parts: list[np.ndarray] = []
-    carry: DivergenceState | None = None
-    for a, b in pairwise([0, *sorted(borders), len(signals)]):
-        found, carry = wrong_branch(_cut_track(wrong, a, b), cut(signals, a, b), VEHICLE, carry)
-        parts.append(found)
-    assert whole.any()
-    np.testing.assert_array_equal(np.concatenate(parts), whole)
-    assert carry is not None
-    np.testing.assert_array_equal(carry.memory, last.memory)
-
-
 def test_the_watch_adds_to_what_an_estimator_says_itself_and_leaves_those_without_a_covariance() -> None:
     signals, truth = motion()
     own = np.zeros(len(signals), dtype=np.bool_)
     own[:10] = True
     wrong = replace(off_by(truth, 20.0, 5.0, 7.0), diverged=own)
-    watch = DivergenceWatch(VEHICLE)
-    parts = [watch.add(_cut_track(wrong, a, b), cut(signals, a, b)) for a, b in ((0, 555), (555, len(signals)))]
-    np.testing.assert_array_equal(concatenate(parts).diverged, own | flags(wrong, signals))
+    np.testing.assert_array_equal(watched_track(wrong, signals, VEHICLE).diverged, own | flags(wrong, signals))
     plain = replace(wrong, covariance=np.empty((0, 3, 3)))
-    assert DivergenceWatch(VEHICLE).add(plain, signals) is plain
+    assert watched_track(plain, signals, VEHICLE) is plain
 
 
 def test_an_estimate_that_is_not_valid_is_not_flagged() -> None:
     signals, truth = motion()
     wrong = off_by(truth, 20.0, 5.0, 7.0)
-    assert not DivergenceWatch(VEHICLE).add(replace(wrong, valid=~wrong.valid), signals).diverged.any()
+    assert not watched_track(replace(wrong, valid=~wrong.valid), signals, VEHICLE).diverged.any()
 
 
 @pytest.fixture(scope="module")

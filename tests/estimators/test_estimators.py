@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields, replace
-from itertools import pairwise
+from functools import partial
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference_car import cut, drive, keep, make_signals, rolling_drive, slalom, tanh_tyre, with_noise
+from made_models import full_network, linear_residual
+from reference_car import START_NS, cut, drive, keep, make_signals, rolling_drive, slalom, tanh_tyre, with_noise
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.car.car import Car, WithoutTruth
+from pdhef_logtool.car.parts import FilterNoise, Trust
+from pdhef_logtool.car.taught import Taught
+from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.estimators import latency_compensation
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator, run_window
+from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
+from pdhef_logtool.estimators.smoothed import SmoothedPhysics
 from pdhef_logtool.estimators.table import Options, all_specs, check_names, make_estimator, runnable, spec_of
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.signals import ALIGNED_SIGNALS, TRUTH_UNITS, Signals
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS, GNSS_COMPONENTS, TRUTH_UNITS, Signals
 from pdhef_logtool.records.steps import MAX_PREDICTION_S, released_steps
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.tracks import StateTrack
 
 pytestmark = pytest.mark.slow
 
@@ -80,33 +85,80 @@ def rough() -> Signals:
     return keep(replace(s, ready_ns=ready), (t < 3.0) | (t > 3.8))
 
 
-# --- windows, causality, symmetry ------------------------------------------------------------------------------------
+# --- pieces, causality, symmetry -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", NAMES)
-@settings(derandomize=True, deadline=None, max_examples=25)
-@given(data=st.data())
-def test_windows_of_any_cut_join_bit_for_bit(name, rough, data):
-    inner = data.draw(st.lists(st.integers(0, len(rough)), max_size=12))
-    estimator = make_estimator(name, car_of())
-    whole, _ = run_window(estimator, rough)
-    edges = [0, *sorted(inner), len(rough)]
-    parts, carry = [], None
-    for first, end in pairwise(edges):
-        track, carry = run_window(estimator, cut(rough, first, end), carry)
-        assert len(track) == end - first
-        parts.append(track)
-    same_bits(concatenate(parts), whole)
+def _any_car(**parts) -> Car:
+    """Return a car with all parts of the physics model, and all that an estimator may need."""
+    vehicle = VEHICLE.model_copy(update={"physics": PhysicsParts(**dict.fromkeys(PhysicsParts.model_fields, True))})
+    noise = {"phy-ukf:tuned": NOISE, "physics": NOISE}
+    trust = Trust(trust_cap=1.0, evidence="a drive of 300 s")
+    return replace(Car.of(vehicle, network=full_network(), noise=noise, trust=trust), **parts)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_carry_can_be_used_twice(name, rough):
-    """An estimator is immutable: what it handed out is not changed by running on."""
-    estimator = make_estimator(name, car_of())
-    _, carry = run_window(estimator, cut(rough, 0, 100), None)
-    first, _ = run_window(estimator, cut(rough, 100, 300), carry)
-    again, _ = run_window(estimator, cut(rough, 100, 300), carry)
-    same_bits(first, again)
+def _calibrated(since_s: float = 0.0, **earlier) -> WithoutTruth:
+    vehicle = VEHICLE.model_copy(update={"yaw_inertia_kg_m2": 1700.0, "steer_offset_rad": 0.003 + 0.001 * since_s})
+    return WithoutTruth(vehicle, NOISE, True, "calibrated", since_ns=START_NS + round(since_s * 1e9), **earlier)
+
+
+def _taught() -> Car:
+    car = Car.of(VEHICLE)
+    return replace(car, taught=Taught(physics_sha256=car.physics_sha256, residual=linear_residual()))
+
+
+def _smoothed(block_s: float) -> SmoothedPhysics:
+    smoother = make_estimator("pd-hef-smoothed", _any_car())
+    assert isinstance(smoother, SmoothedPhysics)
+    return replace(smoother, block_s=block_s)
+
+
+#: Every estimator of the table, and every wrapper that an option or a part of the car puts around one.
+EVERY = {
+    **{s.name: partial(make_estimator, s.name, _any_car()) for s in all_specs() if s.name != OPEN_LOOP},
+    OPEN_LOOP: partial(make_estimator, OPEN_LOOP, _any_car(self_calibrated=_calibrated())),
+    "physics without parts": partial(make_estimator, "physics", car_of()),
+    "calibrated": partial(make_estimator, "physics", _any_car(self_calibrated=_calibrated())),
+    "online": partial(
+        make_estimator, "physics", _any_car(self_calibrated=_calibrated(2.0, earlier=(_calibrated(), _calibrated(1.0))))
+    ),
+    "taught": partial(make_estimator, "pd-hef", _taught()),
+    "GNSS": partial(make_estimator, "physics", _any_car(), Options(gnss=True)),
+    "smoothed in short blocks": partial(_smoothed, 0.7),
+}
+
+
+@pytest.fixture(scope="module")
+def faulty(rough) -> Signals:
+    """The same with GNSS, a stuck gyro, a burst, a spike, spinning wheels and a second without steering."""
+    rng = np.random.default_rng(3)
+    t = (rough.stamps_ns - rough.stamps_ns[0]) * 1e-9
+    changed = ("ay_m_s2", "yaw_rate_rad_s", "steer_rad", "speed_m_s")
+    ay, yaw_rate, steer, speed = (getattr(rough, c).copy() for c in changed)
+    yaw_rate[_between(1.2, 2.2)(t)] = 0.06
+    ay[_between(4.0, 4.6)(t)] += 2.4 * rng.standard_normal(int(_between(4.0, 4.6)(t).sum()))
+    ay[np.searchsorted(t, 0.7)] += 8.0
+    speed[_between(2.3, 2.6)(t)] += 6.0
+    steer[_between(4.8, 5.8)(t)] = np.nan
+    velocity = np.full((len(t), 2), np.nan)
+    velocity[::10] = np.stack([np.full(len(t), 22.0), 0.8 * np.sin(t)], axis=1)[::10]
+    gnss = {"gnss_velocity_m_s": velocity, "gnss_velocity_std_m_s": np.full(len(t), 0.05)}
+    columns = dict(zip(changed, (ay, yaw_rate, steer, speed), strict=True))
+    available = rough.available | GNSS_COMPONENTS
+    return replace(rough, **columns, **gnss, gnss_late_s=np.full(len(t), 0.12), available=available)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_pieces_equal_the_whole_bit_for_bit(name, faulty, monkeypatch):
+    """A piece also leaves the state alone that it continues from: an estimator is immutable."""
+    estimator = EVERY[name]()
+    whole = run_estimator(estimator, faulty)
+    assert whole.valid.any()
+    for size in (37, 210):
+        monkeypatch.setattr(latency_compensation, "PIECE_STEPS", size)
+        same_bits(run_estimator(estimator, faulty), whole)
+    _, state = run_window(estimator, faulty.rows(0, 100), None, faulty.rows(100, 300))
+    again = [run_window(estimator, faulty.rows(100, 300), state, faulty.rows(300, 500))[0] for _ in range(2)]
+    same_bits(*again)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, cut, drive, keep, slalom, tanh_tyre, with_noise
+from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, drive, keep, slalom, tanh_tyre, with_noise
 
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, default_vehicle
 from pdhef_logtool.drive.friction import friction_source, parse_friction
@@ -21,7 +20,6 @@ from pdhef_logtool.records.signals import Signals
 
 pytestmark = pytest.mark.slow
 
-G = 9.80665
 VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
 NO_FRICTION = VEHICLE.model_copy(update={"friction": None})
 STIFFNESS_VEHICLE = VEHICLE.model_copy(
@@ -147,19 +145,6 @@ def rough() -> Signals:
 
 
 ROUGH = rough()
-
-
-@settings(derandomize=True, deadline=None, max_examples=25)
-@given(st.lists(st.integers(0, len(ROUGH)), max_size=8))
-def test_windows_of_any_cut_join_bit_for_bit(inner):
-    bank = FrictionBank(VEHICLE)
-    whole, _ = bank.run(ROUGH, None)
-    parts, carry = [], None
-    for first, end in pairwise([0, *sorted(inner), len(ROUGH)]):
-        part, carry = bank.run(cut(ROUGH, first, end), carry)
-        parts.append(part)
-    for name in ("friction", "std", "observable"):
-        np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in parts]), getattr(whole, name))
 
 
 @settings(derandomize=True, deadline=None, max_examples=20)

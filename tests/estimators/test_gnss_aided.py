@@ -77,17 +77,6 @@ def test_an_accelerometer_that_is_not_where_the_file_has_it_costs_nothing(bare, 
     assert _aided(bare).run(signals, None)[1].aiding.x[2, IMU_X] < -0.5
 
 
-def test_windows_change_no_bit(fishhook, bare):
-    _, signals = fishhook
-    estimator = _aided(bare)
-    whole, _ = estimator.run(signals, None)
-    state, parts = None, None
-    for first, last in ((0, 333), (333, 334), (334, 900), (900, len(signals))):
-        steps, state = estimator.run(signals.rows(first, last), state)
-        parts = steps if parts is None else parts.joined(steps)
-    np.testing.assert_array_equal(parts.aid, whole.aid)
-
-
 @settings(max_examples=8, deadline=None)
 @given(number=st.integers(20, 100), late_s=st.floats(0.0, 0.4))
 def test_a_sample_changes_nothing_before_it_arrives(fishhook, bare, number, late_s):

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference_car import cut, drive, forces, runge_kutta, slalom, with_noise
+from made_models import random_network
+from reference_car import drive, forces, runge_kutta, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
@@ -23,10 +22,8 @@ from pdhef_logtool.estimators.table import check_names, runnable
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
-from pdhef_logtool.records.tracks import concatenate
-from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL, ModelBundle, Normalisation
+from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL, ModelBundle
 from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
-from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
 
 pytestmark = pytest.mark.slow
@@ -35,14 +32,8 @@ VEHICLE = default_vehicle()
 GRAVITY = 9.80665
 
 
-def make_bundle(names: tuple[str, ...] = PAPER_FEATURES, scale: float = 2.0) -> ModelBundle:
-    """Return a small random network whose residuals are of the order of ``scale``."""
-    torch.manual_seed(3)
-    network = ResidualNetwork(Architecture(len(names), 8, 2, (8,)))
-    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
-    size = len(names)
-    normalisation = Normalisation((0.0,) * size, (3.0,) * size, (scale, scale))
-    return ModelBundle(names, 8, 2, (8,), 0.01, normalisation, weights)
+def make_bundle(names: tuple[str, ...] = PAPER_FEATURES) -> ModelBundle:
+    return random_network(3, names, layers=2, head=(8,), scales=(3.0, 2.0))
 
 
 def paper_filter(**options: object) -> PaperHybridUkf:
@@ -233,18 +224,6 @@ def test_it_is_the_papers_equations_in_plain_numpy(weaving):
         np.testing.assert_allclose(got[name], values, rtol=1e-9, atol=1e-9, err_msg=name)
     assert np.ptp(want["beta"][5:]) > 0.5  # the drive goes through the table
     assert np.nanmax(want["r_scale"]) > 5.0
-
-
-def test_windows_join_bit_for_bit(weaving):
-    estimator = paper_filter()
-    whole, _ = run_window(estimator, weaving)
-    carry, parts = None, []
-    for a, b in pairwise((0, 1, 1, 90, 122, 123, 300, len(weaving))):
-        part, carry = run_window(estimator, cut(weaving, a, b), carry)
-        parts.append(part)
-    joined = concatenate(parts)
-    for column in ("vx_m_s", "vy_m_s", "ay_m_s2", "covariance", "network_trust", "r_scale", "nis", "valid"):
-        np.testing.assert_array_equal(getattr(joined, column), getattr(whole, column), err_msg=column, strict=True)
 
 
 def test_it_says_when_the_network_is_not_the_papers():

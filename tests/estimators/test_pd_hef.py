@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
-import torch
+from made_models import random_network
 from physics_oracle import Oracle, parts
 from reference_car import FRICTION
 
@@ -21,10 +20,8 @@ from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.table import make_estimator, runnable
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
-from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack, concatenate
-from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
-from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack
+from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
@@ -33,20 +30,6 @@ pytestmark = pytest.mark.slow
 
 VEHICLE = default_vehicle()
 COMPARED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "covariance", "nis", "valid")
-
-
-def _bundle(constant: tuple[float, float] | None = None) -> ModelBundle:
-    """Return a small network; with ``constant`` one that always says so."""
-    torch.manual_seed(0)
-    network = ResidualNetwork(Architecture(len(FEATURES), 8, 1, (4,)))
-    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
-    if constant is not None:
-        last = max(k for k in weights if k.startswith("head") and k.endswith("bias"))
-        weights[last.replace("bias", "weight")][:] = 0.0
-        weights[last][:] = constant
-    return ModelBundle(
-        FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * len(FEATURES), (10.0,) * len(FEATURES), (1.0, 1.0)), weights
-    )
 
 
 def _signals(count: int = 800, seed: int = 0, speed: float = 25.0) -> Signals:
@@ -66,19 +49,13 @@ def _signals(count: int = 800, seed: int = 0, speed: float = 25.0) -> Signals:
     )
 
 
-def _cut(s: Signals, a: int, b: int) -> Signals:
-    return Signals(
-        **{f.name: getattr(s, f.name)[a:b] for f in fields(Signals) if f.name != "available"}, available=s.available
-    )
-
-
 def _same(a: StateTrack, b: StateTrack) -> bool:
     return all(np.array_equal(getattr(a, c), getattr(b, c), equal_nan=True) for c in COMPARED)
 
 
 def hybrid(*parts: str, network: ModelBundle | None = None, trust: float = 1.0) -> AdaptivePhysics:
     vehicle = VEHICLE.model_copy(update={"physics": PhysicsParts(**dict.fromkeys(parts, True))})
-    return AdaptivePhysics(PhysicsFilter(vehicle), NetworkService(network or _bundle()), trust)
+    return AdaptivePhysics(PhysicsFilter(vehicle), NetworkService(network or random_network()), trust)
 
 
 @pytest.mark.parametrize("parts", [(), ("lag", "roll", "biases", "bank"), tuple(PhysicsParts.model_fields)])
@@ -86,37 +63,12 @@ def test_without_trust_it_is_physics_to_the_bit(parts: tuple[str, ...]) -> None:
     signals = _signals()
     trusted = hybrid(*parts)
     physics, _ = run_window(AdaptivePhysics(trusted.physics, name="physics"), signals)
-    for change in ({"trust": 0.0}, {"network": NetworkService(_bundle((0.0, 0.0)))}):
+    for change in ({"trust": 0.0}, {"network": NetworkService(random_network(constant=(0.0, 0.0)))}):
         track, _ = run_window(replace(trusted, **change), signals)
         for f in fields(StateTrack):
             if f.name not in ("name", "network_trust"):
                 np.testing.assert_array_equal(getattr(track, f.name), getattr(physics, f.name), err_msg=f.name)
     assert not _same(run_window(trusted, signals)[0], physics)
-
-
-def test_windows_join_bit_for_bit() -> None:
-    estimator = hybrid("lag", "roll", "biases", "bank")
-    signals = _signals()
-    whole, _ = run_window(estimator, signals)
-    carry = None
-    parts = []
-    for a, b in pairwise((0, 3, 250, 257, 600, 800)):
-        part, carry = run_window(estimator, _cut(signals, a, b), carry)
-        parts.append(part)
-    assert _same(concatenate(parts), whole)
-
-
-def test_nothing_that_arrives_later_changes_an_output() -> None:
-    estimator = hybrid("lag", "roll")
-    signals = _signals()
-    later = {"ay_m_s2": signals.ay_m_s2.copy(), "steer_rad": signals.steer_rad.copy()}
-    for column in later.values():
-        column[500:] += 0.1
-    before, _ = run_window(estimator, signals)
-    after, _ = run_window(estimator, replace(signals, **later), None)
-    seen = signals.stamps_ns < signals.ready_ns[500]
-    assert np.array_equal(before.vy_m_s[seen], after.vy_m_s[seen], equal_nan=True)
-    assert not np.array_equal(before.vy_m_s, after.vy_m_s, equal_nan=True)
 
 
 def test_a_right_residual_removes_the_error_that_a_missing_force_makes() -> None:
@@ -141,7 +93,7 @@ def test_a_right_residual_removes_the_error_that_a_missing_force_makes() -> None
     )  # fmt: skip
     error = {}
     for trust in (0.0, 0.5, 1.0):
-        track, _ = run_window(hybrid(network=_bundle((force, 0.0)), trust=trust), signals)
+        track, _ = run_window(hybrid(network=random_network(constant=(force, 0.0)), trust=trust), signals)
         error[trust] = float(np.abs(track.vy_m_s - truth[:, 0])[500:].mean())
         if trust == 1.0:
             assert track.ay_m_s2[500:] == pytest.approx(ay[500:], abs=0.003)
@@ -151,7 +103,7 @@ def test_a_right_residual_removes_the_error_that_a_missing_force_makes() -> None
 
 def test_below_the_dynamic_range_the_residual_counts_for_nothing() -> None:
     slow = replace(_signals(speed=1.0), ay_m_s2=np.zeros(800))
-    a, _ = run_window(hybrid(network=_bundle((2.0, 1.0))), slow)
+    a, _ = run_window(hybrid(network=random_network(constant=(2.0, 1.0))), slow)
     b, _ = run_window(hybrid(trust=0.0), slow)
     assert _same(a, b)
 
@@ -176,7 +128,7 @@ def test_it_needs_a_model_and_says_so() -> None:
 
 
 def test_run_with_a_model_writes_its_hash_and_its_estimates(sample_logs_dir: Path, tmp_path: Path) -> None:
-    bundle = _bundle((0.0, 0.0))
+    bundle = random_network(constant=(0.0, 0.0))
     bundle.save(tmp_path / "model")
     names, car = ("pd-hef", "pd-hef:fixed-r"), sample_logs_dir / "vehicle.toml"
     config = RunConfig(car=car, network=tmp_path / "model", estimators=names, annotate="none")

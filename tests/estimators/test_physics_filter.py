@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import combinations, pairwise
+from itertools import combinations
 
 import numpy as np
 import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from physics_oracle import ALL_PARTS, CG_HEIGHT_M, TRACK_M, G, Oracle, names_of, parts, vehicle
 from reference_car import (
     FRICTION,
@@ -19,7 +17,6 @@ from reference_car import (
     REAR_M,
     WHEELBASE_M,
     Drive,
-    cut,
     drive,
     keep,
     magic_tyre,
@@ -61,7 +58,6 @@ from pdhef_logtool.estimators.physics_model import (
 from pdhef_logtool.estimators.table import Options, all_names, make_estimator
 from pdhef_logtool.estimators.unscented import partial_root
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.records.tracks import concatenate
 
 pytestmark = pytest.mark.slow
 
@@ -483,26 +479,6 @@ def test_linked_steps_are_the_steps_and_what_ties_them(names, noisy):
         off = ~np.eye(n, dtype=bool)
         np.testing.assert_allclose(links.predicted_P[k][off], plain[off], rtol=1e-6, atol=1e-10)
         assert (np.diag(links.predicted_P[k]) >= np.diag(plain) - 1e-12).all()
-
-
-COLUMNS = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "covariance", "nis", "valid", "ay_m_s2")
-
-
-@settings(derandomize=True, deadline=None, max_examples=12)
-@given(
-    names=st.sampled_from([(), ("lag",), ("roll", "load_transfer"), ("biases", "bank"), ALL_PARTS]),
-    inner=st.lists(st.integers(0, 721), max_size=6),
-)
-def test_windows_of_any_cut_join_bit_for_bit(noisy, names, inner):
-    estimator = physics_filter(vehicle(*names))
-    whole, _ = run_window(estimator, noisy)
-    found, carry = [], None
-    for first, end in pairwise([0, *sorted(min(i, len(noisy)) for i in inner), len(noisy)]):
-        track, carry = run_window(estimator, cut(noisy, first, end), carry)
-        found.append(track)
-    joined = concatenate(found)
-    for column in COLUMNS:
-        np.testing.assert_array_equal(getattr(joined, column), getattr(whole, column))
 
 
 @pytest.mark.parametrize("names", [(), ALL_PARTS], ids="+".join)

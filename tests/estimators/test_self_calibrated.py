@@ -21,10 +21,9 @@ from pdhef_logtool.estimators.physics_filter import PhysicsFilter, physics_filte
 from pdhef_logtool.estimators.self_calibrated import (
     D2_SHARE,
     OPEN_LOOP,
-    SELF_CALIBRATED,
     SelfCalibrated,
 )
-from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
+from pdhef_logtool.estimators.table import all_names, make_estimator
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -74,10 +73,6 @@ def tracks(name: str, car: Car, *parts: Signals) -> list[StateTrack]:
     return found
 
 
-def test_the_names_are_names_of_estimators() -> None:
-    assert SELF_CALIBRATED | {OPEN_LOOP} <= {s.name for s in SPECS}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["physics", "pd-hef"])
 def test_what_takes_it_is_not_causal_and_says_why(name: str) -> None:
@@ -118,13 +113,6 @@ def test_an_estimated_friction_is_not_taken(signals: Signals) -> None:
     (told,) = tracks(OPEN_LOOP, calibrated(told_friction=False), replace(signals, friction=signals.friction * 0.5))
     (own,) = tracks(OPEN_LOOP, calibrated(), signals)
     np.testing.assert_array_equal(told.vy_m_s, own.vy_m_s)
-
-
-@pytest.mark.parametrize("name", ["physics", OPEN_LOOP])
-def test_windows_change_no_bit(name: str, signals: Signals) -> None:
-    (whole,) = tracks(name, calibrated(), signals)
-    parts = tracks(name, calibrated(), cut(signals, 0, 111), cut(signals, 111, len(signals)))
-    np.testing.assert_array_equal(np.concatenate([p.vy_m_s for p in parts]), whole.vy_m_s)
 
 
 def test_estimators_of_a_run_share_what_their_bands_compare(signals: Signals, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -301,22 +300,6 @@ def rough() -> Signals:
     s.ay_m_s2[(t > 4) & (t < 5)] += 2.0 * rng.standard_normal(int(((t > 4) & (t < 5)).sum()))
     s.ay_m_s2[rng.random(len(t)) < 0.05] = np.nan
     return s
-
-
-@settings(derandomize=True, deadline=None, max_examples=25)
-@given(st.lists(st.integers(0, 701), max_size=10))
-def test_windows_of_any_cut_join_bit_for_bit(rough, inner):
-    whole = found(rough)
-    assert whole.reason.any()
-    parts, carry = [], None
-    for first, end in pairwise([0, *sorted(inner), len(rough)]):
-        part, carry = find_faults(cut(rough, first, end), VEHICLE, carry)
-        parts.append(part)
-    for name in ("extra_r", "noise_std", "reason"):
-        np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in parts]), getattr(whole, name))
-    for name in COLUMNS:
-        got = np.concatenate([getattr(p.network, name) for p in parts])
-        np.testing.assert_array_equal(got, getattr(whole.network, name))
 
 
 @settings(derandomize=True, deadline=None, max_examples=15)

@@ -6,16 +6,13 @@ import io
 import json
 import math
 from dataclasses import fields, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import test_estimators as properties
-import torch
 from filterpy.kalman import KalmanFilter
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from made_models import random_network
 from reference_car import REAR_M, cut, drive, forces, keep, rolling_drive, runge_kutta, slalom, with_noise
 from rich.console import Console
 
@@ -33,19 +30,12 @@ from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.smoothed import SmoothedPhysics, smooth_steps
 from pdhef_logtool.estimators.table import SPECS, make_estimator
 from pdhef_logtool.records.reasons import (
-    BURST_AY,
     BURST_YAW_RATE,
     DEAD_YAW_RATE,
-    MISSING_AY,
-    MISSING_YAW_RATE,
-    SPIKE_AY,
     STUCK_YAW_RATE,
 )
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
-from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
-from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
@@ -57,15 +47,7 @@ ALL = 10**6  # seconds: a block that holds every drive
 NS = 10**9
 
 
-def make_bundle() -> ModelBundle:
-    torch.manual_seed(2)
-    network = ResidualNetwork(Architecture(len(FEATURES), 8, 1, (4,)))
-    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
-    scale = Normalisation((0.0,) * len(FEATURES), (10.0,) * len(FEATURES), (1.0, 1.0))
-    return ModelBundle(FEATURES, 8, 1, (4,), 0.01, scale, weights)
-
-
-BUNDLE = make_bundle()
+BUNDLE = random_network(2)
 
 
 def smoother(
@@ -280,49 +262,6 @@ def stopping() -> Signals:
     """Rolls, stands for three seconds, rolls on."""
     made = rolling_drive(lambda t: 4.0 * np.clip(np.abs(t - 5.5) - 1.5, 0.0, 1.0), lambda t: 0.05 * np.sin(t), 11.0)
     return with_noise(made.signals, seed=2, scale=0.1)
-
-
-def in_windows(estimator: SmoothedPhysics, signals: Signals, edges: list[int]) -> StateTrack:
-    parts, carry = [], None
-    for first, end in pairwise(edges):
-        limit = signals.stamps_ns[end - 1] + round(estimator.look_ahead_s * NS) if end else signals.stamps_ns[-1]
-        until = max(end, int(np.searchsorted(signals.stamps_ns, limit, side="right")))
-        track, carry = run_window(estimator, cut(signals, first, end), carry, cut(signals, end, until))
-        assert len(track) == end - first
-        parts.append(track)
-    return concatenate(parts)
-
-
-@settings(derandomize=True, deadline=None, max_examples=25)
-@given(data=st.data(), block_s=st.sampled_from([0.3, 1.1]))
-def test_windows_of_any_cut_join_bit_for_bit(faulty, data, block_s):
-    inner = data.draw(st.lists(st.integers(0, len(faulty)), max_size=8))
-    estimator = smoother(block_s)
-    whole, _ = run_window(estimator, faulty)
-    kinds = (STUCK_YAW_RATE, BURST_AY, BURST_YAW_RATE, SPIKE_AY, MISSING_AY, MISSING_YAW_RATE)
-    assert all((whole.reason & kind).any() for kind in kinds), "the cuts must fall into faults"
-    properties.same_bits(in_windows(estimator, faulty, [0, *sorted(inner), len(faulty)]), whole)
-
-
-def test_steps_at_once_change_no_bit(faulty, monkeypatch):
-    estimator = smoother(0.4)
-    whole, carry = run_window(estimator, cut(faulty, 0, 400), None, cut(faulty, 400, 600))
-    monkeypatch.setattr(smoothed, "STEPS_AT_ONCE", 37)
-    again, _ = run_window(estimator, cut(faulty, 0, 400), None, cut(faulty, 400, 600))
-    properties.same_bits(again, whole)
-    block = (faulty.stamps_ns - faulty.stamps_ns[0]) // round(0.4 * NS)
-    ahead = int(np.searchsorted(block[:600], block[399] + 2)) - 400
-    state = carry.estimator
-    assert len(state.shared) == ahead > 0, "what was filtered ahead is kept, and no more than is needed"
-    assert state.ahead[-1][0].posterior.stamps_ns[-1] == faulty.stamps_ns[399 + ahead]
-
-
-def test_a_carry_can_be_used_twice(faulty):
-    estimator = smoother(0.4)
-    _, carry = run_window(estimator, cut(faulty, 0, 100), None, cut(faulty, 100, 250))
-    first, _ = run_window(estimator, cut(faulty, 100, 400), carry)
-    again, _ = run_window(estimator, cut(faulty, 100, 400), carry)
-    properties.same_bits(first, again)
 
 
 def test_it_sees_one_to_two_blocks_ahead_and_no_further(rough):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
+from made_models import full_network
 from reference_car import drive, make_signals, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
@@ -43,17 +43,6 @@ from pdhef_logtool.estimators.table import (
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.residual_model.bundle import (
-    LATERAL_VELOCITY,
-    NOMINAL_MODEL,
-    PHYSICS_MODEL,
-    RESIDUAL,
-    ModelBundle,
-    Normalisation,
-)
-from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
-from pdhef_logtool.residual_model.linear_model import LinearModel
-from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.runs.estimating import calibrator
 
 pytestmark = pytest.mark.slow
@@ -66,27 +55,7 @@ LINES = tuple(s for s in all_specs() if s.name != OPEN_LOOP)
 every_spec = pytest.mark.parametrize("spec", LINES, ids=lambda spec: spec.name)
 
 
-def make_network(target: str = RESIDUAL, names: tuple[str, ...] = FEATURES, seed: int = 1) -> ModelBundle:
-    torch.manual_seed(seed)
-    outputs = 2 if target == RESIDUAL else 1
-    network = ResidualNetwork(Architecture(len(names), 8, 1, (4,), outputs=outputs))
-    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
-    normalisation = Normalisation((0.0,) * len(names), (5.0,) * len(names), (1.0,) * outputs)
-    model = PHYSICS_MODEL if target == RESIDUAL and names != PAPER_FEATURES else NOMINAL_MODEL
-    return ModelBundle(names, 8, 1, (4,), 0.01, normalisation, weights, target=target, model=model)
-
-
-def make_model(seed: int = 1) -> ModelBundle:
-    """Return a network with all baselines beside it."""
-    return replace(
-        make_network(seed=seed),
-        pure_lstm=make_network(LATERAL_VELOCITY, seed=seed),
-        linear_regression=LinearModel(("ay_m_s2", "physics_vy_m_s"), (-0.001 * seed, 0.9 / 22.0), 0.0, 2.0),
-        paper_network=make_network(names=PAPER_FEATURES, seed=seed),
-    )
-
-
-MODEL = make_model()
+MODEL = full_network()
 #: It has all that any estimator needs.
 CAR = Car.of(VEHICLE, network=MODEL, noise={"phy-ukf:tuned": NOISE, "physics": NOISE}, trust=EVIDENCE)
 
@@ -265,7 +234,7 @@ def test_the_name_of_a_car_changes_no_algorithm_and_its_physics_do(spec: Any) ->
 
 @every_spec
 def test_another_network_is_another_basis_of_what_has_one(spec: Any) -> None:
-    was, is_now = ran(spec.name), ran(spec.name, replace(CAR, network=make_model(2)))
+    was, is_now = ran(spec.name), ran(spec.name, replace(CAR, network=full_network(2)))
     assert (was.network_sha256 is None) == (not spec.network)
     assert (was.sha256 != is_now.sha256) == (was.network_sha256 != is_now.network_sha256) == bool(spec.network)
     assert was.identity == is_now.identity
@@ -313,7 +282,7 @@ def with_intervals(car: Car, intervals: Intervals, signals: Signals) -> tuple[fl
     estimator = make_estimator("pd-hef", car)
     track, _ = run_window(estimator, signals)
     applied = calibrator(replace(car, intervals=intervals), [estimator])
-    ratio = applied.add(track, signals).sideslip_std_rad / track.sideslip_std_rad
+    ratio = applied.apply(track, signals).sideslip_std_rad / track.sideslip_std_rad
     return float(np.nanmedian(ratio)), applied.notes("pd-hef")
 
 
@@ -352,5 +321,5 @@ def test_trust_changes_no_physics_so_that_the_notes_of_other_filters_stay(signal
     for car in (BARE, CAR):
         estimator = make_estimator("phy-ukf", car)
         applied = calibrator(replace(car, intervals=entries), [estimator])
-        applied.add(run_window(estimator, signals)[0], signals)
+        applied.apply(run_window(estimator, signals)[0], signals)
         assert applied.notes("phy-ukf") == ("intervals calibrated on car for friction and vehicle as given",)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_models import random_network
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import LearntOn
@@ -39,9 +39,6 @@ from pdhef_logtool.learning.stages.gain import errors_by_trust, seen_by_identifi
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
-from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.runs.config import RunConfig
 from tests.command_line import called
@@ -240,22 +237,14 @@ def test_leaving_hard_stamps_out_gains_nothing() -> None:
 # ---- the command ----
 
 
-def _bundle(seed: int = 0) -> ModelBundle:
-    torch.manual_seed(seed)
-    n = len(FEATURES)
-    network = ResidualNetwork(Architecture(n, 8, 1, (4,)))
-    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
-    return ModelBundle(FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * n, (10.0,) * n, (1.0, 1.0)), weights)
-
-
 def _settings(sample_logs_dir: Path, folder: Path, **changes: object) -> LearnSettings:
-    _bundle().save(folder / "model")
+    random_network().save(folder / "model")
     config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=folder / "model")
     return replace(LearnSettings(config=config, stage="gain"), **changes)  # type: ignore[arg-type]
 
 
 def test_the_errors_are_those_of_pd_hef_at_each_trust(sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    vehicle, bundle = load_vehicle(sample_logs_dir / "vehicle.toml"), _bundle()
+    vehicle, bundle = load_vehicle(sample_logs_dir / "vehicle.toml"), random_network()
     car = Car.of(vehicle, network=bundle)
     drive = load_drive(find_logs([str(sample_logs_dir / "dlc.mcap")])[0], car, None, ReadOptions())[1]
     assert drive is not None and drive.truth is not None
@@ -291,7 +280,7 @@ def test_the_file_is_the_one_that_was_given_but_for_the_network(sample_logs_dir:
     found, part = result.figures, after.trust
     assert part is not None
     assert (part.trust_cap, part.evidence) == (found["trust_cap"], found["evidence"])
-    assert part.network_sha256 == found["network_sha256"] == _bundle().sha256
+    assert part.network_sha256 == found["network_sha256"] == random_network().sha256
     assert after.allowed_trust.cap == found["trust_cap"]
     assert part.has_evidence
     for figure in (f"{found['rmse_deg'][0]:.3f}°", f"{found['rmse_deg'][4]:.3f}°", "2 drives"):
@@ -301,7 +290,7 @@ def test_the_file_is_the_one_that_was_given_but_for_the_network(sample_logs_dir:
     assert record["trust_cap"] == found["trust_cap"]
     assert [d["name"] for d in record["drives"]] == ["dlc", "step"]
     assert record["drives"][0]["sha256"]
-    assert record["network_sha256"] == _bundle().sha256
+    assert record["network_sha256"] == random_network().sha256
     # Once more, onto itself: the old evidence is replaced.
     again = replace(options, config=replace(options.config, car=tmp_path / "trusted"))
     learn(logs[:2], tmp_path / "trusted", again)
@@ -313,7 +302,7 @@ def test_a_folder_gets_a_copy_of_the_network_that_was_tried(sample_logs_dir: Pat
     result = learn([str(sample_logs_dir / "dlc.mcap")], tmp_path / "mycar", options)
     shutil.rmtree(tmp_path / "model")
     car = Car.load(tmp_path / "mycar")
-    assert car.network is not None and car.network.sha256 == _bundle().sha256
+    assert car.network is not None and car.network.sha256 == random_network().sha256
     assert car.trust is not None and car.trust.evidence == result.figures["evidence"]
     assert car.trust.physics_sha256 == car.physics_sha256
     assert car.allowed_trust.reason == car.trust.evidence
@@ -380,7 +369,7 @@ def test_wrong_options_are_usage_errors(sample_logs_dir: Path, tmp_path: Path) -
 
 
 def test_the_command_prints_a_table_or_json(sample_logs_dir: Path, tmp_path: Path) -> None:
-    _bundle().save(tmp_path / "model")
+    random_network().save(tmp_path / "model")
     words = ["learn", sample_logs_dir / "dlc.mcap", "--stages", "gain", "--car", sample_logs_dir / "vehicle.toml",
              "--network", tmp_path / "model", "-o", tmp_path / "car"]  # fmt: skip
     shown = called(*words)

@@ -173,20 +173,6 @@ def test_unknown_features_have_gain_zero_and_the_next_ones_go_on() -> None:
     assert np.all(np.isfinite(found.residual_rad)) and np.mean(found.gain[60:] > 0.0) > 0.5
 
 
-@pytest.mark.parametrize("cut", [1, 57, 199])
-def test_windows_do_not_change_a_bit(cut: int) -> None:
-    signals, dt = driving(4.0, 9), np.full(200, 0.02)
-    dt[0] = np.nan
-    whole, _ = slow_features(signals, dt, None)
-    first, memory = slow_features(signals[:cut], dt[:cut], None)
-    second, _ = slow_features(signals[cut:], dt[cut:], memory)
-    for name in ("odd", "even"):
-        assert np.array_equal(np.concatenate([getattr(first, name), getattr(second, name)]), getattr(whole, name))
-    model = random_model()
-    joined = np.concatenate([model.evaluate(part).residual_rad for part in (first, second)])
-    assert np.array_equal(joined, model.evaluate(whole).residual_rad)
-
-
 def test_the_sums_of_blocks_give_the_weighted_ridge_regression_of_the_samples() -> None:
     rng = np.random.default_rng(4)
     phi, error, ridge = rng.normal(size=(300, 5)) + 0.4, rng.normal(size=300) + 2.0, 3.0

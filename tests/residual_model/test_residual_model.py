@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray
@@ -180,25 +177,6 @@ def test_weights_of_another_shape_are_refused(tmp_path: Path) -> None:
     replace(make_bundle(), hidden=32).save(tmp_path)
     with pytest.raises(ModelError, match="architecture"):
         load_bundle(tmp_path)
-
-
-@settings(derandomize=True, max_examples=15, deadline=None)
-@given(st.lists(st.integers(0, 900), max_size=6), st.lists(st.integers(0, 899), max_size=4))
-def test_windows_and_restarts_join_bit_for_bit(cuts: list[int], starts_at: list[int]) -> None:
-    service = NetworkService(make_bundle())
-    rng = np.random.default_rng(1)
-    features = rng.normal(size=(900, len(FEATURES)))
-    features[400:410, 3] = np.nan
-    starts = np.zeros(900, dtype=np.bool_)
-    starts[starts_at] = True
-    whole, _ = service.run(features, starts, None)
-    carry = None
-    parts = []
-    edges = sorted({0, 900, *cuts})
-    for a, b in pairwise(edges):
-        part, carry = service.run(features[a:b], starts[a:b], carry)
-        parts.append(part)
-    np.testing.assert_array_equal(np.concatenate(parts), whole)
 
 
 def test_a_restart_forgets_and_unknown_rows_give_nothing() -> None:
