@@ -226,6 +226,8 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
         summary = summarise(open_run(result.output), result.exit_code, checks_failed)
         console.show(replace(summary, output=result.place or summary.output), render_fleet, as_json)
     else:
+        if not as_json:  # the tables read the reports; a copy of all metric rows for the terminal would be unused
+            result = replace(result, results=tuple(replace(entry, figures=()) for entry in result.results))
         console.show(result, render_run, as_json)
         for entry in result.results:
             if entry.outcome.failed is not None and entry.report is not None:  # of the others the tables state it

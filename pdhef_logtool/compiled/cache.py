@@ -25,6 +25,7 @@ from typing import Any
 
 import numba
 from numba.core import caching, config
+from numba.core.runtime import rtsys
 from numba.extending import overload
 from numba.misc.appdirs import AppDirs
 from numba.np import arrayobj, linalg
@@ -177,7 +178,9 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
     def load_overload(self, signature: Any, context: Any) -> Any:
         overload = None
         try:
-            overload = super().load_overload(signature, context)
+            # Numba's method declares every function that new code can call; cached code needs its runtime only.
+            rtsys.initialize(context)
+            overload = self._load_overload(signature, context)
         except Exception:  # noqa: BLE001 (any error of a pickle that was cut short)
             with contextlib.suppress(OSError):
                 self.flush()
