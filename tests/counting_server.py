@@ -37,7 +37,6 @@ class CountingServer:
     ranges: bool = True
     without: frozenset[str] = frozenset()
     url: str = ""
-    _now: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def place(self, path: str) -> str:
