@@ -208,9 +208,7 @@ class _Copy:
                 async with session.get(self._system.encode_url(place.url)) as empty:
                     yield *self._compared(empty.headers), empty.content.iter_chunked(1 << 20)
                 return
-            if response.status not in (200, 206):
-                kind = ConnectionError if response.status >= 500 else _ERRORS.get(response.status, OSError)
-                raise kind(f"status {response.status}")
+            _check_status(response.status)
             yield *self._compared(response.headers), response.content.iter_chunked(1 << 20)
 
     def _compared(self, head: Mapping[str, Any]) -> tuple[int | None, int]:
@@ -292,9 +290,16 @@ def _words_of(error: Exception) -> tuple[str, str, bool]:
     return *words_of(error), False
 
 
-#: Errors by status. Timeouts, too many requests and restarts (5xx) are temporary, like a lost connection.
-_ERRORS: dict[int, type[OSError]] = dict.fromkeys((408, 425, 429), ConnectionError)
-_ERRORS |= dict.fromkeys((401, 403, 407), PermissionError) | dict.fromkeys((404, 410), FileNotFoundError)
+def _check_status(status: int) -> None:
+    """Raise the error of a status without content; timeouts, too many requests and restarts are temporary."""
+    if status in (408, 425, 429) or status >= 500:
+        raise ConnectionError(f"status {status}")
+    if status in (401, 403, 407):
+        raise PermissionError(f"status {status}")
+    if status in (404, 410):
+        raise FileNotFoundError(f"status {status}")
+    if status not in (200, 206):
+        raise OSError(f"status {status}")
 
 
 def _file_system(place: RemotePlace) -> Any:
