@@ -37,8 +37,6 @@ class CountingServer:
     ranges: bool = True
     without: frozenset[str] = frozenset()
     url: str = ""
-    most_at_once: int = 0
-    _now: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def place(self, path: str) -> str:
@@ -72,15 +70,10 @@ class _Handler(BaseHTTPRequestHandler):
         of, path = self.of, self.path.split("?")[0].lstrip("/")
         with of._lock:
             n = sum(r.path == path for r in of.requests)
-            of._now += 1
-            of.most_at_once = max(of.most_at_once, of._now)
         try:
             self._answer(path, n)
         except (BrokenPipeError, ConnectionResetError):
             self.close_connection = True
-        finally:
-            with of._lock:
-                of._now -= 1
 
     def _answer(self, path: str, n: int) -> None:
         of = self.of
@@ -193,15 +186,5 @@ def stalling(seconds: float) -> Fault:
         time.sleep(seconds)
         handler.close_connection = True
         return True
-
-    return fault
-
-
-def slow(seconds: float) -> Fault:
-    """Answer late, and well."""
-
-    def fault(_: _Handler, __: int) -> bool:
-        time.sleep(seconds)
-        return False
 
     return fault

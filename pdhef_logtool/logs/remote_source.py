@@ -31,8 +31,8 @@ AT_ONCE = 4
 #: Waits before a request is repeated, and timeouts. S3 requests are repeated by its library.
 WAITS_S = (0.5, 1.0, 2.0, 4.0)
 CONNECT_S, SILENCE_S = 15.0, 30.0
-#: Copies of closed objects that are kept for the next opening, so that no pass over the same log fetches it again.
-KEPT_BYTES, KEPT_COPIES = 4 << 30, 100
+#: Copies of closed objects that are kept, so that the next pass over the same log does not fetch it again.
+KEPT_COPIES = 4
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(\d+)")
 
 
@@ -62,8 +62,8 @@ class RemoteSource(ByteSource):
         return self._copy.read(offset, min(offset + size, self.size))
 
     def held_size(self, offset: int, size: int) -> int:
-        """See :class:`ByteSource`."""
-        return self._copy.held_to(offset, offset + size) - offset
+        """Return the bytes up to the end of the block: a read fetches whole blocks."""
+        return min(size, BLOCK_BYTES - offset % BLOCK_BYTES)
 
     def prefetch(self, extents: Iterable[tuple[int, int]]) -> None:
         """See :class:`ByteSource`."""
@@ -139,13 +139,6 @@ class _Copy:
         self.wait(start, end)
         with self._lock:
             return read_at(self._file, start, end - start, end)
-
-    def held_to(self, start: int, end: int) -> int:
-        """Return up to where, at most to ``end``, bytes from ``start`` on are in the file."""
-        reached = start
-        while reached < end and (request := self.blocks.get(reached // BLOCK_BYTES)) is not None and request.done():
-            reached = (reached // BLOCK_BYTES + 1) * BLOCK_BYTES
-        return min(reached, end)
 
     def is_current(self) -> bool:
         """Return whether the object is the one that was copied, and no request for it has failed."""
@@ -351,6 +344,6 @@ def _release(copy: _Copy) -> None:
         if copy.users:
             return
         copy.cancel()
-        idle = [c for c in _copies.values() if not c.users]
-        while len(idle) > KEPT_COPIES or sum(len(c.blocks) for c in idle) * BLOCK_BYTES > KEPT_BYTES:
-            del _copies[idle.pop(0).place]
+        idle = [c.place for c in _copies.values() if not c.users]
+        while len(idle) > KEPT_COPIES:
+            del _copies[idle.pop(0)]

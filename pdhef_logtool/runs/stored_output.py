@@ -8,7 +8,6 @@ and all files at the end of the run.
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,9 +23,8 @@ from pdhef_logtool.storage.files import open_new, scratch_folder
 from pdhef_logtool.storage.object_store import HeldError, Mirror, ObjectFolder
 from pdhef_logtool.workers.supervisor import Tell
 
-#: Interval of the upload of the journal; longer if the upload takes more than a twentieth of the time.
+#: Interval between two uploads of the journal.
 EVERY_S = 30.0
-_SHARE = 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,9 +180,7 @@ class StoredOutput(Mirror):
 
     def _keep(self) -> None:
         """Renew the lock and upload the journal until the end; temporary failures of the store are ignored."""
-        wait_s = EVERY_S
-        while not self._ended.wait(wait_s):
-            began = time.monotonic()
+        while not self._ended.wait(EVERY_S):
             try:
                 self.objects.renew()
                 self._put_journal()
@@ -193,4 +189,3 @@ class StoredOutput(Mirror):
                 return
             except OutputError:
                 pass
-            wait_s = max(EVERY_S, _SHARE * (time.monotonic() - began))

@@ -6,7 +6,6 @@ import dataclasses
 import random
 import struct
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,7 @@ from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.logs.remote_source import RemoteSource
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError, UsageError
 from tests.camera_log import with_camera, write_apart
-from tests.counting_server import CountingServer, cutting, serving, slow, stalling, status
+from tests.counting_server import CountingServer, cutting, serving, stalling, status
 
 pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
 
@@ -90,17 +89,6 @@ def test_any_split_gives_the_same_bytes_and_none_twice(reads: list[tuple[int, in
 
 
 # -------------------------------------------------------------------------------------------------- the same log
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["dlc.mcap", "faults.mcap", "no_truth.mcap"])
-def test_same_as_the_file_and_each_byte_once(sample_logs_dir: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote_source, "MOST_RANGE_BYTES", 30_000)
-    file = sample_logs_dir / name
-    with serving(**{name: file.read_bytes()}) as server:
-        assert _read(_place(server, name)) == _read(file)
-        assert server.twice() == 0
-        assert server.bytes_sent == file.stat().st_size
 
 
 @pytest.mark.slow
@@ -188,32 +176,14 @@ def test_a_drive_apart_from_its_camera_costs_its_chunks_alone(
         assert hashes[0] == hashes[1]
 
 
-def _stale_index(data: bytes) -> bytes:
-    """Return a log whose summary claims one message more than there is; its CRC is right again."""
-    import zlib
-
-    foot = len(data) - 8 - 29
-    start = int.from_bytes(data[foot + 9 : foot + 17], "little")
-    summary, at = bytearray(data[start:foot]), 0
-    while at < len(summary):
-        opcode, length = summary[at], int.from_bytes(summary[at + 1 : at + 9], "little")
-        if opcode == 0x0B:
-            summary[at + 9] += 1
-        at += 9 + length
-    footer = data[foot : foot + 25]
-    crc = struct.pack("<I", zlib.crc32(footer, zlib.crc32(bytes(summary))))
-    return data[:start] + bytes(summary) + footer + crc + data[-8:]
-
-
 @pytest.mark.parametrize(
     "spoil",
     [
         lambda data: data[: len(data) * 2 // 3],
         lambda data: data[:-40],
         lambda data: data[:50_000] + bytes(64) + data[50_064:],
-        _stale_index,
     ],
-    ids=["cut", "no footer", "damaged", "wrong statistics"],
+    ids=["cut", "no footer", "damaged"],
 )
 def test_a_damaged_log_loses_the_same(tmp_path: Path, sample_logs_dir: Path, spoil: Callable[[bytes], bytes]) -> None:
     file = tmp_path / "damaged.mcap"
@@ -244,16 +214,6 @@ def test_other_formats_are_fetched_once_as_a_whole(tmp_path: Path, sample_logs_d
             file.write_bytes(data)
             assert _read(_place(server, name)) == _read(file)
         assert server.twice() == 0
-
-
-def test_several_ranges_at_once_but_not_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote_source, "MOST_RANGE_BYTES", remote_source.BLOCK_BYTES)
-    with serving(x=bytes(20 * remote_source.BLOCK_BYTES)) as server:
-        server.fault = slow(0.5)
-        source = RemoteSource(_place(server, "x"))
-        source.fetch_whole()
-        source.close()
-        assert server.most_at_once == remote_source.AT_ONCE
 
 
 def test_a_server_without_ranges_gives_all_at_once(sample_logs_dir: Path) -> None:
@@ -394,16 +354,6 @@ def test_identity_is_url_size_and_etag(served: CountingServer) -> None:
     assert identity_of(signed) == first
     served.files["dlc.mcap"] += b"x"
     assert identity_of(log) != first
-
-
-def test_identities_are_asked_for_in_threads(served: CountingServer) -> None:
-    served.files |= {f"{i}.mcap": bytes([i]) * 5000 for i in range(30)}
-    logs = find_logs([served.place(f"{i}.mcap") for i in range(30)] * 2)
-    with ThreadPoolExecutor(8) as threads:
-        found = list(threads.map(identity_of, [*logs, *logs]))
-    assert found[:30] == found[30:]
-    assert len(set(found)) == 30
-    assert served.bytes_sent <= 60
 
 
 def test_urls_lists_and_files_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_logs_dir: Path) -> None:

@@ -18,7 +18,7 @@ from pdhef_logtool.results.opened_run import JOURNAL_FILE, METRICS_FILE, open_ru
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.working import DriveEnd, DriveTask
 from pdhef_logtool.storage import object_store
-from pdhef_logtool.storage.object_store import LEFT_OVER_S, HeldError, ObjectFolder
+from pdhef_logtool.storage.object_store import LEFT_OVER_S, HeldError
 from pdhef_logtool.storage.outputs import LOCK_FILE
 from pdhef_logtool.workers.supervisor import Tell
 from tests.runs.stub_drives import stub_drive
@@ -209,21 +209,6 @@ def test_what_has_lost_its_hold_ends(tmp_path: Path, memory: Any, monkeypatch: p
         run(logs, URL, work=taken)
     assert memory.cat_file(lock) == b"00000000-17-1", "it is theirs"
     memory.rm(lock)
-
-
-def test_the_hold_is_renewed_again_and_again(tmp_path: Path, memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pdhef_logtool.runs.stored_output.EVERY_S", 0.01)
-    renewals, renew = [], ObjectFolder.renew
-    monkeypatch.setattr(ObjectFolder, "renew", lambda self: (renewals.append(1), renew(self))[1])
-
-    def patient(task: DriveTask, tell: Tell) -> DriveEnd:
-        give_up = time.monotonic() + 300.0
-        while len(renewals) < 3 and time.monotonic() < give_up:
-            time.sleep(0.01)
-        return stub_drive(task, tell)
-
-    run(named_logs(tmp_path / "logs", "a"), URL, work=patient)
-    assert len(renewals) >= 3
 
 
 @pytest.mark.slow
