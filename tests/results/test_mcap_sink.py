@@ -16,7 +16,7 @@ from written import as_written
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.reasons import REASONS
-from pdhef_logtool.records.tracks import concatenate, make_track
+from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.results.mcap_sink import (
     AnnotatedMcapSink,
     _twist_covariance,
@@ -368,26 +368,6 @@ def test_topics_of_an_earlier_run_go(tmp_path, annotated, circle):
     }
 
 
-def test_in_place(source, circle):
-    annotate(source, source, circle)
-    annotate(source, source, circle)
-    assert {topic for topic, *_ in messages(source)} == set(TOPICS)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("windows", [1, 3, 10])
-def test_content_does_not_depend_on_windows(tmp_path, source, circle, windows):
-    annotate(tmp_path / "a.mcap", source, circle, windows)
-    annotate(tmp_path / "b.mcap", source, circle, 2)
-    assert messages(tmp_path / "a.mcap") == messages(tmp_path / "b.mcap")
-
-
-def test_same_input_gives_the_same_bytes(tmp_path, source, circle):
-    annotate(tmp_path / "a.mcap", source, circle)
-    annotate(tmp_path / "b.mcap", source, circle)
-    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
-
-
 def test_sidecar_holds_our_topics_alone(tmp_path, circle):
     path = tmp_path / "sidecar.mcap"
     annotate(path, None, circle)
@@ -470,39 +450,6 @@ def test_two_estimators_never_share_a_topic(tmp_path, circle):
     with pytest.raises(OutputError, match="different topics"):
         sink.append(circle("pd_hef"))
     sink.abort()
-
-
-def test_nothing_stands_under_the_final_name_before_finish(tmp_path, source, circle):
-    path = tmp_path / "out" / "annotated.mcap"
-    log = open_log(source)
-    sink = AnnotatedMcapSink(path, log)
-    sink.append(circle("zero"))
-    sink.append(circle("zero", 200))
-    assert not path.exists()
-    sink.abort()
-    sink.abort()
-    assert list(path.parent.iterdir()) == []
-    sink = AnnotatedMcapSink(path, log)
-    sink.append(circle("zero"))
-    with pytest.raises(KeyError):
-        sink.finish({})
-    assert list(path.parent.iterdir()) == []
-    sink = AnnotatedMcapSink(path, log)
-    sink.finish(REPORT)
-    sink.abort()
-    log.close()
-    assert [p.name for p in path.parent.iterdir()] == ["annotated.mcap"]
-
-
-def test_unwritable_place_is_one_line(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="expected a place to write to"):
-        AnnotatedMcapSink(tmp_path / "file" / "annotated.mcap", None)
-
-
-def test_a_track_of_all_windows_equals_the_joined_one(circle):
-    joined = concatenate([circle("zero", 0, 300), circle("zero", 300, 300)])
-    np.testing.assert_array_equal(joined.sideslip_rad, circle("zero", 0, 600).sideslip_rad)
 
 
 def test_the_pose_of_what_is_not_shown_first_stands_20_times_a_second_however_windows_fall(tmp_path, circle):

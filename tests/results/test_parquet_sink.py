@@ -16,72 +16,43 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, SHARE_COLUMNS, concatenate, make_track
 from pdhef_logtool.results.parquet_sink import EstimatesSink, list_estimators, read_metrics, read_track, write_metrics
 
-ESTIMATE_COLUMNS = {
-    "stamp_ns": pl.Int64,
-    "estimator": pl.Categorical,
-    "vx_m_s": pl.Float64,
-    "vy_m_s": pl.Float64,
-    "yaw_rate_rad_s": pl.Float64,
-    "sideslip_rad": pl.Float64,
-    "ay_m_s2": pl.Float64,
-    "x_m": pl.Float64,
-    "y_m": pl.Float64,
-    "yaw_rad": pl.Float64,
-    "vx_std_m_s": pl.Float64,
-    "vy_std_m_s": pl.Float64,
-    "yaw_rate_std_rad_s": pl.Float64,
-    "sideslip_std_rad": pl.Float64,
-    "network_trust": pl.Float64,
-    "r_scale": pl.Float64,
-    "nis": pl.Float64,
-    "friction": pl.Float64,
-    "valid": pl.Boolean,
-    "diverged": pl.Boolean,
-    "mixture_weight": pl.Float64,
-    "reason": pl.Int32,
-    "roll_rad": pl.Float64,
-    "bank_rad": pl.Float64,
-    "force_scale": pl.Float64,
-    "steer_bias_rad": pl.Float64,
-    "ay_bias_m_s2": pl.Float64,
-    "yaw_rate_bias_rad_s": pl.Float64,
-    **dict.fromkeys(("share_law", "share_kinematics", "share_gnss", "independent"), pl.Float64),
-    "causal": pl.Boolean,
+#: Type and unit of each column.
+COLUMNS = {
+    "stamp_ns": (pl.Int64, "ns"),
+    "estimator": (pl.Categorical, ""),
+    "vx_m_s": (pl.Float64, "m/s"),
+    "vy_m_s": (pl.Float64, "m/s"),
+    "yaw_rate_rad_s": (pl.Float64, "rad/s"),
+    "sideslip_rad": (pl.Float64, "rad"),
+    "ay_m_s2": (pl.Float64, "m/s^2"),
+    "x_m": (pl.Float64, "m"),
+    "y_m": (pl.Float64, "m"),
+    "yaw_rad": (pl.Float64, "rad"),
+    "vx_std_m_s": (pl.Float64, "m/s"),
+    "vy_std_m_s": (pl.Float64, "m/s"),
+    "yaw_rate_std_rad_s": (pl.Float64, "rad/s"),
+    "sideslip_std_rad": (pl.Float64, "rad"),
+    "network_trust": (pl.Float64, "1"),
+    "r_scale": (pl.Float64, "1"),
+    "nis": (pl.Float64, "1"),
+    "friction": (pl.Float64, "1"),
+    "valid": (pl.Boolean, ""),
+    "diverged": (pl.Boolean, ""),
+    "mixture_weight": (pl.Float64, "1"),
+    "reason": (pl.Int32, ""),
+    "roll_rad": (pl.Float64, "rad"),
+    "bank_rad": (pl.Float64, "rad"),
+    "force_scale": (pl.Float64, "1"),
+    "steer_bias_rad": (pl.Float64, "rad"),
+    "ay_bias_m_s2": (pl.Float64, "m/s^2"),
+    "yaw_rate_bias_rad_s": (pl.Float64, "rad/s"),
+    **dict.fromkeys(("share_law", "share_kinematics", "share_gnss", "independent"), (pl.Float64, "1")),
+    "causal": (pl.Boolean, ""),
 }
+ESTIMATE_COLUMNS = {name: kind for name, (kind, _) in COLUMNS.items()}
 #: Those that none of these tracks has.
 OPTIONAL = {"mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUMNS}
-UNITS = {
-    "stamp_ns": "ns",
-    "estimator": "",
-    "vx_m_s": "m/s",
-    "vy_m_s": "m/s",
-    "yaw_rate_rad_s": "rad/s",
-    "sideslip_rad": "rad",
-    "ay_m_s2": "m/s^2",
-    "x_m": "m",
-    "y_m": "m",
-    "yaw_rad": "rad",
-    "vx_std_m_s": "m/s",
-    "vy_std_m_s": "m/s",
-    "yaw_rate_std_rad_s": "rad/s",
-    "sideslip_std_rad": "rad",
-    "network_trust": "1",
-    "r_scale": "1",
-    "nis": "1",
-    "friction": "1",
-    "valid": "",
-    "diverged": "",
-    "mixture_weight": "1",
-    "reason": "",
-    "roll_rad": "rad",
-    "bank_rad": "rad",
-    "force_scale": "1",
-    "steer_bias_rad": "rad",
-    "ay_bias_m_s2": "m/s^2",
-    "yaw_rate_bias_rad_s": "rad/s",
-    **dict.fromkeys(("share_law", "share_kinematics", "share_gnss", "independent"), "1"),
-    "causal": "",
-}
+UNITS = {name: unit for name, (_, unit) in COLUMNS.items()}
 METRIC_COLUMNS = {
     "log": pl.String,
     "estimator": pl.String,
@@ -154,12 +125,6 @@ def test_file_is_zstd_with_dictionary_and_one_estimator_a_row_group(tmp_path, ci
         assert estimator.statistics.min == estimator.statistics.max
 
 
-def test_bytes_do_not_depend_on_chance(tmp_path, circle):
-    write(tmp_path / "a", circle)
-    write(tmp_path / "b", circle)
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_one_track_comes_back(tmp_path, circle, name):
     path = tmp_path / "estimates.parquet"
@@ -205,27 +170,6 @@ def test_a_file_without_a_column_is_one_line(tmp_path, circle):
         read_track(path, "phy-ukf", ["sideslip_rad"])
 
 
-def test_only_the_row_groups_of_the_estimator_are_read(tmp_path, circle, monkeypatch):
-    path = tmp_path / "estimates.parquet"
-    write(path, circle)
-    metadata = pq.ParquetFile(path).metadata
-    own = [g for g in range(metadata.num_row_groups) if metadata.row_group(g).column(1).statistics.min == "zero"]
-    read: list[tuple[int, tuple[str, ...]]] = []
-    original = pq.ParquetFile.read_row_group
-
-    def spy(self, i, columns=None, **kwargs):
-        read.append((i, tuple(columns)))
-        return original(self, i, columns=columns, **kwargs)
-
-    monkeypatch.setattr(pq.ParquetFile, "read_row_group", spy)
-    track = read_track(path, "zero", ["sideslip_rad"])
-    assert read == [(g, ("stamp_ns", "sideslip_rad")) for g in own]
-    assert len(own) == 3
-    assert_array_equal(track.sideslip_rad, as_written(circle("zero", 0, 600).sideslip_rad, "sideslip_rad"))
-    assert np.isnan(track.vx_m_s).all()
-    assert np.isnan(read_track(path, "zero", ["vx_m_s", "vy_m_s"]).sideslip_rad).all()
-
-
 def test_mixed_row_groups_of_other_writers_are_read(tmp_path, circle):
     path = tmp_path / "estimates.parquet"
     write(path, circle)
@@ -264,21 +208,6 @@ def test_what_is_not_there_is_said(tmp_path, circle):
         read_track(tmp_path / "other.parquet", "zero")
 
 
-def test_nothing_stands_under_the_final_name_before_finish(tmp_path, circle):
-    path = tmp_path / "out" / "estimates.parquet"
-    sink = EstimatesSink(path, 100)
-    sink.append(circle("zero"))
-    assert not path.exists()
-    sink.abort()
-    sink.abort()
-    assert list(path.parent.iterdir()) == []
-    sink = EstimatesSink(path)
-    sink.append(circle("zero"))
-    sink.finish({})
-    sink.abort()
-    assert [p.name for p in path.parent.iterdir()] == ["estimates.parquet"]
-
-
 def test_failure_while_finishing_leaves_the_old_file(tmp_path, circle, monkeypatch):
     path = tmp_path / "estimates.parquet"
     write(path, circle)
@@ -294,12 +223,6 @@ def test_failure_while_finishing_leaves_the_old_file(tmp_path, circle, monkeypat
         sink.finish({})
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["estimates.parquet"]
-
-
-def test_unwritable_place_is_one_line(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="expected a place to write to"):
-        EstimatesSink(tmp_path / "file" / "estimates.parquet")
 
 
 def test_empty_log_gives_an_empty_table(tmp_path):

@@ -63,13 +63,6 @@ def test_what_a_killed_run_left_is_gone_from_the_start(tmp_path: Path) -> None:
     assert folder(tmp_path) == DONE
 
 
-def test_two_targets_in_a_folder_do_not_share_a_temporary_name(tmp_path: Path) -> None:
-    with PendingFile(tmp_path / "a.bin") as a, PendingFile(tmp_path / "b.bin") as b:
-        a.path.write_bytes(b"a")
-        b.path.write_bytes(b"b")
-    assert folder(tmp_path) == {"a.bin": b"a", "b.bin": b"b"}
-
-
 def test_the_content_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     events: list[str] = []
     partial = PendingFile(tmp_path / "out.bin").path
@@ -113,15 +106,6 @@ def test_a_commit_of_nothing_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError):
         PendingFile(tmp_path / "out.bin").commit()
     assert folder(tmp_path) == {}
-
-
-def test_discard_is_harmless_after_commit_and_twice(tmp_path: Path) -> None:
-    pending = PendingFile(tmp_path / "out.bin")
-    pending.path.write_bytes(b"new")
-    pending.commit()
-    pending.discard()
-    pending.discard()
-    assert folder(tmp_path) == DONE
 
 
 def test_a_temporary_file_that_cannot_be_removed_does_not_hide_the_failure(tmp_path: Path) -> None:

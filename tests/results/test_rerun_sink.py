@@ -63,16 +63,14 @@ STATIC = {
 }
 
 
-def write(path: Path, circle, circle_signals, events=EVENTS) -> None:
-    sink = RerunSink(
-        path,
-        application_id="pdhef-x",
-        shown=SHOWN,
-        log_name="drive",
-        input_hash=HASH,
-        start_ns=START_NS,
-        colours=COLOURS,
+def sink_at(path: Path, shown: Shown = SHOWN, **options) -> RerunSink:
+    return RerunSink(
+        path, application_id="pdhef-x", shown=shown, log_name="drive", input_hash=HASH, start_ns=START_NS, **options
     )
+
+
+def write(path: Path, circle, circle_signals, events=EVENTS) -> None:
+    sink = sink_at(path, colours=COLOURS)
     for k in range(2):
         sink.append_signals(circle_signals(300 * k, 300))
         for name in ("phy-ukf", "truth", "zero"):
@@ -223,14 +221,7 @@ def test_events_and_report_are_text(recording):
 
 def test_weights_and_reasons_are_drawn_over_windows(tmp_path, circle):
     path = tmp_path / "recording.rrd"
-    sink = RerunSink(
-        path,
-        application_id="pdhef-x",
-        shown=Shown("pd-hef", "zero"),
-        log_name="drive",
-        input_hash=HASH,
-        start_ns=START_NS,
-    )
+    sink = sink_at(path, Shown("pd-hef", "zero"))
     for k in range(5):
         sink.append(circle("pd-hef", 120 * k, 120, adaptive=True))  # the gyro is stuck over the first cut
         sink.append(circle("zero", 120 * k, 120))
@@ -264,10 +255,7 @@ def test_same_input_gives_the_same_content(tmp_path, circle, circle_signals):
 
 def test_slow_sideslip_is_not_drawn(tmp_path, circle):
     path = tmp_path / "recording.rrd"
-    shown = Shown("phy-ukf", "zero")
-    sink = RerunSink(
-        path, application_id="x", shown=shown, log_name="drive", input_hash=HASH, start_ns=START_NS, min_speed_m_s=11.0
-    )
+    sink = sink_at(path, Shown("phy-ukf", "zero"), min_speed_m_s=11.0)
     sink.append(circle("zero"))
     sink.append(circle("truth"))
     sink.finish(REPORT)
@@ -283,7 +271,7 @@ def test_errors_stand_where_both_are_valid_and_share_a_stamp(tmp_path, circle):
     track, truth = circle("phy-ukf", 0, 40), circle("truth", 5, 40)
     track.valid[20] = False
     truth.valid[25] = False  # stamp 30 of the track
-    sink = RerunSink(path, application_id="x", shown=SHOWN, log_name="drive", input_hash=HASH, start_ns=START_NS)
+    sink = sink_at(path)
     sink.append(track)
     sink.append(truth)
     sink.finish(REPORT)
@@ -295,58 +283,21 @@ def test_errors_stand_where_both_are_valid_and_share_a_stamp(tmp_path, circle):
 
 def test_nothing_stands_under_the_final_name_before_finish(tmp_path, circle):
     path = tmp_path / "out" / "recording.rrd"
-    sink = RerunSink(
-        path,
-        application_id="pdhef-x",
-        shown=SHOWN,
-        log_name="drive",
-        input_hash=HASH,
-        start_ns=START_NS,
-        colours=COLOURS,
-    )
+    sink = sink_at(path)
     sink.append(circle("zero"))
     assert not path.exists()
     sink.abort()
     sink.abort()
     assert list(path.parent.iterdir()) == []
-    sink = RerunSink(
-        path,
-        application_id="pdhef-x",
-        shown=SHOWN,
-        log_name="drive",
-        input_hash=HASH,
-        start_ns=START_NS,
-        colours=COLOURS,
-    )
+    sink = sink_at(path)
     sink.append(circle("zero"))
     with pytest.raises(KeyError):
         sink.finish({})
     assert list(path.parent.iterdir()) == []
-    sink = RerunSink(
-        path,
-        application_id="pdhef-x",
-        shown=SHOWN,
-        log_name="drive",
-        input_hash=HASH,
-        start_ns=START_NS,
-        colours=COLOURS,
-    )
+    sink = sink_at(path)
     sink.finish(REPORT)
     sink.abort()
     assert [p.name for p in path.parent.iterdir()] == ["recording.rrd"]
-
-
-def test_unwritable_place_is_one_line(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="expected a place to write to"):
-        RerunSink(
-            tmp_path / "file" / "recording.rrd",
-            application_id="pdhef-x",
-            shown=SHOWN,
-            log_name="drive",
-            input_hash=HASH,
-            start_ns=START_NS,
-        )
 
 
 SCRIPT = """
@@ -418,7 +369,6 @@ from pathlib import Path
 import numpy as np
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.tracks import make_track
-from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.results import rerun_sink as rerun
 from pdhef_logtool.results.sink import Shown
 
@@ -485,7 +435,7 @@ def test_line_breaks_do_not_depend_on_windows(known, steps, cut):
 
 def test_a_line_breaks_where_nothing_was_recorded(tmp_path, circle):
     path = tmp_path / "recording.rrd"
-    sink = RerunSink(path, application_id="x", shown=SHOWN, log_name="drive", input_hash=HASH, start_ns=START_NS)
+    sink = sink_at(path)
     sink.append(circle("phy-ukf", 0, 40))
     sink.append(circle("phy-ukf", 400, 40))
     sink.finish(REPORT)
@@ -517,15 +467,7 @@ def test_of_a_long_drive_ten_rows_a_second_are_drawn_with_the_largest_nis_and_fi
     nis[1::2] = 1.0
     nis[31_013] = 9.0
     path = tmp_path / "recording.rrd"
-    sink = RerunSink(
-        path,
-        application_id="x",
-        shown=Shown("zero"),
-        log_name="d",
-        input_hash=HASH,
-        start_ns=START_NS,
-        end_ns=int(stamps[-1]) + 1,
-    )
+    sink = sink_at(path, Shown("zero"), end_ns=int(stamps[-1]) + 1)
     for part in (slice(0, 30_003), slice(30_003, n)):  # a window may end inside of a step
         speed = np.full(part.stop - part.start, 20.0)
         for name in ("zero", "zero:no-lateral"):
