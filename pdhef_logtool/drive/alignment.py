@@ -1,7 +1,7 @@
 """From channels on their own clocks to :class:`~pdhef_logtool.records.signals.Signals` on the IMU's stamps.
 
-A plan is made once a log from a survey stretch; :func:`align` then works window by window, and the windows joined are
-bit-identical to one call over the whole, because every rule here reaches no further than ``AlignmentPlan.margin_ns``.
+A plan is made once a log from a survey stretch; :func:`align` applies it to the whole drive or to a part of it. Every
+rule here reaches no further than ``AlignmentPlan.margin_ns``.
 
 Rules
 -----
@@ -53,7 +53,7 @@ SURVEY_S = 600.0
 #: A gap is more than this many median periods, and more than ``MIN_GAP_S``.
 GAP_PERIODS = 5.0
 MIN_GAP_S = 0.1
-#: Never bridged, however slow the channel: it bounds how far windows reach.
+#: Never bridged, however slow the channel: it bounds ``margin_ns``.
 LONGEST_GAP_S = 10.0
 #: Assumed for a channel that shows fewer than two samples in the survey.
 UNKNOWN_PERIOD_S = 0.1
@@ -61,7 +61,7 @@ UNKNOWN_PERIOD_S = 0.1
 LATE_NEIGHBOURHOOD_S = 1.0
 #: Jitter below this is never lateness.
 MIN_LATE_S = 0.05
-#: How far delays may drift away from the survey's before samples count as missing; it bounds how far windows reach.
+#: How far delays may drift away from the survey's before samples count as missing; it bounds ``margin_ns``.
 DELAY_DRIFT_S = 2.0
 #: Share of stamps that must coincide for two channels to be on one clock.
 SAME_CLOCK_SHARE = 0.9
@@ -113,7 +113,7 @@ class ChannelPlan:
 
 @dataclass(frozen=True, slots=True)
 class AlignmentPlan:
-    """How the channels of one log are brought to one grid; made once, valid for all windows.
+    """How the channels of one log are brought to one grid; made once.
 
     Attributes
     ----------

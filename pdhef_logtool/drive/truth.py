@@ -10,8 +10,6 @@ Derivations (``TruthTrack.derivation`` states which applied):
   the attitude, to which body roll adds K_φ a_y. It is unknown without roll: v̇_y + v_x r lacks g sin(bank);
 * derivatives by Savitzky–Golay over the true stamps: a cubic by least squares over ± ``DIFFERENTIATION_HALF_S``, its
   slope at the centre; none where the window would cross a gap or the end of the data.
-
-All of it is local: windows derived with ``TruthPlan.margin_ns`` on both sides join bit-identically.
 """
 
 from __future__ import annotations
@@ -101,14 +99,13 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class TruthPlan:
-    """How one log's ground truth is derived; made once from a survey stretch, valid for all windows.
+    """How one log's ground truth is derived; made once from a survey stretch.
 
     Attributes
     ----------
     base : channel whose stamps are the ground-truth clock. period_s : its median period.
     max_gap_s : longest step that is bridged, by channel. half_window : samples on each side of a derivative.
     position_m : where ground truth is measured, from the CG, ISO 8855. roll_gradient_rad_per_m_s2 : of the car.
-    delay_s : largest median arrival − stamp of the channels.
     """
 
     base: str
@@ -120,15 +117,7 @@ class TruthPlan:
     origin: Origin | None
     attitude: Attitude | None
     position_m: tuple[float, float, float]
-    delay_s: float
     roll_gradient_rad_per_m_s2: float = 0.0
-
-    @property
-    def margin_ns(self) -> int:
-        """Ground truth needed before and after a window, so that windows join bit-identically."""
-        derivative = self.half_window * self.max_gap_s[self.base]  # per pass; velocity, then acceleration
-        reach = 2 * derivative + max(self.max_gap_s.values()) + self.max_gap_s[self.base]
-        return round((reach + MAX_LATENCY_S + self.delay_s + 1.0) * 1e9)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,7 +187,6 @@ def plan_truth(
         origin=origin,
         attitude=None,
         position_m=truth_position_m,
-        delay_s=max(float(np.median(c.arrival_ns - c.stamps_ns)) * 1e-9 for c in survey.values()),
         roll_gradient_rad_per_m_s2=roll_gradient_rad_per_m_s2,
     )
     if "quat_wxyz" not in has:
@@ -217,7 +205,7 @@ def derive_truth(
 
     Parameters
     ----------
-    truth_channels : quality gate applied. For a window: with ``plan.margin_ns`` on both sides.
+    truth_channels : quality gate applied.
     truth_position_m, max_gap_s : as for :func:`plan_truth`; not used when a ``plan`` is given.
     plan : from :func:`plan_truth` over the log's beginning; made from these channels when absent.
 
@@ -600,7 +588,7 @@ class _Source:
 
 
 def _turn(matrix: FloatArray, vectors: FloatArray) -> FloatArray:
-    # Sums written out: a matrix product may round differently with the number of rows, and windows must join.
+    # Sums written out: a matrix product may round differently with the number of rows.
     return np.stack([(matrix[i] * vectors).sum(axis=1) for i in range(3)], axis=1)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pdhef_logtool.mapping.channels import MappedChannels as MappedChannels
 from pdhef_logtool.mapping.channels import clean_samples as clean_samples
 from pdhef_logtool.mapping.channels import gate_mask as gate_mask
-from pdhef_logtool.mapping.channels import join_channels as join_channels
 from pdhef_logtool.mapping.channels import merge_losses as merge_losses
 from pdhef_logtool.mapping.channels import read_signals as read_signals
 from pdhef_logtool.mapping.checking import check_mapping as check_mapping

@@ -143,8 +143,7 @@ def read_signals(
 ) -> MappedChannels:
     """Read the mapped fields of the messages with log time in [start, end) into clean channels.
 
-    Each topic is read once. With the same ``clocks`` the windows of a log, joined by :func:`join_channels`, give the
-    same channels as one window over all of it.
+    Each topic is read once.
 
     Parameters
     ----------
@@ -179,17 +178,6 @@ def read_signals(
             counts["truth", name]["truth-quality"] += len(before[name]) - len(channel)
     times = {topic: columns[topic] for topic in stamps}
     return MappedChannels(signals, truth, merge_losses([losses]), counts, times)
-
-
-def join_channels(parts: Sequence[Channel]) -> Channel:
-    """Join the windows of one channel; a stamp that two windows contain is kept as it arrived first."""
-    first = parts[0]
-    joined = clean_samples(
-        np.concatenate([p.stamps_ns for p in parts]),
-        np.concatenate([p.arrival_ns for p in parts]),
-        np.concatenate([p.values for p in parts]),
-    )
-    return replace(first, stamps_ns=joined.stamps_ns, arrival_ns=joined.arrival_ns, values=joined.values)
 
 
 def merge_losses(parts: Iterable[Iterable[Loss]]) -> tuple[Loss, ...]:

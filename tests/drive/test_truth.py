@@ -1,9 +1,8 @@
-"""Truth: every derivation against one analytic drive, windows that join, latency and dependence found again."""
+"""Truth: every derivation against one analytic drive, latency and dependence found again."""
 
 from __future__ import annotations
 
-from dataclasses import fields
-from itertools import islice, pairwise
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -26,7 +25,6 @@ from pdhef_logtool.drive.truth import (
     yaw_rate_channel,
 )
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel
-from pdhef_logtool.records.tracks import StateTrack
 
 T0 = 1_700_000_000_000_000_000
 LAT, LON = np.deg2rad(57.7), np.deg2rad(11.9)
@@ -366,42 +364,6 @@ def test_headings_are_interpolated_the_shorter_way():
     }
     out = truth_at(derive_truth(channels), stamps[:-1] + 5_000_000)
     np.testing.assert_allclose(np.exp(1j * out.yaw_rad), np.exp(1j * (3.05 + 0.1 * np.arange(9))), atol=1e-12)
-
-
-@pytest.mark.slow
-@settings(derandomize=True, max_examples=25, deadline=None)
-@given(
-    kind=st.sampled_from(KINDS),
-    seed=st.integers(0, 10**6),
-    cuts=st.lists(st.integers(0, 20_000), min_size=1, max_size=4),
-    latency=st.floats(-0.5, 0.5),
-)
-def test_windows_join_bit_identically(kind, seed, cuts, latency):
-    rng = np.random.default_rng(seed)
-    stamps, d = drive(20.0, rate=50, jitter=0.4, seed=seed)
-    channels = {}
-    for n, v in sources(stamps, d)[kind].items():
-        keep = rng.random(stamps.size) > 0.03
-        at = rng.integers(0, stamps.size)
-        keep[at : at + rng.integers(1, 200)] = False
-        channels[n] = channel(n, stamps[keep], v[keep] + rng.normal(0, 1e-3, v[keep].shape))
-    plan = plan_truth(channels, truth_position_m=(0.5, 0.1, 0.0))
-    scored = T0 + np.arange(-100, 2100, dtype=np.int64) * 10_000_000
-    whole = truth_at(derive_truth(channels, plan=plan), scored, latency)
-    edges = [scored[0], *(T0 + c * 1_000_000 for c in sorted(cuts)), scored[-1] + 1]
-    parts = []
-    for start, end in pairwise(edges):
-        lo, hi = start - plan.margin_ns, end + plan.margin_ns
-        near = {}
-        for n, c in channels.items():
-            k = (c.stamps_ns >= lo) & (c.stamps_ns < hi)
-            near[n] = channel(n, c.stamps_ns[k], c.values[k])
-        here = scored[(scored >= start) & (scored < end)]
-        parts.append(truth_at(derive_truth(near, plan=plan), here, latency))
-    for f in fields(StateTrack):
-        if f.name not in ("name", "covariance"):
-            joined = np.concatenate([getattr(p, f.name) for p in parts])
-            np.testing.assert_array_equal(joined, getattr(whole, f.name), err_msg=f.name)
 
 
 # ---- latency ----

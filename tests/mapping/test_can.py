@@ -278,24 +278,6 @@ def test_another_bus_and_masked_bits_are_told_apart(tmp_path: Path) -> None:
     assert channel["speed_m_s"].values.tolist() == pytest.approx([0.0, 0.01, 0.07])
 
 
-def test_windows_join_to_the_whole(tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    frames = [Frame(int(rng.choice([256, 257])), rng.bytes(8)) for _ in range(200)]
-    frames = [f if f.id == 256 else Frame(257, bytes([f.data[0] % 3]) + f.data[1:4]) for f in frames]
-    _write_ros(tmp_path / "a.mcap", frames)
-    mapping = _mapping(tmp_path, _FIELDS)
-    log = open_log(tmp_path / "a.mcap")
-    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-    whole = read_signals(log, mapping, clocks, log.start_ns, log.end_ns).signals
-    cut = log.start_ns + 77_000_000
-    parts = [read_signals(log, mapping, clocks, a, b).signals for a, b in ((log.start_ns, cut), (cut, log.end_ns))]
-    log.close()
-    for name, channel in whole.items():
-        np.testing.assert_array_equal(np.concatenate([p[name].values for p in parts]), channel.values)
-        np.testing.assert_array_equal(np.concatenate([p[name].stamps_ns for p in parts]), channel.stamps_ns)
-    assert len(whole["ay_m_s2"]) > 10
-
-
 def test_inspect_shows_the_signals_and_counts_short_frames(tmp_path: Path) -> None:
     frames = [Frame(256, bytes([i, 0] + [0] * 6)) for i in range(50)] + [Frame(256, b"1")]
     _write_ros(tmp_path / "a.mcap", frames)

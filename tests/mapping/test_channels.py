@@ -1,4 +1,4 @@
-"""Reading mapped fields: values, times, cleaning with counts, the truth gate, and windows that join to the whole."""
+"""Reading mapped fields: values, times, cleaning with counts, and the truth gate."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from fake_drive_log import FakeLog, FakeTopic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.logs.drive_log import windows
 from pdhef_logtool.mapping import (
     Mapping,
     QualityGate,
@@ -18,7 +17,6 @@ from pdhef_logtool.mapping import (
     clean_samples,
     fit_clocks,
     gate_mask,
-    join_channels,
     read_signals,
 )
 from pdhef_logtool.records.signals import Channel, Loss
@@ -50,12 +48,6 @@ def read_all(log: FakeLog, mapping: Mapping) -> tuple[dict[str, Channel], dict[s
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     got = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
     return got.signals, got.truth, {f"{x.kind} {x.where.split(' ')[0]}": x for x in got.losses}
-
-
-def assert_same(a: Channel, b: Channel) -> None:
-    np.testing.assert_array_equal(a.stamps_ns, b.stamps_ns)
-    np.testing.assert_array_equal(a.arrival_ns, b.arrival_ns)
-    np.testing.assert_array_equal(a.values, b.values)
 
 
 def test_scale_offset_latency_and_arrival() -> None:
@@ -229,40 +221,6 @@ def test_cleaning_agrees_with_a_dictionary(samples: tuple[np.ndarray, ...]) -> N
     assert got.values.tolist() == [best[s][1] for s in sorted(best)]
     assert len(got.nan_at) == int((~(np.abs(values) < 1e12)).sum())
     assert len(got.out_of_range_at) == int((values > 5.0).sum())
-
-
-@pytest.mark.slow
-@settings(max_examples=40, deadline=None, derandomize=True)
-@given(seed=st.integers(0, 10_000), length=st.integers(30 * MS, 900 * MS), device=st.booleans())
-def test_windows_joined_are_the_whole(seed: int, length: int, device: bool) -> None:
-    rng = np.random.default_rng(seed)
-    n = 150
-    log = imu_log(n, seed)
-    topic = log.contents["/imu"]
-    stamps = topic.fields["header.stamp"]
-    topic.log_time_ns += (rng.exponential(15.0, n) * MS).astype(np.int64)  # Messages overtake one another.
-    repeated = rng.choice(n - 1, 10, replace=False)
-    stamps[repeated + 1] = stamps[repeated]
-    topic.fields["linear_acceleration.y"][rng.choice(n, 5)] = np.nan
-    gate_times = T0 + np.arange(0, 1600, 50, dtype=np.int64) * MS
-    log.contents["/gate"] = FakeTopic(
-        "x/Status", gate_times + 3 * MS, {"stamp": gate_times, "mode": rng.choice([3.0, 4.0], gate_times.shape[0])}
-    )
-    if device:
-        topic.fields["header.stamp"] = (stamps - T0) + np.rint((stamps - T0) * 2e-4).astype(np.int64) + 5_000_000_000
-    base = imu_mapping(clock="device" if device else "utc")
-    vx = replace(base.signals["ay_m_s2"], name="vx_m_s")
-    mapping = replace(base, truth={"vx_m_s": vx}, quality=QualityGate("/gate", "mode", values=(4.0,)))
-    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-    whole = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
-    parts = [
-        read_signals(log, mapping, clocks, s, e)
-        for s, e in windows(log.start_ns, log.end_ns, length, log.recording_span)
-    ]
-    for name, channel in whole.signals.items():
-        assert_same(join_channels([p.signals[name] for p in parts]), channel)
-    assert 0 < len(whole.truth["vx_m_s"]) < len(whole.signals["ay_m_s2"])
-    assert_same(join_channels([p.truth["vx_m_s"] for p in parts]), whole.truth["vx_m_s"])
 
 
 # --------------------------------------------------------------------------------------------- truth gate
