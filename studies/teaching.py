@@ -163,7 +163,7 @@ def learn(tool: Tool, car: Path, parts: Sequence[TeachPart], name: str) -> tuple
     """Teach a car on parts; return it and the name of its residual."""
     output = tool.work / "cars" / name
     _, *options_of = inputs(tool, parts[0])  # parts that teach together have the same mapping and slice
-    tool.json("learn", *(DRIVES / part.log for part in parts), *options_of, "--car", car, "-o", output, "--fresh")
+    tool.json("learn", *(DRIVES / part.log for part in parts), *options_of, "--car", car, "-o", output)
     taught = json.loads((output / "taught.json").read_text(encoding="utf-8"))
     return output, (taught.get("residual") or {}).get("rung", "none")
 
@@ -171,7 +171,7 @@ def learn(tool: Tool, car: Path, parts: Sequence[TeachPart], name: str) -> tuple
 def learn_by_reference(tool: Tool, car: Path, part: TeachPart, name: str) -> Path | None:
     """Teach a car on a drive of the V40 by the reference with its receiver; None if it does not teach."""
     output = tool.work / "cars" / name
-    given = (*inputs(tool, part, receiver=True, truth=False), "--car", car, "-o", output, "--fresh")
+    given = (*inputs(tool, part, receiver=True, truth=False), "--car", car, "-o", output)
     try:
         tool.json("learn", *given, "--set", "reference=on")
     except RuntimeError as refused:

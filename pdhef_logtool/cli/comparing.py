@@ -123,7 +123,7 @@ def _gate(
 
 @options.command(
     commands,
-    'pdhef events out --where "abs(sideslip_error_deg) > 2 and speed_m_s > 10" --for 0.5s',
+    'pdhef events out --where "abs(sideslip_error_deg) > 2 and slalom" --for 0.5s',
     'pdhef events out --where "diverged or not valid" --json',
     'pdhef events out --where "abs(sideslip_deg) > 9" --clip --pad 3s',
     'pdhef events out --where "abs(ay_m_s2) > 6" --parquet events.parquet',

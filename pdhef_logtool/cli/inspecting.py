@@ -13,7 +13,9 @@ from pdhef_logtool.cli import console, options, panels
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, UsageError
 
 if TYPE_CHECKING:
+    from pdhef_logtool.logs.drive_log import DriveLog
     from pdhef_logtool.runs.config import RunConfig
+    from pdhef_logtool.runs.inspection.report import Inspection
 
 commands = typer.Typer()
 
@@ -64,6 +66,17 @@ def inspect(
     if fields:
         topic_fields = fields_of_log(place, topic, budget=reading.limits, msgs=reading.msgs)
         console.finish(topic_fields, render_fields, as_json, exit_code=EXIT_OK)
+
+    def write_files(inspection: Inspection, open_log: DriveLog) -> None:
+        if write_mapping is not None:
+            write_mapping_file(inspection, write_mapping)
+            console.say(f"mapping written to {write_mapping}")
+        if report is not None:
+            from pdhef_logtool.runs.inspection.page import write_page
+
+            write_page(inspection, open_log, report)
+            console.say(f"page written to {report}")
+
     inspection = inspect_log(
         place,
         config.mapping,
@@ -71,15 +84,8 @@ def inspect(
         budget=reading.limits,
         msgs=reading.msgs,
         whole=whole,
+        then=write_files,
     )
-    if write_mapping is not None:
-        write_mapping_file(inspection, write_mapping)
-        console.say(f"mapping written to {write_mapping}")
-    if report is not None:
-        from pdhef_logtool.runs.inspection.page import write_page
-
-        write_page(inspection, report, place, budget=reading.limits, msgs=reading.msgs)
-        console.say(f"page written to {report}")
     lost = any(loss.severity == "lost" for loss in inspection.lost)
     console.finish(inspection, render_inspection, as_json, exit_code=EXIT_PARTIAL if lost else EXIT_OK)
 

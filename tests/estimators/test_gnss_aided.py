@@ -18,6 +18,7 @@ from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.table import make_estimator, runnable
 from pdhef_logtool.records.signals import GNSS_COMPONENTS
 from studies import reference as study
+from tests.estimators.made_gnss_drive import gnss_drive
 
 AVAILABLE = frozenset({"steer_rad", "speed_m_s", "ay_m_s2", "yaw_rate_rad_s"})
 
@@ -29,14 +30,14 @@ def bare() -> Car:
 
 @pytest.fixture(scope="module")
 def fishhook():
-    drive = study.simulated_drive(study.SIMULATED["fishhook, 70 km/h"])
-    return drive, study.with_gnss(drive, study.RECEIVERS[study.MADE])
+    drive = gnss_drive(study.SIMULATED["fishhook, 70 km/h"])
+    return drive, drive.aided
 
 
 @pytest.fixture(scope="module")
 def road():
-    drive = study.simulated_drive(replace(study.SIMULATED["road, 20 s"], duration_s=45.0))
-    return drive, study.with_gnss(drive, study.RECEIVERS[study.MADE])
+    drive = gnss_drive(replace(study.SIMULATED["road, 20 s"], duration_s=45.0))
+    return drive, drive.aided
 
 
 def _aided(car):
@@ -69,8 +70,8 @@ def test_gnss_corrects_a_limit_manoeuvre_of_a_car_with_wrong_tyres(fishhook, bar
 @pytest.mark.parametrize("manoeuvre", ["fishhook, 70 km/h", "sine with dwell, 80 km/h"])
 def test_an_accelerometer_that_is_not_where_the_file_has_it_costs_nothing(bare, manoeuvre):
     """At the limit; in the double lane change of docs/reference.md it does cost."""
-    drive = study.simulated_drive(replace(study.SIMULATED[manoeuvre], sensors=study.REAR_IMU))
-    signals = study.with_gnss(drive, study.RECEIVERS[study.MADE])
+    drive = gnss_drive(replace(study.SIMULATED[manoeuvre], sensors=study.REAR_IMU))
+    signals = drive.aided
     plain, _ = _error_deg(drive, run_window(make_estimator("physics", bare), signals)[0])
     aided, _ = _error_deg(drive, run_window(_aided(bare), signals)[0])
     assert aided < plain

@@ -49,13 +49,8 @@ def sound(signals: Signals) -> Steps:
     return make_steps(np.full(len(rate), 20.0), 0.0 * rate, rate)
 
 
-def raise_later(_signals: Signals, state: Any) -> None:
-    if state is not None:
-        raise KeyError("boom")
-
-
-def raise_at_once(signals: Signals, _state: Any) -> None:
-    raise_later(signals, 1)
+def raise_error(_signals: Signals, _state: Any) -> None:
+    raise KeyError("boom")
 
 
 def end_process(_signals: Signals, _state: Any) -> None:
@@ -79,7 +74,7 @@ def signals() -> Signals:
 @pytest.mark.parametrize(
     ("misbehave", "got"),
     [
-        (raise_at_once, r"expected an estimator that runs, got KeyError: 'boom' \(test_plug_ins.py, line \d+\)"),
+        (raise_error, r"expected an estimator that runs, got KeyError: 'boom' \(test_plug_ins.py, line \d+\)"),
         (end_process, "expected an estimator that runs, got SystemExit: 0"),
         (write_through_view, "got ValueError: assignment destination is read-only"),
         (lambda s, _: 3, "expected a pair of steps and state, got int"),
@@ -145,7 +140,7 @@ def test_a_plug_in_that_cannot_be_built_is_left_out_with_its_error(monkeypatch: 
 def test_a_plug_in_that_fails_costs_only_its_own_estimates(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, sample_logs_dir: Path
 ) -> None:
-    specs = (*table.SPECS, _spec("late", raise_later), _spec("ends", end_process))
+    specs = (*table.SPECS, _spec("late", raise_error), _spec("ends", end_process))
     monkeypatch.setattr(table, "all_specs", lambda: specs)
     config = RunConfig(car=Path("saloon"), estimators=("zero",), keep="estimates", calibrate="off", reference="off")
     log = [str(sample_logs_dir / "dlc.mcap")]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_network_parts import arrays, residual_rows
+from test_network_parts import arrays, made_rows
 
 from pdhef_logtool.learning.network.cells import (
     COUNT,
@@ -81,7 +81,7 @@ def test_a_second_draws_by_its_log_the_seed_and_itself() -> None:
 
 
 def test_conditions_are_on_the_columns_of_a_row() -> None:
-    rows = residual_rows(50)
+    rows = made_rows(50)
     vx, ay = (rows.features[:, FEATURES.index(n)] for n in ("vx_m_s", "ay_m_s2"))
     holds = Picking(condition_of("abs(ay_m_s2) > 0.5 and not vx_km_h < 1.8 or truth_vx_m_s < 0")).of(rows).chosen
     np.testing.assert_array_equal(holds, (np.abs(ay) > 0.5) & ~(vx * 3.6 < 1.8))

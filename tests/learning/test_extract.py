@@ -121,8 +121,9 @@ def _extract(
     (tmp_path / "m.toml").write_text(MAPPING)
     (tmp_path / "v.toml").write_text(vehicle_toml(car))
     monkeypatch.setattr(reading, "open_log", lambda *_, **__: log)
+    monkeypatch.setattr(reading, "check_unchanged", lambda *_: None)
     monkeypatch.setattr(reading, "identity_of", lambda _: "0" * 64)
-    config = RunConfig(car=tmp_path / "v.toml", mapping=tmp_path / "m.toml", window_s=settings.pop("window_s", 7.0))
+    config = RunConfig(car=tmp_path / "v.toml", mapping=tmp_path / "m.toml")
     return extract(
         [str(tmp_path / "drive.mcap")], tmp_path / "out", ExtractSettings(config, **{"model": "phy-ukf", **settings})
     )

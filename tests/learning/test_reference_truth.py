@@ -61,6 +61,7 @@ def config(
 ) -> RunConfig:
     monkeypatch.setattr(reading, "open_log", lambda *_, **__: recorded[0])
     monkeypatch.setattr(reading, "identity_of", lambda _: "0" * 64)
+    monkeypatch.setattr(reading, "check_unchanged", lambda *_: None)
     (tmp_path / "drive.mcap").write_bytes(b"in memory")
     (tmp_path / "m.toml").write_text(MAPPING)
     text = (sample_logs_dir / "vehicle.toml").read_text()
@@ -102,7 +103,7 @@ def test_learn_is_taught_by_it_on_request_alone(
     with pytest.raises(EstimatorError, match="at least one drive"):
         learn(log, tmp_path / "off", LearnSettings(config=RunConfig(car=config.car, mapping=config.mapping)))
     result = learn(log, tmp_path / "car", LearnSettings(config=config))
-    assert result.drives[0].truth == (ESTIMATED,) and f"taught by {ESTIMATED}" in result.stages[0].text
+    assert result.drives[0].truth == (ESTIMATED,) and f"taught by {ESTIMATED}" in result.text
     document = json.loads((tmp_path / "car" / TAUGHT_FILE).read_text())
     assert document["truth"] == ESTIMATED and document["figures"]["truth"] == ESTIMATED
     assert any(f"taught by {ESTIMATED}" in note for note in Car.load(tmp_path / "car").notes)

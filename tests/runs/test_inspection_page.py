@@ -86,6 +86,13 @@ def test_an_outline_keeps_extremes_where_they_were() -> None:
     assert low.shape == (COLUMNS,)
 
 
+def _page(path: Path) -> str:
+    """Return the page of a log, written while the log is open."""
+    pages: list[bytes] = []
+    inspect_log(path, then=lambda inspection, log: pages.append(inspection_page(inspection, log)))
+    return pages[0].decode()
+
+
 def test_a_page_shows_fields_reasons_and_a_mapping_to_paste(tmp_path: Path) -> None:
     log = write_log(tmp_path / "car.mcap", {"/car": car(), "/other": {"temperature": np.arange(300.0)}})
     file = tmp_path / "page.html"
@@ -118,7 +125,7 @@ def test_a_vector_is_drawn_by_its_length_and_has_figures(sample_logs_dir: Path) 
     quaternion = inspection.truth["quat_wxyz"]
     assert quaternion.minimum == pytest.approx(1.0, abs=1e-4)
     assert quaternion.std < 1e-4
-    text = _text(inspection_page(inspection, sample_logs_dir / "road.mcap").decode())
+    text = _text(_page(sample_logs_dir / "road.mcap"))
     assert "length of the vector" in text
 
 
@@ -126,7 +133,7 @@ def test_a_log_of_many_fields_stays_below_the_limit(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     topics = {f"/ecu{k}": {f"signal_{i}_{'x' * 200}": rng.normal(size=120) for i in range(60)} for k in range(8)}
     log = write_log(tmp_path / "many.mcap", {"/car": car(120), **topics})
-    page = inspection_page(inspect_log(log), log).decode()
+    page = _page(log)
     assert len(page) < _MOST_BYTES
     assert "330 further fields" in _text(page)
     assert page.count('class="spark"') >= 150
@@ -145,7 +152,7 @@ def test_the_log_is_never_replaced_and_fields_stand_alone(tmp_path: Path) -> Non
 @pytest.mark.parametrize("name", ["v40_slalom.vbo", "v40_swd.mf4", "gti_pole_aa.mat"])
 def test_every_format_has_a_page(shared_dir: Path, name: str) -> None:
     log = shared_dir / "data" / "formats" / name
-    page = inspection_page(inspect_log(log), log).decode()
+    page = _page(log)
     assert page.count('<path d="M') > 5
     assert len(page) < _MOST_BYTES
 
@@ -155,7 +162,7 @@ def test_every_format_has_a_page(shared_dir: Path, name: str) -> None:
 def test_hostile_names_run_nothing_and_a_narrow_dark_page_is_readable(tmp_path: Path) -> None:
     log = write_log(tmp_path / "hostile.mcap", {HOSTILE: car(), "/car": {"<img src=x>": np.arange(300.0)}})
     file = tmp_path / "page.html"
-    file.write_bytes(inspection_page(inspect_log(log), log))
+    file.write_text(_page(log))
     for width, scheme in ((390, "light"), (390, "dark"), (1280, "light")):
         with Browser(width, 900) as browser:
             browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])

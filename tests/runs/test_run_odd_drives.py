@@ -20,7 +20,7 @@ from pdhef_logtool.runs import pipeline
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.pipeline import RunResult
-from studies.torture.numerics import NUMERICS, Drive, read_samples, write_samples
+from tests.runs.numeric_drives import NUMERICS, Drive, read_samples, write_samples
 
 
 @dataclass(frozen=True)

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.mapping.channels import si_of
 from pdhef_logtool.mapping.evidence import Pieces, Seen
@@ -61,24 +55,17 @@ class _Subject:
     cards: list[_Card] = field(default_factory=list)
 
 
-def inspection_page(
-    inspection: Inspection,
-    place: LogPlace | str,
-    *,
-    budget: ResourceLimits = DEFAULT_LIMITS,
-    msgs: Path | str | None = None,
-) -> bytes:
-    """Return the page of an inspection, a whole HTML file; pieces of the log at ``place`` are read for its figures."""
+def inspection_page(inspection: Inspection, log: DriveLog) -> bytes:
+    """Return the HTML page of an inspection of the open ``log``. The figures show short sections of the log."""
     others = [c for c in inspection.candidates if not c.taken]
     used = {(s.topic, p) for s in inspection.mapping.sources() for p in s.paths}
     used |= {(c.source.topic, p) for c in others for p in c.source.paths}
-    with closing(open_log(place, budget, msgs, Wanted(frozenset()))) as log:
-        pieces = Pieces(log)
-        requests: dict[str, list[str]] = {}
-        for candidate in others:
-            requests.setdefault(candidate.source.topic, []).extend(candidate.source.paths)
-        samples = pieces.read({topic: [*dict.fromkeys(paths)] for topic, paths in requests.items()})
-        unused, left_out = _unused(log, pieces, used)
+    pieces = Pieces(log)
+    requests: dict[str, list[str]] = {}
+    for candidate in others:
+        requests.setdefault(candidate.source.topic, []).extend(candidate.source.paths)
+    samples = pieces.read({topic: [*dict.fromkeys(paths)] for topic, paths in requests.items()})
+    unused, left_out = _unused(log, pieces, used)
     return render(
         "inspection.html",
         inspection=inspection,
@@ -225,7 +212,7 @@ def sparkline(low: FloatArray, high: FloatArray) -> Markup:
                   '<path d="{}"/></svg>').format(max(2, 2 * len(use) - 2), "".join(path))  # fmt: skip
 
 
-def write_page(inspection: Inspection, file: Path, place: LogPlace | str, **reading: Any) -> None:
-    """Write :func:`inspection_page`; raises UsageError for a file that is the log, OutputError for one that fails."""
+def write_page(inspection: Inspection, log: DriveLog, file: Path) -> None:
+    """Write :func:`inspection_page`. Raise UsageError if ``file`` is the log, OutputError if writing fails."""
     check_no_input([Path(inspection.path)], [file])
-    write_bytes(file, inspection_page(inspection, place, **reading))
+    write_bytes(file, inspection_page(inspection, log))

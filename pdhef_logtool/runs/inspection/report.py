@@ -239,6 +239,7 @@ def inspect_log(
     budget: ResourceLimits = DEFAULT_LIMITS,
     msgs: Path | str | None = None,
     whole: bool = False,
+    then: Callable[[Inspection, DriveLog], None] = lambda *_: None,
 ) -> Inspection:
     """Look a log through and report on it; without a mapping (or its file) the well-known types are recognised.
 
@@ -249,6 +250,7 @@ def inspect_log(
     ----------
     prefer_truth : as for :func:`pdhef_logtool.mapping.auto_map`. budget : resource limits of reading.
     msgs : folder with definitions of types that the log does not define.
+    then : called with the inspection before the log is closed.
 
     Raises
     ------
@@ -267,9 +269,12 @@ def inspect_log(
             damaged = any(loss.severity == "lost" for loss in log.lost)
             sample = partial.sample
             if sample is None or not (damaged or sample.chunks > MOST_SAMPLED * sample.of_chunks):
+                then(partial, log)
                 return partial
     with closing(open_log(path, budget, msgs)) as log:
-        return inspect_drive_log(log, mapping, prefer_truth=prefer_truth)
+        inspection = inspect_drive_log(log, mapping, prefer_truth=prefer_truth)
+        then(inspection, log)
+        return inspection
 
 
 def inspect_drive_log(
