@@ -21,19 +21,6 @@ class Interval:
     blocks: int
 
 
-def block_bootstrap_interval(
-    errors: FloatArray, stamps_ns: IntArray, *, block_s: float = 10.0, n: int = 1000, seed: int = 0
-) -> Interval:
-    """Return the RMSE of errors [N] with its 95 % interval.
-
-    Parameters
-    ----------
-    errors : NaN does not count. stamps_ns : int64 [N]. block_s : at least 10 s (docs/method.md#evaluation). n :
-    resamples.
-    """
-    return _interval(lambda s, c: np.sqrt(s[0] / c), *_block_sums([errors], stamps_ns, block_s), n, seed)
-
-
 def block_bootstrap_difference(
     errors: FloatArray,
     other_errors: FloatArray,
@@ -45,7 +32,8 @@ def block_bootstrap_difference(
 ) -> Interval:
     """Return RMSE(errors) − RMSE(other_errors) with its interval, paired: only stamps where both are known, same draws.
 
-    ``errors`` belong to the better estimator when the whole interval lies below 0.
+    ``errors`` belong to the better estimator when the whole interval lies below 0. ``block_s``: at least 10 s
+    (docs/method.md#evaluation). ``n``: resamples.
     """
     return rmse_difference_interval(*_block_sums([errors, other_errors], stamps_ns, block_s), n=n, seed=seed)
 

@@ -137,24 +137,3 @@ def dead_reckon(
     x = accumulate(start[0], (vx * cos - vy * sin) * dt)
     y = accumulate(start[1], (vx * sin + vy * cos) * dt)
     return x, y, yaw
-
-
-class DeadReckoner:
-    """Dead-reckons part by part; joined, the parts have the bits of :func:`dead_reckon` over the whole."""
-
-    def __init__(self, start: tuple[float, float, float]) -> None:
-        self._pose = start
-        self._before = (np.empty(0, dtype=np.int64), np.empty(0), np.empty(0), np.empty(0))
-
-    def add(
-        self, stamps_ns: IntArray, vx_m_s: FloatArray, vy_m_s: FloatArray, yaw_rate_rad_s: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return x, y, yaw [M] of the next part; parameters as for :func:`dead_reckon`."""
-        columns = (stamps_ns, vx_m_s, vy_m_s, yaw_rate_rad_s)
-        stamps, vx, vy, rate = (np.concatenate(pair) for pair in zip(self._before, columns, strict=True))
-        x, y, yaw = dead_reckon(stamps, vx, vy, rate, self._pose)
-        if len(stamps):
-            self._before = (stamps[-1:], vx[-1:], vy[-1:], rate[-1:])
-            self._pose = (float(x[-1]), float(y[-1]), float(yaw[-1]))
-        skip = len(stamps) - len(stamps_ns)
-        return x[skip:], y[skip:], yaw[skip:]

@@ -57,25 +57,6 @@ def test_signals_of_one_car(log: DriveLog) -> None:
     assert (stamps.max() - stamps.min()) / 1e9 == pytest.approx(19.98, abs=1e-3)
 
 
-@pytest.mark.parametrize("log", [("can_two_channels", "car")], indirect=True)
-def test_a_second_car_has_tables_of_its_own(log: DriveLog) -> None:
-    (first, second) = (log.read({t: ["LatAccel"]})[t].fields["LatAccel"] for t in ("MOTION", "MOTION#bus1"))
-    np.testing.assert_allclose(second, -first)
-
-
-@pytest.mark.parametrize("log", [("can_reference", "j1939")], indirect=True)
-def test_a_database_of_another_car_is_named(log: DriveLog) -> None:
-    assert [t.name for t in log.topics] == ["can"]
-    (note,) = log.lost
-    assert note.what.startswith("3000 frames, no identifier of j1939.dbc: 0x100")
-
-
-def test_a_damaged_object_costs_itself(cases: Path) -> None:
-    with closing(open_log(cases / "hostile" / "blf_hang_a.blf")) as log:
-        assert [(t.name, t.messages) for t in log.topics] == [("can", 621)]
-        assert [(loss.kind, loss.severity) for loss in log.lost] == [("bad-chunk", "lost")]
-
-
 def test_a_file_of_3_mb_that_claims_3_gb_is_one_line(cases: Path) -> None:
     path = cases / "hostile" / "blf_bomb_3MB_3GB.blf"
     with pytest.raises(LogError, match="budget="):

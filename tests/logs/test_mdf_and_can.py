@@ -17,7 +17,6 @@ from pdhef_logtool.logs.mat_log import open_mat
 from pdhef_logtool.logs.mdf_log import open_mdf
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
-from pdhef_logtool.logs.table_clocks import RELATIVE_NS
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.mapping.channels import read_signals
 from pdhef_logtool.mapping.mapping_file import load_mapping
@@ -110,23 +109,6 @@ def test_bus_logging_is_decoded_by_several_databases(tmp_path: Path) -> None:
         read = log.read({"Motion": ["AccelY"], "Steering": ["Angle"]})
     np.testing.assert_allclose(read["Steering"].fields["Angle"], np.round(AY, 3), atol=1e-12)
     assert np.median(read["Steering"].log_time_ns - read["Motion"].log_time_ns) == pytest.approx(1e6, abs=2e5)
-
-
-def test_a_mat_file_of_version_7_3(tmp_path: Path) -> None:
-    path = tmp_path / "a.mat"
-    with h5py.File(path, "w", userblock_size=512) as file:
-        file["t"], file["ay_g"] = TIME_S[None, :], AY[:, None]
-        file["gnss/time"], file["gnss/speed_kmh"] = TIME_S[None, ::10], SPEED[None, ::10]
-        file.create_dataset("#refs#/a", data=[1.0])
-    data = bytearray(path.read_bytes())
-    data[:19] = b"MATLAB 7.3 MAT-file"
-    path.write_bytes(data)
-    with closing(open_log(path)) as log:
-        assert (log.kind, [(t.name, t.messages) for t in log.topics]) == ("mat-7.3", [("gnss", N // 10), ("mat", N)])
-        read = log.read({"mat": ["ay_g"], "gnss": ["speed_kmh"]})
-    np.testing.assert_array_equal(read["mat"].fields["ay_g"], AY)
-    np.testing.assert_array_equal(read["gnss"].fields["speed_kmh"], SPEED[::10])
-    assert read["mat"].log_time_ns[0] == RELATIVE_NS
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime as dt
-import io
 from contextlib import closing
 from pathlib import Path
 
@@ -259,14 +258,6 @@ def test_more_columns_than_the_limit_are_refused_before_they_are_read(tmp_path: 
         _log(tmp_path / "a.csv", text.encode())
 
 
-def test_rows_that_step_back_are_left_out_and_counted(tmp_path: Path) -> None:
-    lines = _csv(SECONDS, _HEAD).splitlines()
-    lines[50], lines[51] = lines[51], lines[50]
-    with closing(_log(tmp_path / "a.csv", "\n".join(lines).encode())) as log:
-        assert [(x.kind, x.count, x.severity) for x in log.lost] == [("out-of-order", 1, "note")]
-        np.testing.assert_array_equal(log.read({"csv": ["ay"]})["csv"].fields["ay"], np.delete(AY, 49))
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -399,19 +390,6 @@ def test_durations_and_times_of_day_are_times(kind: pa.DataType, tmp_path: Path)
     np.testing.assert_allclose((read.log_time_ns - RELATIVE_NS) * 1e-9, TIME_S, atol=1e-9)
 
 
-def test_a_damaged_column_of_a_row_group_is_a_loss(tmp_path: Path) -> None:
-    table = pa.table({"t": TIME_S, "ay": AY})
-    out = io.BytesIO()
-    pq.write_table(table, out, row_group_size=50, compression="zstd")
-    data = bytearray(out.getvalue())
-    at = pq.ParquetFile(io.BytesIO(bytes(data))).metadata.row_group(1).column(1).data_page_offset
-    data[at : at + 60] = b"\xff" * 60
-    with closing(_log(tmp_path / "a.parquet", bytes(data))) as log:
-        assert [(x.kind, x.count, x.severity) for x in log.lost] == [("bad-rows", 50, "lost")]
-        read = log.read({"parquet": ["ay"]})["parquet"].fields["ay"]
-    np.testing.assert_array_equal(read, np.where((np.arange(N) >= 50) & (np.arange(N) < 100), np.nan, AY))
-
-
 # ------------------------------------------------------------------------------------------------ MAT
 
 MAT = {
@@ -422,23 +400,6 @@ MAT = {
     "name": "a drive",
     "gnss": {"time": TIME_S[::10], "speed": SPEED[::10], "inner": {"lat": SPEED[::10]}},
 }
-
-
-@pytest.mark.parametrize("compressed", [False, True])
-def test_a_mat_file_with_vectors_matrices_and_structs(compressed: bool, tmp_path: Path) -> None:
-    savemat(tmp_path / "a.mat", MAT, do_compression=compressed)
-    with closing(open_log(tmp_path / "a.mat")) as log:
-        there = {t.name: [f.path for f in log.fields(t.name)] for t in log.topics}
-        assert there == {
-            "mat": ["ay_mps2", "wheels_kmh_0", "wheels_kmh_1", "wheels_kmh_2", "wheels_kmh_3"],
-            "gnss": ["speed"],
-            "gnss_inner": ["lat"],
-        }
-        assert [(x.kind, x.severity) for x in log.lost] == [("no-clock", "note")]
-        read = log.read({"mat": ["ay_mps2"], "gnss_inner": ["lat"]})
-    np.testing.assert_array_equal(read["mat"].fields["ay_mps2"], AY)
-    np.testing.assert_array_equal(read["gnss_inner"].fields["lat"], SPEED[::10])
-    np.testing.assert_array_equal(read["gnss_inner"].log_time_ns, read["mat"].log_time_ns[::10])
 
 
 @pytest.mark.parametrize(("wrong", "size"), [(1, 10**6), (99, 8)])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ from recorded import decoded_by_rosbags
 from pdhef_logtool.logs.encoding import CdrEncoder
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.schema_files import message_definition
-from pdhef_logtool.logs.writer import LIBRARY, McapLogWriter, RawMessage, TopicBatch
+from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import MappingError, OutputError
 
 pytestmark = pytest.mark.slow
@@ -227,62 +225,6 @@ def test_what_is_written_is_read_back_by_this_and_by_other_readers(tmp_path: Pat
     log.close()
 
 
-def _small_log(path: Path, n: int = 5000) -> None:
-    stamps = T0 + np.arange(n) * 10_000_000
-    with McapLogWriter(path) as writer:
-        writer.add_topic("/imu", "sensor_msgs/msg/Imu")
-        writer.write([TopicBatch("/imu", stamps, stamps, {"angular_velocity.z": np.arange(n) * 0.5})])
-        writer.attachment("report.json", "application/json", b'{"a": 1}', T0, T0 + 1)
-        writer.metadata("metrics", {"rmse": "0.1"})
-
-
-def test_file_has_chunks_indexes_statistics_summary_and_right_crcs(tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-    from mcap.records import Chunk, DataEnd, Footer, MessageIndex
-    from mcap.stream_reader import StreamReader
-
-    path = tmp_path / "log.mcap"
-    _small_log(path)
-    with path.open("rb") as file:
-        # Checks the CRCs of chunks and of the data section on its way.
-        records = list(StreamReader(file, emit_chunks=True, validate_crcs=True).records)
-    with path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True)
-        summary, header = reader.get_summary(), reader.get_header()
-        assert [(a.name, a.data) for a in reader.iter_attachments()] == [("report.json", b'{"a": 1}')]
-        assert [(m.name, m.metadata) for m in reader.iter_metadata()] == [("metrics", {"rmse": "0.1"})]
-    assert (header.profile, header.library) == ("ros2", LIBRARY)
-    chunks = [r for r in records if isinstance(r, Chunk)]
-    assert len(chunks) > 1
-    assert all(c.compression == "zstd" and c.uncompressed_crc for c in chunks)
-    assert sum(len(r.records) for r in records if isinstance(r, MessageIndex)) == 5000
-    assert next(r for r in records if isinstance(r, DataEnd)).data_section_crc
-    assert summary is not None
-    assert summary.statistics is not None
-    assert (summary.statistics.message_count, summary.statistics.chunk_count) == (5000, len(chunks))
-    assert len(summary.chunk_indexes) == len(chunks)
-    (footer,) = (r for r in records if isinstance(r, Footer))
-    content = path.read_bytes()
-    end = len(content) - 8 - 4
-    assert footer.summary_crc == zlib.crc32(content[footer.summary_start : end])
-    assert struct.unpack("<I", content[end : end + 4])[0] == footer.summary_crc
-
-
-def test_rerun_loads_rows_from_what_is_written(tmp_path: Path) -> None:
-    import subprocess
-    import sys
-
-    path, recording = tmp_path / "log.mcap", tmp_path / "log.rrd"
-    _small_log(path, n=50)
-    code = "import sys; import rerun as rr\nrr.init('test'); rr.save(sys.argv[2]); rr.log_file_from_path(sys.argv[1])\n"
-    environment = {"RERUN_ANALYTICS": "0", "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
-    subprocess.run([sys.executable, "-c", code, str(path), str(recording)], check=True, timeout=300, env=environment)
-    from rerun.chunk import RrdReader
-
-    chunks = [c for c in RrdReader(str(recording)).stream() if str(c.entity_path).startswith("/imu")]
-    assert sum(c.num_rows for c in chunks) >= 50
-
-
 def test_an_exception_leaves_nothing_behind(tmp_path: Path) -> None:
     def interrupted() -> None:
         with McapLogWriter(tmp_path / "log.mcap") as writer:
@@ -292,44 +234,6 @@ def test_an_exception_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="stop"):
         interrupted()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_file_appears_only_when_complete_and_replaces_the_old_one(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    path.write_bytes(b"old")
-    writer = McapLogWriter(path)
-    writer.add_topic("/imu", "sensor_msgs/msg/Imu")
-    assert path.read_bytes() == b"old"
-    writer.close()
-    assert path.read_bytes().startswith(b"\x89MCAP0")
-    assert [p.name for p in tmp_path.iterdir()] == ["log.mcap"]
-
-
-def test_same_input_gives_same_bytes(tmp_path: Path) -> None:
-    _small_log(tmp_path / "a.mcap")
-    _small_log(tmp_path / "b.mcap")
-    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
-
-
-def test_raw_messages_and_batches_are_merged_by_log_time(tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-
-    path = tmp_path / "log.mcap"
-    stamps = T0 + np.arange(0, 4000, 2)
-    with McapLogWriter(path) as writer:
-        writer.add_topic("/imu", "sensor_msgs/msg/Imu")
-        channel = writer.add_raw_channel(
-            "/note", schema_name="", schema_encoding="", schema_data=b"", message_encoding="json", metadata={"k": "v"}
-        )
-        raws = (RawMessage(channel, T0 + i, T0 - i, 100 + i, b"x" * 1000) for i in range(4000))
-        writer.write([TopicBatch("/imu", stamps, stamps, {})], raws)
-    with path.open("rb") as file:
-        messages = list(make_reader(file, validate_crcs=True).iter_messages(log_time_order=False))
-    expected = [(T0 + i, topic) for i in range(4000) for topic in (("/note", "/imu") if i % 2 == 0 else ("/note",))]
-    assert [(m.log_time, c.topic) for _, c, m in messages] == expected
-    notes = [(s, c, m) for s, c, m in messages if c.topic == "/note"]
-    assert all(s is None and c.metadata == {"k": "v"} and m.data == b"x" * 1000 for s, c, m in notes)
-    assert [(m.publish_time, m.sequence) for _, _, m in notes] == [(T0 - i, 100 + i) for i in range(4000)]
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from fake_drive_log import FakeLog, FakeTopic
 
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import AutoMapping, auto_map, load_mapping
-from pdhef_logtool.mapping.recognition import _looks_like_body_frame
 
 N = 400
 T = 1_700_000_000_000_000_000 + np.arange(N, dtype=np.int64) * 20_000_000
@@ -264,19 +263,6 @@ def test_a_car_that_stands_still_has_a_twist_of_zero(x_m: float, y_m: float, fil
     assert ("vx_m_s" not in found({"/ins/odom": out}).mapping.truth) == filler
     out.fields["twist.twist.linear.y"] = np.where(np.arange(N) == N - 1, 0.01, 0.0)
     assert "vx_m_s" in found({"/ins/odom": out}).mapping.truth
-
-
-def test_ten_moving_samples_of_which_most_go_forward_tell_the_body_frame() -> None:
-    def looks(along: int, moving: int, slow: int = 0) -> bool | None:
-        forward = np.array([2.0] * along + [-2.0] * (moving - along) + [0.9] * slow + [np.nan])
-        return _looks_like_body_frame(forward, np.zeros(len(forward)))
-
-    assert [looks(9, 9), looks(9, 9, slow=50)] == [None, None]
-    assert [looks(7, 10), looks(6, 10), looks(0, 10)] == [True, False, False]
-    sideways = np.full(20, 1.5)
-    assert _looks_like_body_frame(sideways, sideways) is False
-    assert _looks_like_body_frame(sideways, 0.99 * sideways) is True
-    assert _looks_like_body_frame(np.full(20, 0.8), np.full(20, 0.7)) is True  # 1.06 m/s together
 
 
 def test_what_was_ambiguous_names_its_readings_and_the_one_that_was_taken() -> None:

@@ -16,10 +16,8 @@ from written import as_written
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.reasons import REASONS
-from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.results.mcap_sink import (
     AnnotatedMcapSink,
-    _twist_covariance,
     metrics_record,
     thinned_step_ns,
     topic_of,
@@ -381,26 +379,6 @@ def test_sidecar_holds_our_topics_alone(tmp_path, circle):
     assert set(OUR_TOPICS) <= rows
 
 
-@pytest.mark.slow
-def test_bags_become_ros2(tmp_path, shared_dir, circle):
-    log = open_log(shared_dir / "data" / "drives" / "f1tenth_hoons_run2.bag")
-    path = tmp_path / "annotated.mcap"
-    sink = AnnotatedMcapSink(path, log)
-    track = circle("phy-ukf", 0, 100)
-    inside = make_track("phy-ukf", track.stamps_ns - track.stamps_ns[0] + log.start_ns, vx_m_s=track.vx_m_s)
-    sink.append(inside)
-    sink.finish(REPORT)
-    log.close()
-    with AnyReader([path]) as reader:
-        counts = {c.topic: c.msgcount for c in reader.connections}
-        first = next(reader.messages([c for c in reader.connections if c.topic == "/imu"]))
-        imu = reader.deserialize(first[2], first[0].msgtype)
-    assert counts["/imu"] == counts["/drive"] == counts["/optitrack/twist"] == 4655
-    assert counts["/pdhef/phy_ukf/state"] == 100
-    assert counts["/pdhef/phy_ukf/odometry"] == 0  # no pose was given
-    assert imu.linear_acceleration.z == 9.81
-
-
 def test_odometry_holds_no_pose_that_is_not_known(tmp_path, circle):
     path = tmp_path / "sidecar.mcap"
     track = circle("zero", 0, 10)
@@ -417,16 +395,6 @@ def test_odometry_holds_no_pose_that_is_not_known(tmp_path, circle):
 def test_a_log_without_truth_says_so_in_its_record():
     report = {**REPORT, "truth": {"available": False}, "metrics": [], "estimators": []}
     assert metrics_record(report) == {"log": "drive", "truth": "no ground truth"}
-
-
-def test_a_covariance_that_is_not_known_is_zero_as_ros_wants_it():
-    covariance = np.arange(18.0).reshape(2, 3, 3)
-    covariance[1, 0, 2] = np.nan
-    full = _twist_covariance(covariance, 2).reshape(2, 6, 6)
-    places = np.ix_([0, 1, 5], [0, 1, 5])
-    np.testing.assert_array_equal(full[0][places], covariance[0])
-    assert np.count_nonzero(full) == 8  # the first entry is 0 itself
-    assert not _twist_covariance(np.empty((0, 3, 3)), 2).any()
 
 
 def test_positions_far_from_the_origin_keep_their_millimetres(tmp_path, circle):

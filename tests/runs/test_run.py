@@ -257,20 +257,6 @@ def test_wrong_files_for_all_logs_stop_the_run_before_it_starts(sample_logs_dir:
     assert not (tmp_path / "out" / "run.json").exists()
 
 
-def test_an_error_half_way_leaves_nothing_behind(
-    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from pdhef_logtool.evaluation import metrics
-
-    def broken(*_: object, **__: object) -> None:
-        raise RuntimeError("broken on purpose")
-
-    monkeypatch.setattr(metrics, "evaluate_drive", broken)
-    with pytest.raises(RuntimeError, match="on purpose"):
-        run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path, _config(sample_logs_dir, annotate="full"))
-    assert [p for p in tmp_path.rglob("*") if p.is_file()] == []
-
-
 def test_an_error_half_way_keeps_the_outputs_of_the_run_before(
     sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

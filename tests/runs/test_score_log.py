@@ -14,7 +14,6 @@ import polars as pl
 import pytest
 from mcap.writer import Writer
 
-from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import MappingError, UsageError
 from pdhef_logtool.records.reporter import Reporter
@@ -344,13 +343,3 @@ def test_250_lm_speed_is_not_independent_of_its_truth(shared_dir: Path) -> None:
         assert _value(report, "vx_m_s", "not_independent") == 1.0
         assert _value(report, "vx_m_s", "rmse") < 1e-5
         assert {m["signal"] for m in report["metrics"]} == {"vx_m_s"}  # it claims nothing else
-
-
-def test_log_of_the_fixture_is_what_the_tests_take_it_for(annotated: Path) -> None:
-    log = open_log(annotated / "annotated.mcap")
-    try:
-        counts = {t.name: t.messages for t in log.topics}
-    finally:
-        log.close()
-    # Invalid rows stand in the state topic alone: only so do the two differ.
-    assert counts["/pdhef/phy_ukf/state"] > counts["/pdhef/phy_ukf/odometry"] > 0

@@ -95,15 +95,6 @@ def test_an_exception_leaves_the_old_folder(tmp_path: Path, failure: type[BaseEx
     assert [p.name for p in tmp_path.iterdir()] == ["x"]
 
 
-@pytest.mark.parametrize("act", ["discard", "commit"])
-def test_discard_is_harmless_afterwards(tmp_path: Path, act: str) -> None:
-    change = FolderTransaction(tmp_path / "x")
-    write_bytes(change.file("a.txt"), b"a")
-    getattr(change, act)()
-    change.discard()
-    assert (tmp_path / "x").exists() is (act == "commit")
-
-
 def test_a_folder_behind_a_link_is_replaced_where_it_is(tmp_path: Path) -> None:
     make(tmp_path / "real" / "x", OLD)
     (tmp_path / "logs").mkdir()
