@@ -254,14 +254,6 @@ def test_quiet_leaves_errors_and_results_and_verbose_shows_progress(sample_logs_
 
 
 @pytest.mark.slow
-def test_unknown_manoeuvre_names_those_that_there_are(tmp_path: Path) -> None:
-    result = called("simulate", "moose", "-o", str(tmp_path / "x.mcap"))
-    assert result.returncode == 2
-    assert "dlc" in _one_line_error(result)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
 def test_inspect_writes_a_mapping_that_run_takes(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = str(sample_logs_dir / "dlc.mcap")
     mapping = tmp_path / "mapping.toml"
@@ -286,24 +278,6 @@ def test_inspect_never_overwrites_a_mapping(sample_logs_dir: Path, tmp_path: Pat
     assert result.returncode == 1
     assert "mapping.toml" in _one_line_error(result)
     assert mapping.read_text() == "# mine\n"
-
-
-@pytest.mark.slow
-def test_simulate_writes_a_log_that_inspect_reads(tmp_path: Path) -> None:
-    log = tmp_path / "dlc.mcap"
-    made = called("simulate", "dlc", "--speed", "80", "--seed", "3", "-o", str(log), "--json")
-    assert made.returncode == 0, made.stderr
-    assert json.loads(made.stdout)["output"] == str(log)
-    seen = called("inspect", str(log), "--json")
-    assert seen.returncode == 0
-    assert {"steer_rad", "ay_m_s2", "yaw_rate_rad_s"} <= json.loads(seen.stdout)["signals"].keys()
-
-
-@pytest.mark.slow
-def test_list_of_manoeuvres_names_the_demo_ones() -> None:
-    result = called("simulate", "--list", "--json")
-    assert {"dlc", "sine-sweep", "road"} <= {m["name"] for m in json.loads(result.stdout)["manoeuvres"]}
-    assert "dlc" in called("simulate", "--list").stdout
 
 
 def _run_of(folder: Path, *names: str) -> Path:

@@ -13,10 +13,8 @@ from pdhef_logtool.drive.truth import (
     Attitude,
     dependent_signals,
     derive_truth,
-    estimate_truth_latency,
     plan_truth,
     truth_at,
-    yaw_rate_channel,
 )
 from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
 from pdhef_logtool.evaluation.smoothing import smooth
@@ -82,21 +80,6 @@ def test_measured_against_derived_lateral_acceleration(drive, name, bias, rms):
     assert np.sqrt(np.mean(residual**2)) == pytest.approx(rms, rel=0.25)
 
 
-def test_the_250_lm_knows_its_speed_and_yaw_rate(drive):
-    channels, vehicle = drive("revs_250lm_a.mcap")
-    assert set(dependent_signals(channels.signals, channels.truth)) == {"vx_m_s", "yaw_rate_rad_s"}
-    latency = estimate_truth_latency(channels.signals["yaw_rate_rad_s"], yaw_rate_channel(derive_truth(channels.truth)))
-    assert latency.identical
-    assert latency.latency_s == 0.0
-    signals = aligned(channels, vehicle)
-    assert len(signals) == 30000
-    assert np.isfinite(signals.speed_m_s).all()
-    truth = truth_at(derive_truth(channels.truth), signals.stamps_ns)
-    assert np.rad2deg([np.nanmin(truth.sideslip_rad), np.nanmax(truth.sideslip_rad)]) == pytest.approx(
-        [-5.3, 3.5], abs=0.05
-    )
-
-
 @pytest.mark.parametrize("name", ["f1tenth_hoons_run2.bag", "comma2k19_segment.mcap", "lunda_v40"])
 def test_other_truths_are_independent(drive, name):
     channels, _ = drive(name)
@@ -114,20 +97,6 @@ def test_the_phones_velocity_is_turned_into_the_car(drive):
     both = np.isfinite(truth.vx_m_s) & np.isfinite(signals.speed_m_s)
     speed = np.hypot(truth.vx_m_s[both], truth.vy_m_s[both])
     assert np.sqrt(np.mean((speed - signals.speed_m_s[both]) ** 2)) < 0.25
-
-
-def test_the_v40s_velocities_are_moved_by_the_stated_lever_arm(drive):
-    channels, vehicle = drive("lunda_v40")
-    truth = derive_truth(channels.truth, truth_position_m=vehicle.truth_position_m)
-    track = truth.track
-    known = np.isfinite(track.vy_m_s)
-    assert known.sum() > 2000
-    moved = np.interp(track.stamps_ns, channels.truth["vy_m_s"].stamps_ns, channels.truth["vy_m_s"].values)
-    np.testing.assert_allclose(track.vy_m_s[known], (moved + 0.32 * track.yaw_rate_rad_s)[known], atol=1e-9)
-    gap = np.diff(track.stamps_ns) > 2e9
-    assert gap.sum() == 1
-    inside = truth_at(truth, track.stamps_ns[:-1][gap] + 1_000_000_000)
-    assert not inside.valid.any()
 
 
 @pytest.mark.parametrize(

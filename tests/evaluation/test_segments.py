@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.evaluation import smoothing
 from pdhef_logtool.evaluation.segments import find_intervals, segment_masks
 from pdhef_logtool.evaluation.smoothing import smooth
 from pdhef_logtool.records.signals import Signals
@@ -179,15 +178,3 @@ def test_swings_to_one_side_are_no_slalom():
     ay = np.where((t > 2) & (t < 18), 4.0 * np.maximum(np.sin(2 * np.pi * 0.5 * (t - 2)), 0.0), 0.0)
     masks = segment_masks(signals(t, 0 * t + 20, 0 * t, ay), None, VEHICLE)
     assert not masks["slalom"].any()
-
-
-@pytest.mark.parametrize("n", [3, 40, 107, 108, 5000])
-def test_smoothing_what_is_known_everywhere_is_smoothing_with_weights(n: int) -> None:
-    values = np.random.default_rng(n).standard_normal(n)
-    sigma = smoothing._sigma_rows(10_000_000, 1.0)
-    np.testing.assert_array_equal(smoothing._gaussian_of_ones(n, sigma), smoothing._gaussian(np.ones(n), sigma))
-    reach = int(4.0 * sigma + 0.5)
-    weights = np.exp(-0.5 / (sigma * sigma) * np.arange(-reach, reach + 1) ** 2)
-    padded = np.pad(values, reach)
-    expected = [float(padded[i : i + 2 * reach + 1] @ weights) / weights.sum() for i in range(n)]
-    np.testing.assert_allclose(smoothing._gaussian(values, sigma), expected, atol=1e-12)

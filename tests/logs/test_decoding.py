@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.logs.decoding import NO_TIME_NS
-from pdhef_logtool.logs.message_schema import parse_path
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
 from pdhef_logtool.records.errors import MappingError
@@ -218,17 +217,3 @@ def test_an_empty_window_has_columns_of_the_right_shape(tmp_path: Path) -> None:
     assert columns.fields["orientation_covariance"].shape == (0, 9)
     assert columns.fields["angular_velocity.z"].shape == (0,)
     log.close()
-
-
-@pytest.mark.parametrize(
-    ("path", "steps"),
-    [
-        ("a", ("a",)),
-        ("a.b.c", ("a", "b", "c")),
-        ("a[3]", ("a", 3)),
-        ("a[0][1].b", ("a", 0, 1, "b")),
-        ("data[]", ("data",)),
-    ],
-)
-def test_paths_split_into_steps(path: str, steps: tuple[object, ...]) -> None:
-    assert parse_path(path) == steps

@@ -190,13 +190,6 @@ def test_channel_groups_keep_their_clocks_and_units(version: str, tmp_path: Path
     assert read[imu.name].log_time_ns[0] == read[other.name].log_time_ns[0] == START_NS
 
 
-def test_a_window_is_that_part_of_the_columns(tmp_path: Path) -> None:
-    with closing(open_log(mdf(tmp_path / "a.mf4"))) as log:
-        whole = log.read({"IMU_100_Hz": ["IMU_AccY"]})["IMU_100_Hz"]
-        part = log.read({"IMU_100_Hz": ["IMU_AccY"]}, START_NS + 10**9, START_NS + 2 * 10**9)["IMU_100_Hz"]
-    np.testing.assert_array_equal(part.fields["IMU_AccY"], whole.fields["IMU_AccY"][100:200])
-
-
 def test_a_cut_file_gives_what_is_readable_or_one_line(tmp_path: Path) -> None:
     data = mdf(tmp_path / "a.mf4").read_bytes()
     for share in (0.05, 0.3, 0.6, 0.9, 0.98):

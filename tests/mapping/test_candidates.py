@@ -14,7 +14,7 @@ from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.mapping import AutoMapping, auto_map, fit_clocks
 from pdhef_logtool.mapping.channels import si_of
 from pdhef_logtool.mapping.mapping_file import mapping_from_dict
-from pdhef_logtool.mapping.naming import meaning_of, unit_of, words_of
+from pdhef_logtool.mapping.naming import meaning_of, unit_of
 from pdhef_logtool.mapping.vendors import load_vendors
 from pdhef_logtool.records.errors import MappingFileError
 
@@ -589,37 +589,6 @@ def test_a_well_known_log_is_not_read_for_candidates() -> None:
     )
     auto_map(log)
     assert not any("/other" in read for read in log.reads)
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("SteeringWheelAngle", ("steering", "wheel", "angle")),
-        ("WheelSpd_FL", ("wheel", "spd", "fl")),
-        ("steeringangle", ("steering", "angle")),
-        ("latAccelG", ("lat", "accel", "g")),
-        ("/vehicle/yawrate", ("vehicle", "yaw", "rate")),
-    ],
-)
-def test_names_are_cut_into_words(name: str, words: tuple[str, ...]) -> None:
-    assert words_of(name) == words
-
-
-@pytest.mark.parametrize(
-    ("leaf", "kind", "unit"),
-    [
-        ("yaw_rate_deg_s", "rate", "degps"),
-        ("accel_m_s2", "acceleration", "mps2"),
-        ("velocity_kmh", "speed", "kmh"),
-        ("speed_km_h", "speed", "kmh"),
-        ("VehicleSpeedKph", "speed", "kph"),
-        ("x_accel_g", "acceleration", "g"),
-        ("gyro_z_rad_s", "rate", "radps"),
-        ("steer", "angle", ""),
-    ],
-)
-def test_units_of_names(leaf: str, kind: str, unit: str) -> None:
-    assert unit_of(leaf, kind)[0] == unit
 
 
 @pytest.mark.parametrize(

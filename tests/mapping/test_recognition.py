@@ -177,17 +177,6 @@ def test_commands_are_no_sensors() -> None:
     assert any("command" in n for n in auto.mapping.notes)
 
 
-def test_a_measured_steering_angle_goes_before_a_command() -> None:
-    auto = found(
-        {
-            "/drive": topic("ackermann_msgs/msg/AckermannDrive", "", steering_angle=S),
-            "/report": topic("autoware_vehicle_msgs/msg/SteeringReport", "stamp", steering_tire_angle=S),
-        }
-    )
-    assert auto.mapping.signals["steer_rad"].topic == "/report"
-    assert auto.ambiguities == ()
-
-
 def test_an_unstamped_twist_is_taken_at_log_time() -> None:
     auto = found({"/vehicle/twist": twist("geometry_msgs/msg/Twist", "", 5 + S, 0 * S, stamp="")})
     assert fields_of(auto) == {"speed_m_s": ("/vehicle/twist", "linear.x", "log_time")}

@@ -17,18 +17,6 @@ def columns(**fields: np.ndarray) -> Columns:
     return Columns("/a", times, times, fields)
 
 
-def test_a_scalar_is_scaled_and_shifted() -> None:
-    source = SignalSource("speed_m_s", "/a", "v", scale=2.0, offset=-3.0)
-    np.testing.assert_array_equal(si_values(columns(v=np.arange(N)), source), [-3.0, -1.0, 1.0, 3.0])
-
-
-def test_each_column_of_a_vector_has_its_own_scale_and_offset() -> None:
-    paths = ("e", "n", "u")
-    source = SignalSource("enu_velocity_m_s", "/a", paths, scale=(1.0, 2.0, -1.0), offset=(0.0, 5.0, 0.5))
-    raw = {p: np.full(N, float(i + 1)) for i, p in enumerate(paths)}
-    np.testing.assert_array_equal(si_values(columns(**raw), source), np.tile([1.0, 9.0, -2.5], (N, 1)))
-
-
 @pytest.mark.parametrize(
     ("name", "raw", "shape"),
     [
