@@ -79,7 +79,7 @@ class FrictionSource:
         if self.bank is None:
             return signals if self.factor == 1.0 else replace(signals, friction=signals.friction * self.factor)
         if self._filled is None or self._filled[0] is not signals:
-            self.estimate, _ = self.bank.run(signals, None)
+            self.estimate = self.bank.run(signals)
             self._filled = signals, replace(signals, friction=self.estimate.friction)
         return self._filled[1]
 

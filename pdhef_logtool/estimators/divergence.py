@@ -19,15 +19,15 @@ accelerometer or gyro are attributed to the estimate, except for missing and stu
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, StepColumns, last_stamp_ns, release, step_durations_s
+from pdhef_logtool.records.signals import BoolArray, Signals
+from pdhef_logtool.records.steps import RESTART_GAP_S, release, step_durations_s
 from pdhef_logtool.records.tracks import StateTrack
 
 ON_RAD, OFF_RAD = math.radians(5.0), math.radians(3.0)
@@ -45,23 +45,6 @@ D, FLAG, HAS_LAST, VY, VX, AY, GYRO, AY_AGE, GYRO_AGE, AY_RUN, GYRO_RUN, AY_SLOW
 MEMORY_SIZE = 15
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FlagSteps(StepColumns):
-    """When steps arrived and whether the flag is set at them, [K]."""
-
-    ready_ns: IntArray
-    flags: BoolArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DivergenceState:
-    """State between windows: the sum, and the flags of steps that later stamps need."""
-
-    memory: FloatArray
-    last_stamp_ns: int | None
-    waiting: FlagSteps
-
-
 def watched_track(track: StateTrack, signals: Signals, vehicle: VehicleParameters) -> StateTrack:
     """Return a track [N] with ``diverged`` completed.
 
@@ -69,28 +52,22 @@ def watched_track(track: StateTrack, signals: Signals, vehicle: VehicleParameter
     """
     if track.covariance.shape[0] == 0:
         return track
-    flags, _ = wrong_branch(track, signals, vehicle)
-    return replace(track, diverged=track.diverged | (flags & track.valid))
+    return replace(track, diverged=track.diverged | (wrong_branch(track, signals, vehicle) & track.valid))
 
 
-def wrong_branch(
-    track: StateTrack, signals: Signals, vehicle: VehicleParameters, state: DivergenceState | None = None
-) -> tuple[BoolArray, DivergenceState]:
-    """Return where a track departs from the sensors' motion, [N]; joined windows equal the whole bit for bit.
+def wrong_branch(track: StateTrack, signals: Signals, vehicle: VehicleParameters) -> BoolArray:
+    """Return where a track departs from the sensors' motion, [N].
 
     Computed on measurement time; a scored stamp has the flag of the newest step that had arrived.
 
     Parameters
     ----------
-    track, signals : [N] at the same stamps. state : of the previous window, None at the start of a log.
+    track, signals : [N] at the same stamps.
     """
     signals = without_impossible(signals)
-    count = len(signals)
-    before_ns = state.last_stamp_ns if state else None
-    memory = np.zeros(MEMORY_SIZE) if state is None else state.memory.copy()
     friction = np.where(np.isfinite(track.friction), track.friction, signals.friction)
-    steps = FlagSteps(signals.ready_ns, np.empty(count, dtype=np.bool_))
-    dt_s = step_durations_s(signals.stamps_ns, before_ns)
+    flags = np.empty(len(signals), dtype=np.bool_)
+    dt_s = step_durations_s(signals.stamps_ns, None)
     motion = (
         dt_s, signals.ay_m_s2, signals.yaw_rate_rad_s, friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s,
         track.valid,
@@ -101,13 +78,9 @@ def wrong_branch(
         sensors.yaw_rate_std_rad_s, *vehicle.imu_position_m[:2], LEAST_SPEED_BLENDS * vehicle.low_speed_blend_m_s,
         sensors.imu_hold_s, float(sensors.stuck_samples),
     )  # fmt: skip
-    _watch(motion, car, memory, steps.flags)
-    if state is not None:
-        steps = state.waiting.joined(steps)
-    released = release(steps.ready_ns, signals.stamps_ns)
-    flags: BoolArray = steps.flags[released.row] & released.arrived
-    last = last_stamp_ns(signals.stamps_ns, before_ns)
-    return flags, DivergenceState(memory, last, steps.since(released.needed))
+    _watch(motion, car, np.zeros(MEMORY_SIZE), flags)
+    released = release(signals.ready_ns, signals.stamps_ns)
+    return np.asarray(flags[released.row] & released.arrived, dtype=np.bool_)
 
 
 @njit(cache=True)

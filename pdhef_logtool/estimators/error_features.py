@@ -24,7 +24,6 @@ ignored.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,8 +31,8 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, StepColumns, last_stamp_ns, release, step_durations_s
+from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.steps import RESTART_GAP_S, release, step_durations_s
 from pdhef_logtool.records.tracks import StateTrack
 
 #: In the order of the columns.
@@ -57,52 +56,29 @@ MEMORY_SIZE = 10
 STEP_SIZE = 3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TermSteps(StepColumns):
-    """When steps arrived, [K], and their grip share, kinematic and yaw-rate terms, [K, 3]."""
-
-    ready_ns: IntArray
-    terms: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FeatureState:
-    """Memory between windows: the filters' state, and the steps that coming stamps still need."""
-
-    memory: FloatArray
-    last_stamp_ns: int | None
-    waiting: TermSteps
-
-
-def error_terms(
-    track: StateTrack, signals: Signals, roll_gradient_rad_per_m_s2: float, state: FeatureState | None
-) -> tuple[FloatArray, FeatureState]:
-    """Return the terms [N, 9] of :data:`TERMS` at the stamps of a window; joined windows equal the whole.
+def error_terms(track: StateTrack, signals: Signals, roll_gradient_rad_per_m_s2: float) -> FloatArray:
+    """Return the terms [N, 9] of :data:`TERMS`.
 
     Terms that cannot be known count as 0, for instance before the first sample has arrived.
 
     Parameters
     ----------
-    track, signals : at the same stamps. state : what the previous window's call returned.
+    track, signals : [N] at the same stamps.
     """
     signals = without_impossible(signals)
     count = len(signals)
-    before_ns = state.last_stamp_ns if state else None
     friction = np.where(np.isfinite(track.friction), track.friction, signals.friction)
     friction = np.where(np.isfinite(friction), friction, ASSUMED_FRICTION)
-    memory = np.zeros(MEMORY_SIZE) if state is None else state.memory.copy()
-    steps = TermSteps(signals.ready_ns, np.empty((count, STEP_SIZE)))
-    dt_s = step_durations_s(signals.stamps_ns, before_ns)
+    steps = np.empty((count, STEP_SIZE))
+    dt_s = step_durations_s(signals.stamps_ns, None)
     motion = (
         dt_s, *believed(track, signals), friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s
     )  # fmt: skip
-    _advance(motion, 1.0 + GRAVITY_M_S2 * roll_gradient_rad_per_m_s2, memory, steps.terms)
-    if state is not None:
-        steps = state.waiting.joined(steps)
-    released = release(steps.ready_ns, signals.stamps_ns)
-    arrived_terms = np.where(released.arrived[:, None], steps.terms[released.row], 0.0)
+    _advance(motion, 1.0 + GRAVITY_M_S2 * roll_gradient_rad_per_m_s2, np.zeros(MEMORY_SIZE), steps)
+    released = release(signals.ready_ns, signals.stamps_ns)
+    arrived_terms = np.where(released.arrived[:, None], steps[released.row], 0.0)
     grip = arrived_terms[:, 0]
-    terms = np.stack(
+    return np.stack(
         [
             np.full(count, FLOOR_RAD),
             _known(track.sideslip_std_rad),
@@ -116,8 +92,6 @@ def error_terms(
         ],
         axis=1,
     )
-    last = last_stamp_ns(signals.stamps_ns, before_ns)
-    return terms, FeatureState(memory, last, steps.since(released.needed))
 
 
 def believed(track: StateTrack, signals: Signals) -> tuple[FloatArray, FloatArray]:

@@ -36,11 +36,11 @@ from pdhef_logtool.car.nominal_model import (
 )
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.filter_base import U_STEER, VX, FilterState
+from pdhef_logtool.estimators.filter_base import U_STEER, VX
 from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.records.steps import last_stamp_ns, step_durations_s
+from pdhef_logtool.records.steps import step_durations_s
 
 #: Aligned signals without which nothing can be estimated.
 NEEDS = frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
@@ -73,18 +73,6 @@ _STARTED, _AY, _REACHED, _STEER, _SPEED = range(5)
 _MEMORY = 5
 _NOT_MEASURED = 1e12  # variance of a channel without a sample
 _STEP_VY, _STEP_YAW_RATE = 0.02, 0.002  # for difference quotients
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FrictionState:
-    """What the bank takes from window to window; ``speed_filter`` is the state of the ``phy-ukf`` beside it."""
-
-    weights: FloatArray
-    x: FloatArray
-    P: FloatArray
-    memory: FloatArray
-    last_stamp_ns: int | None
-    speed_filter: FilterState
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +214,7 @@ def _bank(drive, filters, ay_per_friction, bank, out_mu, out_std):  # type: igno
 
 @dataclass(frozen=True, slots=True)
 class FrictionBank:
-    """The bank of this file; immutable, its only memory is the state.
+    """The bank of this file.
 
     Parameters
     ----------
@@ -260,28 +248,21 @@ class FrictionBank:
         roll_gain = max(0.0, GRAVITY_M_S2 * self.vehicle.roll_gradient_rad_per_m_s2)
         return (1.0 + roll_gain) * (front + rear) / self.vehicle.mass_kg
 
-    def run(self, signals: Signals, state: FrictionState | None) -> tuple[FrictionEstimate, FrictionState]:
-        """Estimate over one window; windows join bit for bit. ``signals.friction`` is not looked at."""
+    def run(self, signals: Signals) -> FrictionEstimate:
+        """Estimate over a drive. ``signals.friction`` is not looked at."""
         signals = without_impossible(signals)
         vehicle = self.vehicle.model_copy(update={"friction": USUAL_FRICTION})
         unknown = replace(signals, friction=np.full(len(signals), np.nan))
         speed_filter = PhysicsUkf(vehicle, use_speed=self.use_speed)
-        steps, speed_carry = speed_filter.run(unknown, None if state is None else state.speed_filter)
+        steps, _ = speed_filter.run(unknown, None)
         filters = grid, _, prior, models = self._filters
-        count, bank = (
-            len(signals),
-            (prior.copy(), np.zeros((len(grid), 2)), np.zeros((len(grid), 3)), np.zeros(_MEMORY)),
-        )
-        if state is not None:
-            bank = state.weights.copy(), state.x.copy(), state.P.copy(), state.memory.copy()
-        before_ns = state.last_stamp_ns if state else None
-        dt = step_durations_s(signals.stamps_ns, before_ns)
+        bank = (prior.copy(), np.zeros((len(grid), 2)), np.zeros((len(grid), 3)), np.zeros(_MEMORY))
+        dt = step_durations_s(signals.stamps_ns, None)
         vx = np.where(steps.valid, steps.x[:, VX], np.nan)
         usable = np.asarray(vx > LEAST_SPEED_BLENDS * models[0].blend_high_m_s)
-        friction, std = np.empty(count), np.empty(count)
+        friction, std = np.empty(len(signals)), np.empty(len(signals))
         drive = (
             dt, vx, steps.inputs[:, U_STEER].copy(), usable, signals.ay_m_s2, signals.yaw_rate_rad_s,
         )  # fmt: skip
         _bank(drive, filters, self.ay_per_friction, bank, friction, std)
-        after = FrictionState(*bank, last_stamp_ns(signals.stamps_ns, before_ns), speed_carry)
-        return FrictionEstimate(friction, std, std < OBSERVABLE_STD), after
+        return FrictionEstimate(friction, std, std < OBSERVABLE_STD)

@@ -140,7 +140,7 @@ def calibrated(
     """
     from pdhef_logtool.estimators.error_features import error_terms
 
-    terms, _ = error_terms(track, signals, roll_gradient_rad_per_m_s2, None)
+    terms = error_terms(track, signals, roll_gradient_rad_per_m_s2)
     return inflated(track, terms, inflation)
 
 

@@ -49,7 +49,7 @@ class PosteriorBand:
         if signals is not self._signals:
             self._signals, self._vy = signals, [run_estimator(f, signals).vy_m_s for f in self.filters]
         vehicle = self.filters[0].vehicle
-        terms, _ = error_terms(track, signals, vehicle.roll_gradient_rad_per_m_s2, None)
+        terms = error_terms(track, signals, vehicle.roll_gradient_rad_per_m_s2)
         seen = terms[:, _KINEMATIC] * np.abs(track.vx_m_s)
         return widened(track, self._vy, seen, vehicle.low_speed_blend_m_s, own_share=OWN_SHARE)
 

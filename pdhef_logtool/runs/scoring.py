@@ -58,7 +58,6 @@ def evaluate(
     from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
 
     truth, vehicle = read(TRUTH), drive.car.vehicle
-    signals = Signals.rows(signals, 0, len(signals))  # in memory
     manoeuvres = find_manoeuvres(signals, vehicle)
     masks = segment_masks(signals, truth, vehicle, manoeuvres)
     moving = moving_mask(signals, truth, vehicle)

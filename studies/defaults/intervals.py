@@ -151,7 +151,7 @@ def drive_samples(
     vehicle : the right one; its roll gradient and lowest speed count.
     """
     slow = vehicle.low_speed_blend_m_s
-    terms, _ = error_terms(track, given, vehicle.roll_gradient_rad_per_m_s2, None)
+    terms = error_terms(track, given, vehicle.roll_gradient_rad_per_m_s2)
     error = {s: signal_error(track, truth, s, slow) for s in ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s")}
     sideslip_std, rate_std = track.sideslip_std_rad, track.yaw_rate_std_rad_s
     use = np.isfinite(sideslip_std) & (sideslip_std > 0.0) & np.isfinite(track.vy_std_m_s) & np.isfinite(rate_std)

@@ -83,7 +83,7 @@ def seconds(signals: Signals) -> np.ndarray:
 
 
 def flags(track: StateTrack, signals: Signals, vehicle: VehicleParameters = VEHICLE) -> np.ndarray:
-    return wrong_branch(track, signals, vehicle)[0]
+    return wrong_branch(track, signals, vehicle)
 
 
 @settings(deadline=None, max_examples=20)
@@ -177,7 +177,7 @@ def test_what_comes_later_changes_no_flag() -> None:
     wrong = off_by(truth, 20.0, 5.0, 7.0)
     whole = flags(wrong, signals)
     end = 600
-    part, _ = wrong_branch(_cut_track(wrong, 0, end), cut(signals, 0, end), VEHICLE)
+    part = wrong_branch(_cut_track(wrong, 0, end), cut(signals, 0, end), VEHICLE)
     assert whole[:end].any()
     np.testing.assert_array_equal(part, whole[:end])
 

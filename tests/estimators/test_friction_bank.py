@@ -16,7 +16,7 @@ from pdhef_logtool.drive.friction import friction_source, parse_friction
 from pdhef_logtool.estimators import friction_bank
 from pdhef_logtool.estimators.friction_bank import BOUND_SHARE, FORGETTING_S, FrictionBank, FrictionEstimate
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.signals import Signals, join_signals
 
 pytestmark = pytest.mark.slow
 
@@ -34,7 +34,7 @@ ALL = frozenset({"steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s
 
 
 def estimate(signals: Signals, vehicle=VEHICLE) -> FrictionEstimate:
-    return FrictionBank(vehicle).run(signals, None)[0]
+    return FrictionBank(vehicle).run(signals)
 
 
 def excited(mu: float, duration_s: float = 8.0) -> Signals:
@@ -113,25 +113,23 @@ def test_a_file_with_wrong_stiffness_is_no_slippery_road(front, rear):
     """Half of the grip of a dry road is used, all stiffness errors within the 1-sigma of a file's prior."""
     signals = with_noise(drive(slalom(0.03, 0.5), 12.0, speed=20.0, mu=1.0, tyre=tanh_tyre).signals, seed=9)
     vehicle = STIFFNESS_VEHICLE.with_stiffness(front, rear)
-    found = FrictionBank(vehicle, validated=False).run(signals, None)[0]
+    found = FrictionBank(vehicle, validated=False).run(signals)
     assert found.friction.min() > 0.8
     assert not found.observable.any()
 
 
 def test_saturation_shows_with_a_file_that_may_be_wrong():
-    found = FrictionBank(VEHICLE, validated=False).run(excited(0.3, 10.0), None)[0]
+    found = FrictionBank(VEHICLE, validated=False).run(excited(0.3, 10.0))
     assert abs(np.median(found.friction[-400:]) - 0.3) < 0.1
 
 
 def test_the_acceleration_that_was_reached_is_forgotten_where_saturation_shows():
     """A turn on a dry road, then the excitation of a slippery one."""
     dry, slippery = excited(0.9), excited(0.3)
-    bank = FrictionBank(VEHICLE)
-    _, state = bank.run(dry, None)
     later = replace(slippery, stamps_ns=slippery.stamps_ns + dry.stamps_ns[-1] + 10_000_000 - slippery.stamps_ns[0])
-    found = bank.run(later, state)[0]
-    assert found.friction[0] > 0.7
-    assert abs(np.median(found.friction[-200:]) - 0.3) < 0.1
+    friction = FrictionBank(VEHICLE).run(join_signals([dry, later])).friction
+    assert friction[len(dry)] > 0.7
+    assert abs(np.median(friction[-200:]) - 0.3) < 0.1
 
 
 def rough() -> Signals:

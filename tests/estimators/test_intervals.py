@@ -110,8 +110,8 @@ def test_what_has_not_arrived_changes_nothing(at: int) -> None:
         ay_m_s2=np.where(late, 30.0, signals.ay_m_s2),
         yaw_rate_rad_s=np.where(late, 3.0, signals.yaw_rate_rad_s),
     )
-    before, _ = error_terms(track, signals, 0.009, None)
-    after, _ = error_terms(track, changed, 0.009, None)
+    before = error_terms(track, signals, 0.009)
+    after = error_terms(track, changed, 0.009)
     assert np.array_equal(before[: at + 1], after[: at + 1])
     assert not np.array_equal(before, after)
 
@@ -134,7 +134,7 @@ def test_the_estimate_stays_and_the_covariance_is_scaled_as_one() -> None:
 
 def test_the_filters_own_term_alone_changes_nothing_but_the_scale() -> None:
     signals, track = _drive()
-    terms, _ = error_terms(track, signals, 0.009, None)
+    terms = error_terms(track, signals, 0.009)
     only = make_inflation(
         tuple(2.0 * (t == "filter") for t in SIDESLIP_TERMS), tuple(3.0 * (t == "filter") for t in YAW_RATE_TERMS)
     )
@@ -159,8 +159,8 @@ def test_the_interval_widens_with_every_term() -> None:
 def test_terms_see_a_wrong_sideslip_and_a_wrong_yaw_rate() -> None:
     signals, track = _drive()
     right = replace(track, vy_m_s=track.vy_m_s / 0.8, yaw_rate_rad_s=signals.yaw_rate_rad_s)
-    untilted = error_terms(right, signals, 0.0, None)[0]
-    wrong = error_terms(replace(right, vy_m_s=0.5 * right.vy_m_s), signals, 0.0, None)[0]
+    untilted = error_terms(right, signals, 0.0)
+    wrong = error_terms(replace(right, vy_m_s=0.5 * right.vy_m_s), signals, 0.0)
     late = slice(200, 440)
     kinematic, rate = TERMS.index("kinematic"), TERMS.index("yaw_rate")
     # Half of a swing of 0.3 m/s at 3 rad/s is lost; the high-pass of 0.3 s passes ωτ / √(1 + ω²τ²) = 0.67 of it.
@@ -168,7 +168,7 @@ def test_terms_see_a_wrong_sideslip_and_a_wrong_yaw_rate() -> None:
     assert np.all(untilted[late, kinematic] < 0.3 * expected)
     assert np.median(wrong[late, kinematic]) == pytest.approx(expected, rel=0.25)
     assert np.all(untilted[late, rate] == 0.0)
-    off = error_terms(replace(right, yaw_rate_rad_s=right.yaw_rate_rad_s - 0.01), signals, 0.0, None)[0]
+    off = error_terms(replace(right, yaw_rate_rad_s=right.yaw_rate_rad_s - 0.01), signals, 0.0)
     assert off[400, rate] == pytest.approx(0.01, rel=0.05)
     assert np.all(untilted[:, 0] == FLOOR_RAD)
 
@@ -176,8 +176,8 @@ def test_terms_see_a_wrong_sideslip_and_a_wrong_yaw_rate() -> None:
 def test_grip_follows_the_friction_that_is_told() -> None:
     signals, track = _drive()
     grip = TERMS.index("grip")
-    high = error_terms(track, signals, 0.0, None)[0][:, grip]
-    low = error_terms(track, replace(signals, friction=signals.friction / 2.0), 0.0, None)[0][:, grip]
+    high = error_terms(track, signals, 0.0)[:, grip]
+    low = error_terms(track, replace(signals, friction=signals.friction / 2.0), 0.0)[:, grip]
     np.testing.assert_allclose(low, 2.0 * high)
 
 
@@ -186,7 +186,7 @@ def test_terms_tell_that_an_estimator_cures_its_car_and_sees_a_bank() -> None:
     weight = np.linspace(0.0, 1.0, 900)
     weight[5] = np.nan
     curing = replace(track, mixture_weight=weight, bank_rad=np.full(900, -0.03))
-    plain, told = (error_terms(t, signals, 0.0, None)[0] for t in (track, curing))
+    plain, told = (error_terms(t, signals, 0.0) for t in (track, curing))
     cure, bank = TERMS.index("cure"), TERMS.index("bank")
     np.testing.assert_allclose(told[:, cure], np.nan_to_num(weight) * np.abs(track.sideslip_rad))
     np.testing.assert_array_equal(told[:, bank], 0.03)
@@ -211,7 +211,7 @@ def test_nothing_is_made_of_missing_samples() -> None:
     signals, track = _drive(60)
     nothing = np.full(60, np.nan)
     blind = replace(signals, ay_m_s2=nothing, yaw_rate_rad_s=nothing, friction=nothing)
-    terms, _ = error_terms(track, blind, 0.009, None)
+    terms = error_terms(track, blind, 0.009)
     assert np.all(np.isfinite(terms))
     assert np.all(terms[:, 3:] == 0.0)
 
@@ -221,11 +221,11 @@ def test_a_sensor_that_the_estimator_has_found_faulty_widens_nothing() -> None:
     stuck = np.arange(900) >= 200
     signals = replace(signals, yaw_rate_rad_s=np.where(stuck, 0.4, signals.yaw_rate_rad_s))
     told = replace(track, reason=np.where(stuck, STUCK_YAW_RATE, 0))
-    blind, seeing = (error_terms(t, signals, 0.009, None)[0][300:440, 5:7] for t in (track, told))
+    blind, seeing = (error_terms(t, signals, 0.009)[300:440, 5:7] for t in (track, told))
     assert np.all(seeing < 0.1 * blind)
     # A faulty accelerometer leaves the yaw rate's term alone.
     other = replace(track, reason=np.where(stuck, STUCK_AY, 0))
-    assert np.array_equal(error_terms(other, signals, 0.009, None)[0][300:440, 6], blind[:, 1])
+    assert np.array_equal(error_terms(other, signals, 0.009)[300:440, 6], blind[:, 1])
 
 
 def test_without_an_entry_a_track_stays_as_it_is() -> None:

@@ -86,7 +86,7 @@ def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
     assert {v.yaw_inertia_kg_m2 for v in vehicles} == {1700.0}
     filters = [replace(physics_filter(v, NOISE), read_with=OWN) for v in vehicles]
     middle, *others = (run_window(f, signals)[0].vy_m_s for f in filters)
-    terms, _ = error_terms(plain, signals, car.physics_vehicle.roll_gradient_rad_per_m_s2, None)
+    terms = error_terms(plain, signals, car.physics_vehicle.roll_gradient_rad_per_m_s2)
     seen = terms[:, TERMS.index("kinematic")] * plain.vx_m_s
     expected = (OWN_SHARE * plain.vy_std_m_s) ** 2 + seen**2 + sum((vy - middle) ** 2 for vy in others)
     fast = plain.vx_m_s > OWN.low_speed_blend_m_s

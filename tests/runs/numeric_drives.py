@@ -5,73 +5,12 @@ The signals of a sample drive are changed as columns and written as a log of the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
-from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
-from pdhef_logtool.records.signals import FloatArray, IntArray
-from truthsim.recording import STEERING_REPORT
-
-_IMU = ("angular_velocity.z", "linear_acceleration.x", "linear_acceleration.y")
-_WHEELS = ("fl_m_s", "fr_m_s", "rl_m_s", "rr_m_s")
-_POSE = (*(f"pose.pose.position.{a}" for a in "xyz"), *(f"pose.pose.orientation.{a}" for a in "xyzw"))
-_TWIST = tuple(f"twist.twist.{part}.{a}" for part in ("linear", "angular") for a in "xyz")
-#: Type, path of the stamp, paths of the values, by topic.
-_TOPICS = {
-    "/imu/data": ("sensor_msgs/msg/Imu", "header.stamp", _IMU),
-    "/vehicle/status/steering_status": ("autoware_vehicle_msgs/msg/SteeringReport", "stamp", ("steering_tire_angle",)),
-    "/vehicle/wheel_speeds": ("truthsim_msgs/msg/WheelSpeeds", "header.stamp", _WHEELS),
-    "/truth/perfect/odometry": ("nav_msgs/msg/Odometry", "header.stamp", (*_POSE, *_TWIST)),
-}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Samples:
-    """One topic's columns: recorder's times, stamps, values [N]."""
-
-    log_ns: IntArray
-    stamp_ns: IntArray
-    values: dict[str, FloatArray]
-
-    def take(self, index: IntArray) -> Samples:
-        """Return the samples at these places, in this order."""
-        values = {k: v[index] for k, v in self.values.items()}
-        return Samples(self.log_ns[index], self.stamp_ns[index], values)
-
-
-Drive = dict[str, Samples]
-
-
-def read_samples(path: Path) -> Drive:
-    """Read the topics above."""
-    log = open_log(path)
-    try:
-        columns = log.read({topic: [stamp, *paths] for topic, (_, stamp, paths) in _TOPICS.items()})
-    finally:
-        log.close()
-    samples_by_topic = {}
-    for topic, (_, stamp, paths) in _TOPICS.items():
-        read = columns[topic]
-        samples_by_topic[topic] = Samples(read.log_time_ns, read.fields[stamp], {p: read.fields[p] for p in paths})
-    return samples_by_topic
-
-
-def write_samples(path: Path, drives: Iterable[Drive]) -> None:
-    """Write drives that follow one another; the rows of each in order of log time."""
-    with McapLogWriter(path) as writer:
-        for topic, (type_name, _, _) in _TOPICS.items():
-            definition = STEERING_REPORT if "SteeringReport" in type_name else None
-            writer.add_topic(topic, type_name, definition=definition)
-        for drive in drives:
-            batches = []
-            for topic, samples in drive.items():
-                s = samples.take(np.argsort(samples.log_ns, kind="stable"))
-                batches.append(TopicBatch(topic, s.log_ns, s.log_ns, {_TOPICS[topic][1]: s.stamp_ns, **s.values}))
-            writer.write(batches)
+from studies.torture.hours import Drive, Samples
 
 
 def _sensors(change: Callable[[Samples, np.random.Generator], Samples]) -> Callable[[Drive], Drive]:

@@ -20,7 +20,8 @@ from pdhef_logtool.runs import pipeline
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.pipeline import RunResult
-from tests.runs.numeric_drives import NUMERICS, Drive, read_samples, write_samples
+from studies.torture.hours import Drive, read_samples, write_samples
+from tests.runs.numeric_drives import NUMERICS
 
 
 @dataclass(frozen=True)
