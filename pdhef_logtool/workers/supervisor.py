@@ -267,8 +267,7 @@ class Crew(Generic[T, R]):
             try:
                 worker = _Worker[T](self._server.fork(f"{__name__}:work_on_items", timeout_s=_MESSAGE_S))
             except EOFError:
-                self._note_death(self._server.end())
-                self._server = None
+                self._note_death(self._server)
                 continue
             self._workers.append(worker)
             most = self._limits.memory_bytes
@@ -276,7 +275,10 @@ class Crew(Generic[T, R]):
                 worker.child.connection.send(None if most is None else most + _RESERVED_BYTES)
             return worker
 
-    def _note_death(self, code: int) -> None:
+    def _note_death(self, server: ForkServer) -> None:
+        if server is not self._server:
+            return  # an earlier one, already noted
+        self._server, code = None, server.end()
         self._deaths += 1
         how = f"exit code {code}" if code >= 0 else f"signal {-code}"
         if self._deaths > _RESTARTS:
@@ -334,6 +336,8 @@ class Crew(Generic[T, R]):
         assert attempt is not None
         self._workers.remove(worker)
         code = worker.child.end()
+        if code is None:
+            self._note_death(worker.child.server)
         if code is None and not reason:
             attempt.tries -= 1
             self._returned.append(attempt)
