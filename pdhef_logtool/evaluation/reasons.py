@@ -6,11 +6,12 @@ An interval of a reason runs from a stamp with its bit to the last one with it t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.records.reasons import REASONS
+from pdhef_logtool.records.reasons import REASONS, Reason
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -71,90 +72,46 @@ class SensorFault:
     intervals: tuple[Interval, ...]
 
 
-@dataclass(slots=True)
-class _Spans:
-    """Intervals of one reason: first and last stamps, how many stamps have the bit, how many lie within at all."""
-
-    first_ns: list[int] = field(default_factory=list)
-    last_ns: list[int] = field(default_factory=list)
-    stamps: int = 0
-    within: int = 0
-    last_index: int = 0
-
-    def add(self, stamps_ns: IntArray, index: IntArray) -> None:
-        """Take the stamps [M] with the bit, M > 0, and their places in the whole track."""
-        before_ns = self.last_ns[-1] if self.last_ns else int(stamps_ns[0])
-        before = self.last_index if self.last_ns else int(index[0]) - 1
-        new = np.diff(stamps_ns, prepend=before_ns) > MERGE_S * 1e9
-        new[0] |= not self.last_ns
-        starts = np.flatnonzero(new)
-        # The last stamp before each start, and at the end, ends an interval.
-        ends = stamps_ns[np.append(starts[starts > 0] - 1, len(stamps_ns) - 1)].tolist()
-        if not new[0]:
-            self.last_ns[-1] = ends.pop(0)
-        self.first_ns += stamps_ns[starts].tolist()
-        self.last_ns += ends
-        steps = np.diff(index, prepend=before)
-        self.within += int(np.where(new, 1, steps).sum())
-        self.stamps += len(index)
-        self.last_index = int(index[-1])
-
-
-class ReasonIntervals:
-    """Intervals of every reason of one track, gathered from window to window; the windows leave no mark."""
-
-    def __init__(self) -> None:
-        self._spans: dict[int, _Spans] = {}
-        self._count = 0
-
-    def append(self, stamps_ns: IntArray, reason: IntArray) -> None:
-        """Take the stamps and bit masks [N] of the next window."""
-        for r in REASONS:
-            rows = np.flatnonzero(reason & r.bit)
-            if rows.size:
-                self._spans.setdefault(r.bit, _Spans()).add(stamps_ns[rows], self._count + rows)
-        self._count += len(stamps_ns)
-
-    def intervals(self) -> dict[str, list[Interval]]:
-        """Return the intervals in order of time, by name of the reason; those that never held are left out."""
-        return {r.name: _intervals(self._spans[r.bit]) for r in REASONS if r.bit in self._spans}
-
-    def summary(self) -> tuple[ReasonFacts, ...]:
-        """Return one record a reason that held, in order of the bits."""
-        facts = []
-        for r in REASONS:
-            if r.bit not in self._spans:
-                continue
-            spans = self._spans[r.bit]
-            intervals = _intervals(spans)
-            facts.append(
-                ReasonFacts(
-                    name=r.name,
-                    text=r.text,
-                    share=spans.stamps / self._count,
-                    share_within=spans.stamps / spans.within,
-                    intervals=len(intervals),
-                    first_ns=intervals[0].start_ns,
-                    end_ns=intervals[-1].end_ns,
-                    longest=_longest(intervals, NAMED_INTERVALS),
-                )
-            )
-        return tuple(facts)
+def reason_intervals(track: StateTrack) -> dict[str, list[Interval]]:
+    """Return the intervals of each reason in order of time; reasons that never apply are left out."""
+    intervals = {}
+    for reason, rows in _rows_of_reasons(track):
+        stamps_ns = track.stamps_ns[rows]
+        first, last = _runs(stamps_ns)
+        ends = (stamps_ns[last] + 1).tolist()
+        intervals[reason.name] = [Interval(a, b) for a, b in zip(stamps_ns[first].tolist(), ends, strict=True)]
+    return intervals
 
 
 def summarise_reasons(track: StateTrack) -> tuple[ReasonFacts, ...] | None:
-    """Return the summary of a whole track; None where the source gives no reasons."""
-    gathered = _gathered(track)
-    return None if gathered is None else gathered.summary()
+    """Return one record per reason that applies, in order of the bits; None where the source gives no reasons."""
+    if not _has_reasons(track):
+        return None
+    by_reason, facts = reason_intervals(track), []
+    for reason, rows in _rows_of_reasons(track):
+        intervals = by_reason[reason.name]
+        first, last = _runs(track.stamps_ns[rows])
+        facts.append(
+            ReasonFacts(
+                name=reason.name,
+                text=reason.text,
+                share=len(rows) / len(track),
+                share_within=len(rows) / int((rows[last] - rows[first] + 1).sum()),
+                intervals=len(intervals),
+                first_ns=intervals[0].start_ns,
+                end_ns=intervals[-1].end_ns,
+                longest=_longest(intervals, NAMED_INTERVALS),
+            )
+        )
+    return tuple(facts)
 
 
 def sensor_faults(track: StateTrack) -> tuple[SensorFault, ...] | None:
-    """Return the faults that an estimator found in its sensors; None where it does not look."""
-    gathered = _gathered(track)
-    if gathered is None:
+    """Return the faults that an estimator detected in its sensors; None where the source gives no reasons."""
+    if not _has_reasons(track):
         return None
     faults = []
-    for name, intervals in gathered.intervals().items():
+    for name, intervals in reason_intervals(track).items():
         kind, _, sensor = name.partition("_")
         seconds = sum(i.end_ns - i.start_ns for i in intervals) * 1e-9
         listed = _longest(intervals, LISTED_INTERVALS)
@@ -162,19 +119,24 @@ def sensor_faults(track: StateTrack) -> tuple[SensorFault, ...] | None:
     return tuple(sorted(faults, key=lambda f: f.sensor))
 
 
-def _gathered(track: StateTrack) -> ReasonIntervals | None:
-    if not len(track.reason) == len(track) > 0:
-        return None
-    gathered = ReasonIntervals()
-    gathered.append(track.stamps_ns, track.reason)
-    return gathered
+def _has_reasons(track: StateTrack) -> bool:
+    return len(track.reason) == len(track) > 0
+
+
+def _rows_of_reasons(track: StateTrack) -> Iterator[tuple[Reason, IntArray]]:
+    """Yield each reason that applies with its rows [M], M > 0."""
+    if _has_reasons(track):
+        for reason in REASONS:
+            if len(rows := np.flatnonzero(track.reason & reason.bit)):
+                yield reason, rows
+
+
+def _runs(stamps_ns: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the first and last entries of runs of stamps [M] that are at most :data:`MERGE_S` apart."""
+    breaks = np.flatnonzero(np.diff(stamps_ns) > MERGE_S * 1e9)
+    return np.append(0, breaks + 1), np.append(breaks, len(stamps_ns) - 1)
 
 
 def _longest(intervals: list[Interval], most: int) -> tuple[Interval, ...]:
     longest = sorted(intervals, key=lambda i: (i.start_ns - i.end_ns, i.start_ns))[:most]
     return tuple(sorted(longest, key=lambda i: i.start_ns))
-
-
-def _intervals(spans: _Spans) -> list[Interval]:
-    """``end_ns`` is one past the last stamp inside."""
-    return [Interval(a, b + 1) for a, b in zip(spans.first_ns, spans.last_ns, strict=True)]

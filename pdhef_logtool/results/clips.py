@@ -12,7 +12,7 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.results.events import FoundEvent, FoundEvents
-from pdhef_logtool.results.mcap_sink import NAMESPACE, AnnotatedMcapSink
+from pdhef_logtool.results.mcap_sink import NAMESPACE, AnnotatedMcap
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.results.parquet_sink import list_estimators, read_track
 from pdhef_logtool.results.sink import TRUTH
@@ -85,13 +85,10 @@ def _clips_of(
     for event in events:
         span_ns = _span(source, event, pad_s)
         name = f"{log.label}_{event.start_s:.2f}s.mcap"
-        sink = AnnotatedMcapSink(change.file(name), source, span_ns=span_ns)
-        try:
-            for track in tracks:
-                sink.append(track.between(*span_ns))
-            sink.finish(report)
-        finally:
-            sink.abort()
+        cut = [track.between(*span_ns) for track in tracks]
+        with AnnotatedMcap(change.file(name), source, span_ns=span_ns) as clip:
+            clip.write(cut)
+            clip.finish(report, cut)
         yield name
 
 

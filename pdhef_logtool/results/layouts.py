@@ -12,7 +12,7 @@ from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.mcap_sink import LOG_TOPIC, MAP_FRAME, has_pose, topic_of
 from pdhef_logtool.results.palette import colour_rgb
 from pdhef_logtool.results.run_report import json_bytes
-from pdhef_logtool.results.sink import TRUTH, Event, Sink
+from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.storage.files import write_bytes
 
 
@@ -56,46 +56,27 @@ _STATES = ("valid", "diverged", "reason")
 _PANEL_LEVEL = 2
 
 
-class LayoutsSink(Sink):
-    """Writes the layouts for the topics that :class:`~.mcap.AnnotatedMcapSink` writes of the same tracks.
+def write_layouts(
+    foxglove: Path,
+    plotjuggler: Path,
+    tracks: Sequence[StateTrack],
+    colours: Mapping[str, int],
+    *,
+    shown: Collection[str],
+    fixes: Sequence[str] = (),
+) -> None:
+    """Write the layouts for the topics that :class:`~.mcap_sink.AnnotatedMcap` writes of the same tracks.
 
     Parameters
     ----------
-    foxglove, plotjuggler : where the finished files are.
-    colours : 0xRRGGBB by estimator.
-    shown : tracks whose lines and intervals are on at first.
+    foxglove, plotjuggler : the finished files.
+    colours : 0xRRGGBB by estimator. shown : tracks whose lines and intervals are on at first.
     fixes : topics of satellite fixes in the log, for a map.
     """
-
-    def __init__(
-        self,
-        foxglove: Path,
-        plotjuggler: Path,
-        colours: Mapping[str, int],
-        *,
-        shown: Collection[str],
-        fixes: Sequence[str] = (),
-    ) -> None:
-        self._foxglove, self._plotjuggler = foxglove, plotjuggler
-        self._colours, self._shown, self._fixes = colours, shown, fixes
-        self._tracks: dict[str, str] = {}
-        self._on_map: set[str] = set()
-
-    def append(self, track: StateTrack) -> None:
-        """Take note of a track."""
-        red, green, blue = colour_rgb(track.name, self._colours)
-        self._tracks[track.name] = f"#{red:02x}{green:02x}{blue:02x}"
-        if has_pose(track).any():
-            self._on_map.add(track.name)
-
-    def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
-        """Write both files."""
-        layout = foxglove_layout(self._tracks, self._shown, self._on_map, self._fixes)
-        write_bytes(self._foxglove, json_bytes(layout))
-        write_bytes(self._plotjuggler, plotjuggler_layout(self._tracks, self._shown))
-
-    def abort(self) -> None:
-        """Remove nothing: nothing is written before :meth:`finish`."""
+    drawn = {t.name: "#{:02x}{:02x}{:02x}".format(*colour_rgb(t.name, colours)) for t in tracks}
+    on_map = {t.name for t in tracks if has_pose(t).any()}
+    write_bytes(foxglove, json_bytes(foxglove_layout(drawn, shown, on_map, fixes)))
+    write_bytes(plotjuggler, plotjuggler_layout(drawn, shown))
 
 
 def foxglove_layout(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES
-from pdhef_logtool.evaluation.reasons import ReasonIntervals
+from pdhef_logtool.evaluation.reasons import reason_intervals
 from pdhef_logtool.records.reasons import REASONS
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import Event
 
 DEBUG, INFO, WARN, ERROR = 10, 20, 30, 40  #: of rcl_interfaces/msg/Log
@@ -33,9 +34,7 @@ def event_text(event: Event) -> str:
     return f"{head}: {event.text}" if event.text else head
 
 
-def log_lines(
-    report: Mapping[str, Any], events: Sequence[Event], reasons: Mapping[str, ReasonIntervals]
-) -> list[LogLine]:
+def log_lines(report: Mapping[str, Any], events: Sequence[Event], tracks: Iterable[StateTrack]) -> list[LogLine]:
     """Return the lines in order of time: failed checks, losses, events and manoeuvres, and faults by estimator."""
     start_ns, end_ns = (int(report["log"].get(key, 0)) for key in ("start_ns", "end_ns"))
     lines = [LogLine(e.start_ns, _level(e), "pdhef", event_text(e)) for e in events]
@@ -48,12 +47,11 @@ def log_lines(
         level = WARN if loss["severity"] == "lost" else INFO
         stamp_ns = start_ns if loss["start_ns"] is None else min(max(loss["start_ns"], start_ns), max(end_ns, start_ns))
         lines.append(LogLine(stamp_ns, level, "pdhef", f"{loss['kind']}: {loss['what']} ({loss['where']})"))
-    for name, intervals in reasons.items():
-        for reason, spans in intervals.intervals().items():
-            text = _REASON_TEXTS[reason]
+    for track in tracks:
+        for reason, spans in reason_intervals(track).items():
+            text = f"{track.name}: {_REASON_TEXTS[reason]}"
             lines += [
-                LogLine(s.start_ns, WARN, name, f"{name}: {text}, {(s.end_ns - s.start_ns) * 1e-9:.2f} s")
-                for s in spans
+                LogLine(s.start_ns, WARN, track.name, f"{text}, {(s.end_ns - s.start_ns) * 1e-9:.2f} s") for s in spans
             ]
     return sorted(lines, key=lambda line: (line.stamp_ns, -line.level, line.text))
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import struct
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import astuple
 from pathlib import Path
-from typing import Any
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.evaluation.reasons import ReasonIntervals
 from pdhef_logtool.logs.container import Attachment, RawChunk
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.schema_files import message_definition
@@ -27,12 +27,14 @@ from pdhef_logtool.logs.source_copy import (
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import quat_from_yaw
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.log_lines import LogLine, log_lines, log_message
 from pdhef_logtool.results.plotted import plotted_fields
-from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, Sink, first_of_slots, rounded
+from pdhef_logtool.results.sink import LONGEST_WHOLE_NS, TRUTH, Event, first_of_slots, rounded
 from pdhef_logtool.storage.documents import jsonable
+
+_Raw: TypeAlias = RawMessage | RawChunk
 
 #: Everything below this name in a source log is ours and is replaced.
 NAMESPACE = "/pdhef/"
@@ -58,19 +60,18 @@ _STATE_FIELDS = (
     "nis",
     "friction",
 )
-_ODOMETRY_FIELDS = ("x_m", "y_m", "vx_m_s", "vy_m_s", "yaw_rate_rad_s")
 #: Places of v_x, v_y and yaw rate among x, y, z and the rotations about x, y, z.
 _PLANAR = np.array([0, 1, 5])
 #: Of zstd: of rounded numbers level 3 makes 1 % more bytes, level 6 3 % fewer in three times the time.
 _LEVEL = 1
-#: Between two poses of a track that is not shown first, and between two plotted values of any.
-_POSE_STEP_NS = 50_000_000
-#: Between two points of the map.
-_PATH_STEP_NS = 1_000_000_000
+#: Between two poses of a track that is not shown first and between two plotted values; between two points of the map.
+_POSE_STEP_NS, _PATH_STEP_NS = 50_000_000, 1_000_000_000
 #: Steps of the tracks without a name in --estimators: the shortest that leaves the file small enough is taken.
 _STEPS_NS = tuple(round(s * 1e9) for s in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0))
 #: The shortest one of a long drive.
 _LONG_STEP_NS = 200_000_000
+#: Messages are encoded in pieces of this duration.
+_PIECE_NS = 60_000_000_000
 #: Of the map of a track.
 _MOST_POSES = 1000
 #: Bytes of a message with its index, and of report, figures and schemas: upper bounds of what simulated drives take.
@@ -100,10 +101,8 @@ def thinned_step_ns(source_bytes: int, *, rows: int, others: int, span_ns: int) 
     return next(fit, _STEPS_NS[-1])
 
 
-class AnnotatedMcapSink(Sink):
-    """Writes the annotated log window by window; what the source contains passes through a chunk at a time.
-
-    Sound chunks that contain nothing but what stays are written as they are, others message by message.
+class AnnotatedMcap:
+    """The annotated log; as a context it leaves no file on an exception.
 
     Each track becomes ``state`` (:data:`STATE_TYPE`, every stamp), ``odometry`` (``nav_msgs/msg/Odometry``, the
     stamps that are valid and have a pose, as the message can state neither; of a track that is not shown first, 20 a
@@ -114,13 +113,13 @@ class AnnotatedMcapSink(Sink):
 
     Parameters
     ----------
-    path : where the finished file is.
+    path : the finished file.
     source : the log to copy in full; None, or a log without messages, for a sidecar that contains our topics alone.
-    shown : of the tracks whose pose is written at every stamp; of others every 50 ms. None: all.
+    shown : tracks whose pose is written at every stamp; of others every 50 ms. None: all.
     others_step_ns : step of all topics of the others; those that are shown then have 10 poses a second, and the ground
         truth 20 states. None: as above.
     min_speed_m_s : sideslip is not plotted below.
-    span_ns : only what of it was recorded in [start, end); None: all of it.
+    span_ns : copy what the source recorded in [start, end) only; None: all of it.
     left_out : topics of the source that are not copied; its attachments and metadata are not either. None: all are.
 
     Raises
@@ -139,129 +138,113 @@ class AnnotatedMcapSink(Sink):
         span_ns: tuple[int, int] | None = None,
         left_out: Container[str] | None = None,
     ) -> None:
-        self._copies_rest = left_out is None
         self._source = None if source is None else source.messages
-        self._shown, self._others_step_ns = shown, others_step_ns
-        self._min_speed_m_s = min_speed_m_s
-        self._last_ns: dict[str, int] = {}
-        self._topics: dict[str, str] = {}
-        self._window: dict[str, StateTrack] = {}
-        self._paths: dict[str, list[FloatArray]] = {}
-        self._reasons: dict[str, ReasonIntervals] = {}
-        self._first_ns: int | None = None
-        self._raws: Iterator[RawMessage | RawChunk] = iter(())
-        self._next: RawMessage | RawChunk | None = None
+        self._shown, self._others_step_ns, self._min_speed_m_s = shown, others_step_ns, min_speed_m_s
+        self._span_ns, self._left_out = span_ns, left_out
         profile = "ros2" if self._source is None else source_profile(self._source)
         self._writer = McapLogWriter(path, profile=profile, level=_LEVEL)
-        if self._source is None:
-            return
-        try:
+        self._states: set[str] = set()
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Remove an unfinished file."""
+        self._writer.abort()
+
+    def write(self, tracks: Sequence[StateTrack]) -> tuple[Loss, ...]:
+        """Write the tracks, merged with the messages of the source; return the losses of the copy.
+
+        Sound chunks of the source that contain nothing but what is kept are written as they are, others message by
+        message. The losses of the source itself are complete afterwards.
+        """
+        lost: tuple[Loss, ...] = ()
+        raws: Iterator[_Raw] = iter(())
+        waiting: list[_Raw] = []
+        if self._source is not None:
+            left_out = self._left_out or ()
             channels = register_channels(
                 self._writer,
                 self._source,
-                leave_out=lambda t: t.startswith(NAMESPACE) or t in (left_out or ()),
-                whole_metadata=self._copies_rest,
+                leave_out=lambda topic: topic.startswith(NAMESPACE) or topic in left_out,
+                whole_metadata=self._left_out is None,
             )
-        except BaseException:
-            self._writer.abort()
-            raise
-        self.lost = channels.lost
-        self._raws = iterate_copy(self._source, channels, *(span_ns or (None, None)))
-
-    def append(self, track: StateTrack) -> None:
-        """Take one track of this window."""
-        if track.name in self._window:
-            self._write_window()
-        if track.name not in self._topics:
+            lost, raws = channels.lost, iterate_copy(self._source, channels, *(self._span_ns or (None, None)))
+        for track in tracks:
             self._add_topics(track.name)
-        self._window[track.name] = track
+        rows = [self._rows(track) for track in tracks]
+        for piece in _pieces(tracks):
+            truth = next((t.between(*piece) for t in tracks if t.name == TRUTH), None)
+            batches = [b for t, r in zip(tracks, rows, strict=True) for b in self._batches(t, r, piece, truth)]
+            if ends := [int(b.log_time_ns[-1]) + 1 for b in batches if len(b.log_time_ns)]:
+                self._writer.write(batches, raws=_until(raws, waiting, max(ends)))
+        self._writer.write([], raws=_until(raws, waiting, math.inf))
+        return lost
 
-    def _batches(self, track: StateTrack, truth: StateTrack | None) -> list[TopicBatch]:
-        """Return the messages of one track of a window."""
-        if not len(track):
-            return []
+    def _rows(self, track: StateTrack) -> tuple[IntArray, IntArray, IntArray]:
+        """Return the rows with a state, an odometry message and plotted values."""
         stated = posed = np.arange(len(track))
-        last_ns = self._last_ns.get(track.name)
-        plotted = first_of_slots(track.stamps_ns, _POSE_STEP_NS, last_ns)
-        on_path = first_of_slots(track.stamps_ns, _PATH_STEP_NS, last_ns)
+        plotted = first_of_slots(track.stamps_ns, _POSE_STEP_NS)
         is_shown = self._shown is None or track.name in self._shown
         if self._others_step_ns is None:
             posed = posed if is_shown else plotted
         elif is_shown:
-            posed = first_of_slots(track.stamps_ns, 2 * _POSE_STEP_NS, last_ns)
+            posed = first_of_slots(track.stamps_ns, 2 * _POSE_STEP_NS)
             stated = plotted if track.name == TRUTH else stated
         else:
-            stated = posed = plotted = first_of_slots(track.stamps_ns, self._others_step_ns, last_ns)
-        self._last_ns[track.name] = int(track.stamps_ns[-1])
-        self._first_ns = min(self._first_ns or int(track.stamps_ns[0]), int(track.stamps_ns[0]))
-        if len(track.reason) == len(track):
-            self._reasons.setdefault(track.name, ReasonIntervals()).append(track.stamps_ns, track.reason)
-        on_map = has_pose(track)
-        on_path = on_path[on_map[on_path]]
-        self._paths.setdefault(track.name, []).append(
-            np.stack([track.x_m[on_path], track.y_m[on_path], track.yaw_rad[on_path]], axis=1)
-        )
-        fields = plotted_fields(track, truth, self._min_speed_m_s)
-        return [
-            _state_batch(track, stated),
-            _odometry_batch(track, posed[on_map[posed]]),
-            _plot_batch(track, plotted, fields),
-        ]
+            stated = posed = plotted = first_of_slots(track.stamps_ns, self._others_step_ns)
+        return stated, posed[has_pose(track)[posed]], plotted
 
-    def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:
-        """Write what is left of the source, the metrics record and report.json, and give the file its name."""
-        try:
-            self._write_window()
-            self._writer.write([], raws=self._raws_before(None))
-            self._write_paths()
-            self._write_log(log_lines(report, events, self._reasons))
-            if self._source is not None and self._copies_rest:
-                for attachment in iterate_attachments(self._source):
-                    if not _is_our_report(attachment):
-                        self._writer.attachment(*astuple(attachment))
-                for record in iterate_metadata(self._source):
-                    if record.name != METRICS_RECORD:
-                        self._writer.metadata(record.name, record.metadata)
-            self._writer.metadata(METRICS_RECORD, metrics_record(report))
-            end_ns = int(report["log"]["end_ns"])
-            text = json.dumps(jsonable(_attached(report)), sort_keys=True, separators=(",", ":"), allow_nan=False)
-            self._writer.attachment(REPORT_ATTACHMENT, "application/json", text.encode(), end_ns, end_ns)
-            self._writer.close()
-        except BaseException:
-            self.abort()
-            raise
+    def _batches(
+        self, track: StateTrack, rows: Sequence[IntArray], piece: tuple[int, int], truth: StateTrack | None
+    ) -> list[TopicBatch]:
+        """Return the messages of a track in a piece of the drive."""
+        first, last = np.searchsorted(track.stamps_ns, piece).tolist()
+        part = track.rows(first, last)
+        stated, posed, plotted = (r[slice(*np.searchsorted(r, (first, last)))] - first for r in rows)
+        fields = plotted_fields(part, truth, self._min_speed_m_s)
+        return [_state_batch(part, stated), _odometry_batch(part, posed), _plot_batch(part, plotted, fields)]
 
-    def abort(self) -> None:
-        """Remove what was written."""
-        self._writer.abort()
+    def finish(self, report: Mapping[str, Any], tracks: Sequence[StateTrack], events: Sequence[Event] = ()) -> None:
+        """Write the maps of the tracks, the log, the metrics record and report.json, and give the file its name."""
+        self._write_paths(tracks)
+        self._write_log(log_lines(report, events, tracks))
+        if self._source is not None and self._left_out is None:
+            for attachment in iterate_attachments(self._source):
+                if not _is_our_report(attachment):
+                    self._writer.attachment(*astuple(attachment))
+            for record in iterate_metadata(self._source):
+                if record.name != METRICS_RECORD:
+                    self._writer.metadata(record.name, record.metadata)
+        self._writer.metadata(METRICS_RECORD, metrics_record(report))
+        end_ns = int(report["log"]["end_ns"])
+        text = json.dumps(jsonable(_attached(report)), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        self._writer.attachment(REPORT_ATTACHMENT, "application/json", text.encode(), end_ns, end_ns)
+        self._writer.close()
 
     def _add_topics(self, estimator: str) -> None:
         state, odometry = topic_of(estimator, "state"), topic_of(estimator, "odometry")
-        if state in self._topics.values():
+        if state in self._states:
             raise OutputError(expected="estimators with different topics", got=estimator, where=state)
+        self._states.add(state)
         self._writer.add_topic(state, STATE_TYPE, constants={"header.frame_id": BODY_FRAME})
         frames = {"header.frame_id": MAP_FRAME, "child_frame_id": BODY_FRAME}
         self._writer.add_topic(odometry, ODOMETRY_TYPE, constants=frames)
         self._writer.add_topic(topic_of(estimator, "plot"), PLOT_TYPE, constants={"header.frame_id": BODY_FRAME})
-        self._topics[estimator] = state
 
-    def _write_window(self) -> None:
-        truth = self._window.get(TRUTH)
-        batches = [batch for track in self._window.values() for batch in self._batches(track, truth)]
-        self._window.clear()
-        ends = [int(b.log_time_ns[-1]) + 1 for b in batches if len(b.log_time_ns)]
-        if ends:
-            self._writer.write(batches, raws=self._raws_before(max(ends)))
-
-    def _write_paths(self) -> None:
+    def _write_paths(self, tracks: Sequence[StateTrack]) -> None:
         """Write the way of each track, as one message at the start of the log."""
         raws = []
-        for name, parts in self._paths.items():
-            poses = np.concatenate(parts)
-            if len(poses) and self._first_ns is not None:
-                channel = self._raw_channel(topic_of(name, "path"), PATH_TYPE)
-                data = _path_message(self._first_ns, poses[:: 1 + len(poses) // _MOST_POSES])
-                raws.append(RawMessage(channel, self._first_ns, self._first_ns, 0, data))
+        for track in tracks:
+            rows = first_of_slots(track.stamps_ns, _PATH_STEP_NS)
+            rows = rows[has_pose(track)[rows]]
+            poses = np.stack([track.x_m[rows], track.y_m[rows], track.yaw_rad[rows]], axis=1)
+            if len(poses):
+                start_ns = min(int(t.stamps_ns[0]) for t in tracks if len(t))
+                channel = self._raw_channel(topic_of(track.name, "path"), PATH_TYPE)
+                data = _path_message(start_ns, poses[:: 1 + len(poses) // _MOST_POSES])
+                raws.append(RawMessage(channel, start_ns, start_ns, 0, data))
         self._writer.write([], raws=raws)
 
     def _write_log(self, lines: Sequence[LogLine]) -> None:
@@ -281,17 +264,22 @@ class AnnotatedMcapSink(Sink):
             metadata={},
         )
 
-    def _raws_before(self, end_ns: int | None) -> Iterator[RawMessage | RawChunk]:
-        while True:
-            raw = self._next if self._next is not None else next(self._raws, None)
-            self._next = None
-            if raw is None:
-                return
-            at_ns = raw.start_ns if isinstance(raw, RawChunk) else raw.log_time_ns
-            if end_ns is not None and at_ns >= end_ns:
-                self._next = raw
-                return
-            yield raw
+
+def _pieces(tracks: Sequence[StateTrack]) -> Iterator[tuple[int, int]]:
+    """Yield parts [start, end) of the time of the tracks, so that their messages need little memory."""
+    ends_ns = [(int(t.stamps_ns[0]), int(t.stamps_ns[-1])) for t in tracks if len(t)]
+    if ends_ns:
+        for start_ns in range(min(first for first, _ in ends_ns), max(last for _, last in ends_ns) + 1, _PIECE_NS):
+            yield start_ns, start_ns + _PIECE_NS
+
+
+def _until(raws: Iterator[_Raw], waiting: list[_Raw], end_ns: float) -> Iterator[_Raw]:
+    """Yield the messages up to the first one at or after a time, which waits for the next call."""
+    while (raw := waiting.pop() if waiting else next(raws, None)) is not None:
+        if (raw.start_ns if isinstance(raw, RawChunk) else raw.log_time_ns) >= end_ns:
+            waiting.append(raw)
+            return
+        yield raw
 
 
 def metrics_record(report: Mapping[str, Any]) -> dict[str, str]:
@@ -371,7 +359,8 @@ def _odometry_batch(track: StateTrack, use: IntArray) -> TopicBatch:
     stamps_ns = track.stamps_ns[use]
     n = len(stamps_ns)
     zero = np.zeros(n)
-    x_m, y_m, vx_m_s, vy_m_s, yaw_rate_rad_s = (rounded(c, getattr(track, c)[use]) for c in _ODOMETRY_FIELDS)
+    names = ("x_m", "y_m", "vx_m_s", "vy_m_s", "yaw_rate_rad_s")
+    x_m, y_m, vx_m_s, vy_m_s, yaw_rate_rad_s = (rounded(name, getattr(track, name)[use]) for name in names)
     covariance = track.covariance[use] if track.covariance.shape[0] == len(track) else np.empty((0, 3, 3))
     fields = {
         "header.stamp": stamps_ns,

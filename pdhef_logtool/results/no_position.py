@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
@@ -16,9 +15,8 @@ from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.naming import VOCABULARY, words_of
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
-from pdhef_logtool.records.signals import POSITIONS, Signals
+from pdhef_logtool.records.signals import POSITIONS
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.sink import Event, Sink
 
 #: Words of quantities that move or control a car, that describe a device or a message, and that may be of a place.
 _MOTION, _STATE, _PLACE = (frozenset(words.split()) for words in VOCABULARY["places"].values())
@@ -40,29 +38,10 @@ _DIGITS = 8
 _T = TypeVar("_T")
 
 
-class WithoutPosition(Sink):
-    """A sink that gets all tracks without place and heading."""
-
-    def __init__(self, sink: Sink) -> None:
-        self._sink = sink
-        self.lost = sink.lost
-
-    def append_signals(self, signals: Signals) -> None:
-        """Take what the estimators saw in this window, without GNSS positions."""
-        self._sink.append_signals(replace(signals, gnss_position_deg=np.full((len(signals), 2), np.nan)))
-
-    def append(self, track: StateTrack) -> None:
-        """Take one track of this window."""
-        nowhere = np.full(len(track), np.nan)
-        self._sink.append(track.with_pose(nowhere, nowhere, nowhere))
-
-    def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:
-        """Finish the output."""
-        self._sink.finish(report, events)
-
-    def abort(self) -> None:
-        """Remove what was written."""
-        self._sink.abort()
+def without_pose(track: StateTrack) -> StateTrack:
+    """Return a track without position and heading."""
+    unknown = np.full(len(track), np.nan)
+    return track.with_pose(unknown, unknown, unknown)
 
 
 def topics_with_position(log: DriveLog, mapping: SignalMapping) -> frozenset[str]:

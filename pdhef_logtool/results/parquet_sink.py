@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,10 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, diagonal_covariance, make_track
 from pdhef_logtool.results.arrow_schema import arrow_array, arrow_schema
-from pdhef_logtool.results.sink import TRUTH, Event, Sink, rounded
+from pdhef_logtool.results.sink import TRUTH, rounded
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
-#: Rows that are gathered of one estimator before a row group is written: 10 h at 100 Hz make 110 row groups an
-#: estimator, and the waiting rows of six estimators need less than 30 MB.
+#: Rows of a row group: 10 h at 100 Hz make 110 row groups an estimator.
 ROWS_A_GROUP = 32768
 
 #: Of zstd, of estimates: less work than the lowest level, and 4 % fewer bytes.
@@ -37,157 +36,103 @@ _FLAGS = ("valid", "diverged")
 _STD_COLUMNS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
 
 
-class RowGroups:
-    """A Parquet file that is written in row groups under a temporary name; a row group contains the rows of one key.
+@contextmanager
+def parquet_writer(
+    path: Path,
+    schema: pa.Schema,
+    dictionaries: Sequence[str],
+    *,
+    encodings: Mapping[str, str] | None = None,
+    level: int | None = None,
+) -> Iterator[pq.ParquetWriter]:
+    """Yield the writer of a Parquet file with zstd and page checksums, which gets its name when it is complete.
 
     Parameters
     ----------
-    path : where the finished file is. rows_a_group : rows of one row group.
-    dictionaries : columns of few values.
-    joined : every row group is written from one piece, so that the same rows give the same bytes.
-    encodings : Parquet's, by column. level : of zstd; None: Parquet's own, which is the lowest.
+    path : the finished file. dictionaries : columns of few values.
+    encodings : Parquet's, by column. level : of zstd; None: Parquet's default.
 
     Raises
     ------
     OutputError
         When the file cannot be written.
     """
-
-    def __init__(
-        self,
-        path: Path,
-        schema: pa.Schema,
-        rows_a_group: int,
-        dictionaries: list[str],
-        *,
-        joined: bool = False,
-        encodings: Mapping[str, str] | None = None,
-        level: int | None = None,
-    ) -> None:
-        self._path, self._rows_a_group, self._joined = path, rows_a_group, joined
-        self._waiting: dict[str, list[pa.Table]] = {}
-        self._pending = PendingFile(path)
-        with writing(path):
-            self._file = open_new(self._pending.path)
-        try:
-            with writing(path):
-                self._writer = pq.ParquetWriter(
-                    self._file,
-                    schema,
-                    compression="zstd",
-                    compression_level=level,
-                    use_dictionary=dictionaries,
-                    column_encoding=encodings,
-                    write_page_checksum=True,
-                )
-        except BaseException:
-            self._drop()
-            raise
-
-    def append(self, key: str, table: pa.Table) -> None:
-        """Take the next rows of a key."""
-        waiting = self._waiting.setdefault(key, [])
-        waiting.append(table)
-        if sum(t.num_rows for t in waiting) < self._rows_a_group:
-            return
-        joined = pa.concat_tables(waiting)
-        whole = joined.num_rows - joined.num_rows % self._rows_a_group
-        self._write(joined.slice(0, whole))
-        waiting[:] = [joined.slice(whole)]
-
-    def finish(self, metadata: Mapping[str, str] | None = None) -> None:
-        """Write the waiting rows and the metadata, and give the file its name."""
-        try:
-            for tables in self._waiting.values():
-                self._write(pa.concat_tables(tables))
-            if metadata:
-                self._writer.add_key_value_metadata(dict(metadata))
-            with writing(self._path):
-                self._writer.close()
-                self._file.close()
-        except BaseException:
-            self.abort()
-            raise
-        self._pending.commit()
-
-    def abort(self) -> None:
-        """Remove the unfinished file."""
-        with suppress(OSError, ValueError):  # its last words may not fit the disk either, or come after the file's end
-            self._writer.close()
-        self._drop()
-
-    def _drop(self) -> None:
-        with suppress(OSError):
-            self._file.close()
-        self._pending.discard()
-
-    def _write(self, table: pa.Table) -> None:
-        with writing(self._path):
-            if self._joined:
-                self._writer.write_table(table.combine_chunks(), row_group_size=self._rows_a_group)
-            elif table.num_rows:
-                self._writer.write_table(table, row_group_size=self._rows_a_group)
+    with (
+        PendingFile(path) as pending,
+        writing(path),
+        open_new(pending.path) as file,
+        pq.ParquetWriter(
+            file,
+            schema,
+            compression="zstd",
+            compression_level=level,
+            use_dictionary=list(dictionaries),
+            column_encoding=encodings,
+            write_page_checksum=True,
+        ) as writer,
+    ):
+        yield writer
 
 
-class EstimatesSink(Sink):
-    """Writes estimates.parquet; a row group contains one estimator, so that one can be read without the others.
+def write_estimates(
+    path: Path,
+    tracks: Sequence[StateTrack],
+    *,
+    selected: Sequence[tuple[int, str]] = (),
+    causal_from_ns: Mapping[str, int] | None = None,
+    rows_a_group: int = ROWS_A_GROUP,
+) -> None:
+    """Write estimates.parquet; a row group contains one estimator, so that one can be read without the others.
 
     Numbers are :func:`~pdhef_logtool.results.sink.rounded` and stored byte by byte: a sixth of the file.
 
     Parameters
     ----------
-    path : where the finished file is.
-    rows_a_group : rows of one row group.
-    selected : estimators whose track is written a second time, as :data:`SELECTED`, each from a stamp on.
+    path : the finished file.
+    selected : estimators whose track is written a second time, as :data:`SELECTED`, each from a stamp on. Their tracks
+        have the same stamps.
     causal_from_ns : first stamp from which the rows of an estimator depend on nothing later; an estimator without one
         is causal nowhere. None: unknown, and ``causal`` is null.
+    rows_a_group : rows of one row group.
 
     Raises
     ------
     OutputError : When the file cannot be written.
     """
+    schema = arrow_schema("estimates.parquet.json")
+    split = {f.name: "BYTE_STREAM_SPLIT" for f in schema if pa.types.is_floating(f.type)}
+    encodings = {**split, "stamp_ns": "DELTA_BINARY_PACKED"}
+    copied = next((t.name for t in tracks if t.name in {name for _, name in selected}), None)
+    with parquet_writer(path, schema, ["estimator"], encodings=encodings, level=_LEVEL) as writer:
+        for first in range(0, max(map(len, tracks), default=0), rows_a_group):
+            group = [track.rows(first, first + rows_a_group) for track in tracks]
+            for track in group:
+                _write_group(writer, [(track, track.name)], causal_from_ns)
+                if track.name == copied:
+                    copies = [(part, SELECTED) for part in _selected_parts(group, selected)]
+                    _write_group(writer, copies, causal_from_ns)
 
-    def __init__(
-        self,
-        path: Path,
-        rows_a_group: int = ROWS_A_GROUP,
-        *,
-        selected: Sequence[tuple[int, str]] = (),
-        causal_from_ns: Mapping[str, int] | None = None,
-    ) -> None:
-        self._selected, self._causal_from_ns = selected, causal_from_ns
-        schema = arrow_schema("estimates.parquet.json")
-        split = {f.name: "BYTE_STREAM_SPLIT" for f in schema if pa.types.is_floating(f.type)}
-        encodings = {**split, "stamp_ns": "DELTA_BINARY_PACKED"}
-        self._file = RowGroups(path, schema, rows_a_group, ["estimator"], encodings=encodings, level=_LEVEL)
 
-    def append(self, track: StateTrack) -> None:
-        """Take one track of this window; [N] rows."""
-        causal = self._causal(track)
-        self._file.append(track.name, track_table(track, as_written=True, causal=causal))
-        ends = [since_ns for since_ns, _ in self._selected[1:]] + [None]
-        for (since_ns, name), until_ns in zip(self._selected, ends, strict=False):
-            if track.name == name:
-                first = int(np.searchsorted(track.stamps_ns, since_ns))
-                last = len(track) if until_ns is None else int(np.searchsorted(track.stamps_ns, until_ns))
-                part = replace(track.rows(first, last), name=SELECTED)
-                self._file.append(
-                    SELECTED, track_table(part, as_written=True, causal=None if causal is None else causal[first:last])
-                )
+def _selected_parts(tracks: Sequence[StateTrack], selected: Sequence[tuple[int, str]]) -> Iterator[StateTrack]:
+    ends_ns = [*(since_ns for since_ns, _ in selected[1:]), np.iinfo(np.int64).max]
+    for (since_ns, name), until_ns in zip(selected, ends_ns, strict=True):
+        yield from (track.between(since_ns, until_ns) for track in tracks if track.name == name)
 
-    def _causal(self, track: StateTrack) -> BoolArray | None:
-        if self._causal_from_ns is None or track.name == TRUTH:
-            return None
-        first = self._causal_from_ns.get(track.name)
-        return np.zeros(len(track), np.bool_) if first is None else track.stamps_ns >= first
 
-    def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
-        """Write the waiting rows and give the file its name; the report is not part of this file."""
-        self._file.finish()
-
-    def abort(self) -> None:
-        """Remove the unfinished file."""
-        self._file.abort()
+def _write_group(
+    writer: pq.ParquetWriter, parts: Sequence[tuple[StateTrack, str]], causal_from_ns: Mapping[str, int] | None
+) -> None:
+    """Write parts of tracks, each under a name, as one row group."""
+    tables = []
+    for track, name in parts:
+        causal = None
+        if causal_from_ns is not None and track.name != TRUTH:
+            first = causal_from_ns.get(track.name)
+            causal = np.zeros(len(track), np.bool_) if first is None else track.stamps_ns >= first
+        if len(track):
+            tables.append(track_table(replace(track, name=name), as_written=True, causal=causal))
+    if tables:
+        writer.write_table(pa.concat_tables(tables).combine_chunks())
 
 
 def track_table(track: StateTrack, *, as_written: bool = False, causal: BoolArray | None = None) -> pa.Table:

@@ -7,7 +7,7 @@ import os
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,7 +17,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
-from pdhef_logtool.evaluation.reasons import ReasonIntervals
+from pdhef_logtool.evaluation.reasons import reason_intervals
 from pdhef_logtool.evaluation.track_errors import NORMAL_95
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import DEGREES
@@ -33,11 +33,10 @@ from pdhef_logtool.results.sink import (
     TRUTH,
     Event,
     Shown,
-    Sink,
     first_of_slots,
     is_finished_recording,
 )
-from pdhef_logtool.storage.files import PendingFile, cannot_write, open_new, writing
+from pdhef_logtool.storage.files import cannot_write, open_new, writing
 
 #: Estimators beside the selected estimate and the baseline that the blueprint has places for, hidden until asked for.
 MOST_OTHERS = 12
@@ -53,6 +52,9 @@ DOT_STEP_NS, LONG_DOT_STEP_NS = 50_000_000, 500_000_000
 
 #: Between the rows of a long drive: of what the recording opens on, and of the others.
 LONG_STEP_NS, OTHERS_STEP_NS = 100_000_000, 200_000_000
+
+#: Rows of a chunk.
+_CHUNK_ROWS = 6000
 
 #: How long Rerun may keep one call waiting before the recording is given up.
 LONGEST_WAIT_S = 60.0
@@ -94,26 +96,40 @@ _INPUTS = (
     _Plot("ay_m_s2", "measured a_y [m/s²]", "ay_m_s2"),
     _Plot("yaw_rate_deg_s", "measured yaw rate [deg/s]", "yaw_rate_rad_s", DEGREES),
 )
-_INPUT_RGB = (0x56, 0xB4, 0xE9)
 _TRACK, _SIGNALS = "track", "signals"
 _REASON_TEXTS = {r.name: r.text for r in REASONS}
 
 
-class RerunSink(Sink):
-    """Writes recording.rrd window by window; memory does not grow with the log but for the thinned trajectories.
+def write_recording(
+    path: Path,
+    signals: Signals | None,
+    tracks: Sequence[StateTrack],
+    report: Mapping[str, Any],
+    events: Sequence[Event] = (),
+    *,
+    application_id: str,
+    log_name: str,
+    input_hash: str,
+    start_ns: int,
+    end_ns: int | None = None,
+    shown: Shown,
+    min_speed_m_s: float = 1.0,
+    colours: Mapping[str, int] | None = None,
+) -> None:
+    """Write recording.rrd.
 
     Each track is one entity with a row a stamp (of a drive above ten minutes 10 a second, of other estimators 5) and a
-    component a quantity, with value and confidence interval. Entities are named by what a track is for (``/truth``,
+    component a quantity, with value and confidence interval. Entities are named by the use of a track (``/truth``,
     ``/main``, ``/baseline``, ``/other/1``), so that one blueprint suits all drives of a run with any estimators; the
     lines have their names. Errors are where ground truth and estimate share a stamp.
 
     Parameters
     ----------
-    path : where the finished recording is.
+    path : the finished recording; an unfinished one is left to the caller.
     application_id : the same for all logs of a run; the viewer shows them as one dataset with one blueprint.
-    log_name : shown as the recording's name.
-    input_hash : hexadecimal hash of the log, by which the viewer shows the recordings of a run from one another.
-    start_ns : zero of the timeline ``elapsed``. end_ns : of the drive, which shows whether it is long; None: it is not.
+    log_name : the recording's name.
+    input_hash : hexadecimal hash of the log, which distinguishes the recordings of a run.
+    start_ns : zero of the timeline ``elapsed``. end_ns : of the drive, which decides whether it is long; None: not.
     shown : which estimators the recording opens on.
     min_speed_m_s : sideslip is not drawn below, where it has no meaning. colours : 0xRRGGBB by estimator.
 
@@ -121,129 +137,151 @@ class RerunSink(Sink):
     ------
     OutputError : When the file cannot be written or Rerun is switched off by its environment variable.
     """
+    recording = rr.RecordingStream(application_id, recording_id=input_hash[:32], send_properties=False)
+    if not rr.is_enabled(recording):
+        raise OutputError(
+            expected="Rerun switched on",
+            got="switched off by the environment variable RERUN",
+            where=str(path),
+            remedy="unset RERUN",
+        )
+    is_long = end_ns is not None and end_ns - start_ns > LONGEST_WHOLE_NS
+    places = _places([t.name for t in tracks], shown)
+    truth = next((t for t in tracks if t.name == TRUTH), None)
+    with _stream(path, recording, start_ns) as stream:
+        with stream.calling():
+            recording.send_recording_name(log_name)
+            recording.send_recording_start_time_nanos(start_ns)
+        drawing = _Drawing(stream, is_long, min_speed_m_s)
+        if signals is not None:
+            with stream.calling():
+                drawing.draw_signals(signals)
+        for track in tracks:
+            with stream.calling():
+                drawing.draw_track(track, truth, places[track.name], colour_rgb(track.name, colours or {}))
+        with stream.calling():
+            for track in tracks:
+                drawing.draw_reasons(track)
+            drawing.draw_texts(report, events, tracks)
+    if not is_finished_recording(path):
+        raise OutputError(
+            expected="a recording that Rerun has finished",
+            got="one without its end",
+            where=str(path),
+            remedy="run the log again",
+        )
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        application_id: str,
-        log_name: str,
-        input_hash: str,
-        start_ns: int,
-        end_ns: int | None = None,
-        shown: Shown,
-        min_speed_m_s: float = 1.0,
-        colours: Mapping[str, int] | None = None,
-    ) -> None:
-        self._colours = colours or {}
-        self._start_ns = start_ns
-        self._is_long = end_ns is not None and end_ns - start_ns > LONGEST_WHOLE_NS
-        self._min_speed_m_s = min_speed_m_s
-        self._places = {TRUTH: "truth", shown.main: "main"}
-        if shown.baseline is not None:
-            self._places[shown.baseline] = "baseline"
-        self._others = 0
-        self._rows: dict[str, _Rows] = {}
-        self._paths: dict[str, _Trajectory] = {}
-        self._window: dict[str, StateTrack] = {}
-        self._reasons: dict[str, ReasonIntervals] = {}
-        self._pending = PendingFile(path)
-        self._recording = rr.RecordingStream(application_id, recording_id=input_hash[:32], send_properties=False)
-        if not rr.is_enabled(self._recording):
-            raise OutputError(
-                expected="Rerun switched on",
-                got="switched off by the environment variable RERUN",
-                where=str(path),
-                remedy="unset RERUN",
-            )
-        self._path = path
-        with writing(path):
-            self._outlet = _Outlet(open_new(self._pending.path))
-        try:
-            with self._calling():
-                self._recording.save(self._outlet.name, default_blueprint=_blueprint())
-                self._outlet.opened()
-                self._recording.send_recording_name(log_name)
-                self._recording.send_recording_start_time_nanos(start_ns)
-        except BaseException:
-            self.abort()
-            raise
+
+def _places(names: Sequence[str], shown: Shown) -> dict[str, str]:
+    """Return the entity of each track."""
+    places = {TRUTH: "truth", shown.main: "main"}
+    if shown.baseline is not None:
+        places[shown.baseline] = "baseline"
+    others = [name for name in names if name not in places]
+    return places | {name: f"other/{number}" for number, name in enumerate(others, start=1)}
+
+
+@contextmanager
+def _stream(path: Path, recording: rr.RecordingStream, start_ns: int) -> Iterator[_Stream]:
+    """Yield a recording that Rerun writes to a file; wait at the end until all is written."""
+    with writing(path):
+        outlet = _Outlet(open_new(path))
+    stream = _Stream(path, recording, outlet, start_ns)
+    try:
+        with stream.calling():
+            recording.save(outlet.name, default_blueprint=_blueprint())
+            outlet.opened()
+        yield stream
+        with stream.calling():
+            recording.disconnect()
+            outlet.close()
+    except BaseException:
+        with suppress(OutputError), stream.calling():
+            outlet.drop()
+            recording.disconnect()
+            outlet.close()
+        raise
+
+
+@dataclass(frozen=True, slots=True)
+class _Stream:
+    """A recording that Rerun writes to a file through an outlet."""
+
+    path: Path
+    recording: rr.RecordingStream
+    outlet: _Outlet
+    start_ns: int
 
     @contextmanager
-    def _calling(self) -> Iterator[None]:
-        """Call Rerun, for a limited time; raises OutputError for what could not be written since the last call."""
-        limit = threading.Timer(LONGEST_WAIT_S, self._outlet.give_up)
+    def calling(self) -> Iterator[None]:
+        """Call Rerun, for a limited time; raises OutputError for a failed write since the last call."""
+        limit = threading.Timer(LONGEST_WAIT_S, self.outlet.give_up)
         limit.daemon = True
         limit.start()
         try:
             yield
         except RuntimeError as error:
-            if self._outlet.error is None:
+            if self.outlet.error is None:
                 raise OutputError(
-                    expected="a recording by Rerun", got=str(error), where=str(self._path), remedy="run the log again"
+                    expected="a recording by Rerun", got=str(error), where=str(self.path), remedy="run the log again"
                 ) from error
         finally:
             limit.cancel()
-        if self._outlet.error is not None:
-            raise cannot_write(self._path, self._outlet.error) from self._outlet.error
+        if self.outlet.error is not None:
+            raise cannot_write(self.path, self.outlet.error) from self.outlet.error
 
-    def append_signals(self, signals: Signals) -> None:
-        """Draw what the estimators saw in this window."""
-        with self._calling():
-            self._append_signals(signals)
+    def send(self, entity: str, stamps_ns: IntArray, columns: Iterable[Any]) -> None:
+        """Send rows of an entity."""
+        times = [
+            rr.TimeColumn("time", timestamp=stamps_ns.astype("datetime64[ns]")),
+            rr.TimeColumn("elapsed", duration=(stamps_ns - self.start_ns).astype("timedelta64[ns]")),
+        ]
+        rr.send_columns(entity, indexes=times, columns=columns, recording=self.recording, strict=True)
 
-    def _append_signals(self, signals: Signals) -> None:
-        rows = self._rows.setdefault("inputs", _Rows())
+    def log_static(self, entity: str, what: rr.AsComponents) -> None:
+        """Send something without a time."""
+        self.recording.log(entity, what, static=True, strict=True)
+
+    def flush(self) -> None:
+        """Wait until all is written; otherwise it accumulates in memory."""
+        self.recording.flush(timeout_sec=LONGEST_WAIT_S)
+
+
+@dataclass(frozen=True, slots=True)
+class _Drawing:
+    """Draws signals, tracks and texts."""
+
+    stream: _Stream
+    is_long: bool
+    min_speed_m_s: float
+
+    def draw_signals(self, signals: Signals) -> None:
+        """Draw the inputs of the estimators."""
         columns = {plot.name: np.asarray(getattr(signals, plot.column))[:, None] * plot.factor for plot in _INPUTS}
-        self._send_rows("/inputs", rows, _SIGNALS, signals.stamps_ns, columns, frozenset(columns))
+        self._send_rows("/inputs", _SIGNALS, signals.stamps_ns, columns, frozenset(columns))
 
-    def append(self, track: StateTrack) -> None:
-        """Take one track of this window; it is drawn once the window is whole."""
-        if track.name in self._window:
-            with self._calling():
-                self._draw_window()
-        self._window[track.name] = track
-
-    def _draw_window(self) -> None:
-        truth = self._window.get(TRUTH)
-        for track in self._window.values():
-            self._draw_track(track, truth)
-        self._window.clear()
-        # Without this the file falls behind and the difference waits in memory: 380 MB more after one hour.
-        self._recording.flush(timeout_sec=LONGEST_WAIT_S)
-
-    def _place(self, name: str) -> str:
-        if name not in self._places:
-            self._others += 1
-            self._places[name] = f"other/{self._others}"
-        return self._places[name]
-
-    def _draw_track(self, track: StateTrack, truth: StateTrack | None) -> None:
-        place, rgb = self._place(track.name), colour_rgb(track.name, self._colours)
-        if place not in self._rows:
-            self._rows[place] = _Rows()
-            band = [] if track.name == TRUTH else [f"{track.name} 95 %"] * 2
-            widths = [2.0 if track.name == TRUTH else 1.5, 0.75, 0.75]
-            colours = [rgb, *[(*rgb, 110)] * len(band)]
-            style = rr.SeriesLines(names=[track.name, *band], colors=colours, widths=widths[: len(colours)])
-            self._log_static(f"/{place}", style)
-        is_shown = place in ("main", "baseline")
-        columns = self._columns(track, _STATES + _HEALTH if is_shown else _STATES)
+    def draw_track(self, track: StateTrack, truth: StateTrack | None, place: str, rgb: tuple[int, int, int]) -> None:
+        """Draw a track with its errors and its way."""
+        band = [] if track.name == TRUTH else [f"{track.name} 95 %"] * 2
+        widths = [2.0 if track.name == TRUTH else 1.5, 0.75, 0.75]
+        colours = [rgb, *[(*rgb, 110)] * len(band)]
+        style = rr.SeriesLines(names=[track.name, *band], colors=colours, widths=widths[: len(colours)])
+        self.stream.log_static(f"/{place}", style)
+        columns = self._columns(track, _STATES + _HEALTH if place in ("main", "baseline") else _STATES)
         if track.name != TRUTH:
-            by_name = errors(track, truth, self._min_speed_m_s)
+            by_name = errors(track, truth, self.min_speed_m_s)
             columns |= {f"error_{name}": values[:, None] for name, values in by_name.items()}
         sparse = frozenset(p.name for p in _HEALTH if p.sparse)
-        self._send_rows(f"/{place}", self._rows[place], _TRACK, track.stamps_ns, columns, sparse)
-        if len(track.reason) == len(track):
-            self._reasons.setdefault(track.name, ReasonIntervals()).append(track.stamps_ns, track.reason)
+        self._send_rows(f"/{place}", _TRACK, track.stamps_ns, columns, sparse)
         self._draw_path(track, place, rgb)
+        self.stream.flush()
 
     def _columns(self, track: StateTrack, plots: Sequence[_Plot]) -> dict[str, FloatArray]:
         """Return by component what is drawn of a track, [N, 1] or, with its 95 % interval, [N, 3]; NaN where unknown.
 
-        The blueprint asks for all components: what a track lacks is there as NaN.
+        The blueprint needs all components: those that a track does not have are NaN.
         """
-        fast = np.hypot(track.vx_m_s, track.vy_m_s) >= self._min_speed_m_s
+        fast = np.hypot(track.vx_m_s, track.vy_m_s) >= self.min_speed_m_s
         columns = {}
         for plot in plots:
             values = np.asarray(getattr(track, plot.column), dtype=np.float64) * plot.factor
@@ -257,62 +295,9 @@ class RerunSink(Sink):
             columns[plot.name] = np.stack(drawn, axis=1)
         return columns
 
-    def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:
-        """Add trajectories, events and the text report, and give the recording its name."""
-        try:
-            with self._calling():
-                self._draw_window()
-                self._draw_whole(report, events)
-                self._recording.disconnect()
-                self._outlet.close()
-            if not is_finished_recording(self._pending.path):
-                raise OutputError(
-                    expected="a recording that Rerun has finished",
-                    got="one without its end",
-                    where=str(self._path),
-                    remedy="run the log again",
-                )
-        except BaseException:
-            self.abort()
-            raise
-        self._pending.commit()
-
-    def _draw_whole(self, report: Mapping[str, Any], events: Sequence[Event]) -> None:
-        for name, path in self._paths.items():
-            self._log_static(
-                f"/plan/{self._place(name)}",
-                rr.LineStrips2D(
-                    path.strips(), colors=[colour_rgb(name, self._colours)], radii=[rr.Radius.ui_points(1.5)]
-                ),
-            )
-        self._draw_reasons()
-        if lines := log_lines(report, events, self._reasons):
-            text = rr.TextLog.columns(text=[x.text for x in lines], level=[LEVEL_NAMES[x.level] for x in lines])
-            self._send("/events", np.array([x.stamp_ns for x in lines], dtype=np.int64), text)
-        self._log_static("/report", rr.TextDocument(report_markdown(report), media_type=rr.MediaType.MARKDOWN))
-
-    def abort(self) -> None:
-        """Remove what was written."""
-        with suppress(OutputError), self._calling():
-            self._outlet.drop()
-            self._recording.disconnect()
-            self._outlet.close()
-        self._pending.discard()
-
-    def _send(self, entity: str, stamps_ns: IntArray, columns: Iterable[Any]) -> None:
-        times = [
-            rr.TimeColumn("time", timestamp=stamps_ns.astype("datetime64[ns]")),
-            rr.TimeColumn("elapsed", duration=(stamps_ns - self._start_ns).astype("timedelta64[ns]")),
-        ]
-        rr.send_columns(entity, indexes=times, columns=columns, recording=self._recording, strict=True)
-
-    def _log_static(self, entity: str, what: rr.AsComponents) -> None:
-        self._recording.log(entity, what, static=True, strict=True)
-
     def _send_rows(
         self,
         entity: str,
-        rows: _Rows,
         archetype: str,
         stamps_ns: IntArray,
         columns: Mapping[str, FloatArray],
@@ -320,28 +305,33 @@ class RerunSink(Sink):
     ) -> None:
         """Send the rows of one entity: [N] stamps, and by component [N, k] values, NaN where unknown.
 
-        Lines of ``sparse`` components go on over what is unknown for less than LONGEST_BRIDGE_NS. Of a long drive the
+        Lines of ``sparse`` components continue over unknown rows for up to LONGEST_BRIDGE_NS. Of a long drive the
         first row of each step is sent, with the largest value that a sparse component has in the step.
         """
-        if len(stamps_ns) and self._is_long:
-            step_ns = OTHERS_STEP_NS if entity.startswith("/other/") else LONG_STEP_NS
-            first = first_of_slots(stamps_ns, step_ns, rows.last_ns)
+        if len(stamps_ns) == 0:
+            return
+        if self.is_long:
+            first = first_of_slots(stamps_ns, OTHERS_STEP_NS if entity.startswith("/other/") else LONG_STEP_NS)
             columns = {
-                name: np.fmax.reduceat(values, first) if name in sparse and len(first) else values[first]
+                name: np.fmax.reduceat(values, first) if name in sparse else values[first]
                 for name, values in columns.items()
             }
             stamps_ns = stamps_ns[first]
-        if len(stamps_ns) == 0:
-            return
-        gaps = rows.gaps(stamps_ns)
-        times_ns = np.insert(stamps_ns, gaps, rows.before(stamps_ns)[gaps] + 1)
-        sent = []
-        for name, values in columns.items():
-            absent = rows.bridged(name, stamps_ns, ~np.isnan(values[:, 0])) if name in sparse else None
-            absent = None if absent is None else np.insert(absent, gaps, False)
-            sent.append(_Column(f"{archetype}:{name}", archetype, np.insert(values, gaps, np.nan, axis=0), absent))
-        rows.last_ns = int(stamps_ns[-1])
-        self._send(entity, times_ns, sent)
+        gaps = np.flatnonzero(np.diff(stamps_ns) > LONGEST_BRIDGE_NS) + 1  # lines break there
+        times_ns = np.insert(stamps_ns, gaps, stamps_ns[gaps - 1] + 1)
+        absent = {
+            name: np.insert(_bridged(stamps_ns, ~np.isnan(columns[name][:, 0])), gaps, False)
+            for name in columns
+            if name in sparse
+        }
+        columns = {name: np.insert(values, gaps, np.nan, axis=0) for name, values in columns.items()}
+        for first_row in range(0, len(times_ns), _CHUNK_ROWS):
+            rows = slice(first_row, first_row + _CHUNK_ROWS)
+            sent = [
+                _Column(f"{archetype}:{name}", archetype, values[rows], absent[name][rows] if name in absent else None)
+                for name, values in columns.items()
+            ]
+            self.stream.send(entity, times_ns[rows], sent)
 
     def _draw_path(self, track: StateTrack, place: str, rgb: tuple[int, int, int]) -> None:
         # North is drawn up: the y axis of Rerun's 2D views points down.
@@ -349,25 +339,30 @@ class RerunSink(Sink):
         has_plan = np.isfinite(plan).all(axis=1) & track.valid
         if not has_plan.any():
             return
-        if track.name not in self._paths:
-            self._paths[track.name] = _Trajectory(MOST_TRAJECTORY_POINTS)
-            style = rr.Points2D.from_fields(colors=[rgb], radii=[rr.Radius.ui_points(5.0)], labels=[track.name])
-            self._log_static(f"/plan/{place}/now", style)
-        self._paths[track.name].append(np.where(has_plan[:, None], plan, np.nan))
-        slot = track.stamps_ns // (LONG_DOT_STEP_NS if self._is_long else DOT_STEP_NS)
-        shown = has_plan & (np.diff(slot, prepend=slot[:1] - 1) != 0)
-        if shown.any():
-            points = rr.Points2D.columns(positions=plan[shown])
-            self._send(f"/plan/{place}/now", track.stamps_ns[shown], points)
+        style = rr.Points2D.from_fields(colors=[rgb], radii=[rr.Radius.ui_points(5.0)], labels=[track.name])
+        self.stream.log_static(f"/plan/{place}/now", style)
+        opens = first_of_slots(track.stamps_ns, LONG_DOT_STEP_NS if self.is_long else DOT_STEP_NS)
+        shown = opens[has_plan[opens]]
+        if len(shown):
+            self.stream.send(f"/plan/{place}/now", track.stamps_ns[shown], rr.Points2D.columns(positions=plan[shown]))
+        lines = _strips(np.where(has_plan[:, None], plan, np.nan))
+        self.stream.log_static(f"/plan/{place}", rr.LineStrips2D(lines, colors=[rgb], radii=[rr.Radius.ui_points(1.5)]))
 
-    def _draw_reasons(self) -> None:
+    def draw_reasons(self, track: StateTrack) -> None:
         """Draw each reason as a state that is active in its intervals."""
-        for name, intervals in self._reasons.items():
-            for reason, spans in intervals.intervals().items():
-                text = _REASON_TEXTS[reason]
-                stamps = np.array([t for s in spans for t in (s.start_ns, s.end_ns)], dtype=np.int64)
-                states = rr.StateChange.columns(state=[text, ""] * len(spans))  # the empty one ends the state
-                self._send(f"/reasons/{name}/{reason}", stamps, states)
+        for reason, spans in reason_intervals(track).items():
+            stamps = np.array([t for s in spans for t in (s.start_ns, s.end_ns)], dtype=np.int64)
+            # The empty state ends the one before.
+            states = rr.StateChange.columns(state=[_REASON_TEXTS[reason], ""] * len(spans))
+            self.stream.send(f"/reasons/{track.name}/{reason}", stamps, states)
+
+    def draw_texts(self, report: Mapping[str, Any], events: Sequence[Event], tracks: Sequence[StateTrack]) -> None:
+        """Write the log and the report."""
+        if lines := log_lines(report, events, tracks):
+            text = rr.TextLog.columns(text=[x.text for x in lines], level=[LEVEL_NAMES[x.level] for x in lines])
+            self.stream.send("/events", np.array([x.stamp_ns for x in lines], dtype=np.int64), text)
+        document = rr.TextDocument(report_markdown(report), media_type=rr.MediaType.MARKDOWN)
+        self.stream.log_static("/report", document)
 
 
 class _Outlet:
@@ -466,56 +461,22 @@ class _Column:
         return self._array
 
 
-@dataclass(slots=True)
-class _Rows:
-    """Where an entity is between windows: its last stamp, and when each sparse component was last known."""
-
-    last_ns: int | None = None
-    known_ns: dict[str, int] = field(default_factory=dict)
-
-    def before(self, stamps_ns: IntArray) -> IntArray:
-        """Return the stamp before each one; the first of all has itself."""
-        first = stamps_ns[0] if self.last_ns is None else self.last_ns
-        return np.concatenate([[first], stamps_ns[:-1]])
-
-    def gaps(self, stamps_ns: IntArray) -> IntArray:
-        """Return the rows after more than LONGEST_BRIDGE_NS: lines must break there."""
-        return np.flatnonzero(stamps_ns - self.before(stamps_ns) > LONGEST_BRIDGE_NS)
-
-    def bridged(self, name: str, stamps_ns: IntArray, is_known: BoolArray) -> BoolArray:
-        """Return the unknown rows that a line goes on over: all but one that is too long after the last known one."""
-        never = np.iinfo(np.int64).min
-        latest = np.maximum.accumulate(np.where(is_known, stamps_ns, self.known_ns.get(name, never)))
-        self.known_ns[name] = int(latest[-1])
-        since = np.where(latest == never, 0, stamps_ns - latest)
-        ends = ~is_known & (since > LONGEST_BRIDGE_NS)
-        return np.asarray(~is_known & ~ends, dtype=np.bool_)
+def _bridged(stamps_ns: IntArray, is_known: BoolArray) -> BoolArray:
+    """Return the unknown rows that a line continues over: all but those too long after the last known one."""
+    latest = np.maximum.accumulate(np.where(is_known, np.arange(len(stamps_ns)), -1))
+    since_ns = np.where(latest < 0, 0, stamps_ns - stamps_ns[latest])
+    return np.asarray(~is_known & (since_ns <= LONGEST_BRIDGE_NS), dtype=np.bool_)
 
 
-@dataclass(slots=True)
-class _Trajectory:
-    """Points of a path, thinned to every 2^k-th as it grows; NaN rows part its strips."""
-
-    most_points: int
-    stride: int = 1
-    seen: int = 0
-    parts: list[FloatArray] = field(default_factory=list)
-
-    def append(self, points: FloatArray) -> None:
-        """Add [N, 2] points."""
-        first = -self.seen % self.stride
-        self.parts.append(np.array(points[first :: self.stride]))
-        self.seen += len(points)
-        while sum(map(len, self.parts)) > self.most_points:
-            self.parts = [np.concatenate(self.parts)[::2]]
-            self.stride *= 2
-
-    def strips(self) -> list[FloatArray]:
-        """Return the strips of at least two points, each [N, 2]."""
-        points = np.concatenate(self.parts)
-        is_finite = np.isfinite(points).all(axis=1)
-        pieces = np.split(points, np.flatnonzero(np.diff(is_finite)) + 1)
-        return [p for p in pieces if len(p) > 1 and np.isfinite(p[0]).all()]
+def _strips(points: FloatArray) -> list[FloatArray]:
+    """Return the strips of at least two finite points [N, 2] of a path, thinned to every 2^k-th point."""
+    stride = 1
+    while len(points) > stride * MOST_TRAJECTORY_POINTS:
+        stride *= 2
+    points = points[::stride]
+    is_finite = np.isfinite(points).all(axis=1)
+    pieces = np.split(points, np.flatnonzero(np.diff(is_finite)) + 1)
+    return [p for p in pieces if len(p) > 1 and np.isfinite(p[0]).all()]
 
 
 def _blueprint() -> rrb.Blueprint:
@@ -570,7 +531,7 @@ def _track_view(component: str, title: str, places: Sequence[str], *, legend: bo
 
 
 def _input_view(plot: _Plot) -> rrb.TimeSeriesView:
-    style = rr.SeriesLines(names=[plot.title], colors=[_INPUT_RGB], widths=[1.5])
+    style = rr.SeriesLines(names=[plot.title], colors=[(0x56, 0xB4, 0xE9)], widths=[1.5])
     return _plot_view(plot.title, {"/inputs": [_line_of(f"{_SIGNALS}:{plot.name}", style)]}, legend=False)
 
 

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from hashlib import sha256
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
 from pdhef_logtool.car.parts import PHYSICS
@@ -42,8 +39,8 @@ from pdhef_logtool.records.errors import (
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
-from pdhef_logtool.records.tracks import REFERENCE
-from pdhef_logtool.results.no_position import WithoutPosition, topics_with_position, without_names
+from pdhef_logtool.records.tracks import REFERENCE, StateTrack
+from pdhef_logtool.results.no_position import topics_with_position, without_names, without_pose
 from pdhef_logtool.results.opened_run import (
     ESTIMATES_FILE,
     LOGS,
@@ -73,7 +70,7 @@ from pdhef_logtool.results.run_report import (
     tool_versions,
     write_json,
 )
-from pdhef_logtool.results.sink import TRUTH, Event, Shown, Sink
+from pdhef_logtool.results.sink import TRUTH, Event, Shown
 from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.estimating import Estimated, calibrator, estimate_drive
 from pdhef_logtool.runs.reference_audit import audit_truth
@@ -92,6 +89,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.evaluation.operating_space import OperatingSpace
     from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
+    from pdhef_logtool.results.mcap_sink import AnnotatedMcap
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
     from pdhef_logtool.results.selected_estimate import MainFacts
     from pdhef_logtool.storage.object_store import Mirror
@@ -116,8 +114,6 @@ STALE_FILES = (SETUP_FILE, PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FI
 
 #: Blocks of a requirement in a brief report.
 _BRIEF_BLOCKS = 12
-#: Outputs are written in pieces of this duration, so that their buffers stay small.
-_PIECE_NS = 60_000_000_000
 _SILENT = "{} has no valid row although the car moves"
 _NO_COPY = "annotated.mcap contains the tool's topics only: a log of kind {} has no messages to copy"
 _ALL_SILENT = "no estimator has a valid row although the car moves"
@@ -356,20 +352,22 @@ def _run_estimators(job: _Job, outputs: OutputFolder, config: RunConfig, reporte
         left_out = frozenset(e.name for e in job.ready) - job.requested - {name for _, name in main.spans}
         job, scored, main = _without(left_out, job, scored, main)
         shown = _shown(main, [e.name for e in job.ready])
-        rows = len(estimated.signals)
-        sinks = opened.enter_context(_open_sinks(change, job, config, shown, main.spans, outputs.path, rows))
-        _write(estimated, sinks, left_out)
+        tracks = _written_tracks(estimated, left_out, no_position=config.no_position)
+        outputs_of_log = _Outputs(change, job, config, shown, main.spans, outputs.path, estimated.signals, tracks)
+        annotated = outputs_of_log.annotated()
+        lost = () if annotated is None else opened.enter_context(annotated).write(tracks)
         if intervals.warning:
             drive.tell(intervals.warning)
         if not scored.moves:
             drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
-        losses = merge_losses([drive.losses, *(s.lost for s in sinks), *_losses(drive, scored, causality.failed)])
+        losses = merge_losses([drive.losses, lost, *_losses(drive, scored, causality.failed)])
         facts = _facts(job, config, main, scored, estimated, (intervals, causality.failed), losses)
         report = build_report(facts)
         if config.no_position:
             report = without_names(report, drive.path, drive.name)
-        for sink in sinks:
-            sink.finish(report, scored.events)
+        if annotated is not None:
+            annotated.finish(report, tracks, scored.events)
+        outputs_of_log.write(report, scored.events)
         report = _write_files(change, drive, report, facts.metrics, config.kept)
     outcome = replace(
         outcome_of(drive, losses, neutral=config.no_position),
@@ -595,68 +593,104 @@ def _causal_from_ns(drive: Drive, estimators: Sequence[Estimator]) -> dict[str, 
     return {e.name: first for e in estimators if e.causal and not drive.not_causal}
 
 
-@contextmanager
-def _open_sinks(
-    change: FolderTransaction,
-    job: _Job,
-    config: RunConfig,
-    shown: Shown,
-    selected: Sequence[tuple[int, str]],
-    output: Path,
-    rows: int,
-) -> Iterator[list[Sink]]:
-    """Yield the outputs of a run that are fed window by window; on an exception they are aborted.
+def _written_tracks(estimated: Estimated, left_out: frozenset[str], *, no_position: bool) -> list[StateTrack]:
+    """Return the ground truth and the tracks in the outputs, without those of ``left_out`` estimators."""
+    tracks = [track for name, track in estimated.tracks.items() if name not in left_out]
+    if estimated.drawn_truth is not None:
+        tracks.insert(0, estimated.drawn_truth)
+    return [without_pose(track) for track in tracks] if no_position else tracks
 
-    ``selected`` : estimators, each from a stamp on. ``rows`` : stamps of a track.
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Outputs:
+    """Output files with the tracks of a drive.
+
+    ``selected`` : estimators, each from a stamp on. ``run_folder`` : of the run.
     """
-    from pdhef_logtool.mapping.recognition import FIX_TYPES
-    from pdhef_logtool.results.layouts import LayoutsSink
-    from pdhef_logtool.results.mcap_sink import AnnotatedMcapSink, thinned_step_ns
-    from pdhef_logtool.results.parquet_sink import EstimatesSink
 
-    sinks: list[Sink] = []
-    drive, car = job.drive, job.car
-    colours = {REFERENCE: REFERENCE_COLOUR, **{s.name: s.colour for s in all_specs()}}
-    left_out = _left_out(drive, copied=config.annotation == "full") if config.no_position else None
-    try:
+    change: FolderTransaction
+    job: _Job
+    config: RunConfig
+    shown: Shown
+    selected: Sequence[tuple[int, str]]
+    run_folder: Path
+    signals: Signals
+    tracks: Sequence[StateTrack]
+
+    def annotated(self) -> AnnotatedMcap | None:
+        """Return the annotated log if it is asked for; add remarks of the drive."""
+        from pdhef_logtool.results.mcap_sink import AnnotatedMcap, thinned_step_ns
+
+        config, drive = self.config, self.job.drive
+        left_out = _left_out(drive, copied=self._is_copy) if config.no_position else None
+        if config.annotation == "none":
+            return None
+        if self._is_copy and drive.log.messages is None:
+            drive.remarks.append(_NO_COPY.format(drive.log.kind))
+        is_named = bool(config.estimators) and config.estimators != (ALL_ESTIMATORS,)
+        step_ns = thinned_step_ns(
+            drive.log.size,
+            rows=len(self.signals),
+            others=len(self.job.ready) - 1,
+            span_ns=drive.plan.end_ns - drive.plan.start_ns,
+        )
+        return AnnotatedMcap(
+            self.change.file("annotated.mcap"),
+            drive.log if self._is_copy else None,
+            shown={self.shown.main, TRUTH},
+            others_step_ns=None if is_named else step_ns,
+            min_speed_m_s=self.job.car.vehicle.low_speed_blend_m_s,
+            left_out=left_out,
+        )
+
+    def write(self, report: dict[str, Any], events: Sequence[Event]) -> None:
+        """Write estimates.parquet, the layouts of the annotated log, and recording.rrd, if they are asked for."""
+        from pdhef_logtool.mapping.recognition import FIX_TYPES
+        from pdhef_logtool.results.layouts import write_layouts
+        from pdhef_logtool.results.parquet_sink import write_estimates
+
+        config, drive = self.config, self.job.drive
+        colours = {REFERENCE: REFERENCE_COLOUR, **{s.name: s.colour for s in all_specs()}}
         if config.kept != "metrics":
-            causal_from_ns = _causal_from_ns(drive, job.ready)
-            sinks.append(EstimatesSink(change.file(ESTIMATES_FILE), selected=selected, causal_from_ns=causal_from_ns))
+            causal_from_ns = _causal_from_ns(drive, self.job.ready)
+            path = self.change.file(ESTIMATES_FILE)
+            write_estimates(path, self.tracks, selected=self.selected, causal_from_ns=causal_from_ns)
         if config.annotation != "none":
-            source = drive.log if config.annotation == "full" else None
-            if source is not None and source.messages is None:
-                drive.remarks.append(_NO_COPY.format(source.kind))
-            first = frozenset({shown.main, TRUTH})
-            is_named = bool(config.estimators) and config.estimators != (ALL_ESTIMATORS,)
-            step_ns = thinned_step_ns(
-                drive.log.size,
-                rows=rows,
-                others=len(job.ready) - 1,
-                span_ns=drive.plan.end_ns - drive.plan.start_ns,
+            fixes = [t.name for t in drive.log.topics if t.type_name.replace("/msg/", "/") in FIX_TYPES]
+            write_layouts(
+                self.change.file("foxglove.json"),
+                self.change.file("plotjuggler.xml"),
+                self.tracks,
+                colours,
+                shown={self.shown.main, TRUTH},
+                fixes=fixes if self._is_copy and not config.no_position else (),
             )
-            annotated = AnnotatedMcapSink(
-                change.file("annotated.mcap"),
-                source,
-                shown=first,
-                others_step_ns=None if is_named else step_ns,
-                min_speed_m_s=car.vehicle.low_speed_blend_m_s,
-                left_out=left_out,
-            )
-            sinks.append(annotated)
-            layouts = change.file("foxglove.json"), change.file("plotjuggler.xml")
-            fixes = (
-                [t.name for t in drive.log.topics if t.type_name.replace("/msg/", "/") in FIX_TYPES]
-                if source is not None and not config.no_position
-                else []
-            )
-            sinks.append(LayoutsSink(*layouts, colours, shown=first, fixes=fixes))
         if config.kept == "full":
-            sinks.append(_recording(change, drive, config, car, shown, output, colours))
-        yield [WithoutPosition(sink) for sink in sinks] if config.no_position else sinks
-    except BaseException:
-        for sink in sinks:
-            sink.abort()
-        raise
+            self._write_recording(report, events, colours)
+
+    @property
+    def _is_copy(self) -> bool:
+        return self.config.annotation == "full"
+
+    def _write_recording(self, report: dict[str, Any], events: Sequence[Event], colours: dict[str, int]) -> None:
+        from pdhef_logtool.results.rerun_sink import write_recording
+
+        drive, application_id = self.job.drive, _application_id(self.run_folder, self.config)
+        write_recording(
+            self.change.file(RECORDING_FILE),
+            self.signals,
+            self.tracks,
+            report,
+            events,
+            application_id=application_id,
+            log_name=drive.name,
+            input_hash=sha256(f"{application_id} {drive.sha256} {drive.name}".encode()).hexdigest(),
+            start_ns=drive.plan.start_ns,
+            end_ns=drive.plan.end_ns,
+            shown=self.shown,
+            min_speed_m_s=self.job.car.vehicle.low_speed_blend_m_s,
+            colours=colours,
+        )
 
 
 def _left_out(drive: Drive, *, copied: bool) -> frozenset[str]:
@@ -665,31 +699,6 @@ def _left_out(drive: Drive, *, copied: bool) -> frozenset[str]:
     names = f"topics {', '.join(sorted(topics))}, " if topics else ""
     drive.remarks.append(f"--no-position leaves out {names}attachments, metadata and file names")
     return topics
-
-
-def _recording(  # positional: what `_open_sinks` takes
-    change: FolderTransaction,
-    drive: Drive,
-    config: RunConfig,
-    car: Car,
-    shown: Shown,
-    output: Path,
-    colours: dict[str, int],
-) -> Sink:
-    from pdhef_logtool.results.rerun_sink import RerunSink
-
-    application_id = _application_id(output, config)
-    return RerunSink(
-        change.file(RECORDING_FILE),
-        application_id=application_id,
-        log_name=drive.name,
-        input_hash=sha256(f"{application_id} {drive.sha256} {drive.name}".encode()).hexdigest(),
-        start_ns=drive.plan.start_ns,
-        end_ns=drive.plan.end_ns,
-        shown=shown,
-        min_speed_m_s=car.vehicle.low_speed_blend_m_s,
-        colours=colours,
-    )
 
 
 def _application_id(output: Path, config: RunConfig) -> str:
@@ -732,22 +741,8 @@ def _without_failed(drive: Drive, ready: Sequence[Estimator], failed: dict[str, 
     return left
 
 
-def _write(estimated: Estimated, sinks: Sequence[Sink], left_out: frozenset[str]) -> None:
-    """Write signals and tracks to the outputs a minute at a time, without the tracks of ``left_out`` estimators."""
-    signals, truth = estimated.signals, estimated.drawn_truth
-    tracks = [track for name, track in estimated.tracks.items() if name not in left_out]
-    tracks = tracks if truth is None else [truth, *tracks]
-    edges_ns = np.arange(signals.stamps_ns[0], signals.stamps_ns[-1] + 1, _PIECE_NS)
-    edges = [*np.searchsorted(signals.stamps_ns, edges_ns).tolist(), len(signals)]
-    for first, last in pairwise(edges):
-        for sink in sinks:
-            sink.append_signals(signals.rows(first, last))
-            for track in tracks:
-                sink.append(track.rows(first, last))
-
-
 def friction_events(friction: FrictionSource, signals: Signals) -> list[Event]:
-    """Return when an estimated friction was observable; ``signals`` are those of all windows."""
+    """Return when an estimated friction was observable."""
     from pdhef_logtool.evaluation.segments import find_intervals
 
     intervals = find_intervals(signals, {"friction observable": friction.observable})

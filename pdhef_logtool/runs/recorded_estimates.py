@@ -386,18 +386,11 @@ def _write(
     tracks: Sequence[StateTrack],
     plan: DrivePlan,
 ) -> None:
-    from pdhef_logtool.results.parquet_sink import EstimatesSink, write_metrics
+    from pdhef_logtool.results.parquet_sink import write_estimates, write_metrics
 
     start = first_pose(tracks[0] if tracks[0].name == TRUTH else None)
-    sink = EstimatesSink(change.file("estimates.parquet"))
-    try:
-        for track in tracks:
-            has_pose = track.name == TRUTH and plan.has_truth_pose
-            sink.append(track if has_pose else dead_reckoned(track, start))
-        sink.finish(report)
-    except BaseException:
-        sink.abort()
-        raise
+    drawn = [track if track.name == TRUTH and plan.has_truth_pose else dead_reckoned(track, start) for track in tracks]
+    write_estimates(change.file("estimates.parquet"), drawn)
     write_metrics(change.file("metrics.parquet"), rows)
     write_json(change.file("report.json"), report)
 

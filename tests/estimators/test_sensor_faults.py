@@ -15,9 +15,10 @@ from reference_car import cut, drive, make_signals, slalom, tanh_tyre, with_nois
 from pdhef_logtool.car.vehicle import Sensors, default_vehicle
 from pdhef_logtool.estimators import sensor_faults as sf
 from pdhef_logtool.estimators.sensor_faults import SensorFaults, find_faults
-from pdhef_logtool.evaluation.reasons import ReasonIntervals
+from pdhef_logtool.evaluation.reasons import reason_intervals
 from pdhef_logtool.records import reasons
 from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import make_track
 
 VEHICLE = default_vehicle()
 S0 = np.array([VEHICLE.sensors.ay_std_m_s2, VEHICLE.sensors.yaw_rate_std_rad_s])
@@ -129,9 +130,8 @@ def test_an_hour_of_healthy_driving_reports_one_fault_at_most():
     for seed in range(30):
         s = road(seed)
         result = found(s)
-        gathered = ReasonIntervals()
-        gathered.append(s.stamps_ns, result.reason)
-        told += sum(len(i) for i in gathered.intervals().values())
+        track = make_track("pd-hef", s.stamps_ns, reason=result.reason)
+        told += sum(map(len, reason_intervals(track).values()))
         raised += int((result.extra_r > 0).sum())
     assert told <= 1
     assert raised > 1000

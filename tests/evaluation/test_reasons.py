@@ -1,8 +1,6 @@
-"""Intervals of reasons: the same however the track is cut, merged over short breaks only, named by the longest."""
+"""Intervals of reasons: merged over short breaks only, named by the longest."""
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,22 +12,19 @@ from pdhef_logtool.evaluation.reasons import (
     MERGE_S,
     NAMED_INTERVALS,
     Interval,
-    ReasonIntervals,
+    reason_intervals,
     sensor_faults,
     summarise_reasons,
 )
 from pdhef_logtool.records.reasons import MISSING_AY, REASONS, SPIKE_AY, STUCK_AY, STUCK_YAW_RATE
-from pdhef_logtool.records.tracks import make_track
+from pdhef_logtool.records.tracks import StateTrack, make_track
 
 STEP_NS = 10_000_000
 START_NS = 1_700_000_000_000_000_123
 
 
-def gathered(stamps_ns: np.ndarray, reason: np.ndarray, cuts: tuple[int, ...] = ()) -> ReasonIntervals:
-    found = ReasonIntervals()
-    for a, b in pairwise((0, *cuts, len(reason))):
-        found.append(stamps_ns[a:b], reason[a:b])
-    return found
+def track_of(stamps_ns: np.ndarray, reason: np.ndarray) -> StateTrack:
+    return make_track("pd-hef", stamps_ns, reason=reason)
 
 
 def stamps(count: int) -> np.ndarray:
@@ -50,24 +45,16 @@ def by_hand(stamps_ns: np.ndarray, reason: np.ndarray, bit: int) -> list[Interva
 
 @pytest.mark.slow
 @settings(max_examples=200, derandomize=True, deadline=None)
-@given(
-    st.lists(st.tuples(st.integers(1, 40), st.integers(0, 15)), min_size=1, max_size=60),
-    st.lists(st.integers(0, 60), max_size=4),
-)
-def test_intervals_are_those_found_by_hand_however_the_track_is_cut(
-    samples: list[tuple[int, int]], cuts: list[int]
-) -> None:
-    # Steps of 20 to 800 ms, masks of the first four bits; a cut may leave an empty window.
+@given(st.lists(st.tuples(st.integers(1, 40), st.integers(0, 15)), min_size=1, max_size=60))
+def test_intervals_are_those_found_by_hand(samples: list[tuple[int, int]]) -> None:
+    # Steps of 20 to 800 ms, masks of the first four bits.
     steps, masks = zip(*samples, strict=True)
     stamps_ns = START_NS + np.cumsum(np.array(steps, dtype=np.int64)) * 20_000_000
     reason = np.array(masks, dtype=np.int64)
-    whole = gathered(stamps_ns, reason)
-    cut = gathered(stamps_ns, reason, tuple(sorted(min(c, len(masks)) for c in cuts)))
-    assert cut.intervals() == whole.intervals()
-    assert cut.summary() == whole.summary()
+    track = track_of(stamps_ns, reason)
     expected = {r.name: by_hand(stamps_ns, reason, r.bit) for r in REASONS}
-    assert whole.intervals() == {name: spans for name, spans in expected.items() if spans}
-    for facts in whole.summary():
+    assert reason_intervals(track) == {name: spans for name, spans in expected.items() if spans}
+    for facts in summarise_reasons(track) or ():
         bit = next(r.bit for r in REASONS if r.name == facts.name)
         inside = np.zeros(len(reason), dtype=np.bool_)
         for span in expected[facts.name]:
@@ -84,12 +71,12 @@ def test_a_break_longer_than_half_a_second_parts_two_intervals() -> None:
     for samples, intervals in ((49, 1), (50, 2)):
         # So many stamps without the bit between two with it: 0.5 s and 0.51 s apart.
         reason = np.array([STUCK_AY, *[0] * samples, STUCK_AY])
-        assert len(gathered(stamps(len(reason)), reason).intervals()["stuck_ay"]) == intervals
+        assert len(reason_intervals(track_of(stamps(len(reason)), reason))["stuck_ay"]) == intervals
 
 
 def test_a_sensor_of_half_the_rate_is_missing_at_half_of_the_stamps() -> None:
     reason = np.where(np.arange(1001) % 2 == 1, MISSING_AY, 0)
-    (facts,) = gathered(stamps(1001), reason).summary()
+    (facts,) = summarise_reasons(track_of(stamps(1001), reason)) or ()
     assert (facts.name, facts.intervals) == ("missing_ay", 1)
     assert (facts.share, facts.share_within) == (pytest.approx(500 / 1001), pytest.approx(500 / 999))
 
@@ -98,7 +85,7 @@ def test_the_three_longest_are_named_in_order_of_time() -> None:
     reason = np.zeros(1000, dtype=np.int64)
     for at, length in ((0, 5), (100, 2), (200, 9), (300, 1), (400, 7)):
         reason[at : at + length] = SPIKE_AY
-    (facts,) = gathered(stamps(1000), reason).summary()
+    (facts,) = summarise_reasons(track_of(stamps(1000), reason)) or ()
     assert facts.intervals == 5
     assert [(i.start_ns - START_NS) // STEP_NS for i in facts.longest] == [0, 200, 400]
 

@@ -22,14 +22,14 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.learning.network import baselines, extract_command, fit, train_command
 from pdhef_logtool.learning.network.baselines import SideslipSequence, fit_dataset, run_baselines
-from pdhef_logtool.learning.network.cells import Picked
+from pdhef_logtool.learning.network.cells import EVERYTHING, Picked
 from pdhef_logtool.learning.network.dataset import (
     DriveArrays,
-    DriveWriter,
     drive_file,
     read_dataset,
     read_entry,
     vehicle_entry,
+    write_drive,
     write_manifest,
 )
 from pdhef_logtool.learning.network.extract_command import ExtractSettings
@@ -129,10 +129,7 @@ def write_dataset(folder: Path, **drives: tuple[str, ResidualRows]) -> None:
     entries = []
     for log, (split, rows) in drives.items():
         entries.append(entry_of(log, split, rows, 0.02 if log == "z" else 0.01))
-        writer = DriveWriter(drive_file(folder, entries[-1]), rows_a_group=50)
-        for a in range(0, len(rows), 35):
-            writer.append(replace(rows, **{k: getattr(rows, k)[a : a + 35] for k in rows.__slots__}))
-        writer.finish(entries[-1])
+        write_drive(drive_file(folder, entries[-1]), rows, EVERYTHING.of(rows), entries[-1], rows_a_group=50)
     write_manifest(
         folder,
         entries,
@@ -201,25 +198,13 @@ def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
         write_manifest(tmp_path, document["drives"], [], settings=SETTINGS, seed=3, vehicles={})
 
 
-def test_parts_of_rows_change_no_byte_and_a_dropped_file_is_gone(tmp_path: Path) -> None:
+def test_a_drives_file_has_groups_of_rows_and_a_damaged_or_absent_one_has_no_entry(tmp_path: Path) -> None:
     rows = made_rows(170)
-    files = []
-    for size in (7, 50, 170):
-        path = tmp_path / f"{size}.parquet"
-        writer = DriveWriter(path, rows_a_group=50)
-        for a in range(0, 170, size):
-            writer.append(replace(rows, **{k: getattr(rows, k)[a : a + size] for k in rows.__slots__}))
-        writer.finish({})
-        files.append(path.read_bytes())
-    assert files[0] == files[1] == files[2]
-    import pyarrow.parquet as pq
-
-    metadata = pq.read_metadata(tmp_path / "7.parquet")
+    for name in ("a.parquet", "b.parquet"):
+        write_drive(tmp_path / name, rows, EVERYTHING.of(rows), {}, rows_a_group=50)
+    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
+    metadata = pq.read_metadata(tmp_path / "a.parquet")
     assert [metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)] == [50, 50, 50, 20]
-    writer = DriveWriter(tmp_path / "gone.parquet")
-    writer.append(rows)
-    writer.abort()
-    assert not (tmp_path / "gone.parquet").exists()
     assert read_entry(tmp_path / "gone.parquet") is None
     (tmp_path / "text.parquet").write_text("text")
     assert read_entry(tmp_path / "text.parquet") is None
@@ -310,29 +295,23 @@ def test_perfect_truth_is_called_so_only_when_all_of_it_is() -> None:
 
 
 def test_counts_are_sums_over_the_usable_rows() -> None:
-    counts = extract_command._Counts()
-    assert counts.to_dict() == {
-        "duration_s": 0.0, "rows": 0, "usable_rows": 0, "segments": 0,
-        "residual_rms": {"vy_dot_m_s2": None, "yaw_acceleration_rad_s2": None}, "cells": {},
-    }  # fmt: skip
-    picked = Picked(np.array([True, True, False, True]), np.array([2, 2, 2, 2], dtype=np.int16), np.zeros(4, "f4"))
-    for first, value in ((0, 0.03), (4, 0.04)):
-        counts.add(
-            made_rows(
-                4,
-                stamps_ns=START_NS + (first + np.arange(4)) * 10_000_000,
-                targets=np.tile([value, 0.01], (4, 1)),
-                step_s=np.full(4, 0.01),
-                weight=np.array([1.0, 1.0, 1.0, 0.0]),
-                segment=np.array([first, first, first, 8]),
-            ),
-            picked,
-        )
-    found = counts.to_dict()
+    picked = Picked(np.arange(8) % 4 != 2, np.full(8, 2, dtype=np.int16), np.zeros(8, "f4"))
+    rows = made_rows(
+        8,
+        stamps_ns=START_NS + np.arange(8) * 10_000_000,
+        targets=np.stack([np.repeat([0.03, 0.04], 4), np.full(8, 0.01)], axis=1),
+        step_s=np.full(8, 0.01),
+        weight=np.tile([1.0, 1.0, 1.0, 0.0], 2),
+        segment=np.repeat([0, 8, 4, 8], [3, 1, 3, 1]),
+    )
+    found = extract_command._counts(rows, picked, START_NS - 10**9)
     rms = found.pop("residual_rms")
     cells = {"2": 4}  # of those that the condition chooses
-    assert found == {"duration_s": pytest.approx(0.07), "rows": 8, "usable_rows": 6, "segments": 2, "cells": cells}
+    span = {"start_s": pytest.approx(1.0), "end_s": pytest.approx(1.07), "duration_s": pytest.approx(0.07)}
+    assert found == {**span, "rows": 8, "usable_rows": 6, "segments": 2, "cells": cells}
     assert rms == {"vy_dot_m_s2": pytest.approx(math.sqrt(12.5)), "yaw_acceleration_rad_s2": pytest.approx(1.0)}
+    unused = extract_command._counts(replace(rows, weight=np.zeros(8)), picked, START_NS)
+    assert (unused["usable_rows"], unused["cells"], set(unused["residual_rms"].values())) == (0, {}, {None})
 
 
 def _job(name: str, **changes: Any) -> Any:
@@ -412,9 +391,7 @@ def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch
         assert not (job.output / "manifest.json").exists()  # while drives are written, the old one is not true
         rows, split = made_rows(60), "train" if job.log_input.stem == "a" else "test"
         entry = {**entry_of(job.log_input.stem, split, rows), "vehicle_sha256": job.physics[0]}
-        writer = DriveWriter(drive_file(job.output, entry))
-        writer.append(rows)
-        writer.finish(entry)
+        write_drive(drive_file(job.output, entry), rows, EVERYTHING.of(rows), entry)
         return replace(extract_command._failure(job, ""), entry=entry)
 
     monkeypatch.setattr(extract_command, "_extract", one)

@@ -10,7 +10,7 @@ import numpy as np
 
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.results.error_places import largest_errors
-from pdhef_logtool.results.parquet_sink import EstimatesSink, write_metrics
+from pdhef_logtool.results.parquet_sink import write_estimates, write_metrics
 from pdhef_logtool.results.run_report import write_json
 from pdhef_logtool.storage.documents import seal
 
@@ -123,10 +123,7 @@ def write_run(
     place = folder / "logs" / label
     place.mkdir(parents=True)
     if tracks:
-        sink = EstimatesSink(place / "estimates.parquet")
-        for track in tracks:
-            sink.append(track)
-        sink.finish({})
+        write_estimates(place / "estimates.parquet", tracks)
         write_json(place / "report.json", report_of(tracks, label, **changes))
     write_metrics(folder / "metrics.parquet", [])
     entry = {"log": label, "file": f"{label}.mcap", "sha256": None, "outcome": outcome, "car": None}

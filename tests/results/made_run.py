@@ -12,7 +12,8 @@ import numpy as np
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.tracks import make_track
-from pdhef_logtool.results.parquet_sink import EstimatesSink, write_metrics
+from pdhef_logtool.results.parquet_sink import write_estimates as write_estimates_file
+from pdhef_logtool.results.parquet_sink import write_metrics
 from pdhef_logtool.storage.documents import seal
 
 START_NS = 1_700_000_000_000_000_000
@@ -69,10 +70,10 @@ def write_run(
 
 def write_estimates(folder: Path, label: str, **tracks: Mapping[str, Any]) -> None:
     """Write a log's estimates.parquet, of columns of tracks by name; ``stamps_ns`` is at 100 Hz if it is not given."""
-    sink = EstimatesSink(folder / "logs" / label / "estimates.parquet")
+    made = []
     for name, columns in tracks.items():
         known = dict(columns)
         n = len(next(iter(known.values())))
         stamps = known.pop("stamps_ns", START_NS + 10_000_000 * np.arange(n, dtype=np.int64))
-        sink.append(make_track(name.replace("_", "-"), stamps, **known))
-    sink.finish({})
+        made.append(make_track(name.replace("_", "-"), stamps, **known))
+    write_estimates_file(folder / "logs" / label / "estimates.parquet", made)

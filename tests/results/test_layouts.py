@@ -5,7 +5,7 @@ import json
 import re
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -17,8 +17,8 @@ from mcap.reader import make_reader
 from rosbags.typesys import get_types_from_msg
 
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.layouts import LayoutsSink, foxglove_layout, plotjuggler_layout
-from pdhef_logtool.results.mcap_sink import AnnotatedMcapSink
+from pdhef_logtool.results.layouts import foxglove_layout, plotjuggler_layout, write_layouts
+from pdhef_logtool.results.mcap_sink import AnnotatedMcap
 from pdhef_logtool.results.sink import Event
 
 REPORT = {
@@ -30,27 +30,21 @@ REPORT = {
 }
 
 
-def write(folder: Path, tracks: Iterable[StateTrack]) -> Path:
+def write(folder: Path, tracks: Sequence[StateTrack]) -> Path:
     """Write a sidecar and the layouts of tracks."""
-    layouts = folder / "foxglove.json", folder / "plotjuggler.xml"
-    sinks = (
-        AnnotatedMcapSink(folder / "annotated.mcap", None),
-        LayoutsSink(*layouts, {"pd-hef": 0x123456}, shown={"truth", "pd-hef"}, fixes=["/gnss/fix"]),
-    )
     event = Event("slalom", 1_700_000_000_000_000_123, 1_700_000_001_000_000_123, "")
-    for track in tracks:
-        for sink in sinks:
-            sink.append(track)
-    for sink in sinks:
-        sink.finish(REPORT, [event])
+    with AnnotatedMcap(folder / "annotated.mcap", None) as annotated:
+        annotated.write(tracks)
+        annotated.finish(REPORT, tracks, [event])
+    layouts = folder / "foxglove.json", folder / "plotjuggler.xml"
+    write_layouts(*layouts, tracks, {"pd-hef": 0x123456}, shown={"truth", "pd-hef"}, fixes=["/gnss/fix"])
     return folder
 
 
 @pytest.fixture
 def written(tmp_path: Path, circle: Any) -> Path:
     """Write a sidecar and the layouts of three tracks."""
-    names = ("truth", "pd-hef", "2nd try")
-    return write(tmp_path, [circle(name, first, 100) for first in (0, 100) for name in names])
+    return write(tmp_path, [circle(name, 0, 200) for name in ("truth", "pd-hef", "2nd try")])
 
 
 def fields_by_topic(path: Path) -> dict[str, set[str]]:

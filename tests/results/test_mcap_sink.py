@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import json
-from itertools import pairwise
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +16,10 @@ from written import as_written
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.reasons import REASONS
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.results import mcap_sink
 from pdhef_logtool.results.mcap_sink import (
-    AnnotatedMcapSink,
+    AnnotatedMcap,
     metrics_record,
     thinned_step_ns,
     topic_of,
@@ -85,17 +87,18 @@ METRICS = {
 }
 
 
-def annotate(path: Path, source: Path | None, circle, windows: int = 2) -> None:
-    log = None if source is None else open_log(source)
-    sink = AnnotatedMcapSink(path, log)
-    n = 600 // windows
-    for k in range(windows):
-        for name in NAMES.values():
-            sink.append(circle(name, n * k, n))
-    sink.finish(REPORT)
-    assert sink.lost == ()
-    if log is not None:
-        log.close()
+def annotate(path: Path, source: Path | None, tracks, report=REPORT, events=(), **facts) -> None:
+    """Annotate a log, None: write a sidecar, with tracks."""
+    with ExitStack() as opened:
+        log = None if source is None else opened.enter_context(closing(open_log(source)))
+        with AnnotatedMcap(path, log, **facts) as annotated:
+            assert annotated.write(tracks) == ()
+            annotated.finish(report, tracks, events)
+
+
+@pytest.fixture
+def tracks(circle) -> list[StateTrack]:
+    return [circle(name, 0, 600) for name in NAMES.values()]
 
 
 @pytest.fixture
@@ -106,9 +109,9 @@ def source(tmp_path) -> Path:
 
 
 @pytest.fixture
-def annotated(tmp_path, source, circle) -> Path:
+def annotated(tmp_path, source, tracks) -> Path:
     path = tmp_path / "annotated.mcap"
-    annotate(path, source, circle)
+    annotate(path, source, tracks)
     return path
 
 
@@ -240,20 +243,17 @@ def cdr_only(path: Path, source: Path) -> None:
 
 
 @pytest.fixture
-def ros_only(tmp_path, source, circle) -> Path:
+def ros_only(tmp_path, source, tracks) -> Path:
     drive, path = tmp_path / "ros.mcap", tmp_path / "ros_annotated.mcap"
     cdr_only(drive, source)
-    annotate(path, drive, circle)
+    annotate(path, drive, tracks)
     return path
 
 
 def test_weights_reasons_and_their_names_are_in_the_message(tmp_path, circle):
     path = tmp_path / "sidecar.mcap"
-    sink = AnnotatedMcapSink(path, None)
-    for k in range(2):
-        sink.append(circle("pd-hef", 300 * k, 300, adaptive=True))
-    sink.finish(REPORT)
     track = circle("pd-hef", 0, 600, adaptive=True)
+    annotate(path, None, [track])
     rows = [m for _, m in decoded(path, "/pdhef/pd_hef/state")]
     np.testing.assert_array_equal([m.mixture_weight for m in rows], as_written(track.mixture_weight))
     np.testing.assert_array_equal([m.reason for m in rows], track.reason)
@@ -342,9 +342,9 @@ def test_our_own_reader_takes_the_estimates_as_signals(annotated, circle):
     log.close()
 
 
-def test_annotating_twice_is_annotating_once(tmp_path, annotated, circle):
+def test_annotating_twice_is_annotating_once(tmp_path, annotated, tracks):
     again = tmp_path / "again.mcap"
-    annotate(again, annotated, circle)
+    annotate(again, annotated, tracks)
     assert messages(again) == messages(annotated)
     with again.open("rb") as a, annotated.open("rb") as b:
         first, second = make_reader(a), make_reader(b)
@@ -355,20 +355,24 @@ def test_annotating_twice_is_annotating_once(tmp_path, annotated, circle):
 
 def test_topics_of_an_earlier_run_go(tmp_path, annotated, circle):
     path = tmp_path / "other.mcap"
-    log = open_log(annotated)
-    sink = AnnotatedMcapSink(path, log)
-    sink.append(circle("zero:no-lateral", 0, 600))
-    sink.finish({**REPORT, "metrics": []})
-    log.close()
+    annotate(path, annotated, [circle("zero:no-lateral", 0, 600)], {**REPORT, "metrics": []})
     assert {topic for topic, *_ in messages(path)} == {
         *SOURCE_TOPICS,
         *(f"/pdhef/zero_no_lateral/{what}" for what in ("state", "odometry", "plot", "path")),
     }
 
 
-def test_sidecar_holds_our_topics_alone(tmp_path, circle):
+def test_pieces_change_neither_messages_nor_bytes(tmp_path, source, tracks, monkeypatch):
+    for name, piece_ns in (("a", 60 * 10**9), ("b", 60 * 10**9), ("c", 700_000_000)):
+        monkeypatch.setattr(mcap_sink, "_PIECE_NS", piece_ns)
+        annotate(tmp_path / name, source, tracks)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    assert messages(tmp_path / "a") == messages(tmp_path / "c")
+
+
+def test_sidecar_holds_our_topics_alone(tmp_path, tracks):
     path = tmp_path / "sidecar.mcap"
-    annotate(path, None, circle)
+    annotate(path, None, tracks)
     assert {topic for topic, *_ in messages(path)} == set(OUR_TOPICS)
     assert len(decoded(path, "/pdhef/phy_ukf/odometry")) == 588
     with path.open("rb") as stream:
@@ -384,9 +388,7 @@ def test_odometry_holds_no_pose_that_is_not_known(tmp_path, circle):
     track = circle("zero", 0, 10)
     x = track.x_m.copy()
     x[3:5] = np.nan
-    sink = AnnotatedMcapSink(path, None)
-    sink.append(track.with_pose(x, track.y_m, track.yaw_rad))
-    sink.finish(REPORT)
+    annotate(path, None, [track.with_pose(x, track.y_m, track.yaw_rad)])
     stamps = [t for t, _ in decoded(path, "/pdhef/zero/odometry")]
     assert stamps == np.delete(track.stamps_ns, [3, 4]).tolist()
     assert len(decoded(path, "/pdhef/zero/state")) == 10
@@ -400,9 +402,7 @@ def test_a_log_without_truth_says_so_in_its_record():
 def test_positions_far_from_the_origin_keep_their_millimetres(tmp_path, circle):
     path = tmp_path / "sidecar.mcap"
     track = circle("zero", 0, 10)
-    sink = AnnotatedMcapSink(path, None)
-    sink.append(track.with_pose(track.x_m + 4_500_000.0, track.y_m, track.yaw_rad))
-    sink.finish(REPORT)
+    annotate(path, None, [track.with_pose(track.x_m + 4_500_000.0, track.y_m, track.yaw_rad)])
     x = [m.pose.pose.position.x for _, m in decoded(path, "/pdhef/zero/odometry")]
     np.testing.assert_allclose(x, track.x_m + 4_500_000.0, rtol=0, atol=5e-4)
 
@@ -412,42 +412,27 @@ def test_topic_names_are_legal():
     assert topic_of("2nd try", "odometry") == "/pdhef/_2nd_try/odometry"
 
 
-def test_two_estimators_never_share_a_topic(tmp_path, circle):
-    sink = AnnotatedMcapSink(tmp_path / "a.mcap", None)
-    sink.append(circle("pd-hef"))
+def test_two_estimators_never_share_a_topic_and_a_failure_leaves_no_file(tmp_path, circle):
     with pytest.raises(OutputError, match="different topics"):
-        sink.append(circle("pd_hef"))
-    sink.abort()
+        annotate(tmp_path / "a.mcap", None, [circle("pd-hef"), circle("pd_hef")])
+    with pytest.raises(KeyError):
+        annotate(tmp_path / "a.mcap", None, [circle("zero")], {})
+    assert list(tmp_path.iterdir()) == []
 
 
-def test_the_pose_of_what_is_not_shown_first_stands_20_times_a_second_however_windows_fall(tmp_path, circle):
-    def poses(cuts: list[int]) -> dict[str, list[int]]:
-        path = tmp_path / "annotated.mcap"
-        sink = AnnotatedMcapSink(path, None, shown={"phy-ukf"})
-        for a, b in pairwise(cuts):
-            for name in ("phy-ukf", "zero"):
-                sink.append(circle(name, a, b - a))
-        sink.finish(REPORT)
-        return {t: [s for s, _ in decoded(path, f"/pdhef/{t}/odometry")] for t in ("phy_ukf", "zero")}
-
-    found = poses([0, 300, 600])
-    assert found == poses([0, 7, 333, 600])
+def test_the_pose_of_what_is_not_shown_first_stands_20_times_a_second(tmp_path, tracks):
+    path = tmp_path / "annotated.mcap"
+    annotate(path, None, tracks, shown={"phy-ukf"})
+    found = {t: [s for s, _ in decoded(path, f"/pdhef/{t}/odometry")] for t in ("phy_ukf", "zero")}
     assert len(found["phy_ukf"]) > 4 * len(found["zero"]) > 0
     assert np.median(np.diff(found["zero"])) == 50_000_000
 
 
-def test_of_a_long_drive_what_nobody_asked_for_stands_five_times_a_second_however_windows_fall(tmp_path, circle):
-    def written(cuts: list[int]) -> dict[str, list[int]]:
-        path = tmp_path / "annotated.mcap"
-        sink = AnnotatedMcapSink(path, None, shown={"phy-ukf"}, others_step_ns=200_000_000)
-        for a, b in pairwise(cuts):
-            for name in ("phy-ukf", "zero"):
-                sink.append(circle(name, a, b - a, adaptive=True))
-        sink.finish(REPORT)
-        return {topic: [t for c, t, *_ in messages(path) if c == topic] for topic in OUR_TOPICS}
-
-    found = written([0, 300, 600])
-    assert found == written([0, 7, 333, 600])
+def test_of_a_long_drive_what_nobody_asked_for_stands_five_times_a_second(tmp_path, circle):
+    path = tmp_path / "annotated.mcap"
+    tracks = [circle(name, 0, 600, adaptive=True) for name in ("phy-ukf", "zero")]
+    annotate(path, None, tracks, shown={"phy-ukf"}, others_step_ns=200_000_000)
+    found = {topic: [t for t, *_ in decoded(path, topic)] for topic in OUR_TOPICS}
     assert len(found["/pdhef/phy_ukf/state"]) == 600
     assert len(found["/pdhef/phy_ukf/odometry"]) == pytest.approx(60, abs=2)
     stated = np.array(found["/pdhef/zero/state"])
@@ -464,12 +449,8 @@ def test_of_a_long_drive_what_nobody_asked_for_stands_five_times_a_second_howeve
 
 def test_plots_are_in_degrees_with_limits_and_errors(tmp_path, circle):
     path = tmp_path / "annotated.mcap"
-    sink = AnnotatedMcapSink(path, None)
-    for first in (0, 300):
-        sink.append(circle("phy-ukf", first, 300, bias=0.02))
-        sink.append(circle("truth", first, 300))
-    sink.finish(REPORT)
     estimate, truth = circle("phy-ukf", 0, 600, bias=0.02), circle("truth", 0, 600)
+    annotate(path, None, [estimate, truth])
     rows = decoded(path, "/pdhef/phy_ukf/plot")
     assert len(rows) == 120 and np.all(np.diff([t for t, _ in rows]) == 50_000_000)
     for stamp_ns, row in rows:
@@ -494,9 +475,7 @@ def test_plots_are_in_degrees_with_limits_and_errors(tmp_path, circle):
 
 def test_the_log_has_a_line_for_faults_checks_losses_and_events(tmp_path, circle):
     path = tmp_path / "annotated.mcap"
-    sink = AnnotatedMcapSink(path, None)
     track = circle("pd-hef", 0, 600, adaptive=True)
-    sink.append(track)
     start_ns = int(track.stamps_ns[0])
     check = {"name": "ay.units", "verdict": "failed", "waived": False, "evidence": "°/s"}
     loss = {"kind": "gap", "what": "no samples", "where": "/imu", "start_ns": start_ns + 10**9, "severity": "lost"}
@@ -511,7 +490,7 @@ def test_the_log_has_a_line_for_faults_checks_losses_and_events(tmp_path, circle
         Event("pd-hef diverged", start_ns + 3 * 10**9, start_ns + 4 * 10**9, ""),
         Event("straight", start_ns + 4 * 10**9, start_ns + 5 * 10**9, ""),
     ]
-    sink.finish(report, events)
+    annotate(path, None, [track], report, events)
     lines = [(t - start_ns, m.level, m.name, m.msg) for t, m in decoded(path, "/pdhef/log")]
     assert [x for x in lines if x[2] == "pdhef"] == [
         (0, 40, "pdhef", "check ay.units failed: °/s"),

@@ -13,8 +13,8 @@ from written import as_written
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, SHARE_COLUMNS, concatenate, make_track
-from pdhef_logtool.results.parquet_sink import EstimatesSink, list_estimators, read_metrics, read_track, write_metrics
+from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, SHARE_COLUMNS
+from pdhef_logtool.results.parquet_sink import list_estimators, read_metrics, read_track, write_estimates, write_metrics
 
 #: Type and unit of each column.
 COLUMNS = {
@@ -67,12 +67,8 @@ METRIC_COLUMNS = {
 NAMES = ("phy-ukf", "zero", "truth")
 
 
-def write(path: Path, circle, windows: int = 3, n: int = 200, rows_a_group: int = 256) -> None:
-    sink = EstimatesSink(path, rows_a_group)
-    for k in range(windows):
-        for name in NAMES:
-            sink.append(circle(name, k * n, n))
-    sink.finish({})
+def write(path: Path, circle, rows_a_group: int = 256) -> None:
+    write_estimates(path, [circle(name, 0, 600) for name in NAMES], rows_a_group=rows_a_group)
 
 
 def test_polars_reads_every_column_with_its_type(tmp_path, circle):
@@ -131,7 +127,7 @@ def test_one_track_comes_back(tmp_path, circle, name):
     write(path, circle)
     assert list_estimators(path) == NAMES
     track = read_track(path, name)
-    whole = concatenate([circle(name, 0, 600)])
+    whole = circle(name, 0, 600)
     for column, values in whole.columns().items():
         got = track.columns()[column]
         assert got.dtype == values.dtype
@@ -145,12 +141,8 @@ def test_one_track_comes_back(tmp_path, circle, name):
 
 def test_weights_and_reasons_come_back_where_there_are_some(tmp_path, circle):
     path = tmp_path / "estimates.parquet"
-    sink = EstimatesSink(path, 256)
-    for k in range(3):
-        sink.append(circle("zero", 200 * k, 200))
-        sink.append(circle("pd-hef", 200 * k, 200, adaptive=True))
-    sink.finish({})
     whole = circle("pd-hef", 0, 600, adaptive=True)
+    write_estimates(path, [circle("zero", 0, 600), whole])
     track = read_track(path, "pd-hef")
     assert_array_equal(track.mixture_weight, as_written(whole.mixture_weight))
     assert_array_equal(track.reason, whole.reason)
@@ -180,15 +172,23 @@ def test_mixed_row_groups_of_other_writers_are_read(tmp_path, circle):
     assert set(list_estimators(shuffled)) == set(NAMES)
 
 
-def test_windows_with_and_without_covariance_stay_aligned(tmp_path, circle):
+def test_a_second_copy_joins_the_selected_estimators_and_causal_rows_are_marked(tmp_path, circle):
     path = tmp_path / "estimates.parquet"
-    sink = EstimatesSink(path, 300)
-    sink.append(circle("phy-ukf", 0, 200, covariance=False))
-    sink.append(circle("phy-ukf", 200, 200))
-    sink.finish({})
-    std = read_track(path, "phy-ukf").vx_std_m_s
-    assert np.isnan(std[:200]).all()
-    np.testing.assert_allclose(std[200:], 0.2, rtol=1.3e-4)
+    a, b = circle("phy-ukf", 0, 600, covariance=False), circle("zero", 0, 600, bias=0.1)
+    selected = [(int(a.stamps_ns[0]), "phy-ukf"), (int(a.stamps_ns[200]), "zero"), (int(a.stamps_ns[500]), "phy-ukf")]
+    causal_from_ns = {"phy-ukf": int(a.stamps_ns[100])}
+    write_estimates(path, [a, b], selected=selected, causal_from_ns=causal_from_ns, rows_a_group=250)
+    frame = pl.read_parquet(path)
+    groups = [g["estimator"][0] for g in frame.partition_by("estimator", maintain_order=True)]
+    assert groups == ["phy-ukf", "selected", "zero"]
+    copy = read_track(path, "selected")
+    assert_array_equal(copy.stamps_ns, a.stamps_ns)
+    expected = np.where((np.arange(600) >= 200) & (np.arange(600) < 500), b.sideslip_rad, a.sideslip_rad)
+    assert_array_equal(copy.sideslip_rad, as_written(expected, "sideslip_rad"))
+    assert np.isfinite(copy.vx_std_m_s).sum() == 300
+    causal = frame.filter(pl.col("estimator") == "selected")["causal"].to_numpy()
+    assert np.flatnonzero(causal).tolist() == [*range(100, 200), *range(500, 600)]
+    assert list_estimators(path) == ("phy-ukf", "zero")
 
 
 def test_what_is_not_there_is_said(tmp_path, circle):
@@ -208,26 +208,24 @@ def test_what_is_not_there_is_said(tmp_path, circle):
         read_track(tmp_path / "other.parquet", "zero")
 
 
-def test_failure_while_finishing_leaves_the_old_file(tmp_path, circle, monkeypatch):
+def test_a_full_disk_leaves_the_old_file(tmp_path, circle, monkeypatch):
     path = tmp_path / "estimates.parquet"
     write(path, circle)
     before = path.read_bytes()
-    sink = EstimatesSink(path)
-    sink.append(circle("zero"))
 
     def full_disk(self, table, row_group_size=None):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(pq.ParquetWriter, "write_table", full_disk)
     with pytest.raises(OutputError, match="No space left"):
-        sink.finish({})
+        write(path, circle)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["estimates.parquet"]
 
 
 def test_empty_log_gives_an_empty_table(tmp_path):
     path = tmp_path / "estimates.parquet"
-    EstimatesSink(path).finish({})
+    write_estimates(path, [])
     assert pl.read_parquet(path).schema.names() == list(ESTIMATE_COLUMNS)
 
 
@@ -271,5 +269,5 @@ def test_metrics_come_back(tmp_path):
     write_metrics(path, [])
     assert read_metrics(path) == []
     with pytest.raises(OutputError, match=r"expected the columns of metrics\.parquet"):
-        write(tmp_path / "estimates.parquet", lambda *a: make_track("zero", np.arange(2)))
+        write_estimates(tmp_path / "estimates.parquet", [])
         read_metrics(tmp_path / "estimates.parquet")

@@ -4,37 +4,13 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-import pytest
-
 from pdhef_logtool.results.palette import colour_rgb
-from pdhef_logtool.results.parquet_sink import RowGroups
 from pdhef_logtool.results.run_report import diverged_line, json_bytes, report_markdown, tool_versions
 
 SECOND = 10**9
 START_NS = 1_700_000_000 * SECOND
-
-
-@pytest.mark.parametrize("joined", [False, True])
-def test_a_row_group_holds_so_many_rows_of_one_key(tmp_path: Path, joined: bool) -> None:
-    path, schema = tmp_path / "rows.parquet", pa.schema([("key", pa.string()), ("n", pa.int64())])
-    file = RowGroups(path, schema, 50, ["key"], joined=joined)
-    for a in range(0, 120, 30):
-        for key in "ab":
-            file.append(key, pa.table({"key": [key] * 30, "n": range(a, a + 30)}, schema=schema))
-    file.append("a", pa.table({"key": ["a"] * 130, "n": range(120, 250)}, schema=schema))
-    file.finish({"made": "by hand"})
-    whole = pq.ParquetFile(path)
-    groups = [whole.read_row_group(i).to_pydict() for i in range(whole.num_row_groups)]
-    spans = [("".join(sorted(set(g["key"]))), g["n"][0], g["n"][-1]) for g in groups if g["n"]]
-    first = [("a", 0, 49), ("b", 0, 49), ("a", 50, 99), ("b", 50, 99)]
-    assert spans[:4] == first
-    assert spans[4:] == [("a", 100, 149), ("a", 150, 199), ("a", 200, 249), ("b", 100, 119)]
-    assert whole.metadata.metadata[b"made"] == b"by hand"
 
 
 def test_colours_are_red_green_blue_and_a_names_own() -> None:

@@ -27,14 +27,14 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.car.parts import car_folder
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.learning.network.cells import COUNT, EVERYTHING, Picked, Picking, draw_limits, is_chosen, table_of
+from pdhef_logtool.learning.network.cells import COUNT, Picked, draw_limits, is_chosen, table_of
 from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.results.arrow_schema import arrow_array, arrow_schema
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
-from pdhef_logtool.results.parquet_sink import RowGroups
+from pdhef_logtool.results.parquet_sink import parquet_writer
 from pdhef_logtool.results.run_report import tool_versions, write_json
 from pdhef_logtool.storage.documents import DIGEST, digest, is_sealed, read_sealed, seal, validated
 
@@ -61,36 +61,28 @@ _SCHEMA = "residuals.parquet.json"
 FloatArray32: TypeAlias = NDArray[np.float32]
 
 
-class DriveWriter:
-    """Writes the Parquet file of one drive; the same rows give the same bytes, however they are handed over.
+def write_drive(
+    path: Path,
+    rows: ResidualRows,
+    picked: Picked,
+    entry: Mapping[str, Any],
+    *,
+    truth_source: str = "",
+    rows_a_group: int = ROWS_A_GROUP,
+) -> None:
+    """Write the Parquet file of one drive with the drive's entry.
 
-    ``picking`` states which rows are identified from, ``truth_source`` what gave their true sideslip.
+    ``picked`` states which rows are identified from, ``truth_source`` what gave their true sideslip.
 
     Raises
     ------
     OutputError
         When the file cannot be written.
     """
-
-    def __init__(
-        self, path: Path, picking: Picking = EVERYTHING, rows_a_group: int = ROWS_A_GROUP, truth_source: str = ""
-    ) -> None:
-        self._schema, self._picking, self._truth_source = arrow_schema(_SCHEMA), picking, truth_source
-        self._file = RowGroups(path, self._schema, rows_a_group, ["segment", "cell", "draw"], joined=True)
-
-    def append(self, rows: ResidualRows) -> Picked:
-        """Take the next rows of the drive; return which of them are identified from."""
-        picked = self._picking.of(rows)
-        self._file.append("", _table(rows, picked, self._truth_source, self._schema))
-        return picked
-
-    def finish(self, entry: Mapping[str, Any]) -> None:
-        """Write what waits and the drive's entry, and give the file its name."""
-        self._file.finish({_ENTRY.decode(): json.dumps(seal(entry), sort_keys=True)})
-
-    def abort(self) -> None:
-        """Remove what was written."""
-        self._file.abort()
+    schema = arrow_schema(_SCHEMA)
+    with parquet_writer(path, schema, ["segment", "cell", "draw"]) as writer:
+        writer.write_table(_table(rows, picked, truth_source, schema), row_group_size=rows_a_group)
+        writer.add_key_value_metadata({_ENTRY.decode(): json.dumps(seal(entry), sort_keys=True)})
 
 
 def _table(rows: ResidualRows, picked: Picked, truth_source: str, schema: pa.Schema) -> pa.Table:

@@ -39,19 +39,19 @@ from pdhef_logtool.learning.drives import (
     set_manifest,
     tell_drive,
 )
-from pdhef_logtool.learning.network.cells import COUNT, Picked, Picking, condition_of, rows_by_cell
+from pdhef_logtool.learning.network.cells import Picked, Picking, condition_of, rows_by_cell
 from pdhef_logtool.learning.network.dataset import (
     FORMAT,
     FORMAT_VERSION,
     MANIFEST,
     SPLITS,
-    DriveWriter,
     drive_file,
     read_entry,
     read_manifest,
     remove_unnamed,
     split_folder,
     vehicle_entry,
+    write_drive,
     write_manifest,
 )
 from pdhef_logtool.learning.network.residuals import (
@@ -483,37 +483,33 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             plan, varied.vehicle, drive.options, varied.friction_factor, validated=validated, of_truth=True
         )
         condition = None if settings.where is None else condition_of(settings.where)
-        writer = DriveWriter(target, Picking(condition, f"{settings.seed}:{source}"), truth_source=truth["kind"])
-        try:
-            counts = _counted(drive, physics, smoothing, service, reference, writer, progress)
-            if not counts.rows:
-                raise no_samples(job.log_input.path)
-            friction = drive.friction
-            entry = {
-                "name": job.name,
-                "log": job.log_input.stem,
-                **counts.span(drive.log.start_ns),
-                "source": {"file": job.log_input.path.name, "sha256": source},
-                "signals_sha256": drive.signals_sha256,
-                "split": split,
-                "split_from": split_from,
-                "car": job.physics[1].name,
-                "vehicle_sha256": job.physics[0],
-                "settings_sha256": fingerprint,
-                "mapping_sha256": drive.mapping.sha256,
-                "calibration": service.calibration,
-                "taught_sha256": None if service.model is None else service.model.sha256,
-                "period_s": plan.alignment.grid_period_s,
-                **counts.to_dict(),
-                "truth": truth,
-                "friction_from": friction.label + (f", {friction.summary}" if friction.summary else ""),
-                **({"friction_factor": varied.friction_factor} if settings.vary else {}),
-                "losses": [asdict(x) for x in drive.losses],
-            }
-        except BaseException:
-            writer.abort()
-            raise
-        writer.finish(entry)
+        rows = _residuals(drive, physics, smoothing, service, reference)
+        if not len(rows):
+            raise no_samples(job.log_input.path)
+        picked = Picking(condition, f"{settings.seed}:{source}").of(rows)
+        progress(1.0)
+        friction = drive.friction
+        entry = {
+            "name": job.name,
+            "log": job.log_input.stem,
+            "source": {"file": job.log_input.path.name, "sha256": source},
+            "signals_sha256": drive.signals_sha256,
+            "split": split,
+            "split_from": split_from,
+            "car": job.physics[1].name,
+            "vehicle_sha256": job.physics[0],
+            "settings_sha256": fingerprint,
+            "mapping_sha256": drive.mapping.sha256,
+            "calibration": service.calibration,
+            "taught_sha256": None if service.model is None else service.model.sha256,
+            "period_s": plan.alignment.grid_period_s,
+            **_counts(rows, picked, drive.log.start_ns),
+            "truth": truth,
+            "friction_from": friction.label + (f", {friction.summary}" if friction.summary else ""),
+            **({"friction_factor": varied.friction_factor} if settings.vary else {}),
+            "losses": [asdict(x) for x in drive.losses],
+        }
+        write_drive(target, rows, picked, entry, truth_source=truth["kind"])
         if not entry["usable_rows"]:
             drive.tell("not one usable target: no ground truth above the low-speed limit")
         record = record_of(drive, split=split)
@@ -559,25 +555,23 @@ def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) ->
     return DriveResult(record, entry, kept=True)
 
 
-def _counted(
+def _residuals(
     drive: Drive,
     physics: PhysicsFilter | PhysicsUkf,
     smoothing: _Smoothing,
     service: _Service,
     reference: TruthAt | None,
-    writer: DriveWriter,
-    progress: Callable[[float], None],
-) -> _Counts:
-    """Write the residuals of a drive and return their sums."""
+) -> ResidualRows:
+    """Return the residuals of a drive."""
     whole = drive.whole()
     truth = whole.truth if reference is None else reference(whole.signals.stamps_ns)
-    counts, period_s = _Counts(), drive.plan.alignment.grid_period_s
+    period_s = drive.plan.alignment.grid_period_s
     half_window = round(smoothing.half_s / period_s)
     taught = None
     if service.model is not None and isinstance(physics, PhysicsFilter):
         taught = CorrectedPhysics(AdaptivePhysics(physics), service.model)
     noise = smoothing.noise[0] * period_s / math.sqrt(2.0)  # of v_y itself
-    rows = residual_rows(
+    return residual_rows(
         service.read(whole.signals),
         truth,
         physics,
@@ -586,9 +580,6 @@ def _counted(
         truth_std_m_s=noise if math.isfinite(noise) else 0.0,
         taught=taught,
     )
-    counts.add(rows, writer.append(rows))
-    progress(1.0)
-    return counts
 
 
 def choose_split(
@@ -695,44 +686,23 @@ def _pair(values: Sequence[float]) -> dict[str, float | None]:
     return {n: float(v) if math.isfinite(v) else None for n, v in zip(names, values, strict=True)}
 
 
-class _Counts:
-    """Sums over the rows of a drive."""
-
-    def __init__(self) -> None:
-        self.rows = self.usable = 0
-        self._squares = np.zeros(2)
-        self._cells = np.zeros(COUNT, dtype=np.int64)
-        self._segments: set[int] = set()
-        self._span: tuple[int, int] | None = None
-
-    def add(self, rows: ResidualRows, picked: Picked) -> None:
-        use = rows.weight > 0.0
-        self._cells += rows_by_cell(picked.cell, use & picked.chosen)
-        self.rows += len(rows)
-        self.usable += int(np.count_nonzero(use))
-        squares = np.square(rows.targets[use] / rows.step_s[use, None])
-        # Added one by one, so that the sum does not depend on how the rows come in parts.
-        self._squares = np.cumsum(np.concatenate([self._squares[None], squares]), axis=0)[-1]
-        self._segments.update(int(s) for s in np.unique(rows.segment[use]))
-        first = int(rows.stamps_ns[0]) if self._span is None else self._span[0]
-        self._span = (first, int(rows.stamps_ns[-1]))
-
-    def span(self, log_start_ns: int) -> dict[str, float]:
-        """Return first and last stamp in seconds from the log's start."""
-        first, last = self._span or (log_start_ns, log_start_ns)
-        return {"start_s": (first - log_start_ns) * 1e-9, "end_s": (last - log_start_ns) * 1e-9}
-
-    def to_dict(self) -> dict[str, Any]:
-        first, last = self._span or (0, 0)
-        rms = np.sqrt(self._squares / self.usable) if self.usable else np.full(2, math.nan)
-        return {
-            "duration_s": (last - first) * 1e-9,
-            "rows": self.rows,
-            "usable_rows": self.usable,
-            "segments": len(self._segments),
-            "residual_rms": _pair(rms.tolist()),
-            "cells": {str(n): int(rows) for n, rows in enumerate(self._cells) if rows},
-        }
+def _counts(rows: ResidualRows, picked: Picked, log_start_ns: int) -> dict[str, Any]:
+    """Return the span of the rows of a drive in seconds from the log's start, and their sums."""
+    use = rows.weight > 0.0
+    first, last = int(rows.stamps_ns[0]), int(rows.stamps_ns[-1])
+    squares = np.square(rows.targets[use] / rows.step_s[use, None])
+    mean = np.cumsum(squares, axis=0)[-1] / len(squares) if len(squares) else np.full(2, math.nan)
+    by_cell = rows_by_cell(picked.cell, use & picked.chosen)
+    return {
+        "start_s": (first - log_start_ns) * 1e-9,
+        "end_s": (last - log_start_ns) * 1e-9,
+        "duration_s": (last - first) * 1e-9,
+        "rows": len(rows),
+        "usable_rows": len(squares),
+        "segments": len(np.unique(rows.segment[use])),
+        "residual_rms": _pair(np.sqrt(mean).tolist()),
+        "cells": {str(n): int(count) for n, count in enumerate(by_cell) if count},
+    }
 
 
 def _fingerprint(job: _Job, split: str) -> str:
