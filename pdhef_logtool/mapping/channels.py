@@ -40,8 +40,8 @@ LOST_KINDS = frozenset({"nan", "bad-stamp"})
 class MappedChannels:
     """Channels of one window of log time; each mapped name has a channel, which may be empty.
 
-    ``counts`` has the number of messages ``read`` and of dropped messages by reason, for each section and name. ``stamps``
-    has the times of the requested topics.
+    ``counts`` has the number of messages ``read`` and of dropped messages by reason, for each section and name.
+    ``stamps`` has the times of the requested topics.
     """
 
     signals: dict[str, Channel]

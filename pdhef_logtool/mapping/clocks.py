@@ -56,7 +56,7 @@ class ClockModel:
 
     Attributes
     ----------
-    delay_known : False where log time − stamp is systematically negative or above 1 s; the stamp is then the arrival.
+    delay_known : False where log time − stamp is systematically negative or above 1 s; the stamp then is the arrival.
     median_delay_s, p95_delay_s, min_delay_s : of log time − stamp on the log's clock; NaN without samples.
     residual_s : largest deviation of the envelope from the fitted line; large if the clock stepped.
     median_period_s : median step between stamps; NaN with fewer than two.
