@@ -1,7 +1,8 @@
 """The figures of a whole run: errors over drives, the order of estimators, effects of conditions, and coverage.
 
 Reports are read one after the other and metrics lazily: a few figures of each drive remain in memory, never a series.
-Scores use drives with ground truth that is independent of the estimator; other drives are listed separately. Intervals take the dependence of drives of one day, car or route into account.
+Scores use drives with ground truth that is independent of the estimator; other drives are listed separately.
+Intervals take the dependence of drives of one day, car or route into account.
 """
 
 from __future__ import annotations
