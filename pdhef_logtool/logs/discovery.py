@@ -131,7 +131,7 @@ def folders_of(inputs: Sequence[LogInput]) -> list[str]:
 def identity_of(log: LogInput) -> str:
     """Return the identity of a log, independent of its path: the sha256 of its content.
 
-    An object on a server is not fetched: its identity is the sha256 of its URL, size and ETag (or time of modification).
+    An object on a server is not fetched: its identity is the sha256 of its URL, size and ETag (or modification time).
 
     Raises
     ------
