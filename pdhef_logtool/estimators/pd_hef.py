@@ -63,7 +63,7 @@ def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
 
 def _trust(name: str, car: Car, options: Options) -> tuple[float, tuple[str, ...]]:
     if car.residual_network is None:
-        why = "the car has no network" if car.network is None else "the network is one for phy-ukf, as the paper has it"
+        why = "the car has no network" if car.network is None else "the network is for phy-ukf, as in the paper"
         return 0.0, (f"residual gain 0: {why}",)
     if options.trust is not None:
         return options.trust, ()

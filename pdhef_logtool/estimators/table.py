@@ -77,12 +77,10 @@ class Spec:
         if car.network is None:
             return "no network; --network names one, pdhef train writes one"
         if self.network == "residual":
-            return (
-                "" if car.residual_network is not None else "the network is one for phy-ukf; pdhef train makes another"
-            )
+            return "" if car.residual_network is not None else "the network is for phy-ukf; pdhef train writes another"
         if self.network == "paper":
             has = car.network.paper_network is not None or car.network.model == NOMINAL_MODEL
-            return "" if has else "no network as the paper has it; pdhef train --paper makes one"
+            return "" if has else "no network of the paper's design; pdhef train --paper writes one"
         if getattr(car.network, self.network) is None:
             return "the network has no such baseline; pdhef train --baselines writes it"
         return ""
@@ -147,7 +145,7 @@ SPECS: tuple[Spec, ...] = (
         _INPUTS, 0xE69F00,
     ),
     Spec(
-        OPEN_LOOP, "open-loop on the car as its log calibrated it, without ground truth: not causal",
+        OPEN_LOOP, "open-loop on the car calibrated by its log, without ground truth: not causal",
         "open_loop:build", _INPUTS, 0x661100, causal=False,
     ),
     Spec(
@@ -160,7 +158,7 @@ SPECS: tuple[Spec, ...] = (
         "phy_ukf:build", _INPUTS, 0x0072B2,
     ),
     Spec(
-        "physics", "the strongest filter on physics alone, with the parts that driving of the car gave evidence for",
+        "physics", "best filter with physics only, with the model parts supported by driving data",
         "adaptive_physics:build", _SPEED, 0x44AA99, one_of=_LATERAL,
     ),
     Spec(
@@ -168,11 +166,11 @@ SPECS: tuple[Spec, ...] = (
         "phy_ukf:build", _INPUTS, 0x56B4E9, needs_noise=True,
     ),
     Spec(
-        "pure-lstm", "a network that outputs v_y itself, no filter (needs a network with baselines)",
+        "pure-lstm", "a network that outputs v_y, without a filter (needs a network with baselines)",
         "direct_network:build", FEATURES, 0xAA4499, network="pure_lstm",
     ),
     Spec(
-        "pd-hef", "physics plus the residual of its network, as far as the car's evidence lets it",
+        "pd-hef", "physics plus the residual of its network, with a gain by the car's evidence",
         "pd_hef:build", _SPEED, 0xD55E00, network="optional", one_of=_LATERAL,
     ),
     Spec(
@@ -189,7 +187,7 @@ SPECS: tuple[Spec, ...] = (
         "pd_hef:build", _INPUTS, 0x882255, in_all=False, network="residual",
     ),
     Spec(
-        "pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, to the letter (needs its network)",
+        "pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, unchanged (needs its network)",
         "hybrid_paper:build", FEATURES, 0xCC6677, network="paper",
     ),
 )  # fmt: skip

@@ -139,9 +139,9 @@ def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInp
             expected="drives that no network was trained on" if gain_only else "drives that no result is reported on",
             got=", ".join(refused[:_NAMED]) + more,
             where="learn",
-            remedy="take --split test, or --any-split if this network was not trained on them"
+            remedy="use --split test, or --any-split if this network was not trained on them"
             if gain_only
-            else "a test on drives that a stage has used is no test: take --split validation, or --any-split",
+            else "drives used by a stage are no longer test drives: use --split validation, or --any-split",
         )
     return list(inputs), {i.stem: splits[i.stem] for i in inputs if splits[i.stem]}
 

@@ -28,7 +28,7 @@ LOSS_TEXTS = {
     "bad-stamp": "message without a usable stamp (zero, not a number, or a minute off the others) dropped",
     "nan": "sample that is not a number dropped",
     "out-of-range": "sample outside valid_min and valid_max dropped",
-    "duplicate-stamp": "message that repeats the stamp of another dropped, the first to arrive kept",
+    "duplicate-stamp": "message with the stamp of an earlier one dropped",
     "out-of-order": "message recorded after a later one, sorted back by stamp",
     "truth-quality": "ground-truth sample rejected by the quality gate dropped",
     "delay-unknown": "log time is not 0 to 1 s after the stamps: the delay is unknown, the stamp is used as arrival",
@@ -241,7 +241,7 @@ def _topic_losses(
             if repeated.any():
                 losses.append(dropped("duplicate-stamp", source.read_topic, times[order[repeated]]))
         if clock.unusable:
-            what = f"log time serves instead of {source.stamp}: {clock.unusable}"
+            what = f"log time is used instead of {source.stamp}: {clock.unusable}"
             losses.append(Loss("log-time-serves", what, source.read_topic, severity="note"))
         if not clock.delay_known:
             losses.append(Loss("delay-unknown", LOSS_TEXTS["delay-unknown"], source.read_topic, severity="note"))

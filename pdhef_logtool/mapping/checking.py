@@ -121,7 +121,7 @@ def _path_problem(source: SignalSource, path: str, kinds: dict[str, str]) -> str
         return f"{source.topic}.{path} is a {kind}, not a number"
     if kind == "struct" and (source.columns == 1 or len(source.paths) > 1):
         below = next(p for p in kinds if p.startswith((f"{path}.", f"{path}[")))
-        return f"{source.topic}.{path} is no single number: name one, such as {below}"
+        return f"{source.topic}.{path} contains several numbers: name one, such as {below}"
     if kind != "struct" and source.columns > len(source.paths) == 1 and f"{path}[]" not in kinds:
         return f"{source.topic}.{path} is one number, {source.name} needs {source.columns}"
     return ""

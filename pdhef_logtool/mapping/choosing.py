@@ -115,7 +115,7 @@ def _borrowed(log: DriveLog, mapping: Mapping) -> list[str]:
     files = {source.topic: log.borrowed(source.topic) for source in mapping.sources()}
     return [
         f"{topic} is read by {', '.join(map(str, paths))} of this machine, as the log does not define its type: "
-        "right only if that is the version that was recorded"
+        "correct only if they match the recorded version"
         for topic, paths in files.items()
         if paths
     ]

@@ -331,7 +331,7 @@ class _Weighing:
             ways.append((1.0 + off, "wheel rate", turning))
         (_, kind, taken), (_, _, other) = sorted(ways)[:2]
         said = f"{1.0 / metres:.4g} of it is 1 m/s by a_y ≈ v r"
-        doubt = f"the unit of the wheel speeds is not given: by a_y ≈ v r {taken[0]} is likeliest, then {other[0]}"
+        doubt = f"the unit of the wheel speeds is not given: by a_y ≈ v r {taken[0]} is most likely, then {other[0]}"
         return kind, taken, said, doubt
 
     # --------------------------------------------------------------------------------------------- steering

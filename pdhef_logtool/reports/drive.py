@@ -78,7 +78,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
             why_none = f"{wrong[0].upper()}{wrong[1:]}"
         else:
             if path is None:
-                why_none = f"{ESTIMATES_FILE} is not in the folder of this log; the figures below are of report.json."
+                why_none = f"{ESTIMATES_FILE} is not in the folder of this log; the tables are from report.json."
             elif figures is None:
                 why_none = f"{ESTIMATES_FILE} has no row of {roles.main}."
     charts = Charts() if figures is None else figures.charts
@@ -166,21 +166,21 @@ def _notices(report: Mapping[str, Any], figures: DriveFigures | None) -> list[st
     said = []
     duration = report["log"]["duration_s"]
     if duration < _SHORT_S:
-        said.append(f"The log is only {duration:.1f} s long: too short to judge an estimator by.")
+        said.append(f"The log is only {duration:.1f} s long: too short to evaluate an estimator.")
     if figures is not None and not figures.moves:
-        said.append("The car is never fast enough for a sideslip: none is drawn.")
+        said.append("The car is never fast enough for a sideslip; no sideslip is drawn.")
     if not report["truth"]["available"]:
         said.append(
-            "The log has no ground truth: no error is known, and no estimate can be called good or bad. Shown instead: "
-            "how far the estimates disagree, and how much sensors surprise the filters."
+            "The log has no ground truth: no errors are available. The page shows instead "
+            "the disagreement of the estimates and the innovations of the filters."
         )
     elif figures is not None and not figures.scored and figures.moves:
         said.append(
             "The ground truth of this log does not score sideslip: "
-            "disagreement of the estimates is shown in place of errors."
+            "the page shows the disagreement of the estimates instead of errors."
         )
     if figures is not None and figures.absent:
-        said.append(f"Not in estimates.parquet, so not drawn: {', '.join(figures.absent)}.")
+        said.append(f"Not drawn, as estimates.parquet does not contain them: {', '.join(figures.absent)}.")
     return said
 
 

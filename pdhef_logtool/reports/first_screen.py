@@ -57,7 +57,7 @@ def plan_head(plan: Mapping[str, Any] | None) -> PlanHead | None:
     requirements = plan["requirements"]
     counts = Counter(r["outcome"] for r in requirements)
     parts = [f"{counts[outcome]} {outcome}" for outcome in ("FAIL", "INCONCLUSIVE", "PASS") if counts[outcome]]
-    name = f"Plan {plan['file']}" if plan.get("file") else "Default plan (orientation, decides no exit code)"
+    name = f"Plan {plan['file']}" if plan.get("file") else "Default plan (for orientation; no effect on the exit code)"
     worst = next((k for o, k in (("FAIL", "fail"), ("INCONCLUSIVE", "unknown")) if counts[o]), "pass")
     order = [r for outcome in ("FAIL", "INCONCLUSIVE", "PASS") for r in of_documents(requirements, outcome)]
     notes = joint_notes({str(r["id"]): r.get("notes") or () for r in requirements})

@@ -281,7 +281,7 @@ def extract(
             remove_unnamed(output, manifest)
     empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
     if empty and manifest["drives"] and settings.split is None:
-        reporter.warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
+        reporter.warn(f"no drive is in {' and '.join(empty)}: with few drives choose with --split, or another --seed")
     return ExtractResult(output, manifest, results)
 
 
