@@ -1,4 +1,5 @@
 """Rows of the largest errors of a drive, at least a second apart."""
+
 from __future__ import annotations
 
 import numpy as np
