@@ -160,7 +160,7 @@ class AlignmentPlan:
 
     @property
     def margin_ns(self) -> int:
-        """Time before ``start_ns`` and after ``end_ns`` of which :func:`align` needs the samples."""
+        """Duration before ``start_ns`` and after ``end_ns`` that :func:`align` needs in addition."""
         return self.lookback_ns + _ns(self._longest_gap_s + LATE_NEIGHBOURHOOD_S + self._longest_delay_s)
 
     @property
@@ -221,7 +221,7 @@ def has_imu(channels: Mapping[str, Channel]) -> bool:
 
 def no_alignment(channels: Mapping[str, Channel]) -> AlignmentPlan:
     """Return the plan of a log without IMU: no grid, and none of the channels is used."""
-    unused = tuple((name, "without an IMU there are no stamps to bring it to") for name in sorted(channels))
+    unused = tuple((name, "without an IMU there are no stamps to align it to") for name in sorted(channels))
     return AlignmentPlan("", (), float("nan"), (), unused, "none")
 
 

@@ -34,7 +34,7 @@ def angles_deg(rotation: FloatArray) -> tuple[float, float, float]:
 
 
 def rotation_text(rotation: FloatArray) -> str:
-    """Return a sensor's rotation in words."""
+    """Return a sensor's rotation as text."""
     roll, pitch, yaw = (round(a) + 0 if abs(a - round(a)) < 0.05 else round(a, 1) for a in angles_deg(rotation))
     return f"the IMU is mounted with roll {roll:g}, pitch {pitch:g}, yaw {yaw:g} deg"
 

@@ -280,7 +280,7 @@ _NEVER_TURNED = frozenset({"speed_m_s", "steer_rad", "steering_wheel_rad"})
 
 
 def _together(names: Sequence[str]) -> str:
-    """Return signals in words; the wheel speeds and their mean as one."""
+    """Return names of signals as text, with one name for the wheel speeds and their mean."""
     wheels = [n for n in names if n.startswith("wheel_speed")]
     # The path does not show which of the two is wrong.
     shown = ["truth.x_m or truth.y_m (which may be exchanged)" if n == "truth.y_m" else n for n in names]

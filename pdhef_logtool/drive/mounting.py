@@ -110,7 +110,7 @@ class Mounting:
 
     @property
     def text(self) -> str:
-        """The rotation in words."""
+        """The rotation as text."""
         mirrored = "" if self.hand > 0.0 else ", its angular rates with the opposite sign"
         return f"{rotation_text(self.rotation)}{mirrored}"
 

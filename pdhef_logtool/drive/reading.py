@@ -1,4 +1,4 @@
-"""The one way to read a drive: a log opened for a car, mapped and planned, then read as a whole."""
+"""Reading of a drive: a log is opened for a car, mapped and planned, then read as a whole."""
 
 from __future__ import annotations
 

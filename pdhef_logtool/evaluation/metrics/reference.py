@@ -137,9 +137,9 @@ METRICS = (
     Metric(
         "reference_further",
         "further from reference",
-        "by how much the first of two estimates `a~b` is further from the sideslip reference, as RMS, than the second. "
-        "Only where the difference of their mean squares exceeds 1.96 of its standard deviation, which follows from "
-        "the reference's own, with one error in each 10 s: other pairs are not ranked",
+        "RMS difference of estimate `a` from the sideslip reference minus that difference of `b`, for pairs `a~b`. Only "
+        "if the difference of their mean squares exceeds 1.96 of its standard deviations, which follows from the "
+        "1-sigma of the reference with one error in each 10 s: other pairs are not ranked",
         columns=_ranked,
         formula=_further,
         over=("of_a", "of_b", "std", "block"),
