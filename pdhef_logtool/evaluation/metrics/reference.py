@@ -137,7 +137,7 @@ METRICS = (
     Metric(
         "reference_further",
         "further from reference",
-        "RMS difference of estimate `a` from the sideslip reference minus that difference of `b`, for pairs `a~b`. Only "
+        "RMS difference of estimate `a` from the sideslip reference minus the one of `b`, for pairs `a~b`. Only "
         "if the difference of their mean squares exceeds 1.96 of its standard deviations, which follows from the "
         "1-sigma of the reference with one error in each 10 s: other pairs are not ranked",
         columns=_ranked,
