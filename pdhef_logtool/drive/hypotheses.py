@@ -198,7 +198,7 @@ def posterior(
     # Mistakes of signals without a relation change no likelihood.
     useful = [h for h in hypotheses if h.is_about(touched)]
     priors = np.array([*(h.energy + _of_scales(h, scales or {}) for h in useful), 0.0])
-    # Factor of each mistake on each relation's gain; the last row stands for no mistake.
+    # Factor of each mistake on each relation's gain; the last row is for no mistake.
     acts = np.ones((len(useful) + 1, len(telling)))
     for name in touched:
         factors = np.array([*(h.factors.get(name, 1.0) for h in useful), 1.0])

@@ -18,8 +18,8 @@ from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.storage.documents import checked, digest, read_toml, unknown
 from pdhef_logtool.storage.object_store import is_url
 
-#: Baseline of a requirement that stands for run A of ``pdhef compare``. A path or URL with a slash is the output of
-#: another run; other names are estimators of the same run.
+#: Baseline of a requirement: run A of ``pdhef compare``. A path or URL with a slash is the output of another run; other
+#: names are estimators of the same run.
 RUN = "run"
 POOLED, WORST_DRIVE, QUANTILE = "pooled", "worst drive", "quantile"
 #: Metrics that are means over stamps. The value of several drives is their mean (root mean square), weighted by stamps.

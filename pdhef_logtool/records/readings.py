@@ -20,7 +20,7 @@ POSSIBLE_MAGNITUDE = {
     "yaw_rate_rad_s": 50.0,
     "speed_m_s": 150.0,
 }
-#: The same for an estimate; beyond them it is diverged, whatever the estimator reports.
+#: The same for an estimate; beyond them it is diverged, for any status of the estimator.
 POSSIBLE_STATE = {"vx_m_s": 150.0, "vy_m_s": 60.0, "yaw_rate_rad_s": 50.0}
 #: Range of possible frictions, from ice to racing tyres.
 POSSIBLE_FRICTION = (0.01, 5.0)

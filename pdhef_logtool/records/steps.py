@@ -85,7 +85,7 @@ def step_durations_s(stamps_ns: IntArray, before_ns: int | None) -> FloatArray:
 
 
 def last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
-    """Hold measurements [N], which are finite at single stamps, for up to :data:`RESTART_GAP_S`."""
+    """Extend measurements [N], which are finite at single stamps, over up to :data:`RESTART_GAP_S`."""
     finite = np.isfinite(values)
     last = np.maximum.accumulate(np.where(finite, np.arange(values.shape[0]), -1))
     fresh = (last >= 0) & (stamps_ns - stamps_ns[np.maximum(last, 0)] <= RESTART_GAP_S * 1e9)
