@@ -44,7 +44,7 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
     for line in comparison.unpaired:
         print_indented(f"without partner: {line}", console)
     if comparison.differences:
-        console.print("\nWhat else differs", style="bold")
+        console.print("\nOther differences", style="bold")
         for line in comparison.differences:
             print_indented(line, console)
     if comparison.changed:
