@@ -399,7 +399,7 @@ def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch
     settings = ExtractSettings(RunConfig())
     result = extract_command.extract([str(tmp_path)], tmp_path / "out", settings, reporter=Reporter(warn=warned.append))
     assert warned == [
-        "no --car: residuals are those of the default sedan",
+        "no --car: residuals refer to the default sedan",
         "no drive fell to validation: with few drives choose with --split, or another --seed",
     ]
     assert result.exit_code == 0
