@@ -28,7 +28,7 @@ from pdhef_logtool.results.opened_run import (
 )
 from pdhef_logtool.results.palette import REFERENCE_COLOUR
 from pdhef_logtool.results.run_report import brief_report, build_run, tool_versions, write_json
-from pdhef_logtool.results.sink import TRUTH, Event, Shown
+from pdhef_logtool.results.sink import TRUTH, Event
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import file_sha256
@@ -80,9 +80,9 @@ class DriveOutputs:
         if estimated.drawn_truth is not None:
             tracks.insert(0, estimated.drawn_truth)
         self.tracks = [without_pose(track) for track in tracks] if run.config.no_position else tracks
-        # Recordings also show physics alone, otherwise the naive estimate.
-        order = [PHYSICS, *filter(None, [main.naive]), *main.shown]
-        self._shown = Shown(main.name, next((name for name in order if name in names and name != main.name), None))
+        # Recordings show the selected estimate beside physics alone, otherwise beside the naive estimate.
+        order = dict.fromkeys([main.name, PHYSICS, *filter(None, [main.naive]), *main.shown])
+        self._shown = [name for name in order if name in names][:2]
         self._min_speed_m_s = run.car.vehicle.low_speed_blend_m_s
 
     def annotated(self) -> AbstractContextManager[AnnotatedMcap | None]:
@@ -103,7 +103,7 @@ class DriveOutputs:
         return AnnotatedMcap(
             self._change.file(_ANNOTATED),
             drive.log if self._is_copy else None,
-            shown={self._shown.main, TRUTH},
+            shown={self._main.name, TRUTH},
             others_step_ns=None if is_named else step_ns,
             min_speed_m_s=self._min_speed_m_s,
             left_out=left_out,
@@ -155,7 +155,7 @@ class DriveOutputs:
             self._change.file(_PLOTJUGGLER),
             self.tracks,
             colours,
-            shown={self._shown.main, TRUTH},
+            shown={self._main.name, TRUTH},
             fixes=fixes if self._is_copy and not self._run.config.no_position else (),
         )
 

@@ -91,10 +91,9 @@ def judge(
     from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_file, figures_of_rows, plan_verdicts
 
     done = [r for r in results if r.outcome.failed is None or r.document is not None]
-    outcomes = [r.outcome for r in done]
     drives = [
-        JudgedDrive(o.log, o.main, partial(_report, r), factors_of(asdict(o), None))
-        for r, o in zip(done, outcomes, strict=True)
+        JudgedDrive(r.outcome.log, r.outcome.main, partial(_report, r), factors_of(asdict(r.outcome), None))
+        for r in done
     ]
     if metrics is None:
         figures = figures_of_rows(row for r in done for row in r.rows)
@@ -102,7 +101,7 @@ def judge(
         import polars as pl
 
         figures = figures_of_file(pl.scan_parquet(metrics), plan, [d.main for d in drives])
-    logs = [OpenedLog(o.log, o.outcome, Path(), asdict(o)) for o in outcomes]
+    logs = [OpenedLog(o.log, o.outcome, Path(), asdict(o)) for o in (r.outcome for r in done)]
     return plan_verdicts(plan, figures, drives, strict=strict, against=other_runs(plan, logs))
 
 

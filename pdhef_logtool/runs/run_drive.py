@@ -15,7 +15,6 @@ from pdhef_logtool.evaluation.metrics import EvaluatedDrive
 from pdhef_logtool.evaluation.operating_space import operating_space
 from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS
 from pdhef_logtool.evaluation.segments import find_intervals
-from pdhef_logtool.evaluation.validation_plan import default_plan
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import merge_losses
@@ -44,7 +43,6 @@ if TYPE_CHECKING:
 _SILENT = "{} has no valid row although the car moves"
 _ALL_SILENT = "no estimator has a valid row although the car moves"
 _NEVER_MOVES = "the car is never faster than {:g} m/s: there is nothing to score"
-_OBSERVABLE = "friction observable"
 
 
 def run_log(
@@ -54,8 +52,8 @@ def run_log(
     car: Car,
     mapping: SignalMapping | None,
     *,
-    pool: SelfCalibration | None = None,
-    validation: ValidationPlan | None = None,
+    pool: SelfCalibration | None,
+    validation: ValidationPlan,
     is_first: bool = True,
     reporter: Reporter = SILENT,
 ) -> LogResult:
@@ -64,7 +62,7 @@ def run_log(
     Parameters
     ----------
     pool : calibration of the car from all logs of the run; None: from this log, if the configuration asks for it.
-    validation : plan of the verdicts in the report; None: the default plan.
+    validation : plan of the verdicts in the report.
     is_first : whether it is the run's first log; its estimators get the full causality check.
 
     Raises
@@ -78,7 +76,7 @@ def run_log(
         with outputs.begin(log_place(drive.name), stale=STALE_FILES) as change:
             run, estimated = _estimate(run, CausalityCheck(is_first), reporter)
             run, scored, main = _select(run, estimated, _score(run, estimated))
-            judged = _judge(run, estimated, scored, main, validation or default_plan())
+            judged = _judge(run, estimated, scored, main, validation)
             files = DriveOutputs((change, outputs.path), run, estimated, main)
             with files.annotated() as annotated:
                 lost = () if annotated is None else annotated.write(files.tracks)
@@ -131,7 +129,7 @@ def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     drive, signals = run.drive, estimated.signals
     scored = evaluate(drive, run.names, estimated.read, signals, run.sensors(run.calibration))
     if drive.friction.bank is not None:
-        observable = find_intervals(signals, {_OBSERVABLE: drive.friction.observable})
+        observable = find_intervals(signals, {"friction observable": drive.friction.observable})
         events = [Event(s.name, s.start_ns, s.end_ns, "the estimate of friction can be relied on") for s in observable]
         scored = replace(scored, events=sorted([*scored.events, *events], key=in_time))
     truth, reference = estimated.truth, estimated.read(REFERENCE)
