@@ -53,6 +53,7 @@ class Recorded:
 
 def read_recorded(log: DriveLog, plan: DrivePlan) -> Recorded:
     """Read the slice of a plan once, align it and derive the ground truth."""
+    log.keep_no_more()
     part = read_signals(log, plan.mapping, plan.clocks, plan.start_ns, plan.end_ns)
     channels = [*part.signals.values(), *part.truth.values()]
     samples: Counter[str] = Counter()

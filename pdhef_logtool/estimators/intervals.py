@@ -165,7 +165,9 @@ def scaled_covariance(covariance: FloatArray, of_vy: FloatArray, of_rate: FloatA
     """Return covariances [N, 3, 3] with factors [N] on the 1-sigma of v_y and yaw rate; correlations stay."""
     scale = np.ones(covariance.shape[:2])
     scale[:, 1], scale[:, 2] = of_vy, of_rate
-    return covariance * scale[:, :, None] * scale[:, None, :]
+    scaled: FloatArray = covariance * scale[:, :, None]
+    scaled *= scale[:, None, :]
+    return scaled
 
 
 def combined(terms: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:

@@ -9,7 +9,8 @@ An estimator that reads later samples is not causal: it has each step at the ste
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,7 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
     EstimatorError
         The estimator did not return one step per sample, or its plug-in failed.
     """
-    tracks: list[StateTrack] = []
+    columns: dict[str, Any] = {}
     state = None
     for first in range(0, max(len(signals), 1), PIECE_STEPS):
         piece = signals.rows(first, first + PIECE_STEPS)
@@ -102,21 +103,40 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
             until = int(np.searchsorted(signals.stamps_ns, piece.stamps_ns[-1] + ahead_ns, side="right"))
             ahead = signals.rows(first + PIECE_STEPS, until)
         track, state = run_window(estimator, piece, state, ahead, causality)
-        tracks.append(track)
-    return tracks[0] if len(tracks) == 1 else concatenate(tracks)
+        if len(piece) == len(signals):
+            return track
+        for name in (f.name for f in fields(track) if f.name != "name"):
+            part = getattr(track, name)
+            if name not in columns:
+                columns[name] = np.empty((len(signals) if len(part) else 0, *part.shape[1:]), part.dtype)
+            columns[name][first : first + len(part)] = part
+    return replace(track, **columns)
 
 
 def compensate(
     estimator: Estimator, signals: Signals, steps: Any, before: PendingSteps | None = None
 ) -> tuple[StateTrack, PendingSteps]:
     """Return the track of an estimator's steps of a window at its stamps, and the steps that stay pending."""
-    ready_ns = signals.stamps_ns if look_ahead_of(estimator) else signals.ready_ns
-    pending = PendingSteps(signals.stamps_ns, ready_ns, steps)
-    if before is not None:
-        pending = before.joined(pending)
-    chosen = extrapolation(pending.stamps_ns, pending.ready_ns, pending.steps.valid, signals.stamps_ns)
-    track = predict_track(estimator, pending.steps, chosen, signals.stamps_ns)
-    return track, pending.since(release(pending.ready_ns, signals.stamps_ns).needed)
+    stamps_ns = signals.stamps_ns
+    ready_ns = stamps_ns if look_ahead_of(estimator) else signals.ready_ns
+    window = PendingSteps(stamps_ns, ready_ns, steps)
+    if before is None:
+        chosen = extrapolation(stamps_ns, ready_ns, steps.valid, stamps_ns)
+        track = predict_track(estimator, steps, chosen, stamps_ns)
+        return track, deepcopy(window.since(release(ready_ns, stamps_ns).needed))  # a view would keep all steps
+    # Few stamps need a step of the window before: to join the steps would copy the covariances of a whole window.
+    held = len(before.stamps_ns)
+    ready_ns = np.concatenate([before.ready_ns, ready_ns])
+    valid = np.concatenate([before.steps.valid, steps.valid])
+    chosen = extrapolation(np.concatenate([before.stamps_ns, stamps_ns]), ready_ns, valid, stamps_ns)
+    first = int(np.searchsorted(chosen.step, held))
+    late, new = chosen.rows(slice(first), 0), chosen.rows(slice(first, None), held)
+    tracks = [predict_track(estimator, before.steps, late, stamps_ns[:first])] if first else []
+    if first < len(stamps_ns) or not tracks:
+        tracks.append(predict_track(estimator, steps, new, stamps_ns[first:]))
+    needed = release(ready_ns, stamps_ns).needed
+    pending = deepcopy(window.since(needed - held)) if needed >= held else before.since(needed).joined(window)
+    return concatenate(tracks) if len(tracks) > 1 else tracks[0], pending
 
 
 def _check_steps(estimator: Estimator, signals: Signals, steps: Any) -> None:

@@ -92,8 +92,7 @@ class OnlineCalibrated:
         parts = []
         for number, first, last in _spans(steps.stage[ahead.step]):
             rows = slice(first, last)
-            part = Extrapolation(ahead.step[rows], ahead.arrived[rows], ahead.horizon_s[rows], ahead.usable[rows])
-            parts.append(predict_track(self.stages[number], steps.steps, part, stamps_ns[rows]))
+            parts.append(predict_track(self.stages[number], steps.steps, ahead.rows(rows, 0), stamps_ns[rows]))
         return concatenate(parts)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -124,10 +125,17 @@ def _error(top: FloatArray, below: FloatArray, counts: FloatArray, power: float,
     return result
 
 
+@lru_cache(maxsize=1)
+def _resamples(n: int) -> FloatArray:
+    """Return how often each of ``n`` units counts in each resample, [M, N]; all requirements have the same."""
+    counts = np.random.default_rng(_SEED).multinomial(n, np.full(n, 1.0 / n), size=_RESAMPLES).astype(np.float64)
+    counts.flags.writeable = False
+    return counts
+
+
 def _deviations(top: FloatArray, below: FloatArray, power: float, centre: float, *, log: bool) -> FloatArray:
     """Return (statistic − centre) / its error over resamples of the units."""
-    n = len(top)
-    counts = np.random.default_rng(_SEED).multinomial(n, np.full(n, 1.0 / n), size=_RESAMPLES).astype(np.float64)
+    counts = _resamples(len(top))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = (counts @ top) / (counts @ below)
         statistic = power * np.log(ratio) if log else ratio

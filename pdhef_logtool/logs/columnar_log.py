@@ -346,6 +346,12 @@ class ColumnarLog(DriveLog):
             if topic not in self._expected or not set(paths) <= set(before):
                 self._expected[topic] = self._plan(topic, tuple(dict.fromkeys([*before, *paths])))
 
+    def keep_no_more(self) -> None:
+        """See :class:`~pdhef_logtool.logs.drive_log.DriveLog`."""
+        self._kept.clear()
+        self._kept_bytes = _KEPT_BYTES
+        self._expected = {}
+
     def close(self) -> None:
         """Release the files."""
         self._kept.clear()

@@ -138,6 +138,9 @@ class DriveLog(ABC):
         """
         del requests
 
+    def keep_no_more(self) -> None:  # noqa: B027 (most logs keep nothing)
+        """Announce the last long read: what it decodes is not kept for later ones."""
+
     @abstractmethod
     def close(self) -> None:
         """Release the files."""

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -161,12 +162,13 @@ def read_signals(
     if isinstance(log, CanSignalLog):
         losses += log.short_frames
     counts: dict[tuple[Role, str], Counter[str]] = {}
+    timed: dict[tuple[str, float], _Times] = {}
 
     def channels(role: Role, sources: Mapped[str, SignalSource], units: Mapped[str, str]) -> dict[str, Channel]:
         result = {}
         for name, source in sources.items():
             count = counts[role, name] = Counter()
-            result[name] = _channel(log, source, units.get(name, ""), clocks, columns, losses, count)
+            result[name] = _channel(log, source, units.get(name, ""), clocks, columns, losses, count, timed)
         return result
 
     signals = channels("signal", resolved.signals, SIGNAL_UNITS)
@@ -248,6 +250,23 @@ def _topic_losses(
     return losses
 
 
+class _Times(NamedTuple):
+    """Times of a topic's messages for one latency: measured and arrived [N], and which messages these are [M]."""
+
+    measured_ns: IntArray
+    arrival_ns: IntArray
+    usable: BoolArray
+
+
+def _times(log: DriveLog, topic: Columns, source: SignalSource, clock: ClockModel) -> _Times:
+    on_log_clock, usable = stamps_on_log_clock(log, topic, source, clock)
+    log_time = topic.log_time_ns
+    if not usable.all():
+        on_log_clock, log_time = on_log_clock[usable], log_time[usable]
+    measured = on_log_clock - np.int64(round(source.latency_s * 1e9))
+    return _Times(measured, np.maximum(log_time if clock.delay_known else on_log_clock, measured), usable)
+
+
 def _channel(
     log: DriveLog,
     source: SignalSource,
@@ -256,22 +275,25 @@ def _channel(
     columns: dict[str, Columns],
     losses: list[Loss],
     count: Counter[str],
+    timed: dict[tuple[str, float], _Times],
 ) -> Channel:
-    """Return the clean channel of a source; append to ``losses`` and count its samples in ``count``."""
+    """Return the clean channel of a source; append to ``losses`` and count its samples in ``count``.
+
+    ``timed``: times of the topics, which their channels share.
+    """
     topic = columns.get(source.read_topic)
     if topic is None or len(topic) == 0:
         empty = np.empty(0, np.int64)
         shape = (0,) if source.columns == 1 else (0, source.columns)
         return Channel(source.name, unit, source.label, empty, empty, np.empty(shape))
-    clock = clocks.get(clock_key(source), ClockModel())
-    on_log_clock, usable = stamps_on_log_clock(log, topic, source, clock)
-    values = si_values(topic, source)
-    log_time = topic.log_time_ns
+    key = (clock_key(source), source.latency_s)
+    if key not in timed:
+        timed[key] = _times(log, topic, source, clocks.get(key[0], ClockModel()))
+    measured, arrival, usable = timed[key]
+    values, log_time = si_values(topic, source), topic.log_time_ns
     count.update({"read": len(topic), "bad-stamp": int(np.count_nonzero(~usable))})
     if not usable.all():
-        on_log_clock, values, log_time = on_log_clock[usable], values[usable], log_time[usable]
-    measured = on_log_clock - np.int64(round(source.latency_s * 1e9))
-    arrival = np.maximum(log_time if clock.delay_known else on_log_clock, measured)
+        values, log_time = values[usable], log_time[usable]
     clean = clean_samples(measured, arrival, values, valid_min=source.valid_min, valid_max=source.valid_max)
     where = f"{source.name} ({source.label})"
     count.update({"nan": clean.nan_at.shape[0], "out-of-range": clean.out_of_range_at.shape[0]})

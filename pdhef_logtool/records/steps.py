@@ -114,6 +114,10 @@ class Extrapolation:
     horizon_s: FloatArray
     usable: BoolArray
 
+    def rows(self, part: slice, first_step: int) -> Extrapolation:
+        """Return the stamps of a slice, with steps counted from ``first_step``."""
+        return Extrapolation(self.step[part] - first_step, self.arrived[part], self.horizon_s[part], self.usable[part])
+
 
 def extrapolation(steps_ns: IntArray, ready_ns: IntArray, valid: BoolArray, stamps_ns: IntArray) -> Extrapolation:
     """Choose the step for each scored stamp [M] from steps [K] with stamps, availability times and validity."""

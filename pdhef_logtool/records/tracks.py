@@ -194,8 +194,8 @@ def diagonal_covariance(stds: Sequence[FloatArray]) -> FloatArray:
 
 
 def concatenate(tracks: list[StateTrack]) -> StateTrack:
-    """Join the windows of one track in time order."""
-    joined = {
-        f.name: np.concatenate([getattr(t, f.name) for t in tracks]) for f in fields(StateTrack) if f.name != "name"
-    }
-    return StateTrack(name=tracks[0].name, **joined)
+    """Join the pieces of one track in time order; the list is emptied, so that each column is in memory once."""
+    name = tracks[0].name
+    columns = {f.name: [getattr(t, f.name) for t in tracks] for f in fields(StateTrack) if f.name != "name"}
+    tracks.clear()
+    return StateTrack(name=name, **{column: np.concatenate(columns.pop(column)) for column in [*columns]})
