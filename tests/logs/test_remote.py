@@ -224,6 +224,15 @@ def test_a_server_without_ranges_gives_all_at_once(sample_logs_dir: Path) -> Non
         assert len(server.requests) == 1
 
 
+def test_copies_of_closed_logs_are_kept_up_to_a_size(served: CountingServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    for kept_bytes, fetched in ((1 << 30, 1), (0, 2)):
+        monkeypatch.setattr(remote_source, "KEPT_BYTES", kept_bytes)
+        _read(_place(served, "dlc.mcap"))
+        _read(_place(served, "dlc.mcap"))
+        size = len(served.files["dlc.mcap"])
+        assert fetched * size <= served.bytes_sent <= fetched * size + 100, kept_bytes
+
+
 def test_metadata_is_read_from_head_and_tail(sample_logs_dir: Path) -> None:
     file = sample_logs_dir / "road.mcap"
     with serving(**{file.name: file.read_bytes()}) as server:
