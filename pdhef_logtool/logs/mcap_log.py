@@ -178,20 +178,12 @@ class McapContainer(FileContainer):
     def _skippable(self) -> dict[int, IndexedChunk | tuple[int, int]]:
         """Return the chunks and attachments that are not wanted by their place, and have all else fetched."""
         everything = self._wanted == EVERYTHING or self.source.size <= self._wanted.above_bytes
-        index = None if everything else read_index(self.source)
+        index = None if everything else read_index(self.source, self.meter.limits)
         unwanted: dict[int, IndexedChunk | tuple[int, int]] = {}
-        try:
-            for schema in index.schemas if index else ():
-                self.add_schema(schema)
-            for channel in index.channels if index else ():
-                self.add_channel(channel)
-        except Exception as error:  # noqa: BLE001 (the walk reports the damage)
-            describe_damage(error)
-            self._schemas.clear()
-            self._raw_channels.clear()
-            index = None
         if index is not None:
             self._index_used = True
+            self._schemas.update(index.schemas)
+            self._raw_channels.update(index.channels)
             topics = {id_: channel.topic for id_, channel in self._raw_channels.items()}
             for chunk in index.chunks:
                 if not self._wanted.has([topics[id_] for id_ in chunk.counts], chunk.first_ns, chunk.last_ns):

@@ -13,7 +13,6 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
-import numpy as np
 from mcap.records import Metadata
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
