@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 
-import numpy as np
 from isal.isal_zlib import crc32
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, ChunkIndex, Schema, Statistics
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, McapRecord, Schema, Statistics
 from mcap.stream_reader import StreamReader
 
 from pdhef_logtool.logs.byte_source import ByteSource, CutError
@@ -29,11 +29,10 @@ TAIL_BYTES = 256 << 10
 _MOST_SUMMARY_BYTES = 64 << 20
 RECORD = struct.Struct("<BQ")  # opcode, size of the content
 FOOTER = struct.Struct("<BQQQI")  # the same, then: start of summary and of its offsets, CRC of the summary
-STATISTICS = struct.Struct("<QHIIIIQQI")
 _CRC = struct.Struct("<I")
-COUNTS = np.dtype([("id", "<u2"), ("n", "<u8")])
 _INDEX = struct.Struct("<BQHI")  # message index: opcode, size, channel, size of its pairs
 _PAIR = struct.Struct("<QQ")  # log time and offset of a message
+_UNREADABLE = (McapError, struct.error, ValueError, CutError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,36 +60,51 @@ class McapIndex:
 def read_index(source: ByteSource, limits: ResourceLimits = DEFAULT_LIMITS) -> McapIndex | None:
     """Read the summary of an MCAP from its end; None if there is none that can be used."""
     try:
-        section = _summary(source)
-        return None if section is None else _index(*section, limits)
-    except (McapError, struct.error, ValueError, CutError):
+        summary, start, sound = _summary(source)
+        return _index(summary, start, limits) if sound else None
+    except _UNREADABLE:
         return None
 
 
-def _summary(source: ByteSource) -> tuple[bytes, int] | None:
-    """Return the bytes from the summary section to the end of the file, and where they begin."""
+def chunk_places(source: ByteSource, limits: ResourceLimits) -> list[int]:
+    """Return where chunks begin according to the summary, as far as it can be read, ascending."""
+    places: list[int] = []
+    with suppress(*_UNREADABLE):
+        indexes = (r for r in _records(_summary(source)[0], limits) if isinstance(r, ChunkIndex))
+        places.extend(r.chunk_start_offset for r in indexes if source.read(r.chunk_start_offset, 1)[0] == Opcode.CHUNK)
+    return sorted(places)
+
+
+def _summary(source: ByteSource) -> tuple[bytes, int, bool]:
+    """Return the bytes from the summary section to the end of the file, their place, and whether their CRC matches.
+
+    Raises
+    ------
+    ValueError : there is none.
+    """
     size = source.size
     foot = size - len(MCAP_MAGIC) - FOOTER.size
     if foot <= len(MCAP_MAGIC):
-        return None
-    tail = max(0, size - TAIL_BYTES)
-    source.prefetch([(tail, size)])
+        raise ValueError("a file without a footer")
+    source.prefetch([(max(0, size - TAIL_BYTES), size)])
     end = source.read(foot, size - foot)
     opcode, length, start, _, crc = FOOTER.unpack_from(end)
     if opcode != Opcode.FOOTER or length != FOOTER.size - RECORD.size or end[FOOTER.size :] != MCAP_MAGIC:
-        return None
+        raise ValueError("a file without a footer")
     if not 0 < start < foot or foot - start > _MOST_SUMMARY_BYTES:
-        return None
+        raise ValueError("a file without a summary")
     source.prefetch([(start, size)])
     summary = source.read(start, foot - start)
-    if crc and crc32(end[: FOOTER.size - _CRC.size], crc32(summary)) != crc:
-        return None
-    return summary + end, start
+    return summary + end, start, crc in (0, crc32(end[: FOOTER.size - _CRC.size], crc32(summary)))
+
+
+def _records(summary: bytes, limits: ResourceLimits) -> Iterator[McapRecord]:
+    most = limits.metadata_bytes
+    return StreamReader(BytesIO(summary), skip_magic=True, emit_chunks=True, record_size_limit=most).records
 
 
 def _index(summary: bytes, start: int, limits: ResourceLimits) -> McapIndex | None:
-    reader = StreamReader(BytesIO(summary), skip_magic=True, emit_chunks=True, record_size_limit=limits.metadata_bytes)
-    records = list(reader.records)
+    records = list(_records(summary, limits))
     schemas = {record.id: record for record in records if isinstance(record, Schema)}
     channels = {record.id: record for record in records if isinstance(record, Channel)}
     chunks = sorted((_chunk(r) for r in records if isinstance(r, ChunkIndex)), key=lambda chunk: chunk.start)

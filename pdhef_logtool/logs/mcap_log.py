@@ -24,7 +24,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment as AttachmentRecord
-from mcap.records import Channel, Metadata, Schema
+from mcap.records import Channel, Metadata, Schema, Statistics
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_source import ByteSource
@@ -45,7 +45,7 @@ from pdhef_logtool.logs.container import (
     block_from_lists,
     describe_damage,
 )
-from pdhef_logtool.logs.mcap_index import COUNTS, FOOTER, RECORD, STATISTICS, IndexedChunk, read_index
+from pdhef_logtool.logs.mcap_index import FOOTER, RECORD, IndexedChunk, chunk_places, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.logs.type_names import ros2_type_name
@@ -57,7 +57,6 @@ _MESSAGE_RECORD = struct.Struct("<BQHIQ")
 _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, uncompressed CRC, length of the compression's name
 _INDEX_HEAD = struct.Struct("<9sHI")  # head of the record, channel, bytes of the pairs
 _INDEX_RECORD = struct.Struct("<BQHI")  # the same, with opcode and size
-_CHUNK_PLACE = struct.Struct("<QQQ")  # start of a chunk index: first and last time, offset of the chunk
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 _UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
 _CRC_BLOCK_BYTES = 4 << 20
@@ -211,29 +210,9 @@ class McapContainer(FileContainer):
     def _next_indexed_chunk(self, after: int) -> int | None:
         """Return the first chunk behind a damaged place that the summary names, or None."""
         if self._indexed is None:
-            self._indexed = self._indexed_chunks()
+            self._indexed = chunk_places(self.source, self.meter.limits)
         position = bisect_right(self._indexed, after)
         return self._indexed[position] if position < len(self._indexed) else None
-
-    def _indexed_chunks(self) -> list[int]:
-        read, size = self.source.read, self.source.size
-        foot = size - len(MCAP_MAGIC) - FOOTER.size
-        if (
-            foot <= 0
-            or read(foot, 1)[0] != Opcode.FOOTER
-            or read(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) != MCAP_MAGIC
-        ):
-            return []
-        (offset,) = _U64.unpack(read(foot + RECORD.size, _U64.size))
-        chunks: list[int] = []
-        while offset > 0 and offset + RECORD.size <= foot:
-            opcode, length = RECORD.unpack(read(offset, RECORD.size))
-            if opcode == Opcode.CHUNK_INDEX and length >= _CHUNK_PLACE.size and offset + RECORD.size + length <= foot:
-                chunk = _CHUNK_PLACE.unpack(read(offset + RECORD.size, _CHUNK_PLACE.size))[-1]
-                if chunk < foot and read(chunk, 1)[0] == Opcode.CHUNK:
-                    chunks.append(chunk)
-            offset += RECORD.size + length
-        return sorted(chunks)
 
     def add_schema(self, payload: bytes) -> None:
         """Add a schema record."""
@@ -693,12 +672,9 @@ class _Walk:
 
     def _statistics(self, start: int, end: int) -> None:
         """Note how many messages the file claims by channel."""
-        most = STATISTICS.size + COUNTS.itemsize * (1 << 16)
-        payload = self.of.source.read(start + RECORD.size, min(end - start - RECORD.size, most))
-        total, *_, n = STATISTICS.unpack_from(payload)
-        entries = np.frombuffer(payload, COUNTS, n // COUNTS.itemsize, STATISTICS.size)
-        counts = {c: k for c, k in zip(entries["id"].tolist(), entries["n"].tolist(), strict=True) if k}
-        self.statistics = (total, counts)
+        self.of.meter.limits.check("metadata_bytes", end - start, "the statistics")
+        record = Statistics.read(ReadDataStream(BytesIO(self.of.payload(start, end))))
+        self.statistics = (record.message_count, {c: n for c, n in record.channel_message_counts.items() if n})
 
     def _end_run(self) -> None:
         if self.run is None:
