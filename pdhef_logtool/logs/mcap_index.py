@@ -1,7 +1,7 @@
 """The summary of an MCAP as an index: extents and contents of its chunks, without walking the file.
 
-For remote files, where every read is a request. An index is used only if it is complete, if its sums agree with the
-file's statistics, and if its times are those of a sound recording; otherwise the file is walked like any other.
+For remote files: each read is a request. An index is used only if it is complete, if its sums equal the statistics of
+the file, and if its times ascend as in a sound recording; otherwise the file is walked as a local file is.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class McapIndex:
 
 
 def read_index(source: ByteSource, limits: ResourceLimits = DEFAULT_LIMITS) -> McapIndex | None:
-    """Read the summary of an MCAP from its end; None if there is none that can be used."""
+    """Read the summary of an MCAP from its end; None if it is missing or inconsistent."""
     try:
         summary, start, sound = _summary(source)
         return _index(summary, start, limits) if sound else None
@@ -80,7 +80,7 @@ def _summary(source: ByteSource) -> tuple[bytes, int, bool]:
 
     Raises
     ------
-    ValueError : there is none.
+    ValueError : the file has no footer or no summary.
     """
     size = source.size
     foot = size - len(MCAP_MAGIC) - FOOTER.size

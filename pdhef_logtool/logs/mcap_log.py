@@ -1,8 +1,8 @@
 """MCAP files as a container: one walk over the record headers, chunks decoded one at a time, every CRC checked.
 
 The walk visits every top-level record by its length and uses no index, so that a file without a summary, with
-channels that only its chunks declare, with chunks that no index names, or with a cut end reads like any other. Of a
-remote file, chunks that are not wanted are taken from the index, if it is consistent.
+channels that only its chunks declare, with chunks that no index names, or with a cut end reads like any other. Unwanted
+chunks of a remote file are not walked: its index describes them, if it is consistent.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ _SUMMARY_ONLY = frozenset(
         Opcode.SUMMARY_OFFSET,
     )
 )
-_FIRST_PRIVATE = 0x80  # what is neither known nor private is no record of the format
+_FIRST_PRIVATE = 0x80  # other opcodes, neither defined nor private, are no records of the format
 #: Head of a message record, before its payload.
 MESSAGE_HEAD = np.dtype(
     [("op", "u1"), ("size", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
@@ -343,7 +343,7 @@ class McapContainer(FileContainer):
         )
 
     def _is_known(self, opcode: int, payload: bytes, kept: frozenset[int]) -> bool:
-        """Return whether a record of a chunk declares only what the kept channels are declared as in this file."""
+        """Return whether a record of a chunk declares kept channels only, as this file declares them."""
         try:
             if opcode == Opcode.CHANNEL:
                 channel = Channel.read(ReadDataStream(BytesIO(payload)))
@@ -357,7 +357,7 @@ class McapContainer(FileContainer):
         return True
 
     def times(self, span: Span) -> tuple[IntArray, IntArray]:
-        """Return a span's channels and log times; a chunk's from its message indexes, where it has them."""
+        """Return a span's channels and log times; of a chunk, read its message indexes if it has some."""
         extent = self.chunks[span.index]
         indexes = _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
         if not indexes:
@@ -483,12 +483,12 @@ class _Walk:
         self.data_end: tuple[int, int] | None = None  # extent of the record
         self.data_crc = 0
         self.footer: tuple[int, int] | None = None  # extent of the record
-        self.bare_chunks = False  # whether any chunk has no CRC of its own
+        self.bare_chunks = False  # whether any chunk has no CRC
         self.run: tuple[int, int] | None = None  # extent of consecutive unchunked messages
         self.run_times = (0, 0)
         self.run_counts: Counter[int] = Counter()
         self.run_ordered = True  # whether no log time of it steps back
-        self.chunk: tuple[int, int] | None = None  # extent of the chunk whose message indexes are being read
+        self.chunk: tuple[int, int] | None = None  # extent of the chunk before the message indexes that are being read
         self.index_end = 0
         self.head = (0, 0, 0)  # of the chunk: first and last log time, size
         self.index_counts: Counter[int] = Counter()
@@ -503,7 +503,7 @@ class _Walk:
             self._message_index(start, end)
             return
         if self.chunk is not None and opcode == _FIRST_PRIVATE | _OP_MESSAGE_INDEX:
-            self.index_sound = False  # an index with one wrong bit: what it named is found in the chunk
+            self.index_sound = False  # an index with one wrong bit: its messages are found in the chunk
             return
         self._end_chunk()
         if opcode in _DECLARATIONS:
@@ -531,7 +531,7 @@ class _Walk:
         elif opcode < _FIRST_PRIVATE and (opcode not in _SUMMARY_ONLY or not self.data_end):
             raise SpanDamageError(f"no record of kind {opcode} is allowed here")
         elif opcode - _FIRST_PRIVATE == _OP_CHUNK and self._is_chunk(start, end):
-            raise SpanDamageError("a chunk whose kind has one wrong bit, which makes it a private record")
+            raise SpanDamageError("a chunk with one wrong bit in its opcode, which makes it a private record")
 
     def _is_chunk(self, start: int, end: int) -> bool:
         """Return whether a record of a private kind is laid out like a chunk."""
@@ -555,7 +555,7 @@ class _Walk:
         return indexed.index_end
 
     def messages(self, offset: int) -> int:
-        """Add the message records from here on whose heads are read ahead; return the start of the next record."""
+        """Add the message records from here on with heads that are read ahead; return the start of the next record."""
         of = self.of
         self._end_chunk()
         size = of.source.size
@@ -596,7 +596,7 @@ class _Walk:
         of = self.of
         if self.chunk is None:
             self._end_run()
-            raise SpanDamageError("a message index without its chunk, whose messages are lost")
+            raise SpanDamageError("a message index without its chunk; the messages are lost")
         self.index_end = end
         sound, self.index_sound = self.index_sound, False
         block, place = of.source.ahead(start, min(end - start, _INDEX_HEAD.size))
@@ -639,7 +639,7 @@ class _Walk:
     def _check_data(self) -> None:
         """Check the CRC of the data section if no other checksum or count protects the messages.
 
-        If other damage is known already, the check would add nothing.
+        After other damage, the check is skipped: it adds no information.
         """
         of = self.of
         if self.data_end is None or not self.data_crc or of.lost:

@@ -1,6 +1,6 @@
 """Lossless copies of a log's messages into an MCAP, in order of log time; a few spans are in memory at a time.
 
-Chunks of an MCAP whose channels are all kept are copied as they are: checked, but not compressed again.
+Chunks of an MCAP are copied unchanged if all their channels are kept: checked, but not compressed again.
 
 Messages of an MCAP keep schema, topic, encoding, channel metadata, both times, sequence and payload; attachments and
 metadata records are copied too. rosbag2 databases keep their CDR bytes and definitions. ROS 1 messages become ROS 2
@@ -40,8 +40,8 @@ class SourceChannels:
     ----------
     ids : channel of the copy by file and channel of the source.
     converters : functions from payload to payload of the copy; absent where bytes are kept.
-    numbered : ROS 1 channels whose messages begin with a header: its sequence number, which a ROS 2 header has not,
-        becomes the message's.
+    numbered : ROS 1 channels with a header at the start of each message. ROS 2 headers have no sequence number; it
+        becomes the sequence number of the message.
     lost : channels and messages that cannot be copied.
     verbatim : channels of MCAP files that keep their id, their schema's id and their definition.
     """
@@ -70,13 +70,13 @@ def register_channels(
     leave_out: Callable[[str], bool] = lambda _topic: False,
     whole_metadata: bool = True,
 ) -> SourceChannels:
-    """Add every channel of a log to a writer but those whose topic is to be left out.
+    """Add all channels of a log to a writer, except channels of topics that are left out.
 
     Without ``whole_metadata`` channels keep only the metadata that state how messages are sent.
 
-    Channels that only repeat over split files become one. Channels keep their ids (those of the first file where the
-    ids of split files contradict each other). A ROS 1 channel whose definition does not parse cannot be
-    converted and is left out with a loss.
+    Equal channels of split files become one channel. Channels keep their ids; if the ids of split files contradict each
+    other, the ids of the first file are kept. A ROS 1 channel with a definition that does not parse is left out with a
+    loss.
     """
     ids: dict[_Key, int] = {}
     converters: dict[_Key, Callable[[bytes], bytes | None]] = {}
@@ -163,8 +163,7 @@ def _messages(
 ) -> Iterator[_Sortable]:
     """Yield the messages of a span; ``place``: its file and number.
 
-    Messages that cannot be copied are left out: those of other channels, and those before 1970, whose times an MCAP
-    file cannot contain.
+    Messages of other channels are left out, and messages before 1970: an MCAP file cannot contain their times.
     """
     c = place[0]
     keep = in_window(block.log_time_ns, start_ns, end_ns)
@@ -202,7 +201,7 @@ def _in_file_order_where_overlapping(
 ) -> list[tuple[int, Span]]:
     """Sort groups of overlapping spans that will all be copied as they are back to the order of the file.
 
-    Readers give messages of equal log times in file order, which is then that of the source.
+    Readers return messages of equal log times in file order, which then equals the order in the source.
     """
     groups: list[list[tuple[int, Span]]] = []
     end_ns = 0

@@ -1,4 +1,4 @@
-"""Chunks that a full copy takes over as they are, and what makes it go message by message instead."""
+"""Chunks that a full copy keeps unchanged, and chunks that it copies message by message."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_every_message_is_found_through_the_copied_indexes(tmp_path: Path) -> No
     container = log.containers[0]
     assert isinstance(container, McapContainer)
     for span in container.spans:
-        # Nothing but the chunk's index was read for these counts; the load goes through every message.
+        # These counts are read from the chunk's index only; the load visits every message.
         block = container.load(span)
         ids, counts = np.unique(block.channel, return_counts=True)
         assert dict(zip(ids.tolist(), counts.tolist(), strict=True)) == span.counts

@@ -112,7 +112,7 @@ def test_a_drive_costs_no_more_than_its_file(sample_logs_dir: Path, saloon: Car)
 
 
 def _write_groups(path: Path, seconds: int, groups: dict[str, tuple[list[str], int]]) -> None:
-    """Write a log whose chunks of 10 s hold the topics of one group each: topics and bytes a message."""
+    """Write a log with chunks of 10 s, each with the topics of one group (topics and bytes per message)."""
     schema = ("test_msgs/msg/Noisy", "ros2msg", b"float64 data\nuint8[] noise")
     noise = random.Random(2)
 

@@ -1,4 +1,4 @@
-"""A run whose output is at a URL: the same files as in a folder, one command at a time, and what goes wrong told."""
+"""A run with its output at a URL: the files equal those in a folder, one command at a time, errors in one line."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.runs.stub_drives import stub_drive
 from tests.runs.test_fleet_runs import Counted, named_logs, run
 from tests.s3_store import S3Store, forget_file_systems, s3_store
 
-#: What holds times, or where logs lie.
+#: Files with times or locations of logs.
 TIMED = ("run.json", JOURNAL_FILE)
 URL = "memory://fleet/out"
 
@@ -69,7 +69,7 @@ def test_a_store_has_what_a_folder_has_and_is_gone_on_with(tmp_path: Path, memor
     said: list[str] = []
     run(logs, URL, work=work, resume=True, say=said.append)
     run(logs, tmp_path / "out", resume=True)
-    assert work.asked == ["a", "b", "c"], "only what is new"
+    assert work.asked == ["a", "b", "c"], "only the new log"
     assert (said, stored(memory)) == ([], local(tmp_path / "out"))
     opened = open_run(URL)
     assert (opened.place, [log.label for log in opened.logs]) == (URL, ["a", "b", "c"])
@@ -154,7 +154,7 @@ def test_a_store_that_fails_ends_the_run_and_what_is_put_counts(
         run(logs, URL, work=work)
     assert "\n" not in str(raised.value) and f"{URL}/logs/b/metrics.parquet" in str(raised.value)
     assert str(raised.value).endswith("--resume goes on")
-    assert (raised.value.exit_code, work.asked) == (1, ["a", "b"]), "the third is not worked on for nothing"
+    assert (raised.value.exit_code, work.asked) == (1, ["a", "b"]), "the third log is not started"
     run(logs, URL, work=work, resume=True)
     run(logs, tmp_path / "out")
     assert (work.asked[2:], stored(memory)) == (["b", "c"], local(tmp_path / "out"))
