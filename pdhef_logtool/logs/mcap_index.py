@@ -29,7 +29,6 @@ TAIL_BYTES = 256 << 10
 _MOST_SUMMARY_BYTES = 64 << 20
 RECORD = struct.Struct("<BQ")  # opcode, size of the content
 FOOTER = struct.Struct("<BQQQI")  # the same, then: start of summary and of its offsets, CRC of the summary
-_CRC = struct.Struct("<I")
 _INDEX = struct.Struct("<BQHI")  # message index: opcode, size, channel, size of its pairs
 _PAIR = struct.Struct("<QQ")  # log time and offset of a message
 _UNREADABLE = (McapError, struct.error, ValueError, CutError)
@@ -95,7 +94,7 @@ def _summary(source: ByteSource) -> tuple[bytes, int, bool]:
         raise ValueError("a file without a summary")
     source.prefetch([(start, size)])
     summary = source.read(start, foot - start)
-    return summary + end, start, crc in (0, crc32(end[: FOOTER.size - _CRC.size], crc32(summary)))
+    return summary + end, start, crc in (0, crc32(end[: FOOTER.size - struct.calcsize("<I")], crc32(summary)))
 
 
 def _records(summary: bytes, limits: ResourceLimits) -> Iterator[McapRecord]:

@@ -24,8 +24,7 @@ from pdhef_logtool.records.extras import required
 from pdhef_logtool.storage.files import scratch_folder
 from pdhef_logtool.storage.object_store import s3_system, words_of
 
-BLOCK_BYTES = 64 << 10
-MOST_RANGE_BYTES = 8 << 20
+BLOCK_BYTES, MOST_RANGE_BYTES = 64 << 10, 8 << 20
 AT_ONCE = 4
 #: Waits before a request is repeated, and timeouts. S3 requests are repeated by its library.
 WAITS_S = (0.5, 1.0, 2.0, 4.0)
