@@ -64,7 +64,7 @@ def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell)
 class StoredOutput(Mirror):
     """The output of a run at a URL, locked by this command while the context is entered.
 
-    The local folder contains empty files for the pages of drives in the store.
+    The local folder contains empty files for the pages in the store.
 
     Raises
     ------
@@ -98,10 +98,11 @@ class StoredOutput(Mirror):
         parts = name.split("/")
         if parts[0] == LOGS and len(parts) > 2:
             self._there.setdefault(parts[1], set()).add(name)
-        if parts[-1] == PAGE_FILE:
+        is_page = parts[-1] == PAGE_FILE or name == REPORT_FILE
+        if is_page:
             (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
             (self.folder / name).touch()
-        if parts[-1] == PAGE_FILE or parts[0] == PARTS:
+        if is_page or parts[0] == PARTS:
             self._own.add(name)
 
     def check_no_input(self, inputs: Iterable[LogInput]) -> None:
@@ -152,7 +153,8 @@ class StoredOutput(Mirror):
         """Upload figures, pages and run.json, and the journal last."""
         self.objects.renew()
         pages = [p for p in (self.folder / LOGS).glob(f"*/{PAGE_FILE}") if p.stat().st_size]
-        for path in [*(self.folder / name for name in (METRICS_FILE, PAGE_FILE)), *pages, self.folder / RUN_FILE]:
+        names = (METRICS_FILE, PAGE_FILE, REPORT_FILE)
+        for path in [*(self.folder / name for name in names), *pages, self.folder / RUN_FILE]:
             if path.is_file() and path.stat().st_size:
                 name = path.relative_to(self.folder).as_posix()
                 self.objects.put(name, path)
