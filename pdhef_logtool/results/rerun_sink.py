@@ -482,7 +482,7 @@ def _strips(points: FloatArray) -> list[FloatArray]:
 def _blueprint() -> rrb.Blueprint:
     """Open on the drive: sideslip with intervals, yaw rate, a_y, inputs, the plan; errors, filter and report as tabs.
 
-    It names roles of tracks and no estimator, so that it suits every drive.
+    It refers to main, baseline and others, not to estimators, so that it suits every drive.
     """
     states = ("truth", "baseline", "main", *(f"other/{number}" for number in range(1, MOST_OTHERS + 1)))
     drive = rrb.Horizontal(
