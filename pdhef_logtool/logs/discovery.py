@@ -257,7 +257,7 @@ def _search(folder: Path, visited: set[str]) -> Iterator[Path]:
 
 
 def _bare_name(name: str) -> str:
-    """Return the name without the suffixes of a log, or unchanged if it has none."""
+    """Return the name without the suffixes of a log, or the unchanged name if it has no suffix of a log."""
     bare = name
     for suffix in COMPRESSED_SUFFIXES:
         bare = bare.removesuffix(suffix)

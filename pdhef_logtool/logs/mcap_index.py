@@ -1,37 +1,37 @@
 """The summary of an MCAP as an index: extents and contents of its chunks, without walking the file.
 
-For remote files, where every read is a request. An index is used only if it is complete, if its sums agree with the
-file's statistics, and if its times are those of a sound recording; otherwise the file is walked like any other.
+For remote files: each read is a request. An index is used only if it is complete, if its sums equal the statistics of
+the file, and if its times ascend as in a sound recording; otherwise the file is walked as a local file is.
 """
 
 from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from io import BytesIO
 
-import numpy as np
 from isal.isal_zlib import crc32
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, McapRecord, Schema, Statistics
+from mcap.stream_reader import StreamReader
 
 from pdhef_logtool.logs.byte_source import ByteSource, CutError
 from pdhef_logtool.logs.container import MAX_TIME_NS, MCAP_MAGIC
 from pdhef_logtool.logs.recording_span import SILENCE_NS, STEP_BACK_NS
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 
 #: One request brings the summary of a drive of several minutes; a longer one takes a second request.
 TAIL_BYTES = 256 << 10
 _MOST_SUMMARY_BYTES = 64 << 20
 RECORD = struct.Struct("<BQ")  # opcode, size of the content
 FOOTER = struct.Struct("<BQQQI")  # the same, then: start of summary and of its offsets, CRC of the summary
-_CHUNK_INDEX = struct.Struct("<QQQQI")  # first and last time, offset, length, bytes of the message indexes' offsets
-STATISTICS = struct.Struct("<QHIIIIQQI")
-_CRC = struct.Struct("<I")
-_EXTENT = struct.Struct("<QQ")
-_OFFSETS = np.dtype([("id", "<u2"), ("at", "<u8")])
-COUNTS = np.dtype([("id", "<u2"), ("n", "<u8")])
 _INDEX = struct.Struct("<BQHI")  # message index: opcode, size, channel, size of its pairs
 _PAIR = struct.Struct("<QQ")  # log time and offset of a message
+_UNREADABLE = (McapError, struct.error, ValueError, CutError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,103 +48,99 @@ class IndexedChunk:
 
 @dataclass(frozen=True, slots=True)
 class McapIndex:
-    """Content of a summary: schema and channel records, chunks and attachments [start, end) in file order."""
+    """Content of a summary: schemas and channels by id, chunks and attachments [start, end) in file order."""
 
-    schemas: tuple[bytes, ...]
-    channels: tuple[bytes, ...]
+    schemas: Mapping[int, Schema]
+    channels: Mapping[int, Channel]
     chunks: tuple[IndexedChunk, ...]
     attachments: tuple[tuple[int, int], ...]
 
 
-def read_index(source: ByteSource) -> McapIndex | None:
-    """Read the summary of an MCAP from its end; None without a usable one."""
+def read_index(source: ByteSource, limits: ResourceLimits = DEFAULT_LIMITS) -> McapIndex | None:
+    """Read the summary of an MCAP from its end; None if it is missing or inconsistent."""
     try:
-        section = _summary(source)
-        return None if section is None else _index(*section)
-    except (struct.error, ValueError, IndexError, CutError):
+        summary, start, sound = _summary(source)
+        return _index(summary, start, limits) if sound else None
+    except _UNREADABLE:
         return None
 
 
-def _summary(source: ByteSource) -> tuple[bytes, int] | None:
-    """Return the bytes of the summary section and where it begins."""
+def chunk_places(source: ByteSource, limits: ResourceLimits) -> list[int]:
+    """Return where chunks begin according to the summary, as far as it can be read, ascending."""
+    places: list[int] = []
+    with suppress(*_UNREADABLE):
+        indexes = (r for r in _records(_summary(source)[0], limits) if isinstance(r, ChunkIndex))
+        places.extend(r.chunk_start_offset for r in indexes if source.read(r.chunk_start_offset, 1)[0] == Opcode.CHUNK)
+    return sorted(places)
+
+
+def _summary(source: ByteSource) -> tuple[bytes, int, bool]:
+    """Return the bytes from the summary section to the end of the file, their place, and whether their CRC matches.
+
+    Raises
+    ------
+    ValueError : the file has no footer or no summary.
+    """
     size = source.size
     foot = size - len(MCAP_MAGIC) - FOOTER.size
     if foot <= len(MCAP_MAGIC):
-        return None
-    tail = max(0, size - TAIL_BYTES)
-    source.prefetch([(tail, size)])
+        raise ValueError("a file without a footer")
+    source.prefetch([(max(0, size - TAIL_BYTES), size)])
     end = source.read(foot, size - foot)
     opcode, length, start, _, crc = FOOTER.unpack_from(end)
     if opcode != Opcode.FOOTER or length != FOOTER.size - RECORD.size or end[FOOTER.size :] != MCAP_MAGIC:
-        return None
+        raise ValueError("a file without a footer")
     if not 0 < start < foot or foot - start > _MOST_SUMMARY_BYTES:
-        return None
+        raise ValueError("a file without a summary")
     source.prefetch([(start, size)])
     summary = source.read(start, foot - start)
-    if crc and crc32(end[: FOOTER.size - _CRC.size], crc32(summary)) != crc:
-        return None
-    return summary, start
+    return summary + end, start, crc in (0, crc32(end[: FOOTER.size - struct.calcsize("<I")], crc32(summary)))
 
 
-def _records(summary: bytes) -> Iterator[tuple[int, bytes]]:
-    offset = 0
-    while offset < len(summary):
-        opcode, length = RECORD.unpack_from(summary, offset)
-        if offset + RECORD.size + length > len(summary):
-            raise ValueError("a cut record")
-        yield opcode, summary[offset + RECORD.size : offset + RECORD.size + length]
-        offset += RECORD.size + length
+def _records(summary: bytes, limits: ResourceLimits) -> Iterator[McapRecord]:
+    most = limits.metadata_bytes
+    return StreamReader(BytesIO(summary), skip_magic=True, emit_chunks=True, record_size_limit=most).records
 
 
-def _index(summary: bytes, start: int) -> McapIndex | None:
-    schemas, channels, chunks, attachments = [], [], [], []
-    claimed: Counter[int] | None = None
-    counted = (0, 0, 0)
-    for opcode, record in _records(summary):
-        if opcode == Opcode.SCHEMA:
-            schemas.append(record)
-        elif opcode == Opcode.CHANNEL:
-            channels.append(record)
-        elif opcode == Opcode.CHUNK_INDEX:
-            chunks.append(_chunk(record))
-        elif opcode == Opcode.ATTACHMENT_INDEX:
-            begin, length = _EXTENT.unpack_from(record)
-            attachments.append((begin, begin + length))
-        elif opcode == Opcode.STATISTICS:
-            total, _, _, files, _, n, _, _, size = STATISTICS.unpack_from(record)
-            entries = np.frombuffer(record, COUNTS, size // COUNTS.itemsize, STATISTICS.size)
-            claimed = Counter(dict(zip(entries["id"].tolist(), entries["n"].tolist(), strict=True)))
-            counted = total, n, files
-    chunks.sort(key=lambda chunk: chunk.start)
-    attachments.sort()
-    held: Counter[int] = Counter()
+def _index(summary: bytes, start: int, limits: ResourceLimits) -> McapIndex | None:
+    records = list(_records(summary, limits))
+    schemas = {record.id: record for record in records if isinstance(record, Schema)}
+    channels = {record.id: record for record in records if isinstance(record, Channel)}
+    chunks = sorted((_chunk(r) for r in records if isinstance(r, ChunkIndex)), key=lambda chunk: chunk.start)
+    attachments = sorted((r.offset, r.offset + r.length) for r in records if isinstance(r, AttachmentIndex))
+    counts: Counter[int] = Counter()
     for chunk in chunks:
-        held.update(chunk.counts)
-    agrees = claimed is not None and +claimed == held and counted == (held.total(), len(chunks), len(attachments))
-    declared = {int.from_bytes(record[:2], "little") for record in channels}
-    if not agrees or not held.keys() <= declared or not _apart(chunks, attachments, start) or not _in_order(chunks):
+        counts.update(chunk.counts)
+    agrees = any(
+        +Counter(r.channel_message_counts) == counts
+        and (r.message_count, r.chunk_count, r.attachment_count) == (counts.total(), len(chunks), len(attachments))
+        for r in records
+        if isinstance(r, Statistics)
+    )
+    declared = counts.keys() <= channels.keys() and len(channels) <= limits.channels
+    if not (agrees and declared and _apart(chunks, attachments, start) and _in_order(chunks)):
         return None
-    return McapIndex(tuple(schemas), tuple(channels), tuple(chunks), tuple(attachments))
+    return McapIndex(schemas, channels, tuple(chunks), tuple(attachments))
 
 
-def _chunk(record: bytes) -> IndexedChunk:
-    """Read a chunk index; how many messages each channel has follows from where the message indexes lie."""
-    first, last, start, length, size = _CHUNK_INDEX.unpack_from(record)
-    offsets = np.frombuffer(record, _OFFSETS, size // _OFFSETS.itemsize, _CHUNK_INDEX.size)
-    (index_size,) = struct.unpack_from("<Q", record, _CHUNK_INDEX.size + size)
-    end, index_end = start + length, start + length + index_size
-    order = np.argsort(offsets["at"], kind="stable")
-    begins = offsets["at"][order].tolist()
+def _chunk(record: ChunkIndex) -> IndexedChunk:
+    """Read a chunk index; the places of the message indexes show the number of messages of each channel."""
+    end = record.chunk_start_offset + record.chunk_length
+    index_end = end + record.message_index_length
+    offsets = sorted(record.message_index_offsets.items(), key=lambda item: item[1])
+    places = [*(place for _, place in offsets), index_end]
     counts: dict[int, int] = {}
-    for id_, low, high in zip(offsets["id"][order].tolist(), begins, [*begins[1:], index_end], strict=True):
-        n, rest = divmod(high - low - _INDEX.size, _PAIR.size)
-        if n < 0 or rest or id_ in counts:
+    for (id_, place), following in zip(offsets, places[1:], strict=True):
+        n, rest = divmod(following - place - _INDEX.size, _PAIR.size)
+        if n < 0 or rest:
             raise ValueError("message indexes that do not follow each other")
         if n:
             counts[id_] = n
-    if not counts or begins[0] != end:
+    if not counts or places[0] != end:
         raise ValueError("a chunk without message indexes")
-    return IndexedChunk(start, end, index_end, first, last, counts)
+    return IndexedChunk(
+        record.chunk_start_offset, end, index_end, record.message_start_time, record.message_end_time, counts
+    )
 
 
 def _apart(chunks: list[IndexedChunk], attachments: list[tuple[int, int]], limit: int) -> bool:

@@ -1,8 +1,8 @@
 """MCAP files as a container: one walk over the record headers, chunks decoded one at a time, every CRC checked.
 
 The walk visits every top-level record by its length and uses no index, so that a file without a summary, with
-channels that only its chunks declare, with chunks that no index names, or with a cut end reads like any other. Of a
-remote file, chunks that are not wanted are taken from the index, if it is consistent.
+channels that only its chunks declare, with chunks that no index names, or with a cut end reads like any other. Unwanted
+chunks of a remote file are not walked: its index describes them, if it is consistent.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment as AttachmentRecord
-from mcap.records import Channel, Metadata, Schema
+from mcap.records import Channel, Metadata, Schema, Statistics
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_source import ByteSource
@@ -45,7 +45,7 @@ from pdhef_logtool.logs.container import (
     block_from_lists,
     describe_damage,
 )
-from pdhef_logtool.logs.mcap_index import COUNTS, FOOTER, RECORD, STATISTICS, IndexedChunk, read_index
+from pdhef_logtool.logs.mcap_index import FOOTER, RECORD, IndexedChunk, chunk_places, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.logs.type_names import ros2_type_name
@@ -57,7 +57,6 @@ _MESSAGE_RECORD = struct.Struct("<BQHIQ")
 _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, uncompressed CRC, length of the compression's name
 _INDEX_HEAD = struct.Struct("<9sHI")  # head of the record, channel, bytes of the pairs
 _INDEX_RECORD = struct.Struct("<BQHI")  # the same, with opcode and size
-_CHUNK_PLACE = struct.Struct("<QQQ")  # start of a chunk index: first and last time, offset of the chunk
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 _UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
 _CRC_BLOCK_BYTES = 4 << 20
@@ -80,7 +79,7 @@ _SUMMARY_ONLY = frozenset(
         Opcode.SUMMARY_OFFSET,
     )
 )
-_FIRST_PRIVATE = 0x80  # what is neither known nor private is no record of the format
+_FIRST_PRIVATE = 0x80  # other opcodes, neither defined nor private, are no records of the format
 #: Head of a message record, before its payload.
 MESSAGE_HEAD = np.dtype(
     [("op", "u1"), ("size", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
@@ -178,20 +177,12 @@ class McapContainer(FileContainer):
     def _skippable(self) -> dict[int, IndexedChunk | tuple[int, int]]:
         """Return the chunks and attachments that are not wanted by their place, and have all else fetched."""
         everything = self._wanted == EVERYTHING or self.source.size <= self._wanted.above_bytes
-        index = None if everything else read_index(self.source)
+        index = None if everything else read_index(self.source, self.meter.limits)
         unwanted: dict[int, IndexedChunk | tuple[int, int]] = {}
-        try:
-            for schema in index.schemas if index else ():
-                self.add_schema(schema)
-            for channel in index.channels if index else ():
-                self.add_channel(channel)
-        except Exception as error:  # noqa: BLE001 (the walk reports the damage)
-            describe_damage(error)
-            self._schemas.clear()
-            self._raw_channels.clear()
-            index = None
         if index is not None:
             self._index_used = True
+            self._schemas.update(index.schemas)
+            self._raw_channels.update(index.channels)
             topics = {id_: channel.topic for id_, channel in self._raw_channels.items()}
             for chunk in index.chunks:
                 if not self._wanted.has([topics[id_] for id_ in chunk.counts], chunk.first_ns, chunk.last_ns):
@@ -219,29 +210,9 @@ class McapContainer(FileContainer):
     def _next_indexed_chunk(self, after: int) -> int | None:
         """Return the first chunk behind a damaged place that the summary names, or None."""
         if self._indexed is None:
-            self._indexed = self._indexed_chunks()
+            self._indexed = chunk_places(self.source, self.meter.limits)
         position = bisect_right(self._indexed, after)
         return self._indexed[position] if position < len(self._indexed) else None
-
-    def _indexed_chunks(self) -> list[int]:
-        read, size = self.source.read, self.source.size
-        foot = size - len(MCAP_MAGIC) - FOOTER.size
-        if (
-            foot <= 0
-            or read(foot, 1)[0] != Opcode.FOOTER
-            or read(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) != MCAP_MAGIC
-        ):
-            return []
-        (offset,) = _U64.unpack(read(foot + RECORD.size, _U64.size))
-        chunks: list[int] = []
-        while offset > 0 and offset + RECORD.size <= foot:
-            opcode, length = RECORD.unpack(read(offset, RECORD.size))
-            if opcode == Opcode.CHUNK_INDEX and length >= _CHUNK_PLACE.size and offset + RECORD.size + length <= foot:
-                chunk = _CHUNK_PLACE.unpack(read(offset + RECORD.size, _CHUNK_PLACE.size))[-1]
-                if chunk < foot and read(chunk, 1)[0] == Opcode.CHUNK:
-                    chunks.append(chunk)
-            offset += RECORD.size + length
-        return sorted(chunks)
 
     def add_schema(self, payload: bytes) -> None:
         """Add a schema record."""
@@ -372,7 +343,7 @@ class McapContainer(FileContainer):
         )
 
     def _is_known(self, opcode: int, payload: bytes, kept: frozenset[int]) -> bool:
-        """Return whether a record of a chunk declares only what the kept channels are declared as in this file."""
+        """Return whether a record of a chunk declares kept channels only, as this file declares them."""
         try:
             if opcode == Opcode.CHANNEL:
                 channel = Channel.read(ReadDataStream(BytesIO(payload)))
@@ -386,7 +357,7 @@ class McapContainer(FileContainer):
         return True
 
     def times(self, span: Span) -> tuple[IntArray, IntArray]:
-        """Return a span's channels and log times; a chunk's from its message indexes, where it has them."""
+        """Return a span's channels and log times; of a chunk, read its message indexes if it has some."""
         extent = self.chunks[span.index]
         indexes = _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
         if not indexes:
@@ -512,12 +483,12 @@ class _Walk:
         self.data_end: tuple[int, int] | None = None  # extent of the record
         self.data_crc = 0
         self.footer: tuple[int, int] | None = None  # extent of the record
-        self.bare_chunks = False  # whether any chunk has no CRC of its own
+        self.bare_chunks = False  # whether any chunk has no CRC
         self.run: tuple[int, int] | None = None  # extent of consecutive unchunked messages
         self.run_times = (0, 0)
         self.run_counts: Counter[int] = Counter()
         self.run_ordered = True  # whether no log time of it steps back
-        self.chunk: tuple[int, int] | None = None  # extent of the chunk whose message indexes are being read
+        self.chunk: tuple[int, int] | None = None  # extent of the chunk before the message indexes that are being read
         self.index_end = 0
         self.head = (0, 0, 0)  # of the chunk: first and last log time, size
         self.index_counts: Counter[int] = Counter()
@@ -532,7 +503,7 @@ class _Walk:
             self._message_index(start, end)
             return
         if self.chunk is not None and opcode == _FIRST_PRIVATE | _OP_MESSAGE_INDEX:
-            self.index_sound = False  # an index with one wrong bit: what it named is found in the chunk
+            self.index_sound = False  # an index with one wrong bit: its messages are found in the chunk
             return
         self._end_chunk()
         if opcode in _DECLARATIONS:
@@ -560,7 +531,7 @@ class _Walk:
         elif opcode < _FIRST_PRIVATE and (opcode not in _SUMMARY_ONLY or not self.data_end):
             raise SpanDamageError(f"no record of kind {opcode} is allowed here")
         elif opcode - _FIRST_PRIVATE == _OP_CHUNK and self._is_chunk(start, end):
-            raise SpanDamageError("a chunk whose kind has one wrong bit, which makes it a private record")
+            raise SpanDamageError("a chunk with one wrong bit in its opcode, which makes it a private record")
 
     def _is_chunk(self, start: int, end: int) -> bool:
         """Return whether a record of a private kind is laid out like a chunk."""
@@ -584,7 +555,7 @@ class _Walk:
         return indexed.index_end
 
     def messages(self, offset: int) -> int:
-        """Add the message records from here on whose heads are read ahead; return the start of the next record."""
+        """Add the message records from here on with heads that are read ahead; return the start of the next record."""
         of = self.of
         self._end_chunk()
         size = of.source.size
@@ -625,7 +596,7 @@ class _Walk:
         of = self.of
         if self.chunk is None:
             self._end_run()
-            raise SpanDamageError("a message index without its chunk, whose messages are lost")
+            raise SpanDamageError("a message index without its chunk; the messages are lost")
         self.index_end = end
         sound, self.index_sound = self.index_sound, False
         block, place = of.source.ahead(start, min(end - start, _INDEX_HEAD.size))
@@ -668,7 +639,7 @@ class _Walk:
     def _check_data(self) -> None:
         """Check the CRC of the data section if no other checksum or count protects the messages.
 
-        If other damage is known already, the check would add nothing.
+        After other damage, the check is skipped: it adds no information.
         """
         of = self.of
         if self.data_end is None or not self.data_crc or of.lost:
@@ -701,12 +672,9 @@ class _Walk:
 
     def _statistics(self, start: int, end: int) -> None:
         """Note how many messages the file claims by channel."""
-        most = STATISTICS.size + COUNTS.itemsize * (1 << 16)
-        payload = self.of.source.read(start + RECORD.size, min(end - start - RECORD.size, most))
-        total, *_, n = STATISTICS.unpack_from(payload)
-        entries = np.frombuffer(payload, COUNTS, n // COUNTS.itemsize, STATISTICS.size)
-        counts = {c: k for c, k in zip(entries["id"].tolist(), entries["n"].tolist(), strict=True) if k}
-        self.statistics = (total, counts)
+        self.of.meter.limits.check("metadata_bytes", end - start, "the statistics")
+        record = Statistics.read(ReadDataStream(BytesIO(self.of.payload(start, end))))
+        self.statistics = (record.message_count, {c: n for c, n in record.channel_message_counts.items() if n})
 
     def _end_run(self) -> None:
         if self.run is None:

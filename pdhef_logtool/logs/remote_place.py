@@ -68,18 +68,18 @@ class RemotePlace:
 
     @property
     def identity(self) -> str:
-        """The URL without what gives access to it, in one spelling."""
+        """The URL in a canonical form, without user, password and access tokens."""
         if self.scheme == "s3":
             return str(self)
         asked = [(k, v) for k, v in parse_qsl(self._parts.query, keep_blank_values=True) if not _OF_ACCESS.fullmatch(k)]
         return str(self) + (f"?{urlencode(asked)}" if asked else "")
 
     def __repr__(self) -> str:
-        """Return what may be shown, as what it is."""
+        """Return the type and the text that may be shown."""
         return f"RemotePlace({str(self)!r})"
 
     def __str__(self) -> str:
-        """Return what may be shown."""
+        """Return the URL without user, password and query."""
         return "/".join(self.parts)
 
 
@@ -92,7 +92,7 @@ def place_of(argument: str, *, private_redirects: bool = False) -> LogPlace:
 
     Raises
     ------
-    UsageError : A URL that is none of ours.
+    UsageError : A URL with another scheme or without a server.
     """
     match = _URL.match(argument)
     if match is None or Path(argument).exists():

@@ -12,11 +12,10 @@ import re
 import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping
 from concurrent.futures import Future
-from contextlib import asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from threading import Lock
-from typing import Any, BinaryIO
+from typing import Any
 
 from pdhef_logtool.logs.byte_source import ByteSource, ChangedError, SourceError, read_at
 from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, guarded_client
@@ -25,14 +24,13 @@ from pdhef_logtool.records.extras import required
 from pdhef_logtool.storage.files import scratch_folder
 from pdhef_logtool.storage.object_store import s3_system, words_of
 
-BLOCK_BYTES = 64 << 10
-MOST_RANGE_BYTES = 8 << 20
+BLOCK_BYTES, MOST_RANGE_BYTES = 64 << 10, 8 << 20
 AT_ONCE = 4
 #: Waits before a request is repeated, and timeouts. S3 requests are repeated by its library.
 WAITS_S = (0.5, 1.0, 2.0, 4.0)
 CONNECT_S, SILENCE_S = 15.0, 30.0
-#: Copies of closed objects that are kept, so that the next pass over the same log does not fetch it again.
-KEPT_COPIES = 4
+#: Copies of closed objects are kept up to this size, so that the next pass over the same log does not fetch it again.
+KEPT_BYTES = 1 << 30
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(\d+)")
 
 
@@ -48,8 +46,7 @@ class RemoteSource(ByteSource):
     is_remote = True
 
     def __init__(self, place: RemotePlace) -> None:
-        self._copy = _acquire(place)
-        self._closed = False
+        self._copy = _acquire(place, self)
         super().__init__(self._copy.size or 0)
 
     @property
@@ -74,10 +71,17 @@ class RemoteSource(ByteSource):
         self._copy.wait(0, self.size)
 
     def close(self) -> None:
-        """Release the copy, which is kept for some time in case the same object is opened again."""
-        if not self._closed:
-            self._closed = True
-            _release(self._copy)
+        """Release the copy; copies without users are removed, oldest first, until the others fit in KEPT_BYTES."""
+        with _registry:
+            self._copy.users.discard(self)
+            if not self._copy.users:
+                self._copy.cancel()
+            idle = [copy for copy in _copies.values() if not copy.users]
+            kept_bytes = 0
+            for copy in reversed(idle):
+                kept_bytes += len(copy.blocks) * BLOCK_BYTES
+                if kept_bytes > KEPT_BYTES:
+                    del _copies[copy.place]
 
 
 class _Copy:
@@ -86,7 +90,7 @@ class _Copy:
     Attributes
     ----------
     size, version : bytes of the object (None: not known yet), and its ETag or time of modification.
-    blocks : by number, the request that brings a block. users : sources that read it.
+    blocks : by number, the request that fetches a block. users : open sources that read the copy.
     """
 
     def __init__(self, place: RemotePlace, head_bytes: int) -> None:
@@ -94,13 +98,13 @@ class _Copy:
         self.size: int | None = None
         self.version = ""
         self.blocks: dict[int, Future[None]] = {}
-        self.users = 0
+        self.users: set[RemoteSource] = set()
         self._lock = Lock()
         self._at_once = asyncio.Semaphore(AT_ONCE)
-        folder = scratch_folder()
-        self.path = Path(folder.name) / (place.name.replace("/", "_")[-80:] or "log")
-        self._file = self.path.open("x+b", buffering=0)
-        weakref.finalize(self, _remove, self._file, folder)
+        stack = ExitStack()
+        weakref.finalize(self, stack.close)
+        self.path = Path(stack.enter_context(scratch_folder())) / (place.name.replace("/", "_")[-80:] or "log")
+        self._file = stack.enter_context(self.path.open("x+b", buffering=0))
         first = self._start(self._get, 0, head_bytes)
         first.result()
         if head_bytes >= BLOCK_BYTES:
@@ -208,7 +212,9 @@ class _Copy:
                 async with session.get(self._system.encode_url(place.url)) as empty:
                     yield *self._compared(empty.headers), empty.content.iter_chunked(1 << 20)
                 return
-            _check_status(response.status)
+            if response.status not in (200, 206):
+                kind = ConnectionError if response.status >= 500 else _ERRORS.get(response.status, OSError)
+                raise kind(f"status {response.status}")
             yield *self._compared(response.headers), response.content.iter_chunked(1 << 20)
 
     def _compared(self, head: Mapping[str, Any]) -> tuple[int | None, int]:
@@ -226,11 +232,6 @@ class _Copy:
                 remedy="run again when the object no longer changes",
             )
         return size, int(part[1]) if part else 0
-
-
-def _remove(file: BinaryIO, folder: TemporaryDirectory[str]) -> None:
-    file.close()
-    folder.cleanup()
 
 
 def identity_of_object(place: RemotePlace) -> str:
@@ -274,32 +275,26 @@ def _words_of(error: Exception) -> tuple[str, str, bool]:
     if isinstance(error, PrivateRedirectError):
         remedy = "give the URL that it leads to, or allow it by --set allow_private_redirects=true"
         return f"a redirect to {error}, an address of this machine or its network", remedy, False
-    if isinstance(error, aiohttp.ClientSSLError):
-        return "a server without a valid certificate", "check the URL", False
-    if isinstance(error, aiohttp.InvalidURL | aiohttp.NonHttpUrlClientError | aiohttp.TooManyRedirects | ValueError):
-        return "a URL that cannot be requested", "check the URL", False
-    if isinstance(error, ConnectionError):
-        return str(error), "try again later", True
-    if isinstance(error, aiohttp.ClientPayloadError):
-        return "an answer that is cut", "try again later", True
-    if isinstance(error, TimeoutError):
-        return f"silence of {SILENCE_S:g} s", "try again later", True
-    if isinstance(error, aiohttp.ClientError):
-        why = getattr(error, "strerror", None) or type(error).__name__
-        return f"no connection ({why})", "check the URL, or try again later", True
+    url, later = "check the URL", "try again later"
+    invalid = (aiohttp.InvalidURL, aiohttp.NonHttpUrlClientError, aiohttp.TooManyRedirects, ValueError)
+    reason = getattr(error, "strerror", None) or type(error).__name__
+    causes: tuple[tuple[Any, str, str], ...] = (
+        (aiohttp.ClientSSLError, "a server without a valid certificate", url),
+        (invalid, "a URL that cannot be requested", url),
+        (ConnectionError, str(error), later),
+        (aiohttp.ClientPayloadError, "an answer that is cut", later),
+        (TimeoutError, f"silence of {SILENCE_S:g} s", later),
+        (aiohttp.ClientError, f"no connection ({reason})", f"{url}, or {later}"),
+    )
+    for kinds, cause, remedy in causes:
+        if isinstance(error, kinds):
+            return cause, remedy, later in remedy
     return *words_of(error), False
 
 
-def _check_status(status: int) -> None:
-    """Raise the error of a status without content; timeouts, too many requests and restarts are temporary."""
-    if status in (408, 425, 429) or status >= 500:
-        raise ConnectionError(f"status {status}")
-    if status in (401, 403, 407):
-        raise PermissionError(f"status {status}")
-    if status in (404, 410):
-        raise FileNotFoundError(f"status {status}")
-    if status not in (200, 206):
-        raise OSError(f"status {status}")
+#: Errors by status. Timeouts, too many requests and 5xx are temporary, as a lost connection is.
+_ERRORS: dict[int, type[OSError]] = dict.fromkeys((408, 425, 429), ConnectionError)
+_ERRORS |= dict.fromkeys((401, 403, 407), PermissionError) | dict.fromkeys((404, 410), FileNotFoundError)
 
 
 def _file_system(place: RemotePlace) -> Any:
@@ -327,23 +322,12 @@ _copies: dict[RemotePlace, _Copy] = {}
 _registry = Lock()
 
 
-def _acquire(place: RemotePlace) -> _Copy:
+def _acquire(place: RemotePlace, user: RemoteSource) -> _Copy:
     copy = _copies.get(place)
     if copy is None or not (copy.users or copy.is_current()):
         copy = _Copy(place, BLOCK_BYTES)
     with _registry:
         _copies.pop(place, None)
         _copies[place] = copy
-        copy.users += 1
+        copy.users.add(user)
     return copy
-
-
-def _release(copy: _Copy) -> None:
-    with _registry:
-        copy.users -= 1
-        if copy.users:
-            return
-        copy.cancel()
-        idle = [c.place for c in _copies.values() if not c.users]
-        while len(idle) > KEPT_COPIES:
-            del _copies[idle.pop(0)]

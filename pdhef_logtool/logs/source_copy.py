@@ -1,18 +1,18 @@
-"""Lossless copies of a log's messages into an MCAP: ready bytes in log-time order, a few spans in memory at a time.
+"""Lossless copies of a log's messages into an MCAP, in order of log time; a few spans are in memory at a time.
 
-Chunks of an MCAP whose channels are all kept are copied as they are: checked, but not compressed again.
+Chunks of an MCAP are copied unchanged if all their channels are kept: checked, but not compressed again.
 
-MCAP sources keep schema, topic, encoding, channel metadata, both times, sequence and payload; attachments and metadata
-records come along. rosbag2 databases keep their CDR bytes and definitions. ROS 1 messages become ROS 2 CDR.
+Messages of an MCAP keep schema, topic, encoding, channel metadata, both times, sequence and payload; attachments and
+metadata records are copied too. rosbag2 databases keep their CDR bytes and definitions. ROS 1 messages become ROS 2
+CDR.
 """
 
 from __future__ import annotations
 
-import heapq
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
-import numpy as np
 from mcap.records import Metadata
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
@@ -22,13 +22,14 @@ from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
 from pdhef_logtool.records.signals import Loss
 
-#: Times of MCAP are unsigned; those that readers give are not.
+#: Times of MCAP are unsigned; times in this package are signed.
 _UNSIGNED = (1 << 64) - 1
-_NEVER_NS = int(np.iinfo(np.int64).max)
 _HEADER = "std_msgs/msg/Header"
 
 #: Number of a channel in the log: file of the log, and channel id in that file.
 _Key = tuple[int, int]
+#: A message behind log time, file, span and row.
+_Sortable = tuple[int, int, int, int, RawMessage]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +40,8 @@ class SourceChannels:
     ----------
     ids : channel of the copy by file and channel of the source.
     converters : functions from payload to payload of the copy; absent where bytes are kept.
-    numbered : ROS 1 channels whose messages begin with a header: its sequence number, which a ROS 2 header has not,
-        becomes the message's.
+    numbered : ROS 1 channels with a header at the start of each message. ROS 2 headers have no sequence number; it
+        becomes the sequence number of the message.
     lost : channels and messages that cannot be copied.
     verbatim : channels of MCAP files that keep their id, their schema's id and their definition.
     """
@@ -69,13 +70,13 @@ def register_channels(
     leave_out: Callable[[str], bool] = lambda _topic: False,
     whole_metadata: bool = True,
 ) -> SourceChannels:
-    """Add every channel of a log to a writer but those whose topic is to be left out.
+    """Add all channels of a log to a writer, except channels of topics that are left out.
 
     Without ``whole_metadata`` channels keep only the metadata that state how messages are sent.
 
-    Channels that only repeat over split files become one. Channels keep their ids (those of the first file where the
-    ids of split files contradict each other). A ROS 1 channel whose definition does not parse cannot be
-    converted and is left out with a loss.
+    Equal channels of split files become one channel. Channels keep their ids; if the ids of split files contradict each
+    other, the ids of the first file are kept. A ROS 1 channel with a definition that does not parse is left out with a
+    loss.
     """
     ids: dict[_Key, int] = {}
     converters: dict[_Key, Callable[[bytes], bytes | None]] = {}
@@ -125,51 +126,61 @@ def iterate_copy(
     channels: SourceChannels,
     start_ns: int | None = None,
     end_ns: int | None = None,
-    *,
-    whole: bool = True,
 ) -> Iterator[RawMessage | RawChunk]:
     """Yield the messages of a log with log time in [start, end) in log-time order, with the copy's channel ids.
 
-    Messages of equal log time come in file order. Spans that overlap in time are merged; only these are in memory.
+    Messages of equal log time are in file order. Spans that overlap in time are merged; only these are in memory.
     Damaged spans are left out and reported by ``log.lost``.
 
-    When ``whole``, chunks that can be copied as they are come as such: sound chunks of MCAP files that lie in the
-    window and contain and declare only channels with unchanged ids. They come in order of their first log times, and
-    where they overlap in file order.
+    Chunks that can be copied as they are, are yielded whole: sound chunks of MCAP files that are inside the window and
+    contain and declare only channels with unchanged ids. They are in order of their first log times, and in file order
+    where they overlap.
     """
     unchanged = [frozenset(id_ for of, id_ in channels.verbatim if of == c) for c in range(len(log.containers))]
-    spans = _spans_to_copy(log, channels, start_ns, end_ns)
-    if whole:
-        spans = _in_file_order_where_overlapping(spans, unchanged)
+    spans = _in_file_order_where_overlapping(_spans_to_copy(log, channels, start_ns, end_ns), unchanged)
     for c, container in enumerate(log.containers):
         container.prefetch(span for of, span in spans if of == c)
-    cursors: list[tuple[int, int, int, int, _Cursor]] = []  # next log time, file, span, row: order of ties
-    position = 0
-    while position < len(spans) or cursors:
-        while position < len(spans) and (not cursors or spans[position][1].start_ns <= cursors[0][0]):
-            c, span = spans[position]
-            position += 1
-            block = log.load(c, span)
-            if block is None:
-                continue
-            inside = in_window(block.log_time_ns, start_ns, end_ns) is None
-            chunk = log.containers[c].raw_chunk(span, block, unchanged[c]) if whole and inside else None
-            if chunk is None:
-                _push(cursors, c, span.index, _Cursor(block, start_ns, end_ns))
-            else:
-                yield chunk
-        if cursors:
-            _, c, index, _, cursor = heapq.heappop(cursors)
-            # Continue in this span until another one can come first.
-            next_ns = spans[position][1].start_ns if position < len(spans) else _NEVER_NS
-            limit_ns = min(cursors[0][0] if cursors else _NEVER_NS, next_ns)
-            yield from cursor.take_until(limit_ns, c, channels)
-            _push(cursors, c, index, cursor)
+    pending: list[_Sortable] = []
+    for c, span in spans:
+        ready = bisect_left(pending, (span.start_ns,))
+        yield from (message for *_, message in pending[:ready])
+        del pending[:ready]
+        block = log.load(c, span)
+        if block is None:
+            continue
+        inside = in_window(block.log_time_ns, start_ns, end_ns) is None
+        chunk = log.containers[c].raw_chunk(span, block, unchanged[c]) if inside else None
+        if chunk is None:
+            pending += _messages(block, (c, span.index), channels, start_ns, end_ns)
+            pending.sort()
+        else:
+            yield chunk
+    yield from (message for *_, message in pending)
 
 
-def _push(cursors: list[tuple[int, int, int, int, _Cursor]], c: int, index: int, cursor: _Cursor) -> None:
-    if cursor.remaining:
-        heapq.heappush(cursors, (cursor.time_ns, c, index, cursor.taken, cursor))
+def _messages(
+    block: Block, place: tuple[int, int], channels: SourceChannels, start_ns: int | None, end_ns: int | None
+) -> Iterator[_Sortable]:
+    """Yield the messages of a span; ``place``: its file and number.
+
+    Messages of other channels are left out, and messages before 1970: an MCAP file cannot contain their times.
+    """
+    c = place[0]
+    keep = in_window(block.log_time_ns, start_ns, end_ns)
+    columns = [getattr(block, f.name) for f in fields(block) if f.name not in ("buffer", "dropped")]
+    rows = zip(*((column if keep is None else column[keep]).tolist() for column in columns), strict=True)
+    for row, (channel, log_time, publish_time, sequence, offset, length) in enumerate(rows):
+        id_ = channels.ids.get((c, channel)) if log_time >= 0 else None
+        if id_ is None:
+            continue
+        data: bytes | None = bytes(block.buffer[offset : offset + length])
+        convert = channels.converters.get((c, channel))
+        if convert is not None and data is not None:
+            if (c, channel) in channels.numbered:
+                sequence = int.from_bytes(data[:4], "little")
+            data = convert(data)
+        if data is not None:
+            yield log_time, *place, row, RawMessage(id_, log_time, publish_time & _UNSIGNED, sequence, data)
 
 
 def _spans_to_copy(
@@ -190,7 +201,7 @@ def _in_file_order_where_overlapping(
 ) -> list[tuple[int, Span]]:
     """Sort groups of overlapping spans that will all be copied as they are back to the order of the file.
 
-    Readers give messages of equal log times in file order, which is then that of the source.
+    Readers return messages of equal log times in file order, which then equals the order in the source.
     """
     groups: list[list[tuple[int, Span]]] = []
     end_ns = 0
@@ -216,51 +227,6 @@ def iterate_metadata(log: ColumnarLog) -> Iterator[Metadata]:
     """Yield the metadata records of a log."""
     for container in log.containers:
         yield from container.metadata_records()
-
-
-class _Cursor:
-    """Goes through one span's messages in order of log time."""
-
-    def __init__(self, block: Block, start_ns: int | None, end_ns: int | None) -> None:
-        keep = in_window(block.log_time_ns, start_ns, end_ns)
-        rows = np.arange(len(block)) if keep is None else np.flatnonzero(keep)
-        rows = rows[np.argsort(block.log_time_ns[rows], kind="stable")]
-        self.taken = 0
-        self._buffer = block.buffer
-        columns = (getattr(block, f.name) for f in fields(block) if f.name not in ("buffer", "dropped"))
-        self._rows = list(zip(*(column[rows].tolist() for column in columns), strict=True))
-
-    @property
-    def remaining(self) -> int:
-        """Number of messages that are left."""
-        return len(self._rows) - self.taken
-
-    @property
-    def time_ns(self) -> int:
-        """Log time of the next message."""
-        return int(self._rows[self.taken][1])
-
-    def take_until(self, limit_ns: int, c: int, channels: SourceChannels) -> Iterator[RawMessage]:
-        """Yield the next message, and those after it before a log time.
-
-        Messages that cannot be copied are left out: those of other channels, and those before 1970, whose times an
-        MCAP file cannot contain.
-        """
-        while True:
-            channel, log_time, publish_time, sequence, offset, length = self._rows[self.taken]
-            self.taken += 1
-            id_ = channels.ids.get((c, channel)) if log_time >= 0 else None
-            if id_ is not None:
-                data: bytes | None = bytes(self._buffer[offset : offset + length])
-                convert = channels.converters.get((c, channel))
-                if convert is not None and data is not None:
-                    if (c, channel) in channels.numbered:
-                        sequence = int.from_bytes(data[:4], "little")
-                    data = convert(data)
-                if data is not None:
-                    yield RawMessage(id_, log_time, publish_time & _UNSIGNED, sequence, data)
-            if not self.remaining or self.time_ns >= limit_ns:
-                return
 
 
 def _with_definition(channel: ChannelRecord) -> ChannelRecord:

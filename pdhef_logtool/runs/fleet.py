@@ -348,11 +348,6 @@ class _Fleet:
 
     def _task(self, planned: PlannedLog, keep: Keep) -> DriveTask:
         label = planned.log.stem
-        stored: tuple[str, ...] = ()
-        if self.stored is not None:
-            stored = self.stored.there(label)
-            if (entry := self.plan.journal.entries.get(label)) is not None:
-                self.stored.forget(entry.part)
         return DriveTask(
             planned.log,
             self.plan.output,
@@ -362,7 +357,7 @@ class _Fleet:
             self.pools.get(label),
             self.job.report and keep == "full",
             self._name,
-            stored,
+            () if self.stored is None else self.stored.there(label),
             label == self.plan.logs[0].log.stem,
         )
 
@@ -384,6 +379,8 @@ class _Fleet:
             end.failed_checks, end.error_rad, failed, end.again, quarantined,
         )  # fmt: skip
         self.plan.add(entry, end)
+        if self.stored is not None:
+            self.stored.note_end()
 
     def _warn(self, line: str) -> None:
         """Print a warning once; with many drives, only their reports contain it."""

@@ -1,13 +1,13 @@
 """The output of a run in an object store: each worker uploads its drives, the command uploads the files of the run.
 
 A worker writes a drive to a local folder and uploads it, report.json last. It returns the report and the figures to the
-command, which keeps them with the journal and the pages in a local folder. The command uploads the journal every 30 s
-and all files at the end of the run.
+command, which keeps them with the journal and the pages in a local folder. The command uploads the journal when a drive
+ends, at most every 30 s, and all files at the end of the run.
 """
 
 from __future__ import annotations
 
-import threading
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,10 +20,10 @@ from pdhef_logtool.results.opened_run import JOURNAL_FILE, LOGS, METRICS_FILE, P
 from pdhef_logtool.runs.drive_outputs import STALE_FILES
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work
 from pdhef_logtool.storage.files import open_new, scratch_folder
-from pdhef_logtool.storage.object_store import HeldError, Mirror, ObjectFolder
+from pdhef_logtool.storage.object_store import Mirror, ObjectFolder
 from pdhef_logtool.workers.supervisor import Tell
 
-#: Interval between two uploads of the journal.
+#: Least time between two uploads of the journal.
 EVERY_S = 30.0
 
 
@@ -64,7 +64,7 @@ def stored_drive(objects: ObjectFolder, work: Work, task: DriveTask, tell: Tell)
 class StoredOutput(Mirror):
     """The output of a run at a URL, locked by this command while the context is entered.
 
-    The local folder contains empty files for the pages of drives in the store.
+    The local folder contains empty files for the pages in the store.
 
     Raises
     ------
@@ -76,11 +76,7 @@ class StoredOutput(Mirror):
         super().__init__(url)
         self._there: dict[str, set[str]] = {}
         self._own: set[str] = set()
-        self._ended = threading.Event()
-        self._keeper = threading.Thread(target=self._keep, daemon=True)
-        self._lost: OutputError | None = None
-        self._putting = threading.Lock()
-        self._journal_bytes = -1
+        self._uploaded_s = 0.0
 
     def __enter__(self) -> Self:
         """Lock the URL and list its objects."""
@@ -91,13 +87,10 @@ class StoredOutput(Mirror):
         except BaseException:
             self.objects.release()
             raise
-        self._keeper.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Release the lock."""
-        self._ended.set()
-        self._keeper.join()
         self.objects.release()
 
     def _see(self, name: str) -> None:
@@ -105,10 +98,11 @@ class StoredOutput(Mirror):
         parts = name.split("/")
         if parts[0] == LOGS and len(parts) > 2:
             self._there.setdefault(parts[1], set()).add(name)
-        if parts[-1] == PAGE_FILE:
+        is_page = parts[-1] == PAGE_FILE or name == REPORT_FILE
+        if is_page:
             (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
             (self.folder / name).touch()
-        if parts[-1] == PAGE_FILE or parts[0] == PARTS:
+        if is_page or parts[0] == PARTS:
             self._own.add(name)
 
     def check_no_input(self, inputs: Iterable[LogInput]) -> None:
@@ -133,16 +127,8 @@ class StoredOutput(Mirror):
         """Return the names of a drive's objects in the store."""
         return tuple(sorted(self._there.get(label, ())))
 
-    def forget(self, part: str | None) -> None:
-        """Remove the figures of a drive that is run again: until its end, it does not count as done."""
-        if part in self._own:
-            self.objects.remove([str(part)])
-            self._own.discard(str(part))
-
     def take(self, stored: StoredEnd) -> DriveEnd:
-        """Store the files of a drive and return its result; raises OutputError if another command has the lock."""
-        if self._lost is not None:
-            raise self._lost
+        """Store the files of a drive and return its result."""
         for name in stored.names:
             self._see(name)
         for name, data in stored.files.items():
@@ -158,12 +144,17 @@ class StoredOutput(Mirror):
         self.objects.remove(gone)
         self._own.difference_update(gone)
 
+    def note_end(self) -> None:
+        """Upload the journal after the end of a drive, unless it was uploaded recently."""
+        if time.monotonic() - self._uploaded_s >= EVERY_S:
+            self._put_journal()
+
     def publish(self) -> None:
         """Upload figures, pages and run.json, and the journal last."""
-        if self._lost is not None:
-            raise self._lost
+        self.objects.renew()
         pages = [p for p in (self.folder / LOGS).glob(f"*/{PAGE_FILE}") if p.stat().st_size]
-        for path in [*(self.folder / name for name in (METRICS_FILE, PAGE_FILE)), *pages, self.folder / RUN_FILE]:
+        names = (METRICS_FILE, PAGE_FILE, REPORT_FILE)
+        for path in [*(self.folder / name for name in names), *pages, self.folder / RUN_FILE]:
             if path.is_file() and path.stat().st_size:
                 name = path.relative_to(self.folder).as_posix()
                 self.objects.put(name, path)
@@ -171,21 +162,8 @@ class StoredOutput(Mirror):
         self.begin()
 
     def _put_journal(self) -> None:
-        path = self.folder / JOURNAL_FILE
-        with self._putting:
-            size = path.stat().st_size if path.is_file() else 0
-            if size not in (0, self._journal_bytes):
-                self.objects.put(JOURNAL_FILE, path)
-                self._journal_bytes = size
-
-    def _keep(self) -> None:
-        """Renew the lock and upload the journal until the end; temporary failures of the store are ignored."""
-        while not self._ended.wait(EVERY_S):
-            try:
-                self.objects.renew()
-                self._put_journal()
-            except HeldError as error:
-                self._lost = error
-                return
-            except OutputError:
-                pass
+        """Renew the lock and upload the journal; raises OutputError if another command has the lock."""
+        self.objects.renew()
+        if (path := self.folder / JOURNAL_FILE).is_file():
+            self.objects.put(JOURNAL_FILE, path)
+        self._uploaded_s = time.monotonic()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import weakref
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -53,24 +53,18 @@ class ObjectFolder:
         parts = urlsplit(self.url)
         return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}".rstrip("/")
 
-    @property
-    def name(self) -> str:
-        """The last component of the URL."""
-        return self.shown.rpartition("/")[2]
-
     def names(self) -> list[str]:
         """Return the names of all objects, ascending."""
-        with self._asking():
-            store, root = self._store()
+        with self._asking() as (store, root):
             paths = store.find(root)
         # Some stores give paths a slash more than they take.
         return sorted(path.lstrip("/").removeprefix(f"{root.lstrip('/')}/") for path in paths)
 
     def get(self, name: str, to: Path) -> bool:
         """Copy an object to a file; False if it does not exist."""
-        with self._asking(name):
-            store, root = self._store()
+        with self._asking(name) as (store, root):
             partial = to.with_name(f".{to.name}.partial")
+            to.parent.mkdir(parents=True, exist_ok=True)
             try:
                 store.get_file(f"{root}/{name}", str(partial))
             except FileNotFoundError:
@@ -78,83 +72,68 @@ class ObjectFolder:
             partial.replace(to)
         return True
 
-    def get_all(self, names: Sequence[str], folder: Path) -> None:
+    def get_all(self, names: Iterable[str], folder: Path) -> None:
         """Copy objects to a folder, under their names, many at once."""
-        for parent in {(folder / name).parent for name in names}:
-            parent.mkdir(parents=True, exist_ok=True)
-        with self._asking():
-            store, root = self._store()
-            if names:
-                store.get([f"{root}/{name}" for name in names], [str(folder / name) for name in names])
+        with ThreadPoolExecutor(_AT_ONCE) as several:
+            list(several.map(lambda name: self.get(name, folder / name), names))
 
     def put(self, name: str, path: Path) -> None:
         """Copy a file to an object, which is replaced."""
-        with self._asking(name):
-            store, root = self._store()
+        with self._asking(name) as (store, root):
             store.put_file(str(path), f"{root}/{name}")
 
     def remove(self, names: Iterable[str]) -> None:
         """Remove objects, whether they are there or not."""
 
         def remove_one(name: str) -> None:  # not `rm`, which takes a name for a pattern
-            with suppress(FileNotFoundError):
+            with self._asking(name) as (store, root), suppress(FileNotFoundError):
                 store.rm_file(f"{root}/{name}")
 
-        if gone := list(names):
-            with self._asking(), ThreadPoolExecutor(_AT_ONCE) as several:
-                store, root = self._store()
-                list(several.map(remove_one, gone))
+        with ThreadPoolExecutor(_AT_ONCE) as several:
+            list(several.map(remove_one, names))
 
     def acquire(self) -> None:
-        """Create the lock object of the folder; raises OutputError if another command has locked it.
+        """Create the lock object of the folder; raises HeldError if another command has locked it.
 
         The lock of a command that has ended on this machine, or has not renewed it for long, is replaced.
         """
-        with self._asking():
-            store, root = self._store()
-            for _ in range(2):
-                try:
-                    store.pipe_file(f"{root}/{LOCK_FILE}", process_name().encode(), mode="create")
-                except Exception:
-                    holder = self._holder()
-                    if holder is None:
-                        raise
-                    if not self._is_left_over(holder):
-                        raise self._held(holder) from None
-                    self.remove([LOCK_FILE])
-                else:
-                    return
-        raise self._held(self._holder() or "")
+        with self._asking() as (store, root):
+            if self._is_left_over(self._holder()):
+                self.remove([LOCK_FILE])
+            try:
+                store.pipe_file(f"{root}/{LOCK_FILE}", process_name().encode(), mode="create")
+            except Exception:
+                if (holder := self._holder()) is None:
+                    raise
+                raise self._held(holder) from None
 
     def renew(self) -> None:
-        """Renew the lock of the folder; raises OutputError if it is lost."""
-        with self._asking():
-            store, root = self._store()
-            holder = self._holder()
-            if holder != process_name():
+        """Renew the lock of the folder; raises HeldError if it is lost."""
+        with self._asking() as (store, root):
+            if (holder := self._holder()) != process_name():
                 raise self._held(holder or "")
             store.pipe_file(f"{root}/{LOCK_FILE}", process_name().encode())
 
     def release(self) -> None:
         """Release the lock if this process has it."""
-        with suppress(OutputError), self._asking():
+        with suppress(OutputError):
             if self._holder() == process_name():
                 self.remove([LOCK_FILE])
 
     def _holder(self) -> str | None:
-        store, root = self._store()
-        try:
+        with self._asking() as (store, root), suppress(FileNotFoundError):
             return bytes(store.cat_file(f"{root}/{LOCK_FILE}")).decode("ascii", "replace")
-        except FileNotFoundError:
-            return None
+        return None
 
-    def _is_left_over(self, holder: str) -> bool:
+    def _is_left_over(self, holder: str | None) -> bool:
+        if holder is None:
+            return False
         with suppress(ValueError):
-            if is_alive(holder) is not None:
-                return not is_alive(holder)
-        store, root = self._store()
-        renewed = store.modified(f"{root}/{LOCK_FILE}")
-        return bool((datetime.now(UTC) - renewed.astimezone(UTC)).total_seconds() > LEFT_OVER_S)
+            if (alive := is_alive(holder)) is not None:
+                return not alive
+        with self._asking() as (store, root):
+            age = datetime.now(UTC) - store.modified(f"{root}/{LOCK_FILE}").astimezone(UTC)
+            return bool(age.total_seconds() > LEFT_OVER_S)
 
     def _held(self, holder: str) -> HeldError:
         process = ".".join(holder.split("-")[1:2])
@@ -185,10 +164,10 @@ class ObjectFolder:
         return store, root.rstrip("/")
 
     @contextmanager
-    def _asking(self, name: str = "") -> Iterator[None]:
-        """Convert the errors of a store to OutputError."""
+    def _asking(self, name: str = "") -> Iterator[tuple[Any, str]]:
+        """Yield the file system and the path there; errors of a store become OutputErrors."""
         try:
-            yield
+            yield self._store()
         except (OutputError, UsageError):
             raise
         except Exception as error:
@@ -229,14 +208,10 @@ class Mirror:
         scratch = scratch_folder()
         weakref.finalize(self, scratch.cleanup)
         # Outputs contain the name of their folder.
-        self.folder = Path(scratch.name) / (self.objects.name or "out")
+        self.folder = Path(scratch.name) / (self.objects.shown.rpartition("/")[2] or "out")
         self.folder.mkdir()
 
     def fetch(self, name: str) -> Path | None:
         """Return the local file of an object, fetched once; None if it does not exist."""
         path = self.folder / name
-        if not path.is_file():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if not self.objects.get(name, path):
-                return None
-        return path
+        return path if path.is_file() or self.objects.get(name, path) else None

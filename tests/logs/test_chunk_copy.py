@@ -1,4 +1,4 @@
-"""Chunks that a full copy takes over as they are, and what makes it go message by message instead."""
+"""Chunks that a full copy keeps unchanged, and chunks that it copies message by message."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_every_message_is_found_through_the_copied_indexes(tmp_path: Path) -> No
     container = log.containers[0]
     assert isinstance(container, McapContainer)
     for span in container.spans:
-        # Nothing but the chunk's index was read for these counts; the load goes through every message.
+        # These counts are read from the chunk's index only; the load visits every message.
         block = container.load(span)
         ids, counts = np.unique(block.channel, return_counts=True)
         assert dict(zip(ids.tolist(), counts.tolist(), strict=True)) == span.counts
@@ -275,17 +275,20 @@ def test_overlapping_chunks_keep_the_order_of_the_file(tmp_path: Path) -> None:
     with source.open("wb") as stream:
         writer = Writer(stream, chunk_size=1)  # a chunk a message pair: late, early, and one of both times
         writer.start(profile="ros2", library="recorder")
-        channel = writer.register_channel("/a", "octets", 0)
+        channel, other = (writer.register_channel(topic, "octets", 0) for topic in ("/a", "/b"))
         for times in ((5, 9), (2, 6), (20, 21), (12, 13)):
             writer._Writer__chunk_size = 10**6  # type: ignore[attr-defined]
             for t in times:
                 writer.add_message(channel, T0 + t, bytes([t]), T0)
+            writer.add_message(other, T0 + times[0], b"", T0)
             writer._Writer__finalize_chunk()  # type: ignore[attr-defined]
         writer.finish()
     assert [c.message_start_time - T0 for c in _chunks(source)] == [5, 2, 20, 12]
     _annotate(source, target, batches=False)
     assert [c.message_start_time - T0 for c in _chunks(target)] == [5, 2, 12, 20]
     assert _messages(target) == _messages(source)
+    items, _ = _annotate(source, target, leave_out=lambda topic: topic == "/b", batches=False)
+    assert [item.log_time_ns - T0 for item in items] == [2, 5, 6, 9, 12, 13, 20, 21], "message by message, merged"
 
 
 def test_ids_at_the_end_of_their_range_leave_room_for_more(tmp_path: Path) -> None:

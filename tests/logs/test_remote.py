@@ -112,7 +112,7 @@ def test_a_drive_costs_no_more_than_its_file(sample_logs_dir: Path, saloon: Car)
 
 
 def _write_groups(path: Path, seconds: int, groups: dict[str, tuple[list[str], int]]) -> None:
-    """Write a log whose chunks of 10 s hold the topics of one group each: topics and bytes a message."""
+    """Write a log with chunks of 10 s, each with the topics of one group (topics and bytes per message)."""
     schema = ("test_msgs/msg/Noisy", "ros2msg", b"float64 data\nuint8[] noise")
     noise = random.Random(2)
 
@@ -222,6 +222,15 @@ def test_a_server_without_ranges_gives_all_at_once(sample_logs_dir: Path) -> Non
         server.ranges = False
         assert _read(_place(server, file.name)) == _read(file)
         assert len(server.requests) == 1
+
+
+def test_copies_of_closed_logs_are_kept_up_to_a_size(served: CountingServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    for kept_bytes, fetched in ((1 << 30, 1), (0, 2)):
+        monkeypatch.setattr(remote_source, "KEPT_BYTES", kept_bytes)
+        _read(_place(served, "dlc.mcap"))
+        _read(_place(served, "dlc.mcap"))
+        size = len(served.files["dlc.mcap"])
+        assert fetched * size <= served.bytes_sent <= fetched * size + 100, kept_bytes
 
 
 def test_metadata_is_read_from_head_and_tail(sample_logs_dir: Path) -> None:

@@ -40,7 +40,7 @@ def test_a_prefix_is_searched_like_a_folder(store: S3Store) -> None:
 
 
 def test_same_log_and_a_changed_one(store: S3Store, sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote_source, "KEPT_COPIES", 0)
+    monkeypatch.setattr(remote_source, "KEPT_BYTES", 0)
     file = sample_logs_dir / "road.mcap"
     store.put("a b/dlc+1.mcap", file.read_bytes())
     url = f"{store.url}/a b/dlc+1.mcap"

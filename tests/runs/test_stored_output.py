@@ -1,9 +1,8 @@
-"""A run whose output is at a URL: the same files as in a folder, one command at a time, and what goes wrong told."""
+"""A run with its output at a URL: the files equal those in a folder, one command at a time, errors in one line."""
 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -25,7 +24,7 @@ from tests.runs.stub_drives import stub_drive
 from tests.runs.test_fleet_runs import Counted, named_logs, run
 from tests.s3_store import S3Store, forget_file_systems, s3_store
 
-#: What holds times, or where logs lie.
+#: Files with times or locations of logs.
 TIMED = ("run.json", JOURNAL_FILE)
 URL = "memory://fleet/out"
 
@@ -70,7 +69,7 @@ def test_a_store_has_what_a_folder_has_and_is_gone_on_with(tmp_path: Path, memor
     said: list[str] = []
     run(logs, URL, work=work, resume=True, say=said.append)
     run(logs, tmp_path / "out", resume=True)
-    assert work.asked == ["a", "b", "c"], "only what is new"
+    assert work.asked == ["a", "b", "c"], "only the new log"
     assert (said, stored(memory)) == ([], local(tmp_path / "out"))
     opened = open_run(URL)
     assert (opened.place, [log.label for log in opened.logs]) == (URL, ["a", "b", "c"])
@@ -155,7 +154,7 @@ def test_a_store_that_fails_ends_the_run_and_what_is_put_counts(
         run(logs, URL, work=work)
     assert "\n" not in str(raised.value) and f"{URL}/logs/b/metrics.parquet" in str(raised.value)
     assert str(raised.value).endswith("--resume goes on")
-    assert (raised.value.exit_code, work.asked) == (1, ["a", "b"]), "the third is not worked on for nothing"
+    assert (raised.value.exit_code, work.asked) == (1, ["a", "b"]), "the third log is not started"
     run(logs, URL, work=work, resume=True)
     run(logs, tmp_path / "out")
     assert (work.asked[2:], stored(memory)) == (["b", "c"], local(tmp_path / "out"))
@@ -197,12 +196,11 @@ def test_one_command_at_a_time_holds_the_place(tmp_path: Path, memory: Any, monk
 
 
 def test_what_has_lost_its_hold_ends(tmp_path: Path, memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pdhef_logtool.runs.stored_output.EVERY_S", 0.01)
+    monkeypatch.setattr("pdhef_logtool.runs.stored_output.EVERY_S", 0.0)
     logs, lock = named_logs(tmp_path / "logs", "a", "b"), f"/fleet/out/{LOCK_FILE}"
 
     def taken(task: DriveTask, tell: Tell) -> DriveEnd:
         memory.pipe_file(lock, b"00000000-17-1")
-        time.sleep(3.0)
         return stub_drive(task, tell)
 
     with pytest.raises(HeldError):
