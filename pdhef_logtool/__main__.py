@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import NoReturn
 
@@ -11,6 +12,8 @@ from pdhef_logtool.cli import stopping
 def main() -> NoReturn:
     """Run the command line; Ctrl-C is in order from here on, also while its modules are imported."""
     stopping.watch()
+    # Otherwise pydantic searches all installed packages for its plug-ins.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
     try:
         from pdhef_logtool.cli import app
     except BaseException as error:

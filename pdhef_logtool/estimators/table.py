@@ -10,7 +10,6 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
-from importlib.metadata import entry_points
 from typing import Literal
 
 from pdhef_logtool.car.car import Car
@@ -215,6 +214,8 @@ def all_specs() -> tuple[Spec, ...]:
 
     An entry point that cannot be loaded, or adds a name that exists, is left out with a warning on stderr.
     """
+    from importlib.metadata import entry_points
+
     specs = list(SPECS)
     for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
         reason = ""

@@ -53,7 +53,7 @@ Calibrate = Literal["off", "online", "log", "pool"]
 Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
 
 
-@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid", strict=True, defer_build=True))
 class RunConfig:
     """Settings of a run: the keys of ``pdhef.toml`` and of ``--set``. Types are checked at construction.
 
