@@ -10,19 +10,26 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
 from pdhef_logtool.estimators.plug_ins import contained, package_of
-from pdhef_logtool.estimators.presets import AIDED, check_options, options_of, preset_of
+from pdhef_logtool.estimators.presets import (
+    AIDED,
+    OPEN_LOOP,
+    SELF_CALIBRATED,
+    check_options,
+    options_of,
+    preset_of,
+)
 from pdhef_logtool.estimators.presets import Options as Options
-from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, SelfCalibrated
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import has_gnss
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.base import Estimator
 
 #: What drives the vehicle model; a filter uses a_y and yaw rate where the log has them, ``physics`` steering too.
 _SPEED = frozenset({"speed_m_s"})
@@ -105,6 +112,9 @@ class Spec:
         if car.self_calibrated is None or (self.name != OPEN_LOOP and preset_of(self.name) not in SELF_CALIBRATED):
             estimator: Estimator = build(self.name, car, options)
             return estimator
+        from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
+        from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
+
         calibration = car.self_calibrated
         online = bool(calibration.earlier) and self.causal
         stages = []

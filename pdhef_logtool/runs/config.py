@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from pdhef_logtool.car.car import NO_INTERVALS, SHIPPED_CARS, UNSURE
+from pdhef_logtool.car.names import NO_INTERVALS, SHIPPED_CARS, UNSURE
 from pdhef_logtool.car.vehicle import SENSOR_PROFILES
 from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.drive.options import ReadOptions, parse_time
