@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-#: The car that comes with the package, by name.
+#: Cars of the package, by name.
 SHIPPED_CARS = {"saloon": Path(__file__).parents[1] / "models" / "default"}
-#: Instead of a file: no intervals of the car, or wide ones for a car that may differ from its vehicle file.
+#: Names in place of an intervals file: uncalibrated intervals of the estimators; wide intervals for a car that may
+#: differ from its vehicle file.
 NO_INTERVALS, UNSURE = "none", "unsure"

@@ -1,4 +1,4 @@
-"""``pdhef compile``: what a run uses is compiled now, so that no later one waits."""
+"""``pdhef compile``: compile the code of runs in advance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ commands = typer.Typer()
     "pdhef compile",
     "NUMBA_CACHE_DIR=/opt/pdhef pdhef compile",
     panel=panels.TOOLS,
-    notes="A second call compiles nothing.",
+    notes="A second call has no effect.",
     name="compile",
 )
 def compile_(as_json: options.JsonFlag = False) -> None:
@@ -41,4 +41,4 @@ def compile_(as_json: options.JsonFlag = False) -> None:
     if as_json:
         console.print_json(facts)
     else:
-        console.say(f"everything that a run uses is compiled ({facts['seconds']:.0f} s, {facts['compiled']})")
+        console.say(f"all code of runs is compiled ({facts['seconds']:.0f} s, {facts['compiled']})")

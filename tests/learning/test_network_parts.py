@@ -399,8 +399,8 @@ def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch
     settings = ExtractSettings(RunConfig())
     result = extract_command.extract([str(tmp_path)], tmp_path / "out", settings, reporter=Reporter(warn=warned.append))
     assert warned == [
-        "no --car: residuals are those of the default sedan",
-        "no drive fell to validation: with few drives choose with --split, or another --seed",
+        "no --car: residuals refer to the default sedan",
+        "no drive is in validation: with few drives choose with --split, or another --seed",
     ]
     assert result.exit_code == 0
     assert [v["name"] for v in result.manifest["vehicles"]] == ["sedan"]
