@@ -6,7 +6,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, Protocol, TypeVar
 
@@ -28,7 +28,7 @@ class _Result(Protocol):
     def to_dict(self) -> dict[str, Any]: ...
 
 
-_Shown = TypeVar("_Shown", bound=_Result)
+_Shown = TypeVar("_Shown", bound=_Result | Mapping[str, Any])
 _quiet = _verbose = False
 #: Interval between lines of progress without a terminal, s.
 PROGRESS_S = 30.0
@@ -129,7 +129,7 @@ def print_facts(facts: dict[str, Any]) -> None:
 def show(result: _Shown, render: Callable[[_Shown, Console], None], as_json: bool) -> None:
     """Print a result as a JSON document or as tables."""
     if as_json:
-        print_json(result.to_dict())
+        print_json(result if isinstance(result, Mapping) else result.to_dict())
     else:
         render(all_printable(result), stdout())
 

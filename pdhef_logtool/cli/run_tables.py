@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pdhef_logtool.evaluation.metrics.metric import Metric
-    from pdhef_logtool.results.summary import RunSummary
-    from pdhef_logtool.runs.pipeline import RunResult
+    from pdhef_logtool.runs.run_result import RunResult
 
 _Report: TypeAlias = Mapping[str, Any]
 #: Signal, segment and metric.
@@ -157,50 +156,51 @@ def _recorded(report: _Report) -> str:
     return f"sideslip RMSE of {scored} ({truth_of(report, 'sideslip_rad')})"
 
 
-def _fleet_head(summary: RunSummary) -> Table:
+def _fleet_head(summary: Mapping[str, Any]) -> Table:
     """Return the three lines of a run of many logs."""
-    plan = summary.plan or {}
+    plan = summary["plan"] or {}
     counts = Counter(str(r["outcome"]) for r in plan.get("requirements") or ())
-    rmse = f"median sideslip RMSE {degrees(summary.errors[0].median_rad)}" if summary.errors else "no drive is scored"
-    said = f"{rmse} of {summary.scored} drives"
-    steps = next_steps(plan, ["read the failures below"] if summary.failed else ())
+    errors = summary["errors"]
+    rmse = f"median sideslip RMSE {degrees(errors[0]['median_rad'])}" if errors else "no drive is scored"
+    said = f"{rmse} of {summary['scored']} drives"
+    steps = next_steps(plan, ["read the failures below"] if summary["failed"] else ())
     return three_lines(
         joined(outcomes_text(counts, plan.get("file") or ""), said, plan.get("file")) if counts else said,
         "differs by drive, see report.json",
-        steps[0] if steps else f"open {Path(summary.output) / PAGE_FILE}",
+        steps[0] if steps else f"open {Path(summary['output']) / PAGE_FILE}",
     )
 
 
-def render_fleet(summary: RunSummary, console: Console) -> None:
+def render_fleet(summary: Mapping[str, Any], console: Console) -> None:
     """Print a run of many logs: errors over drives, worst drives, failures, and the location of the outputs."""
     console.print(_fleet_head(summary))
     console.print()
-    if summary.errors:
+    if summary["errors"]:
         spread = table("sideslip by", ">drives", ">median °", ">p90 °", ">largest °")
-        for of in summary.errors:
-            figures = (cell(x, DEGREES, 3) for x in (of.median_rad, of.p90_rad, of.max_rad))
-            spread.add_row(of.estimator, str(of.drives), *figures)
-        console.print(f"RMSE of sideslip over {summary.scored} drives with an independent ground truth")
+        for of in summary["errors"]:
+            figures = (cell(of[f"{name}_rad"], DEGREES, 3) for name in ("median", "p90", "max"))
+            spread.add_row(of["estimator"], str(of["drives"]), *figures)
+        console.print(f"RMSE of sideslip over {summary['scored']} drives with an independent ground truth")
         console.print(spread)
         console.print()
-    if summary.worst:
-        names = list(dict.fromkeys(n for d in summary.worst for n in d.errors_rad if n != d.main))
+    if summary["worst"]:
+        names = list(dict.fromkeys(n for d in summary["worst"] for n in d["errors_rad"] if n != d["main"]))
         worst = table("worst drives", "by", ">RMSE °", *(f">{n} °" for n in names), fold=1)
-        for drive in summary.worst:
-            errors = (cell(drive.errors_rad.get(n), DEGREES, 3) for n in (drive.main, *names))
-            worst.add_row(drive.log, drive.main, *errors)
+        for drive in summary["worst"]:
+            errors = (cell(drive["errors_rad"].get(n), DEGREES, 3) for n in (drive["main"], *names))
+            worst.add_row(drive["log"], drive["main"], *errors)
         console.print(worst)
         console.print()
-    for kind in summary.failed:
-        console.print(Text.assemble((f"{kind.count} failed: ", "bold"), kind.reason))
-        _print_some(kind.labels, kind.count, console)
-    if summary.checks_failed:
-        console.print(Text.assemble((f"{len(summary.checks_failed)} with failed checks", "bold"), ", see report.json:"))
-        _print_some(summary.checks_failed, len(summary.checks_failed), console)
-    left = f", {summary.remaining} not done" if summary.remaining else ""
-    failed = summary.logs - summary.done
-    console.print(f"{summary.logs} logs: {summary.done} done, {failed} failed, {summary.lost} with input lost{left}")
-    _print_outputs(summary.output, console)
+    for kind in summary["failed"]:
+        console.print(Text.assemble((f"{kind['count']} failed: ", "bold"), kind["reason"]))
+        _print_some(kind["labels"], kind["count"], console)
+    if checks := summary["checks_failed"]:
+        console.print(Text.assemble((f"{len(checks)} with failed checks", "bold"), ", see report.json:"))
+        _print_some(checks, len(checks), console)
+    left = f", {summary['remaining']} not done" if summary["remaining"] else ""
+    logs, done, lost = (summary[key] for key in ("logs", "done", "lost"))
+    console.print(f"{logs} logs: {done} done, {logs - done} failed, {lost} with input lost{left}")
+    _print_outputs(summary["output"], console)
 
 
 def _print_some(labels: Sequence[str], count: int, console: Console) -> None:

@@ -18,7 +18,7 @@ from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError, Usa
 
 if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig
-    from pdhef_logtool.runs.pipeline import RunResult
+    from pdhef_logtool.runs.run_result import RunResult
 
 commands = typer.Typer()
 
@@ -223,8 +223,8 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
         from pdhef_logtool.results.summary import summarise
 
         checks_failed = [r.outcome.log for r in result.results if r.failed_checks]
-        summary = summarise(open_run(result.output), result.exit_code, checks_failed)
-        console.show(replace(summary, output=result.place or summary.output), render_fleet, as_json)
+        summary = summarise(open_run(result.output), result.exit_code, checks_failed) | {"output": str(result.place)}
+        console.show(summary, render_fleet, as_json)
     else:
         if not as_json:  # the tables read the reports; a copy of all metric rows for the terminal would be unused
             result = replace(result, results=tuple(replace(entry, figures=()) for entry in result.results))

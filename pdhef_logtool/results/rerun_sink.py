@@ -32,7 +32,6 @@ from pdhef_logtool.results.sink import (
     LONGEST_WHOLE_NS,
     TRUTH,
     Event,
-    Shown,
     first_of_slots,
     is_finished_recording,
 )
@@ -112,7 +111,7 @@ def write_recording(
     input_hash: str,
     start_ns: int,
     end_ns: int | None = None,
-    shown: Shown,
+    shown: Sequence[str],
     min_speed_m_s: float = 1.0,
     colours: Mapping[str, int] | None = None,
 ) -> None:
@@ -130,7 +129,7 @@ def write_recording(
     log_name : the recording's name.
     input_hash : hexadecimal hash of the log, which distinguishes the recordings of a run.
     start_ns : zero of the timeline ``elapsed``. end_ns : of the drive, which decides whether it is long; None: not.
-    shown : which estimators the recording opens on.
+    shown : estimators of ``/main`` and ``/baseline``, on which the recording opens.
     min_speed_m_s : sideslip is not drawn below it. colours : 0xRRGGBB by estimator.
 
     Raises
@@ -172,11 +171,9 @@ def write_recording(
         )
 
 
-def _places(names: Sequence[str], shown: Shown) -> dict[str, str]:
+def _places(names: Sequence[str], shown: Sequence[str]) -> dict[str, str]:
     """Return the entity of each track."""
-    places = {TRUTH: "truth", shown.main: "main"}
-    if shown.baseline is not None:
-        places[shown.baseline] = "baseline"
+    places = {TRUTH: "truth", **dict(zip(shown, ("main", "baseline"), strict=False))}
     others = [name for name in names if name not in places]
     return places | {name: f"other/{number}" for number, name in enumerate(others, start=1)}
 

@@ -6,7 +6,7 @@ The report's document is the only source, so that terminal, report.json, Markdow
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, TypeAlias
 
 from pdhef_logtool.records.geometry import DEGREES
@@ -75,18 +75,10 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
         "next": "; ".join(_next_steps(report, main, figures)[:_MOST_STEPS]),
     }
     best = _best_in_hindsight(report, main, figures)
-    return {
-        "main": main.name,
-        "chosen_by": main.chosen_by,
-        "why": main.why,
-        "distrusted": main.distrusted,
-        "naive": main.naive,
-        "shown": list(main.shown),
-        "named": main.named,
-        **({"over_time": [{"since_ns": t, "name": name} for t, name in main.over_time]} if main.over_time else {}),
-        "best_in_hindsight": best,
-        "texts": texts,
-    }
+    chosen = {"main" if key == "name" else key: value for key, value in asdict(main).items() if key != "over_time"}
+    if main.over_time:
+        chosen["over_time"] = [{"since_ns": t, "name": name} for t, name in main.over_time]
+    return {**chosen, "shown": list(main.shown), "best_in_hindsight": best, "texts": texts}
 
 
 def degrees(value_rad: float) -> str:

@@ -16,8 +16,8 @@ import pytest
 
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.drive_outputs import LOG_FILES
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.pipeline import LOG_FILES
 from pdhef_logtool.runs.recorded_estimates import score_log
 from studies.torture.killing import contents, faults, kill_many, kill_run, leftovers
 from tests.command_line import called

@@ -21,7 +21,7 @@ from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs.config import RunConfig, load_config
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.pipeline import RunResult
+from pdhef_logtool.runs.run_result import RunResult
 
 pytestmark = pytest.mark.slow
 
