@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import os
 import sys
 from typing import NoReturn
 
@@ -11,6 +13,10 @@ from pdhef_logtool.cli import stopping
 def main() -> NoReturn:
     """Run the command line; Ctrl-C is in order from here on, also while its modules are imported."""
     stopping.watch()
+    # The objects of modules stay; to search them for cycles after every 700 new ones takes longer than to load some.
+    gc.set_threshold(10_000, 20)
+    # Otherwise pydantic searches all installed packages for its plug-ins.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
     try:
         from pdhef_logtool.cli import app
     except BaseException as error:

@@ -14,6 +14,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, AssumedValue
+from pdhef_logtool.car.names import NO_INTERVALS as NO_INTERVALS
+from pdhef_logtool.car.names import SHIPPED_CARS as SHIPPED_CARS
+from pdhef_logtool.car.names import UNSURE as UNSURE
 from pdhef_logtool.car.parts import (
     PHYSICS,
     FilterNoise,
@@ -46,11 +49,6 @@ VEHICLE_FILE, FIT_FILE, NOISE_FILE, NETWORK_FILE = "vehicle.toml", "fit.toml", "
 INTERVALS_FILE, UNSURE_FILE, HISTORY_FILE = "intervals.json", "intervals-unsure.json", "history.jsonl"
 NETWORK_FOLDER = "network"
 TAUGHT_FILE = "taught.json"
-#: Cars of the package, by name.
-SHIPPED_CARS = {"saloon": Path(__file__).parents[1] / "models" / "default"}
-#: Names in place of an intervals file: uncalibrated intervals of the estimators; wide intervals for a car that may
-#: differ from its vehicle file.
-NO_INTERVALS, UNSURE = "none", "unsure"
 #: Number of digits of a hash in messages.
 SHOWN_DIGITS = 12
 

@@ -45,7 +45,7 @@ STIFFNESS_TYRE_SHAPE = 1.35
 class Record(BaseModel):
     """Frozen record that rejects unknown entries, wrong types and values that are not finite."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True, allow_inf_nan=False)
 
 
 class AxleTyre(Record):

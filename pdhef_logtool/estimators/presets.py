@@ -19,6 +19,10 @@ OPTIONS: Mapping[str, Mapping[str, tuple[float, float] | None]] = {
     "phy-ukf": {"tuned": None},
     "pd-hef": {"gain": (0.0, 1.0), "fixed-r": None},
 }
+#: Presets built on ``physics``. They use the calibrated vehicle if available; all others use the vehicle file.
+SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
+#: The open-loop model on the calibrated vehicle.
+OPEN_LOOP = "open-loop:calibrated"
 #: Presets that GNSS velocity corrects.
 AIDED = frozenset({"physics", "pd-hef"})
 

@@ -36,10 +36,6 @@ from pdhef_logtool.records.tracks import StateTrack
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 
-#: Presets built on ``physics``. They use the calibrated vehicle if available; all others use the vehicle file.
-SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
-#: The open-loop model on the calibrated vehicle.
-OPEN_LOOP = "open-loop:calibrated"
 #: Factor of lateral kinematic consistency, and s_car above; from seven simulated cars and real drives of four cars.
 D2_SHARE, CAR_STD_RAD = 0.7, math.radians(0.15)
 

@@ -10,20 +10,26 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
-from importlib.metadata import entry_points
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
 from pdhef_logtool.estimators.plug_ins import contained, package_of
-from pdhef_logtool.estimators.presets import AIDED, check_options, options_of, preset_of
+from pdhef_logtool.estimators.presets import (
+    AIDED,
+    OPEN_LOOP,
+    SELF_CALIBRATED,
+    check_options,
+    options_of,
+    preset_of,
+)
 from pdhef_logtool.estimators.presets import Options as Options
-from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, SelfCalibrated
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import has_gnss
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.base import Estimator
 
 #: Inputs of the vehicle model; a filter uses a_y and yaw rate if the log has them, ``physics`` steering too.
 _SPEED = frozenset({"speed_m_s"})
@@ -104,6 +110,9 @@ class Spec:
         if car.self_calibrated is None or (self.name != OPEN_LOOP and preset_of(self.name) not in SELF_CALIBRATED):
             estimator: Estimator = build(self.name, car, options)
             return estimator
+        from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
+        from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
+
         calibration = car.self_calibrated
         online = bool(calibration.earlier) and self.causal
         stages = []
@@ -213,6 +222,8 @@ def all_specs() -> tuple[Spec, ...]:
 
     An entry point that cannot be loaded, or adds a name that exists, is left out with a warning on stderr.
     """
+    from importlib.metadata import entry_points
+
     specs = list(SPECS)
     for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
         reason = ""

@@ -38,7 +38,7 @@ _Range = Annotated[list[float] | None, Field(min_length=2, max_length=2)]
 class ExposureNeed(BaseModel):
     """A table ``[[requirement.exposure]]``: the least driving in conditions, over the scored drives."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
     speed_m_s: Annotated[_Range, Field(description="Speed from, to: multiples of 5; [60, 65] is all above 60.")] = None
     ay_m_s2: Annotated[_Range, Field(description="|a_y| from, to: integers; [12, 13] is all above 12.")] = None
@@ -170,7 +170,7 @@ def shown(value: float, unit: str) -> str:
 class RequirementTable(BaseModel):
     """A table ``[[requirement]]`` of plan.toml."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", description="Unique identifier.")]
     title: Annotated[_Name | None, Field(description="One line for reports. Default: the requirement in words.")] = None
@@ -218,7 +218,7 @@ class RequirementTable(BaseModel):
 class PlanTable(BaseModel):
     """The file plan.toml."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
     title: Annotated[str, Field(max_length=200, description="Name of the plan, for reports.")] = ""
     requirement: Annotated[list[RequirementTable], Field(min_length=1)]

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pdhef_logtool.car.car import NO_INTERVALS, Car
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.names import NO_INTERVALS
 from pdhef_logtool.car.store import check_output, update_car
 from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.learning.drives import (

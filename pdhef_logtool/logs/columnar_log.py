@@ -337,7 +337,16 @@ class ColumnarLog(DriveLog):
             self._asked |= wanted
             self._wanted |= wanted
         times = {topic: _Plan((), {}) for topic in stamps if topic not in plans}
-        return self._collect(plans | times, start_ns, end_ns)
+        plans |= times
+        parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
+        expected = self._expected if self._column_bytes < _COLUMN_BYTES else {}
+        for c, container in enumerate(self.containers):
+            spans = tuple(self._to_read(plans, container, start_ns, end_ns))
+            container.prefetch(spans)
+            with container.meter.running():
+                for span in spans:
+                    self._collect_span(plans, expected, c, span, (start_ns, end_ns), parts)
+        return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
 
     def expect(self, requests: Mapping[str, Sequence[str]]) -> None:
         """See :class:`~pdhef_logtool.logs.drive_log.DriveLog`."""
@@ -508,17 +517,6 @@ class ColumnarLog(DriveLog):
         self._plans[topic, paths] = _Plan(selections, decoders)
         return self._plans[topic, paths]
 
-    def _collect(self, plans: Mapping[str, _Plan], start_ns: int | None, end_ns: int | None) -> dict[str, Columns]:
-        parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
-        expected = self._expected if self._column_bytes < _COLUMN_BYTES else {}
-        for c, container in enumerate(self.containers):
-            container.prefetch(self._to_read(plans, container, start_ns, end_ns))
-            with container.meter.running():
-                for span in container.spans:
-                    if span.overlaps(start_ns, end_ns):
-                        self._collect_span(plans, expected, c, span, (start_ns, end_ns), parts)
-        return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
-
     @staticmethod
     def _to_read(
         topics: Collection[str], container: Container, start_ns: int | None, end_ns: int | None
@@ -540,8 +538,6 @@ class ColumnarLog(DriveLog):
         """Add the columns of the requested topics in a span; if it has to be opened, keep those of expected topics."""
         channels = self.containers[c].channels
         requested = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
-        if not requested:
-            return
         stored = self._columns.get((c, span.index), {})
         if not all(id_ in stored and plans[channels[id_].topic].is_in(stored[id_]) for id_ in requested):
             later = frozenset(id_ for id_ in span.counts if channels[id_].topic in expected and id_ not in stored)

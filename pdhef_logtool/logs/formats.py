@@ -9,12 +9,10 @@ import pkgutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.logs.container import MCAP_MAGIC, ROSBAG1_MAGIC, SQLITE_MAGIC, Container
 from pdhef_logtool.logs.log_file import LogFile
-from pdhef_logtool.logs.reader_process import open_tables
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.drive_log import DriveLog
@@ -64,6 +62,8 @@ class LogFormat:
     def open(self, file: LogFile) -> DriveLog | Container:
         """Open a file."""
         if self.libraries is not None:
+            from pdhef_logtool.logs.reader_process import open_tables
+
             return open_tables(file, self.opener, self.libraries)
         opener: Callable[[LogFile], Any] = pkgutil.resolve_name(self.opener)
         return opener(file)  # type: ignore[no-any-return]
@@ -97,6 +97,8 @@ FORMATS = (
 
 @cache
 def _of_other_packages() -> tuple[LogFormat, ...]:
+    from importlib.metadata import entry_points
+
     entries = sorted(entry_points(group=GROUP), key=lambda entry: entry.name)
     return tuple(entry.load() for entry in entries)
 

@@ -231,8 +231,6 @@ def ros_schema(
     """
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    from pdhef_logtool.logs.idl_parser import idl_types
-
     what = f"the definition of {type_name}"
     borrowed: tuple[Path, ...] = ()
 
@@ -248,7 +246,12 @@ def ros_schema(
         base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
         if text.strip():
             text = _SEPARATOR.sub("=" * 80, text)
-            types = idl_types(text) if encoding == "ros2idl" else get_types_from_msg(text, type_name)
+            if encoding == "ros2idl":
+                from pdhef_logtool.logs.idl_parser import idl_types
+
+                types = idl_types(text)
+            else:
+                types = get_types_from_msg(text, type_name)
             store = get_typestore(Stores.EMPTY)
             try:
                 if referenced(types) - set(types):  # a distribution's types take long to load

@@ -44,7 +44,7 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 class _Timed(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
     topic: Name
     stamp: Name = AUTO_STAMP
@@ -92,7 +92,7 @@ class _GateTable(_Timed):
 
 
 class _CanTable(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
     dbc: Name | Annotated[list[Name], Field(min_length=1)]
     id_field: str = ""

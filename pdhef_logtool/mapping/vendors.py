@@ -36,7 +36,7 @@ _QUANTITIES = {
 
 
 class _FieldTable(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
     field: Annotated[str, Field(min_length=1)] | list[str]
     signal: str = ""
@@ -63,7 +63,7 @@ class _FieldTable(BaseModel):
 
 
 class _TypeTable(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
 
     type: list[str]
     vendor: str

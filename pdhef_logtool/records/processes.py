@@ -10,8 +10,6 @@ import time
 from functools import cache
 from pathlib import Path
 
-import psutil
-
 #: Result of :func:`process_name`, as a regular expression.
 NAME = r"[0-9a-f]{8}-\d+-\d+"
 #: Number of this worker process, from 1; 0 in the command itself.
@@ -53,6 +51,8 @@ def wait_for_end(pid: int, most_s: float = 5.0) -> None:
 
 def _has_ended(pid: int) -> bool:
     """Return whether a process has ended, including zombies."""
+    import psutil
+
     try:
         return psutil.Process(pid).status() in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
     except psutil.NoSuchProcess:
@@ -71,6 +71,8 @@ def _start(pid: int) -> int | None:
         # The name of the program, in brackets, can contain any character.
         return int(Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[19])
     except (OSError, ValueError, IndexError):
+        import psutil
+
         with contextlib.suppress(psutil.Error):
             return int(1000.0 * psutil.Process(pid).create_time())
         return None

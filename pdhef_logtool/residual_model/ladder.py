@@ -60,7 +60,7 @@ class LadderModel(BaseModel):
     largest_rad : largest residual on the training drives.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True, allow_inf_nan=False)
 
     rung: Literal["linear", "random"]
     scale: Row

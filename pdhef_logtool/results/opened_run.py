@@ -44,7 +44,7 @@ _AGAIN = "run the log again"
 class _Checked(BaseModel):
     """The entries that commands use; each is optional, others are ignored."""
 
-    model_config = ConfigDict(extra="ignore", strict=True)
+    model_config = ConfigDict(extra="ignore", strict=True, defer_build=True)
 
 
 class _CarEntry(_Checked):

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from pdhef_logtool.evaluation.metrics import MetricRow
@@ -208,7 +207,8 @@ def _tables(path: Path, estimator: str, columns: set[str] | None) -> Iterator[pa
                     table = file.read_row_group(group, columns=wanted)
                 else:
                     table = file.read_row_group(group, columns=[*wanted, "estimator"])
-                    table = table.filter(pc.field("estimator") == estimator).select(wanted)
+                    of_estimator = pa.array([name == estimator for name in table["estimator"].to_pylist()])
+                    table = table.filter(of_estimator).select(wanted)
             yield table
 
 
@@ -223,7 +223,7 @@ def _track_from_table(name: str, table: pa.Table) -> StateTrack:
     columns: dict[str, Any] = {c: v for c, v in optional.items() if v.null_count < table.num_rows}
     columns |= {c: numbers(c) for c in columns if c != "reason"}
     if "reason" in columns:
-        columns["reason"] = np.asarray(pc.fill_null(columns["reason"], 0).to_numpy(), dtype=np.int64)
+        columns["reason"] = np.asarray(columns["reason"].fill_null(0).to_numpy(), dtype=np.int64)
     flags = {c: np.asarray(table[c].to_numpy(), dtype=np.bool_) for c in _FLAGS if c in table.column_names}
     return make_track(
         name,
@@ -242,7 +242,7 @@ def _estimators_of(file: pq.ParquetFile, group: int) -> tuple[str, ...]:
     if statistics is not None and statistics.has_min_max and statistics.min == statistics.max:
         return (str(statistics.min),)
     column = file.read_row_group(group, columns=["estimator"])["estimator"]
-    return tuple(str(v) for v in pc.unique(column).to_pylist())
+    return tuple(str(v) for v in column.unique().to_pylist())
 
 
 def _open(path: Path, kind: str) -> pq.ParquetFile:

@@ -12,7 +12,8 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from pdhef_logtool.car.car import SHIPPED_CARS, Car
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.names import SHIPPED_CARS
 from pdhef_logtool.car.vehicle import Record
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.open_log import log_metadata

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from pdhef_logtool.car.car import NO_INTERVALS, SHIPPED_CARS, UNSURE
+from pdhef_logtool.car.names import NO_INTERVALS, SHIPPED_CARS, UNSURE
 from pdhef_logtool.car.vehicle import SENSOR_PROFILES
 from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.drive.options import ReadOptions, parse_time
@@ -53,7 +53,7 @@ Calibrate = Literal["off", "online", "log", "pool"]
 Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
 
 
-@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid", strict=True, defer_build=True))
 class RunConfig:
     """Settings of a run: the keys of ``pdhef.toml`` and of ``--set``. Types are checked at construction.
 

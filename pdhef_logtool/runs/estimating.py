@@ -16,8 +16,8 @@ from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.online_calibrated import OnlineBand, OnlineCalibrated
-from pdhef_logtool.estimators.presets import preset_of
-from pdhef_logtool.estimators.self_calibrated import SELF_CALIBRATED, CalibratedBand
+from pdhef_logtool.estimators.presets import SELF_CALIBRATED, preset_of
+from pdhef_logtool.estimators.self_calibrated import CalibratedBand
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import dead_reckon
 from pdhef_logtool.records.readings import without_impossible_states

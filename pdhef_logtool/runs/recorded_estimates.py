@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdhef_logtool.car.car import NO_INTERVALS, Car
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.names import NO_INTERVALS
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive

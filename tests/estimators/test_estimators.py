@@ -20,7 +20,7 @@ from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehiclePara
 from pdhef_logtool.estimators import latency_compensation
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.latency_compensation import run_estimator, run_window
-from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
+from pdhef_logtool.estimators.presets import OPEN_LOOP
 from pdhef_logtool.estimators.smoothed import SmoothedPhysics
 from pdhef_logtool.estimators.table import Options, all_specs, check_names, make_estimator, runnable, spec_of
 from pdhef_logtool.records.errors import UsageError

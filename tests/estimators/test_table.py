@@ -28,8 +28,7 @@ from pdhef_logtool.estimators.base import LookingAhead
 from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS, make_inflation
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import FILE_LAG, PHYSICS_Q_STD
-from pdhef_logtool.estimators.presets import OPTIONS, options_of, preset_of, split_names
-from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
+from pdhef_logtool.estimators.presets import OPEN_LOOP, OPTIONS, options_of, preset_of, split_names
 from pdhef_logtool.estimators.table import (
     SPECS,
     Options,

@@ -13,7 +13,7 @@ import pytest
 from mcap.reader import make_reader
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
+from pdhef_logtool.estimators.presets import OPEN_LOOP
 from pdhef_logtool.estimators.table import SPECS, all_names
 from pdhef_logtool.records.errors import EstimatorError, LogError, MappingError, UsageError, VehicleError
 from pdhef_logtool.records.reporter import Reporter

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.car import NO_INTERVALS, VEHICLE_FILE, Car
+from pdhef_logtool.car.car import VEHICLE_FILE, Car
+from pdhef_logtool.car.names import NO_INTERVALS
 from pdhef_logtool.car.parts import PHYSICS, physics_sha256
 from pdhef_logtool.car.taught import ESTIMATED
 from pdhef_logtool.car.vehicle import VehicleParameters

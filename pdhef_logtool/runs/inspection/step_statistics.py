@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -18,7 +19,7 @@ BURST = 0.75
 COLUMNS = 100
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Steps:
     """Steps between ascending times.
 
@@ -38,7 +39,7 @@ class Steps:
         starts = [part[:-1] for part in parts]
         return cls(sum(map(len, parts)), np.concatenate([np.empty(0), *steps]), np.concatenate([_NONE, *starts]))
 
-    @property
+    @cached_property
     def median_s(self) -> float:
         """Median step; NaN without a step."""
         return float(np.median(self.steps_s)) if self.steps_s.shape[0] else float("nan")
@@ -61,7 +62,7 @@ class Steps:
     def jitter_p95_s(self) -> float:
         """95th percentile of |step − median|; NaN without a step."""
         steps = self.steps_s
-        return float(np.quantile(np.abs(steps - np.median(steps)), 0.95)) if steps.shape[0] else float("nan")
+        return float(np.quantile(np.abs(steps - self.median_s), 0.95)) if steps.shape[0] else float("nan")
 
     def longest(self, above_s: float = MIN_GAP_S) -> tuple[float, int] | None:
         """Return the longest step above a limit and its start in ns."""

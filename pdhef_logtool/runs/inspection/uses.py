@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping as MappingABC
 
 from pdhef_logtool.estimators.presets import preset_of
-from pdhef_logtool.estimators.table import all_specs, spec_of
+from pdhef_logtool.estimators.table import SPECS, all_specs
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.signals import WHEELS
 
@@ -18,7 +18,7 @@ _WORDS = {
     "speed_m_s": "a speed or wheel speeds",
 }
 #: The estimator that the sentence is about.
-_MAIN = "physics"
+_MAIN = next(spec for spec in SPECS if spec.name == "physics")
 
 
 def usable_signals(mapping: Mapping) -> frozenset[str]:
@@ -34,23 +34,27 @@ def usable_signals(mapping: Mapping) -> frozenset[str]:
 def possible_uses(mapping: Mapping) -> str:
     """Return what can be done with a log that is mapped so."""
     have = usable_signals(mapping)
-    names = [preset_of(s.name) for s in all_specs() if not s.lacking(have) and not s.network and not s.needs_noise]
     uses = []
-    if not spec_of(_MAIN).lacking(have):
-        against = _scored(mapping)
-        uses.append(f"estimate sideslip ({_MAIN} and others){against}")
-    elif names and have:
-        uses.append(f"run {', '.join(list(dict.fromkeys(names))[:3])}{_scored(mapping)}")
-    if mapping.truth and not (names and have):
+    if not _MAIN.lacking(have):
+        uses.append(f"estimate sideslip ({_MAIN.name} and others){_scored(mapping)}")
+    elif have and (names := _estimators_with(have)):
+        uses.append(f"run {', '.join(names[:3])}{_scored(mapping)}")
+    elif mapping.truth:
         uses.append("plot the ground truth")
     if have:
         uses.append("export its signals to Rerun or MCAP")
     return "; ".join(uses) or "list its topics and fields (--fields)"
 
 
+def _estimators_with(have: frozenset[str]) -> list[str]:
+    """Return the presets that need neither further signals nor a network nor noise parameters of the car."""
+    specs = (s for s in all_specs() if not s.lacking(have) and not s.network and not s.needs_noise)
+    return list(dict.fromkeys(preset_of(s.name) for s in specs))
+
+
 def missing_for_sideslip(mapping: Mapping) -> str:
     """Return what sideslip still needs, or would gain most from; empty where nothing is missing."""
-    wanted = spec_of(_MAIN).needs | {"steer_rad"}
+    wanted = _MAIN.needs | {"steer_rad"}
     lacking = sorted(wanted - usable_signals(mapping), key=list(_WORDS).index)
     return ", ".join(_WORDS.get(n, n) for n in lacking)
 
