@@ -190,7 +190,7 @@ class FittedPhysics(Record):
 
 
 class Fit(Record):
-    """``fit.toml``, written by ``pdhef learn --without-truth``: the car's physics as the drives show it.
+    """``fit.toml``, written by ``pdhef learn --stages calibrate``: the car's physics as the drives show it.
 
     The noise in ``filter`` was found together with the values and belongs to them (docs/method.md#identification).
     ``physics`` are those of the filter of that name, whose model has other parts: each filter's are found through

@@ -325,7 +325,7 @@ def test_drives_that_a_network_was_trained_on_are_refused(sample_logs_dir: Path,
     with pytest.raises(UsageError, match="drives of split extrapolation, got drives of test, train"):
         choose_drives(logs, replace(options, split="extrapolation"))
     assert [i.stem for i in choose_drives(logs, replace(options, split="test"))[0]] == ["step"]
-    assert [i.stem for i in choose_drives(logs, replace(options, any_split=True))[0]] == ["dlc", "step"]
+    assert [i.stem for i in choose_drives(logs, replace(options, split="any"))[0]] == ["dlc", "step"]
 
 
 def test_a_drive_of_the_identification_is_told(sample_logs_dir: Path) -> None:
