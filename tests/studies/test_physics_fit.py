@@ -258,7 +258,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize(("make", "kept"), [(rolling_car, {"roll"}), (static_drive, set())])
+@pytest.mark.parametrize(
+    ("make", "kept"), [pytest.param(rolling_car, {"roll"}, marks=pytest.mark.fleet), (static_drive, set())]
+)
 def test_a_car_keeps_the_parts_that_it_has(make, kept: set[str]) -> None:
     one, other = [make(1, 12.0)], [make(2, 12.0)]
     told: list[tuple[str, float]] = []

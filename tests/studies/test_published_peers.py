@@ -76,6 +76,7 @@ def simulated(vehicle: VehicleParameters) -> tuple[Signals, np.ndarray]:
     return signals, np.arctan2(vy, SPEED_M_S)
 
 
+@pytest.mark.fleet  # compiles the peers: a minute
 @pytest.mark.slow
 def test_every_peer_recovers_a_linear_car_within_its_bound():
     vehicle = linear_sedan()
@@ -88,6 +89,7 @@ def test_every_peer_recovers_a_linear_car_within_its_bound():
     assert {name: error for name, error in errors.items() if not error < BOUNDS_DEG[name]} == {}
 
 
+@pytest.mark.fleet  # compiles the peers: a minute
 @pytest.mark.slow
 def test_ground_truth_changes_no_estimate(sample_logs_dir: Path):
     log, vehicle = sample_logs_dir / "step.mcap", default_vehicle()
