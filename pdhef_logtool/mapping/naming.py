@@ -13,10 +13,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
 
+from pdhef_logtool.records.geometry import GRAVITY_M_S2
+
 #: Names whose words, units and meanings are kept: the drives of a fleet have the same ones.
 CACHED_NAMES = 8192
 #: Gravity by which accelerations in g are written.
-G_M_S2 = 9.80665
+G_M_S2 = GRAVITY_M_S2
 
 #: Words, units and rules that names are compared with.
 VOCABULARY = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
