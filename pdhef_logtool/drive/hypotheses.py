@@ -27,10 +27,8 @@ UNRELATED_CORRELATION = 0.25
 #: Typical values that recognise one quantity recorded as another.
 TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M = 16.0, 0.3
 _TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f in (t, 1.0 / t)),)
-#: km/h in a m/s, and m/s in a mile per hour.
-KM_H, MPH = 3.6, 0.44704
 #: Factors between units that mappings confuse for any quantity: degrees, g, km/h.
-FOREIGN = (1.0 / DEGREE, G_M_S2, KM_H)
+FOREIGN = (1.0 / DEGREE, G_M_S2, 3.6)
 #: Factors that differ by less in the logarithm are one unit (km/h and mph are 0.48 apart), and ranges of gains that are
 #: narrower rule out all units but one: wider ones are lengths of any car.
 SAME_FACTOR, DECIDES_UNIT = 0.25, 13.0
@@ -292,8 +290,9 @@ def _together(names: Sequence[str]) -> str:
 def units_of(name: str) -> list[tuple[float, str]]:
     """Return by what a signal is off where its unit is taken for another, and how that is stated."""
     to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
-    of_speeds = [(1.0 / KM_H, "is in km/h"), (KM_H, "was converted from km/h twice")]
-    of_speeds += [(MPH, "is in mph"), (1.0 / MPH, "was converted from mph twice")]
+    km_h, mph = 3.6, 0.44704
+    of_speeds = [(1.0 / km_h, "is in km/h"), (km_h, "was converted from km/h twice")]
+    of_speeds += [(mph, "is in mph"), (1.0 / mph, "was converted from mph twice")]
     if name in ("yaw_rate_rad_s", "roll_rate_rad_s", "pitch_rate_rad_s", "sideslip_rad", "yaw_rad"):
         return to_radians
     if name == "steer_rad":
