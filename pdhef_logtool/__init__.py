@@ -1,4 +1,4 @@
-"""Offline sideslip estimation, scoring and annotation of drive logs: what the command line sits on (docs/api.md)."""
+"""Offline sideslip estimation, scoring and annotation of drive logs: the public interface (docs/api.md)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.runs.frames import score as score
     from pdhef_logtool.runs.inspection import inspect_log as inspect_log
 
-#: Where each name is, ``module`` or ``module:name there``; it is imported when it is first asked for.
+#: Module of each public name, ``module`` or ``module:name in it``.
 _HOMES = {
     "Car": "car.car",
     "ReadOptions": "drive.options",
@@ -54,7 +54,7 @@ __all__ = ["__version__", *sorted(_HOMES)]
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for: ``import pdhef_logtool`` itself loads nothing."""
+    """Import a public name at its first use, so that ``import pdhef_logtool`` stays fast."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, _, own_name = _HOMES[name].partition(":")

@@ -165,7 +165,7 @@ def page(times: int, planted: int, drives: int) -> str:
             "This page shows how often [`pdhef compare`](compare.md) reports a regression, with and without one. "
             "Command: `python -m studies.comparing`.",
             "",
-            f"## Nothing changed: how often the gate closes, of {times:,} relabellings",
+            f"## No change: how often the gate closes, of {times:,} relabellings",
             "",
             f"The paired log ratio of drives has a spread of {SPREAD}, the limit is {LIMIT:.0%}. The last column is "
             "the gate that one would think of first: the ratio of the mean RMSE of both runs above the limit.",
@@ -176,7 +176,7 @@ def page(times: int, planted: int, drives: int) -> str:
             "",
             table(["drives", "normal", "heavy tails"], detected, right_from=0),
             "",
-            f"## Nothing changed, {DAYS * DRIVES_A_DAY} drives from {DAYS} days: how often B is called worse",
+            f"## No change, {DAYS * DRIVES_A_DAY} drives from {DAYS} days: how often B is called worse",
             "",
             "The first column is the share of the variance of log ratios between days. The limit is 0, at which the "
             "nominal rate is 5%.",
@@ -185,7 +185,7 @@ def page(times: int, planted: int, drives: int) -> str:
             "",
             "## A run compared with itself",
             "",
-            "The whole command, from its start to its end; processor time is that of an idle core.",
+            "The whole command, from start to end; processor time on an idle core.",
             "",
             table(["drives", "figures", "verdict", "processor s", "MiB at most"], [cost(drives)], right_from=0),
             "",

@@ -389,9 +389,9 @@ How well the [sideslip reference](estimators.md#reference) agrees with ground tr
 for 1:10 cars). Command: `python -m studies.reference`.
 
 RMSE and ± (RMS of the reference's own standard deviation) in degrees; coverage of its 95 % interval;
-share of the stamps where it is valid, and the RMSE there. *refused*: why no stamp is valid. GNSS
+share of valid stamps, and their RMSE. *refused*: why no stamp is valid. GNSS
 *{made}* of recorded drives is made from their ground truth. Constants were chosen on simulated drives, and recorded
-drives seen meanwhile: development figures. The ground truth of the RAV4 is turned by about 0.8°, that of the Polaris
+drives seen meanwhile: development figures. The ground truth of the RAV4 is turned by about 0.8°, the Polaris's
 by 0.5 to 2.3°.
 
 ## Recorded drives

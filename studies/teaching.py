@@ -75,7 +75,7 @@ CARS = (
 
 PAGE = """# Teaching on recorded drives
 
-This page shows what a car that was taught on one drive with ground truth is worth on another drive of the same car.
+This page shows the errors of a car that was taught on one drive with ground truth, on another drive of the same car.
 Command: `python -m studies.teaching`.
 
 Sideslip RMSE in degrees; in brackets without the constant of each drive, which may be an offset of the ground truth.

@@ -1,37 +1,38 @@
-"""Reports of runs whose figures a test makes up."""
+"""Reports of runs with figures that a test gives."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.results.run_report import (
-    EstimatorFacts,
-    FrictionFacts,
-    LogFacts,
-    ReportFacts,
-    SourceFacts,
-    TruthFacts,
-    build_report,
-)
+from pdhef_logtool.evaluation.standing import Standing
+from pdhef_logtool.results.run_report import build_report, estimator_entry, tool_versions
 from pdhef_logtool.results.selected_estimate import MainFacts
 
 SHA = "ab" * 32
 MODEL = {"physics_sha256": SHA, "options": {"trust": 0.5}}
 MAIN = MainFacts("pd-hef", "evidence", "", False, "zero", ("pd-hef", "physics", "zero"), named=False)
-TRUTH = TruthFacts(
-    quantities=[
-        SourceFacts("vx_m_s", "/ins.vx", "m/s", 9),
-        SourceFacts("vy_m_s", "/ins.vy", "m/s", 9),
-        SourceFacts("sideslip_rad", "derived", "rad", 0, "atan2(v_y, v_x)"),
-    ]
-)
-GNSS = TruthFacts(
-    quantities=[SourceFacts("vx_m_s", "derived", "m/s", 0, "ground speed of /fix.{a,b} taken as v_x, no heading known")]
-)
+
+
+def truth(*quantities: tuple[str, str, str], **changes: Any) -> dict[str, Any]:
+    """Return the ground truth of a report: name, source and derivation of each quantity."""
+    keys = {"unit": "", "samples": 9}
+    entries = [{"name": n, "source": s, "derivation": d, **keys} for n, s, d in quantities]
+    unknown = {"latency_s": None, "not_independent": [], "notes": []}
+    return {"available": bool(entries), "quantities": entries, **unknown, **changes}
+
+
+VELOCITY = ("vx_m_s", "/ins.vx", ""), ("vy_m_s", "/ins.vy", "")
+TRUTH = truth(*VELOCITY, ("sideslip_rad", "derived", "atan2(v_y, v_x)"))
+GNSS = truth(("vx_m_s", "derived", "ground speed of /fix.{a,b} taken as v_x, no heading known"))
+
+
+def friction(source: str, **changes: Any) -> dict[str, Any]:
+    unknown = {"estimated": False, "observable_share": None, "observable_std": None, "summary": ""}
+    return {"source": source, **unknown, **changes}
 
 
 def figures(*given: tuple[str, str, str, float]) -> list[MetricRow]:
@@ -42,22 +43,43 @@ def errors_deg(**by_name: float) -> list[MetricRow]:
     return figures(*((n.replace("_", "-"), "sideslip_rad", "rmse", np.deg2rad(v)) for n, v in by_name.items()))
 
 
-def report(main: MainFacts = MAIN, **changes: Any) -> dict[str, Any]:
-    facts = ReportFacts(
-        log=LogFacts("drive", "drive.mcap", "mcap", SHA, 0, 10_000_000_000),
-        signals=[],
-        missing_signals=[],
-        vehicle_name="sedan",
-        vehicle_sha256=SHA,
-        vehicle_file="golf",
-        vehicle_proven=True,
-        estimators=[
-            EstimatorFacts("zero", causal=True, algorithm={"physics_sha256": None, "options": {}}),
-            EstimatorFacts("physics", causal=True, intervals=["intervals calibrated on x"], algorithm=MODEL),
-            EstimatorFacts("pd-hef", causal=True, intervals=["intervals calibrated on x"], algorithm=MODEL),
+def ran(name: str, **changes: Any) -> dict[str, Any]:
+    return estimator_entry(name, **{"causal": True, "algorithm": MODEL, **changes})
+
+
+def report(
+    main: MainFacts | None = MAIN,
+    standings: Sequence[Standing] = (),
+    *,
+    name: str = "drive",
+    vehicle: dict[str, Any] | None = None,
+    **changes: Any,
+) -> dict[str, Any]:
+    """Return a report; ``vehicle`` : changed entries of the vehicle."""
+    nothing: dict[str, Any] = dict.fromkeys(("metrics", "segments", "losses", "warnings", "remarks", "checks"), ())
+    log = {
+        "name": name, "file": f"{name}.mcap", "kind": "mcap", "sha256": SHA, "signals_sha256": None,
+        "truth_sha256": None, "start_ns": 0, "end_ns": 10_000_000_000, "duration_s": 10.0, "topics": [],
+    }  # fmt: skip
+    car = {
+        "name": "sedan", "sha256": SHA, "file": "golf", "proven": True, "taught": None, "sensors": {}, "assumed": [],
+        "low_speed_blend_m_s": None,
+    }  # fmt: skip
+    content = {
+        "log": log,
+        "mapping": {"signals": [], "missing": []},
+        "vehicle": car | (vehicle or {}),
+        "estimators": [
+            ran("zero", algorithm={"physics_sha256": None, "options": {}}),
+            ran("physics", intervals=["intervals calibrated on x"]),
+            ran("pd-hef", intervals=["intervals calibrated on x"]),
         ],
-        truth=TRUTH,
-        friction=FrictionFacts("option, 0.9"),
-        main=main,
-    )
-    return build_report(replace(facts, **changes))
+        "truth": TRUTH,
+        "setup": None,
+        "friction": friction("option, 0.9"),
+        "self_calibration": None,
+        "reference": None,
+        "ledger": {"samples": []},
+        "versions": tool_versions(),
+    }
+    return build_report(content | nothing | changes, main, standings)

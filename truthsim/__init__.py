@@ -1,4 +1,4 @@
-"""Simulator of a car: vehicle, driver, sensors, and logs as a recorder would leave them.
+"""Simulator of a car: vehicle, driver, sensors, and logs in the format of a recorder.
 
-It shares no code with the estimators and their nominal model: a shared model would hide its own error.
+It shares no code with the estimators and their nominal model, so that common errors cannot remain hidden.
 """

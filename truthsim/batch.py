@@ -1,6 +1,6 @@
-"""Many drives at once: what each is made from, work in processes, and a manifest that does not depend on their number.
+"""Simulate many drives in processes, with a manifest that does not depend on the number of processes.
 
-A drive that is on disk as a manifest has it is kept, so that an interrupted batch goes on where it was.
+A drive on disk that matches its manifest entry is kept, so that an interrupted batch can be resumed.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from truthsim.sensors import SIGNED, SensorNoise
 from truthsim.vehicle_choice import choose_vehicle
 
 MANIFEST = "manifest.json"
-#: Bins of |a_y| over μ g (docs/method.md#evaluation), by name; each from its lower limit on.
+#: Bins of |a_y| over μ g (docs/method.md#evaluation): lower limit by name.
 BINS: dict[str, float] = {"low": 0.0, "middle": 0.3, "high": 0.6}
-#: Drives between two writings of the manifest, which is what an interrupted batch goes on from.
+#: Number of drives between updates of the manifest, from which an interrupted batch is resumed.
 _SAVE_EVERY = 25
-#: Lost drives that an error names.
+#: Maximum number of lost drives in an error.
 _TOLD = 5
 
 
 @dataclass(frozen=True, slots=True)
 class DriveSpec:
-    """All that a drive is made from; ``vehicle`` and ``faults`` as the command line has them."""
+    """Input of a drive; ``vehicle`` and ``faults`` as on the command line."""
 
     manoeuvre: str
     speed_km_h: float
@@ -52,7 +52,7 @@ class DriveSpec:
     keep_spins: bool = False
 
     def simulate(self) -> Drive:
-        """Drive it.
+        """Simulate the drive.
 
         Raises
         ------
@@ -75,7 +75,7 @@ class DriveSpec:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One file of a batch: the first of the candidates that the car survives is written; ``facts`` go to its entry."""
+    """One file of a batch, from the first candidate without loss of control; ``facts`` are added to its entry."""
 
     file: str
     candidates: tuple[DriveSpec, ...]
@@ -83,7 +83,7 @@ class Job:
 
     @property
     def key(self) -> str:
-        """Digest of all that the file depends on; an entry with another key is simulated again."""
+        """Digest of all inputs of the file; an entry with another key is simulated again."""
         text = json.dumps([__version__, [asdict(c) for c in self.candidates]], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -94,7 +94,7 @@ def sensor_noise(values: Mapping[str, float]) -> SensorNoise:
     Raises
     ------
     UsageError
-        There is no such value, or it is no finite number.
+        A value does not exist, or is not finite.
     """
     unknown = [name for name in values if name not in SensorNoise._fields]
     if unknown:
@@ -116,7 +116,7 @@ def time_in_bins_s(drive: Drive) -> dict[str, float]:
 
 
 def make_drive(job: Job, folder: Path) -> dict[str, Any]:
-    """Write the job's file and return its entry; one whose candidates all fail has no ``sha256`` but the reasons."""
+    """Write the job's file and return its entry; if all candidates fail, it has the reasons but no ``sha256``."""
     dropped: list[dict[str, Any]] = []
     for spec in job.candidates:
         try:
@@ -157,19 +157,19 @@ def run_jobs(
     progress: Callable[[str, float], None] | None = None,
     finish: Callable[[list[dict[str, Any]]], Mapping[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """Make the files of the jobs in a folder and write ``manifest.json``; returns the manifest.
+    """Write the files of the jobs to a folder, and ``manifest.json``; return the manifest.
 
     Parameters
     ----------
-    head : what the manifest begins with.
-    processes : how many work at once; the result does not depend on it.
-    finish : further entries of the manifest from those of all drives.
+    head : first entries of the manifest.
+    processes : number of processes; the result does not depend on it.
+    finish : function from the entries of all drives to further entries of the manifest.
 
     Raises
     ------
     UsageError : ``processes`` is below 1.
     OutputError : the folder or a file cannot be written.
-    SimulationError : the process of a drive died twice; all others are made.
+    SimulationError : the process of a drive crashed twice; all others are complete.
     """
     if processes < 1:
         raise UsageError(expected="at least one process", got=str(processes), where="--jobs")
@@ -202,7 +202,7 @@ def run_jobs(
             expected=f"{len(jobs)} drives",
             got=f"{len(lost)} that were lost ({'; '.join(lost[:_TOLD])}{'; …' if len(lost) > _TOLD else ''})",
             where="--jobs",
-            remedy="the same command again makes what is missing",
+            remedy="repeat the command to simulate the missing drives",
         )
     return manifest
 
@@ -215,7 +215,7 @@ def _made(folder: Path, job: Job, _tell: Tell) -> dict[str, Any] | PdhefError:
 
 
 def _kept(jobs: Sequence[Job], folder: Path) -> dict[int, dict[str, Any]]:
-    """Entries of an earlier manifest whose files are there with the right content."""
+    """Return the entries of an earlier manifest with unchanged files."""
     try:
         old = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["drives"]
         entries_by_file = {entry["file"]: entry for entry in old}
@@ -237,7 +237,7 @@ def _write_manifest(
     folder: Path, head: Mapping[str, Any], entries: list[dict[str, Any]], *, complete: bool
 ) -> dict[str, Any]:
     manifest = {"format": 1, **head, "complete": complete, "drives": entries}
-    # Through JSON, so that a fresh manifest and one read back are the same.
+    # Converted via JSON, so that a new manifest equals one that is read back.
     text = json.dumps(manifest, indent=1, allow_nan=False)
     write_bytes(folder / MANIFEST, (text + "\n").encode())
     return dict(json.loads(text))

@@ -23,16 +23,16 @@ from truthsim.manoeuvres import MANOEUVRES
 from truthsim.suite import is_held_out
 
 DURATION_S = 12.5
-#: Seconds in a bin of |a_y| over μ g from which on a drive counts there.
+#: Minimum time in a bin of |a_y| over μ g for a drive to count in it.
 BIN_LEAST_S = 0.3
-#: Manoeuvres that go through all bins, for the rows that are driven again with one thing changed.
+#: Manoeuvres through all bins, for rows with one changed condition.
 BASE = ("dlc", "sine-sweep", "ramp-steer", "sine-with-dwell")
 BASE_SPEEDS_KM_H = (60.0, 110.0)
 BASE_FRICTIONS = (0.4, 1.0)
 #: Peak |a_y| over μ g of the base drives: above 0.6, so that each has samples in every bin.
 BASE_PEAK_SHARES = (0.68, 0.92)
 BELOW_TRAINING = (0.15, 0.25)
-#: Steps down by which a drive that ends in a spin is tried again.
+#: Amplitude factors to try in turn if a drive ends in a spin.
 _GENTLER = (1.0, 0.9, 0.8, 0.7, 0.55, 0.4)
 
 
@@ -42,9 +42,9 @@ class Row:
 
     Attributes
     ----------
-    draw : the drive of a number, from a stream of its own and the base drive of that number.
-    assume : changed inputs of the estimators, for the reader of the manifest.
-    reuses : the row whose drives these are.
+    draw : returns a drive from a random stream, the base drive with the same number, and the number.
+    assume : changed inputs of the estimators, for readers of the manifest.
+    reuses : name of the row with the drives.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Row:
 
 
 def _base(rng: np.random.Generator) -> DriveSpec:
-    """Draw a drive inside the training range and outside the cells that are held out."""
+    """Draw a drive inside the training range and outside the held-out cells."""
     while True:
         name = BASE[int(rng.integers(len(BASE)))]
         speed, friction = rng.uniform(*BASE_SPEEDS_KM_H), rng.uniform(*BASE_FRICTIONS)
@@ -84,7 +84,7 @@ def _held_out(rng: np.random.Generator, _base_spec: DriveSpec, _index: int) -> D
 
 
 def _standard(name: str) -> Callable[[np.random.Generator, DriveSpec, int], DriveSpec]:
-    """Return the manoeuvre at its own speed and friction, with new sensor errors each time."""
+    """Return the manoeuvre at its default speed and friction, with new sensor errors each time."""
 
     def draw(rng: np.random.Generator, _base_spec: DriveSpec, _index: int) -> DriveSpec:
         chosen = MANOEUVRES[name]
@@ -139,7 +139,7 @@ def _always(*faults: str) -> Callable[[np.random.Generator, DriveSpec, int], Dri
 
 
 def _biased(rng: np.random.Generator, base: DriveSpec, _index: int) -> DriveSpec:
-    """Three times the usual 1-sigma bias, to either side, on every channel that has one."""
+    """Return the drive with three times the usual 1-sigma bias, of either sign, on every channel with a bias."""
     signs = rng.choice([-1.0, 1.0], size=4)
     values = zip(("ax", "ay", "yaw_rate", "steer"), (0.24, 0.24, 0.0045, 0.0024), signs.tolist(), strict=True)
     return replace(base, faults=tuple(f"bias{sign * size:g}:{name}:0:end" for name, size, sign in values))
@@ -178,9 +178,9 @@ ROW_NAMES = tuple(row.name for row in ROWS)
 
 
 def plan_conditions(drives: int, seed: int, rows: Sequence[str] | None = None) -> tuple[list[Job], list[Row]]:
-    """Draw the drives of the rows named (all when None); returns the jobs and the rows.
+    """Draw the drives of the named rows (all if None); return the jobs and the rows.
 
-    A row that reuses another's drives brings that row with it.
+    A row that reuses another row's drives includes that row.
 
     Raises
     ------
@@ -221,7 +221,7 @@ def write_conditions(
 ) -> dict[str, Any]:
     """Write the drives of the condition table and their manifest into a folder.
 
-    Files that are there already as they should be are kept.
+    Existing files with the right content are kept.
 
     Raises
     ------

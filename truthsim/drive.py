@@ -1,4 +1,4 @@
-"""Simulate a drive: plan, scale, drive, sense; and write it as the log that a recorder would leave."""
+"""Simulate a drive: plan, scale, drive, measure; and write it as a recorder's log."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from truthsim.recording import PARTS, topics_of
 from truthsim.sensors import IMU_PERIOD_S, STEER_PHASE_S, WHEEL_PHASE_S, SensorChannel, SensorNoise, sense
 from truthsim.vehicle import OBSERVED, Vehicle
 
-#: 2026-01-01T00:00:00Z, when every simulated drive begins.
+#: 2026-01-01T00:00:00Z, the start of every simulated drive.
 START_NS = 1_767_225_600_000_000_000
 
-#: What the default vehicle is called.
+#: Name of the default vehicle.
 DEFAULT_VEHICLE = "sedan"
 
 SPIN_RAD = math.radians(20.0)
@@ -43,7 +43,7 @@ _SPIN_MIN_SPEED_M_S = 3.0
 _STEER_LIMIT_RAD = 0.6
 
 
-#: A wheel without load for this long has left the road; shorter than that it bounced.
+#: Minimum time without load for a wheel to count as lifted; a shorter time is a bounce.
 _LIFT_S = 0.05
 
 
@@ -53,17 +53,17 @@ class Drive:
 
     Attributes
     ----------
-    manoeuvre, speed_km_h, friction, seed, duration_s, amplitude : what was asked for.
-    scale : the amplitude found, in the manoeuvre's own unit.
+    manoeuvre, speed_km_h, friction, seed, duration_s, amplitude : requested values.
+    scale : the resulting amplitude, in the unit of the manoeuvre.
     start_ns : time 0 of the log.
     times_s : [N], 100 Hz.
     truth : ground truth [N] by the names of ``truthsim.vehicle.OBSERVED``, ``sideslip_rad`` and ``friction`` (mean of
         the wheels).
     channels : ``imu``, ``steering``, ``wheels``, ``rtk``, ``fix``, with the faults in them.
-    vehicle, vehicle_name, noise, faults : what they were made with.
+    vehicle, vehicle_name, noise, faults : settings of the simulation.
     rtk_rate_hz : rate of ``rtk`` and of the exact ground truth in a written log.
     peak_ay_m_s2, peak_sideslip_rad : largest absolute values; sideslip where the car moves faster than 3 m/s.
-    spun : the peak sideslip went beyond 20 degrees.
+    spun : the peak sideslip exceeded 20 degrees.
     lifted : a wheel left the road for 50 ms or longer.
     notes : remarks for the user, one sentence each.
     """
@@ -92,7 +92,7 @@ class Drive:
 
     @property
     def command(self) -> str:
-        """The command line that makes this drive again."""
+        """The command line that repeats this drive."""
         chosen = MANOEUVRES[self.manoeuvre]
         words = [
             f"pdhef simulate {self.manoeuvre} --speed {_exact(self.speed_km_h)} --mu {_exact(self.friction)}",
@@ -164,7 +164,7 @@ class Drive:
 
 
 def _exact(value: float) -> str:
-    """Shortest text that reads back as the same number, without a needless fraction."""
+    """Return the shortest text that reads back as the same number, without an unnecessary fraction."""
     return str(int(value)) if value == int(value) else repr(float(value))
 
 
@@ -184,23 +184,23 @@ def simulate_drive(
     keep_spins: bool = False,
     tolerance: float = 0.002,
 ) -> Drive:
-    """Simulate a manoeuvre of ``truthsim.manoeuvres.MANOEUVRES``; what is None takes the manoeuvre's default.
+    """Simulate a manoeuvre of ``truthsim.manoeuvres.MANOEUVRES``; None selects the manoeuvre's default.
 
     Parameters
     ----------
-    amplitude : factor on the manoeuvre's own: of its share of μ g, of its standard's angle, or of its course.
-    vehicle, vehicle_name : what drives, and what the command line calls it.
-    keep_spins : keep a drive whose sideslip exceeds 20 degrees or in which a wheel lifts. Else the amplitude of a
-        manoeuvre that is measured by an angle is lowered until it does not (with a note), one that is scaled to
-        μ g stays below such an amplitude, and one with a course of its own is an error.
-    tolerance : how near the peak must come to its share of μ g.
+    amplitude : factor on the manoeuvre's amplitude: its share of μ g, its standard angle, or its course.
+    vehicle, vehicle_name : the vehicle, and its name on the command line.
+    keep_spins : keep a drive with a sideslip above 20 degrees or a lifted wheel. Otherwise, a manoeuvre defined by an
+        angle is repeated with lower amplitudes until neither occurs (with a note), a manoeuvre scaled to μ g is limited
+        to such amplitudes, and for a manoeuvre with a fixed course this is an error.
+    tolerance : relative tolerance of the peak to its share of μ g.
 
     Raises
     ------
     UsageError
         The manoeuvre is unknown.
     SimulationError
-        A value is outside what the simulator can do, or the car spun.
+        A value is outside the simulator's range, or the car spun.
     """
     chosen = MANOEUVRES.get(manoeuvre)
     if chosen is None:
@@ -208,7 +208,7 @@ def simulate_drive(
             expected=f"one of {', '.join(MANOEUVRES)}",
             got=repr(manoeuvre),
             where="manoeuvre",
-            remedy="pdhef simulate --list shows what each does",
+            remedy="pdhef simulate --list describes the manoeuvres",
         )
     speed_km_h = chosen.speed_km_h if speed_km_h is None else float(speed_km_h)
     friction = chosen.friction if friction is None else float(friction)
@@ -299,7 +299,7 @@ def _check(
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a motion went: peaks, and whether the car was lost."""
+    """Outcome of a motion: peaks, spin and lifted wheels."""
 
     peak_ay_m_s2: float
     peak_sideslip_rad: float
@@ -327,7 +327,7 @@ def judge(motion: Motion) -> Outcome:
     Raises
     ------
     SimulationError
-        It left the finite numbers.
+        The state is not finite.
     """
     if not np.isfinite(motion.observed[:, 0]).all():
         raise SimulationError(
@@ -372,7 +372,7 @@ def reference_steer_rad(speed_m_s: float, friction: float, vehicle: Vehicle) -> 
 
 
 def _largest_safe_scale(chosen: Manoeuvre, request: Request, vehicle: Vehicle, notes: list[str]) -> float:
-    """Lower the amplitude by tenths until the car keeps its course and its wheels on the road."""
+    """Lower the amplitude in steps of 10 % until the car keeps its course and its wheels on the road."""
     scale = request.scale
     for _ in range(20):
         outcome = judge(simulate_motion(chosen.plan(replace(request, scale=scale)), request.friction, vehicle=vehicle))
@@ -386,7 +386,7 @@ def _largest_safe_scale(chosen: Manoeuvre, request: Request, vehicle: Vehicle, n
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """The |a_y| (m/s²) that a manoeuvre is scaled to, how near to come, and whether a spin may count."""
+    """The |a_y| (m/s²) to scale a manoeuvre to, its tolerance, and whether spins are allowed."""
 
     chosen: Manoeuvre
     a_y_m_s2: float
@@ -395,10 +395,10 @@ class Goal:
 
 
 def search_scale(goal: Goal, request: Request, vehicle: Vehicle, notes: list[str]) -> float:
-    """Find the scale at which the |a_y| reaches its goal, without a spin or a lifted wheel unless they may be kept.
+    """Search for the scale with the |a_y| of the goal, without a spin or a lifted wheel unless they are allowed.
 
-    From a guess, by proportion while all results lie on one side, then by interpolation within the bracket. Where the
-    goal cannot be had, the scale that comes nearest is taken, with a note.
+    The search starts from a guess, scales proportionally until the goal is bracketed, then interpolates. If the goal is
+    not reached, the scale with the smallest difference is returned, with a note.
     """
     low, high = (0.0, 0.0), (math.inf, math.nan)
     best_scale, best_value = 0.0, 0.0
@@ -438,7 +438,7 @@ def search_scale(goal: Goal, request: Request, vehicle: Vehicle, notes: list[str
 
 
 def _achieved(goal: Goal, request: Request, vehicle: Vehicle) -> float:
-    """|a_y| at a scale; infinite where the car is lost and may not be, so that the search stays below it."""
+    """Return |a_y| at a scale; infinite for a lost car unless allowed, so that the search stays below this scale."""
     plan = goal.chosen.plan(request)
     if plan.steer_rad.size and np.abs(plan.steer_rad).max() > _STEER_LIMIT_RAD:
         return math.inf
@@ -453,7 +453,7 @@ def _achieved(goal: Goal, request: Request, vehicle: Vehicle) -> float:
     return float(np.abs(motion.column("ay_m_s2")[inside]).mean())
 
 
-#: Length of the pieces that a log is written in, so that the messages of a long drive are never in memory at once.
+#: Length of the pieces of a log for writing, which limits the memory for the messages of a long drive.
 _WRITE_NS = 60_000_000_000
 
 
@@ -465,8 +465,8 @@ def write_drive(drive: Drive, path: Path, *, without: Sequence[str] = (), steeri
 
     Parameters
     ----------
-    without : parts (keys of ``truthsim.recording.PARTS``) that the recorder did not record.
-    steering_wheel : record the angle at the steering wheel too.
+    without : parts (keys of ``truthsim.recording.PARTS``) to omit.
+    steering_wheel : also record the angle at the steering wheel.
 
     Raises
     ------

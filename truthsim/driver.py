@@ -46,7 +46,7 @@ PATH_X, PATH_Y, PATH_YAW, PATH_SPEED = range(4)
 def track_progress_m(
     path: FloatArray, step_m: float, progress_m: float, x_m: float, y_m: float, ahead_m: float
 ) -> float:
-    """Arc length of the path's point beside the car, found by stepping on from the last one; never backwards."""
+    """Return the arc length of the path's point beside the car, searched forward from the previous one."""
     progress = progress_m
     for _ in range(3):
         yaw = interpolated(path, progress / step_m, PATH_YAW)
@@ -68,9 +68,9 @@ def preview_steer_rad(
     course_rad: float,
     speed_m_s: float,
 ) -> float:
-    """Road-wheel angle whose circle leads from the present course to the path's point at the preview distance.
+    """Return the road-wheel angle of the circle from the present course to the path's point at the preview distance.
 
-    A straight path's point dead ahead asks for none; e to the side at distance d asks for curvature 2 e / d².
+    A point straight ahead needs no steering; a point at lateral offset e and distance d needs the curvature 2 e / d².
     """
     distance = max(driver.preview_min_m, driver.preview_s * speed_m_s)
     last_m = step_m * (path.shape[0] - 1)
@@ -91,7 +91,7 @@ def preview_steer_rad(
 
 @register_jitable
 def move_steering(driver: Driver, memory: FloatArray, demand_rad: float, dt_s: float) -> float:
-    """Let the hands follow the demand (first-order lag, limited rate); returns the mean road-wheel angle in rad."""
+    """Move the steering towards the demand (first-order lag, limited rate); return the mean road-wheel angle in rad."""
     rate = (demand_rad - memory[STEER]) / driver.steering_lag_s
     rate = min(max(rate, -driver.steer_rate_limit_rad_s), driver.steer_rate_limit_rad_s)
     memory[STEER] += rate * dt_s
@@ -119,10 +119,10 @@ def pedal_torques_n_m(
 
 @register_jitable
 def target_speed_m_s(path: FloatArray, step_m: float, stops: FloatArray, memory: FloatArray) -> tuple[float, float]:
-    """Speed (m/s) that the path asks for beside the car, and its rate (m/s²) along the path.
+    """Return the target speed of the path beside the car (m/s), and its rate along the path (m/s²).
 
-    ``stops`` is [K, 2]: arc length in m, dwell in s. A driver does not roll past a stop that is still to be made, and
-    sets off from one towards the speed a little further on.
+    ``stops`` is [K, 2]: arc length in m, dwell in s. The driver does not pass a stop before its dwell, and starts from
+    it towards the speed a little further ahead.
     """
     k = int(memory[STOP])
     at_m = memory[PROGRESS]

@@ -1,4 +1,4 @@
-"""Injected sensor faults: what goes wrong, with which sensor, from when until when.
+"""Injected sensor faults: kind, sensor, start and end of each.
 
 A fault is written ``KIND:WHAT:START:END`` with times in seconds of the drive (``end`` for the drive's end):
 
@@ -17,7 +17,7 @@ A fault is written ``KIND:WHAT:START:END`` with times in seconds of the drive (`
 
 What: a message (``imu``, ``steering``, ``wheels``, ``rtk``, ``all`` for the three sensors) or one field of one (``ax``,
 ``ay``, ``az``, ``roll_rate``, ``pitch_rate``, ``yaw_rate``, ``steer``, ``wheel_fl`` … ``wheel_rr``). Faults are applied
-in the order given, to the finished readings: outside its interval and its field, a fault changes nothing.
+in the given order to the finished readings; samples outside of a fault's interval and field are unchanged.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _MESSAGE_ONLY = ("delay", "jump")
 
 MESSAGES = ("imu", "steering", "wheels", "rtk")
 _SENSORS = ("imu", "steering", "wheels")
-#: Fields that may fail alone, by the message that carries them.
+#: Fields that may fail individually, with their message.
 FIELDS: dict[str, tuple[str, str]] = {
     "ax": ("imu", "ax_m_s2"),
     "ay": ("imu", "ay_m_s2"),
@@ -54,7 +54,7 @@ FIELDS: dict[str, tuple[str, str]] = {
     "steer": ("steering", "steer_rad"),
     **{f"wheel_{w}": ("wheels", f"{w}_m_s") for w in WHEELS},
 }
-#: What a fault can hit, by its code in ``truthsim_msgs/msg/SensorFault``.
+#: Messages and fields that a fault may affect, by their code in ``truthsim_msgs/msg/SensorFault``.
 TARGETS = (*MESSAGES, "all", *FIELDS)
 
 
@@ -81,7 +81,7 @@ def parse_fault(text: str) -> Fault:
     Raises
     ------
     UsageError
-        The text is no fault.
+        The text is not a valid fault.
     """
 
     def wrong(expected: str) -> UsageError:
@@ -118,7 +118,7 @@ def parse_fault(text: str) -> Fault:
 
 
 def rtk_outages(faults: Sequence[Fault]) -> list[Outage]:
-    """The faults that take the RTK's fix, as ``truthsim.sensors.sense`` wants them."""
+    """Return the outages of the RTK fix by faults, for ``truthsim.sensors.sense``."""
     quality = {"float": RTK_FLOAT, "lost": RTK_LOST}
     return [Outage(f.start_s, f.end_s, quality[f.kind]) for f in faults if f.kind in quality]
 
@@ -126,7 +126,7 @@ def rtk_outages(faults: Sequence[Fault]) -> list[Outage]:
 def apply_faults(
     channels: Mapping[str, SensorChannel], faults: Sequence[Fault], noise: SensorNoise, seed: int
 ) -> dict[str, SensorChannel]:
-    """Return the channels with the faults in them; those that no fault hits are returned as they are."""
+    """Return the channels with the faults applied; channels without faults are returned unchanged."""
     faulty = dict(channels)
     for i, fault in enumerate(faults):
         rng = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(200, i)))
@@ -148,7 +148,7 @@ def _spoil(channel: SensorChannel, fault: Fault, noise: SensorNoise, rng: np.ran
     if fault.kind in ("float", "lost") or not inside.any():
         return channel
     if fault.kind == "delay":
-        # Messages keep their order: what comes right after the fault waits for the last of it.
+        # Messages keep their order: messages after the fault are delayed until its last message.
         late = np.maximum.accumulate(channel.arrival_s + np.where(inside, 1e-3 * fault.value, 0.0))
         return SensorChannel(channel.times_s, late, channel.fields)
     if fault.kind == "jump":
@@ -171,7 +171,7 @@ def _spoil(channel: SensorChannel, fault: Fault, noise: SensorNoise, rng: np.ran
 
 
 def _steering_wheel(channel: SensorChannel, steer: FloatArray, inside: BoolArray) -> FloatArray:
-    """Both readings come from one sensor: the steering wheel's angle follows the road wheels'."""
+    """Return the steering wheel's angle for a road-wheel angle, as one sensor provides both."""
     before, wheel = channel.fields["steer_rad"], channel.fields["steering_wheel_rad"]
     turned = np.abs(before) > 0.0
     ratio = float(np.median(wheel[turned] / before[turned])) if turned.any() else 1.0
@@ -191,7 +191,7 @@ def _fault_value(
         return np.full_like(values, np.nan)
     if fault.kind == "bias":
         return _as_read(values + fault.value, name, noise)
-    # Independent noise on top, so that both together have the sigma asked for.
+    # Add independent noise, so that the total has the requested sigma.
     more = _sigma(name, noise) * np.sqrt(fault.value**2 - 1.0)
     return _as_read(values + student_t(rng, more, values.shape[0]), name, noise)
 
@@ -205,7 +205,7 @@ def _sigma(name: str, noise: SensorNoise) -> float:
 
 
 def _as_read(values: FloatArray, name: str, noise: SensorNoise) -> FloatArray:
-    """Steps and full scale of the sensor, which a fault does not lift."""
+    """Apply the resolution and full scale of the sensor to faulty values."""
     if name.endswith("m_s2"):
         return quantised(values, noise.acceleration_range_m_s2)
     if name.endswith("rate_rad_s"):

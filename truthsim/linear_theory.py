@@ -1,6 +1,6 @@
 """Textbook linear theory of a vehicle, for comparison with the simulator.
 
-Nothing here shares a line with the simulation: gradients are closed forms, frequency responses are solved from the
+This module shares no code with the simulation: gradients are closed forms; frequency responses are solved from the
 linear equations of the single-track model with relaxing tyres, a rolling body and axles that roll on their tyres.
 """
 
@@ -42,7 +42,7 @@ def understeer_gradient_rad_per_m_s2(vehicle: Vehicle, friction: float) -> float
 
 
 class _Roll:
-    """Roll stiffness, damping and arms of a vehicle, as linear theory has them."""
+    """Roll stiffness, damping and arms of a vehicle in linear theory."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         half_square = 0.5 * vehicle.track_m**2
@@ -73,7 +73,7 @@ def steady_roll(vehicle: Vehicle) -> tuple[float, tuple[float, float]]:
     """Roll angle (rad) and load transfer (N, inner to outer wheel, front and rear) per lateral acceleration (m/s²).
 
     Springs and bars of an axle are in series with its tyres. The body's moment about the roll axis is
-    m_s h_arm (a_y + g φ); what the links of an axle carry (roll centre, its own mass) reaches its tyres alone.
+    m_s h_arm (a_y + g φ); forces in the links of an axle (roll centre, axle mass) act on its tyres only.
     """
     roll = _Roll(vehicle)
     lf, lr, radius = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m, vehicle.wheel_radius_m
@@ -114,7 +114,7 @@ def frequency_response(
     comply = (vehicle.front_compliance_rad_per_n / give, -vehicle.rear_compliance_rad_per_n / give)
     relax = tuple(1.0 + t.lateral_relaxation_m / v * s for t in (vehicle.front_tyre, vehicle.rear_tyre))
     lean = roll.sprung / vehicle.mass_kg * roll.arm
-    # Yawing must also spin the outer wheels up and the inner ones down.
+    # Yawing also changes the spin of outer and inner wheels.
     spin_inertia = (vehicle.front_wheel_inertia_kg_m2 + vehicle.rear_wheel_inertia_kg_m2) * track**2 / (2 * radius**2)
     inertia = vehicle.roll_inertia_kg_m2 + roll.sprung * roll.arm**2 * roll.unsprung / vehicle.mass_kg
     v_y, r, body, a_y = 0, 1, 4, 7
@@ -136,7 +136,7 @@ def frequency_response(
         a[3, body] += spring
         a[3, axle] -= spring
         a[turn, axle] = roll.axle_inertia[i] * s**2 + spring + tyre
-        # The axle feels the sideways acceleration of the wheels, which the leaning body adds to.
+        # The axle has the lateral acceleration of the wheels, to which the leaning body contributes.
         arm = (radius - roll.centres[i]) * roll.axle_mass[i]
         a[turn, body] = -spring - arm * lean * s**2
         a[turn, force] = -roll.centres[i]

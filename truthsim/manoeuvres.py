@@ -1,8 +1,8 @@
-"""The manoeuvres: what the driver is asked to do, as steering tables or as paths with speeds, stops and roads.
+"""The manoeuvres: steering tables, or paths with speeds, stops and roads, for the driver.
 
 A manoeuvre is planned for a speed, a friction, a seed, a duration and a scale. Its amplitude is one of three things:
 ``peak_share`` of μ g, for which ``truthsim.drive`` searches the scale; a multiple of the angle at which a slow ramp
-reaches 0.3 g (FMVSS 126 and NHTSA's fishhook), which is measured first; or the course itself.
+reaches 0.3 g (FMVSS 126 and NHTSA's fishhook), which is measured first; or the course.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ WHEELBASE_M = 2.87
 STEERING_RATIO = 16.0
 #: Brake torque that slows the default car by 1 m/s²: 1440 kg · 0.30 m.
 TORQUE_PER_BRAKING = 432.0
-#: Understeer that the guesses of scale 1 assume, rad per m/s².
+#: Understeer assumed in the initial guess of the scale, rad per m/s².
 _GUESSED_UNDERSTEER = 0.0035
-#: The friction of a dry test track, for which the standards' angles are meant.
+#: Friction of a dry test track, to which the standards' angles refer.
 _TRACK_FRICTION = 0.9
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What a plan is made for.
+    """Input of a plan.
 
     Attributes
     ----------
@@ -61,21 +61,21 @@ class Request:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """What the driver will do.
+    """Plan of a drive for the driver.
 
     Attributes
     ----------
-    start_speed_m_s : running straight at this speed at time 0.
-    steer_rad : mean road-wheel angle every 1 ms, [duration / 1 ms + 1]; empty when a path is followed.
-    path : x, y (m), yaw (rad), speed (m/s) every ``PATH_STEP_M``, [P, 4]; empty when the steering is given.
+    start_speed_m_s : speed of straight running at time 0.
+    steer_rad : mean road-wheel angle every 1 ms, [duration / 1 ms + 1]; empty if a path is followed.
+    path : x, y (m), yaw (rad), speed (m/s) every ``PATH_STEP_M``, [P, 4]; empty if ``steer_rad`` is used.
     stops : arc length (m) and dwell (s) of the stops, [K, 2].
     torque_n_m : drive and brake torque (N m, all wheels, at least 0) every 1 ms, [duration / 1 ms + 1, 2]; rows of NaN
         leave the pedals to the driver, who controls the speed. Empty: the driver throughout.
     road : friction under the left and the right wheels, bank (rad) and grade (rad) every ``PATH_STEP_M`` of the
-        distance driven (along the path where one is followed), [R, 4]; beyond its end the last row applies. Empty:
-        level, the same friction everywhere. Bank is positive where the road leans to the right (its left edge higher),
-        as a car's roll; grade is positive uphill.
-    goal_window_s : where the mean |a_y| is what the scale is searched for; None: the peak over the whole drive.
+        distance driven (along the path if one is followed), [R, 4]; beyond its end the last row applies. Empty: level,
+        the same friction everywhere. Bank is positive if the road leans to the right (its left edge higher), as a
+        car's roll; grade is positive uphill.
+    goal_window_s : interval for the mean |a_y| to scale; None: the peak over the whole drive.
     """
 
     start_speed_m_s: float
@@ -95,11 +95,11 @@ class Manoeuvre:
     Attributes
     ----------
     default_duration_s : duration in s by speed in m/s.
-    rtk_rate_hz : default rate of the ground truth; long drives take less.
-    peak_share : goal |a_y| over μ g that the scale is searched for; None where nothing is searched.
-    least_share : peak |a_y| over μ g below which the manoeuvre has failed its purpose.
+    rtk_rate_hz : default rate of the ground truth; lower for long drives.
+    peak_share : goal of |a_y| over μ g for the search of the scale; None for no search.
+    least_share : minimum peak |a_y| over μ g for a meaningful manoeuvre.
     uses_reference : the amplitude is a multiple of the angle at 0.3 g.
-    top_speed_km_h : above it the course cannot be driven.
+    top_speed_km_h : highest speed at which the course can be driven.
     """
 
     name: str
@@ -121,12 +121,12 @@ class Manoeuvre:
 
 
 def reference_a_y_m_s2(friction: float) -> float:
-    """Lateral acceleration of the slow ramp at which FMVSS 126 reads its angle: 0.3 g, less on a slippery road."""
+    """Return the lateral acceleration of the slow ramp for the reference angle (FMVSS 126): 0.3 g, less if slippery."""
     return 0.3 * GRAVITY_M_S2 * min(1.0, friction / _TRACK_FRICTION)
 
 
 def steer_for(a_y_m_s2: float, speed_m_s: float) -> float:
-    """Road-wheel angle (rad) that a linear car with a guessed understeer needs for a lateral acceleration."""
+    """Return the road-wheel angle (rad) for a lateral acceleration, for a linear car with a guessed understeer."""
     return a_y_m_s2 * (WHEELBASE_M / speed_m_s**2 + _GUESSED_UNDERSTEER)
 
 
@@ -135,7 +135,7 @@ def _times_s(duration_s: float) -> FloatArray:
 
 
 def _coasting_from(start_s: float, duration_s: float) -> FloatArray:
-    """Pedal torques of a driver who takes the foot off the throttle at a time."""
+    """Return the pedal torques of a driver who releases the throttle at a time."""
     late = _times_s(duration_s) >= start_s
     return np.where(late[:, None], 0.0, np.full((1, 2), np.nan))
 
@@ -163,7 +163,7 @@ _RUN_OUT_S = 3.0
 
 
 def _double_lane_change(request: Request) -> Plan:
-    """ISO 3888-1 course, the sideways offset times ``scale``, driven closed loop after two seconds straight."""
+    """Plan the ISO 3888-1 course, lateral offset times ``scale``, driven closed loop after two seconds straight."""
     entry, first, side, second, _, _ = ISO_3888_1_M
     start = _RUN_IN_S * request.speed_m_s + entry
     length = request.speed_m_s * request.duration_s + 50.0
@@ -188,9 +188,9 @@ _LINE_RUN_M = 20.0
 
 
 def iso_3888_2_corridor_m(along_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest lateral place [N] of the middle of a car in the lanes, by the distance along the course.
+    """Return the lateral limits [N] for the middle of a car in the lanes, by the distance along the course.
 
-    The entry lane's middle is 0; between the lanes there is no bound, which is ±infinity.
+    The entry lane's middle is 0; between the lanes the limits are infinite.
     """
     entry, side, leave = ISO_3888_2_WIDTHS_M
     edges = np.cumsum([0.0, *ISO_3888_2_M])
@@ -208,10 +208,10 @@ def iso_3888_2_corridor_m(along_m: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @cache
 def iso_3888_2_line_m() -> tuple[float, ...]:
-    """Lateral place every ``PATH_STEP_M`` of the line through the lanes whose largest curvature is least.
+    """Return the lateral position every ``PATH_STEP_M`` of the line through the lanes with the least maximum curvature.
 
-    A practised driver uses the lanes' whole width. Linear programme: the largest second derivative, and with it some of
-    the largest third, which is how fast the steering must be turned.
+    A practised driver uses the full width of the lanes. Linear programme: minimize the largest second derivative, plus
+    some of the largest third derivative, which corresponds to the steering rate.
     """
     from scipy.optimize import linprog
 
@@ -359,7 +359,7 @@ def _brake_in_turn(request: Request) -> Plan:
 
 
 def _slowed_in_turn(request: Request, slowing_m_s2: float, *, rise_s: float) -> Plan:
-    """Return a steady bend whose steering is held, with a brake torque from ``BRAKE_AT_S`` on, scaled to μ."""
+    """Return a steady bend with constant steering, and a brake torque from ``BRAKE_AT_S`` on, scaled to μ."""
     t = _times_s(request.duration_s)
     top = steer_for(0.5 * request.friction * GRAVITY_M_S2, request.speed_m_s)
     press = np.clip((t - BRAKE_AT_S) / rise_s, 0.0, 1.0)
@@ -428,7 +428,7 @@ JUMP_SHARE = 0.5
 
 
 def _friction_jump(request: Request) -> Plan:
-    """A slalom of 0.5 Hz over a road whose second third has half the friction."""
+    """Plan a slalom of 0.5 Hz over a road with half the friction in its second third."""
     t = np.maximum(_times_s(request.duration_s) - 1.0, 0.0)
     top = steer_for(0.6 * request.friction * GRAVITY_M_S2, request.speed_m_s)
     third_m = request.speed_m_s * request.duration_s / 3.0

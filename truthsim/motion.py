@@ -1,4 +1,4 @@
-"""Driver and vehicle in one compiled loop: a plan goes in, the vehicle's motion comes out."""
+"""Simulate a plan: driver and vehicle in one compiled loop."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from truthsim.vehicle import (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """What the vehicle did.
+    """Recorded motion of the vehicle.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Motion:
         return self.observed[:, phase, OBSERVED.index(name)]
 
 
-# positional: it is compiled and called in one place, just below, with the columns of one record
+# positional: called only below, with the columns of one record
 @njit(cache=True)
 def _loop(
     start_speed_m_s: float,
@@ -72,7 +72,7 @@ def _loop(
     substeps: int,
     observed: FloatArray,
 ) -> None:
-    """Drive and write what is observed to ``observed`` [rows, phases, columns]."""
+    """Drive, and write the observed quantities to ``observed`` [rows, phases, columns]."""
     follows = path.shape[0] > 0
     memory = np.zeros(MEMORY_SIZE)
     scratch, stage, view = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(OBSERVED_SIZE)
@@ -149,12 +149,12 @@ def simulate_motion(
     phases_s: tuple[float, ...] = (0.0,),
     substeps: int = 1,
 ) -> Motion:
-    """Drive a plan (RK4 at 1 ms over ``substeps``) and record what can be observed.
+    """Simulate a plan (RK4 at 1 ms over ``substeps``) and record the observable quantities.
 
     Parameters
     ----------
-    friction : of the road under all wheels, unless the plan brings a road of its own.
-    period_s, phases_s : when to record, in whole milliseconds; phases ascend and lie in [0, period).
+    friction : of the road under all wheels, unless the plan contains a road.
+    period_s, phases_s : times to record, in whole milliseconds; phases ascend and lie in [0, period).
     """
     vehicle = Vehicle() if vehicle is None else vehicle
     driver = Driver() if driver is None else driver

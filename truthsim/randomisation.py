@@ -1,6 +1,6 @@
-"""Other cars of the same kind: what differs between two of a model, a full and an empty one, new and worn tyres.
+"""Other cars of the same kind, with the differences due to production, load, and wear of the tyres.
 
-``randomise`` draws from the table ``SPREADS``. A car that would oversteer is drawn again: no maker sells one.
+``randomise`` draws from the table ``SPREADS``. A draw that oversteers is repeated, as no such car is sold.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from truthsim.vehicle import GRAVITY_M_S2, Vehicle
 
 #: Relative half-widths of uniform factors, and their meaning.
 SPREADS: dict[str, float] = {
-    "load": 0.12,  # mass, between the driver alone and all seats with luggage; all inertias go with it
-    "inertia": 0.10,  # each of yaw, roll and pitch beyond the load: where the load lies
+    "load": 0.12,  # mass, between the driver alone and all seats with luggage; all inertias scale with it
+    "inertia": 0.10,  # each of yaw, roll and pitch in addition: distribution of the load
     "cg_height": 0.06,
     "springs": 0.12,  # all four, each damper axle and each bar on its own
     "dampers": 0.25,  # they wear most
@@ -31,7 +31,7 @@ SPREADS: dict[str, float] = {
 }
 #: Half-width of the shift of the CG along the car, as a share of the wheelbase.
 CG_SHIFT = 0.03
-#: Understeer below which a draw is thrown away: 0.5 degrees per g.
+#: Minimum understeer of a draw: 0.5 degrees per g.
 _LEAST_UNDERSTEER = np.radians(0.5) / GRAVITY_M_S2
 _FRICTION = 0.85
 
@@ -40,7 +40,7 @@ def randomise(vehicle: Vehicle, seed: int) -> Vehicle:
     """Return another car of the vehicle's kind; the same seed gives the same car.
 
     Geometry that a maker fixes (track, wheelbase, wheel radius, roll centres, steering ratio, drive and brake split)
-    stays. See ``SPREADS`` for what is drawn, each factor uniform in 1 ± its spread.
+    is unchanged. ``SPREADS`` lists the drawn factors, each uniform in 1 ± its spread.
     """
     rng = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(200,)))
     while True:

@@ -14,7 +14,7 @@ from pdhef_logtool.records.signals import WHEELS, FloatArray, IntArray
 from truthsim.faults import KINDS, TARGETS, Fault
 from truthsim.sensors import IMU_PERIOD_S, RTK_FIXED, RTK_LOST, SensorChannel, SensorNoise
 
-#: Steering has no header there, only a stamp.
+#: The steering message has no header, only a stamp.
 STEERING_REPORT = """builtin_interfaces/Time stamp
 float32 steering_tire_angle
 ================================================================================
@@ -24,12 +24,12 @@ uint32 nanosec
 """
 
 
-#: What is written is rounded to this, far below the noise (16 µm) or any use (60 nm): digits without meaning do not
+#: Resolution of written values, far below the noise (16 µm) or any use (60 nm), because meaningless digits do not
 #: compress.
 RTK_STEP = 2.0**-16
 PERFECT_STEP = 2.0**-24
 
-#: Topics that a log may be written without, by what they are called on the command line.
+#: Topics that may be omitted from a log, by their name on the command line.
 PARTS: dict[str, tuple[str, ...]] = {
     "imu": ("/imu/data",),
     "steering": ("/vehicle/status/steering_status",),
@@ -60,7 +60,7 @@ _EXACT = (
 class Topic:
     """One topic of the log: constants of every message, and the columns.
 
-    ``definition`` is given for a type that ROS 2 itself and our own ``schemas/`` lack.
+    ``definition`` is only needed for types that neither ROS 2 nor ``schemas/`` contains.
     """
 
     name: str
@@ -83,7 +83,7 @@ class Topic:
 
 
 def quaternion(roll_rad: FloatArray, pitch_rad: FloatArray, yaw_rad: FloatArray) -> FloatArray:
-    """Hamilton quaternions [N, 4] (w, x, y, z) of yaw, then pitch, then roll: they turn the body into ENU."""
+    """Hamilton quaternions [N, 4] (w, x, y, z) of yaw, then pitch, then roll, which rotate the body into ENU."""
     cr, sr = np.cos(roll_rad / 2), np.sin(roll_rad / 2)
     cp, sp = np.cos(pitch_rad / 2), np.sin(pitch_rad / 2)
     cy, sy = np.cos(yaw_rad / 2), np.sin(yaw_rad / 2)
@@ -111,7 +111,7 @@ def topics_of(
 ) -> Iterator[Topic]:
     """Yield the topics of a log: sensors, RTK and exact ground truth, and the faults if any.
 
-    ``steering_wheel`` adds the angle at the steering wheel, which is what the steering sensor measures.
+    ``steering_wheel`` adds the angle at the steering wheel, the measured quantity of the steering sensor.
     """
     imu, steering, wheels = (channels[k] for k in ("imu", "steering", "wheels"))
 
@@ -175,7 +175,7 @@ def topics_of(
     rtk, fix = channels["rtk"], channels["fix"]
     held = not np.all(rtk.fields["quality"] == RTK_FIXED)
     place, tilt = noise.rtk_position_m**2, noise.rtk_tilt_rad**2
-    # A body velocity also carries the heading's error across the speed; 0.015 m/s is that of 30 m/s.
+    # The heading error adds a lateral velocity error in the body frame: 0.015 m/s at 30 m/s.
     speed = noise.rtk_velocity_m_s**2 + (30.0 * noise.rtk_heading_rad) ** 2
     yield topic(
         "/rtk/odometry",
@@ -245,7 +245,7 @@ def topics_of(
 
 
 def _events(faults: Sequence[Fault], end_s: float, start_ns: int) -> Topic:
-    """Two messages a fault: when it begins and when it ends, at the latest with the drive."""
+    """Return two messages per fault, at its start and at its end, or at the end of the drive."""
     rows = [
         (
             min(at_s, end_s),

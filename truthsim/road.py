@@ -30,9 +30,9 @@ def read_road(
     Parameters
     ----------
     table : [R, 4], friction left and right, bank and grade (rad) every ``step_m``; empty for a level road.
-    at_m : distance of the CG along the table; ``front_m`` and ``rear_m`` are those of the axles from it, so that an
-        axle meets a change of friction when it gets there.
-    friction : of all wheels where there is no table.
+    at_m : distance of the CG along the table; ``front_m`` and ``rear_m`` are the distances of the axles from the CG, so
+        that a change of friction affects each axle at its position.
+    friction : friction of all wheels without a table.
     """
     if table.shape[0] == 0:
         for i in range(road.shape[0]):

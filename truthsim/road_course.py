@@ -1,6 +1,6 @@
-"""Courses of ordinary roads: town, country and motorway as curvature, speed limit, bank, grade and places to stop.
+"""Courses of ordinary roads: town, country and motorway with curvature, speed limit, bank, grade and stops.
 
-Radii, superelevation, crossfall and grades are those of common road design guides (town junctions of 8 to 16 m, country
+Radii, superelevation, crossfall and grades follow common road design guides (town junctions of 8 to 16 m, country
 bends of 60 to 600 m, motorway curves of 700 m and more; crossfall 2 %, superelevation to 7 %, grades to 7 %).
 """
 
@@ -13,10 +13,10 @@ import numpy as np
 from pdhef_logtool.records.signals import FloatArray
 
 LANE_M = 3.5
-#: Drainage: a road leans to its right edge where nothing else is needed.
+#: Drainage: without superelevation, a road leans to its right edge.
 CROSSFALL_RAD = 0.02
 SUPERELEVATION_MAX_RAD = 0.07
-#: Acceleration and braking that a driver uses without need, m/s².
+#: Acceleration and braking of relaxed driving, m/s².
 EASY_ACCELERATION_M_S2 = 1.7
 EASY_BRAKING_M_S2 = 1.9
 
@@ -82,7 +82,7 @@ MOTORWAY = Surroundings(
     0.035,
     True,
 )
-#: The order in which a road passes through its surroundings, again and again.
+#: Sequence of the surroundings, which is repeated.
 TOUR = (TOWN, RURAL, MOTORWAY, RURAL)
 
 
@@ -154,7 +154,7 @@ def _draw_feature(
     if kind < here.lane_change_share + here.junction_share:
         radius, turn = rng.uniform(8.0, 16.0), rng.uniform(1.2, 1.7)
     else:
-        # Small and large radii alike: bends are spread evenly over the logarithm.
+        # Bends are uniformly distributed over the logarithm of the radius.
         radius = float(np.exp(rng.uniform(*np.log(here.radius_m))))
         turn = rng.uniform(*here.turn_rad)
     pace = min(allowed_m_s, float(np.sqrt(a_y * radius)))
@@ -179,7 +179,7 @@ def lane_change(side: float, speed_m_s: float, seconds: float, step_m: float) ->
 
 
 def _smoothed(values: FloatArray, length_m: float, step_m: float) -> FloatArray:
-    """Moving average over a length; the ends are held."""
+    """Return the moving average over a length, with constant extrapolation at the ends."""
     half = max(1, int(0.5 * length_m / step_m))
     padded = np.concatenate([np.full(half, values[0]), values, np.full(half, values[-1])])
     total = np.cumsum(np.concatenate([[0.0], padded]))
@@ -188,16 +188,16 @@ def _smoothed(values: FloatArray, length_m: float, step_m: float) -> FloatArray:
 
 
 def _bank(curvature: FloatArray, limit_m_s: FloatArray, kind: FloatArray, step_m: float) -> FloatArray:
-    """Crossfall on straights; outside towns a bend leans inward, in full where it needs 1.5 m/s² or more."""
+    """Return crossfall on straights and, outside towns, superelevation, in full for bends of 1.5 m/s² or more."""
     inward = -np.sign(curvature) * SUPERELEVATION_MAX_RAD * np.clip(np.abs(curvature) * limit_m_s**2 / 1.5, 0.0, 1.0)
     superelevated = np.array([s.superelevated for s in TOUR])[kind.astype(np.int64)]
-    # A lane change is no bend of the road: the road's own curvature lasts longer than its transitions.
+    # Exclude lane changes: the curvature of a bend of the road lasts longer than its transitions.
     bends = superelevated & (np.abs(_smoothed(curvature, 60.0, step_m)) > 0.5 * np.abs(curvature)) & (curvature != 0.0)
     return _smoothed(np.where(bends, inward, CROSSFALL_RAD), 40.0, step_m)
 
 
 def _grade(rng: np.random.Generator, kind: FloatArray, step_m: float) -> FloatArray:
-    """Slopes that change every 150 to 400 m, joined by rounded crests and dips."""
+    """Return slopes that change every 150 to 400 m, with rounded crests and dips."""
     steepest = np.array([s.grade_rad for s in TOUR])[kind.astype(np.int64)]
     end_m = kind.shape[0] * step_m
     nodes = [0.0]

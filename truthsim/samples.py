@@ -1,6 +1,6 @@
-"""The sample logs of the repository: ``python -m truthsim.samples sample_logs`` makes them again, bit for bit.
+"""The sample logs of the repository: ``python -m truthsim.samples sample_logs`` regenerates them, bit for bit.
 
-Bit for bit on one machine; another processor's mathematics may differ in the last places of the floating-point values.
+This holds on one machine; results on another processor may differ in the last digits of floating-point values.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from truthsim.faults import parse_fault
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One sample log, and the vehicle file in the same folder that belongs to its road.
+    """One sample log, with the vehicle file in the same folder that matches its road.
 
     A ``file`` without a suffix is a rosbag2 folder (sqlite3).
     """
@@ -36,7 +36,7 @@ class Sample:
     without: tuple[str, ...] = ()
 
     def simulate(self) -> Drive:
-        """Drive it."""
+        """Simulate the drive."""
         return simulate_drive(
             self.manoeuvre,
             speed_km_h=self.speed_km_h,
@@ -88,7 +88,7 @@ MANIFEST = "manifest.toml"
 
 
 def write_sample(sample: Sample, folder: Path) -> str:
-    """Write one sample log and return the command that makes it.
+    """Write one sample log and return the command that regenerates it.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def write_sample(sample: Sample, folder: Path) -> str:
 
 
 def convert_to_rosbag2(log: Path, folder: Path) -> None:
-    """Copy the messages of an MCAP file as they are to a rosbag2 folder (sqlite3), which it replaces.
+    """Copy the messages of an MCAP file unchanged to a rosbag2 folder (sqlite3), replacing an existing one.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def convert_to_rosbag2(log: Path, folder: Path) -> None:
 
 
 def digest(path: Path) -> tuple[str, int]:
-    """SHA-256 and size in bytes of a file, or of the files of a folder one after the other by name."""
+    """Return SHA-256 and size in bytes of a file, or of the concatenated files of a folder by name."""
     data = b"".join(p.read_bytes() for p in sorted(path.iterdir())) if path.is_dir() else path.read_bytes()
     return hashlib.sha256(data).hexdigest(), len(data)
 

@@ -1,7 +1,7 @@
-"""Sensors of the simulated car: what a recorder would have got, with noise, bias, drift, delay, tilt and outages.
+"""Sensors of the simulated car with noise, bias, drift, delay, tilt and outages, as recorded in a log.
 
-Numbers are the paper experiment's (docs/method.md#sensors). Every error source draws from a stream of its own, so that
-changing one leaves the others as they were.
+Numbers are from the paper's experiment (docs/method.md#sensors). Every error source has a separate random stream, so
+that a change of one does not affect the others.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from truthsim.vehicle import Vehicle
 ORIGIN_GEODETIC = (48.0, 11.0, 500.0)
 
 IMU_PERIOD_S = 0.01
-#: A steering sensor and the wheel-speed unit sample when they like, not when the IMU does.
+#: The steering sensor and the wheel-speed unit sample independently of the IMU.
 STEER_PHASE_S = 0.003
 WHEEL_PHASE_S = 0.006
 
@@ -49,14 +49,14 @@ class SensorNoise(NamedTuple):
     rtk_heading_rad: float = 0.0005
     rtk_yaw_rate_rad_s: float = 0.0010
     rtk_tilt_rad: float = 0.0005
-    #: Time constant of the INS's own error; white noise of a third of each sigma comes on top.
+    #: Time constant of the INS's correlated error; white noise of a third of each sigma is added.
     rtk_time_s: float = 2.0
     rtk_delay_s: float = 0.020
     #: Unknown mounting of the INS: offset of its heading, and position relative to the CG, forward and left.
     rtk_heading_offset_rad: float = 0.0
     rtk_x_m: float = 0.0
     rtk_y_m: float = 0.0
-    #: A toothed wheel with 48 teeth gives no pulse in time below this speed, and the sensor reads zero.
+    #: Below this speed a wheel with 48 teeth gives no pulse in time, and the sensor reads zero.
     wheel_dead_m_s: float = 0.15
     #: Full scale of the 16-bit accelerometers and gyros; beyond it they read full scale.
     acceleration_range_m_s2: float = 16.0
@@ -65,27 +65,27 @@ class SensorNoise(NamedTuple):
     imu_x_m: float = 0.0
     imu_y_m: float = 0.0
     imu_z_m: float = 0.0
-    #: The angle is measured at the steering wheel in steps of 0.1 degrees; the ratio is known to this share.
+    #: The angle is measured at the steering wheel in steps of 0.1 degrees; 1-sigma of the relative error of the ratio.
     steering_wheel_step_rad: float = 0.1 * np.pi / 180.0
     steer_gain: float = 0.0
-    #: Free play between steering wheel and road wheels, all of it, as an angle of the road wheels.
+    #: Total free play between steering wheel and road wheels, as an angle of the road wheels.
     steer_play_rad: float = 0.0
     #: Share of the messages of IMU, steering and wheel speeds that the bus loses.
     message_loss: float = 0.0
-    #: Outages of the RTK fix: how often, and how long on average (exponential); half of them leave a float solution.
+    #: Outages of the RTK fix: rate, and mean duration (exponential); half of them leave a float solution.
     rtk_outages_per_h: float = 0.0
     rtk_outage_s: float = 8.0
 
 
-#: Values that may be below 0: places and an offset.
+#: Values that may be negative: positions and an offset.
 SIGNED = frozenset({"imu_x_m", "imu_y_m", "imu_z_m", "rtk_heading_offset_rad", "rtk_x_m", "rtk_y_m"})
 
-#: Quality of a satellite fix, as NMEA GGA counts it.
+#: Quality of a satellite fix, as in NMEA GGA.
 RTK_FIXED, RTK_FLOAT, RTK_LOST = 4, 5, 0
 
 
 class Outage(NamedTuple):
-    """From ``start_s`` until ``end_s`` the RTK has ``quality`` only."""
+    """Interval in which the RTK only has ``quality``."""
 
     start_s: float
     end_s: float
@@ -98,7 +98,7 @@ class SensorChannel:
 
     Attributes
     ----------
-    times_s : [N], measurement time since the start. arrival_s : [N], when the recorder had it.
+    times_s : [N], measurement time since the start. arrival_s : [N], arrival at the recorder.
     fields : by name with unit, each [N].
     """
 
@@ -143,8 +143,8 @@ def sense(
 ) -> dict[str, SensorChannel]:
     """Turn a motion recorded at ``IMU_PERIOD_S`` with the phases 0, steering, wheels into sensor channels.
 
-    ``outages`` of the RTK come on top of those that the noise draws. Returns ``imu``, ``steering``, ``wheels``, ``rtk``
-    (with the ``quality`` of every sample) and ``fix``.
+    ``outages`` of the RTK are added to the outages drawn from the noise. Returns ``imu``, ``steering``, ``wheels``,
+    ``rtk`` (with the ``quality`` of every sample) and ``fix``.
     """
     names = ("ax", "ay", "yaw_rate", "other", "steer", *WHEELS, "rtk", "arrival", "fix", "gain", "loss", "outages")
     streams = {
@@ -180,9 +180,9 @@ def _columns(motion: Motion, *names: str) -> FloatArray:
 
 
 def imu_without_error(motion: Motion, noise: SensorNoise) -> tuple[FloatArray, FloatArray]:
-    """Specific force (m/s²) and rates (rad/s) that perfect sensors read at the IMU's place, each [N, 3].
+    """Return specific force (m/s²) and rates (rad/s) of perfect sensors at the IMU's position, each [N, 3].
 
-    A place away from the CG adds ω̇ × p + ω × (ω × p).
+    The distance p from the CG adds ω̇ × p + ω × (ω × p).
     """
     force = _columns(motion, "specific_force_x_m_s2", "specific_force_y_m_s2", "specific_force_z_m_s2")
     rates = _columns(motion, "gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s")
@@ -194,7 +194,7 @@ def imu_without_error(motion: Motion, noise: SensorNoise) -> tuple[FloatArray, F
 
 
 def quantised(values: FloatArray, full_scale: float) -> FloatArray:
-    """What a 16-bit sensor with a full scale to both sides gives for values."""
+    """Return the readings of a 16-bit sensor with a symmetric full scale."""
     step = full_scale / 2.0**15
     return np.asarray(np.clip(np.round(values / step), -(2.0**15), 2.0**15 - 1.0) * step)
 
@@ -228,7 +228,7 @@ def _imu(motion: Motion, noise: SensorNoise, streams: dict[str, np.random.Genera
 def _steering(
     motion: Motion, vehicle: Vehicle, noise: SensorNoise, streams: dict[str, np.random.Generator]
 ) -> SensorChannel:
-    """The sensor sits at the steering wheel; noise and bias are those of the road-wheel angle, times the ratio."""
+    """Simulate the sensor at the steering wheel; noise and bias refer to the road-wheel angle, times the ratio."""
     rng = streams["steer"]
     clean = motion.column("steer_rad", 1)
     clean = clean + ahead_by_play(clean, noise.steer_play_rad)
@@ -246,10 +246,10 @@ def _steering(
 
 
 def ahead_by_play(steer_rad: FloatArray, play_rad: float) -> FloatArray:
-    """Return by how much the steering wheel is ahead of the road wheels [N], within half of the play to both sides.
+    """Return the lead of the steering wheel over the road wheels [N], within half of the play to both sides.
 
-    Behind a reversal it turns twice as far as they do until it has gone through the play: a spring with dry friction
-    (Prandtl's stop element), as a steering column is.
+    After a reversal the steering wheel turns twice as far as the road wheels until the play is used up: a spring with
+    dry friction (Prandtl's stop element), like a steering column.
     """
     ahead, half = np.zeros_like(steer_rad), 0.5 * play_rad
     value = 0.0
@@ -287,9 +287,9 @@ def _draw_outages(end_s: float, noise: SensorNoise, rng: np.random.Generator) ->
     return outages
 
 
-#: Errors of a float solution over those of a fixed one: decimetres for centimetres.
+#: Ratio of the errors of a float solution to the errors of a fixed one: decimetres to centimetres.
 _FLOAT_POSITION, _FLOAT_VELOCITY, _FLOAT_ANGLE = 30.0, 4.0, 4.0
-#: 1-sigma errors with which an INS of this class coasts without satellites: acceleration and turning of the heading.
+#: 1-sigma errors of an INS of this class without satellites: acceleration and yaw rate.
 _COAST_M_S2, _COAST_RAD_S = 0.02, 0.0003
 
 
@@ -300,7 +300,7 @@ def _rtk(
     every: int,
     outages: Sequence[Outage],
 ) -> SensorChannel:
-    """GNSS/INS at the CG, or at the place taken for it: ENU position and velocity, attitude, body velocity of these."""
+    """Return GNSS/INS at the assumed CG: ENU position and velocity, attitude, body velocity computed from these."""
     rng = streams["rtk"]
     rows = slice(None, None, every)
     times = motion.times_s[rows]
@@ -354,7 +354,7 @@ def _rtk(
 
 
 def _fix(rtk: SensorChannel, rtk_rate_hz: int) -> SensorChannel:
-    """The receiver's own fix at 10 Hz: geodetic position of the CG, NaN without satellites."""
+    """Return the receiver's fix at 10 Hz: geodetic position of the CG, NaN without satellites."""
     rows = slice(None, None, max(1, rtk_rate_hz // 10))
     x, y, z = (rtk.fields[k][rows] for k in ("x_m", "y_m", "z_m"))
     lat, lon, alt = geodetic_from_enu(x, y, z)

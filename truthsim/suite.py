@@ -1,8 +1,8 @@
 """A training set of any size from one seed: manoeuvre, speed, friction, amplitude and vehicle drawn drive by drive.
 
-Each drive draws from a stream of its own number, so that neither the size of the set nor the processes at work change
-any of them. ``fishhook`` is left out: it is the unseen manoeuvre of the condition table. Cells of manoeuvre × speed ×
-friction at the edge of the range are marked ``extrapolation`` and never trained on.
+Each drive has a random stream by its number, so that it depends neither on the size of the set nor on the number of
+processes. ``fishhook`` is excluded: it is the unseen manoeuvre of the condition table. Cells of manoeuvre × speed ×
+friction at the edge of the range are marked ``extrapolation`` and never used for training.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from truthsim.batch import DriveSpec, Job, run_jobs
 from truthsim.drive import DEFAULT_VEHICLE
 from truthsim.manoeuvres import MANOEUVRES
 
-#: How often each manoeuvre is drawn.
+#: Probability of each manoeuvre.
 SHARES: dict[str, float] = {
     "dlc": 0.18,
     "dlc-3888-2": 0.05,
@@ -39,7 +39,7 @@ FRICTIONS = (0.3, 1.0)
 #: Edges of the cells.
 SPEED_EDGES_KM_H = (40.0, 60.0, 80.0, 100.0, 120.0)
 FRICTION_EDGES = (0.3, 0.5, 0.7, 0.85, 1.0)
-#: Peak |a_y| over μ g that a scaled manoeuvre is driven to.
+#: Range of the peak |a_y| over μ g of scaled manoeuvres.
 PEAK_SHARES = (0.2, 0.97)
 #: Factor on the standard's angle, or on the course.
 AMPLITUDES: dict[str, tuple[float, float]] = {
@@ -51,25 +51,25 @@ AMPLITUDES: dict[str, tuple[float, float]] = {
     "stop-and-go": (1.0, 1.0),
     "road": (1.0, 1.0),
 }
-#: Highest speed where the course or the sense of a manoeuvre has one.
+#: Highest speed of manoeuvres with a speed limit.
 _TOP_KM_H = {"dlc-3888-2": 70.0, "stop-and-go": 60.0}
-#: Edge cells (speed, friction) that the manoeuvres leave out in turn: fast and slippery, slow and grippy, and so on.
+#: Held-out edge cells (speed, friction), by manoeuvre in turn: fast and slippery, slow and grippy, and so on.
 _EDGES = (((3, 0), (2, 0)), ((0, 3), (0, 2)), ((3, 3), (3, 2)), ((0, 0), (1, 0)))
 SPLITS = (("train", 0.70), ("validation", 0.15), ("test", 0.15))
 VEHICLE_CHOICES = ("default", "randomised")
-#: Draws that a drive has before it is given up: a car that spins is no drive to learn from.
+#: Maximum number of draws for a drive, as drives with a spin are rejected.
 _ATTEMPTS = 6
 
 
 def cell_of(speed_km_h: float, friction: float) -> tuple[int, int]:
-    """Number of the speed bin and of the friction bin of a drive."""
+    """Return the numbers of the speed bin and of the friction bin of a drive."""
     speed = int(np.clip(np.searchsorted(SPEED_EDGES_KM_H, speed_km_h, side="right") - 1, 0, 3))
     grip = int(np.clip(np.searchsorted(FRICTION_EDGES, friction, side="right") - 1, 0, 3))
     return speed, grip
 
 
 def is_held_out(manoeuvre: str, speed_km_h: float, friction: float) -> bool:
-    """Return whether a drive lies in a cell that is kept for the extrapolation test; the same cells for every seed."""
+    """Return whether a drive is in a cell of the extrapolation test; the cells do not depend on the seed."""
     return cell_of(speed_km_h, friction) in _EDGES[list(SHARES).index(manoeuvre) % len(_EDGES)]
 
 
@@ -118,7 +118,7 @@ def plan_suite(count: int, seed: int, *, vehicles: str = "default", duration_s: 
         place = float(rng.uniform())
         candidates = [draw_spec(rng, duration_s=duration_s, vehicle=vehicle)]
         held_out = _held_out(candidates[0])
-        # What takes a spun drive's place stays on its side of the border.
+        # A replacement for a drive with a spin must be on the same side of the held-out border.
         while len(candidates) < _ATTEMPTS:
             spec = draw_spec(rng, duration_s=duration_s, vehicle=vehicle)
             if _held_out(spec) == held_out:
@@ -151,7 +151,7 @@ def write_suite(
     processes: int = 1,
     progress: Callable[[str, float], None] | None = None,
 ) -> dict[str, Any]:
-    """Write a suite and its manifest into a folder; files that are there already as they should be are kept.
+    """Write a suite and its manifest to a folder; existing files with the right content are kept.
 
     Raises
     ------

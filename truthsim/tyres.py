@@ -16,15 +16,15 @@ from numba.extending import register_jitable
 
 
 class Tyre(NamedTuple):
-    """One tyre (205/55 R16 class). All four wheels carry the same one."""
+    """One tyre (205/55 R16 class), the same on all four wheels."""
 
     nominal_load_n: float = 3530.0
     #: K_y(F_z) = stiffness_peak · F_z0 · sin(2 atan(F_z / (stiffness_load · F_z0)))
     stiffness_peak: float = 18.3
     stiffness_load: float = 1.75
-    #: Power of friction that scales the slopes: a wet or icy road softens them only a little.
+    #: Power of friction that scales the slopes: a wet or icy road reduces them only a little.
     stiffness_friction_power: float = 0.08
-    #: Friction at which the slopes are given.
+    #: Friction to which the slopes refer.
     stiffness_friction: float = 0.85
     lateral_shape: float = 1.35
     lateral_curvature: float = -0.30
@@ -38,8 +38,8 @@ class Tyre(NamedTuple):
     lateral_relaxation_m: float = 0.65
     lateral_relaxation_min_m: float = 0.30
     longitudinal_relaxation_m: float = 0.30
-    #: Carcass damping as slip per metre per second of sliding; fades out with speed (ch. 8.6), else a standing
-    #: car would swing on its tyres for ever.
+    #: Carcass damping as slip per metre per second of sliding; it decreases with speed (ch. 8.6) and prevents endless
+    #: oscillation at standstill.
     lateral_damping_s_per_m: float = 0.06
     longitudinal_damping_s_per_m: float = 0.05
     damping_fade_m_s: float = 2.5
@@ -94,7 +94,7 @@ def forces_n(
 
 @register_jitable
 def lateral_relaxation_length_m(tyre: Tyre, scaled_slip: float) -> float:
-    """Relaxation length in m: the stiffness of the sliding contact over that of the carcass, so it falls with slip."""
+    """Relaxation length in m: contact stiffness over carcass stiffness, which decreases with sliding."""
     free = tyre.lateral_relaxation_m - tyre.lateral_relaxation_min_m
     return tyre.lateral_relaxation_min_m + free / (1.0 + scaled_slip * scaled_slip)
 

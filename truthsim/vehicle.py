@@ -4,13 +4,13 @@ Axes are ISO 8855. The car moves in the plane of the road: ``v_x, v_y`` are the 
 and across its heading, so that a_y = v̇_y + v_x r = (ΣF_y + weight across the road)/m is exact. On top of that
 plane the sprung mass heaves, rolls (positive to the right) and pitches (positive nose down) on springs, dampers and
 anti-roll bars; each unsprung mass moves up and down between them and its tyre's vertical spring, and may leave the
-road. The links are swing arms from each wheel to the roll centre (across) and to the pitch centre (along): what they
-carry reaches the wheel at once, while the springs' share waits for the body to move. Tilts are small, so the sprung
-mass is linear in them; yaw, tyres, steering and the attitude of the road are not. Each mass is where it is: as the
-body leans, the wheels move sideways against the CG of the whole car.
+road. The links are swing arms from each wheel to the roll centre (across) and to the pitch centre (along): forces in
+the links act on the wheel immediately, while forces in the springs follow the motion of the body. Tilts are small, so
+the sprung mass is linear in them; yaw, tyres, steering and the attitude of the road are not. As the body leans, the
+wheels move sideways relative to the CG of the whole car.
 
-What another vehicle must offer to take this one's place is the lower half of the file: ``STATE_SIZE``,
-:func:`standing_state`, :func:`derivative`, :func:`observe` with ``OBSERVED``. Nothing else reads the state vector.
+The interface of a vehicle is the lower half of the file: ``STATE_SIZE``, :func:`standing_state`, :func:`derivative`,
+:func:`observe` with ``OBSERVED``. Other modules do not access the state vector.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ AIR_DENSITY_KG_M3 = 1.204
 
 
 class Vehicle(NamedTuple):
-    """A mid-size saloon with the paper's Table 3 mass and geometry; the rest are typical values.
+    """A mid-size saloon with the paper's Table 3 mass and geometry, and otherwise typical values.
 
     See docs/method.md#simulator.
 
-    ``truthsim/vehicles/`` contains this vehicle and others as files.
+    ``truthsim/vehicles/`` contains this and other vehicles as files.
     """
 
     mass_kg: float = 1440.0
@@ -67,12 +67,12 @@ class Vehicle(NamedTuple):
     rear_roll_centre_height_m: float = 0.10
     #: Height at which the links take the longitudinal force (anti-dive and anti-squat), m.
     pitch_centre_height_m: float = 0.15
-    #: Steering-wheel angle per road-wheel angle; the vehicle is steered by the latter, as the rack has it.
+    #: Steering-wheel angle per road-wheel angle; the input of the vehicle is the road-wheel angle at the rack.
     steering_ratio: float = 16.0
     #: Steering out of the bend under lateral force, per axle (front) and toe-in of the rear axle, rad/N.
     front_compliance_rad_per_n: float = 1.87e-6
     rear_compliance_rad_per_n: float = 1.07e-6
-    #: Lag of these compliances: the wheel's inertia on its bushes.
+    #: Lag of these compliances, by the wheel's inertia on its bushes.
     compliance_lag_s: float = 0.0126
     #: 0 parallel steering, 1 both wheels on one turning centre.
     ackermann: float = 0.5
@@ -91,7 +91,7 @@ ALTITUDE, COMPLIANCE_FRONT, COMPLIANCE_REAR = range(12, 15)
 WHEEL_HEIGHT, WHEEL_RATE, SPIN, SLIP_X, SLIP_Y, BRAKE = 15, 19, 23, 27, 31, 35
 STATE_SIZE = 39
 
-#: Pads and callipers give this much before a standing wheel slips in its brake, rad; the build-up of a turning one, s.
+#: Elastic angle of a standing wheel before it slips in its brake, rad; build-up time of a turning wheel's brake, s.
 BRAKE_GIVE_RAD = 0.01
 BRAKE_LAG_S = 0.005
 BRAKE_DAMPING_S = 0.002
@@ -161,14 +161,14 @@ def static_load_n(vehicle: Vehicle, wheel: int) -> float:
 
 @register_jitable
 def wheel_load_n(static_n: float, height_m: float, rate_m_s: float, vehicle: Vehicle) -> float:
-    """Vertical load (N) by the height of the wheel above its place at rest; none once the tyre leaves the road."""
+    """Return the vertical load (N) by the height of the wheel above its rest position; 0 for a tyre off the road."""
     load = static_n - vehicle.tyre_vertical_n_per_m * height_m - vehicle.tyre_vertical_n_s_per_m * rate_m_s
     return float(max(load, 0.0))
 
 
 @register_jitable
 def compression(state: FloatArray, sprung_x_m: float, vehicle: Vehicle, wheel: int) -> tuple[float, float]:
-    """How far the suspension of a wheel is compressed beyond its place at rest (m), and how fast (m/s)."""
+    """Return the compression of a wheel's suspension relative to rest (m), and its rate (m/s)."""
     x = (vehicle.cg_to_front_axle_m if wheel < 2 else -vehicle.cg_to_rear_axle_m) - sprung_x_m
     y = 0.5 * vehicle.track_m if wheel % 2 == 0 else -0.5 * vehicle.track_m
     corner = state[HEAVE] + y * state[ROLL] - x * state[PITCH]
@@ -178,7 +178,7 @@ def compression(state: FloatArray, sprung_x_m: float, vehicle: Vehicle, wheel: i
 
 @register_jitable
 def suspension_force_n(travel_m: float, rate_m_s: float, other_m: float, vehicle: Vehicle, front: bool) -> float:
-    """Force of spring, damper and anti-roll bar on the body beyond that at rest, N; ``other_m``: the axle's other side.
+    """Return the change of force from rest by spring, damper and bar, N; ``other_m``: compression on the other side.
 
     The bar twists by the difference of both compressions over the track.
     """
@@ -191,7 +191,7 @@ def suspension_force_n(travel_m: float, rate_m_s: float, other_m: float, vehicle
 
 @register_jitable
 def wheel_steer_rad(state: FloatArray, steer_rad: float, vehicle: Vehicle, wheel: int) -> float:
-    """Angle of one wheel in rad: mean steering with part Ackermann in front, less compliance; toe at the rear."""
+    """Return the angle of a wheel in rad: front with partial Ackermann and compliance, rear with toe by compliance."""
     if wheel >= 2:
         return float(state[COMPLIANCE_REAR])
     wheelbase = vehicle.cg_to_front_axle_m + vehicle.cg_to_rear_axle_m
@@ -202,9 +202,9 @@ def wheel_steer_rad(state: FloatArray, steer_rad: float, vehicle: Vehicle, wheel
 
 @register_jitable
 def brake_grip_rate(grip: float, spin_rad_s: float) -> float:
-    """Rate of the share of its torque that a brake opposes turning with, -1 to 1 (Dahl's model of dry friction).
+    """Return the rate of the relative brake friction, −1 to 1 (Dahl's model of dry friction).
 
-    A turning wheel has it all; a standing wheel as much as it needs to stay, so that a car on a hill does not creep.
+    It is ±1 for a turning wheel, and balances the load of a standing wheel, so that a car on a hill does not creep.
     """
     turning = abs(spin_rad_s)
     return (spin_rad_s - turning * grip) / (BRAKE_GIVE_RAD + turning * BRAKE_LAG_S)
@@ -212,9 +212,9 @@ def brake_grip_rate(grip: float, spin_rad_s: float) -> float:
 
 @register_jitable
 def road_rates_rad_s(state: FloatArray, road: FloatArray) -> tuple[float, float, float]:
-    """How the road's plane turns under the moving car, rad/s: about its x and y axes, and the heading's rate.
+    """Return the rotation rates of the road's plane under the moving car, rad/s: about x, about y, and heading rate.
 
-    Turning on a bank tips the plane too: the heading turns about the vertical, which is not the road's normal.
+    Turning on a bank also tips the plane, as the heading is about the vertical, which is not the road's normal.
     """
     heading_rate = state[YAW_RATE] / (math.cos(road[BANK]) * math.cos(road[GRADE]))
     about_x = state[V_X] * road[BANK_PER_M] + heading_rate * math.sin(road[GRADE])
@@ -233,7 +233,7 @@ def _motion(
     rate: FloatArray,
     observed: FloatArray,
 ) -> None:
-    """Write the rate of the state and quantities from the forces: the equations of motion."""
+    """Write the rate of the state and the observed quantities by the equations of motion."""
     v_x, v_y, yaw_rate = state[V_X], state[V_Y], state[YAW_RATE]
     lf, lr, radius = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m, vehicle.wheel_radius_m
     mass = vehicle.mass_kg
@@ -248,7 +248,7 @@ def _motion(
     )
     roll_arm = sprung_height - roll_axis_height
     pitch_arm = sprung_height - vehicle.pitch_centre_height_m
-    # The body leans over its roll and pitch centres, so the CG of the whole car moves against the wheels.
+    # The body leans about its roll and pitch centres, so the CG of the whole car moves relative to the wheels.
     lean, dive = sprung / mass * roll_arm, sprung / mass * pitch_arm
     wheels_left_m, wheels_left_m_s = lean * state[ROLL], lean * state[ROLL_RATE]
     wheels_back_m, wheels_back_m_s = dive * state[PITCH], dive * state[PITCH_RATE]
@@ -257,7 +257,7 @@ def _motion(
     cos_bank, cos_grade = math.cos(road[BANK]), math.cos(road[GRADE])
     weight_x = -GRAVITY_M_S2 * math.sin(road[GRADE])
     weight_y = -GRAVITY_M_S2 * math.sin(road[BANK]) * cos_grade
-    # What presses the car on the road per mass: gravity, and the road that bends up under it.
+    # Normal acceleration: gravity, and the vertical curvature of the road.
     pressing = GRAVITY_M_S2 * cos_bank * cos_grade + road_x * v_y - road_y * v_x
 
     force_x, force_y, moment = 0.0, 0.0, 0.0
@@ -310,11 +310,11 @@ def _motion(
         else:
             axle_rear += fy
 
-        # The body is supported by the springs at the wheel, on the swing arms at their pivots.
+        # The springs at the wheel support the body, the swing arms at their pivots.
         roll_centre = vehicle.front_roll_centre_height_m if front else vehicle.rear_roll_centre_height_m
         spring = suspension_force_n(travel, travel_rate, other, vehicle, front)
         pivot_y = -roll_centre * body_y / arm_y
-        # Brakes act within the wheel's own assembly; drive shafts bring their torque from the body and push back on it.
+        # Brakes act within the wheel assembly; drive shafts transmit torque from the body and react on it.
         pivot_x = -(vehicle.pitch_centre_height_m * body_x + spinning_up - driving) / arm_x
         lift += spring + pivot_x + pivot_y
         roll_moment += arm_y * (spring + pivot_x)
@@ -328,27 +328,27 @@ def _motion(
 
     drag = 0.5 * AIR_DENSITY_KG_M3 * vehicle.drag_area_m2 * v_x * abs(v_x)  # at the sprung mass's CG
     force_x -= drag
-    # Accelerations in the plane of the road, and what of them the car feels: less the weight along it.
+    # Accelerations in the plane of the road, and specific force: without the component of gravity.
     a_x, a_y = force_x / mass + weight_x, force_y / mass + weight_y
     felt_x, felt_y = a_x - weight_x, a_y - weight_y
     yaw_acceleration = moment / vehicle.yaw_inertia_kg_m2
 
     rate[X] = v_x * cos_grade * math.cos(state[YAW]) - v_y * cos_bank * math.sin(state[YAW])
     rate[Y] = v_x * cos_grade * math.sin(state[YAW]) + v_y * cos_bank * math.cos(state[YAW])
-    # The height of the road's middle: a car that crabs through a banked bend does not climb.
+    # Height of the road's middle: lateral motion in a banked bend does not change it.
     rate[ALTITUDE] = v_x * math.sin(road[GRADE])
     rate[YAW] = heading_rate
     rate[V_X] = a_x + v_y * yaw_rate
     rate[V_Y] = a_y - v_x * yaw_rate
     rate[YAW_RATE] = yaw_acceleration
 
-    # Pitching arms push the axles as the unsprung masses are pulled along; across, both sides of an axle cancel.
+    # Longitudinal acceleration of unsprung masses loads the pitch arms; laterally, both sides of an axle cancel.
     arm_pull = (radius - vehicle.pitch_centre_height_m) * felt_x
     inertia_lift = -2.0 * arm_pull * (front_unsprung / lf - rear_unsprung / lr)
     lift += inertia_lift
     pitch_moment += sprung_x * inertia_lift
     supporting = sprung * GRAVITY_M_S2 + lift
-    # About the sprung mass's own CG, which moves against the whole car's by the unsprung share of the lean.
+    # About the sprung mass's CG, which moves relative to the whole car's by the unsprung share of the lean.
     roll_inertia = vehicle.roll_inertia_kg_m2 + sprung * roll_arm * roll_arm * unsprung / mass
     pitch_inertia = vehicle.pitch_inertia_kg_m2 + sprung * pitch_arm * pitch_arm * unsprung / mass
     roll_moment += roll_arm * (sprung * (felt_y + sprung_x * yaw_acceleration) + supporting * state[ROLL])
@@ -393,7 +393,7 @@ def derivative(
 ) -> None:
     """Write the rate [STATE_SIZE] of a state under a mean road-wheel angle and total drive and brake torques.
 
-    ``steer_rad`` is the mean angle of the front wheels as the rack has it; compliance comes on top in the vehicle.
+    ``steer_rad`` is the mean angle of the front wheels at the rack; the vehicle adds compliance.
     ``road`` [ROAD_SIZE] contains the friction of the wheels, bank and grade (see ``FRICTION`` and below).
     ``scratch`` [OBSERVED_SIZE] is overwritten.
     """
@@ -402,7 +402,7 @@ def derivative(
 
 @register_jitable
 def see(state: FloatArray, observed: FloatArray) -> None:
-    """Write the first six columns of ``OBSERVED`` only: pose, velocities and yaw rate, the inputs of the driver."""
+    """Write only the first six columns of ``OBSERVED``: pose, velocities and yaw rate, the inputs of the driver."""
     for i in range(6):
         observed[i] = state[i]
 
@@ -418,11 +418,12 @@ def observe(
     scratch: FloatArray,
     observed: FloatArray,
 ) -> None:
-    """Write what ``OBSERVED`` names [OBSERVED_SIZE]; ``scratch`` [STATE_SIZE] is overwritten.
+    """Write the quantities of ``OBSERVED`` [OBSERVED_SIZE]; ``scratch`` [STATE_SIZE] is overwritten.
 
-    ``ax_m_s2`` and ``ay_m_s2`` are those of the CG in the plane of the road (no gravity felt), ``yaw_rate_rad_s`` is
-    about the road's normal; forces are in the wheels' own frames. Roll, pitch and their rates are against the horizon:
-    body and road together. ``specific_force`` and ``gyro`` are what perfect sensors fixed to the body read at the CG.
+    ``ax_m_s2`` and ``ay_m_s2`` are accelerations of the CG in the plane of the road (without gravity),
+    ``yaw_rate_rad_s`` is about the road's normal; forces are in the wheels' frames. Roll, pitch and their rates are
+    relative to the horizon: body and road together. ``specific_force`` and ``gyro`` are readings of perfect body-fixed
+    sensors at the CG.
     """
     _motion(state, steer_rad, drive_n_m, brake_n_m, road, vehicle, scratch, observed)
     see(state, observed)

@@ -1,8 +1,8 @@
-"""Name a vehicle in one word: one that comes with the simulator, a file, another of its kind, or one that was changed.
+"""Name a vehicle in one word: a shipped one, a file, another of its kind, or a modified one.
 
 ``NAME[~SEED][,CHANGE=VALUE]...``: ``sedan``, ``my_car.toml``, ``suv~7`` (the SUV that ``truthsim.randomisation`` draws
 with seed 7), ``sedan,mass=1.2,cg=0.1``. Changes: ``mass`` (factor, inertias with it), ``cg`` (metres towards the rear),
-``height`` (of the CG, factor), ``stiffness`` (of all tyres' cornering, factor), ``tyres`` (those of another vehicle).
+``height`` (of the CG, factor), ``stiffness`` (of all tyres' cornering, factor), ``tyres`` (tyres of another vehicle).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Vehicles as TOML files: three that come with the simulator, and anybody's own.
+"""Vehicles as TOML files: three shipped ones and the user's.
 
-A file gives every value of ``truthsim.vehicle.Vehicle`` by its name, with the tyres of the axles as tables
-``[front_tyre]`` and ``[rear_tyre]``. Nothing is optional and nothing else is allowed: a forgotten value that silently
-became another car's would be a wrong vehicle.
+A file contains every value of ``truthsim.vehicle.Vehicle`` by its name, with the tyres of the axles as tables
+``[front_tyre]`` and ``[rear_tyre]``. All values are required and no others are allowed, because a default for a
+forgotten value would belong to another car.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Everything that is known of one vehicle."""
+"""Parameters and identified parts of one vehicle."""

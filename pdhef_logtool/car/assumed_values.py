@@ -2,7 +2,7 @@
 
 A file needs the mass, and the wheelbase with the front axle's share of the weight (or both axle distances). Lengths
 scale with the wheelbase, times with its square root, and axle stiffness with the axle load. Each rule has a relative
-standard deviation over vehicles: what a calibration may move the value by, and what an interval must cover.
+standard deviation over vehicles, which a calibration uses as its prior and intervals must cover.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 
-#: A passenger car's: the share of the static weight on the front axle, where the file gives none. 0.63 for front-wheel
-#: drive, 0.50 for rear-engined and sports cars.
+#: Share of the static weight on the front axle of a passenger car, if the file gives none. 0.63 for front-wheel drive,
+#: 0.50 for rear-engined and sports cars.
 FRONT_WEIGHT_SHARE, FRONT_WEIGHT_SHARE_SPREAD = 0.56, 0.08
-#: Relative distance between the default sedan's centre of gravity over the rear axle, 1.71 m, and that of a car without
-#: any file: wheelbases of 2.4 to 3.0 m with 45 to 62 % on the front axle, 1.46 ± 0.18 m.
+#: Relative uncertainty of the distance from the rear axle to the centre of gravity for a car without any file: 1.71 m
+#: for the default sedan, 1.46 ± 0.18 m for wheelbases of 2.4 to 3.0 m with 45 to 62 % on the front axle.
 DEFAULT_CG_SPREAD = 0.18
 
 
 @dataclass(frozen=True, slots=True)
 class AssumedValue:
-    """An entry that was left out: dotted name, value, relative standard deviation over vehicles, and rule."""
+    """A missing entry: dotted name, value, relative standard deviation over vehicles, and rule."""
 
     entry: str
     value: float
@@ -36,7 +36,7 @@ class AssumedValue:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """How an entry follows from those before it. ``value`` takes the entries so far, axle loads in N included."""
+    """Rule for an entry. ``value`` computes it from the entries before it, including axle loads in N."""
 
     entry: str
     value: Callable[[Mapping[str, float]], float]
@@ -52,7 +52,7 @@ def _stiffness_per_load(mass_kg: float) -> float:
     return float(np.interp(math.log(mass_kg), np.log([50.0, 400.0, 4000.0, 12_000.0]), [6.0, 14.5, 14.5, 6.0]))
 
 
-#: In the order in which they build on each other.
+#: In the order of their dependence.
 RULES: tuple[Rule, ...] = (
     Rule(
         "yaw_inertia_kg_m2",
@@ -93,10 +93,10 @@ RULES: tuple[Rule, ...] = (
 
 
 def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValue, ...]]:
-    """Return the entries of a vehicle file with what it left out, and what that is.
+    """Return the completed entries of a vehicle file, and the assumed values.
 
-    ``wheelbase_m`` and ``front_weight_share`` become the axle distances. Entries that are wrong stay as they are, for
-    the validation to name them; nothing is assumed where mass or geometry are missing or no positive numbers.
+    ``wheelbase_m`` and ``front_weight_share`` become the axle distances. Wrong entries are kept, because the validation
+    reports them. No value is assumed unless mass and geometry are positive numbers.
     """
     entries: dict[str, Any] = {k: dict(v) if isinstance(v, Mapping) else v for k, v in raw.items()}
     assumed: list[AssumedValue] = []
@@ -128,7 +128,7 @@ def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValu
     return entries, tuple(assumed)
 
 
-#: Rules that build on an entry which may have been given wrongly.
+#: Errors of rules that depend on a wrong entry.
 _NEEDS = {"relaxation_length_m": ("wheel_radius_m",), "cg_over_roll_axis_m": ("cg_height_m",)}
 
 
@@ -137,7 +137,7 @@ def _axle_distances(entries: dict[str, Any], assumed: list[AssumedValue]) -> Non
     wheelbase, share = entries.get("wheelbase_m"), entries.get("front_weight_share")
     front, rear = entries.get("cg_to_front_axle_m"), entries.get("cg_to_rear_axle_m")
     if front is not None and rear is not None:
-        return  # a wheelbase beside them is refused as an unknown entry
+        return  # an additional wheelbase is rejected as an unknown entry
     if not _is_positive(wheelbase):
         return
     if front is not None or rear is not None:

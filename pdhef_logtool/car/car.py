@@ -1,8 +1,8 @@
-"""Everything that is known of one vehicle, as estimators and commands take it.
+"""Parameters and identified parts of one vehicle, for estimators and commands.
 
-A car is a folder: ``vehicle.toml`` is written by a person and never rewritten; each command writes its part beside it
-(:mod:`~.parts`). A bare ``vehicle.toml`` is a car without parts. A part whose basis has changed is stale: it is not
-used, and the car has a note of it.
+A car is a folder. The user writes ``vehicle.toml``, and no command changes it; each command writes its part beside it
+(:mod:`~.parts`). A single ``vehicle.toml`` is a car without parts. A part with a changed basis is stale: it is not
+used, and the car has a note.
 """
 
 from __future__ import annotations
@@ -46,42 +46,43 @@ VEHICLE_FILE, FIT_FILE, NOISE_FILE, NETWORK_FILE = "vehicle.toml", "fit.toml", "
 INTERVALS_FILE, UNSURE_FILE, HISTORY_FILE = "intervals.json", "intervals-unsure.json", "history.jsonl"
 NETWORK_FOLDER = "network"
 TAUGHT_FILE = "taught.json"
-#: The car that comes with the package, by name.
+#: Cars of the package, by name.
 SHIPPED_CARS = {"saloon": Path(__file__).parents[1] / "models" / "default"}
-#: Instead of a file: intervals as the estimators give them: wide, for a car that may differ from its vehicle file.
+#: Names in place of an intervals file: uncalibrated intervals of the estimators; wide intervals for a car that may
+#: differ from its vehicle file.
 NO_INTERVALS, UNSURE = "none", "unsure"
-#: Digits of a hash that are shown.
+#: Number of digits of a hash in messages.
 SHOWN_DIGITS = 12
 
 PartT = TypeVar("PartT", bound=Record)
-#: A file or folder, or the name of one that is shipped.
+#: A file or folder, or the name of a shipped one.
 Place = Path | str | None
 
 
 @dataclass(frozen=True, slots=True)
 class AllowedTrust:
-    """The cap in [0, 1], and the reason in words."""
+    """The gain limit in [0, 1], and its reason as text."""
 
     cap: float
     reason: str
 
     @property
     def note(self) -> str:
-        """What the report states."""
+        """Text for the report."""
         return f"residual gain {self.cap:g}: {self.reason}"
 
 
 @dataclass(frozen=True, slots=True)
 class WithoutTruth:
-    """The vehicle as driving without ground truth calibrated it, for the log that it is about.
+    """The vehicle as calibrated without ground truth, for one log.
 
-    ``told_friction`` : whether the signals' friction was given to the calibration too; an estimate, made with the
-    file as it is, is none. ``noise`` : of ``physics``. ``note`` : a warning for the reader of the report.
-    ``varied`` : the vehicle one posterior 1-sigma away, in independent directions. ``driven_d2_m_s`` : v̇_y residual of
-    ``physics`` on the log, the part that correlates with the driving, NaN if unknown. ``earlier`` : what applied
-    before, in time order, where the log calibrates its car as it goes on; each applies from its ``since_ns``.
-    ``causal`` : whether it depends on nothing that follows ``since_ns``. ``cg_std_m`` : as :attr:`Car.cg_std_m`.
-    ``error_scale`` : what the model leaves of the sensors, over what the calibration assumes.
+    ``told_friction`` : whether the calibration used the signals' friction; an estimated friction does not count.
+    ``noise`` : of ``physics``. ``note`` : a warning for the reader of the report. ``varied`` : the vehicle one
+    posterior 1-sigma away, in independent directions. ``driven_d2_m_s`` : part of the v̇_y residual of ``physics`` on
+    the log that correlates with the driving, NaN if unknown. ``earlier`` : earlier calibrations of the same log in time
+    order; each applies from its ``since_ns``. ``causal`` : whether it depends only on data before ``since_ns``.
+    ``cg_std_m`` : as :attr:`Car.cg_std_m`. ``error_scale`` : residual of the sensors after the fit, relative to the
+    assumption of the calibration.
     """
 
     vehicle: VehicleParameters
@@ -99,21 +100,21 @@ class WithoutTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Car:
-    """A vehicle with what was identified of it.
+    """A vehicle with its identified parts.
 
     Attributes
     ----------
-    vehicle : physics and sensors, what identification found included.
-    datasheet : physics and sensors as the person's file has them.
-    noise : of filters, by the name of :data:`~.parts.NOISY_FILTERS`; only what belongs to ``vehicle``.
-    fitted_physics : what identification found through ``physics``, None without.
-    taught : prior and residual from drives with ground truth, for the calibration of every later drive; None without.
+    vehicle : physics and sensors, including identified values.
+    datasheet : physics and sensors from the user's file.
+    noise : of filters, by the name of :data:`~.parts.NOISY_FILTERS`; only noise that belongs to ``vehicle``.
+    fitted_physics : values and noise identified with the filter ``physics``, None without.
+    taught : prior and residual from drives with ground truth, for the calibration of later drives; None without.
     network, network_name, network_folder : the residual network, None without; trust : evidence for it.
     intervals : calibrated 95 % intervals, None without.
-    learnt_on : drives that ``vehicle`` was identified on.
-    self_calibrated : the vehicle as the log that is run calibrated it, None without; for the estimators that take it.
-    assumed : entries that the file left out. source : folder or file, None for the default car.
-    notes : what is stale, and why.
+    learnt_on : drives on which ``vehicle`` was identified.
+    self_calibrated : the vehicle as calibrated on the current log, for the estimators that use it; None without.
+    assumed : missing entries of the file. source : folder or file, None for the default car.
+    notes : stale parts, with the reason.
     """
 
     vehicle: VehicleParameters
@@ -134,7 +135,7 @@ class Car:
 
     @classmethod
     def of(cls, vehicle: VehicleParameters, **parts: Any) -> Car:
-        """Return a car of a vehicle and the other attributes as they are given."""
+        """Return a car of a vehicle with other attributes."""
         return cls(vehicle, vehicle, **parts)
 
     @classmethod
@@ -151,7 +152,7 @@ class Car:
         Raises
         ------
         VehicleError, ModelError
-            A file is missing or wrong; all that is wrong in it is named at once.
+            A file is missing or wrong; the error lists all wrong entries.
 
         >>> car = Car.load("saloon")
         >>> car.vehicle.mass_kg, sorted(car.noise), car.allowed_trust.cap
@@ -183,33 +184,33 @@ class Car:
 
     @property
     def file_name(self) -> str | None:
-        """Its folder or file without where that lies, the name of a shipped one, None for the default car."""
+        """Name of its folder or file or of a shipped car, without the path; None for the default car."""
         shipped = [name for name, folder in SHIPPED_CARS.items() if folder == self.source]
         return shipped[0] if shipped else None if self.source is None else self.source.name or str(self.source)
 
     @property
     def physics_sha256(self) -> str:
-        """Digest of the physics that estimators run with."""
+        """Digest of the physics for the estimators."""
         return physics_sha256(self.vehicle)
 
     @property
     def physics_vehicle(self) -> VehicleParameters:
-        """The vehicle as ``physics`` has it: with the values that were found through it, else every filter's."""
+        """The vehicle for the filter ``physics``: with the values identified with it, otherwise as for all filters."""
         fitted = self.fitted_physics
         return self.vehicle if fitted is None else fitted.values.applied_to(self.datasheet)
 
     @property
     def varied_physics(self) -> tuple[VehicleParameters, ...]:
-        """That vehicle one posterior 1-sigma away in each direction that was kept; none without a posterior."""
+        """:attr:`physics_vehicle` one posterior 1-sigma away in each retained direction; empty without a posterior."""
         varied = () if self.fitted_physics is None else self.fitted_physics.varied
         return tuple(values.applied_to(self.physics_vehicle) for values in varied)
 
     def physics_of(self, name: str) -> str:
-        """Return the digest of the physics that the filter of a name runs with, and that its noise belongs to."""
+        """Return the digest of the physics that a filter uses and its noise belongs to."""
         return physics_sha256(self.physics_vehicle if name == PHYSICS else self.vehicle)
 
     def owns_noise(self, name: str, noise: FilterNoise) -> bool:
-        """Whether noise of a filter belongs to the physics that it has here."""
+        """Whether the noise of a filter belongs to the physics of this car."""
         return noise.physics_sha256 in (None, self.physics_of(name))
 
     @property
@@ -219,20 +220,20 @@ class Car:
 
     @property
     def residual_network(self) -> ModelBundle | None:
-        """The network, if it states what ``physics`` lacks; that of the paper states what ``phy-ukf`` lacks."""
+        """The network if its residual is of ``physics``; the paper's network predicts the residual of ``phy-ukf``."""
         return self.network if self.network is not None and self.network.model == PHYSICS_MODEL else None
 
     @property
     def tried_with(self) -> tuple[str, str]:
-        """Digests of the physics and of the noise that ``pd-hef`` runs with: what evidence for its network is about."""
+        """Digests of the physics and of the noise of ``pd-hef``, to which the evidence for its network refers."""
         return self.physics_of(PHYSICS), noise_sha256({n: noise for n, noise in self.noise.items() if n == PHYSICS})
 
     @property
     def allowed_trust(self) -> AllowedTrust:
-        """How far ``pd-hef`` may follow the network on this car, and why (docs/method.md#gain).
+        """Limit of the residual gain of ``pd-hef`` on this car, with the reason (docs/method.md#gain).
 
-        Innovations do not show whether a network helps on a car without training data; ground truth does. Evidence
-        counts for the network, physics and noise that it was found with; a part written by hand names none of them.
+        Only ground truth shows whether a network helps on a car without training data; innovations do not. Evidence is
+        valid for the network, physics and noise of its evaluation; a part written by hand is valid for all.
         """
         trust = self.trust
         if trust is None or not trust.has_evidence:
@@ -253,7 +254,7 @@ class Car:
 
     @property
     def _other_than_tried(self) -> str:
-        """What of the car is another than the network was tried with; empty if nothing is."""
+        """Difference between the car and the evaluation of its network; empty without one."""
         trust = self.trust
         physics, noise = self.tried_with
         if trust is not None and trust.physics_sha256 not in (None, physics):
@@ -267,14 +268,14 @@ class Car:
 
     @property
     def has_evidence(self) -> bool:
-        """Whether driving has shown this vehicle to be right: it was fitted, or its network was tried with it."""
+        """Whether drives confirm this vehicle: it was fitted, or its network was evaluated with it."""
         fitted = bool(self.learnt_on) or self.fitted_physics is not None
         tried = self.trust is not None and self.trust.has_evidence and not self._other_than_tried
         return fitted or tried
 
     @property
     def cg_std_m(self) -> float:
-        """1-sigma of the distance from the rear axle to the centre of gravity where no file gives it; else 0."""
+        """1-sigma of the distance from the rear axle to the centre of gravity; 0 if the file gives this distance."""
         share = next((a.spread for a in self.assumed if a.entry == "front_weight_share"), 0.0)
         if self.source is None and self.datasheet.name == DEFAULT_VEHICLE_NAME:
             share = DEFAULT_CG_SPREAD
@@ -282,7 +283,7 @@ class Car:
 
     @property
     def calibrated_car(self) -> Car:
-        """The car with the vehicle that the log calibrated, for its estimators; itself without a calibration."""
+        """The car with the vehicle as calibrated on the log; the same car without a calibration."""
         calibrated = self.self_calibrated
         if calibrated is None:
             return self
@@ -291,7 +292,7 @@ class Car:
         return car.with_noise(PHYSICS, calibrated.noise)
 
     def with_fit(self, fit: Fit) -> Car:
-        """Return the car as identification found it; what was found of a network with other tyres counts no more."""
+        """Return the car with identified parameters; evidence for a network with other parameters is dropped."""
         vehicle = fit.values.applied_to(self.datasheet)
         fitted_car = replace(self, vehicle=vehicle, fitted_physics=fit.physics)
         how = "(calibrated without ground truth)" if fit.without_truth else "(identified)"
@@ -304,13 +305,13 @@ class Car:
         return replace(fitted_car, vehicle=vehicle, noise=noise, trust=trust, learnt_on=fit.drives)
 
     def with_noise(self, name: str, noise: FilterNoise) -> Car:
-        """Return the car with another noise of one filter."""
+        """Return the car with different noise of one filter."""
         return replace(self, noise={**self.noise, name: noise})
 
     def with_vehicle(self, vehicle: VehicleParameters) -> Car:
-        """Return the car with other physics, made wrong on purpose; the rest, residual gain included, stays.
+        """Return the car with deliberately wrong physics; all else, including the residual gain, is unchanged.
 
-        What was identified through ``physics`` stays, except the changed entries: it would restore the right ones.
+        Values that were identified with ``physics`` are kept, except the changed entries, which they would overwrite.
         """
         trust, physics = self.trust, self.fitted_physics
         other = {k: v for k, v in vehicle if v != getattr(self.vehicle, k)}
@@ -325,7 +326,7 @@ class Car:
 
 
 def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:
-    """Return the vehicle file of a car, that of the default sedan without a source; raises VehicleError."""
+    """Return the vehicle file of a car, or of the default sedan without a source; raises VehicleError."""
     if folder is None:
         return VehicleFile(default_vehicle(), None, ()) if source is None else read_vehicle_file(source)
     if not (folder / VEHICLE_FILE).is_file():
@@ -336,7 +337,7 @@ def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:
 
 
 def _with_parts(car: Car, folder: Path) -> Car:
-    """Return the car with the parts of its folder that are not stale: what it was taught, or fit, noise and gain."""
+    """Return the car with the valid parts of its folder: ``taught.json``, or fit, noise and residual gain."""
     notes: list[str] = []
     taught = _part(folder / TAUGHT_FILE, Taught)
     if taught is not None and taught.physics_sha256 == physics_sha256(car.datasheet):
@@ -367,7 +368,7 @@ def _stale(what: str, why: str, stage: str) -> str:
 
 
 def _part(path: Path, kind: type[PartT]) -> PartT | None:
-    """Return a part of a folder, None if there is none; raises VehicleError."""
+    """Return a part of a folder, None without its file; raises VehicleError."""
     if not path.exists():
         return None
     what = f"a car's {path.name}"
@@ -382,17 +383,17 @@ def _network_of(car: Car, folder: Path | None, chosen: Place) -> tuple[str, Path
         return NO_MODEL, None
     if name in SHIPPED_FOLDERS:
         home = SHIPPED_FOLDERS[name]
-        # A source tree without shipped networks still runs what needs none.
+        # A source tree without shipped networks still runs the estimators that need none.
         return (NO_MODEL, None) if chosen is None and not (home / DOCUMENT_FILE).is_file() else (name, home)
     if chosen is None and folder is not None:
         return name, folder / name
     home = Path(name)
-    # A car's folder may be named where its network is meant.
+    # The path may be a car's folder that contains the network.
     return name, home / NETWORK_FOLDER if (home / NETWORK_FOLDER / DOCUMENT_FILE).is_file() else home
 
 
 def _intervals_of(folder: Path | None, chosen: Place) -> Intervals | None:
-    """Return the intervals in force: the chosen ones, else the car's own."""
+    """Return the intervals in force: the chosen ones, otherwise the car's."""
     if chosen is not None and str(chosen) == NO_INTERVALS:
         return None
     file = UNSURE_FILE if str(chosen) == UNSURE else INTERVALS_FILE
@@ -406,7 +407,7 @@ def _intervals_of(folder: Path | None, chosen: Place) -> Intervals | None:
 
 
 def load_intervals(path: Path) -> Intervals:
-    """Read the intervals of a file, or those in a car's folder.
+    """Read the intervals of a file or of a car's folder.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt descent for fits to drives, with robust errors, scales that follow them, and normal priors."""
+"""Levenberg-Marquardt descent for fits to drives, with robust errors, adaptive scales and normal priors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from pdhef_logtool.records.signals import FloatArray
 
-#: Tries to find a better place before the search ends, each with so much more damping; and what a success takes off it.
+#: Number of attempts per step, factor on the damping after a failed attempt, and divisor after a successful one.
 _TRIES, _MORE, _LESS = 6, 6.0, 5.0
 
 _Errors = TypeVar("_Errors")
@@ -40,7 +40,7 @@ def descend(
     ----------
     errors : function of the parameters θ [K], which are distances from the prior in standard deviations.
     cost : function of errors and θ, including |θ|² for the priors.
-    scaled : function of errors, and of the errors that give the scales, that returns residuals [R]; the cost
+    scaled : function that returns residuals [R] from errors, and from the errors that determine the scales; the cost
         approximates their sum of squares.
     least_gain : function of errors: decrease of the cost below which the search ends.
     derivative_step, max_step : step of θ for derivatives, and the largest step of the search.
@@ -59,7 +59,7 @@ def descend(
         normal = jac.T @ jac + np.eye(theta.size)
         gradient = jac.T @ residuals + theta
         gain = 0.0
-        if not gradient.any():  # the residuals contain nothing about θ, or this is the minimum
+        if not gradient.any():  # the residuals do not depend on θ, or this is the minimum
             break
         for _ in range(_TRIES):
             step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)

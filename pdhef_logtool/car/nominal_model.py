@@ -1,8 +1,8 @@
 """The nominal 3-DOF single-track model f_nom and its measurement function, compiled (docs/method.md#model, Eq 1-4).
 
-State [v_x, v_y, r] at the centre of gravity, ISO 8855, SI. Below the vehicle's low-speed limit the slip angles are
-singular, so that the model blends to the kinematic single-track model, whose lateral velocity and yaw rate follow
-r = v_x tan δ / L and v_y = l_r r with a short time constant.
+State [v_x, v_y, r] at the centre of gravity, ISO 8855, SI. Slip angles are singular at zero speed. Below the vehicle's
+low-speed limit, the model therefore blends to the kinematic single-track model, in which yaw rate and lateral velocity
+approach r = v_x tan δ / L and v_y = l_r r with a short time constant.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import NamedTuple
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 
-#: Time constant of the approach to the kinematic model, s: short for driving, long for a 10 ms step.
+#: Time constant of the approach to the kinematic model, s: short for a car, long compared to a 10 ms step.
 KINEMATIC_TIME_CONSTANT_S = 0.1
 #: The blend starts at this share of the vehicle's low-speed limit and ends at the limit.
 BLEND_START_SHARE = 0.5
@@ -49,7 +49,7 @@ class ModelParameters(NamedTuple):
 def model_parameters(vehicle: VehicleParameters, *, roll_correction: bool = False) -> ModelParameters:
     """Flatten vehicle parameters for the compiled model.
 
-    With ``roll_correction`` the measured a_y is taken as (1 + g·K_φ) times the planar one (docs/method.md#model).
+    With ``roll_correction``, the measured a_y is (1 + g·K_φ) times the planar a_y (docs/method.md#model).
     """
     bf, cf, df, ef = vehicle.magic_formula(True, 1.0)
     br, cr, dr, er = vehicle.magic_formula(False, 1.0)
@@ -86,7 +86,7 @@ def magic_formula_force(alpha, B, C, D_n, E, fixed_stiffness, friction):  # type
 
 @njit(cache=True)
 def dynamic_share(vx, p):  # type: ignore[no-untyped-def]
-    """Return the weight in [0, 1] of the dynamic against the kinematic model at speed ``vx``."""
+    """Return the weight in [0, 1] of the dynamic model at speed ``vx``; the rest is kinematic."""
     w = (vx - p.blend_low_m_s) / (p.blend_high_m_s - p.blend_low_m_s)
     return min(1.0, max(0.0, w))
 

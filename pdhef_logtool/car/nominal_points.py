@@ -1,9 +1,9 @@
-"""The nominal model at many states at once: what the filters move and measure their sigma points with, compiled.
+"""Compiled nominal model for many states at once, for the sigma points of the filters.
 
-The definition is :mod:`~pdhef_logtool.car.nominal_model`; the results here equal it but for rounding. The points lie in
-blocks of a work array, in each the ``WIDTH`` numbers of one quantity after those of another. A step is taken for a
-block in an inner loop without branches or library calls, which the compiler turns into vector instructions. Arctangent
-and sine are polynomials: those of the C library take one number at a time and most of a filter's time.
+The results equal :mod:`~pdhef_logtool.car.nominal_model` except for rounding. The points are in blocks of a work array;
+each block contains ``WIDTH`` numbers of one quantity, then of the next. The inner loop over a block has no branches and
+no library calls, so that the compiler generates vector instructions. Arctangent and sine are polynomials, because the
+functions of the C library are scalar and would take most of a filter's time.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import NamedTuple
 from pdhef_logtool.car.nominal_model import KINEMATIC_TIME_CONSTANT_S
 from pdhef_logtool.compiled.cache import njit
 
-#: Points of one inner loop: a constant, so that no remainder is left and every point is computed alike.
+#: Points of one inner loop: a constant, so that there is no remainder loop and all points are computed alike.
 WIDTH = 16
-#: Where the quantities of a block of points begin: state, inputs, what a step needs of the steering angle, and a_y.
+#: Offsets of the quantities in a block of points: state, inputs, functions of the steering angle, and a_y.
 AT_VX, AT_VY, AT_YAW_RATE, AT_STEER, AT_AX, AT_COS_STEER, AT_TAN_STEER, AT_AY = range(0, 8 * WIDTH, WIDTH)
 BLOCK = 8 * WIDTH
 
@@ -25,12 +25,12 @@ _TAN_3_PI_8 = 2.414213562373095
 _HALF_PI = 0.5 * math.pi
 _QUARTER_PI = 0.25 * math.pi
 _INVERSE_PI = 1.0 / math.pi
-#: π in two parts: what the double leaves out.
+#: π in two parts: the double, and its rounding error.
 _PI_REST = 1.2246467991473532e-16
-#: Adding and subtracting it rounds to the nearest whole number.
+#: Adding and subtracting this value rounds to the nearest integer.
 _ROUND = 1.5 * 2.0**52
 
-# No check of divisors, which would be a branch, and a·b + c as one instruction where the processor has it.
+# No check of divisors, which would be a branch; a·b + c may be one instruction.
 _compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
 _inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
@@ -39,8 +39,8 @@ _inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 def arctangent(y, x):  # type: ignore[no-untyped-def]
     """Return atan(y / x) in rad for x > 0, to 3e-16.
 
-    |y| / x is brought below tan(π/8) by atan q = π/4 + atan((q − 1)/(q + 1)) or π/2 − atan(1/q), with one division.
-    There (atan(√z)/√z − 1)/z is a polynomial of degree 9: interpolated at the Chebyshev points of [0, tan²(π/8)] with
+    |y| / x is reduced below tan(π/8) by atan q = π/4 + atan((q − 1)/(q + 1)) or π/2 − atan(1/q), with one division.
+    There, (atan(√z)/√z − 1)/z is a polynomial of degree 9, interpolated at the Chebyshev points of [0, tan²(π/8)] with
     60 digits, which is near the best of its degree (Trefethen 2013, chapter 16); its error is 6e-17.
     """
     a = abs(y)
@@ -66,7 +66,7 @@ def arctangent(y, x):  # type: ignore[no-untyped-def]
 def sine(x):  # type: ignore[no-untyped-def]
     """Return sin(x) for |x| up to 1e4 rad, to 3e-16.
 
-    x is brought to ±π/2 by whole multiples of π; there (sin(√z)/√z − 1)/z is a polynomial of degree 7, found as that of
+    x is reduced to ±π/2 by multiples of π. There, (sin(√z)/√z − 1)/z is a polynomial of degree 7, found as in
     :func:`arctangent`; its error is 1e-18.
     """
     k = (x * _INVERSE_PI + _ROUND) - _ROUND
@@ -85,7 +85,7 @@ def sine(x):  # type: ignore[no-untyped-def]
 
 
 class _Constants(NamedTuple):
-    """What stays the same for all points of a step: divisions and the friction taken out of the inner loop."""
+    """Constants of all points of a step, computed outside of the inner loop: divisions and friction."""
 
     b_front: float
     b_rear: float
@@ -99,7 +99,7 @@ class _Constants(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def _constants(friction, p):  # type: ignore[no-untyped-def]
-    """Return what stays the same over a step at this friction."""
+    """Return the constants of a step at this friction."""
     return _Constants(
         p.front_B / friction if p.front_fixed_stiffness else p.front_B,
         p.rear_B / friction if p.rear_fixed_stiffness else p.rear_B,
@@ -114,7 +114,7 @@ def _constants(friction, p):  # type: ignore[no-untyped-def]
 
 @_inline
 def _axle_accelerations(vx, vy, r, steer, cos_steer, c, p):  # type: ignore[no-untyped-def]
-    """Return a_y in m/s² and the yaw acceleration in rad/s² (Eq 1-4), as the function of the nominal model does."""
+    """Return a_y in m/s² and the yaw acceleration in rad/s² (Eq 1-4), as in the nominal model."""
     v = max(vx, p.blend_low_m_s)
     front = c.b_front * (steer - arctangent(vy + p.front_m * r, v))
     rear = -c.b_rear * arctangent(vy - p.rear_m * r, v)
@@ -131,7 +131,7 @@ def _share(vx, c, p):  # type: ignore[no-untyped-def]
     return min(1.0, max(0.0, (vx - p.blend_low_m_s) * c.blend_per_m_s))
 
 
-# positional: numbers of one point in an inner loop that is to become vector instructions.
+# positional: scalars of one point in a vectorised inner loop.
 @_inline
 def _derivative(vx, vy, r, steer, cos_steer, tan_steer, ax, c, p):  # type: ignore[no-untyped-def]
     """Return d/dt [v_x, v_y, r] (Eq 1-4 with the blend to the kinematic model)."""
@@ -155,19 +155,19 @@ def _turn(block):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def work_size(count):  # type: ignore[no-untyped-def]
-    """Return how many numbers the work array for ``count`` points has."""
+    """Return the length of the work array for ``count`` points."""
     return (count + WIDTH - 1) // WIDTH * BLOCK
 
 
 @njit(cache=True)
 def place_count(points):  # type: ignore[no-untyped-def]
-    """Return for how many points a work array has room; all of them must be finite."""
+    """Return the capacity of a work array in points; all of them must be finite."""
     return points.shape[0] // BLOCK * WIDTH
 
 
 @njit(forceinline=True)
 def place(i):  # type: ignore[no-untyped-def]
-    """Return the index of the first quantity of point ``i`` in the work array; the others follow at AT_...."""
+    """Return the index of the first quantity of point ``i`` in the work array; the others are at offsets ``AT_*``."""
     return i // WIDTH * BLOCK + i % WIDTH
 
 
@@ -175,7 +175,7 @@ def place(i):  # type: ignore[no-untyped-def]
 def advance_points(points, friction, dt, n, p):  # type: ignore[no-untyped-def]
     """Advance v_x, v_y and r of the points [work_size] by ``dt`` s in ``n`` RK4 steps with constant inputs, in place.
 
-    Inputs: STEER in rad, AX the accelerometer's at the IMU in m/s².
+    Inputs: STEER in rad, AX of the accelerometer at the IMU in m/s².
     """
     k = _constants(friction, p)
     h = dt / n
@@ -200,7 +200,7 @@ def advance_points(points, friction, dt, n, p):  # type: ignore[no-untyped-def]
 
 @_compiled
 def measure_points(points, friction, p):  # type: ignore[no-untyped-def]
-    """Write to AY of the points [work_size] what the accelerometer reads there, m/s²; input STEER."""
+    """Write the accelerometer readings in m/s² to AY of the points [work_size]; input STEER."""
     k = _constants(friction, p)
     for start in range(0, points.shape[0], BLOCK):
         block = points[start : start + BLOCK]

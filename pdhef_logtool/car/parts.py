@@ -1,7 +1,6 @@
-"""What commands learn about a car, one part a command: fit, noise, network and its residual gain, intervals.
+"""Parts of a car, one per command: fit, noise, network with its residual gain, intervals.
 
-Every part names what it depends on by the digest of just that, so that a part whose basis has changed is known to be
-stale and is not taken, however the files came together.
+Each part contains the digest of its inputs. If an input has changed, the part is stale and is not used.
 """
 
 from __future__ import annotations
@@ -26,35 +25,35 @@ from pdhef_logtool.storage.documents import digest, one_of
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
-#: The filter on physics that has parts of its own.
+#: The filter on physics with its own identified values and noise.
 PHYSICS = "physics"
-#: Filters whose noise a car may contain, by the name of the estimator that it belongs to.
+#: Filters with noise in a car, by the name of the estimator.
 NOISY_FILTERS = ("phy-ukf:tuned", PHYSICS)
-#: By what the process noise of v_y and yaw rate is multiplied where ``physics`` is smoothed, and nothing was found on
-#: ground truth: by a search on simulated cars.
+#: Factors on the process noise of v_y and yaw rate for the smoother of ``physics`` unless ground truth gives others;
+#: from a search on simulated cars.
 SMOOTHING = (0.5, 3.0)
-#: Measurements that ``r_std`` is about.
+#: Measurements of ``r_std``.
 MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
-#: Entries of a vehicle file that change no estimate.
+#: Entries of a vehicle file that do not influence estimates.
 _NOT_PHYSICS = {"name", "truth_position_m", "gnss_antenna_position_m"}
 
 
 def physics_sha256(vehicle: VehicleParameters) -> str:
-    """Return the digest of physics and sensors of a vehicle file; name, layout and comments do not count.
+    """Return the digest of physics and sensors of a vehicle file, independent of name, layout and comments.
 
-    Entries at their defaults count as absent: one that a later version adds makes no car stale.
+    Entries at their defaults count as absent, so that new entries of a later version do not make a car stale.
     """
     return digest(vehicle.model_dump(mode="json", exclude=_NOT_PHYSICS, exclude_defaults=True))
 
 
 def car_folder(name: str, physics_sha256: str) -> str:
-    """Return the name of the folder of a car's drives in files by ``car=``: short, portable, another one a physics."""
+    """Return the folder name ``car=...`` of a car's drives: short, portable, and different for different physics."""
     return f"car={re.sub(r'[^A-Za-z0-9._]+', '-', name)[:24]}-{physics_sha256[:8]}"
 
 
 class LearntOn(Record):
-    """A drive that something was identified on, with the span in seconds from the start of its log."""
+    """A drive of an identification, with the span in seconds from the start of its log."""
 
     name: str
     sha256: str = ""
@@ -63,7 +62,7 @@ class LearntOn(Record):
 
 
 class FittedSensors(Record):
-    """Constant errors that identification found."""
+    """Identified constant errors of sensors."""
 
     ay_bias_m_s2: float
     yaw_rate_bias_rad_s: float
@@ -72,7 +71,7 @@ class FittedSensors(Record):
 
 
 class FittedValues(Record):
-    """Entries of the vehicle file that identification found better values for; absent ones stay the file's."""
+    """Identified values of vehicle file entries; for absent ones the file applies."""
 
     yaw_inertia_kg_m2: Positive | None = None
     steer_offset_rad: float | None = None
@@ -91,7 +90,7 @@ class FittedValues(Record):
 
     @classmethod
     def between(cls, datasheet: VehicleParameters, fitted: VehicleParameters) -> FittedValues:
-        """Return the entries of ``fitted`` that are another vehicle's than ``datasheet``."""
+        """Return the entries of ``fitted`` that differ from ``datasheet``."""
         same = {k: None for k in cls.model_fields if getattr(fitted, k) == getattr(datasheet, k)}
         return cls.of(fitted).model_copy(update=same)
 
@@ -103,27 +102,27 @@ class FittedValues(Record):
         return cls(**values)
 
     def applied_to(self, vehicle: VehicleParameters) -> VehicleParameters:
-        """Return the vehicle with these values in place of its own."""
+        """Return the vehicle with these values."""
         update: dict[str, Any] = {k: v for k in type(self).model_fields if (v := getattr(self, k)) is not None}
         if self.sensors is not None:
             update["sensors"] = vehicle.sensors.model_copy(update=self.sensors.model_dump())
         return vehicle.model_copy(update=update)
 
 
-#: ``limit_gain`` of cars that no drive with ground truth has validated (docs/method.md#limit). More lowers the error of
-#: single manoeuvres further, but on laps with a wrong file kinematics then drift with bias and tilt.
+#: ``limit_gain`` of cars without validation by ground truth (docs/method.md#limit). A higher gain reduces the error of
+#: single manoeuvres further, but on laps with a wrong file the estimate then drifts with bias and tilt.
 LIMIT_GAIN = 1.5
 
 
 class FilterNoise(Record):
-    """Process and measurement 1-sigma of one filter, and what they were chosen with.
+    """Process and measurement 1-sigma of one filter, with the origin.
 
     Attributes
     ----------
-    q_std : per square root of second, of v_x, v_y and yaw rate, and of the a_x bias if it is not left out; for
-        ``physics`` also of the two axle forces. Empty: the filter's own.
-    r_std : by measurement; what is left out is the filter's own.
-    limit_gain : growth of the process noise of the axle forces of ``physics`` beyond the linear range; 0: none.
+    q_std : per square root of second, of v_x, v_y and yaw rate, and optionally of the a_x bias; for ``physics`` also of
+        the two axle forces. Empty for the filter's default.
+    r_std : by measurement; the filter's default for missing ones.
+    limit_gain : growth of the process noise of the axle forces of ``physics`` beyond the linear range; 0 without.
     physics_sha256 : of the physics that it belongs to.
     score_deg : objective of the noise search, lower is better; None without a search. trial : number of its trial.
     """
@@ -138,7 +137,7 @@ class FilterNoise(Record):
     trial: int | None = None
 
     def measurement_std(self, sensors: Sensors) -> tuple[float, float, float]:
-        """Return the 1-sigma of a_y, yaw rate and speed; what it leaves out is the sensors'."""
+        """Return the 1-sigma of a_y, yaw rate and speed, from the sensors for missing ones."""
         ay, rate, speed = (self.r_std.get(m, std) for m, std in zip(MEASUREMENTS, sensors.measurement_std, strict=True))
         return ay, rate, speed
 
@@ -167,7 +166,7 @@ FilterTables = Annotated[
 
 
 class TriedParts(Record):
-    """A set of parts of ``physics`` that was tried: its error on folds that its fits had not seen, and the verdict."""
+    """A tested set of model parts of ``physics``: its error on held-out folds, and the verdict."""
 
     parts: Annotated[tuple[str, ...], Field(strict=False)] = ()
     held_out_deg: Annotated[tuple[float, ...], Field(strict=False)]
@@ -175,11 +174,10 @@ class TriedParts(Record):
 
 
 class FittedPhysics(Record):
-    """What ``physics`` has of its own: values and noise that were found through it, and why it has its parts.
+    """Values and noise that were identified with the filter ``physics``, and the evidence for its model parts.
 
-    ``varied``: what of the values is another one posterior 1-sigma away, by direction. The directions are independent,
-    and those that move the sideslip of the drives most: what the drives leave open of the values.
-    ``smoothing``: as :data:`SMOOTHING`, found through the smoother.
+    ``varied``: values one posterior 1-sigma away, by direction. The directions are independent and have the largest
+    influence on the sideslip of the drives. ``smoothing``: as :data:`SMOOTHING`, found with the smoother.
     """
 
     values: FittedValues
@@ -190,12 +188,11 @@ class FittedPhysics(Record):
 
 
 class Fit(Record):
-    """``fit.toml``, written by ``pdhef learn --stages calibrate``: the car's physics as the drives show it.
+    """``fit.toml``, written by ``pdhef learn --stages calibrate``: identified physics of the car.
 
-    The noise in ``filter`` was found together with the values and belongs to them (docs/method.md#identification).
-    ``physics`` are those of the filter of that name, whose model has other parts: each filter's are found through
-    itself. ``without_truth``: the drives had none; they calibrated the car on their sensors alone
-    (docs/method.md#self-calibration).
+    The noise in ``filter`` was identified together with the values (docs/method.md#identification). ``physics``
+    contains the values and noise of the filter ``physics``, which has other model parts and is identified separately.
+    ``without_truth``: the car was calibrated on sensors alone (docs/method.md#self-calibration).
     """
 
     format: Literal["pdhef-fit"] = "pdhef-fit"
@@ -211,7 +208,7 @@ class Fit(Record):
 
 
 class Noise(Record):
-    """``noise.toml``: filter noise by filter, and the search for it."""
+    """``noise.toml``: noise by filter, and the search for it."""
 
     format: Literal["pdhef-noise"] = "pdhef-noise"
     version: Literal[1] = 1
@@ -221,13 +218,13 @@ class Noise(Record):
 
 
 class Trust(Record):
-    """``network.toml``, written by ``pdhef learn --stages gain``: network of this car, its gain limit, and why.
+    """``network.toml``, written by ``pdhef learn --stages gain``: network of this car, its gain limit and evidence.
 
     Attributes
     ----------
     network : a shipped network's name, or the folder ``network`` of the car. network_sha256 : of it.
-    trust_cap : share of its residual that ``pd-hef`` takes, in [0, 1]. evidence : in words, with its figures.
-    physics_sha256, noise_sha256 : of what it was tried with; None: written by hand, applies to any.
+    trust_cap : limit of the residual gain of ``pd-hef``, in [0, 1]. evidence : text with figures.
+    physics_sha256, noise_sha256 : of the evaluation; None for a part written by hand, which applies to any.
     """
 
     format: Literal["pdhef-network"] = "pdhef-network"
@@ -243,12 +240,12 @@ class Trust(Record):
 
     @property
     def has_evidence(self) -> bool:
-        """Whether the part states why; without, its cap counts for nothing."""
+        """Whether the part contains evidence; without it, the gain limit is not used."""
         return self.evidence.strip().lower() not in ("", "none")
 
 
 class YawRateCoefficients(Record):
-    """By term of the yaw rate's variance, where ``filter`` is its own 1-sigma."""
+    """Coefficients by term of the yaw rate's variance; ``filter``: the variance of the filter."""
 
     floor: NonNegative
     filter: NonNegative
@@ -256,7 +253,7 @@ class YawRateCoefficients(Record):
 
 
 class SideslipCoefficients(YawRateCoefficients):
-    """By term of the sideslip's variance."""
+    """Coefficients by term of the sideslip's variance."""
 
     sideslip: NonNegative
     grip: NonNegative
@@ -269,7 +266,7 @@ class SideslipCoefficients(YawRateCoefficients):
 class Inflation(Record):
     """Coefficients of the calibrated 1-sigmas of one algorithm (:mod:`pdhef_logtool.estimators.intervals`).
 
-    ``grip_factors`` : on that of the sideslip, where little, some and much of the grip is used.
+    ``grip_factors`` : factors on the 1-sigma of the sideslip at low, medium and high grip utilization.
     """
 
     sideslip: SideslipCoefficients
@@ -279,14 +276,14 @@ class Inflation(Record):
 
 
 class Algorithm(Record):
-    """What really runs under a name; names are presets, and may represent another algorithm on another car.
+    """Algorithm behind an estimator name. Names are presets; on another car, a name may select another algorithm.
 
     Attributes
     ----------
     algorithm : for example ``adaptive-physics``. version : of the algorithm.
-    options : those that differ from their defaults.
-    noise : process and measurement 1-sigma. use_speed : whether the speed sensor enters after the start.
-    physics_sha256, network_sha256 : of what of the car it uses; None: nothing.
+    options : options that differ from their defaults.
+    noise : process and measurement 1-sigma. use_speed : whether the speed sensor is used after the start.
+    physics_sha256, network_sha256 : of the physics and the network of the car; None if not used.
     """
 
     algorithm: str
@@ -299,20 +296,20 @@ class Algorithm(Record):
 
     @property
     def sha256(self) -> str:
-        """Digest of all of it."""
+        """Digest of all entries."""
         return digest(self.model_dump(mode="json"))
 
     @property
     def identity(self) -> str:
-        """Algorithm, version and options as text, which calibrated intervals belong to; the rest is their basis."""
+        """Algorithm, version and options as text, the key of calibrated intervals."""
         options = ", ".join(f"{name}={self.options[name]}" for name in sorted(self.options))
         return f"{self.algorithm} {self.version}{options and f' ({options})'}"
 
 
 class IntervalEntry(Record):
-    """Intervals of one algorithm; ``estimator`` is the name under which it ran, for people.
+    """Intervals of one algorithm; ``estimator`` is its name in the run, for information.
 
-    ``unseen_factor``: ratio of the width that drives outside the fit need to the fitted width, over all grip use.
+    ``unseen_factor``: ratio of the width for drives outside the fit to the fitted width, over all grip utilization.
     """
 
     estimator: str
@@ -325,7 +322,7 @@ class IntervalEntry(Record):
 class Intervals(Record):
     """``intervals.json``: 95 % intervals by resolved algorithm.
 
-    ``spread`` is by how much friction and vehicle were made wrong too; 0: not at all.
+    ``spread``: size of the deliberate errors of friction and vehicle in the fit; 0 without.
     """
 
     format: Literal["pdhef-intervals"] = "pdhef-intervals"

@@ -1,6 +1,6 @@
-"""Writing a part of a car into its folder, as a change that is either complete or absent.
+"""Atomic change of a part in a car's folder.
 
-The folder is made beside the old one and takes its place by exchange, so that a reader sees one of the two.
+A new folder is written beside the old one and exchanged with it, so that a reader sees one of the two.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.files import write_bytes, writing
 from pdhef_logtool.storage.outputs import LOCK_FILE, FolderLock, FolderTransaction
 
-#: How long a change waits for another command that is changing the same car: such a change takes a moment.
+#: Timeout for waiting until another command has changed the same car.
 LONGEST_WAIT_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What one command adds to a car.
+    """A command's change of a car.
 
     Attributes
     ----------
     command : its name. part : the file of the part that it wrote, by name in the folder.
-    files : content of the part's file and of what goes with it (records, plots), by name in the folder.
-    folders : copied whole into the car's folder, by name.
+    files : content of the part's file and of related files (records, plots), by name in the folder.
+    folders : folders to copy into the car's folder, by name.
     settings, drives : of the command, for the history.
     """
 
@@ -51,7 +51,7 @@ class Change:
 
 
 def check_output(source: Car, output: Path) -> None:
-    """Refuse an output that is no place for this car before anything is computed.
+    """Reject an unsuitable output folder before any computation.
 
     Raises
     ------
@@ -69,15 +69,15 @@ def check_output(source: Car, output: Path) -> None:
         )
     if theirs.is_file() and theirs.read_bytes() != vehicle_file(source):
         raise UsageError(
-            expected="a new folder, or that of the same car",
-            got=f"{output.name}, whose {VEHICLE_FILE} is another",
+            expected="a new folder, or the folder of the same car",
+            got=f"{output.name}, which contains a different {VEHICLE_FILE}",
             where="--output",
             remedy=f"name another folder, or give --car {output}",
         )
 
 
 def vehicle_file(car: Car) -> bytes:
-    """Return the bytes of a car's vehicle.toml; the default car has none, so that one is made."""
+    """Return the bytes of a car's vehicle.toml, generated for the default car."""
     if car.source is None:
         return vehicle_toml(car.datasheet, "The default car of pdhef.").encode()
     return (car.source / VEHICLE_FILE if car.source.is_dir() else car.source).read_bytes()
@@ -91,7 +91,7 @@ def update_car(source: Car, output: Path, change: Change) -> Path:
     Raises
     ------
     OutputError
-        The folder cannot be written; the old one then is as it was.
+        The folder cannot be written; the old one is unchanged.
     UsageError
         See :func:`check_output`.
     """

@@ -1,4 +1,4 @@
-"""What drives with ground truth taught about a car: prior of its calibration, and residual of ``physics``."""
+"""Results of teaching with ground truth: prior of the calibration, and residual of ``physics``."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pdhef_logtool.car.parts import LearntOn, Sha256
 from pdhef_logtool.car.vehicle import Positive, Record
 from pdhef_logtool.residual_model.ladder import LadderModel
 
-#: What teaches.
+#: Sources of the error that teaching uses.
 GROUND_TRUTH, ESTIMATED = "ground truth", "estimated reference"
 
 
 class TaughtParameter(Record):
-    """Prior of a parameter of the calibration: mean and standard deviation, of its logarithm where that is fitted.
+    """Prior of a calibration parameter: mean and standard deviation, of the logarithm for parameters fitted as such.
 
-    ``ay_m_s2`` : lateral acceleration of the driving that taught it; 0 = not stated.
+    ``ay_m_s2`` : lateral acceleration of the drives; 0 if unknown.
     """
 
     name: str
@@ -27,16 +27,16 @@ class TaughtParameter(Record):
 
 
 class Taught(Record):
-    """``taught.json``, written by ``pdhef learn``: what drives with ground truth taught about a car.
+    """``taught.json``, written by ``pdhef learn``: results of teaching with ground truth.
 
     Attributes
     ----------
-    physics_sha256 : of the vehicle file that it is about.
-    parameters : prior of the calibration of every later drive. residual : of the sideslip after it; None: none is
-        worth its uncertainty.
-    calibrated : whether the drives of ``residual`` calibrated their car; else it is one of the vehicle file.
-    truth : what taught, :data:`GROUND_TRUTH`, :data:`ESTIMATED`, or both.
-    figures : evidence and what to drive next.
+    physics_sha256 : of the vehicle file.
+    parameters : prior of the calibration of later drives. residual : of the sideslip after the calibration; None if no
+        residual reduces the error by enough.
+    calibrated : whether the residual is relative to the calibrated car; otherwise to the vehicle file.
+    truth : source, :data:`GROUND_TRUTH`, :data:`ESTIMATED`, or both.
+    figures : evidence and recommended drives.
     """
 
     format: Literal["pdhef-taught"] = "pdhef-taught"

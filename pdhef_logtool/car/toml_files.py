@@ -23,14 +23,14 @@ class _Network(Record):
 
 
 def _what_may_be_left_out(schema: dict[str, Any]) -> None:
-    """Make the JSON Schema that of a file: before :func:`~.assumed_values.completed`, only the mass is required."""
+    """Change the JSON Schema for files: before :func:`~.assumed_values.completed`, only the mass is required."""
     schema["required"] = ["mass_kg"]
     positive = {"exclusiveMinimum": 0, "type": "number"}
     schema["properties"] |= {"wheelbase_m": positive, "front_weight_share": positive | {"exclusiveMaximum": 1}}
 
 
 class VehicleEntries(VehicleParameters):
-    """A vehicle.toml: physics and sensors, and optionally the residual gain that its author allows, with the reason."""
+    """A vehicle.toml: physics and sensors, and optionally the residual gain of its author, with the reason."""
 
     model_config = ConfigDict(json_schema_extra=_what_may_be_left_out)
 
@@ -39,7 +39,7 @@ class VehicleEntries(VehicleParameters):
 
 @dataclass(frozen=True, slots=True)
 class VehicleFile:
-    """Contents of a vehicle.toml: physics and sensors, what of them it left out, and the table ``[network]``."""
+    """Contents of a vehicle.toml: physics and sensors, the assumed values, and the table ``[network]``."""
 
     vehicle: VehicleParameters
     trust: Trust | None
@@ -47,23 +47,23 @@ class VehicleFile:
 
 
 def read_vehicle_file(path: Path) -> VehicleFile:
-    """Read a vehicle.toml; values that it leaves out follow from mass and wheelbase (:mod:`~.assumed_values`).
+    """Read a vehicle.toml; missing values follow from mass and wheelbase (:mod:`~.assumed_values`).
 
     Raises
     ------
     VehicleError
-        The file is missing or no TOML, or has wrong, unknown or missing entries; the message names all of them.
+        The file is missing or is not TOML, or has wrong, unknown or missing entries; the message lists all of them.
     """
     return vehicle_of_entries(read_toml(path, "a vehicle TOML, car folder or 'saloon'", VehicleError), where=str(path))
 
 
 def with_sensors(vehicle: VehicleParameters, profile: Path | str) -> VehicleParameters:
-    """Return a vehicle with a sensor profile: of a name, or the table ``[sensors]`` of a file like vehicle.toml.
+    """Return a vehicle with a named sensor profile, or with the table ``[sensors]`` of a file like vehicle.toml.
 
     Raises
     ------
     VehicleError
-        The file is missing or no TOML, or has no such table, or the table has wrong or unknown entries.
+        The file is missing or is not TOML, or has no such table, or the table has wrong or unknown entries.
     """
     sensors = SENSOR_PROFILES.get(str(profile))
     if sensors is None:
@@ -94,11 +94,11 @@ def load_vehicle(path: Path) -> VehicleParameters:
 
 
 def part_toml(part: Record, head: str, comments: Mapping[str, str] | None = None) -> str:
-    """Return a part of a car's folder as TOML with ``head`` above it and ``comments`` beside entries by dotted name."""
+    """Return a part of a car's folder as TOML with ``head`` above it and ``comments`` on entries by dotted name."""
     plain: dict[str, Any] = part.model_dump(mode="json", exclude_none=True)
     return toml_text({k: v for k, v in plain.items() if v not in ([], {})}, head, comments)
 
 
 def vehicle_toml(vehicle: VehicleParameters, head: str = "") -> str:
-    """Return vehicle.toml of physics and sensors; reading it back gives the same."""
+    """Return physics and sensors as vehicle.toml, without loss."""
     return part_toml(vehicle, head)

@@ -1,4 +1,4 @@
-"""Vehicle parameters: the records behind vehicle.toml, validated where they enter."""
+"""Vehicle parameters: validated records of vehicle.toml."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ STANDSTILL_SHARE = 0.1
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
-#: From a 1:10 car's 0.1 m to a truck's 7 m, wherever the CG is.
+#: From 0.1 m for a 1:10 car to 7 m for a truck, for any position of the CG.
 AxleDistance = Annotated[float, Field(ge=0.01, le=15)]
-#: Inside a truck; no car's length in mm is.
+#: Positions inside a truck, m; lengths of a car in mm are outside.
 Coordinate = Annotated[float, Field(ge=-25, le=25)]
-#: TOML has lists alone.
+#: A list in TOML.
 Position = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
 #: Accelerometer noise; rigidly mounted sensors of a 1:10 car have 5 m/s².
 AccelerationStd = Annotated[float, Field(gt=0, le=30)]
-#: A larger value is no bias but a mounting error, which belongs in the mapping.
+#: A larger value is a mounting error, which belongs in the mapping.
 AccelerationBias = Annotated[float, Field(ge=-5, le=5)]
 AngleStd = Annotated[float, Field(gt=0, le=0.5)]
-#: Interval between samples of a sensor, and how long one is used.
+#: Interval between samples of a sensor, and longest use of a sample.
 SensorTime = Annotated[float, Field(gt=0, le=30)]
 
 #: Remedy for a wrong entry.
 REMEDY = "see docs/formats.md for every entry and its unit"
-#: Shape factor of a tyre that is given by its cornering stiffness (typical lateral C, Pacejka 2012).
+#: Shape factor of a tyre with ``cornering_stiffness_n_per_rad`` (typical lateral C, Pacejka 2012).
 STIFFNESS_TYRE_SHAPE = 1.35
 
 
@@ -51,11 +51,11 @@ class Record(BaseModel):
 class AxleTyre(Record):
     """Axle magic formula at friction 1 (Eq 2, docs/method.md#model), or a cornering stiffness alone.
 
-    ``D_n`` is the axle's peak force in N at friction 1. Eq 2 scales the whole curve with friction, its stiffness too;
-    real tyres keep theirs. With ``reference_friction``, the friction that the curve was measured at, B becomes
-    B · reference / friction: the peak follows friction, the stiffness stays (similarity, Pacejka 2012, section 4.2).
-    A tyre that is given by ``cornering_stiffness_n_per_rad`` keeps that stiffness at any friction and saturates at
-    friction · F_z.
+    ``D_n`` is the axle's peak force in N at friction 1. Eq 2 scales the whole curve with friction, including the
+    stiffness, which is constant for real tyres. With ``reference_friction``, the friction of the measured curve, B
+    becomes B · reference / friction: the peak follows friction, the stiffness is constant (similarity, Pacejka 2012,
+    section 4.2).
+    A tyre with ``cornering_stiffness_n_per_rad`` has this stiffness at any friction and saturates at friction · F_z.
     """
 
     B: Positive | None = None
@@ -89,11 +89,11 @@ class Tyres(Record):
 
 
 class Sensors(Record):
-    """Sensor profile: what a user with other sensors changes, ``[sensors]`` of vehicle.toml.
+    """Sensor profile, ``[sensors]`` of vehicle.toml.
 
     Noise is white and 1 sigma; it is R of the filters with sensor-level noise. A bias is reading minus true value. Bias
-    and gain are corrected before any estimator receives the signal. The defaults, profile ``production``, are those of
-    a production car (docs/method.md#sensors).
+    and gain are corrected before any estimator receives the signal. The defaults, profile ``production``, are for a
+    production car (docs/method.md#sensors).
 
     Attributes
     ----------
@@ -110,14 +110,15 @@ class Sensors(Record):
     ay_bias_std_m_s2 : standard deviation between drives of the remaining bias of a_y.
     yaw_rate_bias_std_rad_s : standard deviation between drives of the remaining bias of the yaw rate.
     steer_bias_std_rad : standard deviation between drives of the remaining bias of the road-wheel angle.
-    imu_rate_hz : rate above which samples of a_y and yaw rate share road and body motion, so evidence of a noise burst.
+    imu_rate_hz : rate above which samples of a_y and yaw rate are correlated by road and body motion, for the detection
+        of noise bursts.
     imu_span_s : longest time of three intervals between samples in which noise bursts and spikes are detected.
-    imu_hold_s : longest use of a sample in the divergence monitor; without a later one the channel is missing.
+    imu_hold_s : longest use of a sample in the divergence monitor; after it, the channel is missing.
     speed_hold_s : longest use of a speed sample.
     steer_hold_s : longest use of a steering sample in a filter.
     stuck_samples : smallest number of equal samples of a stuck channel; repeated samples of a recorder need more.
     speed_zero_m_s : speeds below are a standstill, or wheels without pulses.
-    speed_least_m_s : lowest speed that wheels with few pulses report; a step between it and 0 is no wheel slip.
+    speed_least_m_s : lowest speed that wheels with few pulses report; a step between it and 0 is not wheel slip.
     still_yaw_rate_rad_s : largest yaw rate at a standstill, noise and bias included.
     """
 
@@ -179,7 +180,7 @@ class VehicleParameters(Record):
 
     See docs/formats.md#vehicletoml.
 
-    Ranges include 1:10 cars and trucks of 40 t. Entries that contradict each other are rejected by relations.
+    Ranges include 1:10 cars and trucks of 40 t. Relations reject entries that contradict each other.
     """
 
     name: str = "unnamed"
@@ -237,21 +238,21 @@ class VehicleParameters(Record):
     def _relations(self) -> Iterator[tuple[str, str, tuple[float, ...], float, float]]:
         """Yield name, entries beside the axle distances, values (one must be in range), and range of each relation."""
         length = self.wheelbase_m
-        # Near 1 for cars; 0.5 for the paper's sedan, 3.6 for the 1:10 car of the F1TENTH model, a guess of its authors
-        # that a fit may still double.
+        # Near 1 for cars; 0.5 for the paper's sedan, 3.6 for the 1:10 car of the F1TENTH model (a guess of its authors,
+        # which a fit may double).
         inertia = self.yaw_inertia_kg_m2 / (self.mass_kg * self.cg_to_front_axle_m * self.cg_to_rear_axle_m)
         yield "I_z / (m l_f l_r)", "mass_kg yaw_inertia_kg_m2", (inertia,), 0.15, 8.0
         for axle, front in (("front", True), ("rear", False)):
             load, over = self.axle_load_n(front), f"over static load of the {axle} axle"
             if getattr(self.tyres, axle).D_n is not None:
-                # From ice at friction 1 of the file to 2 for a racing tyre, and twice that for a rough curve.
+                # From ice at friction 1 of the file to 2 for a racing tyre; 4 for an inaccurate curve.
                 peak = self.magic_formula(front, 1.0)[2] / load
                 yield f"peak force {over}", f"tyres.{axle}.D_n mass_kg", (peak,), 0.1, 5.0
-            # Per rad: trucks and 1:10 cars 5, cars 8 to 25, racing cars 40. Eq 2 scales it with friction, so that a
-            # curve may be a plausible one at friction 1 or at the file's.
+            # Per rad: trucks and 1:10 cars 5, cars 8 to 25, racing cars 40. Eq 2 scales it with friction; the curve
+            # must be plausible at friction 1 or at the file's.
             slopes = tuple(self.cornering_stiffness_n_per_rad(front, mu) / load for mu in (1.0, self.assumed_friction))
             yield f"cornering stiffness {over} in 1/rad", f"tyres.{axle} mass_kg", slopes, 2.0, 100.0
-        # A kart is as wide as long, a coach's wheelbase is three times its track.
+        # From a kart, with a track as long as the wheelbase, to a coach with a third of it.
         yield "track over wheelbase", "track_m", (self.track_m / length,), 0.15, 1.5
         # A laden truck: 2.2 m over 3.5 m.
         yield "height of the CG over wheelbase", "cg_height_m", (self.cg_height_m / length,), 0.0, 1.2
@@ -269,7 +270,7 @@ class VehicleParameters(Record):
 
     @property
     def standstill_m_s(self) -> float:
-        """Speed below which the car is at a standstill: the direction of its velocity is noise."""
+        """Speed below which the car is at a standstill and the direction of its velocity is noise."""
         return STANDSTILL_SHARE * self.low_speed_blend_m_s
 
     @property
@@ -329,7 +330,7 @@ def correct_signals(signals: Signals, vehicle: VehicleParameters) -> Signals:
 
 
 def corrected_anew(signals: Signals, was: VehicleParameters, vehicle: VehicleParameters) -> Signals:
-    """Return signals that one vehicle's ratio, offset and biases corrected, as those of another correct them."""
+    """Return signals that were corrected for one vehicle's ratio, offset and biases, corrected for another vehicle."""
     before, after = was.sensors, vehicle.sensors
     if (was.steering_ratio, was.steer_offset_rad, before) == (vehicle.steering_ratio, vehicle.steer_offset_rad, after):
         return signals
@@ -348,6 +349,6 @@ DEFAULT_VEHICLE_NAME = "sedan"
 
 @cache
 def default_vehicle() -> VehicleParameters:
-    """Return the paper's sedan (Table 3) with nominal tyres at friction 0.85, used when no vehicle file is given."""
+    """Return the paper's sedan (Table 3) with nominal tyres at friction 0.85, the default without a vehicle file."""
     text = Path(__file__).with_name(f"{DEFAULT_VEHICLE_NAME}.toml").read_text(encoding="utf-8")
     return VehicleParameters.model_validate(tomllib.loads(text))

@@ -29,10 +29,10 @@ from pdhef_logtool.cli import (
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, PdhefError, UsageError
 from pdhef_logtool.storage.files import OF_WRITING, cannot_write
 
-#: The error of a word that no command takes; it belongs to click, or to the copy of it that newer typers carry.
+#: Usage error of click, or of the copy of click in newer versions of typer.
 _WrongWord: type[Any] = typer.BadParameter.__bases__[0]
 _INTERRUPTED = 130
-#: A reader of the output has had enough, as of any command in a pipe.
+#: Exit code if the reader of a pipe has closed it.
 _NOT_READ = 141
 _GLOBAL = frozenset({"--quiet", "-q", "--verbose", "--no-color"})
 #: Standard input, output and error.
@@ -94,7 +94,7 @@ def _root(
 
 
 def main() -> NoReturn:
-    """Run the command line; every error that a user can repair is one line on stderr and an exit code."""
+    """Run the command line; each error that a user can repair is one line on stderr and an exit code."""
     open_standard_streams()
     stopping.watch()
     try:
@@ -102,7 +102,7 @@ def main() -> NoReturn:
     except BaseException as error:
         if (stop := stopping.came()) is None:
             raise
-        # Any exception: the request to end may have been swallowed, or have become another error, on its way.
+        # Any exception: code may have swallowed the request to end, or converted it to another error.
         if isinstance(error, Exception) and os.environ.get("PDHEF_TRACEBACK"):
             raise
         code = stopping.tell(stop, error)
@@ -121,7 +121,7 @@ def _run() -> int:
         return error.exit_code
     except _WrongWord as error:
         if len(sys.argv) == 1:
-            error.show()  # pdhef alone is asked for its help
+            error.show()  # pdhef without arguments shows its help
         else:
             command = error.ctx.command_path if error.ctx else "pdhef"
             console.error(f"{command}: {' '.join(error.format_message().split()).rstrip('.')}; see {command} --help")
@@ -131,7 +131,7 @@ def _run() -> int:
     except (BrokenPipeError, SystemExit) as error:
         if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
             raise
-        _drop_stdout()  # click has made an exit of it where it came up in a command
+        _drop_stdout()  # within a command, click converts the error to an exit
         return _NOT_READ
     except Exception as error:
         stopping.check()
@@ -150,14 +150,14 @@ def _run() -> int:
 
 
 def _global_options_first(words: list[str]) -> list[str]:
-    """Return the words of the command line with the global options first, as users also write them at the end."""
+    """Return the words of the command line with the global options first; users may also write them at the end."""
     end = words.index("--") if "--" in words else len(words)
     first = [word for word in words[:end] if word in _GLOBAL]
     return [*first, *(word for word in words[:end] if word not in _GLOBAL), *words[end:]]
 
 
 def open_standard_streams() -> None:
-    """Put the null device in the place of standard streams that are closed: else outputs would get their numbers."""
+    """Open the null device for closed standard streams; otherwise, output files would get their descriptors."""
     while (number := os.open(os.devnull, os.O_RDWR)) < _STREAMS:
         os.set_inheritable(number, True)
     os.close(number)
@@ -168,7 +168,7 @@ def open_standard_streams() -> None:
 
 
 def _drop_stdout() -> None:
-    """Send what is still to be printed nowhere, so that the end of the process does not fail on it again."""
+    """Discard all further output, so that the end of the process does not fail on it again."""
     with contextlib.suppress(OSError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""What ``pdhef compare`` prints: what else differs, verdicts, the drives behind them, where their tracks part."""
+"""Output of ``pdhef compare``: other differences, verdicts, their drives, and first differences of tracks."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from pdhef_logtool.storage.files import write_bytes
 if TYPE_CHECKING:
     from rich.console import Console
 
-#: Drives at either end that are named, tracks that are followed, names that are listed.
+#: Number of drives at either end of a list, of compared tracks, and of names in a list.
 _MOST_DRIVES, _MOST_SIGNALS = 5, 8
 
 
 def render_comparison(comparison: Comparison, console: Console) -> None:
-    """Print a comparison: verdict, assumptions and next step, then what they are drawn from."""
+    """Print a comparison: verdict, assumptions and next step, then their basis."""
     requirements = comparison.requirements
     said = "; gate closed: ".join((verdict_text(comparison), *comparison.failures))
     result = said if requirements is None else joined(plan_line(requirements), said, requirements.plan.file)
@@ -44,7 +44,7 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
     for line in comparison.unpaired:
         print_indented(f"without partner: {line}", console)
     if comparison.differences:
-        console.print("\nWhat else differs", style="bold")
+        console.print("\nOther differences", style="bold")
         for line in comparison.differences:
             print_indented(line, console)
     if comparison.changed:

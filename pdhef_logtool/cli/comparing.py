@@ -1,4 +1,4 @@
-"""``pdhef compare`` and ``events``: the difference between two runs, and events within one."""
+"""``pdhef compare`` and ``events``: differences between two runs, and events within one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.results.gate import Gate
 
 commands = typer.Typer()
-#: Room around events: a threshold that is crossed to and fro is one event; a clip shows how it came about.
+#: Time around events: repeated crossings of a threshold are one event; a clip shows the time before and after.
 _PAD_S, _CLIP_PAD_S = 0.25, 5.0
 
 
@@ -30,8 +30,8 @@ _PAD_S, _CLIP_PAD_S = 0.25, 5.0
     "pdhef compare before after --cluster day --html change.html",
     panel=panels.READ,
     notes="Exit codes: 0 no significant regression; 1 no common drive; 3 some drives are damaged, or without a "
-    "counterpart and no limit is given; 4 a requirement of the plan or --max-regression failed, or is inconclusive "
-    "with --strict. Without either a regression does not change the exit code.",
+    "counterpart and there is no limit; 4 a requirement of the plan or --max-regression failed, or is inconclusive "
+    "with --strict. Without either, a regression does not change the exit code.",
 )
 def compare(
     a: Annotated[str, Argument(metavar="A", help="Output of the reference run: folder or URL.")],
@@ -102,7 +102,7 @@ def _gate(
     *,
     allow_unpaired: bool,
 ) -> Gate:
-    """Return the figures that the options ask for; raises UsageError."""
+    """Return the limits from the options; raises UsageError."""
     from pdhef_logtool.evaluation.units import share_of
     from pdhef_logtool.results.gate import MAIN, Figure, Gate, figure_problems, figures_of
 
@@ -128,11 +128,11 @@ def _gate(
     'pdhef events out --where "abs(sideslip_deg) > 9" --clip --pad 3s',
     'pdhef events out --where "abs(ay_m_s2) > 6" --parquet events.parquet',
     panel=panels.READ,
-    notes="EXPR is an expression in the SQL of Polars. Columns: those of estimates.parquet, speed_m_s, and errors "
+    notes="EXPR is an expression in the SQL of Polars. Columns: columns of estimates.parquet, speed_m_s, and errors "
     "relative to ground truth: sideslip_error_rad, vx_error_m_s, vy_error_m_s, yaw_rate_error_rad_s, ay_error_m_s2; "
     "_deg and _km_h instead of _rad and _m_s. They refer to the selected estimate, or to the track before a dot: "
-    'truth.vx_m_s, "pd-hef:gain=1".vx_m_s. A segment or manoeuvre is a column: slalom, "cornering-left". Names with '
-    "other characters than letters and digits need double quotes.",
+    'truth.vx_m_s, "pd-hef:gain=1".vx_m_s. Segments and manoeuvres are columns: slalom, "cornering-left". Names with '
+    "characters other than letters and digits need double quotes.",
 )
 def events(
     output: Annotated[str, Argument(metavar="OUTPUT", help="Output of a run: folder or URL.")],

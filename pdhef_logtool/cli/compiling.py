@@ -1,4 +1,4 @@
-"""``pdhef compile``: what a run uses is compiled now, so that no later one waits."""
+"""``pdhef compile``: compile the code of runs in advance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ commands = typer.Typer()
     "pdhef compile",
     "NUMBA_CACHE_DIR=/opt/pdhef pdhef compile",
     panel=panels.TOOLS,
-    notes="A second call compiles nothing.",
+    notes="A second call has no effect.",
     name="compile",
 )
 def compile_() -> None:
@@ -38,4 +38,4 @@ def compile_() -> None:
         for config in (saloon, sedan):
             run_logs([str(log)], Path(folder) / "out", config, report=False)
     seconds = time.perf_counter() - began_s
-    console.say(f"everything that a run uses is compiled ({seconds:.0f} s, {compiled_digest()})")
+    console.say(f"all code of runs is compiled ({seconds:.0f} s, {compiled_digest()})")

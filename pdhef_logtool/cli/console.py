@@ -1,4 +1,4 @@
-"""What reaches the user: results on stdout, everything else on stderr."""
+"""Output to the user: results on stdout, messages on stderr."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, Protocol, TypeVar
 
@@ -28,23 +28,23 @@ class _Result(Protocol):
     def to_dict(self) -> dict[str, Any]: ...
 
 
-_Shown = TypeVar("_Shown", bound=_Result)
+_Shown = TypeVar("_Shown", bound=_Result | Mapping[str, Any])
 _quiet = _verbose = False
-#: Without a terminal, progress is one line in so many seconds.
+#: Interval between lines of progress without a terminal, s.
 PROGRESS_S = 30.0
 #: A line on stderr is an error or a warning of several parts.
 _MOST_SIGNS = 5000
 
 
 def stdout() -> Console:
-    """Return a console of stdout; no text is read as markup."""
+    """Return a console of stdout without markup."""
     from rich.console import Console
 
     class Piped(Console):
         def on_broken_pipe(self) -> None:
-            raise BrokenPipeError  # as for what is printed without rich
+            raise BrokenPipeError  # as print does
 
-    # A pipe has no width of its own: tables are then as wide as they need to be, unless COLUMNS states otherwise.
+    # A pipe has no width: tables have their full width unless COLUMNS limits it.
     return Piped(
         highlight=False,
         markup=False,
@@ -54,9 +54,9 @@ def stdout() -> Console:
 
 
 def table(*heads: str, fold: int = 0) -> Table:
-    """Return a table without a box; a head that begins with ``>`` is that of a column of numbers.
+    """Return a table without a box; a head that begins with ``>`` marks a column of numbers.
 
-    ``fold`` is how many columns from the left break their text rather than cut it.
+    ``fold``: number of columns from the left that wrap their text instead of truncating it.
     """
     from rich.table import Table
 
@@ -68,7 +68,7 @@ def table(*heads: str, fold: int = 0) -> Table:
 
 
 def three_lines(result: str | Text, assumed: str, following: str) -> Table:
-    """Return the three lines that come first on the terminal: result, assumptions, next step."""
+    """Return the first three lines on the terminal: result, assumptions, next step."""
     from rich.table import Table
 
     lines = Table.grid(padding=(0, 2, 0, 0))
@@ -80,19 +80,19 @@ def three_lines(result: str | Text, assumed: str, following: str) -> Table:
 
 
 def print_indented(line: str | Text, console: Console) -> None:
-    """Print a line, and its continuations, two columns to the right."""
+    """Print a line, and its continuation lines, indented by two columns."""
     from rich.padding import Padding
 
     console.print(Padding(line, (0, 0, 0, 2), expand=False))
 
 
 def cell(value: float | None, factor: float = 1.0, digits: int = 2) -> str:
-    """Return a number for a table, a dash where there is none."""
+    """Return a number for a table, or a dash for None."""
     return "-" if value is None else f"{round(value * factor, digits) + 0.0:.{digits}f}"  # no -0
 
 
 def set_verbosity(*, quiet: bool = False, verbose: bool = False) -> None:
-    """Set what stderr shows beside errors: nothing (quiet), or also progress as lines (verbose)."""
+    """Set the output on stderr: errors only (quiet), or also progress as lines (verbose)."""
     global _quiet, _verbose
     _quiet, _verbose = quiet, verbose
 
@@ -114,22 +114,22 @@ def warn(text: str) -> None:
 
 
 def print_json(document: Any) -> None:
-    """Print one JSON document; what a terminal would obey is as JSON's escape of it."""
+    """Print one JSON document with control characters escaped."""
     text = json.dumps(jsonable(document), indent=2, sort_keys=False, ensure_ascii=False, allow_nan=False)
     signs = (c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text)
     print(text if text.replace("\n", "").isprintable() else "".join(signs))  # noqa: T201
 
 
 def print_facts(facts: dict[str, Any]) -> None:
-    """Print one fact a line."""
+    """Print one fact per line."""
     for key, value in facts.items():
         print(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {printable(value)}")  # noqa: T201
 
 
 def show(result: _Shown, render: Callable[[_Shown, Console], None], as_json: bool) -> None:
-    """Print a result, as its JSON document or as its tables."""
+    """Print a result as a JSON document or as tables."""
     if as_json:
-        print_json(result.to_dict())
+        print_json(result if isinstance(result, Mapping) else result.to_dict())
     else:
         render(all_printable(result), stdout())
 
@@ -137,13 +137,13 @@ def show(result: _Shown, render: Callable[[_Shown, Console], None], as_json: boo
 def finish(
     result: _Shown, render: Callable[[_Shown, Console], None], as_json: bool, *, exit_code: int | None = None
 ) -> NoReturn:
-    """Print a result and leave with ``exit_code``, or else with the result's own; a result without one is whole."""
+    """Print a result and exit with ``exit_code``, otherwise with the exit code of the result or 0."""
     show(result, render, as_json)
     raise typer.Exit(getattr(result, "exit_code", EXIT_OK) if exit_code is None else exit_code)
 
 
 def _progress_lines() -> Callable[[str, float], None]:
-    """Return progress as lines: each change with ``--verbose``, else one in :data:`PROGRESS_S`."""
+    """Return progress as lines: each change with ``--verbose``, otherwise one per :data:`PROGRESS_S`."""
     last, due = "", time.monotonic() + PROGRESS_S
 
     def update(text: str, share: float) -> None:
@@ -159,7 +159,7 @@ def _progress_lines() -> Callable[[str, float], None]:
 
 @contextmanager
 def reporter() -> Iterator[Reporter]:
-    """Yield a reporter on stderr; its progress is a bar on a terminal, lines elsewhere.
+    """Yield a reporter on stderr, with progress as a bar on a terminal and as lines elsewhere.
 
     Its progress raises :class:`~.stopping.Stopped` after a request to end.
     """

@@ -1,4 +1,4 @@
-"""What ``pdhef events`` prints."""
+"""Output of ``pdhef events``."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ if TYPE_CHECKING:
 
     from pdhef_logtool.results.events import FoundEvents
 
-#: Events, and drives that were left out for one reason, that are named.
+#: Largest number of events, and of excluded drives per reason, in the output.
 _MOST_EVENTS, _MOST_NAMED = 50, 5
 
 
 def render_events(events: FoundEvents, console: Console) -> None:
-    """Print the events, and what was not searched."""
+    """Print the events, and the drives that were not searched."""
     total_s = sum(e.end_s - e.start_s for e in events.events)
     drives, count = len({e.drive for e in events.events}), len(events.events)
     summary = f"{count} event{'s' * (count != 1)} in {drives} of {events.searched} drives, {total_s:.2f} s in all"
     left_out = f"; {len(events.left_out)} drives are not searched, see below" if events.left_out else ""
-    following = "nothing is needed" if not count or events.clips else "--clip writes one MCAP file per event"
+    following = "no action needed" if not count or events.clips else "--clip writes one MCAP file per event"
     console.print(three_lines(summary, f"{events.where} of {events.of}{left_out}", following))
     console.print()
     if events.events:

@@ -1,4 +1,4 @@
-"""``pdhef inspect`` and ``map``: the contents of a log and how they map to signals."""
+"""``pdhef inspect`` and ``map``: the contents of a log and their mapping to signals."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def inspect(
     ] = None,
     report: Annotated[
         Path | None,
-        Option(metavar="FILE", help="HTML page: a picture of each candidate field, clocks, checks, mapping to paste."),
+        Option(metavar="FILE", help="HTML page: a plot of each candidate field, clocks, checks, mapping to paste."),
     ] = None,
     fields: Annotated[
         bool, Option("--fields", help="Show the numeric fields of TOPIC, or of all topics, instead.")
@@ -59,7 +59,7 @@ def inspect(
 
     reading = config.read_options
     if topic is not None and not fields:
-        raise UsageError(expected="one log", got=f"{log} and {topic}", where="LOG", remedy="a topic goes with --fields")
+        raise UsageError(expected="one log", got=f"{log} and {topic}", where="LOG", remedy="a topic needs --fields")
     if fields and (report or write_mapping) is not None:
         raise UsageError(expected="--fields alone", got="--report or --write-mapping as well", where="--fields")
     place = one_place(log, private_redirects=config.allow_private_redirects)
@@ -130,5 +130,5 @@ def map_(
 
 
 def _ask(question: str) -> str:
-    """Ask on stderr and return the line that is typed."""
+    """Ask on stderr and return the line from stdin."""
     return str(typer.prompt(question, default="", show_default=False, prompt_suffix="", err=True))

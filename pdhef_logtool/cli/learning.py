@@ -23,13 +23,13 @@ commands = typer.Typer()
     "pdhef learn logs/ --car guess.toml -o mycar --stages calibrate",
     "pdhef learn lap.mcap --car mycar -o mycar --start 155 --stages gain",
     panel=panels.LEARN,
-    notes="""The default stage, teach, uses all driving with ground truth, from 20 s on: it learns the prior for the
-calibration of every later drive, and the residual that physics then lacks (taught.json in the car's folder). With
---set reference=on the sideslip reference takes the place of ground truth where a log has none.
+    notes="""The default stage, teach, uses all driving with ground truth, at least 20 s: it learns the prior for the
+calibration of later drives, and the residual of physics after the calibration (taught.json in the car's folder). With
+--set reference=on, the sideslip reference replaces missing ground truth.
 
-Stage calibrate calibrates the car by the sensors of several logs and reads no ground truth; stage gain finds the
-residual gain of a network (--network). Drives that a simulated set marks test or extrapolation are refused; for gain,
-those marked train or validation; --split any permits them (docs/learn.md).""",
+Stage calibrate calibrates the car by the sensors of several logs without ground truth; stage gain finds the residual
+gain of a network (--network). Drives of the splits test and extrapolation of a simulated set are rejected; for gain,
+drives of train and validation; --split any permits them (docs/learn.md).""",
     shared="sensors friction network",
     car="Car to start from (mass, geometry, sensor noise, priors)",
 )
@@ -69,7 +69,7 @@ def learn(
     notes="Drives are split 70/15/15 by a hash of their content and --seed, unless the manifest of a simulated set or "
     "--split defines the split. Duplicates (drives with identical signals) are used once. Columns of --where: the "
     "features, truth_vx_m_s, truth_vy_m_s; _deg and _km_h instead of _rad and _m_s (docs/retrain.md). With --set "
-    "reference=on the sideslip reference takes the place of ground truth where a log has none.",
+    "reference=on, the sideslip reference replaces missing ground truth.",
     shared="sensors friction",
     car="Nominal car (default: from the manifest of a simulated set)",
 )

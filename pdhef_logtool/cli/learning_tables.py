@@ -1,4 +1,4 @@
-"""What the learning commands print on the terminal."""
+"""Output of the learning commands on the terminal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.learning.network.train_command import TrainResult
 
 
-#: Of more drives than these only those that gave nothing are listed.
+#: Above this number of drives, only the drives without data are listed.
 MOST_DRIVES = 40
 
 
@@ -47,7 +47,7 @@ def _calibration(figures: Mapping[str, Any], console: Console) -> None:
 
 def _gain(figures: Mapping[str, Any], console: Console) -> None:
     """Print the sideslip error at each residual gain, its difference to gain 0 with bounds, and the limit."""
-    errors = table(">residual\ngain", ">sideslip\nRMSE °", ">squared error minus\nthat at 0, deg²", ">\n95 % bounds")
+    errors = table(">residual\ngain", ">sideslip\nRMSE °", ">squared error minus\nvalue at 0, deg²", ">\n95 % bounds")
     columns = (figures[key] for key in ("trusts", "rmse_deg", "against_trust_0"))
     for gain, rmse, b in zip(*columns, strict=True):
         bounds = f"{b['low_deg2']:.4f} to {b['high_deg2']:.4f}" if gain and b["low_deg2"] is not None else "-"
@@ -59,7 +59,7 @@ def _gain(figures: Mapping[str, Any], console: Console) -> None:
 
 
 def _teaching(figures: Mapping[str, Any], console: Console) -> None:
-    """Print the rungs that were tried, what the drives taught is worth on them, and what to drive next."""
+    """Print the tested residual models, the improvement by teaching, and the recommended drives."""
     rungs = table("residual model", ">RMSE °, held-out\nblocks", ">difference °²", ">± 1 se", "outcome")
     for t in figures["rungs"]:
         outcome = "" if not t["against"] else "better" if t["taken"] else "not better"
@@ -85,7 +85,7 @@ _RENDER = {"teach": _teaching, "calibrate": _calibration, "gain": _gain}
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:
-    """Print what each drive gave, and the dataset as a whole."""
+    """Print the data of each drive and of the dataset."""
     residuals = (">v̇_y residual\nRMS m/s²", ">ṙ residual\nRMS rad/s²")
     drives = table("drive", ">seconds", ">usable", *residuals, "split", "truth", fold=1)
     few = len(result.results) <= MOST_DRIVES
@@ -107,7 +107,7 @@ def render_extraction(result: ExtractResult, console: Console) -> None:
             truth["kind"] + (f", ±{half_s:g} s" if half_s else "") + (", kept" if drive.kept else ""),
         )
     if not few:
-        what = "these gave nothing of their own" if shown else "all gave something"
+        what = "these contain no new data" if shown else "all contain data"
         console.print(f"{len(result.results)} drives, listed in manifest.json; {what}")
     if shown:
         console.print(drives)
@@ -119,7 +119,7 @@ def render_extraction(result: ExtractResult, console: Console) -> None:
 
 
 def _print_cells(held: Mapping[str, Any], choice: Mapping[str, Any] | None, console: Console) -> None:
-    """Print how much of each cell of driving split train contains, and how many contain nothing."""
+    """Print the duration of training data in each cell of driving, and the number of empty cells."""
     from pdhef_logtool.learning.network.cells import AY_M_S2, FRICTION, SPEED_M_S, cells
     from pdhef_logtool.learning.network.dataset import CHOSEN_SPLIT
 
@@ -146,7 +146,7 @@ def _span(edges: Sequence[float], number: int) -> str:
 
 
 def render_training(result: TrainResult, console: Console) -> None:
-    """Print how the training went; losses are shares of the target's own mean square."""
+    """Print the losses of a training, relative to the mean square of the target."""
     best = min(result.history, key=lambda e: e.validation_loss)
     seconds = sum(e.seconds for e in result.history)
     losses = f"training {best.train_loss:.4f}, validation {best.validation_loss:.4f} of the target's mean square"
@@ -157,7 +157,7 @@ def render_training(result: TrainResult, console: Console) -> None:
 
 
 def render_baselines(result: BaselinesResult, console: Console) -> None:
-    """Print how both baselines came out."""
+    """Print the errors of both baselines."""
     render_training(result.pure_lstm, console)
     errors = result.regression.provenance["sideslip_rmse_deg"]
     shown = ", ".join(f"{split} {value:.3f}" for split, value in errors.items() if value is not None)

@@ -1,4 +1,4 @@
-"""The options that commands share, and the one place that turns them into a run's configuration."""
+"""Shared options of the commands, and their conversion to the configuration of a run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pdhef_logtool.records.errors import UsageError
 if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig
 
-#: Panels of the help, in order; options without one come first, under "Options".
+#: Panels of the help, in order, after the options without a panel.
 INPUT, ESTIMATION, OUTPUT, WORK, SETTINGS = "Input", "Estimation", "Output", "Processes", "Settings"
 
 Log = Annotated[
@@ -43,7 +43,7 @@ Jobs = Annotated[
 
 
 def local_folder(argument: str) -> Path:
-    """Return the folder that an argument names; raises UsageError for a URL, as the command writes there."""
+    """Return the folder of an argument; raises UsageError for a URL, because the command writes to the folder."""
     from pdhef_logtool.storage.object_store import ObjectFolder, is_url
 
     if is_url(argument):
@@ -59,7 +59,7 @@ def local_folder(argument: str) -> Path:
 
 _Text = str | None
 _File = Path | None
-#: The shared options by the name of the configuration's entry, in the order of the help.
+#: Shared options by the name of the configuration entry, in the order of the help.
 _OPTIONS: dict[str, Any] = {
     "car": Annotated[_File, Option(rich_help_panel=INPUT)],
     "cars": Annotated[
@@ -90,7 +90,7 @@ _OPTIONS: dict[str, Any] = {
     "setup": Annotated[
         _File,
         Option(
-            help="setup.toml of another run of this car and recorder: mounting, delays and clocks are taken from it.",
+            help="setup.toml of another run of this car and recorder, for mounting, delays and clocks.",
             rich_help_panel=ESTIMATION,
         ),
     ],
@@ -196,16 +196,16 @@ def command(
     shared: str = "",
     car: str = "",
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function a command; what it takes as ``config`` is the :class:`RunConfig` that the shared options make.
+    """Make a function a command; its parameter ``config`` receives the :class:`RunConfig` from the shared options.
 
     Parameters
     ----------
     group : commands to add it to.
-    examples, notes : what is below the options: lines as they are typed, and paragraphs.
-    name : that of the command; None = the function's.
+    examples, notes : text below the options: command lines, and paragraphs.
+    name : of the command; None = the name of the function.
     panel : group of commands in the help of ``pdhef``.
-    shared : shared options beside --mapping, --config and --set, which every ``config`` takes.
-    car : what --car means to the command, which then has --start and --end too; empty = it has no car.
+    shared : shared options in addition to --mapping, --config and --set, which every ``config`` has.
+    car : help text of --car for the command, which then also has --start and --end; empty = no car.
     """
     wanted = {"mapping", "config_file", "assignments", *shared.split(), *(("car", "start", "end") if car else ())}
     taken = {key: option for key, option in _OPTIONS.items() if key in wanted}
@@ -227,7 +227,7 @@ def command(
                 values["config"] = run_config({key: values.pop(key) for key in taken})
             function(**values)
 
-        # Typer reads a command's options off its signature, where the shared ones are in the place of ``config``.
+        # Typer reads the options from the signature, in which the shared options replace ``config``.
         hints = get_type_hints(function, localns={"RunConfig": object}, include_extras=True)
         options = [Parameter(key, Parameter.KEYWORD_ONLY, default=None, annotation=o) for key, o in taken.items()]
         parameters: list[Parameter] = []
@@ -242,12 +242,12 @@ def command(
 
 
 def run_config(options: dict[str, Any]) -> RunConfig:
-    """Return the configuration of the shared options as given on the command line (None = not given).
+    """Return the configuration from the shared options of a command line (None = not set).
 
     Raises
     ------
     UsageError
-        A value is none of those allowed, or ``--set`` names no setting.
+        A value is not allowed, or ``--set`` contains an unknown setting.
     """
     from pdhef_logtool.runs.config import load_config, parse_assignments
 

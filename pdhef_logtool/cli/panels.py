@@ -1,4 +1,4 @@
-"""Help texts in panels: commands and options under the heading of their group."""
+"""Help texts in panels: commands and options under the headings of their groups."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LOOK, RUN, READ, LEARN, TOOLS = "Look at logs", "Run and score", "Read results",
 
 
 class PanelCommand(TyperCommand):
-    """A command whose options are listed by their ``rich_help_panel``."""
+    """A command that lists its options by their ``rich_help_panel``."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments, the options without a panel, then each panel."""
@@ -21,7 +21,7 @@ class PanelCommand(TyperCommand):
 
 
 class CommandGroup(TyperGroup):
-    """A group with panels, whose commands may have names of two words: ``simulate suite`` beside ``simulate dlc``."""
+    """A group with panels and with commands of two words, for example ``simulate suite``."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the global options, then the commands."""
@@ -37,7 +37,7 @@ class CommandGroup(TyperGroup):
             _write(formatter, [r for r in records if r[0] == panel], panel)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Take the first word behind the command that is no option as the second word of its name, where it is one."""
+        """Use the first argument that is not an option as the second word of the command if such a command exists."""
         family = [c for name, c in self.commands.items() if name.split()[0] == args[0]]
         valued = {o for c in family for p in c.params if not getattr(p, "is_flag", False) for o in p.opts}
         words = (i for i in range(1, len(args)) if not args[i].startswith("-") and args[i - 1] not in valued)

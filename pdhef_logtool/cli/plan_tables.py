@@ -1,4 +1,4 @@
-"""What commands print of a validation plan: a line for all of it, and a table of its requirements."""
+"""Output of a validation plan: a summary line, and a table of its requirements."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STYLES = {"PASS": "green", "FAIL": "bold red", "INCONCLUSIVE": "dim"}
 
 
 def plan_line(plan_result: PlanVerdicts) -> Text:
-    """Return how many requirements passed, failed and are inconclusive."""
+    """Return the numbers of passed, failed and inconclusive requirements."""
     return outcomes_text(Counter[str](v.outcome for v in plan_result.verdicts), plan_result.plan.file)
 
 
@@ -33,12 +33,12 @@ def outcomes_text(counts: Mapping[str, int], file: str) -> Text:
 
 
 def joined(verdicts: Text, said: str, file: str | None) -> Text:
-    """Return verdicts and result, those of the default plan last."""
+    """Return verdicts and result, with the verdicts of the default plan last."""
     return Text.assemble(verdicts, "; ", said) if file else Text.assemble(said, "; ", verdicts)
 
 
 def render_plan(plan_result: PlanVerdicts, console: Console) -> None:
-    """Print the requirements in a table, and what the inconclusive ones need."""
+    """Print the requirements in a table, and the next steps for inconclusive ones."""
     made = table("", "id", "requirement", ">value", ">margin", fold=3)
     for v in plan_result.verdicts:
         unit = v.requirement.unit

@@ -50,7 +50,7 @@ def report(
 
     if positions and not pdf:
         raise UsageError(expected="--pdf", got="--positions alone", where="--positions")
-    open_run(output)  # before the folder is held, which would make it where it is missing
+    open_run(output)  # before the folder is locked, which would create a missing one
     with OutputFolder(output, (LOGS,)), console.reporter() as reporter:
         result = write_pages(open_run(output), reporter.progress, by=by or ())
         if pdf:
@@ -66,7 +66,7 @@ def report(
 
 
 def open_page(result: WrittenPages) -> None:
-    """Open the page of the run in the browser, that of the log where it is the only one, or state where it is."""
+    """Open the page of the run, or of its only log, in the browser; without a browser, print the path."""
     import webbrowser
 
     pages = (*result.pages, result.fleet) if len(result.pages) == 1 else (result.fleet, *result.pages)
@@ -75,7 +75,7 @@ def open_page(result: WrittenPages) -> None:
         return
     has_display = sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     if not has_display or not webbrowser.open(page.resolve().as_uri()):
-        console.say(f"there is no browser to open it in: {page.resolve()} is one file, to be opened anywhere")
+        console.say(f"no browser is available; open {page.resolve()}, a single file, on any machine")
 
 
 def _render(result: WrittenPages, out: Console) -> None:

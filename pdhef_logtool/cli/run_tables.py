@@ -1,4 +1,4 @@
-"""What ``pdhef run`` and ``pdhef metrics`` print: the selected estimate in words, a table, files to view, verdicts."""
+"""Output of ``pdhef run`` and ``pdhef metrics``: the selected estimate as text, a table, output files, verdicts."""
 
 from __future__ import annotations
 
@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pdhef_logtool.evaluation.metrics.metric import Metric
-    from pdhef_logtool.results.summary import RunSummary
-    from pdhef_logtool.runs.pipeline import RunResult
+    from pdhef_logtool.runs.run_result import RunResult
 
 _Report: TypeAlias = Mapping[str, Any]
 #: Signal, segment and metric.
@@ -35,7 +34,7 @@ _Key: TypeAlias = tuple[str, str, str]
 
 
 class _Column(NamedTuple):
-    """A figure by which estimators are distinguished: its head, what it is of, factor to the unit shown, digits."""
+    """A column of the table of estimators: head, metric, factor to the displayed unit, digits."""
 
     head: str
     signal: str
@@ -50,7 +49,7 @@ class _Column(NamedTuple):
 
 
 _NIS_RATIO = _Column("\nNIS/dof", "state", "all", "nis_ratio", 1.0, 2)
-#: What the narrowest terminal shows, and what a narrow one leaves out first, behind all that is not named here.
+#: Columns of the narrowest terminal, and columns in the order of their omission, after all columns that are not listed.
 _KEPT: tuple[_Key, ...] = (("sideslip_rad", "all", "rmse"), ("sideslip_rad", "all", "coverage95"))
 _LEAVE_LAST: tuple[_Key, ...] = (
     ("vx_m_s", "all", "rmse"),
@@ -65,9 +64,9 @@ _LEAVE_LAST: tuple[_Key, ...] = (
     ("yaw_rate_rad_s", "all", "rmse"),
     ("sideslip_rad", "nonlinear", "rmse"),
 )
-#: Channels that are named where several share a loss, and checks where several are undecided.
+#: Largest number of channels with the same loss, and of undecided checks, in a line.
 _MOST_PLACES, _MOST_UNDECIDED = 3, 4
-#: Logs that are named of those that failed alike.
+#: Largest number of logs with the same failure in a line.
 _MOST_FAILED = 5
 _TEXTS = {
     "result": "Result",
@@ -80,7 +79,7 @@ _TEXTS = {
 
 
 def render_run(result: RunResult, console: Console) -> None:
-    """Print the selected estimate of each log, or of several in one table, and where the outputs are."""
+    """Print the selected estimate of each log, or one table for several logs, and the location of the outputs."""
     reports_by_log = [(r, all_printable(r.report)) for r in result.results]
     reports = [report for _, report in reports_by_log if report is not None]
     is_joint = len(reports) > 1 and all(report["answer"] for report in reports)
@@ -109,19 +108,19 @@ def render_run(result: RunResult, console: Console) -> None:
 
 
 def _assumed(reports: Sequence[_Report]) -> list[str]:
-    """Return what is assumed of all logs, clause by clause."""
+    """Return the common assumptions of all logs as clauses."""
     if reports and all(report["answer"] is None for report in reports):  # recorded estimates
         vehicle = reports[0]["vehicle"]
         slow = f"sideslip is scored above {vehicle['low_speed_blend_m_s']:g} m/s"
         if vehicle["file"] is not None:
             return [f"car {vehicle['file']}", slow]
-        return ["no car given: the ground truth is taken to be measured at the centre of gravity", slow]
+        return ["no car given: the ground truth is assumed to be measured at the centre of gravity", slow]
     first, *others = [_clauses(_texts(report), "assumed") for report in reports] or [[]]
     return [clause for clause in first if all(clause in clauses for clauses in others)]
 
 
 def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str]) -> Table:
-    """Return the three lines that come first: result, assumptions, next step."""
+    """Return the first three lines: result, assumptions, next step."""
     given, texts = result.requirements, [_texts(report) for report in reports]
     failed = [r.outcome.log for r in result.results if r.report is None]
     if len(result.results) == 1:
@@ -133,8 +132,8 @@ def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str])
     steps = next_steps(None if given is None else given.to_dict(), steps)
     return three_lines(
         said if given is None else joined(plan_line(given), said, given.plan.file),
-        "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "nothing beside the log"),
-        steps[0] if steps else f"nothing is needed; pdhef view {result.place or 'OUT'} shows the drive",
+        "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "none"),
+        steps[0] if steps else f"no action needed; pdhef view {result.place or 'OUT'} shows the drive",
     )
 
 
@@ -148,63 +147,64 @@ def _range(reports: Sequence[_Report]) -> str:
 
 
 def _recorded(report: _Report) -> str:
-    """Return the sideslip error of recorded estimates in words."""
+    """Return the sideslip error of recorded estimates as text."""
     figures, names = _figures(report), [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
     errors = [(n, e) for n in names if (e := figures.get((n, "sideslip_rad", "all", "rmse"))) is not None]
     if not errors:
-        return f"sideslip of {', '.join(names)} is not scored" if names else "nothing was estimated"
+        return f"sideslip of {', '.join(names)} is not scored" if names else "no estimate"
     scored = ", ".join(f"{name}: {degrees(error)}" for name, error in errors)
     return f"sideslip RMSE of {scored} ({truth_of(report, 'sideslip_rad')})"
 
 
-def _fleet_head(summary: RunSummary) -> Table:
+def _fleet_head(summary: Mapping[str, Any]) -> Table:
     """Return the three lines of a run of many logs."""
-    plan = summary.plan or {}
+    plan = summary["plan"] or {}
     counts = Counter(str(r["outcome"]) for r in plan.get("requirements") or ())
-    rmse = f"median sideslip RMSE {degrees(summary.errors[0].median_rad)}" if summary.errors else "no drive is scored"
-    said = f"{rmse} of {summary.scored} drives"
-    steps = next_steps(plan, ["read the failures below"] if summary.failed else ())
+    errors = summary["errors"]
+    rmse = f"median sideslip RMSE {degrees(errors[0]['median_rad'])}" if errors else "no drive is scored"
+    said = f"{rmse} of {summary['scored']} drives"
+    steps = next_steps(plan, ["read the failures below"] if summary["failed"] else ())
     return three_lines(
         joined(outcomes_text(counts, plan.get("file") or ""), said, plan.get("file")) if counts else said,
         "differs by drive, see report.json",
-        steps[0] if steps else f"open {Path(summary.output) / PAGE_FILE}",
+        steps[0] if steps else f"open {Path(summary['output']) / PAGE_FILE}",
     )
 
 
-def render_fleet(summary: RunSummary, console: Console) -> None:
-    """Print a run of many logs: the errors over drives, the worst of them, what failed, and where the outputs are."""
+def render_fleet(summary: Mapping[str, Any], console: Console) -> None:
+    """Print a run of many logs: errors over drives, worst drives, failures, and the location of the outputs."""
     console.print(_fleet_head(summary))
     console.print()
-    if summary.errors:
+    if summary["errors"]:
         spread = table("sideslip by", ">drives", ">median °", ">p90 °", ">largest °")
-        for of in summary.errors:
-            figures = (cell(x, DEGREES, 3) for x in (of.median_rad, of.p90_rad, of.max_rad))
-            spread.add_row(of.estimator, str(of.drives), *figures)
-        console.print(f"RMSE of sideslip over {summary.scored} drives with an independent ground truth")
+        for of in summary["errors"]:
+            figures = (cell(of[f"{name}_rad"], DEGREES, 3) for name in ("median", "p90", "max"))
+            spread.add_row(of["estimator"], str(of["drives"]), *figures)
+        console.print(f"RMSE of sideslip over {summary['scored']} drives with an independent ground truth")
         console.print(spread)
         console.print()
-    if summary.worst:
-        names = list(dict.fromkeys(n for d in summary.worst for n in d.errors_rad if n != d.main))
+    if summary["worst"]:
+        names = list(dict.fromkeys(n for d in summary["worst"] for n in d["errors_rad"] if n != d["main"]))
         worst = table("worst drives", "by", ">RMSE °", *(f">{n} °" for n in names), fold=1)
-        for drive in summary.worst:
-            errors = (cell(drive.errors_rad.get(n), DEGREES, 3) for n in (drive.main, *names))
-            worst.add_row(drive.log, drive.main, *errors)
+        for drive in summary["worst"]:
+            errors = (cell(drive["errors_rad"].get(n), DEGREES, 3) for n in (drive["main"], *names))
+            worst.add_row(drive["log"], drive["main"], *errors)
         console.print(worst)
         console.print()
-    for kind in summary.failed:
-        console.print(Text.assemble((f"{kind.count} failed: ", "bold"), kind.reason))
-        _print_some(kind.labels, kind.count, console)
-    if summary.checks_failed:
-        console.print(Text.assemble((f"{len(summary.checks_failed)} with failed checks", "bold"), ", see report.json:"))
-        _print_some(summary.checks_failed, len(summary.checks_failed), console)
-    left = f", {summary.remaining} not done" if summary.remaining else ""
-    failed = summary.logs - summary.done
-    console.print(f"{summary.logs} logs: {summary.done} done, {failed} failed, {summary.lost} with input lost{left}")
-    _print_outputs(summary.output, console)
+    for kind in summary["failed"]:
+        console.print(Text.assemble((f"{kind['count']} failed: ", "bold"), kind["reason"]))
+        _print_some(kind["labels"], kind["count"], console)
+    if checks := summary["checks_failed"]:
+        console.print(Text.assemble((f"{len(checks)} with failed checks", "bold"), ", see report.json:"))
+        _print_some(checks, len(checks), console)
+    left = f", {summary['remaining']} not done" if summary["remaining"] else ""
+    logs, done, lost = (summary[key] for key in ("logs", "done", "lost"))
+    console.print(f"{logs} logs: {done} done, {logs - done} failed, {lost} with input lost{left}")
+    _print_outputs(summary["output"], console)
 
 
 def _print_some(labels: Sequence[str], count: int, console: Console) -> None:
-    """Name the first of so many logs."""
+    """Print the names of the first logs and the number of others."""
     more = f" and {count - _MOST_FAILED} more" if count > _MOST_FAILED else ""
     print_indented(", ".join(labels[:_MOST_FAILED]) + more, console)
 
@@ -216,7 +216,7 @@ def _print_outputs(output: Path | str, console: Console) -> None:
 
 
 def _render_one_of_several(report: _Report, assumed: Sequence[str], console: Console) -> None:
-    """Print what the joint table does not show of a log and a user acts on; ``assumed`` is stated of all logs."""
+    """Print details of a log that need attention and are not in the joint table; ``assumed``: common assumptions."""
     texts, main = _texts(report), report["answer"]["main"]
     is_scored = _figures(report).get((main, "sideslip_rad", "all", "rmse")) is not None
     rest = [clause for clause in _clauses(texts, "assumed") if clause not in assumed]
@@ -228,16 +228,16 @@ def _render_one_of_several(report: _Report, assumed: Sequence[str], console: Con
 
 
 def _render_log(report: _Report, console: Console) -> None:
-    """Print the log of a run of one."""
+    """Print the log of a run with one log."""
     about = f"  {report['log']['kind']}, {report['log']['duration_s']:.1f} s"
     texts = _texts(report)
-    later = _clauses(texts, "next")[1:]  # the head has the first one
+    later = _clauses(texts, "next")[1:]  # the head contains the first one
     shown = {key: text for key, text in texts.items() if key not in ("result", "assumed", "next")}
     shown |= {"next": "; ".join(later)} if later else {}
     _print_log(report, about, [*_failed_checks(report)], shown, [*_below(report)], console, tabled=True)
 
 
-def _print_log(  # positional: what both callers have at hand
+def _print_log(  # positional: two callers in this file
     report: _Report,
     about: str,
     above: Sequence[str | Text],
@@ -260,7 +260,7 @@ def _print_log(  # positional: what both callers have at hand
 
 
 def _texts(report: _Report) -> dict[str, str]:
-    """Return what is stated in words, in its order; nothing where nothing was estimated."""
+    """Return the texts of the selected estimate in order; empty without an estimate."""
     answer = report["answer"]
     if answer is None:
         return {}
@@ -268,12 +268,12 @@ def _texts(report: _Report) -> dict[str, str]:
     if best is not None and best["name"] != answer["main"]:
         error = degrees(best["sideslip_rmse_rad"])
         name = best["name"] if best["causal"] else f"{best['name']} (not causal)"
-        texts["hindsight"] = f"by this log's ground truth {name} was best, {error} RMSE; nothing was chosen by it"
+        texts["hindsight"] = f"{name} has the lowest error by ground truth, {error} RMSE; not used for the selection"
     return {key: texts[key] for key in _TEXTS if texts.get(key)}
 
 
 def _clauses(texts: Mapping[str, str], key: str) -> list[str]:
-    """Return the clauses of a text, which are independent."""
+    """Return the independent clauses of a text."""
     return texts[key].split("; ") if texts.get(key) else []
 
 
@@ -301,7 +301,7 @@ def _failed_checks(report: _Report, *, undecided: bool = True) -> Iterable[str |
 
 
 def _losses(report: _Report, *, notes: bool = True) -> Iterable[str]:
-    """Yield what of the input was lost, then what else is known of it; what several channels share is once."""
+    """Yield the losses of the input, then its notes, with one line for several channels with the same one."""
     where: dict[tuple[str, str, str], list[str]] = {}
     for loss in sorted(report["losses"], key=lambda x: x["severity"] != "lost"):
         has_count = loss["count"] is None or loss["kind"] == "gap" or str(loss["count"]) in loss["what"].split()
@@ -319,12 +319,12 @@ def _losses(report: _Report, *, notes: bool = True) -> Iterable[str]:
 
 
 def _below(report: _Report) -> Iterable[str]:
-    """Yield what belongs below the table: its marks, what did not run, what happened, and remarks."""
+    """Yield the lines below the table: footnotes, estimators that did not run, events, and remarks."""
     shown = _shown(report)
     if report["truth"]["not_independent"]:
-        yield "† the ground truth is an input or the estimate itself: no independent check"
+        yield "† the ground truth is an input or the estimate itself: not an independent check"
     if any(not e["causal"] for e in shown):
-        yield "* not causal: uses what was measured later"
+        yield "* not causal: uses later measurements"
     skipped: dict[str, list[str]] = {}
     for estimator in report["estimators"]:
         if estimator["outcome"] == "skipped":
@@ -344,7 +344,7 @@ def _below(report: _Report) -> Iterable[str]:
 
 
 def _shown(report: _Report) -> list[Mapping[str, Any]]:
-    """Return the estimators that a person is shown: the selected estimate first, or those that are not causal last."""
+    """Return the displayed estimators: the selected estimate first, estimators that are not causal last."""
     answer = report["answer"]
     ran = {e["name"]: e for e in report["estimators"] if e["outcome"] == "ran"}
     if answer is not None and not answer["named"]:
@@ -353,7 +353,7 @@ def _shown(report: _Report) -> list[Mapping[str, Any]]:
 
 
 def _figures(report: _Report) -> dict[tuple[str, str, str, str], float | None]:
-    """Return the figures by estimator, signal, segment and metric, with those that are made of two."""
+    """Return the metrics by estimator, signal, segment and name, including ratios and differences of two."""
     values = {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
     main = None if report["answer"] is None else report["answer"]["main"]
     for (name, signal, segment, metric), value in list(values.items()):
@@ -366,7 +366,7 @@ def _figures(report: _Report) -> dict[tuple[str, str, str, str], float | None]:
 
 
 def _table(report: _Report, console: Console) -> Table:
-    """Return the figures of the estimators that are shown, in as many columns as the terminal is wide enough for."""
+    """Return the table of the displayed estimators, with as many columns as fit the terminal."""
     values = _figures(report)
     shown = [e for e in _shown(report) if any(name == e["name"] for name, *_ in values)]  # --keep metrics has less
     names = [e["name"] for e in shown]
@@ -382,7 +382,7 @@ def _table(report: _Report, console: Console) -> Table:
 
 
 def _columns(*, truth: bool) -> list[_Column]:
-    """Return the columns of figures: what the metrics ask for, by signal, beside those that are made of two."""
+    """Return the columns of the table: columns of the metrics by signal, and ratios and differences of two."""
     metrics = registered()
     asked = [(signal, metric) for metric in metrics.values() for signal in metric.terminal]
     signals = [*dict.fromkeys(signal for signal, _ in asked)]
@@ -435,7 +435,7 @@ def _table_of(
 
 
 def _joint_table(reports: Sequence[_Report]) -> Table:
-    """Return one line a log: the errors of the selected estimate, physics and the naive one, and what to look at."""
+    """Return one line per log: errors of the selected estimate, physics and the baseline, and points to check."""
     mains = list(dict.fromkeys(report["answer"]["main"] for report in reports))
     rivals = [n for n in ("physics", "zero") if [n] != mains and any(n in r["answer"]["shown"] for r in reports)]
     head = f">{mains[0]}\nRMSE °" if len(mains) == 1 else ">sideslip\nRMSE °"
@@ -452,7 +452,7 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
 
 
 def _look_at(report: _Report, inside: float | None, main: str) -> str:
-    """Return what of a log a person should look at, in a few words; ``main`` where the logs' main estimators differ."""
+    """Return the points of a log to check as a short text; ``main``: its selected estimate if logs differ in it."""
     failed = sum(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks") or [])
     scored = any(m["signal"] == "sideslip_rad" and m["metric"] == "rmse" for m in report["metrics"])
     hints = [

@@ -1,4 +1,4 @@
-"""``pdhef run``, ``metrics`` and ``view``: estimate on logs, score what others estimated, look at the recordings."""
+"""``pdhef run``, ``metrics`` and ``view``: estimate on logs, score recorded estimates, show the recordings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError, Usa
 
 if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig
-    from pdhef_logtool.runs.pipeline import RunResult
+    from pdhef_logtool.runs.run_result import RunResult
 
 commands = typer.Typer()
 
@@ -128,8 +128,8 @@ def run(  # positional: one an option of the command line
     notes="Signals of nav_msgs/Odometry, geometry_msgs/Twist*Stamped and pdhef_msgs/VehicleStateEstimate are "
     "recognised by type. Other topics need SIGNAL=, one of vx_m_s, vy_m_s, yaw_rate_rad_s, sideslip_rad, ay_m_s2, "
     "their *_std_*, valid. A mapping file can contain scales, offsets, signs and several estimators, one table "
-    "[estimates.NAME.SIGNAL] per signal. Without ground truth the estimates are compared with the sideslip reference "
-    "of the log's IMU and GNSS, which --reference on does beside ground truth.",
+    "[estimates.NAME.SIGNAL] per signal. Without ground truth, the estimates are compared with the sideslip reference "
+    "from the log's IMU and GNSS; --reference on does so in addition to ground truth.",
     shared="plan reference gnss",
     car="Car of the log (position of the ground truth, friction, lowest speed)",
 )
@@ -215,7 +215,7 @@ def view(
 
 
 def _finish(result: RunResult, as_json: bool) -> NoReturn:
-    """Print and leave; what closed the gate, and what the exit code then does not show, goes to stderr."""
+    """Print and exit; failed requirements, and failures that the exit code does not show, are printed on stderr."""
     from pdhef_logtool.cli.run_tables import render_fleet, render_run
 
     if result.is_fleet and result.output is not None:
@@ -223,14 +223,14 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
         from pdhef_logtool.results.summary import summarise
 
         checks_failed = [r.outcome.log for r in result.results if r.failed_checks]
-        summary = summarise(open_run(result.output), result.exit_code, checks_failed)
-        console.show(replace(summary, output=result.place or summary.output), render_fleet, as_json)
+        summary = summarise(open_run(result.output), result.exit_code, checks_failed) | {"output": str(result.place)}
+        console.show(summary, render_fleet, as_json)
     else:
         if not as_json:  # the tables read the reports; a copy of all metric rows for the terminal would be unused
             result = replace(result, results=tuple(replace(entry, figures=()) for entry in result.results))
         console.show(result, render_run, as_json)
         for entry in result.results:
-            if entry.outcome.failed is not None and entry.report is not None:  # of the others the tables state it
+            if entry.outcome.failed is not None and entry.report is not None:  # the tables show the others
                 console.error(f"pdhef: {entry.outcome.log}: {entry.outcome.failed}")
     plan = result.requirements
     if plan is not None and plan.closes_gate:
@@ -250,12 +250,12 @@ def find_recordings(output: Path, logs: Sequence[str]) -> list[Path]:
     Parameters
     ----------
     output : output folder of a run, the folder of one log, or the recording itself.
-    logs : names of logs; none takes all that have a recording, in the run's order.
+    logs : names of logs; empty selects all logs with a recording, in the order of the run.
 
     Raises
     ------
     OutputError
-        There is no finished run, no recording, or none of a log that was named; the ones that there are get named.
+        There is no finished run, or a selected log has no recording; the error lists the available ones.
     """
     from pdhef_logtool.results.opened_run import RECORDING_FILE, open_run
 
@@ -276,11 +276,11 @@ def find_recordings(output: Path, logs: Sequence[str]) -> list[Path]:
 
 
 def open_viewer(recordings: Sequence[Path], *, web: bool) -> int:
-    """Open recordings in one viewer, which nobody else on the network can reach, and return its exit code."""
+    """Open recordings in one viewer, which is not reachable from the network, and return its exit code."""
     command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--new", *(["--web-viewer"] if web else [])]
     return subprocess.call([*command, *map(str, recordings)])  # noqa: S603 (our own interpreter)
 
 
 def _has_display() -> bool:
-    """Whether a window can be opened; only Linux goes without one."""
+    """Return whether a window can be opened, which may be impossible on Linux only."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -43,15 +43,13 @@ def simulate(
         str | None, Argument(metavar="MANOEUVRE", help="Name of the manoeuvre; --list shows them.")
     ] = None,
     output: Annotated[Path | None, Option("--output", "-o", help="MCAP file to write.")] = None,
-    speed_km_h: Annotated[
-        float | None, Option("--speed", help="Speed in km/h. Default: that of the manoeuvre.")
-    ] = None,
-    friction: Annotated[float | None, Option("--mu", help="Friction. Default: that of the manoeuvre.")] = None,
+    speed_km_h: Annotated[float | None, Option("--speed", help="Speed in km/h. Default: from the manoeuvre.")] = None,
+    friction: Annotated[float | None, Option("--mu", help="Friction. Default: from the manoeuvre.")] = None,
     seed: Annotated[int, Option(help="Seed of noise and of random profiles.")] = 0,
     duration_s: Annotated[
-        float | None, Option("--duration", help="Duration in s. Default: that of the manoeuvre.")
+        float | None, Option("--duration", help="Duration in s. Default: from the manoeuvre.")
     ] = None,
-    amplitude: Annotated[float, Option(help="Factor on the manoeuvre's own amplitude.")] = 1.0,
+    amplitude: Annotated[float, Option(help="Factor on the manoeuvre's amplitude.")] = 1.0,
     vehicle: Annotated[str | None, Option("--vehicle", "-v", help="Vehicle, see below. Default: sedan.")] = None,
     faults: Annotated[_Many, Option("--fault", metavar="FAULT", help="Sensor fault, see below. Repeatable.")] = None,
     sensors: Annotated[
@@ -62,7 +60,7 @@ def simulate(
     ] = None,
     rtk_rate_hz: Annotated[
         int | None,
-        Option("--rtk-rate", help="Rate of the ground truth in Hz: 10, 20, 50 or 100. Default: that of the manoeuvre."),
+        Option("--rtk-rate", help="Rate of the ground truth in Hz: 10, 20, 50 or 100. Default: from the manoeuvre."),
     ] = None,
     keep_spins: Annotated[bool, Option("--keep-spins", help="Keep |sideslip| > 20 degrees and lifted wheels.")] = False,
     list_all: Annotated[bool, Option("--list", help="List the manoeuvres and their defaults.")] = False,

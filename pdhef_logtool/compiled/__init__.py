@@ -1,1 +1,1 @@
-"""Numba code: where machine code is kept."""
+"""Cache of machine code that numba compiles."""

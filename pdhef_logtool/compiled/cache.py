@@ -1,11 +1,11 @@
-"""The ``njit`` of the package: machine code is cached where this user can write, and a cache error never ends a run.
+"""The ``njit`` of the package: machine code is cached in a writable folder, and a cache error never ends a run.
 
-Numba raises an error if no folder can be written, if a cache file is truncated and if the disk is full. Here the code
-goes to the first folder that can be written: ``NUMBA_CACHE_DIR``, the installation, the user's cache, a private
-temporary folder; if there is none, every run compiles. The code of a read-only installation is copied there.
+Numba raises an error if no folder is writable, if a cache file is truncated and if the disk is full. This cache uses
+the first writable folder of ``NUMBA_CACHE_DIR``, the installation, the user's cache and a private temporary folder;
+without any, every run compiles. The code of a read-only installation is copied to that folder.
 
-In each place the code is in a folder that is named after the digest of all sources (:mod:`~.sources`). The
-first process that uses a new digest removes the folders of other sources of this installation.
+In each place, the code is in a folder that is named after the digest of all sources (:mod:`~.sources`). The first
+process with a new digest removes the folders of other sources of this installation.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from pdhef_logtool.compiled import sources
 from pdhef_logtool.records import processes
 from pdhef_logtool.records.printable import printable
 
-#: How long the first run compiles, in seconds; a rough figure for the user.
+#: Typical time to compile everything, s, for the note to the user.
 COMPILING_S = 40
 
 
 def _without_blas() -> None:
-    """Let numba load without SciPy's BLAS, which takes longer than a short log: no function here needs it.
+    """Let numba load without SciPy's BLAS, which takes longer than a short log and is not needed here.
 
     Functions that need LAPACK, such as the repair of a covariance, load it when they are called.
     """
@@ -87,12 +87,12 @@ def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:
     return compiled
 
 
-#: The functions of the modules imported so far whose machine code is kept.
+#: The cached functions of the modules imported so far.
 _kept: list[Any] = []
 
 
 def load_kept() -> bool:
-    """Load all cached machine code, for the processes that are forked from this one; return whether there is any."""
+    """Load all cached machine code, for forked processes; return whether there is any."""
     for function in _kept:
         for signature in function._cache.signatures(function.targetctx.codegen()):
             function.compile(signature)
@@ -100,12 +100,12 @@ def load_kept() -> bool:
 
 
 def _installed() -> Path:
-    """Return the folder in which this installation may bring its machine code along."""
+    """Return the folder for machine code within the installation."""
     return sources.ROOT / "pdhef_logtool/__pycache__/compiled" / sources.compiled_digest()
 
 
 def _places() -> Iterator[Path]:
-    """Yield the places of this installation, in the order in which they are taken."""
+    """Yield the cache folders of this installation, in the order of preference."""
     # Several installations may share the other places.
     name = f"pdhef_logtool_{hashlib.sha256(os.fsencode(sources.ROOT)).hexdigest()[:16]}"
     if config.CACHE_DIR:
@@ -118,7 +118,7 @@ def _places() -> Iterator[Path]:
 
 @functools.cache
 def kept_in() -> Path | None:
-    """Return the folder that keeps the machine code; None: nowhere."""
+    """Return the folder of the machine code; None without a writable one."""
     for place in _places():
         folder = place / sources.compiled_digest()
         is_new = not folder.is_dir()
@@ -132,7 +132,7 @@ def kept_in() -> Path | None:
 
 
 def _remove_stale(place: Path) -> None:
-    """Remove, as far as it can be written, the code of other sources in a place and in the installation."""
+    """Remove the code of other sources in a place and in the installation, as far as these are writable."""
     digest = sources.compiled_digest().partition("-")[0]
     for folder in [*place.glob("*"), *_installed().parent.glob("*")]:
         if re.fullmatch("[0-9a-f]{16}-[0-9a-f]{8}", folder.name) and not folder.name.startswith(digest):
@@ -144,7 +144,7 @@ def _private_folder() -> Path | None:
 
     It has the same name in every process of the user, so that workers and later runs find it.
     """
-    if not hasattr(os, "getuid"):  # such systems have a temporary folder a user
+    if not hasattr(os, "getuid"):  # such systems have one temporary folder per user
         return Path(tempfile.gettempdir()) / "pdhef-compiled"
     with contextlib.suppress(OSError):
         folder = Path(tempfile.gettempdir()) / f"pdhef-compiled-{os.getuid()}"
@@ -189,13 +189,13 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
         return overload
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        # Two processes could give one number to the code for different arguments: the name has the process, too.
+        # Two processes may use one number for the code of different arguments: the name contains the process id, too.
         self._cache_file._data_name_pattern = f"{self._impl.filename_base}.{os.getpid()}-{{number}}.nbc"
         with contextlib.suppress(OSError):  # a full disk: the next run compiles again
             super().save_overload(signature, result)
 
     def signatures(self, codegen: Any) -> list[Any]:
-        """Return for which arguments there is code for this processor."""
+        """Return the signatures with cached code for this processor."""
         try:
             index = self._cache_file._load_index()
         except Exception:  # noqa: BLE001 (any error of a pickle that was cut short)
@@ -203,12 +203,12 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
         return [key[0] for key in index if key == self._index_key(key[0], codegen)]
 
 
-#: Whether the note that compiling begins was printed.
+#: Whether the note about compiling was printed.
 announced = False
 
 
 def announce() -> None:
-    """Print a note on stderr, once, that compiling begins; of several workers only the first prints it."""
+    """Print a note on stderr, once, that compiling begins; only the first of several workers prints it."""
     global announced
     if announced or processes.worker_number > 1:
         return

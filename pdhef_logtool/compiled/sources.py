@@ -1,4 +1,4 @@
-"""The digest of all that machine code depends on: sources, compiler and processor, computed without the compiler.
+"""Digest of all inputs of machine code: sources, compiler and processor, computed without the compiler.
 
 Numba's own cache identifies a function by its file and ignores the files of the functions that it calls. Here all
 compiled code is kept under one digest, so that code of other sources is never loaded.
@@ -23,7 +23,7 @@ _IMPORT = re.compile(rb"^from ((?:pdhef_logtool|truthsim)[\w.]*) import (?:\(([^
 
 @cache
 def compiled_sources(root: Path = ROOT) -> tuple[Path, ...]:
-    """Return the modules with compiled functions and the modules that these import, whose constants they contain."""
+    """Return the modules with compiled functions and the modules that these import, which contain their constants."""
     compiled = [
         (path, text)
         for package in PACKAGES

@@ -1,19 +1,19 @@
 """From channels on their own clocks to :class:`~pdhef_logtool.records.signals.Signals` on the IMU's stamps.
 
-A plan is made once a log from a survey stretch; :func:`align` applies it to the whole drive or to a part of it. Every
-rule here reaches no further than ``AlignmentPlan.margin_ns``.
+A plan is made once per log from the first ten minutes; :func:`align` applies it to the whole drive or to a part of it.
+No rule needs samples beyond ``AlignmentPlan.margin_ns``.
 
 Rules
 -----
 * The grid is the union of the stamps of the IMU channels that share one clock (``AlignmentPlan.grid_channels``).
-  Irregular steps are kept, and no stamp is invented.
-* *Inputs* (steering, a_x, friction) are what the estimator's model is driven with: interpolated when their rate is
-  comparable to the grid's, else the newest sample at or before the grid stamp is held.
-* *Measurements* (a_y, yaw rate, speed, wheel speeds) carry information once: a value is at a grid stamp only when
-  there is a new sample for it, otherwise a filter would count the same reading several times.
-* Nothing is interpolated or held across a gap of more than ``max_gap_s``; nothing is extrapolated.
-* A sample that came much later than its neighbours is not waited for: it counts as missing.
-* A channel whose samples all arrive too late to wait for, or any with ``clock="stamp"``, is read by its stamps.
+  Irregular steps are kept, and no stamp is added.
+* *Inputs* (steering, a_x, friction) drive the estimator's model. They are interpolated if their rate is comparable to
+  the grid's rate; otherwise the newest sample at or before the grid stamp is held.
+* *Measurements* (a_y, yaw rate, speed, wheel speeds) are used once: a grid stamp has a value only if there is a new
+  sample, because a filter would otherwise count one reading several times.
+* No value is interpolated or held across a gap of more than ``max_gap_s``, and no value is extrapolated.
+* A sample that arrives much later than its neighbours counts as missing.
+* A channel is read by its stamps if all of its samples arrive too late to wait for, or with ``clock="stamp"``.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from pdhef_logtool.records.steps import MAX_PREDICTION_S
 from pdhef_logtool.storage.documents import jsonable
 
 Method: TypeAlias = Literal["exact", "interpolate", "hold", "next"]
-#: Which time makes a sample known: when it arrived at the recorder, or its own stamp (offline, not causal).
+#: Time from which a sample is available: its arrival at the recorder, or its own stamp (offline, not causal).
 Clock: TypeAlias = Literal["arrival", "stamp"]
 
-#: Only this much of the log's beginning decides the plan, so that a plan does not depend on how much was read.
+#: The plan depends only on this much of the log's beginning, whichever part of the log is read.
 SURVEY_S = 600.0
 #: A gap is more than this many median periods, and more than ``MIN_GAP_S``.
 GAP_PERIODS = 5.0
@@ -71,7 +71,7 @@ SAME_CLOCK_SHARE = 0.9
 #: error of a position lasts longer than a step.
 LONGEST_FIX_STEP_S, FIX_STD_M, LEAST_FIX_STD_M = 2.5, 0.05, 0.005
 _IMU = ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2")
-#: What only the sideslip reference uses, which is not causal: never waited for.
+#: Only the sideslip reference uses these columns. It is not causal, so that no estimate waits for them.
 _TILT_RATES = frozenset({"roll_rate_rad_s", "pitch_rate_rad_s"})
 #: Columns that only the reference uses, with their own names.
 _ALONE = ("gnss_heading_rad", *sorted(_TILT_RATES))
@@ -80,7 +80,7 @@ _INPUTS = frozenset({"steer_rad", "steering_wheel_rad", "ax_m_s2", "friction"})
 
 @dataclass(frozen=True, slots=True)
 class ChannelPlan:
-    """How one channel comes to the grid.
+    """How one channel is brought to the grid.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class AlignmentPlan:
     ----------
     grid_channel : the IMU channel that sets the clock. grid_channels : those that share its stamps, itself included.
     grid_period_s : its median period.
-    channels : one entry a channel that is used. unused : mapped channels that are not used, with the reason.
+    channels : one entry per used channel. unused : mapped channels that are not used, with the reason.
     speed_from : ``"speed_m_s"``, ``"wheel speeds"``, ``"GNSS"`` or ``"none"``.
     """
 
@@ -142,7 +142,7 @@ class AlignmentPlan:
         return has_gnss({c.target for c in self.channels})
 
     def without(self, refused: Mapping[str, str]) -> AlignmentPlan:
-        """Return the plan without channels; ``refused`` gives the reason by name. The stamps of the grid stay."""
+        """Return the plan without the channels in ``refused`` (name: reason). The grid keeps its stamps."""
         channels = tuple(c for c in self.channels if c.name not in refused)
         unused = {**dict(self.unused), **{c.name: refused[c.name] for c in self.channels if c.name in refused}}
         speed_from = _speed_source({c.target for c in channels})
@@ -150,7 +150,7 @@ class AlignmentPlan:
 
     @property
     def by_stamp(self) -> tuple[ChannelPlan, ...]:
-        """Channels that are read by their stamps: what is estimated from them is not causal."""
+        """Channels that are read by their stamps. Estimates from them are not causal."""
         return tuple(c for c in self.channels if c.clock == "stamp")
 
     @property
@@ -160,7 +160,7 @@ class AlignmentPlan:
 
     @property
     def margin_ns(self) -> int:
-        """How much :func:`align` needs before ``start_ns`` and after ``end_ns``, in stamps or in log time."""
+        """Duration before ``start_ns`` and after ``end_ns`` that :func:`align` needs in addition."""
         return self.lookback_ns + _ns(self._longest_gap_s + LATE_NEIGHBOURHOOD_S + self._longest_delay_s)
 
     @property
@@ -181,14 +181,14 @@ def plan_alignment(
 ) -> AlignmentPlan:
     """Decide clock, method, gaps and lateness of every channel from the first ``SURVEY_S`` seconds.
 
-    The grid channel is the first of yaw rate, a_y, a_x whose rate is within a factor 2 of the fastest of them.
+    The grid channel is the first of yaw rate, a_y, a_x with a rate within a factor 2 of the fastest of them.
 
     Parameters
     ----------
     channels : every mapped signal by name, even if it has no sample in the survey.
     steering_ratio : steering-wheel angle over road-wheel angle. wheel_radius_m : m.
-    clock : ``stamp`` reads all channels by their stamps; ``arrival`` only those that arrive more than
-        ``MAX_PREDICTION_S`` late, which no estimate could wait for.
+    clock : ``stamp`` reads all channels by their stamps; ``arrival`` only channels that arrive more than
+        ``MAX_PREDICTION_S`` late.
 
     Raises
     ------
@@ -221,28 +221,27 @@ def has_imu(channels: Mapping[str, Channel]) -> bool:
 
 def no_alignment(channels: Mapping[str, Channel]) -> AlignmentPlan:
     """Return the plan of a log without IMU: no grid, and none of the channels is used."""
-    unused = tuple((name, "without an IMU there are no stamps to bring it to") for name in sorted(channels))
+    unused = tuple((name, "without an IMU there are no stamps to align it to") for name in sorted(channels))
     return AlignmentPlan("", (), float("nan"), (), unused, "none")
 
 
 def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, end_ns: int) -> Signals:
     """Bring the channels to the grid stamps in [start_ns, end_ns).
 
-    Measurements are used once. On the grid's own clock (``exact``) that is so by itself. ``interpolate``: the value at
-    a grid stamp lies between the sample before and the sample after; it is given only when the sample after has not
-    served the previous grid stamp already. ``next``: the value is, unchanged, at the first grid stamp at or after
-    its own stamp (time error below one grid step); of several samples within one step the newest counts.
+    Measurements are used once. ``exact``: the sample has the stamp of the grid. ``interpolate``: the value at a grid
+    stamp lies between the samples before and after; it is missing if the previous grid stamp has used the same sample
+    after. ``next``: the unchanged value is at the first grid stamp at or after its own stamp (time error below one grid
+    step); of several samples within one step the newest counts.
 
     ``speed_m_s`` without a speed channel comes from the wheel speeds, see :func:`combine_wheel_speeds`.
 
-    ``ready_ns`` is at each stamp the latest arrival of all samples used there (both neighbours of an interpolation),
-    never before the stamp itself, cumulated by maximum: an estimator that steps through the stamps in order cannot have
-    finished step k before ``ready_ns[k]``.
+    ``ready_ns`` is the availability time of each step: the running maximum of the stamp and of the arrivals of all
+    samples used there (both neighbours of an interpolation). An estimator cannot finish step k before ``ready_ns[k]``.
 
     Parameters
     ----------
-    channels : with ``plan.margin_ns`` of samples before ``start_ns`` and after ``end_ns``, as far as the log has them.
-        A channel that is absent has no sample here.
+    channels : with the samples within ``plan.margin_ns`` before ``start_ns`` and after ``end_ns``, if the log contains
+        them. A channel without samples may be absent.
     """
     margin, channels = plan.margin_ns, with_gnss_velocity(channels)
     usable = {
@@ -302,7 +301,7 @@ def gnss_velocity(columns: Mapping[str, FloatArray]) -> FloatArray:
 
 
 def with_gnss_velocity(channels: Mapping[str, Channel]) -> Mapping[str, Channel]:
-    """Return the channels with GNSS velocity halfway between successive positions where no receiver states one."""
+    """Return the channels with GNSS velocity from successive positions if the receiver provides no velocity."""
     if has_gnss(channels) or not has_position(channels):
         return channels
     north, east = (channels[name] for name in GNSS_POSITION)
@@ -326,7 +325,7 @@ def with_gnss_velocity(channels: Mapping[str, Channel]) -> Mapping[str, Channel]
 
 
 def count_late(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, end_ns: int) -> dict[str, int]:
-    """Count the samples with stamps in [start_ns, end_ns) that came too late to be waited for, by channel name.
+    """Count the samples with stamps in [start_ns, end_ns) that arrived too late to be used, by channel name.
 
     Channels without late samples are left out. ``channels`` as for :func:`align`.
     """
@@ -344,9 +343,9 @@ def count_late(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: i
 def combine_wheel_speeds(wheel_speed_m_s: FloatArray) -> FloatArray:
     """Combine wheel speeds [N, 4] (fl, fr, rl, rr; NaN = missing) into one speed [N] in m/s.
 
-    All four: their median, the mean of the middle two, which one spinning or locked wheel cannot move far. Otherwise
-    the mean of the rear axle, else of the front axle: over a whole axle yaw rate × half track cancels. A single wheel
-    gives NaN, because that term would be read as speed.
+    All four: their median, which is robust against one spinning or locked wheel. Otherwise the mean of the rear axle,
+    else of the front axle, in which yaw rate × half track cancels. A single wheel gives NaN, because its speed contains
+    that term.
     """
     front = 0.5 * (wheel_speed_m_s[:, 0] + wheel_speed_m_s[:, 1])
     rear = 0.5 * (wheel_speed_m_s[:, 2] + wheel_speed_m_s[:, 3])
@@ -384,7 +383,7 @@ def _grid_channel(periods: Mapping[str, float | None]) -> str:
     if not period_by_name:
         mapped = ", ".join(sorted(name for name in _IMU if name in periods))
         raise MappingError(
-            expected="samples of yaw_rate_rad_s, ay_m_s2 or ax_m_s2, whose stamps are the grid",
+            expected="samples of yaw_rate_rad_s, ay_m_s2 or ax_m_s2, which set the stamps of the grid",
             got=f"no samples of {mapped}" if mapped else "none of them mapped",
             where="alignment",
             remedy="map an IMU topic (pdhef inspect LOG shows the topics and fields)",
@@ -420,7 +419,7 @@ def _choose_sources(
 
 
 def _speed_source(columns: set[str]) -> str:
-    """Return what the aligned columns take the speed from."""
+    """Return the source of the speed column."""
     if "speed_m_s" in columns:
         return "speed_m_s"
     whole_axle = any({f"wheel_speed_{side}_m_s" for side in axle} <= columns for axle in (("fl", "fr"), ("rl", "rr")))
@@ -457,7 +456,7 @@ def _plan_channel(  # positional: one call
 
 
 def _on_one_clock(channel: Channel, grid: Channel) -> bool:
-    """Stamps decide where there are any; without samples in the survey the topic does."""
+    """Return whether a channel has the grid's stamps, or, without samples in the survey, its topic."""
     if len(channel) == 0:
         return channel.source.split(".")[0] == grid.source.split(".")[0]
     shared = int(np.isin(channel.stamps_ns, grid.stamps_ns, assume_unique=True).sum())

@@ -14,8 +14,8 @@ from pdhef_logtool.records.signals import Channel
 def channels_sha256(channels: Mapping[str, Channel], sources: Mapping[str, SignalSource]) -> str | None:
     """Return the hash of names, stamps on the log's clock and values in SI units; None without samples.
 
-    Stamps count as they are before the latency of a source is taken off them, which a mapping file or a car brings: a
-    drive stays the same drive for a car whose sensors are better known. Arrivals are not part of it.
+    Stamps are hashed before the latency of a source is subtracted, because mapping files and cars may change the
+    latency of the same drive. Arrival times are not hashed.
     """
     total = hashlib.sha256()
     full = [(name, channel) for name, channel in sorted(channels.items()) if len(channel)]

@@ -1,4 +1,4 @@
-"""Channels on one even grid, low-passed, and regressions on it with errors that count independent samples."""
+"""Low-passed channels on one even grid, and regressions with standard errors from the number of independent samples."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
 from pdhef_logtool.records.student import student_quantile
 
 GRID_S = 0.05
-#: −3 dB at 1 Hz: noise and vibration go, manoeuvres stay.
+#: −3 dB at 1 Hz: removes noise and vibration, keeps manoeuvres.
 LOW_PASS_HZ = 1.0
 #: Samples are interpolated onto the grid over gaps of at most this length, and of this many of their periods.
 MAX_GAP_S, MAX_GAP_PERIODS = 0.5, 2.5
-#: Values beyond so many ranges of 99 % of a channel, for so short a time, are spikes.
+#: A spike is further from the median than this many 99 % ranges of the channel, for less than this time.
 SPIKE_RANGES, SPIKE_S = 5.0, 0.2
 #: A slower sensor does not resolve manoeuvres.
 LONGEST_GAP_S = 2.5
-#: 21 hours about the middle of the drive; it keeps one wrong stamp from making a grid of decades.
+#: 21 hours about the middle of the drive. One wrong stamp could otherwise make a grid of decades.
 MAX_CELLS = 1_500_000
-#: Blocks of the parts of a drive that must agree: longer than a manoeuvre, and at most so many.
+#: Length of the alternating blocks of the two parts of a drive (longer than a manoeuvre), and their maximum number.
 PART_S, MOST_PARTS = 4.0, 12
 #: Moving: faster than this share of the drive's fast speeds, and than a speed that is too low for the relations.
 MOVING_SHARE, MIN_MOVING_M_S = 0.25, 0.5
-#: Blocks of a drive that errors are estimated from; fewer give no information on them.
+#: Number of blocks of a drive for the jackknife: minimum and maximum.
 LEAST_BLOCKS, MOST_BLOCKS = 4, 10
 
 
@@ -46,9 +46,9 @@ def columns_on_grid(channels: Mapping[str, Channel]) -> dict[str, FloatArray]:
 
 
 def without_spikes(channel: Channel) -> Channel:
-    """Return a channel without samples far outside its range for a moment: a bus's mark of invalid values.
+    """Return a channel without short spikes far outside its range, by which buses mark invalid values.
 
-    Beyond 1e12 all numbers are one, and below 1e-12: their squares must be finite.
+    Values are limited to 1e12, and values below 1e-12 are set to 0, so that their squares are finite.
     """
     values = np.clip(channel.values, -1e12, 1e12)
     values[np.abs(values) < 1e-12] = 0.0
@@ -71,13 +71,13 @@ def derivative(column: FloatArray) -> FloatArray:
 
 
 def earlier(column: FloatArray, by_s: float) -> FloatArray:
-    """Return a column of the grid as it would be had it come earlier; NaN where that is not known."""
+    """Return a column of the grid shifted to an earlier time; NaN where it is unknown."""
     cell = np.arange(column.shape[0]) + by_s / GRID_S
     return column if by_s == 0.0 else np.interp(cell, np.arange(column.shape[0]), column, left=np.nan, right=np.nan)
 
 
 def moving_at(speed: FloatArray, least_m_s: float = MIN_MOVING_M_S) -> BoolArray:
-    """Return where the car drives: by the drive's own fast speeds, so that a 1:10 car counts as a car does."""
+    """Return where the car moves, relative to the drive's fast speeds, so that 1:10 cars are included."""
     finite = np.abs(speed[np.isfinite(speed)])
     if finite.shape[0] == 0:
         return np.zeros(speed.shape[0], np.bool_)
@@ -87,7 +87,7 @@ def moving_at(speed: FloatArray, least_m_s: float = MIN_MOVING_M_S) -> BoolArray
 
 
 def halves(cells: int) -> tuple[BoolArray, BoolArray]:
-    """Return two independent parts of a drive of so many cells, [cells] each: alternate blocks, so that both drive."""
+    """Return two independent parts of a drive, bool [cells] each: alternate blocks, so that both contain driving."""
     block = max(round(PART_S / GRID_S), cells // MOST_PARTS)
     first = (np.arange(cells) // max(block, 1)) % 2 == 0
     return first, ~first
@@ -99,7 +99,7 @@ def independent_samples(count: int) -> float:
 
 
 def student(blocks: int) -> float:
-    """Return the factor of a standard error from so many blocks, at least two, whose ± 1.96 contains 95 %."""
+    """Return the Student factor for a standard error from this many blocks (at least two) at 95 %."""
     return student_quantile(0.975, blocks - 1) / 1.96
 
 
@@ -126,7 +126,7 @@ def _on_grid(channel: Channel, start_ns: int, cells: int) -> FloatArray:
 
 
 def _low_pass(values: FloatArray, good: BoolArray) -> FloatArray:
-    """Gaussian low pass of zero phase over the good cells; NaN where much of the kernel has none."""
+    """Apply a zero-phase Gaussian low pass to the good cells; NaN where they cover too little of the kernel."""
     sigma = np.sqrt(np.log(2.0)) / (2.0 * np.pi * LOW_PASS_HZ) / GRID_S
     reach = int(np.ceil(4.0 * sigma))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
@@ -143,7 +143,7 @@ def _low_pass(values: FloatArray, good: BoolArray) -> FloatArray:
 
 
 def median_known(column: FloatArray) -> float:
-    """Return the median of what is known of a column [N], 0 where nothing is."""
+    """Return the median of the finite values of a column [N]; 0 without any."""
     finite = column[np.isfinite(column)]
     return float(np.median(finite)) if finite.size else 0.0
 
@@ -155,8 +155,8 @@ def fit(
 
     Returns
     -------
-    coefficients, standard errors with the independent samples counted, and the residual's 1-sigma; None where there
-    are too few, or where the regressors do not vary apart from one another.
+    coefficients, standard errors by the number of independent samples, and 1-sigma of the residual; None if there are
+    too few samples or the regressors are collinear.
     """
     matrix = np.stack(regressors, axis=1)
     usable = use & np.isfinite(measured) & np.isfinite(matrix).all(axis=1)
@@ -177,7 +177,7 @@ def fit(
 def _block_errors(a: FloatArray, b: FloatArray, samples: float) -> FloatArray:
     """Return the jackknife's standard errors of a regression over blocks of the drive; 0 with too few samples.
 
-    What is left is not noise: grade, crossfall, roll and sliding last as long as a bend does.
+    The residual is not white noise: grade, crossfall, roll and sliding last as long as a bend.
     """
     count = min(MOST_BLOCKS, int(samples // (2.0 * a.shape[1])))
     if count < LEAST_BLOCKS:

@@ -15,13 +15,13 @@ from pdhef_logtool.records.signals import FloatArray, IntArray
 
 #: A step of more than this many median periods is a gap.
 GAP_PERIODS = 3.0
-#: The common grid's step is kept within these bounds: finer gains nothing, coarser loses the peak.
+#: Bounds of the common grid's step. Finer steps do not improve the result; coarser ones lose the peak.
 MIN_STEP_S, MAX_STEP_S = 0.005, 0.05
-#: Far above what rounding does to a rough correlation of signals that vary by all of their power; of such as vary by
-#: less of it than the least share no rough value is given.
+#: Bound of the rounding error of a rough correlation, and least share of a signal's power that is its variance: below
+#: that share, the correlation is computed from exact sums only.
 _ROUGH_ERROR, _LEAST_POWER = 1e-10, 1e-4
-#: For the error of a shift: both sides are averaged over so long; blocks of the drive; 1-sigma by stamps and filters of
-#: the two sensors (studies/plus_minus.py).
+#: For the error of a shift: averaging time of both sides, number of blocks, and 1-sigma that stamps and filters of the
+#: two sensors cause (studies/plus_minus.py).
 _ERROR_MEAN_S, _ERROR_BLOCKS, _RESAMPLING_S = 0.2, 10, 2e-4
 
 
@@ -41,7 +41,7 @@ class CommonGrid:
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """By how much ``b`` follows ``a``, and the correlation there. ``inside``: the peak is no end of the range."""
+    """Delay of ``b`` after ``a``, and the correlation there. ``inside``: the peak is not at an end of the range."""
 
     shift_s: float
     correlation: float
@@ -49,11 +49,11 @@ class Shift:
 
 
 class EvenGrid:
-    """One even grid where the stamps of two signals, at least two each, overlap; found once for all of their columns.
+    """Even grid over the overlap of the stamps of two signals, at least two each, for all of their columns.
 
     Parameters
     ----------
-    stamps_a_ns, stamps_b_ns : int64 [N], [M], ascending; may be one and the same array.
+    stamps_a_ns, stamps_b_ns : int64 [N], [M], ascending; may be the same array.
     """
 
     def __init__(self, stamps_a_ns: IntArray, stamps_b_ns: IntArray) -> None:
@@ -104,7 +104,7 @@ def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:
     if grid.both < 2 or not all(np.nan_to_num(values, nan=0.0).any() for values in (grid.a, grid.b)):
         return Shift(float("nan"), float("nan"), False)
     rough, error = _rough_correlations(grid.a, grid.b, reach)
-    # Candidates: all that rounding may have put behind the largest, and what only the exact sums can decide.
+    # Candidates: shifts within the rounding error of the largest value, and shifts without a rough value.
     near = ~(rough + error < np.nanmax(rough - error, initial=-np.inf))
     exact = {k: _correlation(grid.a, grid.b, k) for k in (np.flatnonzero(near) - reach).tolist()}
     finite = [k for k, value in exact.items() if np.isfinite(value)]
@@ -122,8 +122,8 @@ def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:
 def shift_error(grid: CommonGrid, shift_s: float) -> float:
     """Return the standard error of a shift, s, from blocks of equal motion; infinity where the motion does not show it.
 
-    A gain that drifts or bends, an offset and a trend look like a part of the shift, in a ramp like all of it: they are
-    fitted beside it, and what the shift then differs by is part of its error.
+    A drifting or nonlinear gain, an offset and a trend can resemble a shift. They are fitted together with the shift,
+    and the change of the shift by this fit is part of its error.
     """
     steps = round(shift_s / grid.step_s)
     parts = zip((grid.a, grid.b), _overlap(grid.a.shape[0], steps), strict=True)
@@ -153,7 +153,7 @@ def shift_error(grid: CommonGrid, shift_s: float) -> float:
 
 
 def has_peak_within(grid: CommonGrid, low_s: float, high_s: float, least: float) -> bool:
-    """Return whether the correlation has a peak of ``least`` or more inside of a range, and not only beyond it."""
+    """Return whether the correlation has a peak of ``least`` or more inside a range."""
     shifts = range(round(low_s / grid.step_s) - 1, round(high_s / grid.step_s) + 2)
     correlations = np.array([_correlation(grid.a, grid.b, k) for k in shifts])
     inner = correlations[1:-1]
@@ -161,19 +161,19 @@ def has_peak_within(grid: CommonGrid, low_s: float, high_s: float, least: float)
 
 
 def parabolic_peak(before: float, middle: float, after: float) -> float:
-    """Return the place of the vertex of the parabola through values at −1, 0, 1; 0 when it has no maximum."""
+    """Return the position of the vertex of the parabola through values at −1, 0, 1; 0 if it has no maximum."""
     curvature = before - 2.0 * middle + after
     return float(0.5 * (before - after) / curvature) if curvature < 0 else 0.0
 
 
 def _rough_correlations(a: FloatArray, b: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:
-    """Return :func:`_correlation` at all shifts within ± ``reach`` and how far it may be off; NaN where it is unsure.
+    """Return :func:`_correlation` at all shifts within ± ``reach`` and its error bound; NaN if rounding is too large.
 
-    From sums of products at all shifts: by Fourier transforms, or by cumulative sums where the other factor is 1.
+    Sums of products at all shifts: by Fourier transforms, or by cumulative sums if the other factor is 1.
     """
     n, shifts = a.shape[0], np.arange(-reach, reach + 1)
     size = min(base << max(-(-(n + reach) // base) - 1, 0).bit_length() for base in (1, 3, 5, 9, 15))
-    powers = []  # 0, 1 and 2 of each signal, 0 where it is not known
+    powers = []  # powers 0, 1 and 2 of each signal, 0 where the signal is NaN
     for values in (_unit_power(a), _unit_power(b)):
         finite = np.isfinite(values)
         values = np.where(finite, values, 0.0)
@@ -207,7 +207,7 @@ def _rough_correlations(a: FloatArray, b: FloatArray, reach: int) -> tuple[Float
 
 
 def _overlap(n: int, shift: int) -> tuple[slice, slice]:
-    """Return the parts of ``a`` and ``b`` [N] that a shift puts upon one another."""
+    """Return the parts of ``a`` and ``b`` [N] that overlap after a shift."""
     return slice(max(0, -shift), n - max(0, shift)), slice(max(0, shift), n - max(0, -shift))
 
 

@@ -1,8 +1,8 @@
-"""Sensors whose stamps are late relative to one another, detected without ground truth.
+"""Sensors with late time stamps relative to one another, detected without ground truth.
 
-No sensor shows a motion before it happens: of two sensors that follow one motion, the later one is late if their shift
-is larger than that of correct sensors. Only the difference of the rear wheel speeds follows the gyro without a delay;
-sideslip, pitch and the vehicle's response are between the other pairs, so that only large delays show in them.
+No sensor shows a motion before it happens. Of two sensors that follow one motion, the later one is late if their shift
+is larger than for correct sensors. Only the difference of the rear wheel speeds follows the gyro without a delay. Other
+pairs also differ by sideslip, pitch and the vehicle's response; they detect only large delays.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LONGEST_STEP_S = 0.3
 
 @dataclass(frozen=True, slots=True)
 class LateSensor:
-    """Signals of one sensor whose stamps are late: by ``delay_s``, or by at least ``delay_s`` unless ``exact``."""
+    """Signals of one sensor with late stamps: by ``delay_s``, or by at least ``delay_s`` unless ``exact``."""
 
     names: tuple[str, ...]
     delay_s: float
@@ -49,7 +49,7 @@ class LateSensor:
 
 
 def late_sensors(signals: Mapping[str, Channel]) -> tuple[LateSensor, ...]:
-    """Return the sensors whose stamps are late; none where the signals of a pair do not show it."""
+    """Return the sensors with late stamps; pairs that do not show a delay are ignored."""
     late: dict[str, LateSensor] = {}
     for pair in _pairs(signals):
         first, second = _averaged(pair.first), _averaged(pair.second)
@@ -79,8 +79,8 @@ class _Pair(NamedTuple):
 
     Attributes
     ----------
-    names : signals that are late if the first, or the second, is. plausible_s : delay of the second.
-    exact : nothing in the vehicle delays the second.
+    names : name to report if the first or the second signal is late. plausible_s : range of the second's delay, s.
+    exact : the vehicle adds no delay between the two.
     """
 
     text: str

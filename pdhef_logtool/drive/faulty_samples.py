@@ -1,7 +1,7 @@
-"""Samples of an IMU that a sensor fault has spoilt: relations between signals are looked at without them.
+"""IMU samples with sensor faults, which are excluded from the relations between signals.
 
-The detector is that of the filters (:mod:`pdhef_logtool.estimators.sensor_faults`). It cannot distinguish a dead
-channel from one in another unit; here the whole drive is available.
+The filters' detector (:mod:`pdhef_logtool.estimators.sensor_faults`) finds them. It cannot distinguish a dead channel
+from a channel in another unit; this module can, because the whole drive is available.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from pdhef_logtool.drive.alignment import SURVEY_S, align, has_imu, plan_alignme
 from pdhef_logtool.records.reasons import BURST_AY
 from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray, IntArray
 
-#: Left out with a faulty sample on both sides: a fault shows before it is found, and the low pass reaches as far.
+#: Time excluded on both sides of a faulty sample: a fault starts before its detection, and the low pass spreads it.
 BESIDE_S = 0.3
-#: What is silent changes from one such time to the next by no more than this share of what it else does.
+#: Averaging time, s. A silent channel's averages change by no more than this share of its usual change.
 MEAN_S = 0.25
 SILENT = 0.2
-#: A burst begins as long before it is reported.
+#: A burst begins this long before it is reported.
 BURST_S = 1.5
 
 _OTHER = {"ay_m_s2": "yaw_rate_rad_s", "yaw_rate_rad_s": "ay_m_s2"}
@@ -33,7 +33,8 @@ def without_faulty_samples(
 
     Returns
     -------
-    channels, and by name of those that lost samples the share of the drive's motion that the silent ones held.
+    channels : without the faulty samples. shares : for each shortened channel, the share of the drive's motion during
+        its silent samples.
     """
     from pdhef_logtool.estimators.sensor_faults import find_faults  # loads the compiler
 
@@ -52,7 +53,7 @@ def without_faulty_samples(
     for i, (name, other) in enumerate(_OTHER.items()):
         finite = np.isfinite(getattr(aligned, name))
         silent = finite & ~np.isfinite(getattr(faults.filtered, name))
-        # Rough road raises the noise too: a burst is one that would be reported.
+        # Rough roads raise the noise too: only reported bursts count.
         reported = aligned.stamps_ns[faults.reason & (BURST_AY << i) > 0]
         bursts = finite & (faults.extra_r[:, i] > 0.0) & _beside(aligned.stamps_ns, reported, BURST_S)
         if silent.any() and _moves(aligned.stamps_ns, getattr(aligned, name), silent):
@@ -71,7 +72,7 @@ def _topic(channel: Channel) -> str:
 
 
 def _moves(stamps_ns: IntArray, values: FloatArray, silent: BoolArray) -> bool:
-    """Return whether a channel changes in its silent samples as it does in the others: then it is weak, not silent."""
+    """Return whether a channel changes in its silent samples as much as elsewhere: it is weak, not silent."""
     cells = (stamps_ns - stamps_ns[0]) // round(MEAN_S * 1e9)
     finite = np.isfinite(values)
     count = np.bincount(cells[finite])
@@ -96,7 +97,7 @@ def _without(channel: Channel, faulty_ns: IntArray) -> Channel:
 
 
 def _beside(stamps_ns: IntArray, others_ns: IntArray, within_s: float) -> BoolArray:
-    """Return which stamps have one of the others, ascending, within a time."""
+    """Return which stamps are within a time of one of the others (ascending)."""
     within = round(within_s * 1e9)
     first = np.searchsorted(others_ns, stamps_ns - within)
     return np.asarray(first < np.searchsorted(others_ns, stamps_ns + within, side="right"))

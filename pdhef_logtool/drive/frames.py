@@ -1,4 +1,4 @@
-"""Rotations of a sensor in a car, and recorded frames compared with them: they are evidence, and may be wrong."""
+"""Rotations of a sensor in a car, and recorded coordinate frames, which are compared with the drive."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from pdhef_logtool.mapping.frames import Placement
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
-#: Mean accelerations between these are gravity.
+#: A mean acceleration in this range is gravity.
 IS_GRAVITY_M_S2 = (0.75 * GRAVITY_M_S2, 1.25 * GRAVITY_M_S2)
-#: A rotation found from a drive is as good as this, grade and crossfall, sideslip and bias in it.
+#: Accuracy of a rotation that was estimated from a drive with grade, crossfall, sideslip and bias.
 APART_DEG = 12.0
-#: Gravity of a drive is along the car's vertical but for so much.
+#: Largest angle between the mean gravity of a drive and the car's vertical.
 TILT_DEG = 15.0
-#: A frame that is turned by 90 degrees is written with so few digits.
+#: Rounding error of recorded frames that are rotated by multiples of 90 degrees.
 _WRITTEN_DEG = 0.5
 _REMEDY = 'mend the frames, or name the axes in a mapping file, or --waive "imu.frames"'
 
 
 def angles_deg(rotation: FloatArray) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw of a sensor in the car [3, 3]: it is turned by yaw first, then pitch, then roll."""
+    """Return roll, pitch and yaw of a sensor rotation [3, 3], in the order yaw, pitch, roll."""
     m = rotation
     pitch = math.asin(float(np.clip(-m[2, 0], -1.0, 1.0)))
-    if abs(m[2, 0]) > 1.0 - 1e-6:  # straight up or down: roll and yaw are one angle
+    if abs(m[2, 0]) > 1.0 - 1e-6:  # gimbal lock: roll and yaw are not separable
         return 0.0, math.degrees(pitch), math.degrees(math.atan2(-m[0, 1], m[1, 1]))
     roll, yaw = math.atan2(m[2, 1], m[2, 2]), math.atan2(m[1, 0], m[0, 0])
     return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
 
 
 def rotation_text(rotation: FloatArray) -> str:
-    """Return a sensor's rotation in words."""
+    """Return a sensor's rotation as text."""
     roll, pitch, yaw = (round(a) + 0 if abs(a - round(a)) < 0.05 else round(a, 1) for a in angles_deg(rotation))
     return f"the IMU is mounted with roll {roll:g}, pitch {pitch:g}, yaw {yaw:g} deg"
 
 
 def nearest_step(rotation: FloatArray) -> FloatArray:
-    """Return the multiple of 90 degrees [3, 3] that a rotation is nearest to."""
+    """Return the nearest rotation [3, 3] by multiples of 90 degrees."""
     rows = np.eye(3)[list(permutations(range(3)))]
     steps = np.concatenate([rows * np.array(signs)[:, None] for signs in product((1.0, -1.0), repeat=3)]) + 0.0
     steps = steps[np.linalg.det(steps) > 0.0]
@@ -48,13 +48,13 @@ def nearest_step(rotation: FloatArray) -> FloatArray:
 
 
 def placed_rotation(placed: Placement) -> FloatArray:
-    """Return the rotation [3, 3] that frames give, the multiple of 90 degrees where it is one but for its digits."""
+    """Return the rotation [3, 3] of recorded frames, snapped to a multiple of 90 degrees within the rounding error."""
     step = nearest_step(placed.rotation)
     return step if _between_deg(step, placed.rotation) < _WRITTEN_DEG else placed.rotation
 
 
 def gravity_agrees(placed: Placement, force: FloatArray) -> str:
-    """Return why frames are accepted by gravity, the mean [3] of the accelerations; empty where it does not show it."""
+    """Return why frames agree with gravity, the mean acceleration [3]; empty if they do not or gravity is removed."""
     tilt = _tilt_deg(placed, force)
     if tilt is None or tilt > TILT_DEG:
         return ""
@@ -63,7 +63,7 @@ def gravity_agrees(placed: Placement, force: FloatArray) -> str:
 
 
 def frames_check(placed: Placement, shown: FloatArray | None, evidence: str, force: FloatArray) -> Check | None:
-    """Compare frames against the rotation [3, 3] that the drive shows, else with gravity; None without both."""
+    """Compare frames with the rotation [3, 3] from the drive, otherwise with gravity; None without both."""
     said = f"the recorded frames ({placed.frame} in {placed.base}): {rotation_text(placed_rotation(placed))}"
     apart = None if shown is None else _between_deg(placed.rotation, shown)
     tilt = _tilt_deg(placed, force)
@@ -79,13 +79,13 @@ def frames_check(placed: Placement, shown: FloatArray | None, evidence: str, for
 
 
 def frames_alone(placed: Placement, believed: str) -> Check:
-    """Report that nothing but frames and gravity shows how the IMU lies."""
+    """Report that only frames and gravity show how the IMU is mounted."""
     evidence = f"{rotation_text(placed_rotation(placed))}: {believed}; the drive does not show the rest"
     return Check("imu.frames", "ay_m_s2", "undecided", evidence, _REMEDY)
 
 
 def _tilt_deg(placed: Placement, force: FloatArray) -> float | None:
-    """Return the angle from the vertical of frames to gravity; None where the sensor takes gravity off."""
+    """Return the angle between the frames' vertical and gravity; None if the sensor subtracts gravity."""
     size = float(np.linalg.norm(force))
     if not IS_GRAVITY_M_S2[0] < size < IS_GRAVITY_M_S2[1]:
         return None

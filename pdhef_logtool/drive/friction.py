@@ -1,4 +1,4 @@
-"""Where the friction of a run comes from; every estimator, network and segment is given the same one."""
+"""Source of the friction of a run. All estimators, networks and segments use the same friction."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from pdhef_logtool.records.tracks import StateTrack
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.friction_bank import FrictionBank, FrictionEstimate
 
-#: What may be asked for beside a number.
+#: Choices of the option beside a number.
 CHOICES = ("auto", "file", "estimate")
-#: 1-sigma of an estimate by the tyres of the vehicle file: without evidence, when the stiffness may be wrong by a
-#: factor of two at each axle, and with it (simulated cars, studies/plus_minus.py, seeds 555 and 99004).
+#: 1-sigma of the friction estimate due to errors of the vehicle file's tyres: without validation, where the stiffness
+#: of each axle may be wrong by a factor of two, and with it (simulated cars, studies/plus_minus.py, seeds 555, 99004).
 MODEL_STD = {False: 0.5, True: 0.015}
 
 
@@ -29,7 +29,7 @@ def parse_friction(text: str | float) -> str | float:
 
     Raises
     ------
-    UsageError : The text is neither, or the number is no friction.
+    UsageError : The text is neither, or the number is outside the range of frictions.
     """
     if text in CHOICES:
         return text
@@ -47,17 +47,17 @@ def parse_friction(text: str | float) -> str | float:
 
 @dataclass(slots=True)
 class FrictionSource:
-    """Puts the friction of a run into the signals, and keeps what an estimate was worth.
+    """Fills in the friction of a run, and records the accuracy of an estimated friction.
 
     Attributes
     ----------
-    label : where it comes from, in the words of the report.
-    note : what a user must be given before the run; empty: nothing.
-    constant : given to all estimators; None leaves the signals' own (and the vehicle file's where they have none).
-    bank : estimates it; None where nothing is estimated.
-    factor : error made on purpose in the friction of topic or option, for training (docs/method.md#limits).
-    model_std : 1-sigma of the estimate's error that comes of the vehicle file (:data:`MODEL_STD`).
-    of_truth : it is that of the ground truth, for datasets: no estimator of a run is given it.
+    label : source of the friction, for the report.
+    note : warning to the user before the run; empty without one.
+    constant : friction for all estimators; None uses the signals' friction, or else the vehicle file's.
+    bank : estimates the friction; None if it is not estimated.
+    factor : deliberate error of the friction of topic or option, for training (docs/method.md#limits).
+    model_std : 1-sigma of the estimate due to errors of the vehicle file (:data:`MODEL_STD`).
+    of_truth : uses the friction of the ground truth, for datasets only; estimators of a run never receive it.
     """
 
     label: str
@@ -71,7 +71,7 @@ class FrictionSource:
     _filled: tuple[Signals, Signals] | None = None
 
     def fill(self, signals: Signals, truth: StateTrack | None = None) -> Signals:
-        """Return the signals of a drive [N] with their friction; ``estimate`` is what came of an estimate."""
+        """Return the signals of a drive [N] with their friction; an estimated friction is kept in ``estimate``."""
         if self.of_truth and truth is not None:
             signals = replace(signals, friction=truth.friction)
         if self.constant is not None:
@@ -90,33 +90,33 @@ class FrictionSource:
 
     @property
     def std(self) -> FloatArray:
-        """1-sigma of the estimate at each stamp; of length 0 where nothing is estimated."""
+        """1-sigma of the estimate at each stamp [N]; empty without an estimate."""
         return np.empty(0) if self.estimate is None else np.hypot(self.estimate.std, self.model_std)
 
     @property
     def observable(self) -> BoolArray:
-        """Whether the drive shows its friction, at each stamp; of length 0 where nothing is estimated."""
+        """Whether the friction is observable at each stamp [N]; empty without an estimate."""
         return np.zeros(0, dtype=np.bool_) if self.estimate is None else self.estimate.observable
 
     @property
     def observable_share(self) -> float:
-        """Share of the stamps at which the drive shows its friction; NaN where nothing is estimated."""
+        """Share of the stamps with observable friction; NaN without an estimate."""
         return float(np.mean(self.observable)) if self.observable.size else math.nan
 
     @property
     def observable_std(self) -> float:
-        """Median 1-sigma of the estimate where it is observable; NaN where it never is."""
+        """Median 1-sigma of the estimate where it is observable; NaN if it never is."""
         return float(np.median(self.std[self.observable])) if self.observable.any() else math.nan
 
     @property
     def summary(self) -> str:
-        """What came of an estimate, for the report; empty where nothing is estimated."""
+        """Observability and accuracy of the estimate, for the report; empty without an estimate."""
         if not self.observable.size:
             return ""
         text = f"observable {100 * self.observable_share:.0f} % of the time"
         if self.observable.any():
             text += f", median 1-sigma {self.observable_std:.2f} there"
-        return text + "; elsewhere it goes back to that of a dry road"
+        return text + "; elsewhere it returns to the friction of a dry road"
 
 
 def friction_source(
@@ -129,20 +129,20 @@ def friction_source(
     factor: float = 1.0,
     validated: bool = True,
 ) -> FrictionSource:
-    """Decide where a drive's friction comes from.
+    """Choose the source of a drive's friction.
 
-    ``auto`` is the log's own where it has one, else the vehicle file's, else an estimate; where the log lacks what an
-    estimate needs, 1 is assumed.
+    ``auto`` uses the friction of the log, otherwise of the vehicle file, otherwise an estimate. If signals for the
+    estimate are missing, 1 is assumed.
 
     Parameters
     ----------
     choice : of :func:`parse_friction`. available : signals that the log provides. topic : of its friction, ``/a.b``.
-    factor : on the friction of topic or option; a vehicle file must contain its wrong friction already.
-    validated : whether a drive has shown that the tyres of the vehicle are right.
+    factor : on the friction of topic or option; it does not change the friction of a vehicle file.
+    validated : whether a drive has confirmed the tyres of the vehicle.
 
     Raises
     ------
-    UsageError : What was asked for is not there.
+    UsageError : The chosen source is not available.
     """
     if not isinstance(choice, str):
         return FrictionSource(f"option, {choice:g}", constant=choice * factor)
@@ -163,11 +163,11 @@ def friction_source(
     bank = FrictionBank(vehicle, use_speed, validated)
     missing = sorted(NEEDS - available)
     if not missing:
-        nothing = "neither log nor vehicle file gives a friction: it is estimated on line" if choice == "auto" else ""
+        nothing = "neither log nor vehicle file gives a friction: it is estimated online" if choice == "auto" else ""
         return FrictionSource("estimate", nothing, bank=bank, model_std=MODEL_STD[validated])
     if choice == "estimate":
         raise UsageError(
-            expected="a log with what an estimate of friction needs",
+            expected="a log with the signals that the friction estimate needs",
             got=f"no {', '.join(missing)}",
             where="--friction estimate",
             remedy="map the missing signals, or give --friction VALUE",

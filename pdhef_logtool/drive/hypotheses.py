@@ -1,8 +1,8 @@
-"""One engine for wrong units, signs and fields: the posterior of each hypothesis, given the relations between signals.
+"""Posterior probabilities of wrong units, signs and fields, given the relations between signals.
 
-A relation has the gains of the blocks of a drive. A hypothesis multiplies them with what undoes it; its energy is its
-prior plus what the gains then miss the plausible range by, bounded for each block: a car that slides, a wheel that
-spins, or a bank is wrong in some blocks, a unit in all of them. Probabilities are exp(-energy), normalised.
+Each relation stores one gain per block of the drive. A hypothesis rescales these gains. Its energy is the prior plus
+the distance of the rescaled gains from the plausible range. The distance is bounded for each block, because sliding,
+wheel spin or a bank change some blocks only, and a wrong unit changes all. Probabilities are exp(-energy), normalised.
 """
 
 from __future__ import annotations
@@ -19,49 +19,49 @@ from pdhef_logtool.mapping.naming import CACHED_NAMES, G_M_S2
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
 DEGREE = float(np.pi / 180.0)
-#: Below this correlation a gain gives no information, and above it, it is between the two regressions. It must be so
-#: far from chance, by Fisher's z of the independent samples; below so many of them (3 s) nothing is stated.
+#: Least correlation at which a gain gives information (the true gain is between the two regressions), least Fisher z
+#: of the correlation, and least number of independent samples (3 s).
 MIN_CORRELATION, MIN_CHANCE_Z, MIN_SAMPLES = 0.6, 3.0, 6.0
-#: Two sides that move, and not with one another: another field was mapped.
+#: Two sides that move with a lower correlation are unrelated: another field is mapped.
 UNRELATED_CORRELATION = 0.25
 #: Typical values that recognise one quantity recorded as another.
 TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M = 16.0, 0.3
 _TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f in (t, 1.0 / t)),)
 #: Factors between units that mappings confuse for any quantity: degrees, g, km/h.
 FOREIGN = (1.0 / DEGREE, G_M_S2, 3.6)
-#: Factors that differ by less in the logarithm are one unit (km/h and mph are 0.48 apart), and ranges of gains that are
-#: narrower rule out all units but one: wider ones are lengths of any car.
+#: Logarithms of factors that differ by less are one unit (km/h and mph are 0.48 apart). A range of gains with a smaller
+#: ratio of its ends rules out all units but one; wider ranges are lengths of any car.
 SAME_FACTOR, DECIDES_UNIT = 0.25, 13.0
 
-#: 1-sigma of the logarithm of a gain within a range that decides units, beyond its edges, and beyond those of a range
-#: that has room for any car.
+#: 1-sigma of the logarithm of a gain: within a range that decides units, beyond the edges of such a range, and beyond
+#: the edges of a range for any car.
 LEAST_WIDTH, EDGE, WIDE_EDGE = 0.05, 0.15, 0.04
-#: Largest energy of one relation (sensors fail and cars slide), and its energy with a field that is something else.
+#: Largest energy of one relation (sensors fail and cars slide), and its energy if a wrong field is mapped.
 MOST_ENERGY, _ANY_GAIN = 20.0, 2.0
-#: Energies of hypotheses (negative logarithms of their prior odds): mistakes are seldom, two of them more so, units of
-#: another quantity are the slips of templates, and a field that is something else explains any gain.
+#: Energies of hypotheses (negative logarithms of their prior odds). Mistakes are rare; units of another quantity come
+#: from copied templates, and a wrong field explains any gain.
 PRIORS = {"unit": 5.0, "sign": 5.0, "sign and unit": 9.0, "foreign": 5.7, "field": 14.0, "open": 0.0}
-PRIORS |= {"open sign": 1.0}  # that nothing documents: most recorders count to the left
-#: One in ten scales of right mappings is not that of a unit: raw counts, a ratio, a calibration.
+PRIORS |= {"open sign": 1.0}  # an undocumented sign: for most recorders, left is positive
+#: One in ten scales of correct mappings is not a unit factor: raw counts, a ratio, a calibration.
 PRIORS |= {"odd scale": math.log(10.0)}
-#: Of signals that explain a contradiction equally well the first is the likeliest: no standard states how a steering
-#: angle counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
+#: Signals by the frequency of their mistakes, most frequent first: no standard defines the sign of a steering angle,
+#: and IMU axes are rotated more often than a gyro on the right axis has the wrong sign.
 _OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 _SELDOM, _SELDOM_STEP = 1.0, 0.3
-#: Blocks of a drive whose gains are compared.
+#: Number of blocks of a drive with separate gains.
 BLOCKS = 8
 
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """One relation with its measured gain; ``powers`` show how the gain grows with each signal's own scale.
+    """One relation with its measured gain; ``powers`` are the exponents of the signals' scales in the gain.
 
     Attributes
     ----------
-    expected : range of a plausible gain. samples : independent ones. moves : both sides, or one of two that must move
-        together, move by more than what disturbs them. signless : a side is a size.
+    expected : range of plausible gains. samples : number of independent samples. moves : both sides, or one of two that
+        must move together, move by more than disturbances do. signless : one side has no sign.
     least_correlation : below it the gain gives no information.
-    typical : the likeliest gain. blocks : gains of blocks of the drive, each without its own means.
+    typical : the likeliest gain. blocks : gains of blocks of the drive, each without the block's means.
     """
 
     text: str
@@ -78,7 +78,7 @@ class Relation:
 
     @property
     def decides_unit(self) -> bool:
-        """Return whether no other unit that is met in mappings would be plausible between the two regressions."""
+        """Return whether the plausible range is narrow enough to exclude all other units."""
         return self.expected[1] < DECIDES_UNIT * self.expected[0] * self.correlation**2
 
     @property
@@ -90,30 +90,30 @@ class Relation:
 
     @property
     def unrelated(self) -> bool:
-        """Return whether the sides move, and not with one another."""
+        """Return whether both sides move without being correlated."""
         return self.moves and self.samples >= 4.0 * MIN_SAMPLES and abs(self.correlation) < UNRELATED_CORRELATION
 
     def accepts(self, factor: float = 1.0) -> bool:
-        """Return whether the gain is plausible after multiplying it with ``factor``.
+        """Return whether the gain times ``factor`` is plausible.
 
-        It lies between the two regressions, which are correlation x gain and gain / correlation.
+        The true gain is between the two regressions, correlation x gain and gain / correlation.
         """
         gain, size = self.gain * factor, abs(self.correlation)
         gain = abs(gain) if self.signless else gain
         return size > 0.0 and gain / size >= self.expected[0] and gain * size <= self.expected[1]
 
     def energies(self, factors: FloatArray) -> FloatArray:
-        """Return the negative log likelihoods [N] of the blocks' gains after multiplying them with each factor [N].
+        """Return the negative log likelihoods [N] of the blocks' gains times each factor [N].
 
-        NaN: another field, whose gain may be any.
+        A NaN factor means a wrong field, for which any gain is possible.
         """
         gains = factors[:, None] * (self.blocks or (self.gain,))
         low, high = (math.log(max(e, 1e-12)) for e in self.expected)
         with np.errstate(divide="ignore"):
             size = np.log(np.abs(gains))
         room = -math.log(max(abs(self.correlation), 1e-3))  # between the two regressions
-        # Blocks that differ show what changes: sliding, a frequency that tyres do not follow; a unit does not change.
-        # A drive without blocks slides for all of it: they would differ by half of what the relation leaves.
+        # Blocks differ by sliding and by fast steering, which change during the drive; a wrong unit does not change.
+        # A drive without blocks may slide throughout: half of the unexplained share is assumed as their difference.
         unknown = 0.5 * math.sqrt(max(0.0, 1.0 - self.correlation**2))
         apart = float(np.std(np.log(np.abs(self.blocks)))) if self.blocks and all(self.blocks) else unknown
         beyond = np.maximum(np.maximum(low - room - size, size - high - room), 0.0)
@@ -128,7 +128,7 @@ class Relation:
 
     @property
     def evidence(self) -> str:
-        """What was measured, in words."""
+        """The measured gain and correlation as text."""
         low, high = self.expected
         return (
             f"{self.text}: gain {self.gain:.3g} where {low:.3g} to {high:.3g} is plausible, correlation "
@@ -138,7 +138,7 @@ class Relation:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A mistake of a mapping: ``factors`` by signal undo it, NaN: nothing does. ``kind``: a key of :data:`PRIORS`."""
+    """A mapping error. ``factors`` correct it, by signal (NaN: not correctable). ``kind``: a key of :data:`PRIORS`."""
 
     factors: dict[str, float]
     words: str
@@ -146,12 +146,12 @@ class Hypothesis:
 
     @property
     def is_exact(self) -> bool:
-        """Whether the factors are those of units and signs, not a typical steering ratio or wheel radius."""
+        """Whether the factors are exact units and signs, not a typical steering ratio or wheel radius."""
         return not any(abs(f) in _TYPICAL or math.isnan(f) for f in self.factors.values())
 
     @cached_property
     def energy(self) -> float:
-        """The negative logarithm of its prior odds."""
+        """Negative logarithm of the prior odds."""
         if self.kind.startswith("open"):
             return PRIORS[self.kind]
         names = {"wheels" if n.startswith("wheel_speed") else n for n in self.factors}
@@ -160,18 +160,18 @@ class Hypothesis:
         return PRIORS[self.kind] + seldom + 0.5 * (len(names) - 1) + (0.0 if self.is_exact else 0.5)
 
     def is_about(self, names: set[str]) -> bool:
-        """Return whether all of it, or of an open sign a part, is of these signals."""
+        """Return whether all signals of the hypothesis (for an open sign: any) are among these names."""
         shared = len(self.factors.keys() & names)
         return shared == len(self.factors) or (self.kind == "open sign" and shared > 0)
 
     def acts_on(self, relation: Relation) -> float:
-        """Return what undoing it multiplies the relation's gain with."""
+        """Return the factor on the relation's gain when the mistake is corrected."""
         return math.prod(f ** relation.powers[n] for n, f in self.factors.items() if n in relation.powers)
 
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """Sets of mistakes with their probabilities, the likeliest first; the empty set: the mapping is right."""
+    """Sets of mistakes with their probabilities, the likeliest first; the empty set means a correct mapping."""
 
     sets: tuple[tuple[float, tuple[Hypothesis, ...]], ...]
 
@@ -182,23 +182,23 @@ class Posterior:
         return sorted(shares, key=lambda x: -x[0])
 
     def turned(self, name: str) -> float:
-        """Return the probability that an open sign is the other one."""
+        """Return the probability that an open sign is inverted."""
         return sum(p for p, c in self.sets if any(h.kind == "open sign" and name in h.factors for h in c))
 
 
 def posterior(
     relations: Sequence[Relation], hypotheses: Sequence[Hypothesis], scales: Mapping[str, object] | None = None
 ) -> Posterior:
-    """Return the probabilities of sets of at most two hypotheses, given the relations that count.
+    """Return the probabilities of sets of at most two hypotheses, given the informative relations.
 
-    ``scales``: what the mapping multiplies the signals' raw values with, where known.
+    ``scales``: known scales of the mapping, by signal.
     """
     telling = [r for r in relations if r.tells]
     touched = {n for r in telling for n in r.powers}
-    # With a signal that no relation is about, a mistake is another one of the same likelihood.
+    # Mistakes of signals without a relation change no likelihood.
     useful = [h for h in hypotheses if h.is_about(touched)]
     priors = np.array([*(h.energy + _of_scales(h, scales or {}) for h in useful), 0.0])
-    # What each mistake, and at last none, multiplies each relation's gain with.
+    # Factor of each mistake on each relation's gain; the last row is for no mistake.
     acts = np.ones((len(useful) + 1, len(telling)))
     for name in touched:
         factors = np.array([*(h.factors.get(name, 1.0) for h in useful), 1.0])
@@ -214,7 +214,7 @@ def posterior(
     first, second = sets.T
     energy = priors[first] + priors[second] + sum(table[index[first], index[second]] for table, index in looked_up)
     least = float(energy.min())
-    likely = np.flatnonzero(energy < least + 25.0)  # the others have less than 1e-10 of the likeliest's probability
+    likely = np.flatnonzero(energy < least + 25.0)  # all others are less than 1e-10 times as likely
     weights = {tuple(k for k in sets[i].tolist() if k != none): math.exp(least - energy[i]) for i in likely}
     total = sum(weights.values())
     ordered = sorted(weights.items(), key=lambda x: (-x[1], x[0]))
@@ -222,7 +222,7 @@ def posterior(
 
 
 def _compatible(mistakes: Sequence[Hypothesis]) -> BoolArray:
-    """Return [N, N] which of them may both be true: of different signals, and neither is a foreign factor."""
+    """Return bool [N, N], the pairs that can be true together: of different signals, neither of kind ``foreign``."""
     names = sorted({n for h in mistakes for n in h.factors})
     about = np.array([[n in h.factors for n in names] for h in mistakes], dtype=bool).reshape(len(mistakes), len(names))
     common = np.array([h.kind != "foreign" for h in mistakes], dtype=bool)
@@ -233,16 +233,16 @@ def _compatible(mistakes: Sequence[Hypothesis]) -> BoolArray:
 def known_hypotheses(
     names: tuple[str, ...], together: tuple[tuple[str, ...], ...] = (), open_signs: tuple[tuple[str, ...], ...] = ()
 ) -> tuple[Hypothesis, ...]:
-    """List the mistakes that mappings make with these signals.
+    """List the possible mapping errors of these signals.
 
     Parameters
     ----------
-    together : signals of one sensor, whose units or signs are wrong together.
-    open_signs : signals whose sign nothing documents; those of a group share it. A recorder may turn all of them.
+    together : signals of one sensor, which have wrong units or signs together.
+    open_signs : groups of signals with an undocumented sign; each group has one sign, and a recorder may invert all.
     """
     groups = [[n for n in group if n in names] for group in together]
     parts = [part for group in groups for size in range(2, len(group) + 1) for part in combinations(group, size)]
-    # The mean of the wheels is no signal.
+    # The mean of the wheels is not a signal.
     alone = [(n,) for n in names if n != "wheel_speeds"]
     out = [h for part in (*alone, *dict.fromkeys(parts)) for h in _of_part(part)]
     every = tuple(n for group in open_signs for n in group)
@@ -254,7 +254,7 @@ def known_hypotheses(
 
 
 def _of_part(part: tuple[str, ...]) -> Iterator[Hypothesis]:
-    """Yield the wrong units and signs that signals have together."""
+    """Yield the hypotheses of a wrong unit or sign that the signals share."""
     words, is_one = _together(part), len(part) == 1
     units = units_of(part[0].removeprefix("truth."))
     for name in part[1:]:
@@ -265,7 +265,7 @@ def _of_part(part: tuple[str, ...]) -> Iterator[Hypothesis]:
         if is_one:
             both = f"{words} {text} and has the wrong sign"
             yield Hypothesis({part[0]: -factor}, both, "sign and unit")
-    # A sensor is mounted upside down or backwards, or ground truth has another convention; speeds count ahead.
+    # Sensors are mounted upside down or backwards, and ground truth has other conventions; speeds are positive ahead.
     if part != ("truth.position_speed_m_s",) and (is_one or not _NEVER_TURNED & set(part)):  # a size has no sign
         has = "has" if is_one else "have"
         yield Hypothesis(dict.fromkeys(part, -1.0), f"{words} {has} the wrong sign", "sign")
@@ -280,7 +280,7 @@ _NEVER_TURNED = frozenset({"speed_m_s", "steer_rad", "steering_wheel_rad"})
 
 
 def _together(names: Sequence[str]) -> str:
-    """Return signals in words; the wheel speeds and their mean as one."""
+    """Return names of signals as text, with one name for the wheel speeds and their mean."""
     wheels = [n for n in names if n.startswith("wheel_speed")]
     # The path does not show which of the two is wrong.
     shown = ["truth.x_m or truth.y_m (which may be exchanged)" if n == "truth.y_m" else n for n in names]
@@ -288,7 +288,7 @@ def _together(names: Sequence[str]) -> str:
 
 
 def units_of(name: str) -> list[tuple[float, str]]:
-    """Return by what a signal is off where its unit is taken for another, and how that is stated."""
+    """Return the correction factors for the units in which a signal may be recorded, each with its text."""
     to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
     km_h, mph = 3.6, 0.44704
     of_speeds = [(1.0 / km_h, "is in km/h"), (km_h, "was converted from km/h twice")]
@@ -311,7 +311,7 @@ def units_of(name: str) -> list[tuple[float, str]]:
 
 
 def _of_scales(mistake: Hypothesis, scales: Mapping[str, object]) -> float:
-    """Return the energy of undoing a mistake in a mapping: its scales should become those of units."""
+    """Return the energy of correcting a mistake: the corrected scales should be unit factors."""
     energies = [
         PRIORS["odd scale"] * (is_odd(name, scale * factor) - is_odd(name, scale))
         for name, factor in mistake.factors.items()
@@ -333,11 +333,11 @@ def _unit_scales(name: str) -> tuple[float, ...]:
 
 
 def block_gains(reference: FloatArray, measured: FloatArray, blocks: int) -> tuple[float, ...]:
-    """Return the gains [at most ``blocks``] of blocks of a drive that move; each has its own means: a bank, a bias.
+    """Return the gains [at most ``blocks``] of moving blocks; each block's means are removed (bank, bias).
 
     Parameters
     ----------
-    reference, measured : float64 [N], known everywhere.
+    reference, measured : float64 [N], without NaN.
     """
     least, gains = 0.3 * float(reference.std()), []
     for a, b in zip(np.array_split(reference, blocks), np.array_split(measured, blocks), strict=True):

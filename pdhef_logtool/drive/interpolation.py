@@ -1,4 +1,4 @@
-"""Linear interpolation between the two samples around each stamp, never across a gap."""
+"""Linear interpolation between the two samples around each stamp, except across gaps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 
 class Bracket:
-    """The samples around each of M stamps, found once and used for many columns.
+    """The samples around each of M stamps, searched once for many columns.
 
     Parameters
     ----------

@@ -33,12 +33,12 @@ _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """Columns of the grid by name, those of ground truth with ``truth.``, and the relations that they allow.
+    """Columns of the grid by name and the relations between them; names of ground truth begin with ``truth.``.
 
     Attributes
     ----------
-    speed_name : the column used as the speed. topics : of the signals, by name.
-    scales : by name, those of ground truth with ``truth.``, what the mapping multiplies the raw values with.
+    speed_name : the column used as the speed. topics : topics of the signals, by name.
+    scales : scales of the mapping, by name.
     """
 
     columns: Mapping[str, FloatArray]
@@ -54,14 +54,14 @@ class Measured:
         return ("truth.lon_deg", "truth.lat_deg") if is_place else ("truth.x_m", "truth.y_m")
 
     def without_truth(self) -> Measured:
-        """Return what the signals alone state."""
+        """Return the columns and relations of the signals alone."""
         columns = {n: c for n, c in self.columns.items() if not n.startswith("truth.")}
         kept = tuple(r for r in self.relations if not any(n.startswith("truth.") for n in r.powers))
         speed = None if (self.speed_name or "").startswith("truth.") else self.speed_name
         return replace(self, columns=columns, speed_name=speed, relations=kept)
 
     def parts(self, vehicle: VehicleParameters | None) -> Iterator[Measured]:
-        """Yield what two independent parts of the drive state, each by itself."""
+        """Yield the measurements of two independent parts of the drive."""
         cells = len(next(iter(self.columns.values()), np.empty(0)))
         for part in halves(cells):
             columns = {n: np.where(part, c, np.nan) for n, c in self.columns.items()}
@@ -69,7 +69,7 @@ class Measured:
             yield replace(self, columns=columns, relations=tuple(related))
 
     def without(self, names: Iterable[str]) -> Measured:
-        """Return it without columns that no relation is about."""
+        """Return the measurements without these columns, which have no relations."""
         gone = set(names)
         columns = {n: c for n, c in self.columns.items() if n not in gone}
         return replace(self, columns=columns, topics={n: t for n, t in self.topics.items() if n not in gone})
@@ -82,12 +82,12 @@ class Measured:
         )
 
     def agrees(self, name: str, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> bool:
-        """Return whether a signal is wrong by these relations too, if one of them counts."""
+        """Return whether these relations confirm that a signal is wrong; True without an informative relation."""
         mistakes = self.posterior(mounting_is_known=mounting_is_known, open_signs=open_signs).of(name)
         return sum(p for p, _ in mistakes) > 0.5 or not any(r.tells and name in r.powers for r in self.relations)
 
     def groups(self, *, mounting_is_known: bool) -> list[tuple[str, ...]]:
-        """Return the signals whose signs or units are wrong together: those of one topic, and of ground truth."""
+        """Return groups of signals with a common error of sign or unit: per topic, and of ground truth."""
         columns = self.columns
         topics: dict[str, list[str]] = {}
         for name, topic in () if mounting_is_known else self.topics.items():
@@ -117,14 +117,14 @@ def measure(
 
     Parameters
     ----------
-    derived : ground truth at the CG. vehicle : the default car states nothing. mapping : of the channels, if known.
+    derived : ground truth at the CG. vehicle : not used if it is the default car. mapping : of the channels, if known.
     """
     columns, speed_name = drive_columns(signals, truth or {}, derived)
     topics = {n: c.source.split(".")[0] for n, c in signals.items()}
     of_truth = {} if mapping is None else {f"truth.{n}": s for n, s in mapping.truth.items()}
     sources = {**({} if mapping is None else mapping.signals), **of_truth}
     related = measured_relations(columns, speed_name, _known(vehicle))
-    # Two quantities of ground truth that are read from one field agree by themselves.
+    # Two quantities of ground truth from the same field agree trivially.
     read = [[(of_truth[n].topic, of_truth[n].paths) for n in r.powers if n in of_truth] for r in related]
     related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
     return Measured(columns, speed_name, tuple(related), topics, {n: s.scale for n, s in sources.items()})
@@ -138,7 +138,7 @@ def drive_columns(
     if derived is not None:
         for name in _TRUTH:
             channels[f"truth.{name}"] = channel_of(derived, name)
-        # As mapped: a wrong unit is wrapped away in what is derived of it, and a derived a_y gives no new information.
+        # Mapped values replace derived ones: wrapping hides a wrong unit, and a derived a_y adds no information.
         if "vy_m_s" in truth and "truth.vy_m_s" in channels:
             channels[CG_VY] = channels["truth.vy_m_s"]
         channels |= {f"truth.{n}": truth[n] for n in ("vy_m_s", "sideslip_rad", "ay_m_s2") if n in truth}
@@ -169,7 +169,7 @@ def _over_ground(channels: Mapping[str, Channel]) -> dict[str, Channel]:
 
 
 def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack) -> dict[str, Channel]:
-    """Return the velocities ahead and to the left that positions and heading of one topic have; empty without them."""
+    """Return body velocities from positions and heading of one topic; empty without them."""
     pose = [truth[n] for n in ("x_m", "y_m", "yaw_rad", "quat_wxyz") if n in truth]
     finite = np.isfinite(track.yaw_rad)
     stamps = pose[0].stamps_ns if pose else np.empty(0, np.int64)
@@ -177,7 +177,7 @@ def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack) -> dict[str,
     if not {"x_m", "y_m"} <= truth.keys() or len(topics) > 1 or not finite.any() or stamps.size < 3:
         return {}
     yaw = np.interp(stamps, track.stamps_ns[finite], np.unwrap(track.yaw_rad[finite]))
-    y_m = np.interp(stamps, truth["y_m"].stamps_ns, truth["y_m"].values)  # a sample of it may be missing
+    y_m = np.interp(stamps, truth["y_m"].stamps_ns, truth["y_m"].values)  # single samples may be missing
     vx, vy, rate = (np.gradient(c, (stamps - stamps[0]) * 1e-9) for c in (truth["x_m"].values, y_m, yaw))
     ahead, left = np.cos(yaw) * vx + np.sin(yaw) * vy, np.cos(yaw) * vy - np.sin(yaw) * vx
     columns = {"truth.pose_vx_m_s": ahead, "truth.pose_vy_m_s": left, "truth.heading_rate_rad_s": rate}
@@ -185,7 +185,7 @@ def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack) -> dict[str,
 
 
 def _speed_of(columns: dict[str, FloatArray]) -> str | None:
-    """Return the name of the column used as the speed; the wheels' is added: one alone turns in bends, or spins."""
+    """Return the name of the speed column. Without a speed sensor, a robust mean of the wheel speeds is added."""
     if "speed_m_s" in columns:
         return "speed_m_s"
     for unit in ("m_s", "rad_s"):
@@ -194,9 +194,9 @@ def _speed_of(columns: dict[str, FloatArray]) -> str | None:
             middle = np.median(wheels, axis=0)
             most = SPIN_SHARE * np.abs(middle)
             with np.errstate(divide="ignore", invalid="ignore"):
-                # A wheel that spins or locks counts with ``most``; of two that do, no wheel shows how fast the car was.
+                # The deviation of one spinning or locked wheel is limited to ``most``; with two, the speed is unknown.
                 shares = wheels / np.where(moving_at(middle), middle, np.nan)
-                typical = [[median_known(share)] for share in shares]  # of another unit, a wheel does not spin
+                typical = [[median_known(share)] for share in shares]  # a wheel in another unit does not spin
                 spin = np.sum(np.abs(shares - typical) > SPIN_SHARE, axis=0) > 1
             mean = np.mean(np.clip(wheels, middle - most, middle + most), axis=0)
             columns[WHEEL_SPEEDS] = np.asarray(np.where(spin, np.nan, mean))

@@ -1,8 +1,8 @@
-"""How an IMU is mounted in the car, from gravity, its speed and its turning.
+"""Mounting of an IMU in the car, from gravity, speed and yaw rate.
 
-The mean specific force, less the accelerations of the car, shows which way is up; the rate about that axis is the yaw
-rate. Then what is left of the accelerations must be (v̇, v r) in the car's axes: one angle about the vertical makes it
-so, by complex regression, and its fit gives whether all of it is accepted.
+The mean specific force minus the accelerations of the car points up; the rate about that axis is the yaw rate. In the
+car's axes, the level accelerations are (v̇, v r). A complex regression gives the angle about the vertical that rotates
+the sensor's axes to these; its correlation, gain and error decide whether the mounting is accepted.
 """
 
 from __future__ import annotations
@@ -58,38 +58,38 @@ from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
 
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 
-#: Mean accelerations below are no gravity: the sensor's software took it off.
+#: Below this mean acceleration, the sensor's software has subtracted gravity.
 COMPENSATED_M_S2 = 3.0
-#: How far speed and yaw rate explain the level accelerations once the axes are right; the rest is sideslip, roll,
-#: grade, crossfall and noise. Below, nothing is stated.
+#: Least correlation of the level accelerations with speed and yaw rate in the correct axes; the rest is sideslip, roll,
+#: grade, crossfall and noise.
 MIN_CORRELATION = 0.75
-#: Independent samples: 5 s of driving.
+#: Least number of independent samples: 5 s of driving.
 MIN_SAMPLES = 10.0
-#: The regression's own gain: a unit is wrong beyond, and then no angle can be derived from it.
+#: Plausible gain of the regression. Outside, a unit is wrong and the angle is unknown.
 GAIN_RANGE = (0.5, 2.0)
-#: Of a multiple of 90 degrees: half of 45 degrees at three standard errors.
+#: Largest standard error of the angle for a multiple of 90 degrees: three errors are half of 45 degrees.
 MAX_ERROR_DEG = 7.5
-#: A mounting is a multiple of 90 degrees unless it is off by more than this, and than three standard errors. Grade,
-#: crossfall and bias are 0.5 m/s^2 over 20 s, 3 degrees of tilt; sideslip makes 2 degrees of yaw.
+#: A mounting is a multiple of 90 degrees unless it differs by more than this and by more than three standard errors.
+#: Grade, crossfall and bias are 0.5 m/s^2 over 20 s, 3 degrees of tilt; sideslip causes 2 degrees of yaw.
 TURNED_DEG = 4.0
 ASKEW_SAMPLES = 40.0
-#: A part of a drive shows less than all of it; where the parts are too short, all of it must show more.
+#: Least correlation of each part of a drive. If the parts are too short, the drive needs ``ASKEW_CORRELATION``.
 PART_CORRELATION = 0.6
-#: Two parts of a drive that differ by more do not agree; beyond the number the regressors are not separable.
+#: Largest difference between two parts of a drive, and condition number above which the regressors are not separable.
 PARTS_AGREE_DEG, PARTS_AGREE_SHARE, WELL_CONDITIONED = 2.5, 0.2, 60.0
 ASKEW_CORRELATION, ASKEW_ERROR_DEG = 0.85, 1.5
-#: Correlation of the yaw rate with another measurement of it that settles its sign.
+#: Least correlation of the yaw rate with another measurement that decides its sign.
 SIGN_CORRELATION = 0.5
-#: And that makes a sensor left-handed: the wheels' difference turns round where a car pushes over its front tyres.
+#: The same for a left-handed sensor: the wheels' difference changes its sign when a car understeers strongly.
 HAND_CORRELATION = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mounting:
-    """Rotation [3, 3] from the sensor's axes to forward, left, up; what it was found from; whether it can be applied.
+    """Rotation [3, 3] from the sensor's axes to forward, left, up, with its evidence.
 
-    ``named`` are the rows [3, 3] that the mapping reads as it is, 0 where it lacks one. ``hand``: -1 where the
-    sensor's rates turn to the left about its axes.
+    ``named``: the rows [3, 3] that the mapping reads now, 0 where it lacks a signal. ``confident``: the rotation may be
+    applied. ``hand``: -1 if the sensor's rates are left-handed.
     """
 
     rotation: FloatArray
@@ -100,7 +100,7 @@ class Mounting:
 
     @property
     def rows(self) -> FloatArray:
-        """Forward and left [3] of the accelerometer, up of the gyro: what a mapping should read."""
+        """Rows [3, 3] that a mapping should read: forward and left of the accelerometer, up of the gyro."""
         return np.concatenate([self.rotation[:2], self.hand * self.rotation[2:]])
 
     @property
@@ -110,7 +110,7 @@ class Mounting:
 
     @property
     def text(self) -> str:
-        """The rotation in words."""
+        """The rotation as text."""
         mirrored = "" if self.hand > 0.0 else ", its angular rates with the opposite sign"
         return f"{rotation_text(self.rotation)}{mirrored}"
 
@@ -118,7 +118,7 @@ class Mounting:
 def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None], mapping: Mapping) -> Mounting | None:
     """Find the rotation of an IMU from its six components; None without them, or if the drive does not show it.
 
-    ``measured``: with the components of the triads; ground truth, if any, for the sign of the yaw rate.
+    ``measured`` contains the components of the triads. Ground truth, if any, gives the sign of the yaw rate.
     """
     accelerations, rates = triads
     columns, speed_name = measured.columns, measured.speed_name
@@ -134,7 +134,7 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
         references = steering_references(columns, speed_name)
     turns = [m for h in (1.0, -1.0) for up in ups if (m := _turned(f, h * w, speed, up, references)) is not None]
     hands = [1.0] * (len(turns) // 2) + [-1.0] * (len(turns) // 2)
-    # Another measurement of the yaw rate must show it before a sensor is taken for a left-handed one.
+    # A sensor is left-handed only if another measurement of the yaw rate confirms it.
     fitting = [(m, h) for m, h in zip(turns, hands, strict=True) if m.fits and h * HAND_CORRELATION > -m.sign]
     if not fitting:
         return None
@@ -149,7 +149,7 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
 
 
 def _parts_agree(whole: _Turn, parts: Sequence[_Turn | None]) -> bool:
-    """Return whether the parts of a drive show the same step; of a short drive, all of it must correlate closely."""
+    """Return whether the parts of a drive give the same step; a short drive must correlate closely as a whole."""
     step, fitted = nearest_step(whole.rotation), [p for p in parts if p is not None]
     agree = all(p.correlation >= PART_CORRELATION and np.allclose(nearest_step(p.rotation), step) for p in fitted)
     return agree and (len(fitted) == len(parts) or whole.correlation >= ASKEW_CORRELATION)
@@ -166,10 +166,10 @@ def _named_rows(mapping: Mapping, accelerations: Triad, rates: Triad) -> FloatAr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Turn:
-    """A rotation for one choice of the vertical, and how well it explains the drive.
+    """A rotation for one choice of the vertical, with its fit to the drive.
 
-    ``sign``: correlation of the yaw rate with another measurement of it, 0: none. ``along``: the speed alone shows
-    which way is forward. ``f``, ``driven``, ``rate``, ``use``: the drive that it explains.
+    ``sign``: correlation of the yaw rate with another measurement, 0 without one. ``along``: the speed alone shows
+    which way is forward. ``f``, ``driven``, ``rate``, ``use``: data of the fit.
     """
 
     rotation: FloatArray
@@ -187,7 +187,7 @@ class _Turn:
 
 
 def _ups(f: FloatArray, w: FloatArray, named: FloatArray) -> list[FloatArray]:
-    """Return the directions [3] that may be up: gravity's, or any axis where the sensor takes gravity off."""
+    """Return the candidates [3] for up: gravity, or both directions of the main rotation axis if gravity is removed."""
     mean = np.nanmean(f, axis=0) if np.isfinite(f).all(axis=1).any() else np.zeros(3)
     size = float(np.linalg.norm(mean))
     if IS_GRAVITY_M_S2[0] < size < IS_GRAVITY_M_S2[1]:
@@ -211,7 +211,7 @@ def _turned(
     moving = moving_at(speed)
     rotation, correlation, gain, error = np.zeros((3, 3)), 0.0, 0.0, math.inf
     axis, mean = up, up
-    for _ in range(3):  # what driving makes of the mean tilts the vertical, a little
+    for _ in range(3):  # iterates, because the accelerations of the drive tilt the mean slightly
         e1 = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
         e1 /= np.linalg.norm(e1)
         e2 = np.cross(axis, e1)
@@ -222,7 +222,7 @@ def _turned(
         samples = independent_samples(int(np.count_nonzero(use)))
         if samples < MIN_SAMPLES:
             return None
-        # What a sensor off the CG reads beside them goes with the yaw acceleration.
+        # A sensor away from the CG also measures a term in proportion to the yaw acceleration.
         turning = 1j * derivative(rate)
         use &= np.isfinite(turning)
         a = np.stack([driven[use] - driven[use].mean(), turning[use] - turning[use].mean()], axis=1)
@@ -256,13 +256,13 @@ def _turned(
 
 
 def _along(measured: FloatArray, driven: FloatArray) -> bool:
-    """Return whether speeding up and braking alone show which way is forward."""
+    """Return whether accelerating and braking alone show which way is forward."""
     spread = float(measured.std() * driven.std())
     return spread > 0.0 and float(np.mean((measured - measured.mean()) * (driven - driven.mean()))) / spread > 0.5
 
 
 def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tuple[float, str]:
-    """Return the correlation of the yaw rate with the best of other measurements of it, and what that is; 0: none."""
+    """Return the correlation of the yaw rate with its best other measurement, and a text; 0 and empty without one."""
     best, said = 0.0, ""
     for text, reference in references:
         use = np.isfinite(rate) & np.isfinite(reference)
@@ -277,7 +277,7 @@ def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tupl
 
 
 def _snapped(turn: _Turn) -> FloatArray:
-    """Return the multiple of 90 degrees beside a rotation, with what of the rest is no grade, crossfall or sideslip."""
+    """Return the nearest multiple of 90 degrees, with the remaining tilt and yaw if both parts of the drive agree."""
     rotation = turn.rotation
     step = nearest_step(rotation)
     rest = rotation @ step.T
@@ -299,10 +299,10 @@ def _snapped(turn: _Turn) -> FloatArray:
 
 
 def _parts_turned(turn: _Turn, yaw_deg: float) -> bool:
-    """Return whether two parts of the drive agree that the sensor is turned about the vertical.
+    """Return whether two parts of the drive agree that the sensor is rotated about the vertical.
 
-    Steady sideslip turns the acceleration by an angle that grows with lateral acceleration and curvature, roll and
-    pitch change the gains of both axes, and grade and crossfall are slow: each has its regressor, or is a constant.
+    Steady sideslip rotates the acceleration by an angle that grows with lateral acceleration and curvature. Roll and
+    pitch change the gains of both axes. Each has a regressor; grade and crossfall are part of the constant.
     """
     z, lateral = turn.f @ (turn.rotation[0] + 1j * turn.rotation[1]), turn.driven.imag
     regressors = [turn.driven, turn.driven.conj(), 1j * derivative(turn.rate), lateral**2, turn.rate**2]
@@ -330,7 +330,7 @@ def _parts_tilted(turn: _Turn) -> bool:
         if not usable.any():
             return False
         level, driven = turn.rotation @ turn.f[usable].T, turn.driven[usable]
-        # The body rolls and pitches with what it drives: a tilt is what is left without driving.
+        # The body rolls and pitches with the accelerations; the tilt is the remainder at zero acceleration.
         along = [
             (d, float(np.cov(d, z)[0, 1] / max(float(d.var()), 1e-9)))
             for d, z in zip((driven.real, driven.imag), level[:2], strict=True)
@@ -347,9 +347,9 @@ def _parts_tilted(turn: _Turn) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """The first minutes of a log as its mapping reads them, the IMU turned into the car where that is certain.
+    """The first minutes of a log as its mapping reads them, with the IMU rotated to the car's axes if that is certain.
 
-    ``vehicle``: from the vehicle file, or the default car. ``corrected``: what the drive changed in a recognised
+    ``vehicle``: from the vehicle file, or the default car. ``corrected``: checks for the changes of a recognised
     mapping. ``reread``: completes the checks of a mapping file.
     """
 
@@ -368,7 +368,7 @@ class Survey:
 
     @property
     def mounted(self) -> tuple[Check, ...]:
-        """Whether each of the IMU's signals is read from the axis that the drive shows, and what frames state of it."""
+        """Checks of the axes that the IMU's signals are read from, by the drive and by recorded frames."""
         framed = () if self.framed is None else (self.framed,)
         if self.mounting is None:
             return framed
@@ -376,30 +376,30 @@ class Survey:
 
     @property
     def is_mounted(self) -> bool:
-        """Whether the IMU is known to be read from the right axes."""
+        """Whether the drive confirms that the IMU is read from the right axes."""
         return self.mounting is not None and self.mounting.confident and self.mounting.is_as_named
 
     @cached_property
     def checks(self) -> tuple[Check, ...]:
-        """The checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.running.check_drive`."""
+        """Checks of the mounting and of :func:`~pdhef_logtool.drive.checks.running.check_drive`."""
         drive_checks = self._drive_checks(self.channels.truth, self.truth, self.latency, self.measured)
         checks = (*self.mounted, *self.corrected, *self._of_names(drive_checks), *drive_checks)
         return checks if self.reread is None else self.reread(checks)
 
     @cached_property
     def sensor_checks(self) -> tuple[Check, ...]:
-        """The checks of the sensors by one another: ground truth must not decide what the estimators read."""
+        """Checks of the sensors without ground truth, which must not influence the inputs of the estimators."""
         if not self.channels.truth:
             return self.checks
         measured = measure(self.channels.signals, {}, None, self.vehicle, self.mapping)
         return (*self.mounted, *self._drive_checks({}, None, None, measured))
 
     def refused(self, waived: Sequence[str] = (), *, is_causal: bool = False) -> dict[str, str]:
-        """Return by channel why nothing may be computed from it: sensors by one another, ground truth by everything.
+        """Return the channels that must not be used, with the reason. Ground truth does not decide about sensors.
 
         Parameters
         ----------
-        waived : names of checks that stop nothing. is_causal : no sensor may be refused because of later samples.
+        waived : names of checks that are ignored. is_causal : no sensor is refused because of later samples.
         """
         by_everything = misread_channels(self.checks, waived)
         refused = {n: why for n, why in by_everything.items() if n.startswith("truth.")}
@@ -425,12 +425,12 @@ class Survey:
 
     @cached_property
     def late(self) -> tuple[LateSensor, ...]:
-        """The sensors whose stamps are late as the signals alone show; a sensor that fails for a while is none."""
+        """Sensors with late time stamps, from the signals alone. Sensors with a temporary fault are excluded."""
         sensors = late_sensors(self.channels.signals)
         return sensors and late_sensors(without_faulty_samples(self.channels.signals, self.vehicle)[0])
 
     def _of_names(self, drive_checks: tuple[Check, ...]) -> Iterator[Check]:
-        """Yield what the mapping's names left undecided and the drive has not settled since."""
+        """Yield the mapping's undecided checks that the drive does not decide either."""
         passed = {c.name for c in drive_checks if c.verdict == "passed"} - {
             f"{c.subject}.sign" for c in drive_checks if c.verdict != "passed"
         }
@@ -440,7 +440,7 @@ class Survey:
             signal = check.name.removesuffix(".candidate")
             if check.name == "imu.mounting" and self.mounting is not None and self.mounting.confident:
                 continue
-            # Rim speed in m/s and in rad/s look alike where the radius is not known. v_y has the unit of its v_x.
+            # Without a known radius, rim speeds in m/s and in rad/s look alike. v_y has the unit of its v_x.
             unit = f"{signal.replace('truth.vy', 'truth.vx')}.unit"
             is_resolved = unit in passed and not signal.startswith("wheel") and "a share" not in check.evidence
             if f"{signal}.sign" not in passed or (signal in doubted and not is_resolved):
@@ -456,14 +456,14 @@ def survey_log(
     *,
     rescale: bool = True,
 ) -> Survey:
-    """Read a span of a log and find how its IMU is mounted, and what unit or sign is wrong.
+    """Read a span of a log and find the mounting of its IMU and a wrong unit or sign.
 
-    A recognised mapping is turned and scaled where that is certain, with a note; a mapping file is only checked.
+    A recognised mapping is corrected where that is certain, with a note; a mapping file is only checked.
 
     Parameters
     ----------
-    vehicle : of the drive; None: nothing is known of it.
-    rescale : whether a wrong unit or sign is looked for.
+    vehicle : of the drive; None uses the default car.
+    rescale : whether to search for a wrong unit or sign.
     """
     vehicle = vehicle or default_vehicle()
     triads = find_triads(log, mapping)
@@ -475,7 +475,7 @@ def survey_log(
     truth_plan = plan_truth(channels.truth, truth_position_m=place, roll_gradient_rad_per_m_s2=gradient)
     truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
     measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
-    # The input of an estimator must not depend on ground truth: with it, a mounting is only checked.
+    # The inputs of an estimator must not depend on ground truth: a mounting from ground truth is only checked.
     mounting = find_mounting(measured.without_truth(), triads, mapping)
     blind = mounting is not None and mounting.confident
     if not blind and truth is not None:
@@ -489,7 +489,7 @@ def survey_log(
     if mounting is not None and mapping.origin == "auto" and trusted and not mounting.is_as_named:
         note = f"{mounting.text}, and is read so: {mounting.evidence}"
         signals = turned_signals(mapping, mounting, triads)
-        if by_frames is None:  # what the log itself states is no correction
+        if by_frames is None:  # a mounting that the log records is not a correction
             corrected = [_corrected(n, signals[n], note) for n in MOUNTED if signals.get(n) != mapping.signals.get(n)]
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
         channels = read_signals(log, mapping, clocks, *span_ns)
@@ -524,7 +524,7 @@ def _by_frames(
     triads: tuple[Triad | None, Triad | None],
     by_drive: Mounting | None,
 ) -> tuple[Check | None, Mounting | None]:
-    """Return the check of recorded frames, and the mounting where they alone state it."""
+    """Return the check of recorded frames, and the mounting if only the frames provide it."""
     accelerations, rates = triads
     placed = None if accelerations is None else placement_of(log, accelerations.source.topic)
     if placed is None or accelerations is None or rates is None:
@@ -543,17 +543,17 @@ def _by_frames(
 
 
 def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
-    """Return the survey with the signs that nothing documents, or one wrong unit or sign, as the drive shows them.
+    """Return the survey with undocumented signs decided, or with one wrong unit or sign corrected.
 
-    It must be certain, and no part of the drive may contradict it by itself. Ground truth takes no part where something
-    documented is corrected, which is a failed check.
+    A correction must be certain, and no part of the drive may contradict it. Documented units and signs are corrected
+    without ground truth, and each such correction is a failed check.
     """
     mapping, is_mounted, measured = survey.mapping, survey.is_mounted, survey.measured
     groups, turned = mapping.open_signs, []
     if groups:
         probable = measured.posterior(mounting_is_known=is_mounted, open_signs=groups)
         turned = [n for g in groups if probable.turned(g[0]) >= CERTAIN for n in g]
-    factors = dict.fromkeys(turned, (-1.0, "nothing documents its sign, and the drive shows it"))
+    factors = dict.fromkeys(turned, (-1.0, "its sign is not documented, and the drive shows it"))
     if not turned:
         groups, measured = (), measured.without_truth()
         factors = explained_factors(measured, mounting_is_known=is_mounted, most=1)
@@ -574,7 +574,7 @@ def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_
         return survey
     scaled = replace(mapping, signals=sections[""], truth=sections["truth."], notes=tuple(notes), open_signs=())
     again = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=bool(turned))
-    # A failing sensor resembles a wrong unit of another one; after a right correction nothing contradicts any more.
+    # A failing sensor resembles a wrong unit of another one, but only a right correction leaves no contradiction.
     failed = [check.name for check in again.checks if check.verdict == "failed"]
     is_bad = not turned and any(n.endswith((".sign", ".unit", ".axis", ".fault")) for n in failed)
     return survey if is_bad else replace(again, corrected=(*checks, *again.corrected))
@@ -585,17 +585,17 @@ def _corrected(name: str, source: SignalSource, note: str) -> Check:
 
 
 def scaled_source(source: SignalSource, factor: float) -> SignalSource:
-    """Return a source whose values are multiplied by a factor."""
+    """Return a source with scale and offset multiplied by a factor, without its valid range."""
 
     def times(value: float | tuple[float, ...]) -> float | tuple[float, ...]:
         return tuple(v * factor for v in value) if isinstance(value, tuple) else value * factor
 
-    # A range of wrong values would drop the right ones.
+    # A valid range in the wrong unit would drop correct values.
     return replace(source, scale=times(source.scale), offset=times(source.offset), valid_min=None, valid_max=None)
 
 
 def truth_latency(channels: MappedChannels, truth: TruthTrack | None) -> LatencyEstimate | None:
-    """Return the latency of ground truth relative to the gyro, or of the gyro; None where one is missing."""
+    """Return the latency of ground truth relative to the gyro, or of the gyro; None if one is missing."""
     gyro = channels.signals.get("yaw_rate_rad_s")
     if truth is None or gyro is None or not len(gyro):
         return None
@@ -614,7 +614,7 @@ def truth_latency(channels: MappedChannels, truth: TruthTrack | None) -> Latency
 def turned_signals(
     mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]
 ) -> dict[str, SignalSource]:
-    """Return the mapping's signals with forward, left and up of the sensor as it is mounted."""
+    """Return the mapping's signals, rotated by the mounting of the sensor."""
     accelerations, rates = triads
     assert accelerations is not None and rates is not None
     signals = dict(mapping.signals)
@@ -628,7 +628,7 @@ def turned_signals(
 
 
 def mounting_checks(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]) -> list[Check]:
-    """Return for each of the IMU's signals whether it is read from the axis that the drive states."""
+    """Return for each of the IMU's signals whether it is read from the axis that the drive shows."""
     turned = turned_signals(mapping, mounting, triads)
     checks = []
     for i, name in enumerate(MOUNTED):

@@ -1,4 +1,4 @@
-"""What of a log is read and how: slice, sensors, ground truth, friction; and times as users write them."""
+"""Options for reading a log (slice, sensors, ground truth, friction), and the formats of times."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ NANOSECONDS_FROM = 10**15
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """Everything that decides what an estimator sees of a log, beside the mapping and the car.
+    """All options that influence the inputs of an estimator, except the mapping and the car.
 
     Attributes
     ----------
-    start, end : slice as given (:func:`parse_time`); None = the log's own.
+    start, end : slice as text (:func:`parse_time`); None = start and end of the log.
     sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
-    friction : of :func:`~pdhef_logtool.drive.friction.parse_friction`; None leaves what the log states, if anything.
-    prefer_truth : which ground truth counts in a simulated log that has both.
-    clock : ``arrival`` takes samples as known when they arrived, as in a car; ``stamp`` by their stamps (not causal).
-    budget : factor on what reading a log may cost.
-    waived : names of checks that do not count.
-    setup : file with what is decided once per drive; None decides it on the log. setup_from_s : decided on the first so
-        many seconds of the slice; None = its first ten minutes, and clocks on all of it.
+    friction : of :func:`~pdhef_logtool.drive.friction.parse_friction`; None keeps the friction of the log, if any.
+    prefer_truth : ground truth to use if a simulated log contains both.
+    clock : ``arrival`` makes samples available at their arrival, as in a car; ``stamp`` at their stamps (not causal).
+    budget : factor on the resource limits for reading a log.
+    waived : names of checks to ignore.
+    setup : frozen set-up file; None decides the set-up on the log. setup_from_s : duration at the start of the slice
+        that decides the set-up; None = ten minutes, and the whole slice for clocks.
     msgs : folder with definitions of message types that a log does not define.
     allow_private_redirects : whether a web server may redirect to other hosts of this machine and its network.
     """
@@ -48,7 +48,7 @@ class ReadOptions:
     allow_private_redirects: bool = False
 
     def __post_init__(self) -> None:
-        """Take places as texts or paths."""
+        """Convert texts to paths."""
         object.__setattr__(self, "setup", None if self.setup is None else Path(self.setup))
         object.__setattr__(self, "msgs", None if self.msgs is None else Path(self.msgs))
 
@@ -59,12 +59,12 @@ class ReadOptions:
 
     @property
     def limits(self) -> ResourceLimits:
-        """What reading a log may cost."""
+        """Resource limits for reading a log."""
         return DEFAULT_LIMITS.times(self.budget)
 
 
 def parse_time(text: str, start_ns: int, end_ns: int, *, option: str) -> int:
-    """Turn a time as users write it into int64 nanoseconds of the log's clock.
+    """Convert a time from user input to int64 nanoseconds of the log's clock.
 
     ``12.5`` and ``+12.5s`` are seconds from the log's start, ``end-5s`` is 5 s before its end, a bare integer of at
     least 1e15 is nanoseconds, and anything with a ``T`` or ``-`` between digits is RFC 3339 (UTC when it names no
@@ -72,7 +72,7 @@ def parse_time(text: str, start_ns: int, end_ns: int, *, option: str) -> int:
 
     Raises
     ------
-    UsageError : The text is none of these.
+    UsageError : The text has another format.
     """
     text = text.strip()
     if re.fullmatch(r"\d+", text) and int(text) >= NANOSECONDS_FROM:

@@ -1,8 +1,8 @@
-"""Whether a mapping file reads a wrong field: recognition names another one of the log, and the drive decides.
+"""Detection of wrong fields in a mapping file: recognition proposes other fields, and the drive decides.
 
-A signal with a wrong unit still goes with the others; one that is read from another field often does too, by chance or
-because both move in bends. Each suspicion is tested: such signals are read from the fields that recognition reads, and
-only if all checks of them then pass, and fewer fail than before, the checks name those fields.
+A signal from a wrong field may still correlate with the others, by chance or because both move in bends. Suspicious
+signals are therefore read from the fields that recognition proposes. If all of their checks then pass, and fewer checks
+fail than before, the checks name these fields.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ def with_other_fields(
     checks_of: Callable[[Mapping], Sequence[Check]],
     recognise: Callable[[], Mapping],
 ) -> tuple[Check, ...]:
-    """Return the checks of a mapping file, with those of signals replaced that another field of the log is right for.
+    """Return the checks of a mapping file; for signals with a better field in the log, the check names that field.
 
     Parameters
     ----------
-    checks_of : returns the checks of another mapping of the log. recognise : what is read without a mapping file.
+    checks_of : returns the checks of another mapping of the log. recognise : returns the mapping without a file.
     """
     failed = _contradicted(checks)
     if not failed:
@@ -39,7 +39,7 @@ def with_other_fields(
     doubted = {c.subject for c in checks if c.verdict != "passed" and c.name.endswith(_MISREAD)}
     try:
         differing = {n: s for n, s in _others(recognise(), mapping).items() if n not in mounted}
-    except PdhefError:  # nothing is recognised
+    except PdhefError:  # no signal is recognised
         return tuple(checks)
     for others in ({n: s for n, s in differing.items() if n in doubted}, differing):
         try:
@@ -63,7 +63,7 @@ def _contradicted(checks: Sequence[Check]) -> set[str]:
 
 
 def _others(recognised: Mapping, mapping: Mapping) -> dict[str, SignalSource]:
-    """Return by signal the source that recognition reads it from, where that is another one."""
+    """Return by signal the recognised source, where it differs from the mapping's."""
     pairs = [(n, s, recognised.signals.get(n)) for n, s in mapping.signals.items()]
     pairs += [(f"truth.{n}", s, recognised.truth.get(n)) for n, s in mapping.truth.items()]
     return {

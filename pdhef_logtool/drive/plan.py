@@ -1,4 +1,4 @@
-"""What is decided once per log, from its first ten minutes: clocks, alignment, ground truth and checks."""
+"""Plan of a drive, decided from its first ten minutes: clocks, alignment, ground truth and checks."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from pdhef_logtool.records.signals import Channel
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivePlan:
-    """What is decided from the first ten minutes of a log and applies to all of it.
+    """Decisions from the first ten minutes of a log that apply to all of it.
 
     Attributes
     ----------
-    survey_truth : channels of the ground truth that it was decided on.
+    survey_truth : ground truth channels of these minutes.
     latency : of the ground truth against the sensors; None without ground truth yaw rate or gyro.
     dependent : ground truth quantities that are an input of the estimators, with the reason.
-    derivation : by ground truth quantity, how it is derived.
-    decided_s : seconds of the log, or of that of the set-up, that the sensors' part was decided on.
+    derivation : derivation of each ground truth quantity.
+    decided_s : duration that decided the sensors' part, of this log or of the log of the set-up.
     checks : of signals, ground truth and vehicle file.
-    refused : mapped channels, those of ground truth with ``truth.``, that nothing is computed from, with the reason.
+    refused : mapped channels that must not be used, with the reason; names of ground truth begin with ``truth.``.
     """
 
     mapping: Mapping
@@ -49,7 +49,7 @@ class DrivePlan:
 
     @property
     def truth_latency_s(self) -> float:
-        """Latency that all estimators' comparison with ground truth uses; 0 unless it is out of its own uncertainty."""
+        """Latency for all comparisons with ground truth; 0 unless it exceeds two standard errors."""
         is_significant = self.latency is not None and abs(self.latency.latency_s) > 2.0 * self.latency.std_error_s
         return self.latency.latency_s if is_significant and self.latency is not None else 0.0
 
@@ -77,11 +77,11 @@ def plan_drive(
     ----------
     require_imu : False gives a plan with no alignment (``alignment.channels`` empty) where there is no IMU.
     clock : as for :func:`~.alignment.plan_alignment`. setup : the sensors' part of the plan; None decides it here.
-    waived : names of checks whose failure does not stop the use of a channel.
+    waived : names of checks that may fail without excluding a channel.
 
     Raises
     ------
-    MappingError : The log lacks what is mapped, or there is no IMU to set the stamps.
+    MappingError : The log lacks a mapped topic or field, or an IMU.
     """
     mapping = with_gyro_delay(mapping, vehicle)
     if setup is not None:
@@ -103,7 +103,7 @@ def plan_drive(
         )
     else:
         alignment = no_alignment(survey.signals)
-    # What a set-up reads must not depend on later samples.
+    # The signals of a set-up must not depend on later samples.
     refused = looked_at.refused(waived, is_causal=setup is not None)
     mapping, sound = without_refused_truth(mapping, refused), looked_at
     if mapping is not looked_at.mapping:
@@ -129,7 +129,7 @@ def plan_drive(
 
 
 def without_refused_truth(mapping: Mapping, refused: Mapped[str, str]) -> Mapping:
-    """Return the mapping without refused ground truth; without any if a quantity that is derived is refused."""
+    """Return the mapping without refused ground truth; without all ground truth if a derived quantity is refused."""
     names = {n.removeprefix("truth.") for n in refused if n.startswith("truth.")}
     if not names:
         return mapping
@@ -138,7 +138,7 @@ def without_refused_truth(mapping: Mapping, refused: Mapped[str, str]) -> Mappin
 
 
 def setup_of(plan: DrivePlan) -> Setup:
-    """Return what of a plan can be frozen: mapping, clocks and alignment of the sensors."""
+    """Return the frozen set-up of a plan: mapping, clocks and alignment of the sensors."""
     keys = {clock_key(source) for source in plan.mapping.signals.values()}
     return Setup(
         signals=plan.mapping.signals,
@@ -150,7 +150,7 @@ def setup_of(plan: DrivePlan) -> Setup:
 
 
 def with_gyro_delay(mapping: Mapping, vehicle: VehicleParameters) -> Mapping:
-    """Return the mapping with the gyro's delay that the car has: all of it, in place of the mapping's own."""
+    """Return the mapping with the car's gyro delay in place of the mapping's."""
     delay_s, gyro = vehicle.sensors.yaw_rate_delay_s, mapping.signals.get("yaw_rate_rad_s")
     if delay_s == 0.0 or gyro is None or gyro.latency_s == delay_s:
         return mapping

@@ -1,7 +1,7 @@
 """Corrections of sensors and ground truth that a drive shows and that belong in its mapping.
 
-Unit, sign, mounting, a turned ground truth and a recorder's delay. Each is measured on what the mapping already takes
-off: applied in any order, each is taken off once.
+Corrections of unit, sign, mounting, heading of ground truth and delay. Each is relative to the current mapping, so that
+the order of their application does not matter.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
 from pdhef_logtool.drive.truth import LATE_GYRO_S
 from pdhef_logtool.mapping.records import Mapping, SignalSource
 
-#: Less is within what the roll of the body does.
+#: Smaller delays of a_y may be due to body roll.
 LEAST_AY_DELAY_S = 0.015
 
 
@@ -29,7 +29,7 @@ class Proposal:
     Attributes
     ----------
     subject : signal, or ``truth.QUANTITY``. evidence : one sentence with figures.
-    source : of the subject as it should be read, for the mapping.
+    source : corrected source of the subject, for the mapping.
     """
 
     subject: str
@@ -49,7 +49,7 @@ def apply_proposals(proposals: Iterable[Proposal], mapping: Mapping) -> Mapping:
 
 
 def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
-    """Return the mountings, units, signs and delays that the first minutes of a drive ask for; no doubtful one."""
+    """Return the certain corrections of mounting, unit, sign and delay from the first minutes of a drive."""
     mapping = survey.mapping
     proposals: list[Proposal] = []
     signals, truth = dict(mapping.signals), dict(mapping.truth)
@@ -76,7 +76,7 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
 
 
 def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
-    """Return by signal what its stamps are late by, with the evidence: by ground truth, else by another sensor."""
+    """Return the delay and the evidence of each late signal, from ground truth, otherwise from another sensor."""
     delays: dict[str, tuple[float, str]] = {}
     latency = survey.latency
     if latency is not None and latency.gyro_delay_s >= LATE_GYRO_S:
@@ -94,7 +94,7 @@ def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
 
 
 def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
-    """Return corrected sources of ground truth whose sideslip has a constant offset, if a mapping can correct it."""
+    """Return corrected ground-truth sources if the sideslip has a constant offset that a mapping can correct."""
     offset_and_error = sideslip_offset(survey.measured.columns)
     if offset_and_error is None or survey.truth is None:
         return []
@@ -102,7 +102,7 @@ def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
     if not is_beyond(offset, error, (-SIDESLIP_OFFSET_RAD, SIDESLIP_OFFSET_RAD)):
         return []
     truth = survey.mapping.truth
-    evidence = f"sideslip is {math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg where the car goes straight"
+    evidence = f"sideslip is {math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg in straight driving"
     vx, vy = truth.get("vx_m_s"), truth.get("vy_m_s")
     changed: dict[str, SignalSource] = {}
     if "sideslip_rad" in truth:

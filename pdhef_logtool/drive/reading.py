@@ -1,4 +1,4 @@
-"""The one way to read a drive: a log opened for a car, mapped and planned, then read as a whole."""
+"""Reading of a drive: a log is opened for a car, mapped and planned, then read as a whole."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ from pdhef_logtool.records.steps import MAX_PREDICTION_S
 from pdhef_logtool.records.tracks import StateTrack
 
 Tell = Callable[[str], None]
-#: Makes the mapping that is read with from the log and the mapping in effect; may print a message.
+#: Returns the mapping to read with, from the log and the mapping in effect; may print a message.
 Adjust = Callable[[DriveLog, Mapping, Tell], Mapping]
 
-#: Signals, ground truth and what is computed of them may take this much memory, of all drives of a command together.
+#: Memory limit of signals, ground truth and derived columns of all drives of a command together.
 MAX_BYTES = 2 << 30
 _AS_IT_IS = ReadOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WholeDrive:
-    """A drive in memory: signals [N], and the ground truth [N] at their stamps (None if the log has none)."""
+    """A drive in memory: signals [N], and the ground truth [N] at their stamps (None for a log without it)."""
 
     name: str
     path: LogPlace
@@ -75,14 +75,14 @@ class WholeDrive:
 
 @dataclass(slots=True, eq=False)
 class Drive:
-    """One log, opened for one car; a context that closes the log.
+    """One log, opened for one car; a context manager that closes the log.
 
     Attributes
     ----------
-    name : of the log in tables and folders. chosen : the mapping as it was before anything was decided.
-    plan : what was decided from the first minutes; another one may be put in its place before reading.
-    friction : what :meth:`whole` fills in; another one may be put in its place before reading.
-    notes : everything that was given of this drive: what may be wrong. remarks : what else is worth knowing.
+    name : of the log in tables and folders. chosen : the mapping before the drive changed it.
+    plan : decisions from the first minutes; may be replaced before reading.
+    friction : friction source for :meth:`whole`; may be replaced before reading.
+    notes : warnings to the user about this drive. remarks : other information.
     """
 
     name: str
@@ -106,7 +106,7 @@ class Drive:
 
     @property
     def mapping(self) -> Mapping:
-        """The mapping that it is read with."""
+        """The mapping in effect."""
         return self.plan.mapping
 
     @property
@@ -133,7 +133,7 @@ class Drive:
 
     @property
     def causal_from_s(self) -> float | None:
-        """Seconds from the start of the slice from which on the set-up depends on nothing later; None: on all of it."""
+        """Time in the slice, s, from which the set-up depends on past samples only; None: it depends on all of them."""
         if self.options.setup is not None:
             device = any(map(is_device_clock, self.plan.clocks.values()))
             return CLOCK_START_S if device else 0.0
@@ -141,7 +141,7 @@ class Drive:
 
     @property
     def not_causal(self) -> str:
-        """Why no estimate of this drive is causal, regardless of the estimator; empty if an estimator decides it."""
+        """Reason why no estimator is causal on this drive; empty if causality depends on the estimator."""
         names = [c.name for c in self.plan.alignment.channels if c.clock == "stamp" or not self._delay_known(c.name)]
         if not names:
             return ""
@@ -150,12 +150,12 @@ class Drive:
 
     def _delay_known(self, signal: str) -> bool:
         sources = self.mapping.signals
-        source = sources[signal if signal in sources else GNSS_POSITION[0]]  # a velocity may be that of positions
+        source = sources[signal if signal in sources else GNSS_POSITION[0]]  # GNSS velocity from positions
         return self.plan.clocks.get(clock_key(source), ClockModel()).delay_known
 
     @property
     def checks(self) -> tuple[Check, ...]:
-        """What physics states of signals, ground truth and vehicle file, with those that the options waive."""
+        """Checks of signals, ground truth and vehicle file; waived checks are marked."""
         return _checks_of(self.plan, self.options)
 
     @property
@@ -167,7 +167,7 @@ class Drive:
 
     @property
     def signals_sha256(self) -> str | None:
-        """Hash of the mapped signals, None where there are none, or before they were read."""
+        """Hash of the mapped signals; None without samples or before reading."""
         return None if self._recorded is None else self._recorded.signals_sha256
 
     @property
@@ -177,14 +177,14 @@ class Drive:
 
     @property
     def losses(self) -> tuple[Loss, ...]:
-        """What could not be used; complete once the drive was read. Files are named without their folder."""
+        """Data that could not be used; complete after reading. Files are named without their folder."""
         merged = merge_losses(
             [self.log.lost, () if self._recorded is None else self._recorded.losses, damage(self.sample_ledger)]
         )
         return tuple(replace(x, where=self.without_folder(x.where)) for x in merged)
 
     def without_folder(self, where: str) -> str:
-        """Return a place in the log without the folder that the log lies in."""
+        """Return a place in the log without the folder of the log."""
         return where.removeprefix(f"{self.path.parent}/")
 
     @property
@@ -194,7 +194,7 @@ class Drive:
 
     @property
     def sample_ledger(self) -> tuple[SampleCount, ...]:
-        """What became of every sample of the mapped topics; empty before the drive was read."""
+        """Counts of used and dropped samples of each mapped signal; empty before reading."""
         return () if self._recorded is None else self._recorded.ledger
 
     def tell(self, text: str) -> None:
@@ -203,16 +203,16 @@ class Drive:
         self._tell(f"{self.name}: {text}")
 
     def whole(self, *, fill_friction: bool = True, max_bytes: int | None = None) -> WholeDrive:
-        """Return all of the drive; it is read once for a plan.
+        """Return the whole drive; it is read once per plan.
 
         Parameters
         ----------
-        fill_friction : False leaves the friction that the log states.
-        max_bytes : that signals and ground truth may take; None = no bound.
+        fill_friction : False keeps the friction of the log.
+        max_bytes : memory limit of signals and ground truth; None = no limit.
 
         Raises
         ------
-        EstimatorError : The slice contains no stamp, or the drive takes more memory than it may.
+        EstimatorError : The slice contains no stamp, or the drive exceeds the memory limit.
         """
         recorded = self.recorded()
         signals, truth = recorded.signals, recorded.truth
@@ -226,7 +226,7 @@ class Drive:
         return whole
 
     def recorded(self) -> Recorded:
-        """Return what the plan reads of the log, also where that is nothing."""
+        """Return the drive as recorded, which may be empty."""
         if self._recorded is None or self._recorded.plan is not self.plan:
             self._recorded = read_recorded(self.log, self.plan)
         return self._recorded
@@ -254,13 +254,13 @@ def read_drive(
     adjust: Adjust | None = None,
     require_sensors: bool = True,
 ) -> Drive:
-    """Open a log for a car and decide everything that applies to all of it: mapping, clocks, alignment, friction.
+    """Open a log for a car, and decide mapping, clocks, alignment and friction for all of it.
 
     Parameters
     ----------
-    log : a file, folder or URL; a :class:`LogInput` brings the name that the drive has beside others, and may bring
-        a slice.
-    car : or what :meth:`Car.load` takes. mapping : or its file; None recognises types.
+    log : a file, folder or URL, or a :class:`LogInput`, which also contains the name of the drive and may contain a
+        slice.
+    car : a car, or an argument for :meth:`Car.load`. mapping : a mapping or its file; None recognises message types.
     tell : called with ``NAME: text`` for each note to the user; :attr:`Drive.notes` contains them too.
     adjust : changes the mapping in effect.
     require_sensors : False reads a log without an IMU, or without any recognised signal, for its ground truth alone.
@@ -271,7 +271,7 @@ def read_drive(
 
     Raises
     ------
-    PdhefError : Nothing of the log can be read, the mapping names what it lacks, or the slice is outside of it.
+    PdhefError : The log is not readable, it lacks a mapped field, or the slice is outside of it.
 
     >>> with read_drive("sample_logs/dlc.mcap", Car.load("saloon")) as drive:
     ...     len(drive.whole().signals), drive.losses
@@ -329,7 +329,7 @@ def read_drive(
 def _setup_of(
     log: DriveLog, mapping: Mapping, vehicle: VehicleParameters, slice_ns: tuple[int, int], options: ReadOptions
 ) -> Setup | None:
-    """Return the frozen set-up that the options ask for: that of a file, or that of the first seconds; else None."""
+    """Return the frozen set-up from a file or from the first seconds, as the options choose; None without one."""
     if options.setup is not None:
         return load_setup(options.setup)
     if options.setup_from_s is None:
@@ -341,7 +341,7 @@ def _setup_of(
 
 
 def _as_far_as_decided(log: DriveLog, options: ReadOptions) -> DriveLog:
-    """Return the log as far as a set-up from the first seconds may look at it, otherwise all of it."""
+    """Return the log up to the end of the set-up from the first seconds, or all of it without such a set-up."""
     if options.setup_from_s is None or log.end_ns <= log.start_ns:
         return log
     start_ns, _ = time_slice(options, log.start_ns, log.end_ns)
@@ -349,7 +349,7 @@ def _as_far_as_decided(log: DriveLog, options: ReadOptions) -> DriveLog:
 
 
 def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], options: ReadOptions) -> DriveLog:
-    """Open a log that is far again, now that it is known what of it is wanted; nothing is fetched twice."""
+    """Reopen a remote log with its mapped topics and slice; fetched bytes are not fetched again."""
     whole = slice_ns == (log.start_ns, log.end_ns)
     wanted = Wanted(frozenset(s.topic for s in mapping.sources()), *((None, None) if whole else slice_ns))
     opened = open_log(log.path, options.limits, options.msgs, wanted)
@@ -358,7 +358,7 @@ def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], option
 
 
 def one_log(argument: LogPlace | str, options: ReadOptions = _AS_IT_IS) -> LogInput:
-    """Return the log that a file, folder or pattern represents; raises UsageError unless it is one."""
+    """Return the log that a file, folder or pattern represents; raises UsageError unless there is exactly one."""
     inputs = find_logs(argument, private_redirects=options.allow_private_redirects)
     if len(inputs) != 1:
         raise UsageError(expected="one log", got=f"{len(inputs)} of them", where=str(argument))
@@ -366,12 +366,12 @@ def one_log(argument: LogPlace | str, options: ReadOptions = _AS_IT_IS) -> LogIn
 
 
 def lost_texts(losses: Iterable[Loss]) -> tuple[str, ...]:
-    """Return what of the input is gone, in words."""
+    """Return the lost parts of the input as texts."""
     return tuple(f"{x.what} ({x.where})" for x in losses if x.severity == "lost")
 
 
 def _name_damage(error: BaseException, log: DriveLog) -> None:
-    """Add the damage of a log to an error, as its probable cause: a file that is cut contains no mapped fields."""
+    """Add the damage of a log to an error as the probable cause: a truncated file may lack mapped fields."""
     if not isinstance(error, MappingError | EstimatorError) or not (
         lost := [x for x in log.lost if x.severity == "lost"]
     ):
@@ -387,14 +387,14 @@ def no_samples(path: LogPlace) -> EstimatorError:
         expected="IMU samples in the chosen slice",
         got="none that can be used",
         where=str(path),
-        remedy="pdhef inspect LOG shows what the log contains and what was dropped",
+        remedy="pdhef inspect LOG shows the contents of the log and the dropped samples",
     )
 
 
 def too_big(where: str) -> EstimatorError:
     """Return the error for drives that do not fit into memory."""
     return EstimatorError(
-        expected=f"drives whose signals and ground truth fit in {MAX_BYTES >> 20} MiB together",
+        expected=f"drives with at most {MAX_BYTES >> 20} MiB of signals and ground truth together",
         got="more",
         where=where,
         remedy="give fewer drives, or a slice of each with --start and --end",
@@ -434,9 +434,9 @@ def friction_of(
     validated: bool,
     of_truth: bool = False,
 ) -> FrictionSource:
-    """Return the friction of a drive as the options choose it, for a vehicle; ``factor`` makes it wrong on purpose.
+    """Return the friction source of a drive by its options; ``factor`` is a deliberate error.
 
-    With ``of_truth``, ``auto`` is the friction of the ground truth where the log has one.
+    With ``of_truth``, ``auto`` uses the friction of the ground truth if the log contains it.
     """
     if of_truth and options.friction == "auto" and (true := plan.mapping.truth.get("friction")) is not None:
         return FrictionSource(f"ground truth {true.label}", factor=factor, of_truth=True)

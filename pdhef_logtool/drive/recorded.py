@@ -21,10 +21,10 @@ from pdhef_logtool.records.signals import Channel, FloatArray, Loss, Signals
 from pdhef_logtool.records.steps import last_known
 from pdhef_logtool.records.tracks import StateTrack
 
-#: A silence of a channel is reported from this time on, and from this many of its periods.
+#: A gap of a channel is reported if it is longer than both this time and this many periods.
 TOLD_GAP_S = 1.0
 TOLD_GAP_PERIODS = 10.0
-#: Why a signal's samples are not used although nothing is wrong with them.
+#: Reason for intact samples of a signal that is not needed.
 _NOT_NEEDED = "not-needed"
 _IMPOSSIBLE = "readings that no vehicle can have were taken as missing by the estimators"
 _LATE = "samples arrived much later than their neighbours: they were not waited for and count as missing"
@@ -32,13 +32,13 @@ _LATE = "samples arrived much later than their neighbours: they were not waited 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
-    """What a plan reads of a log.
+    """A drive as its plan reads it from the log.
 
     Attributes
     ----------
     signals, truth : [N] at the same stamps; N may be 0, and ``truth`` is None without ground truth.
-    samples : messages that were used, by source. ledger : what became of every sample of the mapped topics.
-    signals_sha256, truth_sha256 : of the channels' content, None where there is none.
+    samples : number of used messages, by source. ledger : used and dropped samples of each mapped signal.
+    signals_sha256, truth_sha256 : hashes of the channels' content; None without samples.
     """
 
     plan: DrivePlan
@@ -89,7 +89,7 @@ def read_recorded(log: DriveLog, plan: DrivePlan) -> Recorded:
 
 
 def _measured_speed(signals: Signals) -> FloatArray:
-    """Return the last known speed [N], of GNSS where no other sensor measures it."""
+    """Return the last known speed [N]; from GNSS where no other sensor measures it."""
     of_gnss = np.hypot(*signals.gnss_velocity_m_s.T)
     speed = np.where(np.isfinite(signals.speed_m_s), signals.speed_m_s, of_gnss)
     return last_known(signals.stamps_ns, speed)
@@ -98,7 +98,7 @@ def _measured_speed(signals: Signals) -> FloatArray:
 def sample_ledger(
     log: DriveLog, plan: DrivePlan, counts: Mapped[tuple[Role, str], Counter[str]]
 ) -> tuple[SampleCount, ...]:
-    """Return what became of every sample of the mapped topics, of the counts of a plan's slice."""
+    """Return the numbers of used and dropped samples of each mapped signal, from the counts of a plan's slice."""
     messages = {t.name: t.messages for t in log.topics}
     whole = plan.start_ns <= log.start_ns and plan.end_ns >= log.end_ns
     aligned = {c.name for c in plan.alignment.channels}
@@ -107,7 +107,7 @@ def sample_ledger(
         source = (plan.mapping.signals if role == "signal" else plan.mapping.truth)[name]
         dropped = Counter({reason: n for reason, n in count.items() if reason != "read"})
         total = count["read"]
-        if source.read_topic in messages:  # a signal of raw CAN frames is read of some of its topic's messages
+        if source.read_topic in messages:  # a signal of raw CAN frames is in some messages of its topic only
             left_out = log.recording_span.left_out.get(source.topic, {})
             rest = messages[source.topic] - total - sum(left_out.values())
             total = messages[source.topic]
@@ -131,7 +131,7 @@ def _impossible(signals: Signals) -> list[Loss]:
 
 
 def _gaps(channel: Channel) -> list[Loss]:
-    """Return the silences within a channel."""
+    """Return the gaps within a channel."""
     stamps = channel.stamps_ns
     if stamps.shape[0] < 3:
         return []

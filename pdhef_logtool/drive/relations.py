@@ -1,4 +1,4 @@
-"""The table of relations between signals: what rigid-body kinematics and rolling wheels want of pairs of them."""
+"""Relations between pairs of signals, from rigid-body kinematics and rolling wheels."""
 
 from __future__ import annotations
 
@@ -13,54 +13,54 @@ from pdhef_logtool.drive.columns import derivative, fit, independent_samples, me
 from pdhef_logtool.drive.hypotheses import BLOCKS, MIN_CORRELATION, MIN_SAMPLES, Relation, block_gains
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
-#: What is left of two columns by regression is small, and a car that slides leaves it related otherwise.
+#: Least correlation of two residuals of a regression: they are small, and sliding changes their relation.
 MIN_PARTIAL_CORRELATION = 0.8
-#: Column of the ground-truth v_y at the CG, where v_y itself is mapped and is a column as mapped: the lever's part of a
-#: v_y at the CG would hide its unit.
+#: Column of the ground-truth v_y at the CG if v_y is mapped. The mapped v_y has its own column, because the lever-arm
+#: term of v_y at the CG would hide a wrong unit.
 CG_VY = "truth.vy_m_s at the CG"
-#: Column of the turning of the ground-truth path, under the name of the position whose sign it has.
+#: Column of the course rate of the ground-truth path, named after the position that determines its sign.
 COURSE_RATE = "truth.y_m"
-#: Column of the turning of the mapped ground-truth heading, under its name.
+#: Column of the rate of the mapped ground-truth heading, under the name of the heading.
 TURNING = "truth.yaw_rad"
-#: Column of the turning of a receiver's velocity over ground.
+#: Column of the course rate of a GNSS receiver's velocity.
 GNSS_COURSE_RATE = "gnss_course_rate_rad_s"
 #: Columns of the velocity along the axes of the ground-truth positions.
 POSITION = "truth.position_vx_m_s", "truth.position_vy_m_s"
-#: One of two sides that moves by more must move the other. Crossfall and grade alone move an accelerometer by less (5 %
-#: are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
+#: A side that moves by more than this must also move the other side. Crossfall and grade alone move an accelerometer by
+#: less (5 % are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
 MOVES_M_S2 = 1.0
 MOVES_RAD_S = 0.06
-#: Gains between these are tyres, roll, bank, grade and noise; beyond them they are units.
+#: Gains that tyres, roll, bank, grade and noise explain; outside, a unit is wrong.
 GAIN_RANGE = (0.55, 1.8)
 #: The same quantity measured twice.
 SAME_RANGE = (0.75, 1.33)
-#: a_y - v_x r over the derivative of v_y: small differences of large quantities, of a body that rolls.
+#: a_y - v_x r over the derivative of v_y: small differences of large quantities, with body roll.
 SIDESLIP_RANGE = (0.5, 2.0)
-#: Slip of a rear axle at 1 m/s^2: cornering stiffness over load is 4 to 40 per rad, and much less where a model car
-#: drifts. It gives a sign, no unit.
+#: Slip of a rear axle at 1 m/s^2: cornering stiffness over load is 4 to 40 per rad, and much less for a drifting model
+#: car. The range decides a sign, but not a unit.
 COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
-#: Beyond, sideslip times lateral acceleration is no longer small beside the derivative of the speed.
+#: Above this, sideslip times lateral acceleration is not small compared to the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
-#: Share of its speed that a car drives ahead, if its heading is right.
+#: Least share of v_x in the speed if the heading is right.
 AHEAD_SHARE = 0.9
-#: No car reverses for long at more. The sign of a faster speed is known, and not its unit.
+#: No car reverses faster for long: the sign of a faster speed is known, but not its unit.
 REVERSE_M_S = 10.0
-#: A wheel differs from the others by less in a bend; one that differs by more spins or locks.
+#: In a bend, wheels differ by less; a wheel that differs by more spins or locks.
 SPIN_SHARE = 0.2
 #: Rim speed over ground speed, 5 % of slip and 5 % of radius; angular over rim speed, wheels of 4 cm to 80 cm radius.
 WHEEL_RANGE = (0.88, 1.14)
 WHEEL_PER_RADIAN_RANGE = (1.25, 25.0)
-#: Effective wheelbase L (1 + K v²) from road-wheel and from steering-wheel angles; m. From a model car to a truck, and
-#: at speeds that only full-size vehicles reach.
+#: Effective wheelbase L (1 + K v²), m, from road-wheel and from steering-wheel angles: from a model car to a truck, and
+#: for speeds that only full-size vehicles reach.
 ROAD_WHEEL_LENGTH_M, FULL_SIZE_LENGTH_M = (0.15, 12.0), (1.2, 12.0)
 STEERING_WHEEL_LENGTH_M, FULL_SIZE_STEERING_WHEEL_LENGTH_M = (12.0, 240.0), (22.0, 240.0)
 FULL_SIZE_M_S = (12.0, 70.0)
-#: The same over L + K v² of the vehicle file, with room for a wrong ratio in it, and tyres near their limit. A speed
-#: that is wrong itself must not make it longer than at the last: the slowest of speed, ground truth and a_y / r counts.
+#: The same divided by L + K v² of the vehicle file; the range includes a wrong ratio in the file and tyres near their
+#: limit. A wrong speed must not lengthen it: the lowest of speed, ground truth and a_y / r counts, up to ``FAST_M_S``.
 KNOWN_LENGTH, FAST_M_S = (0.4, 2.5), 40.0
 #: Track from a 1:10 car to a truck.
 TRACK_M = (0.12, 3.0)
-#: Share of the drive's lateral acceleration up to which the steering angle is compared with the curvature: beyond, the
+#: Share of the drive's lateral acceleration up to which the steering angle is compared with the curvature; above, the
 #: front tyres slip.
 STEERING_SHARE = 0.6
 
@@ -68,12 +68,12 @@ STEERING_SHARE = 0.6
 def measured_relations(
     columns: Mapping[str, FloatArray], speed_name: str | None, vehicle: VehicleParameters | None = None
 ) -> list[Relation]:
-    """Return every relation that the columns allow, whether it shows or not.
+    """Return all relations between the columns, including uninformative ones.
 
     Parameters
     ----------
-    columns : on the grid, SI, by signal name; those of ground truth begin with ``truth.``.
-    speed_name : the column used as the speed. vehicle : of a file; None: nothing is known of it.
+    columns : on the grid, SI, by signal name; names of ground truth begin with ``truth.``.
+    speed_name : the column used as the speed. vehicle : of a file; None without a file.
     """
     relations: list[Relation] = []
     speed = None if speed_name is None else columns[speed_name]
@@ -116,12 +116,12 @@ def compare(
     moves: float | None = None,
     either: bool = True,
     gentle: BoolArray | None = None,
-) -> list[Relation]:  # positional: both sides of a relation and what is wanted of them
-    """Return the relation between two columns where ``use`` and both are known; none without driving.
+) -> list[Relation]:  # positional: the two sides of a relation and their expected gain
+    """Return the relation between two columns where ``use`` and both are finite; an empty list without driving.
 
-    ``moves``: both sides have one unit, and one that moves by more than this, 1-sigma, must move the other; with
-    ``either`` False the reference must move the measured side only. ``gentle``: where the relation counts instead if it
-    is only plausible there. A sign, a unit and an axis are wrong everywhere, not where the car slides alone.
+    ``moves``: both sides have one unit, and a side that moves by more than this, 1-sigma, must move the other; with
+    ``either`` False only the reference must move the measured side. ``gentle``: samples of gentle driving. The relation
+    of these is returned if only it is plausible: a wrong sign, unit or axis is wrong everywhere, sliding is not.
     """
     if gentle is not None:
         relations = compare(text, powers, reference, measured, use, expected, moves=moves)
@@ -140,9 +140,9 @@ def compare(
     if min(spread_a, spread_b) <= 1e-12:
         return [Relation(text, powers, 0.0, float("nan"), expected, samples, both)]
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
-    # The ratio of the spreads lies between the two regressions, as the position of the noise is unknown.
+    # The ratio of the spreads lies between the two regressions, because either side may be noisy.
     gain = float(np.copysign(spread_b / spread_a, correlation))
-    # A block of fewer samples has a gain by chance.
+    # The gain of a block with fewer samples is random.
     blocks = block_gains(a, b, min(BLOCKS, max(1, int(samples / MIN_SAMPLES))))
     return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=blocks)]
 
@@ -162,9 +162,9 @@ def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace
         text = f"{prefix}ax_m_s2 against the derivative of the speed"
         with np.errstate(invalid="ignore"):
             straight = moving if yaw is None else moving & (np.abs(yaw * pace) < STRAIGHT_M_S2)
-        if yaw is not None and not moving_at(pace).any():  # in no known unit
+        if yaw is not None and not moving_at(pace).any():  # unknown unit
             straight = gentle_at(yaw * pace, moving)
-        # A pitching body moves a_x without any change of the speed, and noise the derivative of a satellite's.
+        # Pitch changes a_x at constant speed, and noise changes the derivative of a GNSS speed.
         moves = None if pace_name == "truth.vx_m_s" else MOVES_M_S2
         reference = derivative(pace)
         relations += compare(text, powers, reference, forward, straight, GAIN_RANGE, moves=moves, either=False)
@@ -176,7 +176,7 @@ def _best(either: list[Relation]) -> list[Relation]:
 
 
 def gentle_at(lateral_m_s2: FloatArray, moving: BoolArray) -> BoolArray:
-    """Return where the car moves and corners gently by the drive's own measure."""
+    """Return where the car moves with a lateral acceleration that is small for this drive."""
     size = np.abs(lateral_m_s2)
     finite = moving & np.isfinite(size)
     if not finite.any():
@@ -186,7 +186,7 @@ def gentle_at(lateral_m_s2: FloatArray, moving: BoolArray) -> BoolArray:
 
 
 def _moving(columns: Mapping[str, FloatArray], speed: FloatArray) -> BoolArray:
-    """Return where the car drives; by the shape of the speed alone if it is too low, and IMU or other speeds move."""
+    """Return where the car moves; by the relative speed alone if it is too low and IMU or other speeds show motion."""
     moving = moving_at(speed)
     if moving.any():
         return moving
@@ -239,7 +239,7 @@ def _steering(
             for use in (moving, gentle)
             for r in compare(f"{name} against yaw_rate_rad_s / speed", powers, curvature, steer, use, lengths)
         ]
-        # Sliding front tyres break the relation, and so does noise where there is little of it.
+        # Sliding front tyres break the relation at large angles, and noise breaks it at small ones.
         relations += _best(either)
         if "ay_m_s2" in columns:
             powers = {"ay_m_s2": 1, name: -1, speed_name: -2}
@@ -257,7 +257,7 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
     wanted |= {"truth.vx_m_s": SAME_RANGE, "truth.position_speed_m_s": SAME_RANGE}
     relations = []
     moving = _moving(columns, speed)
-    # At the limit each wheel goes its own way where the car does.
+    # Near the limit, wheel speeds differ from the speed of the car.
     gentle = moving if "yaw_rate_rad_s" not in columns else gentle_at(columns["yaw_rate_rad_s"] * speed, moving)
     for name, expected in wanted.items():
         column = columns.get(name)
@@ -280,25 +280,25 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
     of_wheels = any(n.startswith("wheel") and n.endswith("_rad_s") for n in columns) and speed_name == "wheel_speeds"
     fast = speed[np.abs(speed) > REVERSE_M_S * (3.0 if of_wheels else 1.0)]
     if (samples := independent_samples(fast.size)) >= 2.0 * MIN_SAMPLES:
-        text, ahead = f"{speed_name} where it is too fast for reversing", float(np.sign(np.median(fast)))
+        text, ahead = f"{speed_name} at speeds too high for reversing", float(np.sign(np.median(fast)))
         relations.append(Relation(text, {speed_name: 1}, 1.0, ahead, (0.0, np.inf), samples))
     return relations
 
 
 def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
-    """Return other measurements of the yaw rate than the gyro's, to any factor; steering has no certain sign."""
+    """Return other measurements of the yaw rate than the gyro's, up to a factor; steering has no certain sign."""
     references = [(n, columns[n]) for n in (COURSE_RATE, GNSS_COURSE_RATE, "truth.yaw_rate_rad_s") if n in columns]
     return references + ([] if speed_name is None else _axle_differences(columns, columns[speed_name]))
 
 
 def steering_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
-    """Return the steering angles times the speed, to any factor: a yaw rate whose sign is often recorded wrong."""
+    """Return steering angle times speed: yaw rates up to a factor, which are often recorded with the wrong sign."""
     steers = [] if speed_name is None else [n for n in ("steer_rad", "steering_wheel_rad") if n in columns]
     return [(f"{n} x speed", columns[n] * columns[str(speed_name)]) for n in steers]
 
 
 def _axle_differences(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[tuple[str, FloatArray]]:
-    """Return what the wheels of each axle turn faster on the right, scaled to the speed: radii and units aside."""
+    """Return the speed difference (right minus left) of each axle, scaled to the speed to remove radii and units."""
     moving = _moving(columns, speed)
     differences = []
     for unit in ("m_s", "rad_s"):
@@ -311,7 +311,7 @@ def _axle_differences(columns: Mapping[str, FloatArray], speed: FloatArray) -> l
 
 
 def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
-    """Relate yaw rate and a_y to what the wheels of an axle turn faster on the right: no wheel is mounted wrong."""
+    """Relate yaw rate and a_y to the speed differences of the axles, which have no mounting error."""
     moving = _moving(columns, speed)
     pairs = _axle_differences(columns, speed)
     gentle = moving if "yaw_rate_rad_s" not in columns else gentle_at(columns["yaw_rate_rad_s"] * speed, moving)
@@ -333,7 +333,7 @@ def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed
 
 
 def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> FloatArray:
-    """Return a wheel's speed [N] scaled to that of the car, NaN where the wheel spins or locks."""
+    """Return a wheel's speed [N], scaled to the speed of the car; NaN where the wheel spins or locks."""
     use = moving & np.isfinite(wheel) & np.isfinite(speed)
     ratio = float(np.median(wheel[use] / speed[use])) if use.any() else 0.0
     if ratio == 0.0:
@@ -342,13 +342,13 @@ def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> Float
 
 
 def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relation]:
-    """Relate the yaw rates to the rate of the course over ground, of the ground truth or else of a receiver."""
+    """Relate the yaw rates to the course rate of the ground truth, otherwise of a GNSS receiver."""
     path = next((n for n in (COURSE_RATE, GNSS_COURSE_RATE) if n in columns), "")
     if not path:
         return []
     course, signs = columns[path], {COURSE_RATE: -1} if path == COURSE_RATE else {}
     turnings = [course]
-    if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # in a spin the sideslip turns as well
+    if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # in a spin, the sideslip changes as well
         turnings.append(course - direction_rate(columns["truth.vx_m_s"], columns["truth.vy_m_s"]))
     relations = []
     moving = _moving(columns, speed)
@@ -368,10 +368,10 @@ def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relat
 
 
 def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
-    """Return what the scales of the ground-truth x and y are to be multiplied with; NaN where the drive shows none.
+    """Return the correction factors of the scales of the ground-truth x and y; NaN if the drive does not show them.
 
-    v_x² = a² ẋ² + b² ẏ², less v_y², whose unit may be wrong: of a car that drifts at 45 degrees 0.7 are left. A car
-    that drives along one axis shows only its scale.
+    v_x² = a² ẋ² + b² ẏ². v_y² is neglected, because its unit may be wrong; a car that drifts at 45 degrees gives 0.7. A
+    drive along one axis shows only the scale of that axis.
     """
     vx = columns.get("truth.vx_m_s")
     squares = [columns[n] ** 2 for n in POSITION if n in columns]
@@ -382,15 +382,15 @@ def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
 
 
 def is_misscaled(factor: float) -> bool:
-    """Return whether a factor of a position is another unit: feet are 3.3 times off."""
+    """Return whether the correction factor of a position is due to another unit (feet: 3.3)."""
     return factor < 0.6 or factor > 1.7
 
 
 def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
-    """Relate the mapped ground-truth sideslip, or v_y, to what positions and heading of one device give.
+    """Relate the mapped ground-truth sideslip, or v_y, to the sideslip or v_y from positions and heading of one device.
 
-    The frame of a pose may be mirrored: heading and course then turn against the yaw rates, and if only some do, the
-    sign is not known.
+    The frame of a pose may be mirrored: heading and course then have the opposite sign of the yaw rates. If this
+    applies to some of the yaw rates only, the sign is unknown.
     """
     subject = next((n for n, of in (("truth.sideslip_rad",) * 2, ("truth.vy_m_s", CG_VY)) if of in columns), "")
     if not {subject, "truth.pose_vy_m_s"} <= columns.keys():
@@ -399,21 +399,21 @@ def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
     moving = moving_at(ahead)
     speed = np.where(moving, np.hypot(ahead, left), np.nan)
     if median_known(ahead / speed) < AHEAD_SHARE:
-        return []  # the heading is not that of the car
+        return []  # the heading is not the car's
     yaws = [columns[n] for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
     signs = [np.sign(r.gain) for yaw in yaws for r in compare("", {}, turning, yaw, moving, GAIN_RANGE) if r.tells]
     is_vy = subject == "truth.vy_m_s"
     powers = {subject: 1} | ({"truth.position_speed_m_s": -1} if is_vy else {})
     expected = min(signs, default=1.0) * (left if is_vy else left / speed)
     sides = (f"{subject} against ground-truth positions and heading", powers, expected, columns[subject])
-    # Velocity and position may be of two places of the car, which turn about one another.
+    # Velocity and position may refer to different points of the car; yaw adds a velocity between them.
     apart = _partial(*sides, [turning, np.ones_like(turning)], moving, SAME_RANGE)
     best = _best([*compare(*sides, moving, SAME_RANGE), *apart])
     return [replace(r, signless=len(signs) < 2 or len(set(signs)) > 1) for r in best]
 
 
 def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
-    """Return how fast the direction of a velocity turns, rad/s [N]; NaN where it is slow: noise turns it."""
+    """Return the rate of a velocity's direction, rad/s [N]; NaN at low speed, where noise dominates."""
     ax, ay = derivative(vx), derivative(vy)
     speed = np.hypot(vx, vy)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -421,11 +421,12 @@ def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
 
 
 def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Relation]:
-    """Relate the ground-truth sideslip to a_y: by kinematics where it moves fast, by the rear axle else.
+    """Relate the ground-truth sideslip to a_y, by kinematics and by the rear axle.
 
-    a_y - v_x r is the derivative of v_y; the lever of an accelerometer, the roll of the body and a bias are next to
-    it and go with the derivative of the yaw rate, with v_x r and with nothing. In gentle driving sideslip is the
-    curvature times a lever, less a_y times the compliance of the rear tyres, if neither ``is_known`` from a file.
+    a_y - v_x r is the derivative of v_y, plus terms of the accelerometer's lever arm, of body roll and of a bias, which
+    are in proportion to the yaw acceleration, to v_x r and to 1. In gentle driving, sideslip is the curvature times a
+    lever arm minus a_y times the compliance of the rear tyres; this relation is used unless both are known
+    (``is_known``) from a file.
     """
     turning = next((n for n in ("truth.yaw_rate_rad_s", "yaw_rate_rad_s") if n in columns), "")
     names = ("ay_m_s2", "truth.vx_m_s", "truth.vy_m_s", turning)
@@ -435,13 +436,13 @@ def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Rel
     subject = "truth.sideslip_rad" if "truth.sideslip_rad" in columns else "truth.vy_m_s"
     moving, ones = _moving(columns, vx), np.ones_like(ay)
     text = f"ay_m_s2 - v_x r against the derivative of {subject}"
-    of_vx = subject != "truth.sideslip_rad"  # the sideslip is then v_y over v_x, else v_y is v_x times its tangent
+    of_vx = subject != "truth.sideslip_rad"  # sideslip from v_y and v_x, otherwise v_y from sideslip and v_x
     powers = {subject: -1, "ay_m_s2": 1} | ({} if of_vx else {"truth.vx_m_s": -1})
     relations = _partial(text, powers, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving, SIDESLIP_RANGE)
     if is_known:
         return relations
     with np.errstate(divide="ignore", invalid="ignore"):
-        curvature, ratio = rate / vx, vy / vx  # no angle: it would not be in proportion to a wrong v_y
+        curvature, ratio = rate / vx, vy / vx  # linear in a wrong v_y, unlike the angle
     sideslip = columns.get("truth.sideslip_rad", ratio)
     text = f"{subject} against -ay_m_s2, apart from curvature"
     gentle = gentle_at(vx * rate, moving)
@@ -452,9 +453,9 @@ def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Rel
 def _axle_sideslips(
     columns: Mapping[str, FloatArray], vehicle: VehicleParameters | None, speed_name: str | None, agree: bool
 ) -> list[Relation]:
-    """Relate the ground-truth sideslip to that of the vehicle file's rear axle, v_y = l r - C a_y v.
+    """Relate the ground-truth sideslip to the rear axle model of the vehicle file, v_y = l r - C a_y v.
 
-    Only where a_y and r ``agree``: it would not be known which of both terms is wrong.
+    The relation needs a_y and r that ``agree``; otherwise either term may be wrong.
     """
     subject = next((n for n in ("truth.sideslip_rad", "truth.vy_m_s") if n in columns), "")
     ay, rate, sideslip = (columns.get(n) for n in ("ay_m_s2", "yaw_rate_rad_s", subject))
@@ -470,7 +471,7 @@ def _axle_sideslips(
         with np.errstate(divide="ignore", invalid="ignore"):
             expected /= speed
     low, high = KNOWN_LENGTH
-    # Files that give no place of ground truth mean the CG: it may be at any axle.
+    # Files without a position of ground truth imply the CG, but it may be at any axle.
     high *= max(1.0, vehicle.wheelbase_m / (2.0 * max(lever, 1e-3)))
     return compare(text, {subject: 1, "ay_m_s2": -1}, expected, sideslip, gentle, (low, high))
 
@@ -483,8 +484,8 @@ def _partial(
     others: list[FloatArray],
     use: BoolArray,
     expected: tuple[float, float],
-) -> list[Relation]:  # positional: both sides of a relation and what is wanted of them
-    """Return the relation between what regression on other columns leaves of two columns; none if that is little."""
+) -> list[Relation]:  # positional: the two sides of a relation and their expected gain
+    """Return the relation between the residuals of two columns after regression on others; none with few samples."""
     finite = use & np.isfinite(np.stack([reference, measured, *others])).all(axis=0)
     if independent_samples(int(np.count_nonzero(finite))) < 2.0 * MIN_SAMPLES:
         return []
@@ -495,7 +496,7 @@ def _partial(
         out[finite] = column[finite] - aside @ np.linalg.lstsq(aside, column[finite], rcond=None)[0]
         left.append(out)
     relations = compare(text, powers, left[0], left[1], finite, expected)
-    # That so many blocks of the drive agree on the sign is no chance.
+    # Agreement of most blocks on the sign is not random.
     is_steady = [len(r.blocks) > BLOCKS // 2 and len(set(np.sign(r.blocks))) == 1 for r in relations]
     least = [MIN_CORRELATION if steady else MIN_PARTIAL_CORRELATION for steady in is_steady]
     return [replace(r, least_correlation=n) for r, n in zip(relations, least, strict=True)]

@@ -1,8 +1,8 @@
-"""A frozen set-up: what is decided once per drive, taken from another log or from the first seconds of this one.
+"""Frozen set-up: mounting, delays and clocks from another log or from the first seconds of this one.
 
-In a car, mounting, delays and clocks are decided before the drive, or from what it has shown so far. Offline they come
-from the first ten minutes of the log (:mod:`~.windows`), so that estimates of these minutes depend on later samples.
-With a frozen set-up they do not: every run writes its own as ``setup.toml``, and a later run can start from it.
+In a car, these are decided before the drive or from its past. Offline they come from the first ten minutes of the log,
+so that estimates of these minutes depend on later samples. With a frozen set-up they do not. Every run writes its
+set-up as ``setup.toml``, and a later run can use it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Setup:
     signals, can : the mapping of the sensors, with mounting and units applied.
     clocks : relation of stamps to log time, by topic and stamp of the sensors.
     alignment : source, delay and gaps of every channel.
-    decided_s : seconds of the log that it was decided on.
+    decided_s : duration of the log that decided the set-up.
     """
 
     signals: dict[str, SignalSource]
@@ -48,28 +48,28 @@ class Setup:
     version: Literal[1] = 1
 
     def applied_to(self, mapping: Mapping) -> Mapping:
-        """Return a mapping that reads the sensors as this set-up does; the ground truth stays that of the log."""
+        """Return the mapping with the sensors of this set-up; its ground truth is unchanged."""
         return replace(mapping, signals=self.signals, can=self.can, origin="file")
 
 
 class LogUntil:
-    """A log up to a time: no later sample can be read."""
+    """A log up to a time; later samples are not readable."""
 
     def __init__(self, log: DriveLog, end_ns: int) -> None:
         self._log, self.end_ns = log, min(end_ns, log.end_ns)
 
     def __getattr__(self, name: str) -> Any:
-        """Return everything else of the log."""
+        """Return all other attributes of the log."""
         return getattr(self._log, name)
 
     def read(self, requests: Any, start_ns: int | None = None, end_ns: int | None = None, **options: Any) -> Any:
-        """Read no message after the end."""
+        """Read the messages up to the end."""
         end_ns = self.end_ns if end_ns is None else min(end_ns, self.end_ns)
         return self._log.read(requests, start_ns, end_ns, **options)
 
 
 def setup_toml(setup: Setup, head: str) -> str:
-    """Return a set-up as TOML; reading it back gives the same."""
+    """Return a set-up as TOML, without loss."""
     return toml_text(_plain(setup), head)
 
 
@@ -90,7 +90,7 @@ def load_setup(path: Path) -> Setup:
 
 
 def clocks_of(setup: Setup, log: DriveLog, mapping: Mapping, start_ns: int) -> dict[str, ClockModel]:
-    """Return the clocks of the sensors: a device clock keeps its drift and starts with this log's first messages.
+    """Return the clocks of the sensors. A device clock keeps its drift; its offset is from this log's first messages.
 
     Parameters
     ----------

@@ -1,15 +1,15 @@
-"""Ground truth on its own clock: every quantity that the mapped channels allow, how it was derived, and its latency.
+"""Ground truth on its own clock: quantities, their derivations from the mapped channels, and the latency.
 
-Derivations (``TruthTrack.derivation`` states which applied):
+Derivations (``TruthTrack.derivation`` contains the ones in use):
 
 * body velocity from v_x and v_y; v_x and sideslip; ENU or ECEF velocity and heading (quaternion or yaw); position and
   heading; v_x, course and yaw; ground speed and sideslip; ground speed alone (then v_x only);
-* moved to the CG by v_cg = v − ω × p, and position, a_y likewise;
+* velocity moved to the CG by v_cg = v − ω × p; position and a_y likewise;
 * yaw rate from heading when it is not mapped;
 * a_y, the lateral specific force in the road plane: mapped, or (v̇_y + v_x r + g sin φ) / (1 + g K_φ) with the roll φ of
   the attitude, to which body roll adds K_φ a_y. It is unknown without roll: v̇_y + v_x r lacks g sin(bank);
 * derivatives by Savitzky–Golay over the true stamps: a cubic by least squares over ± ``DIFFERENTIATION_HALF_S``, its
-  slope at the centre; none where the window would cross a gap or the end of the data.
+  slope at the centre; NaN where the window crosses a gap or the end of the data.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ from pdhef_logtool.records.tracks import StateTrack, make_track
 
 #: Half window of the smoothing derivative. A cubic over ±0.2 s passes 1 Hz with 1 % loss.
 DIFFERENTIATION_HALF_S = 0.2
-#: Latency is searched for within this range.
+#: Search range of the latency.
 MAX_LATENCY_S = 0.5
-#: And known to this, 1-sigma.
+#: Largest standard error of a reliable latency.
 MAX_LATENCY_ERROR_S = 0.005
-#: Ground truth that leads the gyro by more than this does not: the gyro's stamps are late.
+#: Ground truth cannot lead the gyro by more than this: the gyro's stamps are late.
 LATE_GYRO_S = 0.005
 #: Two channels are the same if this share of their samples agrees to ``SAME_RELATIVE``.
 SAME_SHARE = 0.99
 SAME_RELATIVE = 1e-6
 
-#: Columns of a track by what a derivation calls them.
+#: Columns of a track by the names of derivations.
 _COLUMNS = {
     **{name: (name,) for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "yaw_rad")},
     "position_m": ("x_m", "y_m"),
 }
-#: A condition of the drive, no part of the state that an estimate is scored against.
+#: Friction is a condition of the drive, not a state to score.
 _FRICTION = "friction"
 _AY_DERIVED = "smoothing derivative of v_y plus v_x times yaw rate plus g sin(roll), without body roll"
 _AY_UNKNOWN = "not scored: needs a mapped a_y, or an attitude with roll and the car's roll gradient"
@@ -78,9 +78,9 @@ VelocitySource: TypeAlias = Literal[
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """What a quaternion means: it turns ``body`` axes (FLU or FRD) into ``frame`` (ENU, NED or ECEF).
+    """Convention of a quaternion: it rotates ``body`` axes (FLU or FRD) to ``frame`` (ENU, NED or ECEF).
 
-    ``has_roll``: it is more than a heading.
+    ``has_roll``: it contains roll, not only a heading.
     """
 
     frame: Literal["ENU", "NED", "ECEF"]
@@ -90,7 +90,7 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where the local ENU frame is: ECEF position in m, latitude and longitude in rad."""
+    """Origin of the local ENU frame: ECEF position in m, latitude and longitude in rad."""
 
     ecef_m: tuple[float, float, float]
     lat_rad: float
@@ -99,13 +99,13 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class TruthPlan:
-    """How one log's ground truth is derived; made once from a survey stretch.
+    """Derivation of one log's ground truth, decided once from the first ten minutes.
 
     Attributes
     ----------
-    base : channel whose stamps are the ground-truth clock. period_s : its median period.
+    base : channel that provides the stamps of the ground truth. period_s : its median period.
     max_gap_s : longest step that is bridged, by channel. half_window : samples on each side of a derivative.
-    position_m : where ground truth is measured, from the CG, ISO 8855. roll_gradient_rad_per_m_s2 : of the car.
+    position_m : measurement point of the ground truth from the CG, ISO 8855. roll_gradient_rad_per_m_s2 : of the car.
     """
 
     base: str
@@ -122,9 +122,9 @@ class TruthPlan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruthTrack:
-    """Ground truth at the CG on its own clock. ``derivation`` gives by quantity where it comes from.
+    """Ground truth at the CG on its own clock. ``derivation`` describes the source of each quantity.
 
-    ``max_gap_s``: no value may be interpolated across a longer step.
+    ``max_gap_s``: values are not interpolated across longer steps.
     """
 
     track: StateTrack
@@ -134,11 +134,11 @@ class TruthTrack:
 
 @dataclass(frozen=True, slots=True)
 class LatencyEstimate:
-    """How much later than the sensors ground truth shows the same motion.
+    """Delay of the ground truth after the sensors.
 
     ``latency_s`` is 0 unless ``reliable``. ``identical``: the ground-truth yaw rate is the gyro's own channel, so that
     the latency is 0 by construction and gives no information about the other truth channels. ``reason`` is for the
-    report. ``gyro_delay_s``: the gyro's stamps are late by so much; the ground-truth latency is then 0.
+    report. ``gyro_delay_s``: delay of the gyro's stamps; if it is not 0, the ground-truth latency is 0.
     """
 
     latency_s: float
@@ -157,13 +157,13 @@ def plan_truth(
     max_gap_s: float | None = None,
     roll_gradient_rad_per_m_s2: float = 0.0,
 ) -> TruthPlan | None:
-    """Decide clock, derivation, local frame and the meaning of the quaternion from the first 600 s.
+    """Decide clock, derivation, local frame and the convention of the quaternion from the first 600 s.
 
     Parameters
     ----------
     channels : truth channels by name, quality gate applied (samples that failed are absent).
-    truth_position_m : where ground truth is measured, from the CG. max_gap_s : default three median periods.
-    roll_gradient_rad_per_m_s2 : of the car: the share of roll that is no bank of the road.
+    truth_position_m : measurement point from the CG. max_gap_s : default three median periods.
+    roll_gradient_rad_per_m_s2 : of the car; separates body roll from the bank of the road.
 
     Returns
     -------
@@ -206,14 +206,14 @@ def derive_truth(
     Parameters
     ----------
     truth_channels : quality gate applied.
-    truth_position_m, max_gap_s : as for :func:`plan_truth`; not used when a ``plan`` is given.
-    plan : from :func:`plan_truth` over the log's beginning; made from these channels when absent.
+    truth_position_m, max_gap_s : as for :func:`plan_truth`; not used with a ``plan``.
+    plan : from :func:`plan_truth` over the log's beginning; computed from these channels by default.
 
     Returns
     -------
     TruthTrack
-        Empty without ground truth. Stamps are those of the plan's base channel. Sideslip is the atan2 of the velocities
-        at the CG, or the mapped sideslip where no velocity is known. ``yaw_rad`` is wrapped.
+        Empty without ground truth, with the stamps of the plan's base channel. Sideslip is the atan2 of the velocities
+        at the CG, or the mapped sideslip without velocities. ``yaw_rad`` is wrapped.
     """
     if plan is None:
         plan = plan_truth(truth_channels, truth_position_m=truth_position_m, max_gap_s=max_gap_s)
@@ -257,8 +257,8 @@ def truth_at(
     Parameters
     ----------
     stamps_ns : int64 [N], the stamps to score at, on the sensors' clock.
-    latency_s : ground truth shows at t + latency what the sensors show at t.
-    standstill_m_s : below this speed there is no sideslip.
+    latency_s : delay of the ground truth; its value at t + latency belongs to the sensors' values at t.
+    standstill_m_s : below this speed, sideslip is undefined.
 
     Returns
     -------
@@ -289,10 +289,10 @@ def truth_at(
 
 
 def valid_as_a_whole(truth: StateTrack, derivation: Mapping[str, str], standstill_m_s: float) -> StateTrack:
-    """Return the ground truth [N] as it is written: valid where all is known that it consists of by its derivation.
+    """Return the ground truth [N] for output, with ``valid`` True where all of its derived quantities are finite.
 
-    At standstill that is without sideslip, and always without an a_y that is a derivative of the velocities: it ends
-    earlier than they do. Figures count each quantity where it is known itself.
+    Sideslip is not required at standstill. An a_y from the derivative of the velocities is never required, because it
+    ends before them. Metrics use each quantity wherever it is finite.
     """
     standing = np.hypot(truth.vx_m_s, truth.vy_m_s) < standstill_m_s
     complete = truth.valid & (np.isfinite(truth.sideslip_rad) | standing | ("sideslip_rad" not in derivation))
@@ -317,10 +317,10 @@ def yaw_rate_channel(truth: TruthTrack) -> Channel:
 
 
 def booked_on_the_late(latency: LatencyEstimate, speed: LatencyEstimate | None) -> LatencyEstimate:
-    """Return the latency with what is the gyro's taken from ground truth.
+    """Return the latency, with a negative one attributed to the gyro.
 
-    No ground truth shows a motion before it happens: where it leads the gyro, the gyro's stamps are late. Only where a
-    speed sensor of another topic is late by as much do all sensors agree, and the ground-truth clock is early.
+    Ground truth cannot show a motion before it happens. If it leads the gyro, the gyro's stamps are late. If a speed
+    sensor of another topic is equally late, all sensors agree, and the ground-truth clock is early.
 
     Parameters
     ----------
@@ -350,8 +350,8 @@ def estimate_truth_latency(
 
     Parameters
     ----------
-    sensor_yaw_rate, truth_yaw_rate : on their own clocks. Never give an estimator's output here: its lag, which is what
-        the metrics shall show, would be taken for that of ground truth.
+    sensor_yaw_rate, truth_yaw_rate : on their own clocks. Do not pass an estimator's output: its lag, which the metrics
+        show, would be attributed to the ground truth.
     """
     if _same_share(sensor_yaw_rate, truth_yaw_rate) >= SAME_SHARE:
         return LatencyEstimate(0.0, 1.0, 0.0, True, True, "the ground-truth yaw rate is the gyro's channel")
@@ -382,18 +382,18 @@ def estimate_truth_latency(
 def dependent_signals(
     signals_channels: Mapping[str, Channel], truth_channels: Mapping[str, Channel], *, role: str = "input"
 ) -> dict[str, str]:
-    """Find truth channels that are an input channel in disguise.
+    """Find truth channels that equal an input channel.
 
     Equal means: at the same stamps (or, for channels of the same length, sample by sample) values agree to 1e-6
     relative, more than the rounding of float32, on at least 99 % of the samples, and the channel is not constant.
 
     Parameters
     ----------
-    role : what the sentences call the channels of ``signals_channels``.
+    role : name of the channels of ``signals_channels`` in the sentences.
 
     Returns
     -------
-    By name of the truth channel, a sentence for the report. Metrics of that name are to be marked ``not independent``.
+    One sentence for the report per truth channel. Metrics of these channels are marked ``not independent``.
     """
     dependent: dict[str, str] = {}
     for name, truth in sorted(truth_channels.items()):
@@ -433,7 +433,7 @@ def _velocity_source(
     has: frozenset[str], survey: Mapping[str, Channel], origin: Origin | None
 ) -> tuple[VelocitySource, str]:
     velocity = _first(has, "enu_velocity_m_s", "ecef_velocity_m_s")
-    # Without a place on Earth an ECEF velocity has no east and north that a yaw could be applied to.
+    # Without a position on Earth, east and north of an ECEF velocity are unknown, and a yaw cannot be applied.
     placeless = velocity == "ecef_velocity_m_s" and origin is None
     heading = _first(has - {"yaw_rad"} if placeless else has, "yaw_rad", "quat_wxyz")
     position = _first(has & (frozenset({"ecef_position_m"}) | _pairs(has)), "x_m", "ecef_position_m", "lat_deg")
@@ -492,12 +492,12 @@ def _find_attitude(source: _Source) -> Attitude:
         if score > best_score + 0.05:
             best, best_score = Attitude(frame, body), score
     left_up = source.rotation(best)[:, 2, 1]
-    rolls = np.abs(left_up - median_known(left_up)) > 1e-6  # else it is a heading; NaN compares False
+    rolls = np.abs(left_up - median_known(left_up)) > 1e-6  # otherwise only a heading; NaN compares False
     return replace(best, has_roll=source.reference == "ENU" and bool(rolls.any()))
 
 
 def _forward_share(rotation: FloatArray, velocity: FloatArray) -> float:
-    """Median of v_x / |v| in body axes while the car moves; 0 if it is not known to."""
+    """Return the median of v_x / |v| in body axes while the car moves; 0 without motion."""
     speed = np.linalg.norm(velocity, axis=1)
     moving = speed > 1.0  # NaN compares False
     return median_known((rotation[moving, :, 0] * velocity[moving]).sum(axis=1) / speed[moving])
@@ -523,7 +523,7 @@ class _Source:
         return self._channels[channel].source if channel in self._channels else channel
 
     def column(self, name: str) -> FloatArray:
-        """Return a channel at the base stamps, [N] or [N, k]; NaN where it has a gap."""
+        """Return a channel at the base stamps, [N] or [N, k]; NaN in gaps."""
         channel = self._channels.get(name)
         if channel is None or name not in self.plan.max_gap_s:
             n, k = self.stamps_ns.shape[0], VECTOR_COLUMNS.get(name, 1)
@@ -537,7 +537,7 @@ class _Source:
 
     @property
     def reference(self) -> Literal["ENU", "ECEF"]:
-        """Frame of three-dimensional vectors: ECEF only when nothing shows where on Earth the car is."""
+        """Frame of three-dimensional vectors: ENU, or ECEF if the position on Earth is unknown."""
         only_ecef = "ecef_velocity_m_s" in self and "enu_velocity_m_s" not in self and self.plan.origin is None
         return "ECEF" if only_ecef else "ENU"
 
@@ -546,7 +546,7 @@ class _Source:
         return np.eye(3) if origin is None else enu_from_ecef_rotation(origin.lat_rad, origin.lon_rad)
 
     def position(self) -> FloatArray:
-        """Return [N, 3] in the local ENU frame; height 0 when it is not known."""
+        """Return [N, 3] in the local ENU frame; an unknown height is 0."""
         if {"x_m", "y_m"} <= self.plan.used:
             x, y = self.column("x_m"), self.column("y_m")
             return np.stack([x, y, np.zeros_like(x)], axis=1)
@@ -588,7 +588,7 @@ class _Source:
 
 
 def _turn(matrix: FloatArray, vectors: FloatArray) -> FloatArray:
-    # Sums written out: a matrix product may round differently with the number of rows.
+    # Explicit sums, because the rounding of a matrix product may depend on the number of rows.
     return np.stack([(matrix[i] * vectors).sum(axis=1) for i in range(3)], axis=1)
 
 
@@ -663,7 +663,7 @@ def _yaw_rate(source: _Source, yaw: FloatArray, says: dict[str, str]) -> FloatAr
 
 
 def _body_velocity(source: _Source, says: dict[str, str]) -> tuple[FloatArray, FloatArray]:
-    """Return v_x, v_y at the point where ground truth is measured."""
+    """Return v_x, v_y at the measurement point of the ground truth."""
     kind = source.plan.velocity
     nothing = np.full(source.stamps_ns.shape[0], np.nan)
     if kind == "none":
@@ -764,7 +764,7 @@ def _lateral_acceleration(
 
 
 def _same_share(a: Channel, b: Channel) -> float:
-    """Share of samples at common stamps (or by index when the lengths agree) whose values agree; 0 if too few."""
+    """Return the share of equal values at common stamps, or by index for equal lengths; 0 with too few samples."""
     _, i, j = np.intersect1d(a.stamps_ns, b.stamps_ns, assume_unique=True, return_indices=True)
     shares = [0.0]
     if i.size >= max(10, 0.5 * min(len(a), len(b))):

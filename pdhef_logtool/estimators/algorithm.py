@@ -1,9 +1,10 @@
-"""The identity of an estimator: the algorithm that its class declares, and how this instance differs from the default.
+"""The identity of an estimator: the algorithm of its class, and the differences of this instance from the default.
 
-An estimator class has two class attributes: ``algorithm``, a name that never changes, and ``version``, an integer that
-is raised whenever the class returns other estimates from the same inputs. A third, ``options``, names the fields that
-select a variant of the algorithm. An option counts only where it differs from the default of its field, so that a new
-option with a default changes no identity. An option that is an algorithm itself counts with its own name and options.
+An estimator class has two class attributes: ``algorithm``, a permanent name, and ``version``, an integer that is
+incremented whenever the class returns other estimates for the same inputs. A third attribute, ``options``, names the
+fields that select a variant of the algorithm. An option is part of the identity only if it differs from the default of
+its field, so that a new option with a default changes no identity. An option that is itself an algorithm is included
+with its name and options.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ def resolve(estimator: Estimator) -> Algorithm:
     Raises
     ------
     UsageError
-        Its class does not declare an algorithm and a version.
+        Its class does not declare algorithm and version.
     """
     kind = type(estimator).__name__
     name, version = getattr(estimator, "algorithm", None), getattr(estimator, "version", None)
@@ -42,7 +43,7 @@ def resolve(estimator: Estimator) -> Algorithm:
 
 
 def _describe(part: Any, prefix: str, facts: dict[str, Any]) -> None:
-    """Add the options, noise and digests of an algorithm and of the algorithms that it contains."""
+    """Add the options, noise and digests of an algorithm and of its nested algorithms."""
     for name in _NOISE:
         if hasattr(part, name):
             facts["noise"][prefix + name] = _plain(getattr(part, name))

@@ -1,8 +1,8 @@
-"""The interface of estimators: steps on measurement time, from which the harness makes what is scored.
+"""The interface of estimators: steps on measurement time, from which the scored tracks are computed.
 
-An estimator turns the signals of a window into one step per sample, each from that sample and the ones before it, and
-never sees a scored stamp. :mod:`~.latency_compensation` decides for all estimators which step had arrived by a scored
-stamp, and how far it is extrapolated.
+An estimator returns one step per sample of a window, each from that sample and earlier ones, and has no access to
+scored stamps. :mod:`~.latency_compensation` determines for all estimators which step is available at a scored stamp,
+and how far it is extrapolated.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ VX, VY, YAW_RATE, AY = 0, 1, 2, 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps(StepColumns):
-    """Estimates on measurement time, [K]: the state after all samples of the stamp were used.
+    """Estimates on measurement time, [K]: the state after the update with all samples of the stamp.
 
-    ``values`` [K, 4] over [v_x, v_y, r, a_y], NaN where unknown; ``rates`` [K, 4] their time derivatives, which the
-    latency compensation contains; ``valid`` [K].
+    ``values`` [K, 4] over [v_x, v_y, r, a_y], NaN where unknown; ``rates`` [K, 4] their time derivatives for the
+    latency compensation; ``valid`` [K].
     """
 
     values: FloatArray
@@ -36,14 +36,14 @@ class Steps(StepColumns):
 def make_steps(
     vx_m_s: FloatArray, vy_m_s: FloatArray, yaw_rate_rad_s: FloatArray, ay_m_s2: FloatArray | None = None
 ) -> Steps:
-    """Return steps of quantities [K] without rates, NaN where unknown; valid where v_x and yaw rate are known."""
+    """Return steps of quantities [K] without rates, NaN where unknown; valid where v_x and yaw rate are finite."""
     ay = np.full(len(vx_m_s), np.nan) if ay_m_s2 is None else ay_m_s2
     values = np.stack([vx_m_s, vy_m_s, yaw_rate_rad_s, ay], axis=1)
     return Steps(values, np.zeros_like(values), np.isfinite(vx_m_s) & np.isfinite(yaw_rate_rad_s))
 
 
 class Estimator(Protocol):
-    """Turns aligned signals into steps; immutable, so that its only memory is the state that it returns."""
+    """Converts aligned signals to steps; immutable: its only memory is the state that it returns."""
 
     @property
     def algorithm(self) -> str:
@@ -52,7 +52,7 @@ class Estimator(Protocol):
 
     @property
     def version(self) -> int:
-        """Version of the algorithm, a class attribute: raised whenever the same inputs give other estimates."""
+        """Version of the algorithm, a class attribute: incremented when the same inputs give other estimates."""
         ...
 
     @property
@@ -62,7 +62,7 @@ class Estimator(Protocol):
 
     @property
     def causal(self) -> bool:
-        """Whether each step uses only its own sample and those before it; checked in every run."""
+        """Whether each step uses only its own sample and earlier ones; checked in every run."""
         ...
 
     def run(self, signals: Signals, state: Any | None) -> tuple[Any, Any]:
@@ -70,13 +70,12 @@ class Estimator(Protocol):
 
         Parameters
         ----------
-        signals : the window. state : what the call for the previous window returned, None at the start of a log.
+        signals : the window. state : the state returned for the previous window, None at the start of a log.
 
         Returns
         -------
-        steps : one row per stamp of ``signals``: :class:`Steps`, or a record of its own where the estimator is a
-            :class:`ModelPredictor`. Joining the steps of consecutive windows gives the same bits as one call over the
-            whole log.
+        steps : one row per stamp of ``signals``: :class:`Steps`, or another record if the estimator is a
+            :class:`ModelPredictor`. Joined steps of consecutive windows equal one call over the whole log bit for bit.
         state : for the next window.
         """
         ...
@@ -84,7 +83,7 @@ class Estimator(Protocol):
 
 @runtime_checkable
 class ModelPredictor(Protocol):
-    """An estimator that extrapolates its steps with its own model; others are extrapolated by :func:`linear_track`."""
+    """An estimator that extrapolates its steps with its model; others are extrapolated by :func:`linear_track`."""
 
     def predict(self, steps: Any, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Return the track at the scored stamps [M]; rows that are not ``usable`` are not valid."""
@@ -93,28 +92,28 @@ class ModelPredictor(Protocol):
 
 @runtime_checkable
 class LookingAhead(Protocol):
-    """An estimator that is not causal: beside the window it may see what follows."""
+    """A non-causal estimator, which may use samples after the window."""
 
     @property
     def look_ahead_s(self) -> float:
-        """How much of what follows a window it must be given for its result not to depend on the windows."""
+        """Look-ahead in s that makes the result independent of the windows."""
         ...
 
     def run(self, signals: Signals, state: Any | None, ahead: Signals | None = None) -> tuple[Any, Any]:
-        """Process one window as :meth:`Estimator.run`; ``ahead`` is what follows, and the next window begins with it.
+        """Process one window as :meth:`Estimator.run`; ``ahead`` has the samples after it, and begins the next window.
 
-        Without it the log ends with the window for all that the estimator has.
+        Without ``ahead``, the log ends with the window.
         """
         ...
 
 
 def look_ahead_of(estimator: Estimator) -> float:
-    """Return how much of what follows a window an estimator must be given, s; 0 for a causal one."""
+    """Return the required look-ahead of an estimator in s; 0 for a causal one."""
     return estimator.look_ahead_s if isinstance(estimator, LookingAhead) else 0.0
 
 
 def run_steps(estimator: Estimator, signals: Signals, state: Any | None, ahead: Signals | None) -> tuple[Any, Any]:
-    """Run one window; only an estimator that is not causal gets what follows."""
+    """Run one window; only a non-causal estimator receives ``ahead``."""
     if isinstance(estimator, LookingAhead):
         return estimator.run(signals, state, ahead)
     return estimator.run(signals, state)
@@ -128,7 +127,7 @@ def predict_track(estimator: Estimator, steps: Any, ahead: Extrapolation, stamps
 
 
 def linear_track(name: str, steps: Steps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
-    """Extrapolate steps to first order, with their rates held."""
+    """Extrapolate steps to first order with constant rates."""
     out = steps.values[ahead.step] + steps.rates[ahead.step] * ahead.horizon_s[:, None]
     out[~ahead.usable] = np.nan
     return make_track(
@@ -143,5 +142,5 @@ def linear_track(name: str, steps: Steps, ahead: Extrapolation, stamps_ns: IntAr
 
 
 def notes_of(estimator: Estimator) -> tuple[str, ...]:
-    """Return the notes on an estimator for the reader of the report; most have none."""
+    """Return the notes on an estimator for the report; empty for most."""
     return tuple(getattr(estimator, "notes", ()))

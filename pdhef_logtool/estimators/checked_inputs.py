@@ -1,6 +1,6 @@
-"""What filters that heed sensor faults start from: checked signals, and the network's residual made of them.
+"""Common inputs of filters with fault handling: checked signals, and the network's residual computed from them.
 
-The detector checks the window, the parallel filter runs on what it leaves, and the network sees that filter's
+The detector checks the window; the parallel filter runs on the accepted samples, and the network receives the filter's
 prediction in place of a bad sample. Without a network there is no parallel filter and no residual.
 """
 
@@ -21,7 +21,7 @@ from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InputState:
-    """What the detector, the parallel filter and the network take from window to window; None: there is none."""
+    """State of the detector, the parallel filter and the network between windows; None for a missing part."""
 
     faults: FaultState | None
     physics: FilterState | None = None
@@ -30,14 +30,14 @@ class InputState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedInputs:
-    """What the detector found, and the network's residual rate [N, 2] in m/s² and rad/s², at gain 1."""
+    """Result of the detector, and the network's residual rate [N, 2] in m/s² and rad/s², at gain 1."""
 
     faults: SensorFaults
     rate: FloatArray
 
     @property
     def nbytes(self) -> int:
-        """Memory that this takes beside the signals it was made of."""
+        """Memory in addition to the input signals."""
         f = self.faults
         arrays = [self.rate, f.extra_r, f.noise_std, f.reason]
         arrays += [x for s in (f.filtered, f.network) for x in (s.ay_m_s2, s.yaw_rate_rad_s)]
@@ -55,7 +55,7 @@ class CheckedInputs:
 def check_inputs(
     physics: PhysicsFilter, network: NetworkService | None, signals: Signals, state: InputState | None
 ) -> tuple[CheckedInputs, InputState]:
-    """Look for faults in one window, and run parallel filter and network on what they leave.
+    """Detect faults in one window, and run parallel filter and network on the accepted samples.
 
     Joined windows give the same bits as one call over the whole log.
     """
@@ -88,6 +88,6 @@ def residual_rate(
 
 
 def r_scale(extra_r: FloatArray, r_std: FloatArray) -> FloatArray:
-    """Return the larger factor by which the detector raised R of a_y or yaw rate, [N], at a filter's 1-sigmas [≥2]."""
+    """Return the larger factor on R of a_y or yaw rate by the detector, [N], for a filter's 1-sigmas [≥2]."""
     factor: FloatArray = 1.0 + (extra_r / np.square(r_std[:2])).max(axis=1, initial=0.0)
     return factor

@@ -1,7 +1,7 @@
-"""``physics`` plus the residual of its car's ladder (:mod:`pdhef_logtool.residual_model.ladder`), at the output.
+"""``physics`` plus the trained residual of its car (:mod:`pdhef_logtool.residual_model.ladder`) at the output.
 
-The filter runs as it does without a residual; its steps give the features, so that nothing feeds back. Each step has
-its residual, which a scored stamp takes from the newest step that had arrived.
+The filter runs without the residual, and its steps provide the features, so that there is no feedback. Each step has
+its residual; a scored stamp uses the residual of the newest available step.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _BAD_AY = BURST_AY | SPIKE_AY | STUCK_AY | DEAD_AY | MISSING_AY
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedSteps(StepColumns):
-    """Steps of ``physics``, and by step [K]: residual with its 1-sigma, rad, both times the gain; and the gain."""
+    """Steps of ``physics``, and for each step [K] the residual with its 1-sigma, rad, both times the gain; the gain."""
 
     steps: MixtureSteps
     residual_rad: FloatArray
@@ -56,7 +56,7 @@ def features_of(
 ) -> tuple[SlowFeatures, FloatArray]:
     """Return the features of a window's steps [K] and the memory for the next window.
 
-    A missing or faulty a_y is replaced by that of the model.
+    A missing or faulty a_y is replaced by the model's.
     """
     weights = np.where(np.stack([s.valid for s in steps.filters], axis=1), steps.weights, 0.0)
     filters = [np.where(w[:, None] > 0.0, w[:, None] * s.x[:, : REAR + 1], 0.0) for w, s in _pairs(weights, steps)]
@@ -88,7 +88,7 @@ class CorrectedPhysics:
 
     Parameters
     ----------
-    physics : the filter. model : what it lacks. notes : of the report.
+    physics : the filter. model : the residual model. notes : for the report.
     """
 
     algorithm = "corrected-physics"

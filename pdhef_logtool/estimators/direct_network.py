@@ -1,8 +1,8 @@
-"""``pure-lstm``: a network that outputs v_y itself, from the inputs of the hybrid filter's network, without a filter.
+"""``pure-lstm``: a network that outputs v_y directly, with the inputs of the hybrid filter's network.
 
-The paper's Pure-LSTM with the same information as PD-HEF: sensors, the parallel physics filter's outputs and friction.
-v_x is that filter's, the yaw rate the gyro's. At the scored stamp is what the sensors state of the latency:
-v_x and v_y go on by a_x + v_y r and a_y − v_x r, a_y corrected for body roll.
+The paper's Pure-LSTM with the same information as PD-HEF: sensors, outputs of the parallel physics filter, friction.
+v_x is the parallel filter's, the yaw rate the gyro's. Over the latency, v_x and v_y are extrapolated to the scored
+stamp by a_x + v_y r and a_y − v_x r, with a_y corrected for body roll.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _VX, _AX, _AY, _RATE = (FEATURES.index(n) for n in ("vx_m_s", "ax_m_s2", "ay_m_s
 
 
 def direct_steps(vehicle: VehicleParameters, features: FloatArray, vy_m_s: FloatArray, usable: BoolArray) -> Steps:
-    """Return the steps of an estimator whose only own output is v_y; the other quantities are the features'.
+    """Return the steps of an estimator that outputs only v_y; the other quantities come from the features.
 
     Parameters
     ----------
-    vehicle : its roll gradient gives the planar a_y.
-    features : [K, f] of :func:`~.parallel_physics.run_features`. vy_m_s : [K]. usable : [K], where both are known.
+    vehicle : provides the roll gradient for the planar a_y.
+    features : [K, f] of :func:`~.parallel_physics.run_features`. vy_m_s : [K]. usable : [K], both are finite.
     """
     values, rates = np.full((len(features), 4), np.nan), np.zeros((len(features), 4))
     vx, yaw_rate, vy = features[usable, _VX], features[usable, _RATE], vy_m_s[usable]
@@ -55,7 +55,7 @@ class DirectState:
 
 @dataclass(frozen=True, slots=True)
 class DirectNetwork:
-    """The estimator of this file; ``network`` is one whose target is the lateral velocity."""
+    """The estimator of this file; ``network`` must have the lateral velocity as target."""
 
     algorithm = "direct-network"
     version = 1
@@ -70,7 +70,7 @@ class DirectNetwork:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """State which file ran: run.json has the residual network's hash alone."""
+        """Return the network's hash; run.json only contains the residual network's."""
         return (f"network {self.network.bundle.sha256}",)
 
     def run(self, signals: Signals, state: DirectState | None) -> tuple[Steps, DirectState]:
@@ -87,7 +87,7 @@ class DirectNetwork:
 
 
 def build(name: str, car: Car, options: Options) -> DirectNetwork:
-    """Return ``pure-lstm`` of a car whose network has it."""
+    """Return ``pure-lstm`` for a car with such a network."""
     del name
     assert car.network is not None and car.network.pure_lstm is not None
     return DirectNetwork(car.vehicle, NetworkService(car.network.pure_lstm), use_speed=options.use_speed)

@@ -32,7 +32,7 @@ from pdhef_logtool.records.tracks import StateTrack
 
 ON_RAD, OFF_RAD = math.radians(5.0), math.radians(3.0)
 LINEAR_S, LIMIT_S = 0.5, 3.0
-#: Shares of the grip, abs a_y / (μ g), between which the leak goes from quick to slow.
+#: Shares of the grip, abs a_y / (μ g), between which the leak changes from fast to slow.
 GRIP_LOW, GRIP_HIGH = 0.5, 0.7
 GRIP_SMOOTHING_S, GRIP_HOLD_S = 0.1, 1.0
 #: Tolerance for the noise in D, in standard deviations.

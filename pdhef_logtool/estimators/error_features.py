@@ -16,9 +16,9 @@ term          unit  definition
 ``bank``      rad   abs of the estimated road bank
 ============  ====  ================================================================================================
 
-Samples arrive later than their stamps. The terms are computed on measurement time, and a scored stamp has those of the
-newest step that had arrived (:mod:`~.release`), as estimates do. Samples that the estimator reports as faulty are
-ignored.
+Samples arrive later than their stamps. The terms are computed on measurement time, and a scored stamp has the terms of
+the newest available step (:mod:`~.latency_compensation`), as for estimates. Samples that the estimator reports as
+faulty are ignored.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ MEMORY_S = 1.0
 MIN_SPEED_M_S = 3.0
 #: Friction if neither log nor estimator provides it.
 ASSUMED_FRICTION = 1.0
-#: The bits of the yaw rate are the same, shifted left by one.
+#: Reason bits of a_y; the bits of the yaw rate are shifted left by one.
 _AY_BITS = BURST_AY | SPIKE_AY | STUCK_AY | DEAD_AY | MISSING_AY
 
 # Entries of the memory.
@@ -59,7 +59,7 @@ STEP_SIZE = 3
 def error_terms(track: StateTrack, signals: Signals, roll_gradient_rad_per_m_s2: float) -> FloatArray:
     """Return the terms [N, 9] of :data:`TERMS`.
 
-    Terms that cannot be known count as 0, for instance before the first sample has arrived.
+    Unknown terms are 0, for instance before the first sample.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def grip_share(terms: FloatArray) -> FloatArray:
 
 
 def _column(track: StateTrack, values: FloatArray) -> FloatArray:
-    """Return an optional column of a track [N], 0 where it is missing."""
+    """Return an optional column of a track [N]; zeros if it is missing."""
     return _known(values) if len(values) == len(track) else np.zeros(len(track))
 
 

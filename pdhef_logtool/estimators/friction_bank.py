@@ -1,22 +1,22 @@
-"""Road friction on line, from a bank of filters that each assume another one (docs/method.md#friction).
+"""Online road friction from a bank of filters with different frictions (docs/method.md#friction).
 
-Every filter j of the bank has the state [v_y, r] at its own friction μ_j, and the speed and held inputs of one
-``phy-ukf`` beside the bank. It is an extended Kalman filter on the nominal model, a_y corrected for body roll, R at
-model-error level: below some four tenths of the grip a model error has more effect than friction, and must not move it.
+Every filter j of the bank has the state [v_y, r] at its friction μ_j; speed and held inputs come from a common
+``phy-ukf``. It is an extended Kalman filter on the nominal model, with a_y corrected for body roll and R at model-error
+level: below about 40 % of the grip, model errors have more effect than friction and must not change the weights.
 
-The weights follow w_j ∝ (w_j^f · prior_j^(1−f)) · L_j^η with f = exp(−Δt/τ): what was seen is forgotten with the time
-constant τ, and where nothing shows frictions apart the dry prior comes back. L_j is the likelihood of the innovations
-of a_y and yaw rate under a Student distribution, so that no single sample decides, without its normalising factor: R is
-much larger than the noise, and a filter that claims a smaller covariance is not the better one for it (with the factor
-a straight road would look slippery). The power η < 1 counts neighbouring samples, whose model errors are the same, as
-fewer than they are.
+The weights follow w_j ∝ (w_j^f · prior_j^(1−f)) · L_j^η with f = exp(−Δt/τ): past evidence is forgotten with the time
+constant τ, and without new evidence the weights return to the prior of a dry road. L_j is the likelihood of the
+innovations of a_y and yaw rate under a Student distribution, which limits the effect of single samples. Its normalising
+factor is omitted: R is much larger than the noise, and a smaller predicted covariance is no evidence for a filter (with
+the factor, a straight road would appear slippery). The power η < 1 accounts for correlated model errors of neighbouring
+samples.
 
-Where no drive has shown that the tyres of the vehicle file are right, eight more filters assume friction 1 and tyres
-that are softer or stiffer at either axle. Only what they cannot explain, saturation, then shows a slippery road.
+If no drive has validated the tyres of the vehicle file, eight more filters assume friction 1 and softer or stiffer
+tyres at either axle. Then only saturation, which they cannot explain, indicates a slippery road.
 
-The estimate is the weighted mean, but not less than the lateral acceleration that was reached needs; this bound is
-forgotten once the weights show saturation. What is at step k was known before the samples of step k: a filter that
-uses it is not handed its own measurement back.
+The estimate is the weighted mean, with a lower bound from the largest lateral acceleration so far; this bound is
+dropped once the weights indicate saturation. The estimate at step k uses only samples before step k, so that a filter
+that uses it does not process its measurements twice.
 """
 
 from __future__ import annotations
@@ -42,33 +42,33 @@ from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.steps import step_durations_s
 
-#: Aligned signals without which nothing can be estimated.
+#: Required aligned signals.
 NEEDS = frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
-#: Frictions of the bank, and how likely each is on a road that nothing is known of: mean 0.86, 1-sigma 0.23.
+#: Frictions of the bank, and their prior probabilities on an unknown road: mean 0.86, 1-sigma 0.23.
 GRID = (0.12, 0.2, 0.3, 0.4, 0.5, 0.62, 0.75, 0.88, 1.0, 1.12)
 PRIOR = (0.015, 0.02, 0.025, 0.025, 0.03, 0.055, 0.14, 0.27, 0.27, 0.15)
 USUAL_FRICTION = sum(mu * weight for mu, weight in zip(GRID, PRIOR, strict=True))
-#: Stiffness of the front and rear axle over that of the file, where it may be wrong: one 1-sigma of its prior from it.
+#: Factors on the stiffness of the front and rear axle of an unvalidated file: prior 1-sigma steps.
 STIFFNESS = tuple(pair for pair in product((0.625, 1.0, 1.6), repeat=2) if pair != (1.0, 1.0))
 #: Process 1-sigma per √s of v_y (m/s) and r (rad/s); measurement 1-sigma of a_y (m/s²) and r (rad/s), at model-error
-#: level; all by the sideslip errors that follow, on simulated drives that no table is made of.
+#: level; all tuned for the sideslip error on simulated drives that are not used in any table.
 Q_VY, Q_YAW_RATE = 0.3, 0.1
 R_AY, R_YAW_RATE = 1.5, 0.006
 #: Degrees of freedom of the Student distribution, the power η, and the forgetting time τ.
 STUDENT_DOF, LIKELIHOOD_POWER, FORGETTING_S = 4.0, 0.3, 2.0
 INITIAL_VY_STD, INITIAL_YAW_RATE_STD = 0.5, 0.1
-#: Slower than this many times the low-speed blend, or behind a longer step, the bank waits and forgets.
+#: Below this multiple of the low-speed blend, and after a longer step, the bank pauses and forgets.
 LEAST_SPEED_BLENDS = 1.67
 LONGEST_STEP_S = 0.1
-#: A filter that assumes too little grip drifts off; it is held within this |v_y| / v_x.
+#: Limit of |v_y| / v_x, as filters with too low friction drift off.
 MAX_VY_SHARE = 0.7
-#: The lower bound is this share of what the smoothed a_y that was reached needs.
+#: The lower bound is this share of the friction required by the smoothed a_y.
 BOUND_SHARE, BOUND_SMOOTHING_S = 0.9, 0.1
-#: Friction is observable where the 1-sigma of the weights is below this; that of the prior is 0.23.
+#: Friction is observable if the 1-sigma of the weights is below this; for the prior it is 0.23.
 OBSERVABLE_STD = 0.12
 
-# Scalars that are carried: whether the states are started, smoothed a_y, the highest one that counts, and of the step
-# before steering and speed.
+# Scalars carried between steps: whether the states are initialized, smoothed a_y, the largest relevant a_y, and
+# steering and speed of the previous step.
 _STARTED, _AY, _REACHED, _STEER, _SPEED = range(5)
 _MEMORY = 5
 _NOT_MEASURED = 1e12  # variance of a channel without a sample
@@ -77,7 +77,7 @@ _STEP_VY, _STEP_YAW_RATE = 0.02, 0.002  # for difference quotients
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrictionEstimate:
-    """Friction at each stamp, [N] each: estimate, 1-sigma of the bank's weights, and whether the drive shows it."""
+    """Friction at each stamp, [N] each: estimate, 1-sigma of the weights, and whether it is observable."""
 
     friction: FloatArray
     std: FloatArray
@@ -98,9 +98,9 @@ def _advance(v, vy, r, steer, friction, dt, n, p):  # type: ignore[no-untyped-de
 
 @njit(cache=True)
 def _step(x, P, over, now, friction, dt, p):  # type: ignore[no-untyped-def]
-    """Take one filter over a step, x [2] and P [3] (vv, vr, rr) in place; return its log-likelihood, not normalised.
+    """Advance one filter by a step, x [2] and P [3] (vv, vr, rr) in place; return its log-likelihood, not normalised.
 
-    ``over`` are speed and steering over the step, ``now`` those at its end, a_y and yaw rate; the last two may be NaN.
+    ``over`` has speed and steering over the step, ``now`` the same at its end, a_y and yaw rate, which may be NaN.
     """
     v, steer = over
     v_now, steer_now, ay, yaw_rate = now
@@ -131,13 +131,13 @@ def _step(x, P, over, now, friction, dt, p):  # type: ignore[no-untyped-def]
         return 0.0
     var_a = R_AY * R_AY if has_ay else _NOT_MEASURED
     var_r = R_YAW_RATE * R_YAW_RATE if has_rate else _NOT_MEASURED
-    c0, c1 = p0 * h0 + p1 * h1, p1 * h0 + p2 * h1  # P Hᵀ of a_y; that of r is (p1, p2)
+    c0, c1 = p0 * h0 + p1 * h1, p1 * h0 + p2 * h1  # P Hᵀ of a_y; for r it is (p1, p2)
     s00, s01, s11 = h0 * c0 + h1 * c1 + var_a, c1, p2 + var_r
     det = s00 * s11 - s01 * s01
     square = (s11 * nu_a * nu_a - 2.0 * s01 * nu_a * nu_r + s00 * nu_r * nu_r) / det
     log_likelihood = -0.5 * (STUDENT_DOF + dof) * math.log(1.0 + square / STUDENT_DOF)
 
-    # An outlier of the Student distribution is a sample with a larger R.
+    # An outlier of the Student distribution is equivalent to a sample with a larger R.
     inflation = (STUDENT_DOF + square) / (STUDENT_DOF + dof)
     if inflation > 1.0:
         s00 += (inflation - 1.0) * var_a
@@ -155,7 +155,7 @@ def _step(x, P, over, now, friction, dt, p):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _weigh(weights, prior, log_likelihood, keep):  # type: ignore[no-untyped-def]
-    """Move the weights [M] by a share 1 - ``keep`` towards the prior [M], and by the log-likelihoods [M]; in place."""
+    """Move the weights [M] by a share 1 - ``keep`` towards the prior [M], add the log-likelihoods [M]; in place."""
     total = 0.0
     best = log_likelihood.max()
     for j in range(weights.shape[0]):
@@ -169,7 +169,7 @@ def _weigh(weights, prior, log_likelihood, keep):  # type: ignore[no-untyped-def
 def _bank(drive, filters, ay_per_friction, bank, out_mu, out_std):  # type: ignore[no-untyped-def]
     """Run the bank over one window; weights [M], x [M, 2], P [M, 3] and memory of ``bank`` are updated in place.
 
-    ``filters`` : friction, its 1-sigma where a filter is right, prior weight [M] and M model parameters.
+    ``filters`` : friction, its 1-sigma if the filter is right, prior weight [M] and M model parameters.
     """
     dt, vx, steer, usable, ay, yaw_rate = drive
     grid, spread, prior, models = filters
@@ -218,9 +218,9 @@ class FrictionBank:
 
     Parameters
     ----------
-    vehicle : parameters; its friction is not looked at by the bank.
-    use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter that gives the speed.
-    validated : whether a drive has shown that the tyres of the vehicle are right.
+    vehicle : parameters; the bank ignores its friction.
+    use_speed : False is the paper's ``esp`` suite: the speed sensor only initializes the filter for the speed.
+    validated : whether a drive has validated the tyres of the vehicle.
     """
 
     vehicle: VehicleParameters
@@ -238,7 +238,7 @@ class FrictionBank:
         models += tuple(model_parameters(vehicle, roll_correction=True) for vehicle in others)
         more = np.ones(len(STIFFNESS))
         unknown = math.sqrt(prior @ (grid - USUAL_FRICTION) ** 2)
-        prior = np.append(prior, more / len(more)) / 2.0  # as likely, together, as the tyres of the file
+        prior = np.append(prior, more / len(more)) / 2.0  # half of the weight for the tyres of the file
         return np.append(grid, more), np.append(exact, unknown * more), prior, models
 
     @property
@@ -249,7 +249,7 @@ class FrictionBank:
         return (1.0 + roll_gain) * (front + rear) / self.vehicle.mass_kg
 
     def run(self, signals: Signals) -> FrictionEstimate:
-        """Estimate over a drive. ``signals.friction`` is not looked at."""
+        """Estimate the friction over a drive; ``signals.friction`` is ignored."""
         signals = without_impossible(signals)
         vehicle = self.vehicle.model_copy(update={"friction": USUAL_FRICTION})
         unknown = replace(signals, friction=np.full(len(signals), np.nan))

@@ -1,9 +1,9 @@
-"""The paper's fuzzy scheduler: residual gain from two signs that the model fails (Eq 24, 25, Table 2).
+"""The paper's fuzzy scheduler: residual gain from two indicators of model error (Eq 24, 25, Table 2).
 
-Inputs are E_ay = |a_y,m − a_y,nom| and I_dyn = |a_y,m| / (μ g), each in three overlapping sets. The paper gives Table 2
-and no set; docs/method.md#paper-adaptation fixes the sets: triangles with shoulders whose tops are at the constants
-below. A rule is as strong as the weaker of its two memberships (Mamdani's AND); the output is the mean of the rules'
-singletons weighted by strength, which is the centre of gravity of singletons.
+Inputs are E_ay = |a_y,m − a_y,nom| and I_dyn = |a_y,m| / (μ g), each with three overlapping sets. The paper provides
+only Table 2; docs/method.md#paper-adaptation defines the sets: triangles with shoulders, with tops at the constants
+below. The strength of a rule is the smaller of its two memberships (Mamdani's AND); the output is the mean of the
+rules' singletons weighted by strength, which is the centre of gravity of singletons.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ DEVIATION_TOPS_M_S2 = (0.3, 1.0, 2.5)
 INTENSITY_TOPS = (0.3, 0.6, 0.85)
 #: Table 2: rows I_dyn small, medium, large; columns E_ay small, medium, large.
 RULES = ((0.1, 0.2, 0.3), (0.3, 0.5, 0.7), (0.5, 0.8, 0.9))
-#: Residual gain where nothing is known: the rule of the undisturbed drive.
+#: Residual gain without inputs: the rule for undisturbed driving.
 NOMINAL_TRUST = RULES[0][0]
 
 
 @njit(cache=True)
 def memberships(value, tops):  # type: ignore[no-untyped-def]
-    """Return how far ``value`` is small, medium and large, each in [0, 1], their sum 1."""
+    """Return the memberships of ``value`` in small, medium and large, each in [0, 1] with sum 1."""
     low, middle, high = tops
     small = min(1.0, max(0.0, (middle - value) / (middle - low)))
     large = min(1.0, max(0.0, (value - middle) / (high - middle)))
@@ -33,7 +33,7 @@ def memberships(value, tops):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def fuzzy_trust(deviation_m_s2, intensity):  # type: ignore[no-untyped-def]
-    """Return β in [0.1, 0.9] of E_ay in m/s² and I_dyn, both not negative; NaN of NaN."""
+    """Return β in [0.1, 0.9] for non-negative E_ay in m/s² and I_dyn; NaN for NaN."""
     if not (math.isfinite(deviation_m_s2) and math.isfinite(intensity)):
         return math.nan
     columns = memberships(deviation_m_s2, DEVIATION_TOPS_M_S2)

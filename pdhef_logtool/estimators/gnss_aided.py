@@ -1,16 +1,17 @@
-"""``physics`` and ``pd-hef`` with GNSS velocity, as late as it arrives (docs/method.md#gnss).
+"""``physics`` and ``pd-hef`` with GNSS velocity, including its delay (docs/method.md#gnss).
 
-One antenna shows a course and no heading. Hypotheses differ in how certain v_y of the filter is (as it is, good in the
-linear range of the tyres, poor) and the position of the accelerometer. For each a Kalman filter estimates [v_y,
-heading, bias of a_y, bias of the gyro, error of the filter's v_y, antenna x, delay of the receiver, accelerometer x]
-from
+A single antenna provides a course but no heading. Hypotheses differ in the uncertainty of the filter's v_y (unchanged,
+good in the linear range of the tyres, poor) and in the position of the accelerometer. For each one a Kalman filter
+estimates [v_y, heading, bias of a_y, bias of the gyro, error of the filter's v_y, antenna x, delay of the receiver,
+accelerometer x] from
 
     v̇_y = a_y − b − x ṙ − (r − b_r) v_x,   ψ̇ = r − b_r,   v_y,filter = v_y − S v_x d,
 
 with d of unit variance and S the uncertainty of the hypothesis, and from the velocity of the antenna across the
-heading. That of a late sample is the present one less what the sensors have integrated since. The likelihood of the
-GNSS samples, forgotten within seconds, weighs the hypotheses, as in :mod:`~.adaptive_physics`: where GNSS does not
-contradict the filter, its estimate stays. Samples between a jump against the sensors and one back are not used.
+heading; for a late sample, the motion that the sensors measured since then is subtracted from the present velocity. The
+hypotheses are weighted by the likelihood of the GNSS samples, with a forgetting time of seconds, as in
+:mod:`~.adaptive_physics`: unless GNSS contradicts the filter, its estimate is unchanged. Samples between a jump against
+the sensors and a jump back are ignored.
 """
 
 from __future__ import annotations
@@ -40,35 +41,35 @@ from pdhef_logtool.records.tracks import StateTrack
 VY, HEADING, AY_BIAS, RATE_BIAS, LAW_ERROR, ANTENNA_X, DELAY, IMU_X, STATES = range(9)
 #: Uncertainty of the filter's v_y over v_x in degrees: constant, per m/s², per m/s³, per square of the share of the
 #: grip beyond the linear range; the logarithm of the prior weight; and 1-sigma of the accelerometer's position in m.
-#: Chosen on simulated drives. A position that is free in every hypothesis would explain what the tyres lack.
+#: Tuned on simulated drives. A free position in every hypothesis would absorb tyre model errors.
 HYPOTHESES = ((0.01, 0.0, 0.0, 0.0, 0.0, 0.0), (0.06, 0.02, 0.02, 30.0, -5.5, 0.0), (0.06, 0.02, 0.02, 30.0, -6.5, 1.0),
               (1.0, 0.3, 0.1, 30.0, -9.0, 0.3), (10.0, 0.3, 0.1, 30.0, -13.0, 0.3))  # fmt: skip
-#: 1-sigma of a GNSS velocity at least, m/s; gate in 1-sigmas.
+#: Minimum 1-sigma of a GNSS velocity, m/s; gate in 1-sigmas.
 GNSS_STD_M_S, GATE_SIGMA = 0.1, 4.0
-#: Time constant with which the likelihood is forgotten, s; time after which a heading that samples contradict is
-#: determined again, s.
+#: Forgetting time constant of the likelihood, s; time of contradicting samples after which the heading is
+#: reinitialized, s.
 FORGET_S, LOST_S = 5.0, 20.0
 #: Height of an antenna over the roll axis and its 1-sigma, m; 1-sigma of antenna x, unknown and known, m.
 ANTENNA_HEIGHT_M, HEIGHT_STD_M, ANTENNA_STD_M, KNOWN_ANTENNA_STD_M = 1.2, 0.5, 0.5, 0.1
-#: 1-sigmas at the start: heading, rad; gyro, rad/s; delay, s.
+#: Initial 1-sigmas: heading, rad; gyro, rad/s; delay, s.
 HEADING_STD, RATE_STD, DELAY_STD_S = 0.1, 0.002, 0.03
-#: White noise of accelerometer, m/s²/√Hz, and gyro, rad/s/√Hz; walk of the gyro's bias, rad/s/√s; interval to which the
-#: white part of the filter's error belongs, s, and its floor, m/s.
+#: White noise of accelerometer, m/s²/√Hz, and gyro, rad/s/√Hz; random walk of the gyro's bias, rad/s/√s; time interval
+#: of the white part of the filter's error, s, and its floor, m/s.
 AY_NOISE, RATE_NOISE, RATE_WALK, KNOT_S, FLOOR_M_S = 0.05, 0.001, 1e-5, 0.05, 0.005
-#: Low passes of a_y: for its size and its derivative, s. GNSS samples that can wait for their arrival.
+#: Low-pass time constants for the magnitude and the derivative of a_y, s; capacity of the queue of late GNSS samples.
 SIZE_S, SLOPE_S, QUEUE = 0.05, 0.1, 64
 _LAW = np.array(HYPOTHESES) * np.array([math.pi / 180.0] * 4 + [1.0, 1.0])
 
-# Entries of what all hypotheses share, and columns of a sample that waits.
+# Entries of the state shared by all hypotheses, and columns of a queued sample.
 _CLOCK, _RATE, _AY, _VX, _TURNED, _MOVED, _SIZE, _SLOPE = range(8)
 _GRIP, _RUNS, _LEFT, _LAST, _JUMP, _SINCE, _AGREES, _FIRST, _END = range(8, 17)
 _EAST, _NORTH, _AT, _ARRIVAL, _TURNED_THEN, _MOVED_THEN, _RATE_THEN, _AY_THEN, _ROLL_THEN, _STD = range(10)
 
 
 class Aiding(NamedTuple):
-    """Memory between windows: states [H, 8] and covariances, facts of each, what they share, samples that wait.
+    """Memory between windows: states [H, 8] and covariances, facts of each, shared state, queued samples.
 
-    ``facts`` [H, 3]: evidence, whether the heading is known, and since when samples are rejected (−1: they are not).
+    ``facts`` [H, 3]: evidence, whether the heading is initialized, and start of the rejection of samples (−1: none).
     """
 
     x: FloatArray
@@ -93,9 +94,9 @@ def _start(memory, antenna, imu_x_m, vy, vx):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _advance(x, P, dt, vx, ay_slope, kinematic):  # type: ignore[no-untyped-def]
-    """Move one hypothesis by a step; ``kinematic``: what the sensors integrate to.
+    """Advance one hypothesis by a step; ``kinematic`` has the integrals of the sensors.
 
-    Of v_y at their place, at constant heading, of the heading, and of the yaw rate.
+    These are the changes of v_y at the sensors for constant heading, of the heading, and of the yaw rate.
     """
     kept, law_kept = math.exp(-dt / BIAS_S), math.exp(-dt / LAW_S)
     x[VY] += kinematic[0] - dt * (x[AY_BIAS] - x[RATE_BIAS] * vx) - kinematic[2] * x[IMU_X]
@@ -124,7 +125,7 @@ def _advance(x, P, dt, vx, ay_slope, kinematic):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _residual(x, P, facts, sample, shared, h):  # type: ignore[no-untyped-def]
-    """Return residual and variances, the sample's and in all, of a GNSS velocity across the heading; Jacobian in h."""
+    """Return the residual of a GNSS velocity across the heading, its own and its total variance; Jacobian in h."""
     age = shared[_CLOCK] - sample[_AT]
     turned = shared[_TURNED] - sample[_TURNED_THEN] - age * x[RATE_BIAS]
     moved = shared[_MOVED] - sample[_MOVED_THEN] - age * (x[AY_BIAS] - x[RATE_BIAS] * shared[_VX])
@@ -156,7 +157,7 @@ def _residual(x, P, facts, sample, shared, h):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _use(x, P, facts, sample, shared, h, doubt):  # type: ignore[no-untyped-def]
-    """Update one hypothesis with a GNSS velocity; return the residual left. ``doubt``: cost of not fitting."""
+    """Update one hypothesis with a GNSS velocity; return the remaining residual. ``doubt``: cost of a misfit."""
     error, white, variance = _residual(x, P, facts, sample, shared, h)
     square = error * error / variance
     facts[0] -= 0.5 * (min(square, GATE_SIGMA**2) + math.log(variance))
@@ -173,7 +174,7 @@ def _use(x, P, facts, sample, shared, h, doubt):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _has_jumped(error, sample, shared, facts):  # type: ignore[no-untyped-def]
-    """Return whether GNSS is between a jump against the sensors and one back (multipath), for ``LOST_S`` at most."""
+    """Return whether GNSS is between a jump against the sensors and a jump back (multipath), at most ``LOST_S``."""
     change = error - shared[_LEFT]
     limit = JUMP_M_S + 0.02 * abs(sample[_AY_THEN]) + 0.5 * (sample[_AT] - shared[_LAST]) + abs(sample[_ROLL_THEN])
     limit += 0.3 * abs(sample[_RATE_THEN])  # an error of v_x becomes one of v_y
@@ -192,10 +193,10 @@ def _has_jumped(error, sample, shared, facts):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _queue(columns, k, p_roll, shared, waiting):  # type: ignore[no-untyped-def]
-    """Put the GNSS velocity of step k where it waits for its arrival; the oldest one goes where there is no room."""
+    """Queue the GNSS velocity of step k until its arrival; a full queue drops the oldest sample."""
     east, north, std, late = columns[7:]
     row, last = waiting[int(shared[_END]) % QUEUE], waiting[int(shared[_END] - 1.0) % QUEUE]
-    if shared[_END] > 0.0:  # a course that turns against the gyro is that of exchanged or mirrored axes
+    if shared[_END] > 0.0:  # a course that turns against the gyro indicates exchanged or mirrored axes
         turn = last[_EAST] * north[k] - last[_NORTH] * east[k]
         shared[_AGREES] += turn / (math.hypot(east[k], north[k]) ** 2) * (shared[_TURNED] - last[_TURNED_THEN])
     row[_EAST], row[_NORTH], row[_AT], row[_ARRIVAL] = east[k], north[k], shared[_CLOCK], shared[_CLOCK] + late[k]
@@ -209,7 +210,7 @@ def _queue(columns, k, p_roll, shared, waiting):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _share(columns, k, dt, roll_gradient, grip_m_s2, shared):  # type: ignore[no-untyped-def]
-    """Move what the hypotheses share to step k; return what the sensors integrate to, and the slope of a_y."""
+    """Advance the shared state to step k; return the integrals of the sensors, and the slope of a_y."""
     ay, rate, vx = columns[2:5]
     new_rate = rate[k] if math.isfinite(rate[k]) else shared[_RATE]
     new_ay = ay[k] / (1.0 + GRAVITY_M_S2 * roll_gradient) if math.isfinite(ay[k]) else shared[_AY]
@@ -232,10 +233,10 @@ def _share(columns, k, dt, roll_gradient, grip_m_s2, shared):  # type: ignore[no
 
 @njit(cache=True)
 def _mixture(x, P, facts, agrees, vy, out, k):  # type: ignore[no-untyped-def]
-    """Write what the hypotheses add to v_y at step k, the weight of the filter, and their part of the variance."""
+    """Write the correction of v_y at step k by the hypotheses, the weight of the filter, and their variance."""
     total, mean, variance, most = 0.0, 0.0, 0.0, np.max(facts[:, 0] + _LAW[:, 4])
     for i in range(x.shape[0]):
-        has_heading = i == 0 or (agrees and facts[i, 1] > 0.0)  # without a heading GNSS states nothing
+        has_heading = i == 0 or (agrees and facts[i, 1] > 0.0)  # GNSS is not informative without a heading
         weight = math.exp(facts[i, 0] + _LAW[i, 4] - most) if has_heading else 0.0
         total += weight
         if i > 0:
@@ -249,7 +250,7 @@ def _mixture(x, P, facts, agrees, vy, out, k):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _aid(columns, body, antenna, memory, out):  # type: ignore[no-untyped-def]
-    """Run over one window; ``memory`` is moved in place. ``out`` [K, 3] as :func:`_mixture` writes it."""
+    """Process one window; ``memory`` is updated in place. ``out`` [K, 3] as in :func:`_mixture`."""
     dts, ready, _, _, vx, vy, usable, east, north, _, _ = columns
     x, P, facts, shared, waiting = memory
     h = np.empty(STATES)
@@ -292,7 +293,7 @@ def _aid(columns, body, antenna, memory, out):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AidedSteps(StepColumns):
-    """Steps of the filter, and by step what GNSS adds to v_y, the filter's weight and other variance, [K, 3]."""
+    """Steps of the filter, and for each step the correction of v_y, the filter's weight and more variance, [K, 3]."""
 
     steps: Any
     aid: FloatArray
@@ -305,7 +306,7 @@ class AidedSteps(StepColumns):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AidedState:
-    """State of the filter and of the aid, and the last stamp, between windows."""
+    """State of the filter and of the GNSS correction, and the last stamp, between windows."""
 
     filter: Any
     aiding: Aiding
@@ -314,7 +315,7 @@ class AidedState:
 
 @dataclass(frozen=True, slots=True)
 class GnssAided:
-    """The estimator of this file; ``estimator`` is what GNSS velocity corrects."""
+    """The estimator of this file; GNSS velocity corrects ``estimator``."""
 
     algorithm = "gnss-aided"
     version = 1
@@ -325,17 +326,17 @@ class GnssAided:
 
     @property
     def name(self) -> str:
-        """That of the filter."""
+        """Name of the filter."""
         return self.estimator.name
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes of the report."""
+        """Notes for the report."""
         return (*notes_of(self.estimator), "GNSS velocity corrects v_y")
 
     @property
     def calibrated_as(self) -> AdaptivePhysics | CorrectedPhysics:
-        """Whose intervals apply where it has none of its own."""
+        """Estimator that provides the intervals if this one has no calibrated intervals."""
         return self.estimator
 
     @property
@@ -368,7 +369,7 @@ class GnssAided:
         return AidedSteps(steps, out), AidedState(after, aiding, last_stamp_ns(stamps_ns, before_ns))
 
     def predict(self, steps: AidedSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
-        """Extrapolate the filter's steps and add what GNSS adds (see :class:`~.base.ModelPredictor`)."""
+        """Extrapolate the filter's steps and add the GNSS correction (see :class:`~.base.ModelPredictor`)."""
         track = self.estimator.predict(steps.steps, ahead, stamps_ns)
         change, weight, variance = steps.aid[ahead.step].T
         change = np.where(track.valid, change, 0.0)

@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from pdhef_logtool.estimators.presets import Options
 
 #: Time constant of the leak, s. A pure integrator drifts by bias · time (0.08 m/s² gives 24 m/s in five minutes).
-#: Tuned to the ground truth of simulated drives, which is to its advantage.
+#: Tuned with the ground truth of simulated drives, which is an advantage of this estimator.
 LEAK_S = 0.7
-#: What it takes of a sensor profile; the wheel-slip gate has the default noise.
+#: Fields used from a sensor profile; the wheel-slip gate has the default noise.
 _PROFILE = ("speed_hold_s", "speed_zero_m_s", "speed_least_m_s")
 
 
 @njit(cache=True)
 def _kinematic(window, leak_s, hold_s, zero, state, values, rates, valid):  # type: ignore[no-untyped-def]
     dt, ax, ay, yaw_rate, speed = window
-    # state: v_x, age of the speed sample, v_y, v̇_y of the step before
+    # state: v_x, age of the speed sample, v_y, v̇_y of the previous step
     for k in range(dt.shape[0]):
         advance_speed(state, dt[k], ax[k], speed[k], hold_s)
         is_complete = math.isfinite(state[0]) and math.isfinite(yaw_rate[k]) and math.isfinite(ay[k])
@@ -48,7 +48,7 @@ def _kinematic(window, leak_s, hold_s, zero, state, values, rates, valid):  # ty
 
 @dataclass(frozen=True, slots=True)
 class Kinematic:
-    """The integrator of this file as an estimator; needs no vehicle at all."""
+    """The integrator of this file as an estimator; it needs no vehicle parameters."""
 
     algorithm = "kinematic"
     version = 1

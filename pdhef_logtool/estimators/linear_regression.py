@@ -1,4 +1,4 @@
-"""``linear-regression``: sideslip linear in the network's features, low-passed; what a network has to beat."""
+"""``linear-regression``: sideslip as a linear function of the network's low-passed features, a baseline."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class LinearRegression:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """State which file ran: run.json has the residual network's hash alone."""
+        """Return the model's hash; run.json only contains the residual network's."""
         return (f"coefficients {self.model.sha256}",)
 
     def run(self, signals: Signals, state: RegressionState | None) -> tuple[Steps, RegressionState]:
@@ -66,14 +66,14 @@ class LinearRegression:
         # The low-pass restarts wherever the parallel filter does.
         dt = np.where(starts, np.nan, step_durations_s(signals.stamps_ns, before_ns))
         low_pass(beta, dt, self.model.low_pass_hz, sideslip, beta)
-        # Sideslip is an angle of the velocity: beyond 80 degrees the line has left its range.
+        # Sideslip is the direction of the velocity: beyond 80 degrees the linear model is out of its range.
         vy = features[:, 0] * np.tan(np.clip(beta[:, 0], -1.4, 1.4))
         steps = direct_steps(self.vehicle, features, vy, usable)
         return steps, RegressionState(after, sideslip, last_stamp_ns(signals.stamps_ns, before_ns))
 
 
 def build(name: str, car: Car, options: Options) -> LinearRegression:
-    """Return ``linear-regression`` of a car whose network has it."""
+    """Return ``linear-regression`` for a car with such a model."""
     del name
     assert car.network is not None and car.network.linear_regression is not None
     return LinearRegression(car.vehicle, car.network.linear_regression, use_speed=options.use_speed)

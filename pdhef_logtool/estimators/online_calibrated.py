@@ -1,7 +1,7 @@
-"""Estimators on a car that is calibrated again and again while the log goes on (docs/method.md#self-calibration).
+"""Estimators on a car that is recalibrated during the log (docs/method.md#self-calibration).
 
-Each stage is the estimator on the vehicle that the log had shown by then. A stage begins at its own stamp with the
-state of the stage before it, and nothing at a stamp depends on a later one.
+Each stage is the estimator on the vehicle of the latest calibration. A stage begins at its stamp with the state of the
+previous stage, and its estimates do not depend on later samples.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StagedSteps(StepColumns):
-    """Steps of the estimator [K], and the stage that each comes from, [K]."""
+    """Steps of the estimator [K], and the stage of each, [K]."""
 
     steps: Any
     stage: IntArray
@@ -48,7 +48,7 @@ def _stage_of(stamps_ns: IntArray, stages: Sequence[WithoutTruth]) -> IntArray:
 
 @dataclass(frozen=True)
 class OnlineCalibrated:
-    """An estimator on the vehicle that the log has shown so far; ``stages`` in time order, at least two."""
+    """An estimator on the vehicle calibrated so far; ``stages`` in time order, at least two."""
 
     algorithm = "online-calibrated"
     version = 1
@@ -60,17 +60,17 @@ class OnlineCalibrated:
 
     @property
     def estimator(self) -> SelfCalibrated:
-        """The last stage, whose algorithm is that of all."""
+        """The last stage; all stages have the same algorithm."""
         return self.stages[-1]
 
     @property
     def name(self) -> str:
-        """That of the estimator."""
+        """Name of the estimator."""
         return self.estimator.name
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes of the report."""
+        """Notes for the report."""
         return self.estimator.notes
 
     def run(self, signals: Signals, state: Any | None) -> tuple[StagedSteps, Any]:
@@ -99,7 +99,7 @@ class OnlineCalibrated:
 
 @dataclass(slots=True)
 class OnlineBand:
-    """The interval of :class:`~.self_calibrated.CalibratedBand`, of each stage for its part of the log."""
+    """The interval of :class:`~.self_calibrated.CalibratedBand`, from each stage for its part of the log."""
 
     stages: Sequence[WithoutTruth]
     read_with: VehicleParameters
@@ -111,7 +111,7 @@ class OnlineBand:
         """Return a track [N] with wider 1-sigmas of sideslip and v_y."""
         if not len(signals):
             return track
-        if signals is not self._signals:  # tracks share the parts, which identify them for the intervals
+        if signals is not self._signals:  # tracks share the parts, by which the intervals identify them
             self._signals, spans = signals, _spans(_stage_of(signals.stamps_ns, self.stages))
             self._parts = [(number, first, last, signals.rows(first, last)) for number, first, last in spans]
         parts = []

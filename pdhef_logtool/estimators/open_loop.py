@@ -1,4 +1,4 @@
-"""``open-loop``: the nominal model driven by steering and measured speed, corrected by no other sensor."""
+"""``open-loop``: the nominal model with steering and measured speed as inputs, without correction by other sensors."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.presets import Options
 
-#: The rate of a_y is taken along the motion over this time.
+#: Time step of the derivative of a_y along the motion.
 AY_RATE_STEP_S = 0.001
 
 
 @njit(cache=True)
 def _open_loop(inputs, hold_s, default_friction, p, state, values, rates, valid):  # type: ignore[no-untyped-def]
     dt, steer, ax, speed, friction = inputs
-    # state: v_x, age of the speed sample, v_y, r, steering and friction of the step before
+    # state: v_x, age of the speed sample, v_y, r, steering and friction of the previous step
     for k in range(dt.shape[0]):
         before = state[0]
         advance_speed(state, dt[k], ax[k], speed[k], hold_s)
@@ -51,7 +51,7 @@ def _open_loop(inputs, hold_s, default_friction, p, state, values, rates, valid)
             state[2] = p.rear_m * state[3]
         ok = ok and math.isfinite(state[2]) and math.isfinite(state[3])
         if not ok:
-            state[2] = math.nan  # steering lost, or a vehicle too light for its tyres: start again
+            state[2] = math.nan  # steering missing, or vehicle too light for its tyres: restart
         state[4] = steer[k]
         state[5] = mu
         valid[k] = ok

@@ -1,7 +1,7 @@
-"""The pure physics filter that runs beside the network and gives it its features (docs/method.md#network).
+"""The pure physics filter that runs in parallel to the network and provides its features (docs/method.md#network).
 
-Which one a network was trained with is in its bundle: ``physics``, or ``phy-ukf`` for the paper's network and the
-baselines beside it, which are frozen.
+The bundle of a network names the filter that it was trained with: ``physics``, or ``phy-ukf`` for the paper's network
+and the baselines, which are frozen.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from pdhef_logtool.residual_model.features import make_features
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
 
-#: Entries of the features that the states of ``physics`` beyond the motion give.
+#: Number of features from the states of ``physics`` beyond the motion.
 _BODY = 4
 
 
@@ -59,15 +59,12 @@ def _physics_ay(x, inputs, layout, p, f, out):  # type: ignore[no-untyped-def]
 
 
 def parallel_filter(vehicle: VehicleParameters, *, use_speed: bool = True, slip_gate: bool = True) -> PhysicsUkf:
-    """Return the filter whose steps the features of the paper's network and of the baselines are made of.
-
-    That is ``phy-ukf`` as it is frozen.
-    """
+    """Return the filter for the features of the paper's network and of the baselines, the frozen ``phy-ukf``."""
     return PhysicsUkf(vehicle, use_speed=use_speed, slip_gate=slip_gate, name="parallel")
 
 
 def filter_of(car: Car, model: str, *, use_speed: bool = True) -> PhysicsUkf | PhysicsFilter:
-    """Return the parallel filter of networks for a model, one of :data:`~.bundle.MODELS`."""
+    """Return the parallel filter for networks of a model, one of :data:`~.bundle.MODELS`."""
     return (
         of_car(car, use_speed=use_speed)
         if model == PHYSICS_MODEL
@@ -87,13 +84,13 @@ def run_features(
 
     Parameters
     ----------
-    seen : the measurements that the network may see; those of ``signals`` when None.
+    seen : measurements for the network; by default the measurements in ``signals``.
     extra_r : [K, 2], as for :meth:`~.phy_ukf.PhysicsUkf.run`.
 
     Returns
     -------
-    features : [K, 15], NaN without steering, or where the filter has no state or one that goes backwards against the
-        speed sensor.
+    features : [K, 15], NaN without steering, without a state of the filter, or if the filter moves backwards against
+        the speed sensor.
     steps, state : of the filter.
     """
     steps, after = physics.run(signals, state, extra_r=extra_r)

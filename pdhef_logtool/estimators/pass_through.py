@@ -1,4 +1,4 @@
-"""``zero`` (β = 0) and ``zero:no-lateral`` (the sensors as they are): what any estimator must beat."""
+"""``zero`` (β = 0) and ``zero:no-lateral`` (the unchanged sensors): baselines for all estimators."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PassThrough:
-    """Speed sensor, gyro and accelerometer passed through; ``zero`` adds v_y = 0, ``zero:no-lateral`` claims no v_y.
+    """Passes speed sensor, gyro and accelerometer through; ``zero`` adds v_y = 0, ``zero:no-lateral`` no v_y.
 
-    Both have the sensors' delay: the newest sample that had arrived is held until the scored stamp.
+    Both have the sensors' delay: the newest available sample is held until the scored stamp.
     """
 
     algorithm = "pass-through"

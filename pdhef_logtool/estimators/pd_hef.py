@@ -1,6 +1,6 @@
 """``pd-hef`` and its variants: ``physics`` of the car plus residual gain times the network's residual.
 
-The gain is what the car's evidence allows; without a network or evidence it is 0, and ``pd-hef`` is ``physics``.
+The gain depends on the car's evidence; without a network or evidence it is 0, and ``pd-hef`` equals ``physics``.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from pdhef_logtool.estimators.physics_filter import of_car
 from pdhef_logtool.estimators.presets import options_of
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
 
-#: The preset that takes what the car was taught.
+#: The preset that uses the taught part of a car.
 PRESET = "pd-hef"
-FILTER_ALONE = "taught residual not used: it is fitted to the error of the filter, and a smoother has another"
+FILTER_ALONE = "taught residual not used: it was fitted to the error of the filter, which differs from the smoother's"
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 
 def build(name: str, car: Car, options: Options) -> AdaptivePhysics | CorrectedPhysics:
-    """Return ``physics`` of a car with the residual of its teaching drives, or with its network.
+    """Return ``physics`` of a car with its taught residual, or with its network.
 
-    The network has the residual gain that options, name or evidence state; a name with options means the network.
+    The residual gain of the network comes from options, name or evidence; a name with options selects the network.
     """
     taught = car.taught
     if name == PRESET and options.trust is None and taught is not None and taught.residual is not None:
@@ -53,7 +53,7 @@ def _with_network(name: str, car: Car, options: Options) -> AdaptivePhysics:
 
 
 def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
-    """Return the same smoothed, with the noise for that; ``name`` is that of the result."""
+    """Return the smoothed filter, with the noise for smoothing; ``name`` is the name of the result."""
     filtered = _with_network(name, car, options)
     factors = SMOOTHING if car.fitted_physics is None else car.fitted_physics.smoothing
     filtered = replace(filtered, physics=for_smoothing(filtered.physics, factors))
@@ -63,7 +63,7 @@ def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
 
 def _trust(name: str, car: Car, options: Options) -> tuple[float, tuple[str, ...]]:
     if car.residual_network is None:
-        why = "the car has no network" if car.network is None else "the network is one for phy-ukf, as the paper has it"
+        why = "the car has no network" if car.network is None else "the network is for phy-ukf, as in the paper"
         return 0.0, (f"residual gain 0: {why}",)
     if options.trust is not None:
         return options.trust, ()

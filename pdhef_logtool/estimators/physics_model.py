@@ -1,30 +1,31 @@
-"""The single-track model of ``physics``: axle forces that lag, load transfer, braking, roll, bank.
+"""The single-track model of ``physics``: axle forces with lag, load transfer, braking, roll, bank.
 
 See docs/method.md#physics.
 
-State of a point, ISO 8855, SI, at the centre of gravity: [v_x, v_y, r, b_ax, f_f, f_r] and, each where the car has that
-part, [φ, φ̇], [bank], [s], [b_δ], [b_ay, b_r]. f = F_y / m is an axle's lateral force over the vehicle's mass in m/s².
+State of a point, ISO 8855, SI, at the centre of gravity: [v_x, v_y, r, b_ax, f_f, f_r] and, for cars with the
+respective part, [φ, φ̇], [bank], [s], [b_δ], [b_ay, b_r]. f = F_y / m is an axle's lateral force over the vehicle's
+mass in m/s².
 
-- **Lag**: (σ / v_x) ḟ + f = f_ss(α). Without it f is the tyres' force at once.
-- **Roll**: φ̈ = ω² (G a_y − φ) − 2 ζ ω φ̇ with the roll gradient G. The tyres see v_y + h_s φ̇, for the centre of gravity
-  swings h_s above the roll axis; the accelerometer reads g φ beside the forces. Without it the body follows at once:
-  (1 + g G) Σf.
-- **Load transfer** takes x = 2 h a_y / (g T) of a wheel's load to the other one of its axle; with roll a_y is φ / G,
-  for springs carry it. A tyre whose force per load falls by the share s_z for each relative excess of load leaves
-  1 − s_z x² of an axle's force (Eq 7). A magic formula that was fitted to an axle contains that loss already for steady
-  cornering, in which the axle's own force states what a_y was: what is left is the ratio of the two.
-- **Braking** (``ax`` below 0) moves the load a_x h / L to the front and takes from both axles' grip what it uses,
-  √(1 − (a_x / μ g)²), with brakes that are shared as the loads are. Which axle drives is not known: nothing is done
-  when the car accelerates.
-- **Bank**: −g · bank in v̇_y and nowhere else, an Ornstein-Uhlenbeck process.
+- **Lag**: (σ / v_x) ḟ + f = f_ss(α). Without it f is the steady force of the tyres.
+- **Roll**: φ̈ = ω² (G a_y − φ) − 2 ζ ω φ̇ with the roll gradient G. The tyres see v_y + h_s φ̇, because the centre of
+  gravity is h_s above the roll axis; the accelerometer measures g φ in addition to the forces. Without this part, roll
+  is in equilibrium: (1 + g G) Σf.
+- **Load transfer** moves the share x = 2 h a_y / (g T) of a wheel's load to the other wheel of the axle; with roll, a_y
+  is φ / G, as the springs transfer it. If the force per load of a tyre decreases by the share s_z per relative excess
+  of load, the axle force has the factor 1 − s_z x² (Eq 7). A magic formula fitted to an axle already includes this
+  factor for steady cornering, at the a_y that corresponds to the axle force: then the ratio of the two is used.
+- **Braking** (``ax`` below 0) moves the load a_x h / L to the front and reduces the grip of both axles by the factor
+  √(1 − (a_x / μ g)²), for brake forces proportional to the loads. The driven axle is unknown: there is no correction
+  for acceleration.
+- **Bank**: −g · bank in v̇_y only, an Ornstein-Uhlenbeck process.
 - **Force scale**: 1 + s on the tyres' forces, an Ornstein-Uhlenbeck process.
 
-A step moves eight points at once in an inner loop without branches, as :mod:`~pdhef_logtool.car.nominal_points` does:
-each part has its place there, and what a car lacks is 0 (:func:`spread_layout`). One evaluation of the tyres a step:
-the exponential kernel of the lag weighs what they were asked over the step, and represents one instant of it, t*; the
-state there is that at the start, moved by its derivative. Velocities take the mean of the forces at both ends. Second
-order in the step but for what changes slowly over one (speed in the lag, bank, force scale, and the load transfer where
-nothing rolls), and stable for any lag.
+A step processes eight points at once in an inner loop without branches, as in
+:mod:`~pdhef_logtool.car.nominal_points`: each part has a fixed place in the state, with 0 for missing parts
+(:func:`spread_layout`). The tyres are evaluated once per step, at the instant t* at which the exponential kernel of the
+lag has its centroid, with the initial state extrapolated by its derivative. Velocities use the mean of the forces at
+both ends. The method is of second order in the step except for slow quantities (speed in the lag, bank, force scale,
+and the load transfer without roll), and stable for any lag.
 """
 
 from __future__ import annotations
@@ -39,14 +40,14 @@ from pdhef_logtool.car.nominal_points import arctangent, sine
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 
-#: Entries of the state that every car has, and how many of the others its parts add.
+#: Entries of the state of every car, and their number.
 VX, VY, YAW_RATE, AX_BIAS, FRONT, REAR = range(6)
 CORE = 6
-#: Entries of the others, where every part has its place whether or not the car has it (:func:`spread_layout`), and how
-#: many entries such a state has.
+#: Optional entries; in a spread state every part has its place, whether or not the car has it (:func:`spread_layout`).
+#: Number of entries of a spread state.
 ROLL, ROLL_RATE, BANK, FORCE_SCALE, STEER_BIAS, AY_BIAS, RATE_BIAS = range(CORE, CORE + 7)
 PLACES = 13
-#: Points that an inner loop takes, and for how many a block of points has room: a multiple of it.
+#: Points per inner loop, and points per block: a multiple of it.
 LANES = 8
 WIDTH = 3 * LANES
 
@@ -56,9 +57,9 @@ FORCE_SCALE_TIME_S = 2.0
 BANK_TIME_S = 5.0
 #: Largest product of step and the roll mode's frequency; longer steps are divided.
 _MAX_ROLL_STEP = 0.5
-#: Grip is never taken to be used up by braking alone: a car that still steers has this share.
+#: Minimum share of the grip that braking leaves for lateral forces.
 _LEAST_GRIP = 0.2
-#: A body that hardly rolls, rad/(m/s²), shows nothing of the load transfer, which then follows the acceleration.
+#: Below this roll gradient, rad/(m/s²), roll does not indicate load transfer, which then follows the acceleration.
 LEAST_ROLL_GRADIENT = 1e-3
 
 _compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -66,18 +67,18 @@ _inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
 
 class Layout(NamedTuple):
-    """Where the entries of the parts are in the state; −1: the car has no such part."""
+    """Index of each part in the state; −1 if the car lacks the part."""
 
     size: int
     roll: int  # φ, and φ̇ behind it
     bank: int
     force_scale: int
     steer_bias: int
-    sensor_bias: int  # of a_y, and of the yaw rate behind it; the last entries, for only the sensors feel them
+    sensor_bias: int  # of a_y, then of the yaw rate; the last entries, as only the sensors depend on them
 
     @property
     def named(self) -> dict[str, int]:
-        """Where the states are that a track has a column for, by its name; those that the car has."""
+        """Indices of the states with a column in a track, by column name."""
         places = {
             "roll_rad": self.roll,
             "bank_rad": self.bank,
@@ -91,7 +92,7 @@ class Layout(NamedTuple):
 
 @njit(cache=True)
 def spread_layout(layout):  # type: ignore[no-untyped-def]
-    """Return the layout of a state in which every part has its place: still −1 for a part that the car lacks."""
+    """Return the layout of a spread state, in which every part has a fixed place; −1 for missing parts."""
     return Layout(
         PLACES,
         ROLL if layout.roll >= 0 else -1,
@@ -104,7 +105,7 @@ def spread_layout(layout):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def places_of(layout):  # type: ignore[no-untyped-def]
-    """Return where each entry of a state [n] is in one in which every part has its place, [n]."""
+    """Return the index in a spread state of each entry of a state [n], [n]."""
     places = np.arange(layout.size)
     for position, place, width in (
         (layout.roll, ROLL, 2),
@@ -120,7 +121,7 @@ def places_of(layout):  # type: ignore[no-untyped-def]
 
 
 class PhysicsParameters(NamedTuple):
-    """What the compiled model needs beside :class:`~pdhef_logtool.car.nominal_model.ModelParameters`."""
+    """Parameters of the compiled model in addition to :class:`~pdhef_logtool.car.nominal_model.ModelParameters`."""
 
     relaxation_length_m: float  # 0: no lag
     load_sensitivity: float  # s_z; 0: no load transfer
@@ -138,7 +139,7 @@ class PhysicsParameters(NamedTuple):
 
 
 def layout_of(vehicle: VehicleParameters) -> Layout:
-    """Return where the states of a car's parts are."""
+    """Return the indices of a car's parts in the state."""
     parts = vehicle.physics
     size = CORE
     places = []
@@ -149,7 +150,7 @@ def layout_of(vehicle: VehicleParameters) -> Layout:
 
 
 def physics_parameters(vehicle: VehicleParameters) -> PhysicsParameters:
-    """Flatten what the parts of a car need."""
+    """Return the parameters of a car's parts for the compiled model."""
     parts, height = vehicle.physics, vehicle.cg_height_m
     front, rear = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
     moved = height / GRAVITY_M_S2 if parts.braking else 0.0
@@ -171,7 +172,7 @@ def physics_parameters(vehicle: VehicleParameters) -> PhysicsParameters:
 
 
 class _Step(NamedTuple):
-    """What stays the same for all points of a step."""
+    """Constants of a step, common to all points."""
 
     angle: float
     cos: float
@@ -181,16 +182,16 @@ class _Step(NamedTuple):
     b_rear: float
     peak_front: float  # over the mass, friction and braking applied, m/s²
     peak_rear: float
-    kept: float  # share of an axle's force at the start that is left at the end of the step
-    tyre_s: float  # t*: the time from the step's start at which the tyres are asked
+    kept: float  # share of an axle's initial force that remains at the end of the step
+    tyre_s: float  # t*: time from the step's start to the evaluation of the tyres
     inertia: float  # m / I_z
-    front_held: float  # s_z where the front axle's formula contains the transfer of steady cornering already, else 0
+    front_held: float  # s_z if the front axle's formula already contains the transfer of steady cornering, else 0
     rear_held: float
 
 
 @njit(cache=True)
 def step_count(vx, dt, friction, layout, p, f):  # type: ignore[no-untyped-def]
-    """Return into how many steps ``dt`` must be divided: as the nominal model, and for the roll mode."""
+    """Return the number of substeps for ``dt``, by the nominal model and by the roll mode."""
     n = substeps(vx, dt, friction, p)
     if layout.roll >= 0:
         n = max(n, math.ceil(dt * f.roll_frequency_rad_s / _MAX_ROLL_STEP))
@@ -199,7 +200,7 @@ def step_count(vx, dt, friction, layout, p, f):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def grip_under_braking(ax, friction, load_per_ax):  # type: ignore[no-untyped-def]
-    """Return the factor on an axle's lateral force: its load, and what braking leaves of its grip."""
+    """Return the factor on an axle's lateral force by its change of load and by the grip used for braking."""
     if ax >= 0.0 or load_per_ax == 0.0:
         return 1.0
     used = ax / (friction * GRAVITY_M_S2)
@@ -209,7 +210,7 @@ def grip_under_braking(ax, friction, load_per_ax):  # type: ignore[no-untyped-de
 
 @njit(cache=True)
 def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
-    """Return what stays the same over a step of ``h`` s at a speed of about ``vx``."""
+    """Return the constants of a step of ``h`` s at a speed of about ``vx``."""
     kept, tyre_s = 0.0, h
     if f.relaxation_length_m > 0.0:
         x = h * max(vx, p.blend_low_m_s) / f.relaxation_length_m
@@ -234,15 +235,15 @@ def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
 
 @_inline
 def _transfer_factor(ay, sensitivity, f):  # type: ignore[no-untyped-def]
-    """Return 1 − s_z x² of an axle at lateral acceleration ``ay``; x ends at 1, the inner wheel off the road."""
+    """Return 1 − s_z x² of an axle at lateral acceleration ``ay``; x is limited to 1, where the inner wheel lifts."""
     x = min(1.0, abs(f.transfer_per_ay * ay))
     return 1.0 - sensitivity * x * x
 
 
-# positional: numbers of one point in an inner loop that is to become vector instructions.
+# positional: numbers of one point in an inner loop for vectorization.
 @_inline
 def _tyre_forces(v, vy, r, angle, ay, force, c, p, f):  # type: ignore[no-untyped-def]
-    """Return F_yf/m and F_yr/m in m/s² to which the tyres settle; ``ay`` is what the load transfer goes by."""
+    """Return the steady F_yf/m and F_yr/m in m/s²; the load transfer depends on ``ay``."""
     front = c.b_front * (angle - arctangent(vy + p.front_m * r, v))
     rear = -c.b_rear * arctangent(vy - p.rear_m * r, v)
     front = arctangent(front - p.front_E * (front - arctangent(front, 1.0)), 1.0)
@@ -255,13 +256,13 @@ def _tyre_forces(v, vy, r, angle, ay, force, c, p, f):  # type: ignore[no-untype
     return ff, fr
 
 
-# positional: numbers and records of numbers, which a compiled function takes at no cost.
+# positional: numbers and records of numbers, which are free of cost in compiled calls.
 @_compiled
 def advance_block(points, count, vx, over, dt, n, layout, p, f):  # type: ignore[no-untyped-def]
-    """Advance a block of points [PLACES · WIDTH], an entry after the other, by ``dt`` s in ``n`` steps.
+    """Advance a block of points [PLACES · WIDTH], entry by entry, by ``dt`` s in ``n`` steps.
 
-    As :func:`advance`, but every part has its place; of the points the first ``count`` move, and those that fill the
-    last ``LANES``: all of them must be numbers. ``vx`` is the speed that they all go by.
+    As :func:`advance`, for spread states. The first ``count`` points are advanced, and the points that fill the last
+    ``LANES``, which must be finite. ``vx`` is the common speed of all points.
     """
     h = dt / n
     c = _prepare(vx, h, over.steer, over.ax, over.friction, p, f)
@@ -333,8 +334,8 @@ def advance_block(points, count, vx, over, dt, n, layout, p, f):  # type: ignore
 def advance(points, count, over, dt, n, layout, p, f):  # type: ignore[no-untyped-def]
     """Advance the first ``count`` of points [state, S] by ``dt`` s in ``n`` steps with constant inputs.
 
-    ``over`` are steering angle, accelerometer's a_x and friction. The rows of sensors' biases are not looked at. All
-    points go by the speed of the first.
+    ``over`` has steering angle, accelerometer's a_x and friction. The rows of the sensors' biases are ignored. All
+    points have the speed of the first.
     """
     places, block, vx = places_of(layout), np.empty(PLACES * WIDTH), points[VX, 0]
     for first in range(0, count, WIDTH):
@@ -352,12 +353,12 @@ def advance(points, count, over, dt, n, layout, p, f):  # type: ignore[no-untype
 
 @njit(cache=True)
 def settle_forces(x, steer, ax, friction, layout, p, f):  # type: ignore[no-untyped-def]
-    """Put the axles' forces of a state [n] to the tyres' steady ones at their own lateral acceleration; no roll."""
+    """Set the axle forces of a state [n] to the steady tyre forces at their lateral acceleration; without roll."""
     c = _prepare(x[VX], 0.01, steer, ax, friction, p, f)
     v = max(x[VX], p.blend_low_m_s)
     force = max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
     x[FRONT], x[REAR] = 0.0, 0.0
-    for _ in range(3):  # a strong contraction
+    for _ in range(3):  # converges fast
         ay = x[FRONT] * c.cos + x[REAR]
         x[FRONT], x[REAR] = _tyre_forces(v, x[VY], x[YAW_RATE], steer, ay, force, c, p, f)
     if layout.roll >= 0:
@@ -367,14 +368,14 @@ def settle_forces(x, steer, ax, friction, layout, p, f):  # type: ignore[no-unty
 
 @njit(cache=True)
 def planar_ay(x, steer, p):  # type: ignore[no-untyped-def]
-    """Return the lateral acceleration at the centre of gravity in state x [n], m/s², but for that of the bank."""
+    """Return the lateral acceleration at the centre of gravity in state x [n], m/s², without the bank's part."""
     w = dynamic_share(x[VX], p)
     return w * (x[FRONT] * math.cos(steer) + x[REAR]) + (1.0 - w) * x[VX] * x[YAW_RATE]
 
 
 @njit(cache=True)
 def sensed_ay(x, steer, layout, p, f, row):  # type: ignore[no-untyped-def]
-    """Return what the accelerometer reads in state x [n], and write its derivative by the state to row [n]."""
+    """Return the accelerometer's reading in state x [n], and write its derivative by the state to row [n]."""
     row[:] = 0.0
     w = dynamic_share(x[VX], p)
     c = math.cos(steer)

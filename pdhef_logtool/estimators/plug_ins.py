@@ -1,4 +1,4 @@
-"""Containment of estimators of other packages: their errors, what they print, and their writes to shared data."""
+"""Isolation of estimators of other packages: their errors, their output, and their writes to shared data."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def package_of(code: Any) -> str:
 
 @contextmanager
 def contained(name: str, package: str) -> Iterator[None]:
-    """Run code of another package, ``package``, for the estimator ``name``; code of this one (empty) runs as it is.
+    """Run the code of ``package`` for the estimator ``name``; code of this package (empty) runs without isolation.
 
-    Its output goes to stderr, and its change of the working folder is undone.
+    Output is redirected to stderr, and a change of the working folder is undone.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def contained(name: str, package: str) -> Iterator[None]:
 
 
 def read_only(signals: Signals) -> Signals:
-    """Return copies of the columns that cannot be written to."""
+    """Return copies with read-only columns."""
     copies: dict[str, Any] = {
         f.name: np.array(getattr(signals, f.name)) for f in fields(signals) if f.name != "available"
     }

@@ -1,13 +1,13 @@
-"""95 % confidence intervals from the spread of a car's parameters: what identification left of it, else their prior.
+"""95 % confidence intervals from the uncertainty of a car's parameters, by their posterior or prior.
 
     s² = (k_o s_own)² + Σ_i (v_y,i − v_y)² / v_x² + w²
 
-v_y,i is that of the physics filter on the vehicle one 1-sigma away in direction i of the posterior, or of the prior if
-no drive has shown the vehicle file to be right, without the states that cure what a car lacks. w is the disagreement of
-accelerometer and gyro with the estimate's own changes, ``kinematic`` of
-:mod:`~pdhef_logtool.estimators.error_features`: driving unlike that of the identification shows there. Both are
-available online, so that the confidence interval is causal. The own one counts less, for the noise of an identified car
-includes what its model leaves of a_y.
+v_y,i is the lateral velocity of the physics filter on the vehicle one 1-sigma away in direction i of the posterior, or
+of the prior if no drive has validated the vehicle file, without the states that compensate model errors. w is the
+disagreement of accelerometer and gyro with the estimate's changes, ``kinematic`` of
+:mod:`~pdhef_logtool.estimators.error_features`; it indicates driving unlike the identification's. Both are available
+online, so that the confidence interval is causal. s_own has a reduced weight, because the noise of an identified car
+includes the model error of a_y.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from pdhef_logtool.estimators.self_calibrated import widened
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
-#: k_o above, chosen on 8 simulated cars, identified on one drive and judged on drives of other manoeuvres. The other
-#: two count as they are.
+#: k_o above, tuned on 8 simulated cars, each identified on one drive and evaluated on drives of other manoeuvres. The
+#: other two terms have the weight 1.
 OWN_SHARE = 0.5
 _KINEMATIC = TERMS.index("kinematic")
 
@@ -37,7 +37,7 @@ _KINEMATIC = TERMS.index("kinematic")
 class PosteriorBand:
     """The confidence interval of one car over one drive.
 
-    ``filters`` : the physics filter on the car, then on it away from there. All tracks share their runs.
+    ``filters`` : the physics filter on the car, then on its variations. All tracks share their runs.
     """
 
     filters: tuple[PhysicsFilter, ...]
@@ -45,7 +45,7 @@ class PosteriorBand:
     _vy: list[FloatArray] = field(default_factory=list)
 
     def widen(self, track: StateTrack, signals: Signals) -> StateTrack:
-        """Return a track [N] with 1-sigmas as the head of this file has them."""
+        """Return a track [N] with the 1-sigmas of this module's equation."""
         if signals is not self._signals:
             self._signals, self._vy = signals, [run_estimator(f, signals).vy_m_s for f in self.filters]
         vehicle = self.filters[0].vehicle
@@ -55,7 +55,7 @@ class PosteriorBand:
 
 
 def posterior_band(car: Car, *, use_speed: bool = True) -> PosteriorBand | None:
-    """Return the intervals of estimators on the vehicle file; None where identification has kept no posterior."""
+    """Return the intervals of estimators on the vehicle file; None if identification stored no posterior."""
     varied = prior_variations(car.physics_vehicle) if car.fitted_physics is None else car.varied_physics
     if not varied:
         return None

@@ -1,4 +1,4 @@
-"""Names of estimators: a preset, with the options of its variant behind a colon, such as ``pd-hef:gain=1,fixed-r``."""
+"""Names of estimators: a preset, with options after a colon, such as ``pd-hef:gain=1,fixed-r``."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class Options:
     Attributes
     ----------
     use_speed : False is the paper's ``esp`` suite for the filters: the speed sensor only initializes them.
-    trust : residual gain of the hybrid filters, in [0, 1]; None: as far as the car's evidence allows.
-    gnss : whether GNSS velocity corrects :data:`AIDED` where the log has it.
-    network : the car's network, ready to run, where several estimators share it; None: loaded by each estimator.
+    trust : residual gain of the hybrid filters, in [0, 1]; None: by the car's evidence.
+    gnss : whether GNSS velocity corrects :data:`AIDED` if the log has it.
+    network : the car's network, shared by several estimators; None: each estimator loads it.
     """
 
     use_speed: bool = True
@@ -41,7 +41,7 @@ class Options:
     gnss: bool = False
 
     def service(self, car: Car) -> NetworkService:
-        """Return the car's network, ready to run."""
+        """Return the car's network."""
         assert car.network is not None, "the table lets no estimator run without the network that it needs"
         from pdhef_logtool.residual_model.service import NetworkService
 
@@ -60,7 +60,7 @@ def options_of(name: str) -> dict[str, str]:
 
 
 def split_names(text: str) -> tuple[str, ...]:
-    """Split a comma-separated list of names; an option of the name before it is part of that name."""
+    """Split a comma-separated list of names; an option belongs to the name before it."""
     names: list[str] = []
     for part in filter(None, map(str.strip, text.split(","))):
         if names and ":" in names[-1] and part.partition("=")[0] in OPTIONS.get(preset_of(names[-1]), ()):
@@ -71,7 +71,7 @@ def split_names(text: str) -> tuple[str, ...]:
 
 
 def check_options(names: Sequence[str]) -> None:
-    """Raise UsageError for an option that its preset does not have, or for a value out of range."""
+    """Raise UsageError for an unknown option of a preset, or for a value out of range."""
     for name in names:
         preset, colon, _ = name.partition(":")
         allowed, given = OPTIONS.get(preset, {}), options_of(name)

@@ -1,17 +1,18 @@
-"""Estimators on the vehicle that their log has calibrated: they see their signals as that vehicle reads them.
+"""Estimators on the vehicle calibrated by their log, with signals as this vehicle reads them.
 
-What a whole log states of its car is known only at its end: none of them is causal.
+The calibration uses the whole log: these estimators are not causal.
 
-Their variance of sideslip is their own, what the parameters leave open, and what the sensors contradict
-(docs/method.md#intervals):
+Their variance of sideslip has three sources: the estimator's own, the uncertainty of the parameters, and contradictions
+between the sensors (docs/method.md#intervals):
 
     s² = χ² (s_own² + s_car²) + (Σ_i (v_y,i − v_y)² + (0.7 lateral kinematic consistency)² + (s_l r)²) / v_x²,
 
-where v_y,i is that of the physics filter on the vehicle one posterior 1-sigma away in direction i, and d² that of
-the whole log as far as it goes with the driving. s_car is what no parameter of a single track explains: nearly constant
-within a drive, it differs between drives and cars, as does the RMS error χ ≥ 1 that the fit leaves over the assumed one
-(Birge 1932). s_l is that of the distance from the rear axle to the centre of gravity where no file gives it: the rear
-axle determines its own lateral velocity. That of v_y is the same sum as a velocity. Estimates themselves do not change.
+where v_y,i is the lateral velocity of the physics filter on the vehicle one posterior 1-sigma away in direction i. Of
+the lateral kinematic consistency of the whole log, only the part that correlates with the driving is used. s_car is the
+model error of a single track, which is nearly constant within a drive and differs between drives and cars. χ ≥ 1 is the
+RMS error of the fit over the assumed one (Birge 1932). s_l is the uncertainty of the distance from the rear axle to the
+centre of gravity if no file contains it: the lateral velocity is determined at the rear axle. The variance of v_y is
+the same sum as a velocity. The estimates are unchanged.
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ from pdhef_logtool.records.tracks import StateTrack
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 
-#: Presets built on ``physics``. They use the calibrated vehicle if there is one; all others use the vehicle file.
+#: Presets built on ``physics``. They use the calibrated vehicle if available; all others use the vehicle file.
 SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
 #: The open-loop model on the calibrated vehicle.
 OPEN_LOOP = "open-loop:calibrated"
-#: Factor of lateral kinematic consistency, and s_car above; on seven simulated cars and the real drives of four.
+#: Factor of lateral kinematic consistency, and s_car above; from seven simulated cars and real drives of four cars.
 D2_SHARE, CAR_STD_RAD = 0.7, math.radians(0.15)
 
 
@@ -65,7 +66,7 @@ class CalibratedBand:
 
     @property
     def _filters(self) -> tuple[PhysicsFilter, ...]:
-        """The physics filter on the calibrated vehicle and on its variations; none without variations."""
+        """The physics filter on the calibrated vehicle and on its variations; empty without variations."""
         from pdhef_logtool.estimators.physics_filter import physics_filter
 
         calibration = self.calibration
@@ -74,7 +75,7 @@ class CalibratedBand:
 
 
 def of_friction(signals: Signals, calibration: WithoutTruth) -> Signals:
-    """Return signals without a friction that was only estimated with the vehicle file."""
+    """Return signals without a friction that was estimated with the vehicle file."""
     return signals if calibration.told_friction else replace(signals, friction=np.full(len(signals), np.nan))
 
 
@@ -84,7 +85,7 @@ class SelfCalibrated:
 
     Parameters
     ----------
-    estimator : on the calibrated vehicle. calibration : where that comes from.
+    estimator : on the calibrated vehicle. calibration : source of the vehicle.
     read_with : the vehicle that the drive's signals were read with.
     """
 
@@ -99,22 +100,22 @@ class SelfCalibrated:
 
     @property
     def name(self) -> str:
-        """That of the estimator."""
+        """Name of the estimator."""
         return self.estimator.name
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the report states of it."""
+        """Notes for the report."""
         return (*notes_of(self.estimator), self.calibration.note)
 
     @property
     def look_ahead_s(self) -> float:
-        """What the estimator must see of what follows a window."""
+        """Look-ahead of the estimator."""
         return look_ahead_of(self.estimator)
 
     @property
     def intervals_note(self) -> str:
-        """What its intervals are made of: none that was calibrated on driving of another car."""
+        """Components of its intervals; calibrated intervals of another car are not used."""
         parts = ["own", *(["parameters"] if self.calibration.varied else [])]
         parts += ["d2"] if math.isfinite(self.calibration.driven_d2_m_s) else []
         return f"intervals: {', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else "intervals not calibrated"
@@ -128,7 +129,7 @@ class SelfCalibrated:
         return predict_track(self.estimator, steps, ahead, stamps_ns)
 
     def given(self, signals: Signals) -> Signals:
-        """Return the signals that the estimator gets, as its vehicle reads them."""
+        """Return the signals for the estimator, as its vehicle reads them."""
         return corrected_anew(of_friction(signals, self.calibration), self.read_with, self.calibration.vehicle)
 
 
@@ -140,9 +141,9 @@ def widened(
     Parameters
     ----------
     compared : v_y of the physics filter [N], first on the vehicle, then on those away from it.
-    seen_m_s : what the sensors contradict, as a velocity [N].
-    slow_m_s : a velocity shows of sideslip no more below this speed than there.
-    own_share : of the track's own 1-sigma that counts.
+    seen_m_s : contradiction between the sensors, as a velocity [N].
+    slow_m_s : lower limit of the speed in the conversion of velocities to angles.
+    own_share : factor on the track's own 1-sigma.
     """
     added = np.where(np.isfinite(seen_m_s), seen_m_s, 0.0)
     for vy in compared[1:]:

@@ -11,8 +11,9 @@ No innovation of a filter with a network is used, so that a model error cannot b
 * stuck: at least five identical samples that chance does not explain. Quantized signals repeat, so the share of
   repetitions is learned while the car moves, and a coarse signal is stuck only if the car has turned meanwhile; at a
   standstill no channel is stuck.
-* dead, with or without noise: three measures of the yaw rate: r, (a_y − v̇_y)/v_x, and that of the open-loop nominal
-  model with steering and speed, which provides v̇_y too. If two agree and the third stays near zero, the third is dead.
+* dead, with or without noise: three measures of the yaw rate: r, (a_y − v̇_y)/v_x, and the yaw rate of the open-loop
+  nominal model with steering and speed, which also provides v̇_y. If two agree and the third stays near zero, the third
+  is dead.
 
 Stuck, dead and spike samples are treated as missing. s₀ is the vehicle file's, or the usual noise of the log if larger:
 a rough road is no burst.
@@ -45,7 +46,7 @@ from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_A
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import last_stamp_ns, step_durations_s
 
-# The two channels; the bits of the second are those of the first, shifted left by one.
+# The two channels; the bits of the yaw rate are the bits of a_y, shifted left by one.
 AY, YAW_RATE = 0, 1
 CHANNELS = 2
 
@@ -62,7 +63,7 @@ MEDIAN_SQUARE = 0.4549
 #: Constant-velocity tracker: gains, spike limit, and largest second derivatives of a car (m/s⁴, rad/s³).
 TRACK_GAIN, TRACK_RATE_GAIN = 0.7, 0.4
 SPIKE_SIGMA = 6.0
-#: 1-sigma of the tracker's innovation over that of a sample, for the gains above.
+#: Ratio of the 1-sigma of the tracker's innovation to the sample noise, for the gains above.
 TRACK_INNOVATION_RATIO = 1.5
 CURVATURE = (2000.0, 100.0)
 #: Largest number of consecutive spikes; more are a jump or a burst.
@@ -88,7 +89,7 @@ DEAD_SHARE = 0.3
 DEAD_BAND_RAD_S = 0.008
 DEAD_BAND_SIGMAS = 2.0
 DEAD_AFTER_S = 0.15
-#: A dead channel recovers if it reads this share of both others for a time, or if nothing turns for longer.
+#: A dead channel recovers if it reads this share of both others for a time, or after a longer time without rotation.
 ALIVE_SHARE = 0.6
 ALIVE_AFTER_S = 0.2
 QUIET_RAD_S = 0.03

@@ -1,26 +1,27 @@
 """``pd-hef-smoothed``: Rauch-Tung-Striebel smoothing over ``pd-hef`` (docs/method.md#smoothing). Not causal.
 
-Forward run the filters of ``pd-hef``, each with its residual, on checked signals (:mod:`~.checked_inputs`);
-backward goes each of them, from the last step that is seen,
+The filters of ``pd-hef``, each with its residual, run forward on checked signals (:mod:`~.checked_inputs`). Each filter
+is then smoothed backward from its last available step:
 
     G_k = C_{k,k+1} P_{k+1|k}⁻¹
     x^s_k = x_k + G_k (x^s_{k+1} − x_{k+1|k})
     P^s_k = P_k + G_k (P^s_{k+1} − P_{k+1|k}) G_kᵀ
 
-with C from the sigma points of the step before Q is added and they are redrawn (Särkkä 2008). The network's residual
-is a known input of the step, so that it is in x_{k+1|k} and needs no term of its own. The process noise is what
-identification found for smoothing, another one than the filter's (:func:`for_smoothing`).
+with C from the sigma points of the step before Q is added and they are redrawn (Särkkä 2008). The network's residual is
+a known input of the step: it is contained in x_{k+1|k}. The process noise is identified separately for smoothing
+(:func:`for_smoothing`).
 
-- A start (first step, gap, failure) ends the recursion: nothing behind it shows of what lies before it.
-- A standstill overwrites the motion with zero. That is no measurement, so none of it goes back.
-- Where the gate opened, the inflated covariance counts as that of the prediction: process noise of that step.
-- The detector is causal: what comes later does not make it find a fault sooner.
+- A start (first step, gap, failure) ends the recursion: later steps give no information on earlier ones.
+- A standstill sets the motion to zero. This is no measurement and is not propagated backward.
+- If the gate opened, the inflated covariance is used as predicted covariance, like process noise of that step.
+- The detector is causal: later samples do not make it detect a fault sooner.
 
-They are mixed as in :mod:`~.adaptive_physics`, with the likelihood of what comes later, forgotten with its distance,
-beside that of what came before: Λ_k + Λ'_k.
+The filters are mixed as in :mod:`~.adaptive_physics`, with the evidence of earlier and of later samples, the latter
+forgotten with its distance: Λ_k + Λ'_k.
 
-A log is smoothed in blocks of fixed time, counted from its first step: each with all that follows up to the end of the
-next block. So a step sees from one to two blocks ahead, memory is bounded, and no window changes a bit.
+A log is smoothed in blocks of fixed duration, counted from its first step, each with all steps up to the end of the
+next block. A step therefore uses one to two blocks of look-ahead, memory is bounded, and the result does not depend on
+the windows.
 """
 
 from __future__ import annotations
@@ -57,13 +58,13 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signa
 from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
 from pdhef_logtool.records.tracks import StateTrack
 
-#: A step sees at least this much ahead and at most twice as much. Sensor biases remember for minutes: against a
-#: smoother that sees all of a drive of 300 s this changed v_y by less than 5e-5 m/s (60 s: 5e-4 m/s).
+#: Minimum look-ahead of a step; the maximum is twice as much. Sensor biases have time constants of minutes: compared
+#: with a look-ahead over a drive of 300 s, v_y changes by less than 5e-5 m/s (60 s: 5e-4 m/s).
 BLOCK_S = 120.0
-#: Steps that are filtered and smoothed at a time, regardless of the window. Changes no bit.
+#: Number of steps that are filtered and smoothed at a time. The result does not depend on it.
 STEPS_AT_ONCE = 8192
-#: What the report states of it.
-NOT_CAUSAL = "not causal: an estimate uses what was measured later; to be ranked apart from causal ones"
+#: Note for the report.
+NOT_CAUSAL = "not causal: estimates use later measurements; to be ranked apart from causal estimators"
 
 
 _compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -92,13 +93,13 @@ def _gain(cross, predicted_P, first, A, L, gain):  # type: ignore[no-untyped-def
             gain[i, k] /= L[i, i]
 
 
-# positional: arrays of steps with a place in them: a view for each would cost as much as the sums.
+# positional: arrays of steps with an index; slices would cost as much time as the sums.
 @_compiled
 def _step_back(forward, k, links, following, xs, Ps, work):  # type: ignore[no-untyped-def]
-    """Take the smoothed state [n] and covariance [n, n] from the step behind to step k of ``forward``.
+    """Update the smoothed state [n] and covariance [n, n] from the following step to step k of ``forward``.
 
-    ``links`` are by step the kind of link, predicted covariance, cross covariance and prior state; ``following`` is the
-    step behind in them.
+    ``links`` has for each step the kind of link, predicted covariance, cross covariance and prior state; ``following``
+    is the index of the following step in it.
     """
     x, P, _ = forward
     kind, predicted_P, cross, prior = links
@@ -134,11 +135,11 @@ def _step_back(forward, k, links, following, xs, Ps, work):  # type: ignore[no-u
 
 @_compiled
 def _smooth(forward, links, tie, span, xs, Ps, out_x, out_P):  # type: ignore[no-untyped-def]
-    """Smooth steps of a piece from the last of a span to its first; ``xs`` [n] and ``Ps`` [n, n] are moved.
+    """Smooth steps of a piece from the last of a span to its first; ``xs`` [n] and ``Ps`` [n, n] are updated in place.
 
-    ``forward`` are posterior state, covariance and prior state, ``links`` kind, predicted covariance, cross covariance
-    and prior, and ``tie`` those of the step behind the span, where xs and Ps are; without one they are not looked at.
-    ``span`` is the first step, the last one that is written and the last one, inclusive.
+    ``forward`` has posterior state, covariance and prior state; ``links`` kind, predicted covariance, cross covariance
+    and prior state. ``tie`` is the link of the step after the span, to which xs and Ps belong, or empty without such
+    a step. ``span``: the first step, the last step to write and the last step, inclusive.
     """
     x, P, _ = forward
     first, last, end = span
@@ -171,9 +172,9 @@ class ForwardSteps(StepColumns):
 
 
 def spans(stamps_ns: IntArray, count: int, origin_ns: int, block_ns: int) -> Iterator[tuple[int, int, int]]:
-    """Yield of each block that begins in the first ``count`` steps its first and last step there, and the last it sees.
+    """Yield for each block that begins in the first ``count`` steps its first, its last, and its last look-ahead step.
 
-    A step of block b, counted from ``origin_ns``, is smoothed with what is given of blocks b and b + 1.
+    A step of block b, counted from ``origin_ns``, is smoothed with the available steps of blocks b and b + 1.
     """
     block = (stamps_ns - origin_ns) // block_ns
     for b in np.unique(block[:count]).tolist():
@@ -189,7 +190,7 @@ def smooth_steps(
     return x[:count], P[:count]
 
 
-# positional: those of `smooth_steps`, and what is known already.
+# positional: arguments of `smooth_steps`, and earlier results.
 def smooth_blocks(
     pieces: Sequence[ForwardSteps],
     stamps_ns: IntArray,
@@ -198,9 +199,9 @@ def smooth_blocks(
     block_ns: int,
     earlier: Smoothed | None = None,
 ) -> Smoothed:
-    """Return what `smooth_steps` does of all steps of the blocks that the first ``count`` steps lie in, [M ≥ count].
+    """Return `smooth_steps` for all steps of the blocks that contain the first ``count`` steps, [M ≥ count].
 
-    ``pieces`` follow each other and contain the steps at ``stamps_ns``. ``earlier`` [D] is the result for the first
+    ``pieces`` are consecutive and contain the steps at ``stamps_ns``. ``earlier`` [D] is the result for the first
     steps, up to the end of a block, which is not computed again.
     """
     n, done = pieces[0].posterior.x.shape[1], 0 if earlier is None else len(earlier[0])
@@ -235,13 +236,13 @@ def _smooth_pieces(
 
 
 def _tie(piece: ForwardSteps) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Return the link of each step to the one before: kind, predicted covariance, cross covariance and prior state."""
+    """Return the link of each step to the previous one: kind, predicted covariance, cross covariance, prior state."""
     return piece.links.kind, piece.links.predicted_P, piece.links.cross, piece.posterior.prior
 
 
 @njit(cache=True)
 def _look_back(dt, likelihood, starts, span, out):  # type: ignore[no-untyped-def]
-    """Add to Λ [K, H] of the first steps of a span the likelihood of what follows them in it."""
+    """Add to Λ [K, H] of the first steps of a span the likelihood of the following steps."""
     first, last, end = span
     later = np.zeros(likelihood.shape[1])
     for k in range(end - 1, first - 1, -1):
@@ -263,10 +264,10 @@ def for_smoothing(physics: PhysicsFilter, factors: Sequence[float]) -> PhysicsFi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedSteps(StepColumns):
-    """Columns that all filters share, and their weights.
+    """Columns shared by all filters, and their weights.
 
-    Their evidence Λ and log-likelihood [K, H] and where the first of them starts [K]; of the detector ``extra_r``
-    [K, 2] and ``reason`` [K].
+    Evidence Λ and log-likelihood [K, H], starts of the first filter [K]; from the detector ``extra_r`` [K, 2] and
+    ``reason`` [K].
     """
 
     stamps_ns: IntArray
@@ -287,11 +288,10 @@ Piece: TypeAlias = tuple[ForwardSteps, ...]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothedState:
-    """State of the inputs, the forward filters [H] and their evidence behind all steps that are taken; those ahead.
+    """State of the inputs, of the forward filters [H] and of their evidence after all processed steps; steps ahead.
 
-    The steps ahead lie in pieces, which are handed on and
-    never joined. ``origin_ns`` is where the blocks begin; ``smoothed`` what is done already of the steps ahead, by
-    filter.
+    The steps ahead are stored in pieces, which are passed on without being joined. ``origin_ns`` is the start of the
+    blocks; ``smoothed`` has the smoothed states of the steps ahead so far, by filter.
     """
 
     inputs: InputState | None
@@ -309,8 +309,8 @@ class SmoothedPhysics:
 
     Parameters
     ----------
-    filtered : the smoothed estimator: its inputs, and its filters run forward.
-    block_s : a step sees at least this much ahead, in s, and at most twice as much.
+    filtered : the estimator to smooth, with its inputs and forward filters.
+    block_s : minimum look-ahead of a step, in s; the maximum is twice as much.
     notes : for the report.
     """
 
@@ -326,7 +326,7 @@ class SmoothedPhysics:
 
     @property
     def look_ahead_s(self) -> float:
-        """How much of what follows a window :meth:`run` is to be given."""
+        """Look-ahead of :meth:`run` beyond a window."""
         return 2.0 * self.block_s
 
     def run(
@@ -339,8 +339,8 @@ class SmoothedPhysics:
 
         Parameters
         ----------
-        ahead : what follows the window, at least ``look_ahead_s`` of it or all that there is; the next window begins
-            with it. Without it the log ends here for all that the smoother has.
+        ahead : samples after the window, at least ``look_ahead_s`` or all that exist; the next window begins with them.
+            Without it, the log ends with the window.
         """
         given = signals if ahead is None else join_signals([signals, ahead])
         if state is None:
@@ -361,7 +361,7 @@ class SmoothedPhysics:
         return reduce(MixtureSteps.joined, parts), state
 
     def _seen(self, stamps_ns: IntArray, end: int, origin_ns: int | None) -> int:
-        """Return how many steps there are up to the end of the block behind that of the last of the first ``end``."""
+        """Return the number of steps up to the end of the block after the one that contains step ``end`` − 1."""
         if end == 0 or origin_ns is None:
             return 0
         block_ns = round(self.block_s * 1e9)
@@ -369,7 +369,7 @@ class SmoothedPhysics:
         return int(np.searchsorted(stamps_ns, origin_ns + (block + 2) * block_ns))
 
     def _filtered(self, checked: CheckedInputs, state: SmoothedState) -> SmoothedState:
-        """Run the filters forward over steps that they have not taken yet; they follow those ahead."""
+        """Run the forward filters over new steps and append these to the steps ahead."""
         filters = self.filtered.filters
         for begin in range(0, max(len(checked.rate), 1), STEPS_AT_ONCE):
             part = checked.cut(begin, begin + STEPS_AT_ONCE)
@@ -393,9 +393,9 @@ class SmoothedPhysics:
         return state
 
     def _smoothed(self, count: int, state: SmoothedState) -> tuple[MixtureSteps, tuple[Smoothed, ...]]:
-        """Smooth the first ``count`` of the steps ahead, with all of them.
+        """Smooth the first ``count`` of the steps ahead, using all of them.
 
-        Also returns, by filter, the smoothed steps that follow, as far as they are done.
+        Also return, by filter, the smoothed states of later steps as far as available.
         """
         shared = state.shared
         assert shared is not None
@@ -445,7 +445,7 @@ def _first_of(pieces: Sequence[PosteriorSteps], count: int) -> PosteriorSteps:
 
 
 def _without(state: SmoothedState, passed: int, smoothed: tuple[Smoothed, ...]) -> SmoothedState:
-    """Return the state behind the first steps ahead, with what is smoothed of those that follow."""
+    """Return the state without the first steps ahead, with the smoothed states of later steps."""
     assert state.shared is not None
     ahead, rest = list(state.ahead), passed
     while ahead and len(ahead[0][0]) <= rest:

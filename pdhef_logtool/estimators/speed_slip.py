@@ -70,7 +70,7 @@ _MEMORY = 28
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlipState:
-    """Memory between windows; ``last_stamp_ns`` is that of the last step."""
+    """Memory between windows; ``last_stamp_ns`` is the stamp of the last step."""
 
     memory: FloatArray
     last_stamp_ns: int | None
@@ -118,7 +118,7 @@ def _brakes(m):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _start(v, wheels, bound, spins):  # type: ignore[no-untyped-def]
-    """Return v̂ at an alarm: the dead-reckoned speed, or that of the axle with less slip if it indicates more slip.
+    """Return v̂ at an alarm: the dead-reckoned speed, or the speed of the axle with less slip if it shows more slip.
 
     Slip that grew slowly at first has changed the speed before the sum began to grow.
     """
@@ -270,7 +270,7 @@ def _run(signals: Signals, sensors: Sensors, state: SlipState | None) -> tuple[b
 def without_slip(
     signals: Signals, sensors: Sensors, state: SlipState | None, *, reckoned: bool = False
 ) -> tuple[Signals, SlipState]:
-    """Return the signals without the speed samples of slipping wheels; the same object if there are none.
+    """Return the signals without the speed samples of slipping wheels; the same object if no sample is removed.
 
     Causal: step k depends on samples up to k. Joined windows give the same bits as one call over the whole log.
 

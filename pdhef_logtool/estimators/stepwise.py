@@ -18,7 +18,7 @@ from pdhef_logtool.records.steps import last_stamp_ns, step_durations_s
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepState:
-    """State of a baseline between windows: its own state vector."""
+    """State of a baseline between windows, including its state vector."""
 
     state: FloatArray
     last_stamp_ns: int | None
@@ -56,7 +56,7 @@ def run_stepwise(
 
 
 def measured_speed(signals: Signals, hold_s: float, before: StepState | None) -> tuple[FloatArray, StepState]:
-    """Return the measured speed at each stamp, [K]: carried on by a_x between samples (:func:`advance_speed`)."""
+    """Return the measured speed at each stamp, [K], integrated by a_x between samples (:func:`advance_speed`)."""
 
     def step(
         dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, _rates: FloatArray, _valid: BoolArray
@@ -76,9 +76,9 @@ def _advance_speeds(dt, ax, speed, hold_s, state, values):  # type: ignore[no-un
 
 @njit(cache=True)
 def advance_speed(state, dt, ax, speed, hold_s):  # type: ignore[no-untyped-def]
-    """Advance [v_x, age of the last speed sample] by one step in place; v_x is NaN where no sample is near.
+    """Advance [v_x, age of the last speed sample] by one step in place; v_x is NaN without a recent sample.
 
-    Between samples v_x follows a_x (0 where it is missing), at most ``hold_s``.
+    Between samples v_x is integrated by a_x (0 if missing), for at most ``hold_s``.
     """
     if math.isfinite(speed):
         state[0] = speed

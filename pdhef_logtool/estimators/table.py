@@ -1,6 +1,6 @@
-"""Every estimator: a line of :data:`SPECS` and a file that builds it.
+"""Registry of estimators: a line of :data:`SPECS` and a file with the builder of each.
 
-A name is a preset: ``build`` makes of it, for a car and options, the algorithm that runs (:mod:`~.algorithm`).
+A name is a preset: ``build`` returns the algorithm for a car and options (:mod:`~.algorithm`).
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import has_gnss
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 
-#: What drives the vehicle model; a filter uses a_y and yaw rate where the log has them, ``physics`` steering too.
+#: Inputs of the vehicle model; a filter uses a_y and yaw rate if the log has them, ``physics`` steering too.
 _SPEED = frozenset({"speed_m_s"})
 _INPUTS = _SPEED | {"steer_rad"}
 _LATERAL = frozenset({"steer_rad", "yaw_rate_rad_s", "ay_m_s2"})
-#: What the features of a network and the evidence of learning are made of.
+#: Signals for the features of a network and the evidence of learning.
 FEATURES: frozenset[str] = _INPUTS | {"ay_m_s2", "yaw_rate_rad_s"}
 
 
@@ -41,12 +41,12 @@ class Spec:
     ----------
     build : called with the name, the :class:`Car` and :class:`Options`: a function, or ``module:function`` under
         :mod:`pdhef_logtool.estimators`, imported when it is first needed.
-    needs : aligned signals without which it cannot run. one_of : signals; it needs at least one of them; empty: none.
-    colour : 0xRRGGBB in every plot, tellable apart with any colour vision (Okabe and Ito 2008; Tol's muted scheme).
-    causal : whether an estimate at t uses only what had arrived by t.
+    needs : required aligned signals. one_of : signals; it requires at least one of them, unless empty.
+    colour : 0xRRGGBB in every plot, distinguishable with any colour vision (Okabe and Ito 2008; Tol's muted scheme).
+    causal : whether an estimate at t uses only samples available at t.
     in_all : whether it is one of :data:`ALL_ESTIMATORS`.
-    network : which part of a network bundle it needs; empty: none; ``optional``: it runs without as well.
-    needs_noise : whether it cannot run without noise of its own in the car.
+    network : required part of a network bundle; empty: no part; ``optional``: it also runs without.
+    needs_noise : whether it requires filter noise in the car.
     """
 
     name: str
@@ -61,11 +61,11 @@ class Spec:
     one_of: frozenset[str] = frozenset()
 
     def lacking(self, available: frozenset[str]) -> list[str]:
-        """Return the signals that a log would have to provide for it, beside those that it has."""
+        """Return the required signals that a log does not provide."""
         return sorted(self.needs - available | (self.one_of if self.one_of.isdisjoint(available) else frozenset()))
 
     def missing(self, car: Car) -> str:
-        """Return why a car does not let it run, empty if it does."""
+        """Return why it cannot run on a car, empty if it can."""
         if self.name == OPEN_LOOP and car.self_calibrated is None:
             return "the log has not calibrated its car"
         if preset_of(self.name) in SELF_CALIBRATED:
@@ -77,26 +77,24 @@ class Spec:
         if car.network is None:
             return "no network; --network names one, pdhef train writes one"
         if self.network == "residual":
-            return (
-                "" if car.residual_network is not None else "the network is one for phy-ukf; pdhef train makes another"
-            )
+            return "" if car.residual_network is not None else "the network is for phy-ukf; pdhef train writes another"
         if self.network == "paper":
             has = car.network.paper_network is not None or car.network.model == NOMINAL_MODEL
-            return "" if has else "no network as the paper has it; pdhef train --paper makes one"
+            return "" if has else "no network of the paper's design; pdhef train --paper writes one"
         if getattr(car.network, self.network) is None:
             return "the network has no such baseline; pdhef train --baselines writes it"
         return ""
 
     def make(self, car: Car, options: Options) -> Estimator:
-        """Build it; compiled code is imported here and not before.
+        """Build the estimator; compiled code is only imported here.
 
         Raises
         ------
         UsageError
-            The car lacks what it needs.
+            The car lacks a required part.
         """
         if reason := self.missing(car):
-            raise UsageError(expected="a car that has what it needs", got=reason, where=self.name)
+            raise UsageError(expected="a car with all required parts", got=reason, where=self.name)
         build = self.build
         if isinstance(build, str):
             module, _, function = build.partition(":")
@@ -117,18 +115,18 @@ class Spec:
 
 
 def _aided(build: Callable[[str, Car, Options], Estimator], name: str, car: Car, options: Options) -> Estimator:
-    from pdhef_logtool.estimators.gnss_aided import GnssAided  # compiled code is imported where it is needed
+    from pdhef_logtool.estimators.gnss_aided import GnssAided  # compiled code is imported on demand
 
     return GnssAided(build(name, car, options))  # type: ignore[arg-type]
 
 
 #: Estimators of other packages: each entry point names a :class:`Spec`.
 ENTRY_POINTS = "pdhef.estimators"
-#: What the fork server of workers that filter has loaded.
+#: Modules that the fork server of workers has loaded.
 FILTERS = ("pdhef_logtool.estimators.*", "pdhef_logtool.compiled.cache:load_kept")
-#: In place of names: every estimator that the car suits.
+#: In place of names: every estimator that can run on the car.
 ALL_ESTIMATORS = "all"
-#: Those of this package, in the order of the tables.
+#: Estimators of this package, in the order of the tables.
 SPECS: tuple[Spec, ...] = (
     Spec(
         "zero", "sideslip 0; speed, yaw rate and lateral acceleration from the sensors", "pass_through:build",
@@ -147,7 +145,7 @@ SPECS: tuple[Spec, ...] = (
         _INPUTS, 0xE69F00,
     ),
     Spec(
-        OPEN_LOOP, "open-loop on the car as its log calibrated it, without ground truth: not causal",
+        OPEN_LOOP, "open-loop on the car calibrated by its log, without ground truth: not causal",
         "open_loop:build", _INPUTS, 0x661100, causal=False,
     ),
     Spec(
@@ -160,7 +158,7 @@ SPECS: tuple[Spec, ...] = (
         "phy_ukf:build", _INPUTS, 0x0072B2,
     ),
     Spec(
-        "physics", "the strongest filter on physics alone, with the parts that driving of the car gave evidence for",
+        "physics", "best filter with physics only, with the model parts supported by driving data",
         "adaptive_physics:build", _SPEED, 0x44AA99, one_of=_LATERAL,
     ),
     Spec(
@@ -168,11 +166,11 @@ SPECS: tuple[Spec, ...] = (
         "phy_ukf:build", _INPUTS, 0x56B4E9, needs_noise=True,
     ),
     Spec(
-        "pure-lstm", "a network that outputs v_y itself, no filter (needs a network with baselines)",
+        "pure-lstm", "a network that outputs v_y, without a filter (needs a network with baselines)",
         "direct_network:build", FEATURES, 0xAA4499, network="pure_lstm",
     ),
     Spec(
-        "pd-hef", "physics plus the residual of its network, as far as the car's evidence lets it",
+        "pd-hef", "physics plus the residual of its network, with a gain by the car's evidence",
         "pd_hef:build", _SPEED, 0xD55E00, network="optional", one_of=_LATERAL,
     ),
     Spec(
@@ -180,7 +178,7 @@ SPECS: tuple[Spec, ...] = (
         "pd_hef:build", _INPUTS, 0x117733, network="residual",
     ),
     Spec(
-        "pd-hef-smoothed", "pd-hef smoothed with what came later: not causal, ranked apart",
+        "pd-hef-smoothed", "pd-hef smoothed with later samples: not causal, ranked apart",
         "pd_hef:build_smoothed", _SPEED, 0x332288, causal=False, network="optional", one_of=_LATERAL,
     ),
     Spec(
@@ -189,7 +187,7 @@ SPECS: tuple[Spec, ...] = (
         "pd_hef:build", _INPUTS, 0x882255, in_all=False, network="residual",
     ),
     Spec(
-        "pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, to the letter (needs its network)",
+        "pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, unchanged (needs its network)",
         "hybrid_paper:build", FEATURES, 0xCC6677, network="paper",
     ),
 )  # fmt: skip
@@ -237,7 +235,7 @@ def all_specs() -> tuple[Spec, ...]:
 
 
 def spec_of(name: str) -> Spec:
-    """Return the line of a name; raises UsageError if there is none."""
+    """Return the spec of a name; raises UsageError for an unknown name."""
     check_names((name,))
     lines = {s.name: s for s in all_specs()}
     if name in lines:
@@ -248,7 +246,7 @@ def spec_of(name: str) -> Spec:
 
 
 def check_names(names: Sequence[str]) -> None:
-    """Raise UsageError if a name is unknown or occurs twice, or there is none; :data:`ALL_ESTIMATORS` is used alone."""
+    """Raise UsageError for an unknown or repeated name, and for no names; :data:`ALL_ESTIMATORS` must be alone."""
     if tuple(names) == (ALL_ESTIMATORS,):
         return
     presets = list(dict.fromkeys(preset_of(s.name) for s in all_specs()))
@@ -263,16 +261,16 @@ def check_names(names: Sequence[str]) -> None:
 
 
 def all_names(car: Car) -> tuple[str, ...]:
-    """Return the estimators that :data:`ALL_ESTIMATORS` represents: those that the car has what they need for.
+    """Return the estimators of :data:`ALL_ESTIMATORS`: those that find all required parts in the car.
 
-    Baselines and physics first, then what depends on a network.
+    Baselines and physics first, then estimators with a network.
     """
     suited = [s for s in all_specs() if s.in_all and not s.missing(car)]
     return tuple(s.name for s in sorted(suited, key=lambda s: bool(s.network)))
 
 
 def make_estimator(name: str, car: Car, options: Options | None = None) -> Estimator:
-    """Build an estimator by its name; raises UsageError if the car lacks what it needs."""
+    """Build an estimator by its name; raises UsageError if the car lacks a required part."""
     return spec_of(name).make(car, options or Options())
 
 
@@ -283,12 +281,12 @@ def runnable(
     options: Options | None = None,
     refused: Collection[str] = (),
 ) -> tuple[list[Estimator], list[Skipped]]:
-    """Split estimators into those whose needs car and log meet, built, and those that are skipped with the reason.
+    """Build the estimators that car and log allow; return these, and the skipped ones with their reasons.
 
     Parameters
     ----------
     names : of estimators, or :data:`ALL_ESTIMATORS` alone. available : signals of the log.
-    refused : signals that the log has and that nothing is computed from, because a check of them failed.
+    refused : signals of the log that failed a check and are not used.
     """
     options = options or Options()
     options = replace(options, gnss=options.gnss and has_gnss(available))
@@ -311,6 +309,6 @@ def runnable(
 
 
 def _sources_of(aligned: Sequence[str], refused: Collection[str]) -> set[str]:
-    """Return the refused signals that aligned ones could come from: a steering or wheel angle has two names."""
+    """Return the refused signals that may be the source of aligned ones: steering and wheel angles have two names."""
     stems = {name.partition("_")[0] for name in aligned} | ({"wheel", "gnss"} if "speed_m_s" in aligned else set())
     return {name for name in refused if name in aligned or name.partition("_")[0] in stems}

@@ -2,7 +2,7 @@
 
 See docs/method.md#filter.
 
-All functions work on small float64 arrays in place of allocation where it matters, and contain no vehicle model.
+All functions operate on small float64 arrays, avoid allocation in inner loops, and contain no vehicle model.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.records.signals import FloatArray
 
-#: Smallest variance that a repaired covariance keeps on its diagonal.
+#: Smallest variance on the diagonal of a repaired covariance.
 COVARIANCE_FLOOR = 1e-12
 
 
@@ -54,7 +54,7 @@ def cholesky_lower(P, L):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def repair_covariance(P):  # type: ignore[no-untyped-def]
-    """Make P [n, n] symmetric positive definite in place: eigenvalues below the floor are raised to it.
+    """Make P [n, n] symmetric positive definite in place by raising eigenvalues to the floor.
 
     Non-finite values are kept; the filter detects them.
     """
@@ -199,7 +199,7 @@ def whiten(nu, S, use, index, L, w):  # type: ignore[no-untyped-def]
     """Whiten the innovation nu [m], of covariance S [m, m], in the channels of ``use`` (bool [m]).
 
     Writes which channels are used to ``index`` [m], and in their order the factor of their covariance to L [m, m] and
-    w = L⁻¹ν [m]. Returns what :func:`kalman_update` does.
+    w = L⁻¹ν [m]. Returns the results of :func:`kalman_update`.
     """
     used = 0
     for k in range(nu.shape[0]):
@@ -238,7 +238,7 @@ def kalman_update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
     nis : νᵀ S⁻¹ ν over the used channels. dof : how many. log_likelihood : of the innovation, Gaussian.
     """
     n, m = Pxz.shape
-    work = np.empty((n + m + 1, m))  # to allocate takes longer than to compute
+    work = np.empty((n + m + 1, m))  # one allocation, as it takes longer than the computation
     G, L, w = work[:n], work[n : n + m], work[n + m]
     index = np.empty(m, dtype=np.int64)
     nis, d, log_likelihood = whiten(nu, S, use, index, L, w)

@@ -1,4 +1,4 @@
-"""Block bootstrap within one drive: errors are correlated over seconds, so whole blocks are drawn, not samples."""
+"""Block bootstrap within one drive. Blocks are drawn instead of samples, because errors are correlated over seconds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pdhef_logtool.records.signals import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A figure with its percentile interval. ``blocks``: number of blocks drawn from; below 2 the bounds are NaN."""
+    """A value with its percentile interval. ``blocks``: number of blocks; below 2 the bounds are NaN."""
 
     value: float
     low: float
@@ -30,16 +30,16 @@ def block_bootstrap_difference(
     n: int = 1000,
     seed: int = 0,
 ) -> Interval:
-    """Return RMSE(errors) − RMSE(other_errors) with its interval, paired: only stamps where both are known, same draws.
+    """Return RMSE(errors) − RMSE(other_errors) with its interval, over the same stamps and draws.
 
-    ``errors`` belong to the better estimator when the whole interval lies below 0. ``block_s``: at least 10 s
-    (docs/method.md#evaluation). ``n``: resamples.
+    ``errors`` belong to the better estimator if the whole interval is below 0. ``block_s``: at least 10 s
+    (docs/method.md#evaluation). ``n``: number of resamples.
     """
     return rmse_difference_interval(*_block_sums([errors, other_errors], stamps_ns, block_s), n=n, seed=seed)
 
 
 def rmse_difference_interval(sums: FloatArray, counts: FloatArray, *, n: int = 1000, seed: int = 0) -> Interval:
-    """Return the first RMSE less the second with its interval; ``sums`` of squares [2, K], ``counts`` [K]."""
+    """Return the first RMSE minus the second with its interval; ``sums`` of squares [2, K], ``counts`` [K]."""
     return _interval(lambda s, c: np.sqrt(s[0] / c) - np.sqrt(s[1] / c), sums, counts, n, seed)
 
 
@@ -76,5 +76,5 @@ def _interval(
 
 @lru_cache(maxsize=2)
 def _draws(blocks: int, n: int, seed: int) -> IntArray:
-    """Return how often each block is in each resample, [n, blocks]: the same for all figures of a drive."""
+    """Return the count of each block in each resample, [n, blocks], the same for all values of a drive."""
     return np.random.default_rng(seed).multinomial(blocks, np.full(blocks, 1.0 / blocks), size=n)

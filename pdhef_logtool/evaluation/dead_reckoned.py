@@ -1,9 +1,9 @@
-"""Errors of positions, which exist only with the ground-truth pose: an estimate dead-reckoned from it.
+"""Position errors of an estimate that is dead-reckoned from the ground-truth pose.
 
 ``position_m``: distance between the ground-truth position and v_x, v_y, r dead-reckoned from the ground-truth pose at
-the first common stamp. ``lateral_1s_m``: dead reckoning is restarted from the ground-truth pose every second; the error
-is the lateral one, in the ground-truth axes, at the end of each second. A second with an invalid estimate, a missing
-pose or a gap does not count.
+the first common stamp. ``lateral_1s_m``: dead reckoning restarts from the ground-truth pose every second; the error is
+the lateral distance, in the ground-truth axes, at the end of each second. Seconds with an invalid estimate, a missing
+pose or a gap are excluded.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pdhef_logtool.records.tracks import StateTrack
 
 ANCHOR_S = 1.0
 _MOST_POINTS = 500
-#: No second of dead reckoning may contain a longer step between stamps.
+#: Longest step between stamps within a second of dead reckoning.
 MAX_STEP_S = 0.2
 
 
@@ -37,7 +37,7 @@ def position_error(estimate: StateTrack, truth: StateTrack) -> FloatArray:
 
 
 def lateral_errors(estimate: StateTrack, truth: StateTrack) -> FloatArray:
-    """Return the lateral errors [K] in m at the ends of the seconds that count."""
+    """Return the lateral errors [K] in m at the ends of the valid seconds."""
     pose, motion, stamps = pose_known(truth), _motion_known(estimate), truth.stamps_ns
     if not (pose & motion).any():
         return np.empty(0)
@@ -49,7 +49,7 @@ def lateral_errors(estimate: StateTrack, truth: StateTrack) -> FloatArray:
     whole = (lost[end] == (lost - ~motion)[begin]) & (gaps[end] == gaps[begin]) & pose[begin] & pose[end]
     whole &= end > begin
     begin, end = begin[whole], end[whole]
-    # One dead reckoning serves all seconds: a new start pose only turns and moves it.
+    # One dead reckoning is enough for all seconds: a new start pose only rotates and moves it.
     x, y, yaw = _dead_reckon(estimate, (0.0, 0.0, 0.0))
     turn = truth.yaw_rad[begin] - yaw[begin]
     cosine, sine = np.cos(turn), np.sin(turn)
@@ -61,10 +61,10 @@ def lateral_errors(estimate: StateTrack, truth: StateTrack) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class PathDrift:
-    """Distance of a dead-reckoned path from that of the ground truth in m.
+    """Distance of a dead-reckoned path from the path of the ground truth in m.
 
     ``end_m`` at the end of ``length_m`` from a common start; ``largest_aligned_m`` after the rotation and translation
-    (SE(2)) that bring the paths closest to one another.
+    (SE(2)) that minimise the distance of the paths.
     """
 
     end_m: float
@@ -87,7 +87,7 @@ def path_drift(estimate: StateTrack, truth: StateTrack) -> PathDrift | None:
 
 
 def aligned_path(source: FloatArray, target: FloatArray) -> FloatArray:
-    """Return points [2, K] after the rotation and translation that bring them closest to ``target`` [2, K]."""
+    """Return points [2, K] after the rotation and translation that minimise their distance to ``target`` [2, K]."""
     a, b = (p - p.mean(axis=1, keepdims=True) for p in (source, target))
     angle = np.arctan2(np.sum(a[0] * b[1] - a[1] * b[0]), np.sum(a * b))
     cosine, sine = np.cos(angle), np.sin(angle)

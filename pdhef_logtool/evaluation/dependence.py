@@ -1,10 +1,10 @@
-"""How much drives of one day, car or route depend on one another, estimated from a figure of these drives.
+"""Dependence of drives with the same day, car or route, estimated from the scores of these drives.
 
-Drives that share a factor are correlated. The correlation r of such pairs is estimated from the scores themselves, and
-widens intervals by the design effect D = 1 + r P / n of n drives with P ordered pairs (Kish 1965, section 8.2). A pair
-that shares several factors counts once (Cameron, Gelbach and Miller 2011), so that nested factors are not counted
-twice. With G groups the degrees of freedom are (G - 1) D / (D - 1). Those of Satterthwaite (1946), (G - 1) (D / (D -
-1))^2, are too many because r is limited to r >= 0; docs/comparing.md shows the resulting rate of false alarms.
+Drives that share a factor are correlated. The correlation r of such pairs is estimated from the scores and widens
+intervals by the design effect D = 1 + r P / n of n drives with P ordered pairs (Kish 1965, section 8.2). A pair that
+shares several factors counts once (Cameron, Gelbach and Miller 2011), so that nested factors are not counted twice.
+With G groups, the degrees of freedom are (G - 1) D / (D - 1). The formula of Satterthwaite (1946), (G - 1) (D / (D -
+1))^2, gives too many, because r is limited to r >= 0; docs/comparing.md shows the resulting rate of false alarms.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ import numpy as np
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.records.student import student_quantile
 
-#: Metadata keys that name a route, the first one that a log has.
+#: Metadata keys of a route; the first one in the log counts.
 ROUTE_KEYS = ("route", "track", "course")
 
-#: What is estimated unless the user names a cluster.
+#: Factors unless the user names a cluster.
 FACTORS = ("day", "car", "route")
-#: A design effect that an estimated correlation may give at least.
+#: Lower limit of an estimated design effect.
 _LEAST_EFFECT = 0.2
-#: What each drive states by factor (day, car, route); None: the log does not state it.
+#: Values of each drive by factor (day, car, route); None if the log does not contain it.
 Factors = Mapping[str, Sequence[object]]
 
 
 @dataclass(frozen=True, slots=True)
 class Dependence:
-    """The dependence of drives on one another.
+    """Dependence between drives.
 
     Attributes
     ----------
-    design_effect : variance of a mean relative to independent drives, at least 1; less is possible for a difference.
-    freedom : degrees of freedom of the estimate; infinite where no dependence is found.
-    by : factors whose drives are correlated, the strongest first.
+    design_effect : variance of a mean relative to independent drives, at least 1; it may be lower for a difference.
+    freedom : degrees of freedom of the estimate; infinite without dependence.
+    by : factors with correlated drives, the strongest first.
     levels : number of different values of each factor that has two or more.
     """
 
@@ -52,7 +52,7 @@ class Dependence:
         """Return a sentence on the dependence of drives of one day, car or route."""
         groups = [f"{count} {name}s" for name, count in self.levels if count > 1]
         if not groups:
-            return "Drives are taken as independent: days, cars and routes are the same in all drives, or not recorded."
+            return "Drives are assumed independent: days, cars and routes are the same in all drives, or not recorded."
         among = f"{drives} drives of {', '.join(groups)}"
         if self.design_effect == 1.0:
             return f"Design effect 1: no dependence between {among}."
@@ -72,7 +72,7 @@ def deviate(share: float, freedom: float) -> float:
 
 
 def numbered(values: Sequence[object]) -> IntArray:
-    """Return an integer for each different value [N]; a drive that states none (None) is a value of its own."""
+    """Return an integer for each different value [N]; each None is a separate value."""
     numbers: dict[object, int] = {}
     return np.array(
         [numbers.setdefault(("alone", i) if v is None else v, len(numbers)) for i, v in enumerate(values)],
@@ -83,12 +83,12 @@ def numbered(values: Sequence[object]) -> IntArray:
 def dependence(scores: FloatArray, factors: Factors, weights: FloatArray | None = None) -> Dependence:
     """Return the dependence of drives by their scores [N], which need not be centred.
 
-    ``weights`` [N]: those of a difference of two means, for its design effect. It is below 1 for drives of the same
-    days, as the influence of these cancels; the scores are then deviations from both means.
+    ``weights`` [N]: weights of a difference of two means, for its design effect. The scores are then deviations from
+    both means. The effect is below 1 for drives of the same days, because their influence cancels.
     """
     n = len(scores)
     x = scores - scores.mean() if n else scores
-    means = 1 if weights is None else 2  # which the scores are deviations from
+    means = 1 if weights is None else 2
     weights = np.ones(n) if weights is None else weights
     parts: dict[str, IntArray] = {}
     for name, values in factors.items():
@@ -116,7 +116,7 @@ def _pairs(values: FloatArray, parts: Sequence[IntArray]) -> float:
     """Return the sum of products over ordered pairs of drives that share any of the partitions."""
     square = float(values @ values)
     products = 0.0
-    for size in range(1, len(parts) + 1):  # inclusion and exclusion: a pair that shares several counts once
+    for size in range(1, len(parts) + 1):  # inclusion and exclusion: a pair with several common factors counts once
         for some in combinations(parts, size):
             sums = _sums(values, some)
             products -= (-1.0) ** size * (float(sums @ sums) - square)
@@ -130,7 +130,7 @@ def _correlation(x: FloatArray, parts: Sequence[IntArray]) -> float:
     others = n * (n - 1.0) - pairs
     if pairs <= 0.0 or others <= 0.0:
         return 0.0
-    # Centring puts the same amount into the products of all pairs: their difference is free of it.
+    # Centring adds the same amount to the products of all pairs; it cancels in their difference.
     products = _pairs(x, parts) * n / float(x @ x)
     shared, apart = products / pairs, (-n - products) / others
     return (shared - apart) / (1.0 - apart)
@@ -150,13 +150,13 @@ def _sums(values: FloatArray, parts: Sequence[IntArray]) -> FloatArray:
 
 
 def _freedom(part: IntArray, means: int) -> float:
-    """Return the effective number of a partition's groups, less the number of means."""
+    """Return the effective number of a partition's groups minus the number of means."""
     counts = np.bincount(part).astype(np.float64)
     return max(float(np.sum(counts**2) ** 2 / np.sum(counts**4)) - means, 1.0)
 
 
 def factors_of(entry: Mapping[str, Any], report: Mapping[str, Any] | None) -> dict[str, str | None]:
-    """Return day (UTC), car and route of a drive by its entry in run.json, day and route else by its report."""
+    """Return day (UTC), car and route of a drive from run.json, or day and route from its report."""
     car = (entry.get("car") or {}).get("name")
     stated = {key: entry.get(key) for key in ("day", "route")}
     if report is not None and not any(stated.values()):
@@ -166,7 +166,7 @@ def factors_of(entry: Mapping[str, Any], report: Mapping[str, Any] | None) -> di
 
 
 def day_and_route(start_ns: int | None, metadata: Mapping[str, Any]) -> tuple[str | None, str | None]:
-    """Return the day (UTC) on which a log starts, and the route that its metadata name."""
+    """Return the day (UTC) on which a log starts, and the route from its metadata."""
     from datetime import UTC, datetime
 
     texts = {str(k).rpartition(".")[2].lower(): str(v) for k, v in metadata.items()}

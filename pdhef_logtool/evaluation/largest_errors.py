@@ -1,4 +1,4 @@
-"""The places of the largest errors of a drive, at least a second apart."""
+"""Rows of the largest errors of a drive, at least a second apart."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import numpy as np
 
 from pdhef_logtool.records.signals import FloatArray, IntArray
 
-#: Places at most; two of them are further apart than this, and than this share of the drive.
+#: Largest number of rows; least distance of two rows in time, and as a share of the drive.
 PLACES, _APART_S, _APART_SHARE = 10, 1.0, 0.02
 
 
 def largest_places(stamps_ns: IntArray, error: FloatArray) -> list[int]:
-    """Return the rows of the largest absolute errors [N], the largest first; NaN does not count."""
+    """Return the rows of the largest absolute errors [N], the largest first, without NaN."""
     if not len(stamps_ns):
         return []
     size = np.nan_to_num(np.abs(error), nan=0.0)

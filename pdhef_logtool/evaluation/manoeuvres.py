@@ -1,9 +1,10 @@
-"""Manoeuvres of the standards in a recorded drive, by rules on steering, yaw rate, speed and acceleration.
+"""Detection of standard manoeuvres in a recorded drive, by rules on steering, yaw rate, speed and acceleration.
 
-Sensors decide, never ground truth. The steering angle is converted into a *demand*: the lateral acceleration of a
-linear car in steady state, ``δ v² / (L (1 + v²/v_ch²))``. One threshold then suits all speeds and sizes of cars, and
-does not depend on friction. A *swing* is the time in which the demand stays to one side; its duration is measured at
-half its peak. Every rule is mirror symmetric. Thresholds are in :class:`ManoeuvreRules`, the rules in docs/metrics.md.
+The rules use sensors only, never ground truth. The steering angle is converted to a *demand*: the lateral acceleration
+of a linear car in steady state, ``δ v² / (L (1 + v²/v_ch²))``. One threshold then suits all speeds and sizes of cars,
+and does not depend on friction. A *swing* is the time in which the demand stays to one side; its duration is measured
+at half its peak. All rules are mirror symmetric. :class:`ManoeuvreRules` contains the thresholds, docs/metrics.md the
+rules.
 """
 
 from __future__ import annotations
@@ -36,46 +37,46 @@ MANOEUVRES = (
 )
 _STEP_NS = 20_000_000
 _STEP_S = 0.02
-#: Of the steering's zero one row in so many is enough.
+#: The zero of the steering is computed from one row in this many.
 _ZERO_EVERY = 10
 
 
 @dataclass(frozen=True, slots=True)
 class ManoeuvreRules:
-    """All thresholds; ``demand`` and ``swing``: as the head of this file defines them.
+    """All thresholds; the module docstring defines demand and swing.
 
     Attributes
     ----------
-    characteristic_speed_m_s : nominal v_ch. least_speed_m_s : below it nothing is a manoeuvre.
-    swing_m_s2, least_peak_m_s2 : demand that bounds a swing, and that its peak reaches.
-    peak_m_s2, strong_m_s2 : demand that steps and repeated swings reach; sine steer, sine with dwell, fishhook and lane
-        changes.
-    slack_m_s2 : demand by which steering that is held may differ beside ``held``: noise, and correction by the driver.
-    straight_m_s2, straight_s : mean |v r| below, and for how long, before a manoeuvre that starts straight ahead.
-    wheels_straight_rad : steering within which the gyro's zero is read.
+    characteristic_speed_m_s : nominal v_ch. least_speed_m_s : lowest speed of a manoeuvre.
+    swing_m_s2, least_peak_m_s2 : demand at the ends of a swing, and least demand at its peak.
+    peak_m_s2, strong_m_s2 : least peak demand of steps and repeated swings; of sine steer, sine with dwell, fishhook
+        and lane changes.
+    slack_m_s2 : demand by which held steering may differ in addition to ``held``: noise and corrections of the driver.
+    straight_m_s2, straight_s : largest mean |v r| and least duration of straight driving before a manoeuvre.
+    wheels_straight_rad : largest steering angle for the gyro's zero.
     swing_gap_s, swing_s : longest time between two swings of one manoeuvre; longest swing of repeated ones.
     equal_peaks : smallest ratio of the peaks of two swings that count as equal.
     sine_hz, sine_equal : frequencies of a single sine (ISO 7401), smallest ratio of the durations of its swings.
-    dwell_s : by how much the second swing of a sine with dwell lasts longer (FMVSS 126: 0.5 s).
+    dwell_s : additional duration of the second swing of a sine with dwell (FMVSS 126: 0.5 s).
     fishhook_s, fishhook_first_s : shortest second and longest first swing of a fishhook (NHTSA: second held for 3 s).
     repeated, sweep_repeated : least number of swings of a slalom; of a continuous sine or sweep.
-    regular : largest difference of a spacing of swings to the one before, as a share.
+    regular : largest relative difference between successive spacings of swings.
     slalom_hz, sweep_ratio : highest frequency of a slalom; least growth of the frequency in a sweep.
     side_m : distance over which the path of a double lane change is beyond half its offset (24 m on the course of ISO
-        3888-2, 52 m on that of ISO 3888-1). severe_m, severe_m_s : below both it is ISO 3888-2.
-    offset_m, exit_m, returned, overshoot, sideways, heading_left : of a double lane change: sideways offset; length of
-        the exit lane; largest share of the offset that is left on its average, and how much less an overshoot to the
-        other side counts; sideways distance beside 1.2 times that of going out and back once, as a share of it for each
-        swing above three; largest share of the peak heading that is left on the exit lane's average.
-    step_rise_s, held, held_s : 10 to 90 % of a step; share within which the steering is held, and for how long.
+        3888-2, 52 m of ISO 3888-1). severe_m, severe_m_s : a manoeuvre below both is ISO 3888-2.
+    offset_m, exit_m, returned, overshoot, sideways, heading_left : of a double lane change: lateral offset; length of
+        the exit lane; largest remaining share of the offset, averaged over the exit lane, and weight of an overshoot to
+        the other side; allowance for lateral distance above 1.2 times one way out and back, as a share of it for each
+        swing above three; largest remaining share of the peak heading, averaged over the exit lane.
+    step_rise_s, held, held_s : 10 to 90 % rise time of a step; tolerance of held steering, and its duration.
     ramp_s, ramp_m_s2, ramp_misfit, ramp_speed : of a ramp: duration, demand at its end, largest RMS deviation from a
         line over its height, largest change of speed.
-    circle_rad, circle_s, circle_m_s2, circle_share : of a circle: heading turned, duration, least |v r|, and the share
-        within which the curvature stays.
+    circle_rad, circle_s, circle_m_s2, circle_share : of a circle: change of heading, duration, least |v r|, and
+        relative tolerance of the curvature.
     turn_m_s2, turn_s, turn_speed : steady cornering before the car slows: |v r|, duration, largest change of speed.
     brake_m_s2, gentle_brake_m_s2, brake_share : braking is a fall of a_x by the first, or by the second and this share
         of |v r| (low friction). power_off_m_s2 : least fall of a_x when the throttle is released.
-    slowing_s, longest_slowing_s : how long the car slows at least, and at most for one manoeuvre.
+    slowing_s, longest_slowing_s : shortest and longest deceleration of one manoeuvre.
     """
 
     characteristic_speed_m_s: float = 25.0
@@ -137,7 +138,7 @@ RULES = ManoeuvreRules()
 
 @dataclass(frozen=True, slots=True)
 class Manoeuvre:
-    """A manoeuvre in [start_ns, end_ns): first side (1 left, -1 right), speed at its start, and peaks in SI units."""
+    """A manoeuvre in [start_ns, end_ns): first side (1 left, -1 right), speed at the start, and peaks in SI units."""
 
     name: str
     start_ns: int
@@ -151,7 +152,7 @@ class Manoeuvre:
 
     @property
     def text(self) -> str:
-        """Return what is worth knowing, in words."""
+        """Return side, speed and peaks as text."""
         return (
             f"{'left' if self.side > 0 else 'right'}, from {self.speed_m_s * 3.6:.0f} km/h, |a_y| to "
             f"{self.peak_ay_m_s2:.1f} m/s², yaw rate to {np.degrees(self.peak_yaw_rate_rad_s):.0f}°/s, "
@@ -160,7 +161,7 @@ class Manoeuvre:
 
 
 def find_manoeuvres(signals: Signals, vehicle: VehicleParameters, rules: ManoeuvreRules = RULES) -> list[Manoeuvre]:
-    """Return the manoeuvres of a drive in order of time; no two overlap."""
+    """Return the manoeuvres of a drive in order of time, without overlaps."""
     wheelbase_m = vehicle.cg_to_front_axle_m + vehicle.cg_to_rear_axle_m
     zeros = _zeros(signals, wheelbase_m, rules)
     manoeuvres = [m for run in _runs_of(signals, wheelbase_m, zeros, rules) for m in _manoeuvres_of(run, rules)]
@@ -168,7 +169,7 @@ def find_manoeuvres(signals: Signals, vehicle: VehicleParameters, rules: Manoeuv
 
 
 def manoeuvre_masks(stamps_ns: IntArray, manoeuvres: Sequence[Manoeuvre]) -> dict[str, BoolArray]:
-    """Return the mask [N] of every manoeuvre by name."""
+    """Return the mask [N] of each manoeuvre by name."""
     masks = {name: np.zeros(len(stamps_ns), dtype=np.bool_) for name in MANOEUVRES}
     for m in manoeuvres:
         masks[m.name][np.searchsorted(stamps_ns, m.start_ns) : np.searchsorted(stamps_ns, m.end_ns)] = True
@@ -180,9 +181,10 @@ def manoeuvre_masks(stamps_ns: IntArray, manoeuvres: Sequence[Manoeuvre]) -> dic
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Run:
-    """Columns [N] every 20 ms from ``start_ns`` on, in SI units.
+    """Columns [N] every 20 ms from ``start_ns``, in SI units.
 
-    ``steer``: from its zero; ``gain``: demand over steering; ``turn``: v r; ``curvature``: r / v, smoothed to 1 Hz.
+    ``steer``: corrected by its zero; ``gain``: demand over steering; ``turn``: v r; ``curvature``: r / v, smoothed to
+    1 Hz.
     """
 
     start_ns: int
@@ -215,7 +217,7 @@ class _Swing:
 
 
 def _speed(signals: Signals) -> FloatArray:
-    """Return the speed [N]: measured, else of the wheels, else of GNSS."""
+    """Return the speed [N] from the speed sensor, otherwise from the wheels, otherwise from GNSS."""
     speed = signals.speed_m_s
     if not np.isfinite(speed).any():
         counts = np.isfinite(signals.wheel_speed_m_s).sum(axis=1)
@@ -231,9 +233,9 @@ def _gain(speed_m_s: FloatArray, wheelbase_m: float, rules: ManoeuvreRules) -> F
 
 
 def _zeros(signals: Signals, wheelbase_m: float, rules: ManoeuvreRules) -> tuple[float, float]:
-    """Return what steering (rad) and gyro (rad/s) read straight ahead.
+    """Return the readings of steering (rad) and gyro (rad/s) straight ahead.
 
-    Of the steering the median of what turning does not explain; of the gyro the median with the wheels straight.
+    Steering: the median after subtraction of the steady-state angle; gyro: the median with straight wheels.
     """
     speed, rate = _speed(signals), signals.yaw_rate_rad_s
     straight = (np.abs(rate * speed) < rules.straight_m_s2) & (speed > rules.least_speed_m_s)
@@ -272,7 +274,7 @@ def _on_grid(
     wheelbase_m: float,
     rules: ManoeuvreRules,
 ) -> _Run:
-    """Return the run whose speed, steering and yaw rate (``columns`` [N]) are known at ``rows``; ``span`` in steps."""
+    """Return the run from speed, steering and yaw rate (``columns`` [N]), known at ``rows``; ``span`` in steps."""
     grid = (span[0] + np.arange(span[1], dtype=np.int64)) * _STEP_NS
     zero_ns = int(signals.stamps_ns[rows[0]])
     times, to = (signals.stamps_ns[rows] - zero_ns) * 1e-9, (grid - zero_ns) * 1e-9
@@ -299,7 +301,7 @@ def _on_grid(
 
 
 def _bridged(stamps_ns: IntArray, finite: BoolArray) -> BoolArray:
-    """Fill holes that are shorter than the gap which ends a run."""
+    """Fill gaps that are too short to end a run."""
     rows = np.flatnonzero(finite)
     filled = finite.copy()
     for i in np.flatnonzero(np.diff(rows) > 1):
@@ -309,7 +311,7 @@ def _bridged(stamps_ns: IntArray, finite: BoolArray) -> BoolArray:
 
 
 def _manoeuvres_of(run: _Run, rules: ManoeuvreRules) -> list[Manoeuvre]:
-    """Return the manoeuvres of a run; where two overlap, the earlier rule of this list is right."""
+    """Return the manoeuvres of a run; of two that overlap, the earlier rule of this list applies."""
     swings = _swings(run, rules)
     spans: list[tuple[str, int, int]] = []
     taken = np.zeros(len(run), dtype=np.bool_)
@@ -346,7 +348,7 @@ def _measured(run: _Run, name: str, a: int, b: int) -> Manoeuvre:
 
 
 def _swings(run: _Run, rules: ManoeuvreRules) -> list[_Swing]:
-    """Return the swings whose peak is high enough, in order."""
+    """Return the swings with a sufficient peak, in order."""
     demand = run.steer * run.gain
     stamps = np.arange(len(run), dtype=np.int64) * _STEP_NS
     swings = []
@@ -362,7 +364,7 @@ def _swings(run: _Run, rules: ManoeuvreRules) -> list[_Swing]:
 
 
 def _chains(swings: Sequence[_Swing], gap_s: float, *, alternate: bool) -> Iterator[list[_Swing]]:
-    """Yield longest chains of swings that follow within a time, of alternating sign where asked."""
+    """Yield the longest chains of swings with gaps up to a time, optionally of alternating sign."""
     chain: list[_Swing] = []
     for swing in swings:
         close = bool(chain) and (swing.start - chain[-1].end) * _STEP_S <= gap_s
@@ -383,7 +385,7 @@ def _repeated(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Ite
 
 
 def _long_repeated(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
-    """Those that are too long, and too even towards their end, for a lane change and the corrections after it."""
+    """Repeated swings that are too long and too regular for a lane change with corrections after it."""
     for part in _regular_chains(swings, rules):
         if len(part) >= rules.sweep_repeated and min(s.peak for s in part[-2:]) >= 0.5 * max(s.peak for s in part):
             yield _name_of_repeated(part, rules), part[0].start, part[-1].end
@@ -398,7 +400,7 @@ def _regular_chains(swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator
 
 
 def _regular_parts(chain: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[list[_Swing]]:
-    """Yield the parts of a chain in which each spacing is like the one before, of enough swings."""
+    """Yield the parts of a chain with regular spacing and enough swings."""
     part = list(chain[:1])
     for swing in chain[1:]:
         spacing = _middle(swing) - _middle(part[-1])
@@ -429,7 +431,7 @@ def _name_of_repeated(part: Sequence[_Swing], rules: ManoeuvreRules) -> str:
 
 
 def _lane_changes(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
-    """Double lane changes: out, back, and as straight at the end as before, within the length of a course."""
+    """Double lane changes: out, back, and straight at the end, within the length of a course."""
     for i in range(len(swings)):
         before = swings[i - 1] if i and (swings[i].start - swings[i - 1].end) * _STEP_S < rules.swing_gap_s else None
         if before is not None and before.peak > rules.equal_peaks * swings[i].peak:
@@ -444,10 +446,10 @@ def _lane_changes(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) ->
 
 
 def _side_lane_m(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> float:
-    """Return over which distance the path is beyond half its offset; 0 for what is no double lane change.
+    """Return the distance over which the path is beyond half its offset; 0 if it is not a double lane change.
 
-    The path goes out to one side and back once, and heading and offset return over the length of an exit lane, however
-    the driver steers there.
+    In a double lane change, the path leaves to one side and returns once. Heading and offset return on average over the
+    exit lane, in which the driver may steer.
     """
     sides = [s.sign for s in swings if s.peak >= 0.25 * max(w.peak for w in swings)]
     changes = sum(a != b for a, b in pairwise(sides))
@@ -471,7 +473,7 @@ def _side_lane_m(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> 
 
 
 def _straight_before(run: _Run, row: int, rules: ManoeuvreRules) -> bool:
-    """Return whether the car ran straight before a row, which at the run's start is taken for granted."""
+    """Return whether the car drove straight before a row; True at the start of the run."""
     before = run.turn[max(row - round(rules.straight_s / _STEP_S), 0) : max(row, 1)]
     return bool(np.mean(np.abs(before)) < rules.straight_m_s2)
 
@@ -592,7 +594,7 @@ def _slowing(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iter
 
 
 def _onset(run: _Run, row: int, before: float, change: float, pre: int) -> int:
-    """Return the row near ``row`` at which a_x falls through a quarter of its change."""
+    """Return the row near ``row`` at which a_x has fallen by a quarter of its change."""
     here = run.ax[row : row + 40] < before + 0.25 * change
     return max(row + (int(np.argmax(here)) if here.any() else 0), pre)
 
@@ -612,12 +614,12 @@ def _steady_before(run: _Run, onset: int, pre: int, ahead: int, rules: Manoeuvre
 
 
 def _tolerance(level_rad: float, gain: float, rules: ManoeuvreRules) -> float:
-    """Return by how much a steering angle that is held may differ from its level, in rad."""
+    """Return the tolerance of a held steering angle in rad."""
     return rules.held * abs(level_rad) + rules.slack_m_s2 / gain
 
 
 def _slowing_end(run: _Run, onset: int, limit_m_s2: float, rules: ManoeuvreRules) -> int:
-    """Return the row at which the car no longer slows or the steering is let go."""
+    """Return the row at which the deceleration or the held steering ends."""
     last = min(onset + round(rules.longest_slowing_s / _STEP_S), len(run))
     level = float(run.steer[onset])
     over = (run.ax[onset:last] > limit_m_s2) | (np.abs(run.steer[onset:last] - level) > 2.0 * rules.held * abs(level))

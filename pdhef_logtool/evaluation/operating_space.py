@@ -1,8 +1,8 @@
-"""Where a drive went in speed and lateral acceleration: seconds and sideslip error by cell of a fixed grid.
+"""Operating space of a drive: duration and sideslip error by cell of a fixed grid of speed and lateral acceleration.
 
-Lateral acceleration and speed are those of the segments (:mod:`~pdhef_logtool.evaluation.segments`): of ground truth
-where it has them, else of the sensors, the acceleration smoothed to 1 Hz. The grid is the same for all drives, so that
-the cells of a fleet add up.
+Lateral acceleration and speed are as for segments (:mod:`~pdhef_logtool.evaluation.segments`): from ground truth if it
+contains them, otherwise from the sensors; the acceleration is smoothed to 1 Hz. The grid is the same for all drives, so
+that cells of a fleet can be added.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from pdhef_logtool.evaluation.track_errors import signal_error
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 
-#: Lower edges of the cells; what is beyond the last one lies in the last cell. 60 m/s are 216 km/h.
+#: Lower edges of the cells; the last cell has no upper edge. 60 m/s are 216 km/h.
 SPEED_EDGES_M_S = tuple(float(5 * i) for i in range(13))
 AY_EDGES_M_S2 = tuple(float(i) for i in range(13))
-#: A longer step between stamps counts as this long.
+#: Upper limit of the duration of a step between stamps.
 MAX_STEP_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A cell of the grid that the drive was in.
+    """A cell of the grid with data of the drive.
 
-    ``speed`` and ``ay`` number its lower edges; ``scored`` stamps of it have the mean squared sideslip error of the
-    selected estimate, NaN without one.
+    ``speed`` and ``ay``: indices of the lower edges. ``scored``: number of stamps with the mean squared sideslip error
+    of the selected estimate, NaN without one.
     """
 
     speed: int
@@ -43,7 +43,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class OperatingSpace:
-    """The cells that a drive was in, in order, the grid, and the median friction of the drive."""
+    """Cells with data of a drive, in order, the grid, and the median friction of the drive."""
 
     cells: Sequence[Cell]
     friction_median: float
@@ -54,11 +54,11 @@ class OperatingSpace:
 def operating_space(
     signals: Signals, truth: StateTrack | None, estimate: StateTrack | None, vehicle: VehicleParameters
 ) -> OperatingSpace:
-    """Return where a drive went.
+    """Return the operating space of a drive.
 
     Parameters
     ----------
-    signals, truth, estimate : at the same stamps [N]; ground truth or estimate None: no error.
+    signals, truth, estimate : at the same stamps [N]; without ground truth or estimate, the error is NaN.
     """
     shape = len(SPEED_EDGES_M_S), len(AY_EDGES_M_S2)
     size = shape[0] * shape[1]

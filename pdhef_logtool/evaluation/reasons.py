@@ -1,7 +1,7 @@
-"""When an estimator had a reason not to use its sensors as usual: intervals, and a summary of them.
+"""Intervals and summary of the reasons for which an estimator did not use its sensors as usual.
 
-An interval of a reason runs from a stamp with its bit to the last one with it that follows no more than
-:data:`MERGE_S` behind the one before: a gyro that is stuck for seconds is one interval, though a sample of it may move.
+Stamps with the bit of a reason that are at most :data:`MERGE_S` apart form one interval: a gyro that is stuck for
+seconds gives one interval, even if single samples change.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from pdhef_logtool.records.tracks import StateTrack
 
 #: Stamps with the same reason up to this far apart are one interval.
 MERGE_S = 0.5
-#: Intervals that a summary names, and that a list of faults contains.
+#: Largest number of intervals in a summary and in a list of faults.
 NAMED_INTERVALS = 3
 LISTED_INTERVALS = 50
-#: Signal by what the name of a reason ends with.
+#: Signal by the ending of a reason's name.
 _SENSORS = {"ay": "ay_m_s2", "yaw_rate": "yaw_rate_rad_s"}
 
 
@@ -34,13 +34,13 @@ class Interval:
 
 @dataclass(frozen=True, slots=True)
 class ReasonFacts:
-    """How often one reason held.
+    """Frequency of one reason.
 
     Attributes
     ----------
     name, text : the reason for programs and for people.
-    share : of all stamps of the track, in (0, 1]. share_within : of the stamps inside the intervals; a sensor at half
-        the rate of the stamps is missing at one half of them.
+    share : of all stamps of the track, in (0, 1]. share_within : of the stamps inside the intervals; for example, a
+        sensor at half the rate of the stamps is missing at half of them.
     intervals : their number. first_ns, end_ns : from the first interval's start to the last one's end.
     longest : up to :data:`NAMED_INTERVALS` of the longest, in order of time.
     """
@@ -84,7 +84,7 @@ def reason_intervals(track: StateTrack) -> dict[str, list[Interval]]:
 
 
 def summarise_reasons(track: StateTrack) -> tuple[ReasonFacts, ...] | None:
-    """Return one record per reason that applies, in order of the bits; None where the source gives no reasons."""
+    """Return one record per reason that applies, in order of the bits; None if the source provides no reasons."""
     if not _has_reasons(track):
         return None
     by_reason, facts = reason_intervals(track), []
@@ -107,7 +107,7 @@ def summarise_reasons(track: StateTrack) -> tuple[ReasonFacts, ...] | None:
 
 
 def sensor_faults(track: StateTrack) -> tuple[SensorFault, ...] | None:
-    """Return the faults that an estimator detected in its sensors; None where the source gives no reasons."""
+    """Return the sensor faults that an estimator detected; None if the source provides no reasons."""
     if not _has_reasons(track):
         return None
     faults = []

@@ -1,4 +1,4 @@
-"""The metric of each requirement in blocks of 10 s of one drive, from which few drives get their confidence bounds."""
+"""Metric of each requirement in blocks of 10 s of one drive, for confidence bounds from few drives."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pdhef_logtool.records.tracks import StateTrack
 
 #: Errors are correlated over seconds (docs/method.md#evaluation).
 BLOCK_S = 10.0
-#: A report has at most so many blocks of a requirement: those of a longer drive are longer.
+#: Largest number of blocks per requirement in a report; a longer drive has longer blocks.
 MOST_BLOCKS = 360
 _Read = Callable[[str], StateTrack | None]
 
@@ -29,8 +29,8 @@ class RequirementBlocks:
 
     Attributes
     ----------
-    of : :attr:`~.validation_plan.Requirement.measured`. estimator : that was scored. block_s : length of a block.
-    number, n, seconds, metres : number since the start, scored stamps, time and way of each block [K].
+    of : :attr:`~.validation_plan.Requirement.measured`. estimator : the scored one. block_s : length of a block.
+    number, n, seconds, metres : index from the start, scored stamps, time and distance of each block [K].
     value, baseline : metric of the estimator and of the baseline in each block [K]; baseline empty without one.
     std : root mean square of the reference's 1-sigma in the block [K]; empty for ground truth.
     """
@@ -48,15 +48,15 @@ class RequirementBlocks:
 
     @property
     def estimated(self) -> bool:
-        """Whether errors are those against the estimated reference."""
+        """Whether errors are relative to the estimated reference."""
         return bool(self.std)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoredDrive:
-    """The tracks of a drive at the stamps of ``truth``: ground truth, or the estimated reference.
+    """Tracks of a drive at the stamps of ``truth``, which is ground truth or the estimated reference.
 
-    ``read`` returns the track of a name; ``masks`` of the segments; ``not_independent``: signals without a verdict.
+    ``read`` returns a track by name. ``masks``: of the segments. ``not_independent``: signals without a verdict.
     """
 
     read: _Read
@@ -70,9 +70,9 @@ class ScoredDrive:
 def requirement_blocks(
     requirements: Sequence[Requirement], main: str | None, drive: ScoredDrive, most: int = MOST_BLOCKS
 ) -> list[RequirementBlocks]:
-    """Return the blocks of the requirements that this drive scores and whose metric is a mean over stamps.
+    """Return the blocks of all requirements with a mean over stamps as the metric and with data in this drive.
 
-    ``main`` : the selected estimate, of requirements that name no estimator.
+    ``main`` : the selected estimate, for requirements without an estimator.
     """
     results: list[RequirementBlocks] = []
     for requirement in requirements:
@@ -103,7 +103,7 @@ def _has_blocks(requirement: Requirement, drive: ScoredDrive) -> bool:
 def _blocks(
     requirement: Requirement, name: str, tracks: Sequence[StateTrack], drive: ScoredDrive, most: int
 ) -> RequirementBlocks | None:
-    """Sum the summands of one requirement by block of time."""
+    """Return the summands of one requirement, summed over blocks of time."""
     truth = drive.truth
     if not len(truth):
         return None
@@ -144,7 +144,7 @@ def _rounded(values: FloatArray) -> list[float]:
 def _summands(
     requirement: Requirement, tracks: Sequence[StateTrack], truth: StateTrack, drive: ScoredDrive
 ) -> FloatArray:
-    """Return what the metric is the mean of at each stamp [tracks, M]; NaN where it is not scored."""
+    """Return the values [tracks, M] that the metric averages; NaN at stamps that are not scored."""
     signal, metric = requirement.signal, requirement.metric
     at_truth = scorable(truth, signal, drive.low_speed_m_s)
     if drive.estimated:
@@ -173,7 +173,7 @@ def _summands(
 
 
 def from_document(documents: Sequence[Mapping[str, object]]) -> list[RequirementBlocks]:
-    """Return the blocks of a report.json; those of another version are left out."""
+    """Return the blocks of a report.json; blocks of other versions are skipped."""
     results = []
     for document in documents:
         try:

@@ -1,9 +1,10 @@
 """Confidence bounds of a requirement's statistic over units: drives, or blocks of time within drives.
 
-The pooled statistic uses the studentised bootstrap (Efron & Tibshirani 1993, chapter 12) of the logarithm: errors of
-drives are skewed, so that percentile intervals of few drives are too low. Below ``_LOGNORMAL`` drives the upper bound
-is at least halfway to that of lognormal errors (Zou, Taleban & Huo 2009, CSDA 53, 3755): few drives lack a tail. Drives
-of one day, car or route widen both by the design effect. Both sides use half of 1 − confidence.
+The pooled statistic uses the studentised bootstrap (Efron & Tibshirani 1993, chapter 12) of the logarithm, because
+errors of drives are skewed and percentile intervals of few drives are too low. Few drives lack a tail: below
+``_LOGNORMAL`` drives, the upper bound is at least halfway to the bound for lognormal errors (Zou, Taleban & Huo 2009,
+CSDA 53, 3755). The design effect of drives of one day, car or route widens both bounds. Each side uses half of
+1 − confidence.
 """
 
 from __future__ import annotations
@@ -17,20 +18,20 @@ from pdhef_logtool.evaluation.dependence import Dependence, Factors, dependence,
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.student import student_quantile
 
-#: Fewer drives: blocks within them are drawn instead. Fewer blocks: no bounds.
+#: With fewer drives, blocks within them are drawn. With fewer blocks, there are no bounds.
 LEAST_DRIVES, LEAST_BLOCKS = 5, 6
 _RESAMPLES, _SEED = 2000, 0
 #: More units than this are drawn in groups.
 _MOST_UNITS = 1000
-#: Largest studentised deviation, in quantiles of Student's t: of few units some resamples have nearly no spread.
+#: Largest studentised deviation, in quantiles of Student's t: some resamples of few units have nearly no spread.
 _MOST_DEVIATION = 2.0
-#: From so many drives on the bootstrap alone covers.
+#: Number of drives from which the coverage of the bootstrap alone is sufficient.
 _LOGNORMAL = 300
 
 
 @dataclass(frozen=True, slots=True)
 class Bounded:
-    """A statistic with its bounds; NaN where there are too few units. ``units``: number of them; ``effect`` of them."""
+    """A statistic with its bounds, NaN with too few units; number of units and their dependence (``effect``)."""
 
     value: float
     low: float
@@ -49,10 +50,10 @@ def pooled(
     level: float,
     factors: Factors | None = None,
 ) -> Bounded:
-    """Return the mean of values [N] weighted by stamps [N], or its ratio to that of ``others`` [N].
+    """Return the mean of values [N] weighted by stamps [N], or its ratio to the mean of ``others`` [N].
 
-    ``squares``: root mean square. ``positive``: values ≥ 0, whose logarithm is drawn; else the value itself is.
-    ``level``: of the two-sided interval. ``factors``: what drives may depend on; None for blocks of time.
+    ``squares``: root mean square. ``positive``: values ≥ 0, for which the bootstrap uses the logarithm.
+    ``level``: of the two-sided interval. ``factors``: factors of dependence of drives; None for blocks of time.
     """
     top = weights * (values**2 if squares else values)
     below = weights if others is None else weights * (others**2 if squares else others)
@@ -71,7 +72,7 @@ def pooled(
     if not positive:
         return Bounded(value, value - below_s, value + above_s, n, effect)
     if factors is not None and others is None:
-        # The mean of both: that of lognormal errors alone is wide where few drives differ much.
+        # The mean of both: the bound for lognormal errors alone is too wide if few drives differ much.
         scale = math.sqrt(effect.design_effect)
         above_s += 0.5 * max(scale * _lognormal_excess(values, 1.0 if squares else 0.5, tail) - above_s, 0.0)
     return Bounded(value, value * math.exp(-below_s), value * math.exp(min(above_s, 50.0)), n, effect)
@@ -82,7 +83,7 @@ def _studentised(
 ) -> tuple[float, float]:
     """Return the distances from the statistic, or its logarithm, to its lower and upper bound."""
     n = len(top)
-    if n > _MOST_UNITS:  # neighbours are drawn together
+    if n > _MOST_UNITS:  # neighbours form groups
         groups = np.arange(n) * _MOST_UNITS // n
         top, below = (np.bincount(groups, weights=c).astype(np.float64) for c in (top, below))
     error = float(_error(top, below, np.ones((1, len(top))), power, log=log)[0])
@@ -92,7 +93,7 @@ def _studentised(
     deviations = _deviations(top, below, power, math.log(ratio) * power if log else ratio, log=log)
     most_deviation = _MOST_DEVIATION * student_quantile(1.0 - tail, len(top) - 1)
     least, most = np.clip(np.quantile(deviations, [tail, 1.0 - tail]), -most_deviation, most_deviation)
-    if effect.by:  # few days: their number limits what is known of the spread
+    if effect.by:  # the number of days limits the degrees of freedom of the spread
         reach = deviate(1.0 - tail, effect.freedom)
         least, most = min(least, -reach), max(most, reach)
     error *= math.sqrt(effect.design_effect)
@@ -100,7 +101,7 @@ def _studentised(
 
 
 def _lognormal_excess(values: FloatArray, power: float, tail: float) -> float:
-    """Return ln(upper bound / estimate) of exp(μ + ``power`` σ²) of lognormal values [N]; 0 of too few or too many."""
+    """Return ln(upper bound / estimate) of exp(μ + ``power`` σ²) of lognormal values [N]; 0 for too few or too many."""
     from scipy.special import chdtri
 
     n = len(values)
@@ -112,7 +113,7 @@ def _lognormal_excess(values: FloatArray, power: float, tail: float) -> float:
 
 
 def _error(top: FloatArray, below: FloatArray, counts: FloatArray, power: float, *, log: bool) -> FloatArray:
-    """Return the standard errors [M] of the statistic where units [N] count ``counts`` [M, N] times: delta method."""
+    """Return the standard errors [M] of the statistic with ``counts`` [M, N] of the units [N], by the delta method."""
     total, base = counts @ top, counts @ below
     ratio = total / base
     n = len(top)
@@ -136,9 +137,9 @@ def _deviations(top: FloatArray, below: FloatArray, power: float, centre: float,
 
 
 def quantile(values: FloatArray, share: float, level: float, factors: Factors | None = None) -> Bounded:
-    """Return a quantile of drives [N] with its bounds by order statistics; infinite where N is too small.
+    """Return a quantile of drives [N] with its bounds by order statistics; infinite if N is too small.
 
-    They are exact for independent drives, else those of the normal approximation with the design effect.
+    The bounds are exact for independent drives; otherwise a normal approximation with the design effect is used.
     """
     n = len(values)
     if not n:
@@ -164,7 +165,7 @@ def quantile(values: FloatArray, share: float, level: float, factors: Factors | 
 
 
 def least_drives(share: float, level: float) -> int:
-    """Return the number of drives from which on a quantile has an upper bound: 1 − share^N ≥ (1 + level) / 2."""
+    """Return the least number of drives N for an upper bound of a quantile: 1 − share^N ≥ (1 + level) / 2."""
     return math.ceil(math.log(0.5 * (1.0 - level)) / math.log(share))
 
 

@@ -1,4 +1,4 @@
-"""The verdict on one requirement: PASS, FAIL or INCONCLUSIVE by confidence bounds, with margin and exposure."""
+"""Verdict on one requirement: PASS, FAIL or INCONCLUSIVE by confidence bounds, with margin and exposure."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from pdhef_logtool.evaluation.validation_plan import (
 from pdhef_logtool.records.signals import FloatArray
 
 Outcome: TypeAlias = Literal["PASS", "FAIL", "INCONCLUSIVE"]
-#: A margin relative to an estimated reference is at least so many of its standard deviations.
+#: Least margin relative to an estimated reference, in standard deviations of the reference.
 REFERENCE_SDS = 2.0
-#: Of a coverage that is too low.
-NARROW = "the estimate states too small an uncertainty; the size of its error is judged by other requirements"
-#: A share of drives below this is not shown.
+#: Explanation of a coverage that is too low.
+NARROW = "the stated uncertainty of the estimate is too small; other requirements limit its error"
+#: Smallest share of drives that is shown.
 _SHARE_SHOWN = 0.5
-#: More driving than this many times that of now is no advice.
+#: Largest factor on the driving that is recommended.
 _MOST_TIMES = 30.0
 
 
@@ -48,11 +48,11 @@ class DriveValue:
 
     Attributes
     ----------
-    estimator : that was scored. n : stamps behind ``value``; ``baseline`` None without one.
+    estimator : the scored one. n : number of stamps of ``value``; ``baseline`` None without one.
     seconds, metres : scored driving, NaN where unknown. std : root mean square of the 1-sigma of the estimated
-        reference; NaN for ground truth. blocks : None where the run kept none. same : estimator and baseline are the
-        same algorithm. factors : its day, car and route; None: the log does not state it.
-    space, friction : seconds by the lower edges of speed and |a_y|, and the median friction, where a plan asks for it.
+        reference; NaN for ground truth. blocks : None if the run stored none. same : estimator and baseline are the
+        same algorithm. factors : its day, car and route, None if unknown.
+    space, friction : seconds by the lower edges of speed and |a_y|, and the median friction, if a plan needs them.
     """
 
     log: str
@@ -70,7 +70,7 @@ class DriveValue:
     friction: float = math.nan
 
     def seconds_in(self, need: ExposureNeed) -> float:
-        """Return the driving in conditions."""
+        """Return the duration of driving in conditions, s."""
         if not _inside(need.friction, self.friction) or need.car not in (None, self.factors.get("car")):
             return 0.0
         return math.fsum(
@@ -97,12 +97,12 @@ class RequirementVerdict:
 
     Attributes
     ----------
-    value, low, high : statistic and its two-sided interval; None where there is none.
-    margin : distance of the value to the limit, negative beyond it. estimators : that were scored.
-    basis : ``drives`` or ``blocks``: what the interval is drawn from; ``units`` of them, ``block_s`` long.
-        ``design_effect`` of drives that depend on one another.
+    value, low, high : statistic and its two-sided interval; None if not available.
+    margin : distance of the value to the limit, negative beyond it. estimators : the scored ones.
+    basis : units of the bootstrap, ``drives`` or ``blocks``; ``units``: their number; ``block_s``: length of a block;
+        ``design_effect``: of dependent drives.
     against : ``ground truth`` or ``estimated reference``. worst : the drive with the largest error.
-    reason : the verdict in words. next : what to do, empty after a PASS. notes : what limits the verdict.
+    reason : text of the verdict. next : next step, empty after a PASS. notes : limitations of the verdict.
     """
 
     requirement: Requirement
@@ -143,8 +143,8 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
 
     Parameters
     ----------
-    drives : that have the metric; all against ground truth, or all against the estimated reference.
-    missing : why no drive has the metric.
+    drives : the drives with the metric; all against ground truth, or all against the estimated reference.
+    missing : reason if no drive has the metric.
     """
     exposure = _exposure(drives)
     estimated = bool(drives) and math.isfinite(drives[0].std)
@@ -191,7 +191,7 @@ def _exposure(drives: Sequence[DriveValue]) -> Exposure:
 
 
 def _ratios(drives: Sequence[DriveValue]) -> FloatArray:
-    """Return the values of drives, of a requirement with a baseline their ratios."""
+    """Return the values of drives, or their ratios for a requirement with a baseline."""
     values = np.array([d.value for d in drives], dtype=np.float64)
     if not drives or drives[0].baseline is None:
         return values
@@ -202,7 +202,7 @@ def _ratios(drives: Sequence[DriveValue]) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class _Statistic:
-    """A statistic with its bounds, what they are drawn from, how many units, and the length of a block."""
+    """A statistic with its bounds, the kind and number of the units, and the length of a block."""
 
     bounded: Bounded
     basis: Literal["drives", "blocks"] = "drives"
@@ -226,7 +226,7 @@ def _statistic(requirement: Requirement, drives: Sequence[DriveValue]) -> _Stati
 
 
 def _of_drives(requirement: Requirement, values: FloatArray, factors: Factors) -> Bounded:
-    """Return a quantile of the drives, or the worst one, which has no bounds beside itself."""
+    """Return a quantile of the drives, or the worst drive, which has no confidence interval."""
     if requirement.quantile is not None:
         return quantile(values, requirement.quantile, requirement.confidence, factors)
     if not len(values):
@@ -265,7 +265,7 @@ def _pooled(
         level=requirement.confidence,
         factors=factors,
     )
-    if metric == "bias":  # limited in size
+    if metric == "bias":  # its absolute value is limited
         low = 0.0 if bounded.low <= 0.0 <= bounded.high else min(abs(bounded.low), abs(bounded.high))
         return replace(bounded, value=abs(bounded.value), low=low, high=max(abs(bounded.low), abs(bounded.high)))
     if metric in AT_LEAST:
@@ -274,7 +274,7 @@ def _pooled(
 
 
 def _typical_ratio(ratios: FloatArray, level: float, factors: Factors) -> Bounded:
-    """Return the geometric mean of the drives' ratios to another run: each drive is its values yardstick."""
+    """Return the geometric mean of the drives' ratios to another run, which compares each drive with itself."""
     with np.errstate(divide="ignore"):
         logs = np.log(ratios)
     bounded = pooled(np.ones(len(logs)), logs, None, squares=False, positive=False, level=level, factors=factors)
@@ -336,7 +336,7 @@ def _decide(
 
 
 def _without_bounds(requirement: Requirement, bounded: Bounded) -> bool:
-    """Return whether there are too few units for the bound that decides."""
+    """Return whether the bound that decides is missing, because there are too few units."""
     if requirement.quantile is not None and math.isinf(bounded.high):
         return bounded.low <= requirement.bound
     return not (math.isfinite(bounded.low) or math.isfinite(bounded.high))
@@ -350,7 +350,7 @@ def _outcome(requirement: Requirement, bounded: Bounded) -> Outcome:
 
 
 def _interval(requirement: Requirement, bounded: Bounded, exposure: Exposure, outcome: Outcome) -> str:
-    """Return the statistic with its interval in words."""
+    """Return the statistic with its interval as text."""
     value, unit = shown(bounded.value, requirement.unit), requirement.unit
     if requirement.statistic != WORST_DRIVE:
         bounds = f"{shown(bounded.low, unit)} to {shown(bounded.high, unit)}"
@@ -363,7 +363,7 @@ def _interval(requirement: Requirement, bounded: Bounded, exposure: Exposure, ou
 
 
 def _lacking(requirement: Requirement, exposure: Exposure, drives: Sequence[DriveValue]) -> list[tuple[str, str]]:
-    """Return what of the required driving is missing: in words, and how much more."""
+    """Return the missing part of the required driving as texts: amounts so far, and amounts to add."""
     needs: list[tuple[str, float, float | None, str]] = [
         ("drives", float(requirement.exposure_drives), float(exposure.drives), "{:.0f}"),
         ("minutes", requirement.exposure_minutes, exposure.minutes, "{:.1f}"),
@@ -389,14 +389,14 @@ def _what_to_record(requirement: Requirement) -> str:
 
 
 def _too_few(requirement: Requirement, bounded: Bounded, basis: str, where: str) -> tuple[str, str]:
-    """Return why there is no interval, and what to drive."""
+    """Return the reason for a missing interval, and the driving that is needed."""
     value = shown(bounded.value, requirement.unit)
     if requirement.quantile is not None:
         least = least_drives(requirement.quantile, requirement.confidence)
         more = f"drive {least - bounded.units} more drives{where}"
         return f"{value}; no confidence interval from {bounded.units} drives", more
     if basis == "blocks" and not bounded.units:
-        return f"{value}; this run kept no blocks for this requirement", "run the logs again with this plan"
+        return f"{value}; this run stored no blocks for this requirement", "run the logs again with this plan"
     blocks = "1 block" if bounded.units == 1 else f"{bounded.units} blocks"
     reason = f"{value}; no confidence interval from {blocks} of driving{where}, it needs {LEAST_BLOCKS}"
     seconds = (LEAST_BLOCKS - bounded.units) * 10
@@ -404,9 +404,10 @@ def _too_few(requirement: Requirement, bounded: Bounded, basis: str, where: str)
 
 
 def _decisive(requirement: Requirement, bounded: Bounded, exposure: Exposure, where: str) -> str:
-    """Return how much driving would decide, if value and spread stay: the interval narrows with its square root.
+    """Return the amount of driving that decides if value and spread do not change.
 
-    That of a positive value does so in its logarithm, as it was drawn.
+    The width of the interval is in proportion to the inverse square root of the amount, for positive values in the
+    logarithm, as in the bootstrap.
     """
     near, value = requirement.bound, bounded.value
     end = bounded.low if value > near else bounded.high
@@ -442,7 +443,7 @@ def _notes(
 
 
 def gates(verdicts: Sequence[RequirementVerdict], *, strict: bool) -> bool:
-    """Return whether verdicts close the gate: a FAIL, or with ``strict`` an INCONCLUSIVE."""
+    """Return whether a verdict is a FAIL, or with ``strict`` an INCONCLUSIVE."""
     return any(v.outcome == "FAIL" or (strict and v.outcome == "INCONCLUSIVE") for v in verdicts)
 
 
@@ -452,7 +453,7 @@ def of_documents(verdicts: Sequence[Mapping[str, Any]], outcome: Outcome) -> lis
 
 
 def joint_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return the notes of requirements by their id, each once, with the ids where it is not of all."""
+    """Return each note of the requirements once, with the ids of its requirements unless it applies to all."""
     ids: dict[str, list[str]] = {}
     for name, of_requirement in notes.items():
         for note in of_requirement:
@@ -461,7 +462,7 @@ def joint_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def next_steps(plan: Mapping[str, Any] | None, more: Sequence[str] = ()) -> list[str]:
-    """Return what to do by a document: failed requirements, inconclusive ones, ``more``; of the default plan last."""
+    """Return the next steps of a document: failed requirements, inconclusive ones, ``more``; the default plan last."""
     requirements = (plan or {}).get("requirements") or ()
     ids: dict[str, list[str]] = {}
     for r in (*of_documents(requirements, "FAIL"), *of_documents(requirements, "INCONCLUSIVE")):

@@ -1,9 +1,9 @@
 """Parts of a drive: boolean masks over the scored stamps, and the same as intervals.
 
-Lateral acceleration is that of ground truth if it has one, else the sensor's; likewise yaw rate and speed;
-longitudinal acceleration is always the sensor's. Accelerations and yaw rate are smoothed without phase (Gaussian, over
-at most the gap-free run around a stamp): to 4 Hz for ``linear`` and ``nonlinear``, to 1 Hz for manoeuvres. μ is the
-ground truth's friction, else the log's, else the vehicle file's, else 1.
+Lateral acceleration, yaw rate and speed are from ground truth if it contains them, otherwise from the sensors;
+longitudinal acceleration is always from the sensor. Accelerations and yaw rate are smoothed with zero phase (Gaussian,
+within the gap-free run around a stamp): to 4 Hz for ``linear`` and ``nonlinear``, to 1 Hz for manoeuvres. μ is the
+friction of the ground truth, otherwise of the log, otherwise of the vehicle file, otherwise 1.
 
 ====================  ==================================================================================================
 ``all``               every stamp
@@ -68,12 +68,12 @@ def segment_masks(
     vehicle: VehicleParameters,
     manoeuvres: Sequence[Manoeuvre] | None = None,
 ) -> dict[str, BoolArray]:
-    """Return the masks [N] of every segment by name, in the order of this file's table; none is left out when empty.
+    """Return the masks [N] of all segments by name, in the order of this file's table, including empty ones.
 
     Parameters
     ----------
-    signals : what the sensors state at the scored stamps. truth : at the same stamps, or None.
-    manoeuvres : of the drive; None: they are detected.
+    signals : at the scored stamps. truth : at the same stamps, or None.
+    manoeuvres : of the drive; None detects them.
     """
     manoeuvres = find_manoeuvres(signals, vehicle) if manoeuvres is None else manoeuvres
     of_truth = known_of(truth)
@@ -112,14 +112,14 @@ def segment_masks(
 def _grip_masks(
     friction: FloatArray, stamps: IntArray, ay: FloatArray, step_ns: float, vehicle: VehicleParameters
 ) -> tuple[BoolArray, BoolArray]:
-    """Return where the grip is used little and much, [N]."""
+    """Return the masks of low and high grip utilization, [N]."""
     grip = np.abs(smooth(stamps, ay, GRIP_SMOOTHING_HZ, step_ns))
     grip /= np.where(np.isfinite(friction), friction, vehicle.assumed_friction) * GRAVITY_M_S2
     return grip < LINEAR_SHARE, grip > NONLINEAR_SHARE
 
 
 def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehicleParameters) -> BoolArray:
-    """Return where the car is faster than the low-speed blend, [N]; everywhere if its speed is known nowhere.
+    """Return where the car is faster than the low-speed blend, [N]; True everywhere if the speed is unknown.
 
     ``signals``, ``truth`` as for :func:`segment_masks`.
     """
@@ -130,7 +130,7 @@ def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehiclePara
 
 
 def known_of(truth: StateTrack | None) -> frozenset[str]:
-    """Return what is taken from ground truth: all that it ever has, so that a drive does not mix two sources."""
+    """Return the columns to use from ground truth: all with any finite value, so that a drive has one source each."""
     if truth is None:
         return frozenset()
     columns = ("ay_m_s2", "yaw_rate_rad_s", "vx_m_s", "friction")
@@ -155,7 +155,7 @@ def _speed(signals: Signals, truth: StateTrack | None, of_truth: frozenset[str])
 
 
 def find_intervals(stamped: Signals | StateTrack, masks: Mapping[str, BoolArray]) -> list[Segment]:
-    """Turn masks [N] into intervals in order of time; a step of more than ``smoothing.RUN_GAP_S`` ends an interval.
+    """Convert masks [N] to intervals in order of time; a step of more than ``smoothing.RUN_GAP_S`` ends an interval.
 
     ``end_ns`` is one past the last stamp inside.
     """

@@ -1,4 +1,4 @@
-"""Series at irregular stamps: smoothing without phase, gap-free runs, and measurements held."""
+"""Series at irregular stamps: zero-phase smoothing, gap-free runs, and held measurements."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 #: A longer step between stamps ends every run and every interval.
 RUN_GAP_S = 0.5
-#: Rows that are smoothed at once: they stay near the processor.
+#: Rows that are smoothed at once, so that they fit into the cache.
 _NEAR_ROWS = 1 << 12
 
 
@@ -23,10 +23,10 @@ def _sigma_rows(step_ns: float, cutoff_hz: float) -> float:
 
 
 def smooth(stamps_ns: IntArray, values: FloatArray, cutoff_hz: float, step_ns: float | None = None) -> FloatArray:
-    """Smooth [N] without phase by a Gaussian whose gain is 1/√2 at ``cutoff_hz``; NaN stays, but does not spread.
+    """Smooth [N] with zero phase by a Gaussian with gain 1/√2 at ``cutoff_hz``; NaN stays, but does not spread.
 
-    The Gaussian runs over samples of the median step, cut off at 4 σ, and does not reach across steps of more than
-    ``RUN_GAP_S``. ``step_ns``: the median step, None: it is computed.
+    The Gaussian is truncated at 4 σ and does not cross steps of more than ``RUN_GAP_S``. ``step_ns``: the median step;
+    computed by default.
     """
     out = np.full(values.shape, np.nan)
     if values.shape[0] < 2:
@@ -45,9 +45,9 @@ def smooth(stamps_ns: IntArray, values: FloatArray, cutoff_hz: float, step_ns: f
 
 
 def _gaussian(values: FloatArray, sigma_rows: float) -> FloatArray:
-    """Return values [N], 0 beyond their ends, under a Gaussian cut off at 4 σ.
+    """Return values [N], with 0 beyond their ends, filtered by a Gaussian truncated at 4 σ.
 
-    The same sums in the same order as SciPy's ``gaussian_filter1d``, which takes longer to load than a short log.
+    The sums equal SciPy's ``gaussian_filter1d``, which takes longer to import than a short log takes to process.
     """
     reach = int(4.0 * sigma_rows + 0.5)
     weights = np.exp(-0.5 / (sigma_rows * sigma_rows) * np.arange(-reach, reach + 1) ** 2)
@@ -67,7 +67,7 @@ def _gaussian(values: FloatArray, sigma_rows: float) -> FloatArray:
 
 
 def _gaussian_of_ones(n: int, sigma_rows: float) -> FloatArray:
-    """Return :func:`_gaussian` of n ones, which is the same everywhere but near the ends."""
+    """Return :func:`_gaussian` of n ones, which is constant except near the ends."""
     reach = int(4.0 * sigma_rows + 0.5)
     if n <= 2 * reach:
         return _gaussian(np.ones(n), sigma_rows)

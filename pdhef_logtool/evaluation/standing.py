@@ -1,8 +1,9 @@
-"""The selected estimate of a drive against the best physics, signal by signal, by blocks of time.
+"""Selected estimate of a drive compared with the best physics estimate, by signal.
 
-The blocks and the interval of an RMSE are those of requirements (:mod:`~pdhef_logtool.evaluation.requirement_blocks`);
+The blocks and the interval of an RMSE are as for requirements (:mod:`~pdhef_logtool.evaluation.requirement_blocks`);
 whole blocks are drawn for the interval of a difference (:mod:`~pdhef_logtool.evaluation.bootstrap`). The best physics
-is the best by this drive's ground truth: a rival that was chosen in hindsight, which favours no estimate.
+estimate is the one with the lowest error against this drive's ground truth, which is an advantage over the selected
+estimate.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from pdhef_logtool.evaluation.requirement_bounds import LEAST_BLOCKS, pooled
 from pdhef_logtool.evaluation.validation_plan import Requirement
 from pdhef_logtool.records.tracks import StateTrack
 
-#: What a drive is judged by, in the order in which it is given.
+#: Compared signals, in the order of output.
 JUDGED_SIGNALS = ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s")
 
 
@@ -28,8 +29,8 @@ class Standing:
 
     Attributes
     ----------
-    rmse : None where nothing is scored. rival : the best physics; None where none is scored beside it.
-    rival_rmse : of the rival, and ``difference`` the estimator's RMSE less the rival's, at the stamps of both.
+    rmse : None without scored stamps. rival : the best physics estimate; None if no other one is scored.
+    rival_rmse : of the rival. difference : RMSE of the estimator minus RMSE of the rival, at the stamps of both.
     block_s : length of a block; the bounds of intervals are NaN below :data:`LEAST_BLOCKS` of them.
     """
 
@@ -45,11 +46,11 @@ class Standing:
 def standings(
     name: str, rivals: Sequence[str], read: Callable[[str], StateTrack | None], truth: StateTrack, low_speed_m_s: float
 ) -> list[Standing]:
-    """Return how an estimator compares in each of :data:`JUDGED_SIGNALS`.
+    """Return the comparison of an estimator in each of :data:`JUDGED_SIGNALS`.
 
     Parameters
     ----------
-    rivals : estimators on physics alone. read : returns the track of a name, at the stamps of ``truth``.
+    rivals : estimators on physics alone. read : returns a track by name, at the stamps of ``truth``.
     """
     everywhere = {"all": np.ones(len(truth), dtype=np.bool_)}
     drive = ScoredDrive(read, truth, everywhere, low_speed_m_s)

@@ -1,4 +1,4 @@
-"""Errors of an estimate against ground truth at the same stamps, sample by sample, and where they count."""
+"""Errors of an estimate against ground truth at the same stamps, and the stamps that are scored."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ _STDS = {
 
 
 def truth_speed(truth: StateTrack) -> FloatArray:
-    """Return the ground-truth speed [N] in m/s, abs v_x where v_y is not known, the measured one where v_x is not."""
+    """Return the ground-truth speed [N] in m/s: abs v_x without v_y, the measured speed without v_x."""
     speed = np.where(np.isfinite(truth.vy_m_s), np.hypot(truth.vx_m_s, truth.vy_m_s), np.abs(truth.vx_m_s))
     measured = truth.measured_speed_m_s
     return np.where(np.isfinite(speed), speed, np.abs(measured)) if len(measured) == len(speed) else speed
 
 
 def signal_error(estimate: StateTrack, truth: StateTrack, signal: str, low_speed_m_s: float) -> FloatArray:
-    """Return estimate − ground truth [N] of a signal; NaN where it is not scored."""
+    """Return estimate − ground truth [N] of a signal; NaN at stamps that are not scored."""
     error = raw_error(estimate, truth, signal)
     scored = estimate.valid & scorable(truth, signal, low_speed_m_s)
     return np.where(scored & np.isfinite(error), error, np.nan)
 
 
 def raw_error(estimate: StateTrack, truth: StateTrack, signal: str) -> FloatArray:
-    """Return estimate − ground truth [N], angles wrapped, also where it is not scored."""
+    """Return estimate − ground truth [N], angles wrapped, including stamps that are not scored."""
     error: FloatArray = getattr(estimate, signal) - getattr(truth, signal)
     return wrap_angle(error) if signal == "sideslip_rad" else error
 
 
 def scorable(truth: StateTrack, signal: str, low_speed_m_s: float) -> BoolArray:
-    """Return where ground truth can score a signal [N]: sideslip only above a speed."""
+    """Return where ground truth can score a signal [N]; sideslip only above a speed."""
     is_scorable: BoolArray = truth.valid & np.isfinite(getattr(truth, signal))
     if signal == "sideslip_rad":
         is_scorable = is_scorable & (truth_speed(truth) > low_speed_m_s)
@@ -49,7 +49,7 @@ def scorable(truth: StateTrack, signal: str, low_speed_m_s: float) -> BoolArray:
 
 
 def total_std(estimate: StateTrack, truth: StateTrack, signal: str) -> FloatArray | None:
-    """Return the 1-sigma of the error [N]; None where the estimate never has one."""
+    """Return the 1-sigma of the error [N]; None if the estimate provides none."""
     name = _STDS.get(signal)
     if name is None or (name != "sideslip_std_rad" and not estimate.covariance.shape[0]):
         return None
@@ -61,5 +61,5 @@ def total_std(estimate: StateTrack, truth: StateTrack, signal: str) -> FloatArra
 
 
 def selected(values: NDArray[Any], mask: BoolArray) -> NDArray[Any]:
-    """Return the values [N] of a mask [N]; without copying them where it has all."""
+    """Return the values [N] of a mask [N]; a view if the mask is True everywhere."""
     return values if mask.all() else values[mask]

@@ -1,4 +1,4 @@
-"""Scored signals with their labels and units, and the units in which people read and type figures: the one place."""
+"""Scored signals with their labels and units, and the units for display and input."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ SCORED_SIGNALS: dict[str, str] = {
     "sideslip_rad": "rad",
     "ay_m_s2": "m/s^2",
 }
-#: Every signal of metrics.parquet, with its unit. ``state``: all of an estimate.
+#: All signals of metrics.parquet, with their units. ``state``: the complete state of an estimate.
 SIGNALS: dict[str, str] = {**SCORED_SIGNALS, "position_m": "m", "lateral_1s_m": "m", "state": "1"}
-#: The definition of a_y of estimates and ground truth; a ground truth without it is not scored.
+#: Definition of a_y for estimates and ground truth; a ground truth without a_y is not scored.
 AY_NOTE = (
     "a_y is the lateral specific force at the CG in the road plane, the axles' forces over the mass: "
     "v̇_y + v_x r + g sin(bank)"
 )
-#: What people call them, in the order of tables.
+#: Names of the signals for display, in the order of tables.
 LABELS = {
     "sideslip_rad": "sideslip",
     "vy_m_s": "v_y",
@@ -32,24 +32,24 @@ LABELS = {
     "lateral_1s_m": "1 s lateral",
     "state": "state",
 }
-#: By unit of metrics.parquet: the unit that people read, and the factor to it.
+#: Unit for display and factor to it, by unit of metrics.parquet.
 _READ = {"rad": ("°", DEGREES), "rad/s": ("°/s", DEGREES), "m/s^2": ("m/s²", 1.0), "s": ("ms", 1e3), "1": ("", 1.0)}
-#: The same in letters, as people type it.
+#: The same for input, in ASCII letters.
 _TYPED = {"rad": ("deg", DEGREES), "rad/s": ("deg/s", DEGREES), "s": ("ms", 1e3), "1": ("%", 100.0)}
 
 
 def read_unit(unit: str) -> tuple[str, float]:
-    """Return the unit that people read for one of metrics.parquet, and the factor to it."""
+    """Return the unit for display and the factor to it, for a unit of metrics.parquet."""
     return _READ.get(unit, (unit, 1.0))
 
 
 def typed_unit(unit: str) -> tuple[str, float]:
-    """Return the unit that people type for one of metrics.parquet, and the factor to it."""
+    """Return the unit for input and the factor to it, for a unit of metrics.parquet."""
     return _TYPED.get(unit, (unit, 1.0))
 
 
 def share_of(text: str) -> float | None:
-    """Return the share that ``5%`` or ``0.05`` represents; None for what is none, or above 10."""
+    """Return the share that ``5%`` or ``0.05`` represents; None for other texts and for values above 10."""
     try:
         share = float(text.strip().removesuffix("%")) / (100.0 if text.strip().endswith("%") else 1.0)
     except ValueError:

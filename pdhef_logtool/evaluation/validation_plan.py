@@ -18,14 +18,14 @@ from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.storage.documents import checked, digest, read_toml, unknown
 from pdhef_logtool.storage.object_store import is_url
 
-#: Baseline of a requirement: run A of ``pdhef compare``; a path or URL with a slash is another run's output, all else
-#: an estimator of the same run.
+#: Baseline of a requirement: run A of ``pdhef compare``. A path or URL with a slash is the output of another run; other
+#: names are estimators of the same run.
 RUN = "run"
 POOLED, WORST_DRIVE, QUANTILE = "pooled", "worst drive", "quantile"
-#: Metrics that are means over stamps: the value of several drives is their mean (root mean square) weighted by stamps.
+#: Metrics that are means over stamps. The value of several drives is their mean (root mean square), weighted by stamps.
 SQUARES = frozenset({"rmse", "reference_rms"})
 MEANS = frozenset({"mae", "bias", "coverage95", "availability", "reference_independent"})
-#: Metrics whose limit is a minimum.
+#: Metrics with a minimum as the limit.
 AT_LEAST = frozenset({"coverage95", "availability"})
 _QUANTILE = re.compile(r"quantile (0\.\d+)")
 
@@ -36,7 +36,7 @@ _Range = Annotated[list[float] | None, Field(min_length=2, max_length=2)]
 
 
 class ExposureNeed(BaseModel):
-    """A table ``[[requirement.exposure]]``: the least driving in conditions, of the drives that are scored."""
+    """A table ``[[requirement.exposure]]``: the least driving in conditions, over the scored drives."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
@@ -59,7 +59,7 @@ class ExposureNeed(BaseModel):
 
     @property
     def label(self) -> str:
-        """``20 to 30 m/s, μ 0 to 0.4``, as people read it."""
+        """The conditions as text, for example ``20 to 30 m/s, μ 0 to 0.4``."""
         ranges = (("", self.speed_m_s, " m/s"), ("|a_y| ", self.ay_m_s2, " m/s²"), ("μ ", self.friction, ""))
         words = [f"{name}{r[0]:g} to {r[1]:g}{unit}" for name, r, unit in ranges if r is not None]
         return ", ".join([*words, *([] if self.car is None else [f"car {self.car}"])])
@@ -71,13 +71,13 @@ class Requirement:
 
     Attributes
     ----------
-    estimator : None: the selected estimate of each drive, or the recorded estimate.
-    limit : maximum of the metric (:data:`AT_LEAST`: minimum). None for a requirement on the ratio to ``baseline``, an
-        estimator of the same run, :data:`RUN`, or the output of another run, which is at most ``max_ratio``.
+    estimator : None for the selected estimate of each drive, or the recorded estimate.
+    limit : maximum of the metric (:data:`AT_LEAST`: minimum). None for a requirement on the ratio to ``baseline``,
+        which is at most ``max_ratio``. baseline : estimator of the same run, :data:`RUN`, or output of another run.
     statistic : of several drives: :data:`POOLED` over all their stamps, :data:`WORST_DRIVE`, or the ``quantile`` of the
         drives. confidence : of the interval that decides.
-    exposure_drives, exposure_minutes, exposure_km : the least scored driving for a verdict; ``exposure``: that in
-        conditions.
+    exposure_drives, exposure_minutes, exposure_km : the least scored driving for a verdict. exposure : the least scored
+        driving in conditions.
     """
 
     id: str
@@ -104,14 +104,14 @@ class Requirement:
 
     @property
     def unit(self) -> str:
-        """Unit of its value: that of the metric, 1 for a ratio, ``share`` of coverage and availability."""
+        """Unit of the value: the unit of the metric, 1 for a ratio, ``share`` for coverage and availability."""
         if self.baseline is not None:
             return "1"
         return "share" if self.metric in AT_LEAST else registered()[self.metric].unit_of(self.signal)
 
     @property
     def measured(self) -> str:
-        """What is measured of a drive, independent of the limit: requirements with equal values share blocks."""
+        """Description of the measurement without the limit; requirements with equal descriptions share blocks."""
         of = self.estimator or "selected"
         against = "" if self.baseline == self.other_run else f" / {self.baseline}"
         return f"{self.signal} {self.metric} {self.segment} {of}{against}"
@@ -125,7 +125,7 @@ class Requirement:
 
     @property
     def label(self) -> str:
-        """``sideslip RMSE ≤ 0.5° (nonlinear)``, as people read it."""
+        """The requirement as text, for example ``sideslip RMSE ≤ 0.5° (nonlinear)``."""
         what = f"{LABELS[self.signal]} {registered()[self.metric].label}"
         if self.baseline is None:
             limit = f"{'≥' if self.metric in AT_LEAST else '≤'} {shown(self.bound, self.unit)}"
@@ -143,7 +143,7 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True)
 class ValidationPlan:
-    """Requirements in order. ``file``: name of the file; empty for the default plan, which decides no exit code."""
+    """Requirements in order. ``file``: name of the file; empty for the default plan, which sets no exit code."""
 
     requirements: tuple[Requirement, ...]
     title: str = ""
@@ -158,7 +158,7 @@ class ValidationPlan:
 
 
 def shown(value: float, unit: str) -> str:
-    """Return a value with its unit as people read it."""
+    """Return a value with its unit for display."""
     text, factor = read_unit(unit)
     if unit == "share":
         return f"{round(100.0 * value, 1):g} %"
@@ -230,7 +230,8 @@ def load_plan(path: Path) -> ValidationPlan:
     Raises
     ------
     UsageError
-        The file is missing, is no TOML, or contains wrong, unknown, missing or contradicting entries; all are named.
+        The file is missing, is not TOML, or contains wrong, unknown, missing or contradicting entries; the error lists
+        all of them.
     """
     raw = read_toml(path, "a validation plan (TOML)", UsageError, "pdhef plan init -o plan.toml writes an example")
     plan = plan_from_dict(raw, where=str(path), file=path.name)
@@ -238,7 +239,7 @@ def load_plan(path: Path) -> ValidationPlan:
 
 
 def _placed(requirement: Requirement, folder: Path) -> Requirement:
-    """Return a requirement whose baseline, if it is a path, is relative to the working folder."""
+    """Return a requirement with a baseline path relative to the working folder."""
     baseline = requirement.other_run
     if baseline is None or baseline == RUN or is_url(baseline):
         return requirement
@@ -246,7 +247,7 @@ def _placed(requirement: Requirement, folder: Path) -> Requirement:
 
 
 def plan_from_dict(raw: dict[str, Any], *, where: str, file: str = "") -> ValidationPlan:
-    """Return the plan of parsed TOML; raises UsageError with every problem in one line."""
+    """Return the plan of parsed TOML; raises UsageError with all problems in one line."""
     problems = [unknown(key, PlanTable.model_fields) for key in raw if key not in PlanTable.model_fields]
     title = raw.get("title", "")
     if not isinstance(title, str) or len(title) > 200:
@@ -305,14 +306,14 @@ def _read(raw: object, where: str, problems: list[str]) -> Requirement | None:
 
 
 def comparable() -> tuple[str, ...]:
-    """Return the metrics that a requirement can limit: those with a better side."""
+    """Return the metrics that a requirement can limit: metrics with a better direction."""
     return tuple(
         name for name, m in registered().items() if m.best == "lower" or name in AT_LEAST or name in ("bias", "lag_s")
     )
 
 
 def _limit(table: RequirementTable, where: str, problems: list[str]) -> float | None:
-    """Return the limit in the unit of metrics.parquet, None for a ratio; add what is wrong with it."""
+    """Return the limit in the unit of metrics.parquet, None for a ratio; append its errors to ``problems``."""
     unit = registered()[table.metric].unit_of(table.signal)
     given = {
         "limit": (table.limit, unit, 1.0),
@@ -341,7 +342,7 @@ def _limit(table: RequirementTable, where: str, problems: list[str]) -> float | 
 
 
 def default_plan() -> ValidationPlan:
-    """Return the plan that reports show where none is given: an orientation, not a standard."""
+    """Return the plan of reports without ``--plan``: an orientation, not a standard."""
     beta, degree = "sideslip_rad", 1.0 / DEGREES
     return ValidationPlan(
         (
@@ -356,6 +357,6 @@ def default_plan() -> ValidationPlan:
 
 
 def names_of(requirements: Sequence[Requirement]) -> frozenset[str]:
-    """Return the estimators of the run that requirements name, as subject or baseline."""
+    """Return the estimators of the run that requirements use, as subject or baseline."""
     named = {r.estimator for r in requirements} | {r.baseline for r in requirements}
     return frozenset(name for name in named if name is not None and name != RUN and "/" not in name)

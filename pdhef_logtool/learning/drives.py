@@ -28,18 +28,18 @@ from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
 
-#: Stages of ``pdhef learn``. ``teach``, the default: prior of the calibration and residual of a car, from all drives
-#: with ground truth. ``calibrate``: the car by its sensors alone. ``gain``: residual gain of a network.
+#: Stages of ``pdhef learn``. ``teach``, the default: prior of the calibration and residual of a car, from drives
+#: with ground truth. ``calibrate``: the car from its sensors alone. ``gain``: residual gain of a network.
 TEACH, CALIBRATE, GAIN = STAGES = ("teach", "calibrate", "gain")
-#: Splits of a simulated set that results are reported on, and those that a network is trained on and chosen by.
+#: Splits of a simulated set: those for results, and those for training and model selection.
 HELD_OUT, SEEN = ("test", "extrapolation"), ("train", "validation")
 #: Entries of the configuration that affect the result of learning.
 _SETTINGS = (
     "car", "mapping", "network", "start", "end", "sensors", "friction", "prefer_truth", "reference", "gnss",
 )  # fmt: skip
-#: Value of ``split`` that refuses no drive.
+#: Value of ``split`` that accepts every drive.
 ANY_SPLIT = "any"
-#: Drives that are named in an error.
+#: Maximum number of drives to name in an error.
 _NAMED = 3
 
 
@@ -51,9 +51,9 @@ class LearnSettings:
     ----------
     config : car, network, mapping, slice, sensors, truth channel.
     stage : one of :data:`STAGES`.
-    seed : of every random draw.
-    split : only drives that their set's manifest assigns to this split; "any" accepts drives of all splits, also of
-        those that the stage refuses by default.
+    seed : seed of every random draw.
+    split : use only drives that their set's manifest assigns to this split; "any" accepts drives of all splits, also
+        of those that the stage otherwise rejects.
     """
 
     config: RunConfig
@@ -81,7 +81,7 @@ def config_document(config: RunConfig) -> dict[str, Any]:
 
 
 def open_car(config: RunConfig, warn: Tell) -> Car:
-    """Return the car that a command requires; raises UsageError where none is named."""
+    """Return the car that a command requires; raises UsageError if none is named."""
     if config.car is None:
         raise UsageError(
             expected="a car",
@@ -96,12 +96,12 @@ def open_car(config: RunConfig, warn: Tell) -> Car:
 
 
 def open_mapping(config: RunConfig) -> SignalMapping | None:
-    """Return the mapping that is configured, None without."""
+    """Return the configured mapping, or None."""
     return mapping_of(config.mapping)
 
 
 def record_head(kind: str, version: int, settings: LearnSettings, car: Car) -> dict[str, Any]:
-    """Return how every record of a command begins; no date, so that the same command gives the same bytes."""
+    """Return the common first entries of the records; without a date, so that equal commands give equal bytes."""
     return {
         "format": kind,
         "version": version,
@@ -113,12 +113,12 @@ def record_head(kind: str, version: int, settings: LearnSettings, car: Car) -> d
 
 
 def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInput], dict[str, str]]:
-    """Return the logs to take, and by name the split that the manifest of a set beside a log assigns to it.
+    """Return the logs to use, and by name the split that a set's manifest assigns to a log.
 
     Raises
     ------
     UsageError
-        A drive belongs to a refused split, or none is left.
+        A drive belongs to a rejected split, or no drive is left.
     """
     inputs = find_logs(arguments, private_redirects=settings.config.allow_private_redirects)
     manifests = cache(set_manifest)
@@ -140,9 +140,9 @@ def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInp
             expected="drives that no network was trained on" if gain_only else "drives that no result is reported on",
             got=", ".join(refused[:_NAMED]) + more,
             where="learn",
-            remedy="take --split test, or --split any if this network was not trained on them"
+            remedy="use --split test, or --split any if this network was not trained on them"
             if gain_only
-            else "a test on drives that a stage has used is no test: take --split validation, or --split any",
+            else "drives used by a stage are no longer test drives: use --split validation, or --split any",
         )
     return list(inputs), {i.stem: splits[i.stem] for i in inputs if splits[i.stem]}
 
@@ -165,12 +165,12 @@ def _entries(value: Any) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class DriveRecord:
-    """Record of a drive in every command; ``left_out`` is the reason why it is not used, empty if it is.
+    """Record of a drive in every command; ``left_out`` is the reason for its exclusion, empty if it is used.
 
     Attributes
     ----------
-    seconds : from first to last stamp. span_s : these two, in seconds from the log's start.
-    truth : sources of the ground truth. friction_from : in the words of the report. notes : of the reading.
+    seconds : from first to last stamp. span_s : these stamps in seconds from the log's start.
+    truth : sources of the ground truth. friction_from : source of the friction. notes : notes of the reader.
     counts : counts of the command, by name.
     """
 
@@ -189,13 +189,13 @@ class DriveRecord:
 
     @property
     def learnt_on(self) -> LearntOn:
-        """The drive as a car remembers it."""
+        """The drive as an entry of a car file."""
         start_s, end_s = self.span_s or (0.0, 0.0)
         return LearntOn(name=self.name, sha256=self.sha256, start_s=round(start_s, 2), end_s=round(end_s, 2))
 
     @property
     def lost(self) -> tuple[str, ...]:
-        """Losses of the input, in words."""
+        """Losses of the input as text."""
         return lost_texts(self.losses)
 
     def to_dict(self) -> dict[str, Any]:
@@ -216,7 +216,7 @@ class DriveRecord:
 def record_of(
     drive: Drive, *, split: str | None = None, whole: WholeDrive | None = None, left_out: str = ""
 ) -> DriveRecord:
-    """Return the record of a drive, after it was read."""
+    """Return the record of a drive that was read."""
     return DriveRecord(
         name=drive.name,
         file=drive.file,
@@ -233,7 +233,7 @@ def record_of(
 
 
 def tell_drive(record: DriveRecord, warn: Tell) -> None:
-    """Warn of the notes and losses of a drive, and of the reason why it is left out."""
+    """Warn of the notes and losses of a drive, and of the reason for its exclusion."""
     for text in (*record.notes, *record.lost):
         warn(f"{record.name}: {text}")
     if record.left_out:
@@ -241,14 +241,14 @@ def tell_drive(record: DriveRecord, warn: Tell) -> None:
 
 
 def exit_code(records: Sequence[DriveRecord]) -> int:
-    """Return 0 if all drives took part as they were recorded, 3 if not, 1 if none took part."""
+    """Return 0 if all drives were used completely, 3 if not, 1 if none was used."""
     if all(r.left_out for r in records):
         return EXIT_FAILURE
     return EXIT_PARTIAL if any(r.left_out or r.lost for r in records) else EXIT_OK
 
 
 def no_drive(expected: str, where: str) -> EstimatorError:
-    """Return the error where no drive can be used."""
+    """Return the error for a command without a usable drive."""
     return EstimatorError(
         expected=f"at least one drive with {expected}",
         got="none",
@@ -259,7 +259,7 @@ def no_drive(expected: str, where: str) -> EstimatorError:
 
 
 def drives_document(records: Sequence[DriveRecord]) -> dict[str, list[dict[str, Any]]]:
-    """Return the drives and those left out for the JSON of a command."""
+    """Return the used and the excluded drives for the JSON of a command."""
     return {
         "drives": [r.to_dict() for r in records if not r.left_out],
         "left_out": [r.to_dict() for r in records if r.left_out],
@@ -267,7 +267,7 @@ def drives_document(records: Sequence[DriveRecord]) -> dict[str, list[dict[str, 
 
 
 def no_true_sideslip(plan: DrivePlan) -> str:
-    """Return why a drive has no ground truth of the sideslip, empty if it has."""
+    """Return why a drive has no ground truth of the sideslip; empty if it has."""
     if plan.truth is None or "sideslip_rad" not in plan.derivation:
         return "no true sideslip"
     if "sideslip_rad" in plan.dependent:
@@ -276,7 +276,7 @@ def no_true_sideslip(plan: DrivePlan) -> str:
 
 
 def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
-    """Return where [N] the sideslip of the ground truth is available above the low-speed limit."""
+    """Return a mask [N]: sideslip of the ground truth available, speed above the low-speed limit."""
     finite: BoolArray = np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))
     return finite
 
@@ -295,8 +295,8 @@ def load_drive(
 
     Parameters
     ----------
-    refuse : why a command cannot use it, empty if it can; asked before anything but its beginning is read.
-    least_scored : stamps with a true sideslip above the car's lowest speed that it must have.
+    refuse : returns why a command cannot use the drive, empty if it can; called before all of the log is read.
+    least_scored : required number of stamps with a true sideslip above the car's low-speed limit.
 
     Raises
     ------

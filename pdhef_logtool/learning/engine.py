@@ -47,17 +47,17 @@ class LearnResult:
 
     @property
     def exit_code(self) -> int:
-        """0 if all drives took part completely, 3 otherwise."""
+        """0 if all drives were used completely, 3 otherwise."""
         return exit_code(self.records)
 
     @property
     def drives(self) -> tuple[DriveRecord, ...]:
-        """Drives that took part."""
+        """Drives that were used."""
         return tuple(r for r in self.records if not r.left_out)
 
     @property
     def left_out(self) -> tuple[DriveRecord, ...]:
-        """Drives that did not take part."""
+        """Drives that were excluded."""
         return tuple(r for r in self.records if r.left_out)
 
     def to_dict(self) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
     UsageError
         An option is wrong, or the set of a drive excludes it from learning.
     PdhefError
-        A file or log cannot be read: without it the result would change unnoticed.
+        A file or log cannot be read; without it the result would differ.
     EstimatorError
         There is too little driving with ground truth.
     """
@@ -107,7 +107,7 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
 
 
 def _open(settings: LearnSettings, warn: Tell) -> Car:
-    """Return the car to start from; all stages but ``gain`` start from its vehicle file alone."""
+    """Return the car to start from; all stages but ``gain`` use only its vehicle file."""
     config = settings.config
     if settings.stage == GAIN:
         return open_car(config, warn)

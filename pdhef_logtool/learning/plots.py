@@ -1,4 +1,4 @@
-"""How learning commands set up and write plots: small PNGs, the same bytes for the same figures."""
+"""Set up and write plots of the learning commands: small PNGs, with equal bytes for equal figures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure of a size in inches."""
+    """Return an empty figure; size in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -20,7 +20,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """Return a figure as PNG, without a time or a version in it."""
+    """Return a figure as PNG without time stamp and version."""
     content = io.BytesIO()
     figure.savefig(content, format="png", metadata={"Software": None})
     return content.getvalue()

@@ -1,4 +1,4 @@
-"""The sideslip that teaches: ground truth, or on request the sideslip reference where a log has none."""
+"""Sideslip for training: ground truth, or on request the sideslip reference of a log without ground truth."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.referencing import reference_of
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, lacking
 
-#: Sideslip error of a single track, at which ground truth of the same uncertainty has half the weight, rad.
+#: Sideslip error of a single track in rad; ground truth with the same uncertainty has the weight 1/2.
 MODEL_STD_RAD = math.radians(0.3)
 
-#: Gives what teaches at stamps [N].
+#: Returns the sideslip for training at stamps [N].
 TruthAt = Callable[[IntArray], StateTrack]
 
 
 def weight_of(std_rad: FloatArray) -> FloatArray:
-    """Return the weights of a sideslip by its 1-sigma: one over its variance and the model's together, 1 if exact."""
+    """Return weights by the 1-sigma of the sideslip: model variance over the total variance, 1 if exact."""
     return np.asarray(1.0 / (1.0 + (std_rad / MODEL_STD_RAD) ** 2), dtype=np.float64)
 
 
 def teaching_reference(drive: Drive, config: RunConfig) -> tuple[TruthAt | None, str]:
-    """Return the reference that teaches, None where a log has ground truth; and why there is neither."""
+    """Return the reference, or None if a log has ground truth; and the reason if there is neither."""
     lacks = no_true_sideslip(drive.plan)
     if not lacks or config.reference != "on" or lacking(drive):
         return None, lacks
@@ -41,5 +41,5 @@ def teaching_reference(drive: Drive, config: RunConfig) -> tuple[TruthAt | None,
 
 
 def independent(reference: StateTrack) -> StateTrack:
-    """Return a reference without the stamps at which it is not independent of the estimators' sensors."""
+    """Return a reference without stamps at which it depends on the estimators' sensors."""
     return replace(reference, valid=reference.valid & (reference.independent > 0.0))

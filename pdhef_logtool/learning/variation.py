@@ -1,9 +1,8 @@
-"""Wrong friction and wrong vehicle files on purpose: what a network must get along with (docs/method.md#limits).
+"""Random errors of friction and vehicle file in training data (docs/method.md#limits).
 
-In service the nominal model has a friction and a vehicle that are not quite those of the drive. A network that was
-trained on right ones takes a model error for something else. So a share of the drives of a training set is extracted
-with a nominal model that is wrong by a random amount, the same for the whole drive; features and targets follow from it
-as they would in service.
+In operation, friction and vehicle of the nominal model differ from the real ones. A network trained with exact ones
+would attribute the model error to other causes. A share of the drives of a training set is therefore extracted with a
+nominal model with random errors, constant over a drive; features and targets follow from it as in operation.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import AxleTyre, VehicleParameters
 
-#: Share of the drives that are left as they are: most logs come with a good vehicle file.
+#: Share of the drives without variation: most logs have a good vehicle file.
 UNVARIED_SHARE = 0.4
-#: 1-sigma of the natural logarithm, as multiples of the spread that is asked for.
+#: 1-sigma of the natural logarithm, as multiples of the requested spread.
 SPREADS = {
     "friction": 1.5,
     "mass": 0.7,  # with all inertia
@@ -31,7 +30,7 @@ SPREADS = {
 CG_SHIFT = 0.2
 #: Largest spread.
 MAX_VARIATION = 0.3
-#: No draw goes further than this many 1-sigma.
+#: Limit of a draw in multiples of 1-sigma.
 LIMIT = 2.5
 
 
@@ -48,7 +47,7 @@ def vary(vehicle: VehicleParameters, spread: float, key: str) -> Variation:
 
     Parameters
     ----------
-    spread : about the relative 1-sigma of the stiffness; 0 leaves everything as it is.
+    spread : approximate relative 1-sigma of the stiffness; 0 for no variation.
     key : the same key gives the same draw, for instance the hash of the log and a seed.
     """
     rng = np.random.default_rng(int.from_bytes(hashlib.sha256(key.encode()).digest()[:8]))

@@ -369,7 +369,7 @@ def _load_cached(path: Path, _modified_ns: int, _size: int) -> Database:
     from cantools.database.can import Database
 
     try:
-        # Overlapping signals are an error of the file, not of the signals that are asked for.
+        # Overlapping signals are an error of the file, not of the requested signals.
         matches = cantools.database.load_file(path, strict=False)
     except Exception as error:  # noqa: BLE001  cantools' parsers raise any exception for a malformed file.
         raise _no_dbc(path, (str(error).splitlines() or [""])[0] or type(error).__name__) from None

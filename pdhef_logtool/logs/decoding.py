@@ -100,7 +100,7 @@ def channel_schema(
 class ChannelDecoder:
     """Decodes the messages of one channel for one set of paths.
 
-    ``undecodable`` are the rows of the last block whose payload does not fit their type (their fields are NaN).
+    ``undecodable`` are the rows of the last block with a payload that does not fit their type (their fields are NaN).
     """
 
     schema: MessageSchema
@@ -131,7 +131,7 @@ class ChannelDecoder:
     def _read_records(
         self, block: Block, rows: IntArray, left: IntArray, partial: list[tuple[IntArray, dict[str, NDArray[Any]]]]
     ) -> IntArray:
-        """Read what has a fixed layout; returns the rows that have none."""
+        """Read messages of a fixed layout; return the other rows."""
         offset, length = block.offset[rows], block.length[rows]
         no_layout: list[IntArray] = []
         tried = 0
@@ -157,7 +157,7 @@ class ChannelDecoder:
         return np.concatenate([*no_layout, left]) if no_layout else left
 
     def _check_widths(self, layout: WireLayout, n: int) -> None:
-        """Refuse a layout one of whose arrays has too many elements for N rows of columns."""
+        """Refuse a layout with an array that has too many elements for N rows of columns."""
         most = min(self.schema.limits.array_width, _most_columns(n))
         selected = (layout.leaves.get(s.components[0]) for s in self.selections if s.shape == "array")
         if any((leaf.count or 0) > most for leaf in selected if leaf is not None):
@@ -172,7 +172,7 @@ class ChannelDecoder:
         left: IntArray,
         partial: list[tuple[IntArray, dict[str, NDArray[Any]]]],
     ) -> IntArray:
-        """Read what has this layout; returns the rows that have not."""
+        """Read messages of this layout; return the other rows."""
         if len(left) < len(offset):
             offset, length = offset[left], length[left]
         candidates = left
@@ -220,7 +220,7 @@ class ChannelDecoder:
         return lambda message: bytes_of_text(plain(message), selection.text)
 
     def single_decoder(self) -> Callable[[bytes], object]:
-        """Return what decodes one message; None where its payload does not fit the type, or costs too much."""
+        """Return a decoder of one message; it returns None if the payload does not fit the type or is too large."""
         schema = self.schema
         if schema.wire == "protobuf":
             return _tolerant(schema.message_class.FromString, schema)
@@ -254,7 +254,7 @@ def _tolerant(decode: Callable[[bytes], object], schema: MessageSchema) -> Calla
 
 
 def _affordable_bytes(schema: MessageSchema) -> float:
-    """Return the bytes of a message whose objects fit a memory: one of a byte or two takes a hundred."""
+    """Return the largest message for which decoded objects fit the memory: 100 bytes per field of a byte or two."""
     if schema.wire == "protobuf":
         return schema.limits.chunk_bytes / 4
     if schema.wire == "json":

@@ -1,4 +1,4 @@
-"""Message definitions for logs without any: the user's, those of an installed ROS, and a few that are shipped."""
+"""Message definitions for logs without any: the user's, an installed ROS's, and a few that are shipped."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _USUAL = (Path("/usr/local"), Path("/usr"))
 class Definitions:
     """Files of definitions by type name in ROS 2 form, and by bare name where a file lies in no package.
 
-    ``archive`` is the zip file or wheel in which the files are; None where they are files of their own. ``prefixes``
+    ``archive`` is the zip file or wheel with the files; None for plain files. ``prefixes``
     and ``sources`` are folders of an installed ROS: ``share/PACKAGE/msg`` below the first, ``PACKAGE/msg`` below the
     others.
     """
@@ -39,9 +39,9 @@ class Definitions:
     sources: tuple[Path, ...] = ()
 
     def text_of(self, type_name: str) -> str:
-        """Return the text of a type without the types it contains; empty where there is none.
+        """Return the text of a type without the types it contains, or an empty string.
 
-        The user's files come first, then what is shipped, then what is installed.
+        The order is the user's files, shipped files, installed files.
         """
         package, _, name = type_name.partition("/msg/")
         path = self.files.get(type_name) or self.files.get(name if package else "")
@@ -71,13 +71,13 @@ class Definitions:
             yield from sorted(source.glob(f"*/{package}/{file.as_posix()}"))
 
 
-#: Shipped definitions only, without those of the user and the machine.
+#: Shipped definitions only, without the user's and the machine's.
 SHIPPED = Definitions()
 
 
 @cache
 def _of_machine(prefixes: str, sources: str) -> Definitions:
-    """Return what is shipped and installed: sourced workspaces first, then the newest distribution."""
+    """Return shipped and installed definitions: sourced workspaces first, then the newest distribution."""
     named = (Path(p) for p in prefixes.split(os.pathsep) if p)
     distributions = sorted(Path("/opt/ros").glob("*"), reverse=True)
     return Definitions(

@@ -31,7 +31,7 @@ RUN_FILE = "run.json"
 class LogInput:
     """A log and its ``stem``: unique in a run, fit for a folder name on any system, equal to ``log`` in the tables.
 
-    The stem is the log's name; where that is none for a folder, or another log's too, hash digits end it.
+    The stem is the log's name; hash digits follow if it is not unique or not valid as a folder.
     ``span_s``: only this slice of it, in seconds from its start; it takes precedence over a slice for all logs.
     """
 
@@ -46,7 +46,7 @@ class LogInput:
 
     @property
     def folder(self) -> Path | None:
-        """Its folder on this machine; None for a remote log, beside which nothing is searched."""
+        """Its folder on this machine; None for a remote log: no files beside it are searched."""
         return self.path.parent if isinstance(self.path, Path) else None
 
 
@@ -55,9 +55,9 @@ Logs: TypeAlias = "str | LogPlace | Sequence[str | LogPlace] | Sequence[LogInput
 
 
 def find_logs(arguments: Logs, *, private_redirects: bool = False) -> list[LogInput]:
-    """Expand what names logs to logs in a stable order; each log once. What was found stays as it is.
+    """Expand paths, patterns and URLs to logs in a stable order; each log once. Logs that were found already are kept.
 
-    A file or rosbag2 folder that is named outright is taken as it is, whether it is readable or not. Folders, and
+    A file or rosbag2 folder that is named itself is a log, readable or not. Folders, and
     ``s3://bucket/prefix/``, are searched for logs by suffix; a rosbag2 folder of this machine counts as one log. Any
     other URL is one log. ``@list.txt`` means the lines of a file. ``private_redirects`` as for
     :class:`~pdhef_logtool.logs.remote_place.RemotePlace`.
@@ -131,8 +131,7 @@ def folders_of(inputs: Sequence[LogInput]) -> list[str]:
 def identity_of(log: LogInput) -> str:
     """Return the identity of a log, independent of its path: the sha256 of its content.
 
-    Of an object on a server, which is not fetched for this, it is that of its URL, size and ETag (or, where the server
-    gives none, time of modification).
+    An object on a server is not fetched: its identity is the sha256 of its URL, size and ETag (or modification time).
 
     Raises
     ------
@@ -173,7 +172,7 @@ def hash_log(path: Path) -> str:
 
 
 def log_state(path: LogPlace) -> tuple[tuple[int, int, int], ...]:
-    """Return what differs after a file of a local log was replaced or written: file number, size, time of change."""
+    """Return an identity that changes when a file of a local log is replaced or written: file number, size, time."""
     if isinstance(path, RemotePlace):
         return ()  # each request names the version of the object
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
@@ -312,7 +311,7 @@ def _stays(name: str, counts: Mapping[str, int]) -> bool:
 
 
 def as_taken(name: str) -> str:
-    """Return what two names share that some file system takes for one."""
+    """Return a key that two names share if a file system may regard them as equal."""
     return unicodedata.normalize("NFC", name).casefold()
 
 

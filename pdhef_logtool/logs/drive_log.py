@@ -1,8 +1,8 @@
 """The interface of log formats: topics, field types, and columns of the requested fields, in windows of log time.
 
 A format implements :class:`DriveLog`, or gives its columns to :class:`~pdhef_logtool.logs.table_log.TableLog`, and is
-listed in :mod:`~pdhef_logtool.logs.formats`. What only some logs can do (copies of messages, an index) is a capability:
-a property that is None by default.
+listed in :mod:`~pdhef_logtool.logs.formats`. Features of some logs only (copies of messages, an index) are
+capabilities: properties that are None by default.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ class DriveLog(ABC):
 
     @property
     def messages(self) -> ColumnarLog | None:
-        """The log as messages whose bytes can be copied to another file; None: it has columns only."""
+        """The log as messages with bytes that can be copied to another file; None: it has columns only."""
         return None
 
     @property
@@ -172,7 +172,7 @@ class DriveLog(ABC):
         return self.given_databases
 
     def definition(self, path: Path) -> Path:
-        """Return a file that defines something of the log, where it is."""
+        """Return the file that contains a definition of the log."""
         return path
 
     def unreadable(self, topic: str) -> str:

@@ -31,5 +31,5 @@ class _QuickParser(IDLParser):
 
 
 def idl_types(text: str) -> Any:
-    """Return the types of an IDL text as rosbags has them; raises what its parser raises."""
+    """Return the types of an IDL text as rosbags has them; raises the errors of its parser."""
     return make_typesdict(_QuickParser(text).specification())

@@ -17,7 +17,7 @@ class LogFile:
     Attributes
     ----------
     path : on this machine. place : as the user named it; ``path`` may be a decompressed or downloaded copy.
-    meter : what reading may cost. release : to be called when the log is closed; removes a copy.
+    meter : counts the cost of reading. release : to be called when the log is closed; removes a copy.
     cut : why a copy does not have all of the file; empty where it does.
     """
 

@@ -19,10 +19,10 @@ from pdhef_logtool.logs.byte_source import ByteSource, CutError
 from pdhef_logtool.logs.container import MAX_TIME_NS, MCAP_MAGIC
 from pdhef_logtool.logs.recording_span import SILENCE_NS, STEP_BACK_NS
 
-#: One request brings the summary of a drive of several minutes; what is missing of a longer one comes with a second.
+#: One request brings the summary of a drive of several minutes; a longer one takes a second request.
 TAIL_BYTES = 256 << 10
 _MOST_SUMMARY_BYTES = 64 << 20
-RECORD = struct.Struct("<BQ")  # opcode, size of what follows
+RECORD = struct.Struct("<BQ")  # opcode, size of the content
 FOOTER = struct.Struct("<BQQQI")  # the same, then: start of summary and of its offsets, CRC of the summary
 _CHUNK_INDEX = struct.Struct("<QQQQI")  # first and last time, offset, length, bytes of the message indexes' offsets
 STATISTICS = struct.Struct("<QHIIIIQQI")
@@ -57,7 +57,7 @@ class McapIndex:
 
 
 def read_index(source: ByteSource) -> McapIndex | None:
-    """Read the summary of an MCAP from its end; None if there is none that can be used."""
+    """Read the summary of an MCAP from its end; None without a usable one."""
     try:
         section = _summary(source)
         return None if section is None else _index(*section)
@@ -155,7 +155,7 @@ def _apart(chunks: list[IndexedChunk], attachments: list[tuple[int, int]], limit
 
 
 def _in_order(chunks: list[IndexedChunk]) -> bool:
-    """Return whether the chunks' times are those of a sound recording; any other file is walked."""
+    """Return whether the chunks' times are plausible for a sound recording; other files are walked."""
     newest: dict[int, int] = {}
     for chunk in chunks:
         if not 0 <= chunk.last_ns - chunk.first_ns < SILENCE_NS or chunk.last_ns >= MAX_TIME_NS:

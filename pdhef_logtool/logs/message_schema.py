@@ -41,8 +41,8 @@ class FieldInfo:
 
     ``path`` is dotted (``linear_acceleration.x``); fixed arrays appear as ``name[i]`` per element when they have at
     most 16 elements, sequences as ``name[]``. ``kind`` is ``number``, ``bool``, ``string`` or ``time`` (a ROS
-    builtin time, whose path names the whole struct, for example ``header.stamp``). ``code`` is NumPy's of a number in a
-    binary message (``f4``), empty where the encoding has no such types. ``unit`` is the text that the file gives
+    builtin time; the path then names the struct, for example ``header.stamp``). ``code`` is NumPy's of a number in
+    a binary message (``f4``), empty where the encoding has no such types. ``unit`` is the text that the file gives
     (``km/h``), empty where it gives none.
     """
 
@@ -99,7 +99,7 @@ Node: TypeAlias = Scalar | Struct | Array | Unknown
 
 @dataclass(frozen=True, slots=True)
 class MessageSchema:
-    """A message type: its tree, and what its messages are decoded with.
+    """A message type: its tree and its decoder.
 
     ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` has the definitions of ROS types,
     ``message_class`` is the class of a protobuf type; ``limits`` apply to its messages, too; ``borrowed`` are the files
@@ -197,7 +197,7 @@ _CODES = {
 _SEPARATOR = re.compile(r"^={3,}[ \t]*$", re.MULTILINE)
 
 
-#: Bytes of descriptors that cost what one byte of a text costs, which a grammar parses step by step.
+#: Bytes of descriptors at the cost of one byte of text, which a grammar parses step by step.
 _BYTES_OF_TEXT = 32
 #: An element of a fixed array of structs or texts is a line in each of the functions that rosbags writes for its type.
 _PLACES_AN_ELEMENT = 8
@@ -347,7 +347,7 @@ _JSON_SCALARS: dict[object, Scalar] = {
 
 
 def _json_node(schema: Any, whole: _Json, times: int, inside: tuple[str, ...], depth: int) -> Node:
-    """Return a schema's tree; ``inside`` are the references that lead here: what contains itself is left open."""
+    """Return a schema's tree; ``inside`` are the references that lead here: recursion is left open."""
     if not isinstance(schema, dict) or depth > whole.unfolding.limits.schema_depth:
         return Unknown()
     whole.unfolding.enter(times, 0)
@@ -370,7 +370,7 @@ def _json_node(schema: Any, whole: _Json, times: int, inside: tuple[str, ...], d
 
 
 def _referenced(document: Any, reference: str) -> Any:
-    """Return the part of a document that ``#/definitions/Name`` names; None where there is none."""
+    """Return the part of a document that ``#/definitions/Name`` names, or None."""
     for part in reference[2:].split("/"):
         document = document.get(part) if isinstance(document, dict) else None
     return document
@@ -506,7 +506,7 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
 
 
 def _part(node: Node | None, step: Step) -> Node | None:
-    """Return a member of a struct or an element of an array; None where there is none."""
+    """Return a member of a struct or an element of an array, or None."""
     if isinstance(node, Struct) and isinstance(step, str):
         return node.members.get(step)
     is_element = isinstance(node, Array) and isinstance(step, int) and (node.length is None or step < node.length)

@@ -34,7 +34,7 @@ from pdhef_logtool.storage.documents import read_text
 from pdhef_logtool.storage.files import scratch_folder
 
 _REMEDY = "give the recording itself"
-#: What a repository contains in place of a large file that was not fetched.
+#: First bytes of a Git LFS pointer, which is in a repository in place of a large file that was not fetched.
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 #: Kinds of logs by container format, as a file and as a folder.
 _KINDS = {"mcap": "mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}
@@ -55,10 +55,10 @@ def open_log(
 
     Parameters
     ----------
-    limits : resource limits of reading; what exceeds them is a loss.
+    limits : resource limits of reading; data beyond them are a loss.
     msgs : folder, zip file or wheel with definitions of types that the log does not define (:func:`read_definitions`);
         or a DBC file, or a folder of them, that defines the CAN frames of a log of tables.
-    wanted : what of a remote log will be read.
+    wanted : the parts of a remote log that will be read.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def _open_file(path: Path, meter: Meter) -> Container | DriveLog:
 
 
 def _open_remote(place: RemotePlace, meter: Meter, wanted: Wanted) -> Container | DriveLog:
-    """Open an object; what has no index, or needs all of its file, is read from a copy that is fetched once."""
+    """Open an object; a log without an index, or of a format that needs the whole file, is copied once."""
     from pdhef_logtool.logs.remote_source import RemoteSource
 
     source = RemoteSource(place)

@@ -114,7 +114,7 @@ def _message_node(descriptor: Any, above: tuple[str, ...], unfolding: Unfolding)
 
 
 def _field_node(field: Any, inside: tuple[str, ...], unfolding: Unfolding) -> Node | None:
-    """Return a field's node; None where it has no place among columns."""
+    """Return a field's node; None if it cannot be a column."""
     from google.protobuf.descriptor import FieldDescriptor
 
     unfolding.enter(1, len(inside))
@@ -136,7 +136,7 @@ def _field_node(field: Any, inside: tuple[str, ...], unfolding: Unfolding) -> No
 def compile_getter(schema: MessageSchema, selection: Selection) -> Callable[[Any], object]:
     """Turn a resolved path into a function of a message: one value, or a tuple of them for several components.
 
-    The function gives None for what a message lacks, and for None.
+    The function returns None for absent fields and for None.
     """
     getters = [_compile_steps(schema.message_class.DESCRIPTOR, steps) for steps in selection.components]
     return getters[0] if len(getters) == 1 else lambda message: tuple(get(message) for get in getters)

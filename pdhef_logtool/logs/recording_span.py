@@ -9,7 +9,7 @@ boot splits a recording in two; a clock that is set back records the same times 
   step are left out while their times were recorded before, and ``BREAK_NS`` around, so that two passes are never
   interleaved and the break is a gap.
 
-Of a sound log nothing is left out, and its first and last log time do not change.
+A sound log keeps all messages, and its first and last log time.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from pdhef_logtool.logs.container import Container, Span
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
-#: A longer silence ends a stretch. Shorter ones cost no window of their own.
+#: A longer silence ends a stretch.
 SILENCE_NS = 600_000_000_000
 #: A stretch with at most this many messages is an outlier: too short for any estimate.
 OUTLIER_MESSAGES = 3
@@ -37,7 +37,7 @@ STEP_BACK_NS = 1_000_000_000
 STEP_BACK_MESSAGES = 5
 #: Left out beside times that were recorded twice: the true duration of the step is unknown.
 BREAK_NS = 1_000_000_000
-#: Below this share of a log's messages what is left out is a note, above it is a loss.
+#: Messages left out are a note below this share of a log's messages, a loss above it.
 NOTED_SHARE = 0.01
 
 OUTLIER, OTHER_EPOCH, TIME_JUMP = "outlier", "other-epoch", "time-jump"
@@ -54,7 +54,7 @@ SpanTimes = Callable[[int, Span], tuple[IntArray, IntArray] | None]
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """Messages of a topic in [low_ns, high_ns] that were recorded at or after a place: file, span, row of its own."""
+    """Messages of a topic in [low_ns, high_ns] that were recorded at or after a place: file, span, row."""
 
     topic: str
     place: tuple[int, int, int]
@@ -69,7 +69,7 @@ class RecordingSpan:
     Attributes
     ----------
     intervals : [start, end) in ns, ascending, apart by more than ``SILENCE_NS``; none for a log without messages.
-    cuts : what is left out within them. left_out : messages left out, by topic and reason. losses : the same in words.
+    cuts : intervals left out within them. left_out : messages left out, by topic and reason. losses : in words.
     """
 
     intervals: tuple[tuple[int, int], ...]
@@ -144,7 +144,7 @@ def steps_back(times_ns: IntArray) -> IntArray:
 
 
 def recorded_twice(times_ns: IntArray) -> list[tuple[int, int, int]]:
-    """Return (place, low, high): times [N] in [low, high] at or after a place repeat those of an earlier pass.
+    """Return (place, low, high): times [N] in [low, high] at or after a place repeat an earlier pass.
 
     A pass ends where the times fall back by more than ``STEP_BACK_NS``.
     """
@@ -165,7 +165,7 @@ def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> Rec
 
     Parameters
     ----------
-    times : reads the times of a span. where : what losses call the log.
+    times : reads the times of a span. where : name of the log in losses.
     """
     look = _look(containers, times)
     intervals, left_out, losses, total = _kept_epoch(look, where)
@@ -284,7 +284,7 @@ def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
 
 
 def _cuts(looked: Sequence[_Looked], intervals: Sequence[tuple[int, int]]) -> list[Cut]:
-    """Return what was recorded twice, of all topics, if the time of one of them clearly stepped back."""
+    """Return the intervals that were recorded twice, of all topics, if the time of one of them clearly stepped back."""
     if all(of.stamps is None for of in looked):
         return []
     sequences: dict[str, tuple[IntArray, list[tuple[int, int, int, int]]]] = {}

@@ -1,7 +1,7 @@
 """Resource limits of reading a log, for all readers of untrusted input; exceeding one counts as damage.
 
 A hundred bytes of a third-party file can declare gigabytes, and a short schema can unfold without end. Each limit is
-far above what recorders write and far below what harms a machine; one factor raises all (``--set budget=FACTOR``).
+far above the files of recorders and far below a machine's capacity; one factor raises all (``--set budget=FACTOR``).
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class ResourceLimits:
 
     Attributes
     ----------
-    chunk_bytes : decompressed bytes of what is read as a whole: a chunk, or a run of messages without chunks.
+    chunk_bytes : decompressed bytes of a unit of reading: a chunk, or a run of messages without chunks.
     chunk_ratio : decompressed by stored bytes of a chunk, or file, of more than a MiB.
-    chunk_messages : messages of what is read as a whole.
+    chunk_messages : messages of a unit of reading.
     messages_per_byte : messages by stored bytes of a chunk of more than 65,536 messages.
     channels : of one file. metadata_bytes : of one declaration, metadata record or header.
     schema_bytes : text or descriptors of one schema. schema_leaves : scalar places of an unfolded schema.
@@ -86,7 +86,7 @@ class ResourceLimits:
         self.check("table_bytes", size - self.table_ratio * stored, what)
 
     def check_messages(self, count: int, stored: int) -> None:
-        """Raise :class:`LimitError` if ``stored`` bytes may not contain so many messages."""
+        """Raise :class:`LimitError` if ``stored`` bytes cannot contain this number of messages."""
         self.check("chunk_messages", count, "a chunk")
         if count > _FEW_MESSAGES:
             self.check("messages_per_byte", count / max(stored, 1), "a chunk")

@@ -134,7 +134,7 @@ class Rosbag1Container(FileContainer):
         self.drop_undeclared("connections")
 
     def _check_infos(self, chunks: int) -> None:
-        """Open the chunks whose index records differ from the bag's index section, as these could hide messages."""
+        """Open the chunks with index records that differ from the bag's index section: these could hide messages."""
         chunks_read, spans = self.chunks, self.spans[:]
         missing = chunks - self._found
         self.chunks = []
@@ -196,7 +196,7 @@ class Rosbag1Container(FileContainer):
         )
 
     def _close_chunk(self, complete: bool = True) -> None:
-        """Add the chunk whose index records were read; open it where they are missing or cannot be right."""
+        """Add the chunk after its index records; open it if they are missing or implausible."""
         chunk, self._pending = self._pending, None
         if chunk is None:
             return

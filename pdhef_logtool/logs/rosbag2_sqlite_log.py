@@ -1,4 +1,4 @@
-"""rosbag2 SQLite databases as a container: opened immutable, pages of rows as spans, nothing written beside."""
+"""rosbag2 SQLite databases as a container: opened immutable, pages of rows as spans; no file is written beside it."""
 
 from __future__ import annotations
 
@@ -235,5 +235,5 @@ class SqliteContainer(Container):
 
 
 def _text(stored: bytes) -> str:
-    """Decode a text column even where it is damaged."""
+    """Decode a text column even if it is damaged."""
     return stored.decode("utf-8", errors="replace")

@@ -23,7 +23,7 @@ def schema_file(name: str) -> Traversable:
 
 @cache
 def shipped_definition(type_name: str) -> str:
-    """Return the text of a type that is shipped, without the types it contains; empty where it is not."""
+    """Return the text of a shipped type without the types it contains, or an empty string."""
     if not _TYPE_NAME.fullmatch(type_name):
         return ""
     file = schema_file(f"{type_name}.msg")

@@ -1,4 +1,4 @@
-"""Byte layouts of CDR and ROS 1 messages whose strings and sequences have known lengths.
+"""Byte layouts of CDR and ROS 1 messages with strings and sequences of known lengths.
 
 Such a message is one record of fixed size, so that N of them are one structured NumPy array: read and written
 column by column instead of message by message. Alignment follows CDR version 1: every primitive is aligned to its
@@ -63,7 +63,7 @@ class WireLayout:
     texts: Mapping[Steps, tuple[int, int]]
 
 
-#: Returns the length of the string or sequence at these steps, whose length word is at this offset.
+#: Returns the length of the string or sequence at these steps, with its length word at this offset.
 LengthOf: TypeAlias = Callable[[Steps, int, bool], int]
 
 
@@ -170,7 +170,7 @@ class LayoutReader:
     Parameters
     ----------
     layout : the layout. wire : ``cdr`` or ``ros1``.
-    wanted : steps of the leaves to read; what the layout has not is left out.
+    wanted : steps of the leaves to read; those absent from the layout are left out.
     """
 
     def __init__(self, layout: WireLayout, wire: str, wanted: Iterable[Steps]) -> None:

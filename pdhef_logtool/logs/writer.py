@@ -130,7 +130,7 @@ class _Merged:
 
 
 class McapLogWriter:
-    """Writes one MCAP file under a temporary name and renames it on :meth:`close`; leaves nothing on an error.
+    """Writes one MCAP file under a temporary name and renames it on :meth:`close`; removes it on an error.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ class McapLogWriter:
         return schema.id
 
     def _free_id(self, taken: Mapping[int, object], wanted: int | None) -> int:
-        """Return the wanted id, otherwise one above all that are taken, or a gap where there is none above."""
+        """Return the wanted id if it is free, otherwise the next above all ids, or a gap."""
         if wanted is not None and 0 <= wanted <= _LARGEST_ID and wanted not in taken:
             return wanted
         above = max(taken, default=0) + 1
@@ -299,7 +299,7 @@ class McapLogWriter:
         """Write messages merged by log time; on equal times raw messages come first, then batches in their order.
 
         Raw messages are consumed as they come (in ascending log time) and not held. Raw chunks are written as they
-        are; the batches then go into chunks of their own, and all chunks into the order of their first log times.
+        are; the batches then become separate chunks, and all chunks are sorted by their first log times.
         """
         records = [self._encode(batch) for batch in batches if len(batch.log_time_ns)]
         for record in records:
@@ -469,8 +469,8 @@ class McapLogWriter:
         self._pending.commit()
 
     def abort(self) -> None:
-        """Remove what was written."""
-        with contextlib.suppress(OSError):  # what is still buffered may not fit the disk either
+        """Remove the written part."""
+        with contextlib.suppress(OSError):  # the buffered rest may not fit the disk either
             self._file.close()
         self._pending.discard()
 

@@ -1,9 +1,9 @@
-"""Raw CAN frames into signals of a user's DBC, column by column.
+"""Decode raw CAN frames into the signals of a DBC file, column by column.
 
-A source whose field is ``can:<message>.<signal>`` gets a view of its own: the frames of that message (and, for a
-multiplexed signal, of that selector) with the signal as a column. Everything behind it reads the view like a topic.
-Recognition examines a view of each message (:func:`decoded_frames`), by the DBC files that are given with the log or
-attached to it.
+A source with the field ``can:<message>.<signal>`` is read through a view: a virtual topic that contains the frames of
+that message (for a multiplexed signal, of that selector) and the signal as a column. Later code reads a view like a
+topic. Recognition examines one view per message (:func:`decoded_frames`). DBC files are given on the command line or
+attached to the log.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
 
-# Where frames keep their parts, best first; names are compared in lower case without underscores.
+# Names of the fields of a frame, best first; names are compared in lower case without underscores.
 ID_NAMES = ("id", "canid", "arbitrationid", "address", "identifier", "frameid", "msgid", "messageid")
 DATA_NAMES = ("data", "payload", "dat", "bytes")
 LENGTH_NAMES = ("dlc", "len", "length", "datalength", "size")
@@ -61,7 +61,7 @@ SHORT_FRAME = "frame that ends before its signal dropped"
 
 
 def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
-    """Return a log that offers a view for each ``can:`` source of the mapping; the log itself if there is none.
+    """Return a log with a view for each ``can:`` source of the mapping, or ``log`` if the mapping has none of them.
 
     Raises
     ------
@@ -107,9 +107,9 @@ def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
 
 
 def decoded_frames(log: DriveLog, topics: Sequence[TopicInfo]) -> CanSignalLog | None:
-    """Return a log with a view for each message of its DBC files that topics of frames contain; None without one.
+    """Return a log with a view for each message of its DBC files that occurs in the topics of frames, or None.
 
-    Of several files with one identifier, that named like the topic decides, or that with most of its identifiers.
+    If several files define an identifier, the file named like the topic decides, else the one with most identifiers.
     """
     databases = [(path, load_dbc(path)) for path in log.databases] if topics else []
     views: dict[str, _CanView] = {}
@@ -157,7 +157,7 @@ def _is_named_like(path: Path, topic: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _FramePaths:
-    """Where a topic's messages keep the parts of a frame; None where they have no such part."""
+    """Field paths of the parts of a frame in a topic; None for parts that the topic does not contain."""
 
     identifier: str
     data: str
@@ -174,7 +174,7 @@ class _FramePaths:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CanView:
-    """Signals of one message by field. ``selectors`` are the multiplexers that have to contain one of their values."""
+    """Signals of one message by field. Each multiplexer in ``selectors`` must contain one of its listed values."""
 
     topic: str
     paths: _FramePaths
@@ -185,9 +185,9 @@ class _CanView:
 
 
 class CanSignalLog(DriveLog):
-    """A log with a view for each CAN signal; everything else is the log's own.
+    """A log with a view for each CAN signal; all other topics are passed through.
 
-    ``short_frames`` counts what the last read dropped: :class:`Loss` by topic and message.
+    ``short_frames`` counts the frames that the last read dropped: :class:`Loss` by topic and message.
     """
 
     def __init__(self, log: DriveLog, views: Mapping[str, _CanView], settings: CanSettings) -> None:
@@ -213,23 +213,23 @@ class CanSignalLog(DriveLog):
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
-        """The log's topics, and one for each view."""
+        """Return the log's topics, and one for each view."""
         wanted = {t.name: t for t in self._log.topics}
         views = (TopicInfo(name, v.message.name, "can", wanted[v.topic].messages) for name, v in self._views.items())
         return (*wanted.values(), *views)
 
     @property
     def recording_span(self) -> RecordingSpan:
-        """That of the log."""
+        """Recording span of the log."""
         return self._log.recording_span
 
     @property
     def lost(self) -> tuple[Loss, ...]:
-        """What the log could not read."""
+        """Losses of the log."""
         return self._log.lost
 
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
-        """Return a topic's leaves; of a view those of its topic and the signal."""
+        """Return a topic's leaves; for a view, the leaves of its topic that are no part of frames, and the signals."""
         view = self._views.get(topic)
         if view is None:
             return self._log.fields(topic, quiet=quiet)
@@ -261,7 +261,7 @@ class CanSignalLog(DriveLog):
         quiet: bool = False,
         stamps: Collection[str] = (),
     ) -> dict[str, Columns]:
-        """Read fields; each topic of frames is read once, however many signals are taken from it."""
+        """Read fields; each topic of frames is read once for all of its signals."""
         raw: dict[str, list[str]] = {}
         for topic, paths in requests.items():
             view = self._views.get(topic)
@@ -279,7 +279,7 @@ class CanSignalLog(DriveLog):
 
     @property
     def size(self) -> int:
-        """Where the bytes of each file went."""
+        """Size of the log in bytes."""
         return self._log.size
 
     def close(self) -> None:
@@ -357,7 +357,7 @@ def _payload(frames: Columns, paths: _FramePaths, rows: IntArray) -> tuple[NDArr
 def _make_view(
     source: SignalSource, paths: _FramePaths | str, databases: Sequence[tuple[Path, Database]]
 ) -> _CanView | str:
-    """Return the view of a source, or what is wrong with it."""
+    """Return the view of a source, or a text that describes the error."""
     if isinstance(paths, str):
         return paths
     names = source.can_signal
@@ -386,12 +386,12 @@ def _make_view(
 
 
 def holds_frames(topic: str, fields: tuple[FieldInfo, ...]) -> bool:
-    """Return whether a topic's fields are those of raw CAN frames, by their names."""
+    """Return whether the field names of a topic match raw CAN frames."""
     return not isinstance(_frame_paths(topic, fields, CanSettings(())), str)
 
 
 def _frame_paths(topic: str, fields: tuple[FieldInfo, ...], settings: CanSettings) -> _FramePaths | str:
-    """Find the parts of frames among a topic's fields, or return what is missing."""
+    """Return the field paths of the parts of frames in a topic, or a text that lists the missing parts."""
     kinds = _plain_kinds(fields)
     problems: list[str] = []
 
@@ -423,7 +423,7 @@ def _frame_paths(topic: str, fields: tuple[FieldInfo, ...], settings: CanSetting
 
 
 def _plain_kinds(fields: tuple[FieldInfo, ...]) -> dict[str, str]:
-    """Return kinds by path, arrays of numbers as one ``array``; what is inside arrays of structs is left out."""
+    """Return kinds by path; an array of numbers is one ``array``, and fields in arrays of structs are excluded."""
     kinds: dict[str, str] = {}
     for leaf in fields:
         base, bracket, rest = leaf.path.partition("[")
@@ -435,7 +435,7 @@ def _plain_kinds(fields: tuple[FieldInfo, ...]) -> dict[str, str]:
 
 
 def _best(paths: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return the least nested paths whose last component is the first of the names that any has."""
+    """Return the least nested paths that end in the first name with any match."""
     for name in names:
         matches = [p for p in paths if p.rsplit(".", 1)[-1].replace("_", "").lower() == name]
         if matches:

@@ -1,8 +1,8 @@
-"""Candidates for signals and ground truth among all numeric fields of a log: by names first, then by values.
+"""Search all numeric fields of a log for signals and ground truth, first by names, then by values.
 
-Recognised message types come before (``recognition.py``); what they leave open is looked for here. A candidate is
-*taken* when its name or a documented type gives its quantity and nothing contradicts; what remains unsure about a
-taken one (its unit, its sign) becomes a check that is undecided. Other candidates are in the mapping as comments.
+Recognised message types have priority (``recognition.py``); this module searches for the remaining signals. A candidate
+is *taken* if its name or a documented type gives its quantity and no value contradicts. If its unit or sign is
+uncertain, an undecided check records this. Other candidates are listed in the mapping as comments.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
 from pdhef_logtool.records.signals import FloatArray
 
-#: What the names around a field make of it.
+#: Kind of data in a field, according to the names around it.
 Role: TypeAlias = Literal["sensor", "navigation", "truth", "estimate", "command", "device"]
-#: A field whose name or documented type gives it a meaning; the last entry shows a documented one.
+#: A field with a meaning from its name or documented type. The last entry is True for a documented type.
 Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 
-#: Words of a field that a navigation system gives beside others' sensors.
+#: Words in field names of navigation systems.
 _NAVIGATION = frozenset({"gps", "gnss", "ins", "rtk"})
-#: Words of axes that are the car's, whose sign alone is open.
+#: Words for the axes of a car, for which only the sign is unknown.
 _CAR_AXES = frozenset({"lat", "lateral", "long", "longitudinal", "lng", "trans", "transverse", "transversal", "down"})
-#: Controls beside which a steering may be one.
+#: Controls; a steering signal in the same struct may be a control, too.
 _PEDALS = frozenset({"throttle", "brake", "gas"})
-#: How the name of a sign differs from that of its magnitude.
+#: Affix that distinguishes the name of a sign from the name of its magnitude.
 _SIGN = re.compile(r"(?<![A-Za-z0-9])(?:VZ|vorzeichen|sign|sgn)_|_(?:VZ|vorzeichen|sign|sgn)$", re.IGNORECASE)
-#: A topic with more numeric fields than this is no sensor's; looking at its names alone would take long.
+#: Limit of numeric fields in a topic. Larger topics are no sensors and would take long to examine.
 MOST_FIELDS = 3000
-#: Fields that are read at most; the best names first.
+#: Maximum number of fields to read; the best names have priority.
 MOST_READ = 160
-#: A candidate below is no more than a comment.
+#: Candidates with a lower score are listed as comments only.
 LEAST_SCORE = 0.45
 
-#: Factors that a field without a unit may have, the first one by convention, and the kind of unit by quantity.
+#: Possible factors of a field without a unit, by kind of unit; the conventional one is first.
 SPEEDS = (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704))
 ANGLES = (("rad", 1.0), ("deg", math.radians(1.0)))
 HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
@@ -57,7 +57,7 @@ HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
     "wheel rate": (("rad/s", 1.0), ("rpm", 2.0 * math.pi / 60.0)),
     **dict.fromkeys(("latitude", "longitude"), (("deg", 1.0),)),
 }
-#: What a car can do, in SI, by quantity: a value beyond is of another unit, or no such quantity.
+#: Physical limits of a car in SI, by quantity. A larger value has another unit or is another quantity.
 MOST = {
     "acceleration": 80.0, "rate": 9.0, "steering": 16.0, "sideslip": math.pi, "speed": 110.0, "velocity": 60.0,
     "wheel speed": 130.0, "wheel rate": 400.0, "latitude": 90.0, "longitude": 180.0,
@@ -71,8 +71,8 @@ class Candidate:
     Attributes
     ----------
     section : ``signals`` or ``truth``. source : the field, with its likeliest scale and offset.
-    score : 0 to 1. reason : what speaks for it. doubt : what is unsure of it, empty if nothing is.
-    taken : it is in the mapping.
+    score : 0 to 1. reason : evidence for the quantity. doubt : uncertain properties; empty if there are none.
+    taken : the mapping contains it.
     """
 
     section: Literal["signals", "truth"]
@@ -83,7 +83,7 @@ class Candidate:
     taken: bool = False
 
     def __str__(self) -> str:
-        """One line for a report or a comment."""
+        """Return one line for a report or a comment."""
         doubt = f"; unsure: {self.doubt}" if self.doubt else ""
         return f"{self.source.label}, scale {_short(self.source.scale)}: score {self.score:.2f}, {self.reason}{doubt}"
 
@@ -94,15 +94,15 @@ def _short(scale: float | tuple[float, ...]) -> str:
 
 @dataclass(slots=True)
 class Field:
-    """A field with a meaning, while it is being judged.
+    """A field with a meaning, during the evaluation.
 
     Attributes
     ----------
-    factors : units that it may be in, the likeliest first. fixed : unit and sign are documented.
+    factors : possible units, the likeliest first. fixed : unit and sign are documented.
     section : ``signals`` or ``truth`` by its documentation.
-    known : its unit is sure. anchor : it is mapped already. sign : that it is taken with.
-    sign_path : of the field that contains its sign.
-    is_weak : values do not decide what it is, so that it is never taken.
+    unit_known : its unit is certain. anchor : the mapping already contains it. sign : sign of the scale.
+    sign_path : path of the field that contains its sign.
+    is_weak : its values cannot identify the quantity, so that it is never taken.
     """
 
     topic: TopicInfo
@@ -126,7 +126,7 @@ class Field:
 
     @property
     def scale(self) -> float:
-        """Raw to SI, with the sign that it is taken with."""
+        """Factor from raw to SI, including the sign."""
         return self.sign * self.factors[0][1]
 
     @property
@@ -136,7 +136,7 @@ class Field:
 
     @property
     def unit_doubt(self) -> list[str]:
-        """Doubt about a unit that neither the name nor the drive gives."""
+        """Doubt about a unit that neither the name nor the drive determines."""
         if self.unit_known or self.fixed:
             return []
         unit = self.factors[0][0]
@@ -146,18 +146,18 @@ class Field:
 
     @property
     def is_axis(self) -> bool:
-        """Return whether an axis letter names it: where its axes point is a question of its mounting."""
+        """Return whether its name is an axis letter; the direction of the axis then depends on the mounting."""
         leaf_words = words_of(self.path.rpartition(".")[2])
         return "yaw" not in leaf_words and not _CAR_AXES & set(leaf_words)
 
     @property
     def is_downward(self) -> bool:
-        """Return whether it is positive about, or along, the downward axis by its name."""
+        """Return whether the name defines it as positive about, or along, the downward axis."""
         return "down" in words_of(self.path.rpartition(".")[2]) and self.meaning.part == "z"
 
     @property
     def score(self) -> float:
-        """Confidence that the field is the quantity that its name gives, 0 to 1."""
+        """Confidence in the quantity given by the name, 0 to 1."""
         if self.fixed:
             return 0.95
         score = 0.45 * self.meaning.strength + 0.1 + self.bonus
@@ -167,18 +167,18 @@ class Field:
         return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
 
     def standing_for(self, speed: FloatArray) -> Field:
-        """Return a known speed on the grid [M], m/s, that is made of this field and others like it."""
+        """Return a speed on the grid [M] in m/s with a known unit, computed from this field and similar ones."""
         meaning = Meaning("speed", "x", 1.0, "m/s", 1.0, "mean of wheel speeds")
         seen = Seen(speed, speed, self.seen.rate_hz)
         return replace(self, meaning=meaning, seen=seen, factors=(("m/s", 1.0),), sign=1.0, offset=0.0, unit_known=True)
 
     def use(self, unit: str) -> None:
-        """Take the field in a unit."""
+        """Select a unit."""
         self.factors = tuple(sorted(self.factors, key=lambda f: f[0] != unit))
         self.unit_known = True
 
     def candidate(self, name: str, section: Literal["signals", "truth"], *, taken: bool) -> Candidate:
-        """Return the record of the field as a source of a signal."""
+        """Return the field as a candidate source of a signal."""
         source = SignalSource(name, self.topic.name, self.path, self.stamp, self.scale, self.offset)
         if self.sign_path:
             source = replace(source, field=(self.path, self.sign_path), scale=(self.scale, 1.0), combine="signed")
@@ -192,7 +192,7 @@ class Field:
 
 
 def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendors: Vendors) -> list[Named]:
-    """Return the fields whose name or documented type gives them a meaning; the last entry shows a documented one."""
+    """Return the fields with a meaning from their name or documented type (last entry True)."""
     results = []
     for topic, role in topics:
         fields = log.fields(topic.name, quiet=True)
@@ -217,9 +217,9 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
 
 
 def _meaning_by_names(topic: TopicInfo, info: FieldInfo, there: set[str]) -> Meaning | None:
-    """Return what names give, short ones beside others: g_x beside a_x is a gyro, r beside v_x and v_y a yaw rate.
+    """Return the meaning by names; short names depend on others: g_x with a_x is a gyro, r with v_x and v_y a yaw rate.
 
-    The third element shows whether an array without a length has axes.
+    An array without a known length is also tried as a vector of three axes.
     """
     path = info.path
     if (gyro := re.fullmatch(r"(.*(?:^|[._]))g([xyz])", path)) and f"{gyro[1]}a{gyro[2]}" in there:
@@ -237,12 +237,12 @@ def _is_setpoint(topic: TopicInfo, info: FieldInfo) -> bool:
 
 
 def _signs_of(paths: Collection[str]) -> dict[str, str]:
-    """Return the paths of signs by those of their magnitudes."""
+    """Return the paths of signs by the paths of their magnitudes."""
     return {m: path for path in paths if (m := _SIGN.sub("", path)) != path and m in paths}
 
 
 def _no_values(topic: TopicInfo, fields: Sequence[FieldInfo]) -> set[str]:
-    """Return the paths of signs, and of magnitudes whose sign cannot be read: a text, or a signal of a bus."""
+    """Return the paths of signs, and of magnitudes with an unreadable sign: a text, or a signal of a bus."""
     signs, texts = _signs_of({f.path for f in fields}), {f.path for f in fields if f.kind == "string"}
     return {*signs.values(), *(m for m, sign in signs.items() if topic.encoding == "can" or sign in texts)}
 
@@ -250,9 +250,9 @@ def _no_values(topic: TopicInfo, fields: Sequence[FieldInfo]) -> set[str]:
 def look(
     log: DriveLog, named: Sequence[Named], vendors: Vendors, sources: Sequence[SignalSource]
 ) -> tuple[Pieces, list[Field]]:
-    """Read what has a meaning, and what is mapped already, in a few pieces of the log.
+    """Read the named fields and the mapped sources in a few pieces of the log.
 
-    Fields without a number and those that no unit brings into a car's range are left out.
+    Fields without a number are excluded, as are fields that exceed a car's range in every unit.
     """
     named = sorted(named, key=lambda n: (not n[4], -n[3].strength))[:MOST_READ]
     requests: dict[str, list[str]] = {}
@@ -317,19 +317,19 @@ def _weighable(
 
 
 def _may_be_share(item: Field) -> bool:
-    """Return whether a steering in [-1, 1] has neither a unit nor the name of an angle."""
+    """Return whether a steering signal in [-1, 1] has neither a unit nor the name of an angle."""
     is_open = item.meaning.quantity == "steering" and not item.unit_known and item.seen.largest <= 1.0
     return is_open and not {"angle", "ang", "delta"} & set(words_of(item.path))
 
 
 def _has_pedals_beside(item: Field, fields: tuple[FieldInfo, ...]) -> bool:
-    """Return whether pedals are in the same struct: it is a control as they are."""
+    """Return whether the same struct contains pedals, so that the steering signal is a control, too."""
     places = (f.path.rpartition(".") for f in fields)
     return any(struct == item.path.rpartition(".")[0] and _PEDALS & set(words_of(leaf)) for struct, _, leaf in places)
 
 
 def _is_nested_imu(topic: TopicInfo, fields: tuple[FieldInfo, ...], path: str) -> bool:
-    """Return whether a field is one of a ``sensor_msgs/Imu`` inside of another ROS message."""
+    """Return whether a field belongs to a ``sensor_msgs/Imu`` nested in another ROS message."""
     struct = path.rpartition(".")[0]
     if topic.encoding not in ("cdr", "ros1") or not struct.endswith(("linear_acceleration", "angular_velocity")):
         return False
@@ -345,7 +345,7 @@ def _document(item: Field, entry: VendorField) -> None:
 
 
 def anchors_of(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]) -> list[Field]:
-    """Return mapped sources as fields that are not changed."""
+    """Return mapped sources as fields with a fixed meaning."""
     topics = {t.name: t for t in log.topics}
     results = []
     for source in sources:
@@ -363,15 +363,15 @@ def anchors_of(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tup
 
 
 def anchor_of(source: SignalSource, results: Sequence[Field]) -> Field | None:
-    """Return the anchor that a mapped source became."""
+    """Return the anchor of a mapped source."""
     meaning = meaning_of_signal(source.name)
     return next((f for f in results if f.anchor and f.meaning == meaning), None)
 
 
 def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:
-    """Return the units that a field can be in by its range; a unit in its name is the only one."""
+    """Return the units that are possible by a field's range; a unit in its name excludes all others."""
     most = MOST.get(meaning.quantity)
-    if meaning.scale is not None:  # beyond a car's range it is of another unit than its name gives
+    if meaning.scale is not None:  # beyond a car's range the unit in the name is wrong
         return () if most is not None and seen.largest * meaning.scale > most else ((meaning.unit, meaning.scale),)
     every = HYPOTHESES.get(meaning.quantity, ())
     largest = seen.largest
@@ -379,7 +379,7 @@ def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:
 
 
 def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:
-    """Return the stamp of a field: that of the innermost message around it that has one."""
+    """Return the stamp of the innermost message around a field that has a stamp."""
     times = {f.path for f in fields if f.kind == "time"}
     parts = path.split(".")[:-1]
     while parts:
@@ -391,11 +391,11 @@ def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:
 
 
 def triad_of(item: Field) -> str:
-    """Return what the three axes of one vector share: topic and struct, or name without the axis."""
+    """Return the key shared by the three axes of a vector: topic and struct, or the name without the axis."""
     return f"{item.topic.name}.{item.path.rpartition('.')[0] or item.path.rstrip('xyzXYZ0123[]_')}"
 
 
 def leaf_group(item: Field) -> tuple[str, str]:
-    """Return topic and innermost-but-one struct: accelerations and rates of one IMU share it."""
+    """Return topic and innermost-but-one struct, which accelerations and rates of one IMU share."""
     parts = item.path.split(".")
     return item.topic.name, ".".join(parts[: max(0, len(parts) - 2)])

@@ -18,30 +18,30 @@ from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.records.ledger import Role
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Channel, FloatArray, IntArray, Loss
 
-#: A gate sample applies to this many of its periods, then the ground-truth quality is unknown.
+#: A gate sample is valid for this many of its periods; after that the ground-truth quality is unknown.
 GATE_HOLD_PERIODS = 2.0
-#: How much earlier or later than ground truth a gate message with the same stamp may be recorded.
+#: Largest difference in log time between ground truth and a gate message with the same stamp.
 GATE_MARGIN_NS = 2_000_000_000
 
-#: What one loss of each kind states; how many there are, and when, is next to it.
+#: Description of each kind of loss; count and span are reported with it.
 LOSS_TEXTS = {
     "bad-stamp": "message without a usable stamp (zero, not a number, or a minute off the others) dropped",
     "nan": "sample that is not a number dropped",
     "out-of-range": "sample outside valid_min and valid_max dropped",
-    "duplicate-stamp": "message that repeats the stamp of another dropped, the first to arrive kept",
+    "duplicate-stamp": "message with the stamp of an earlier one dropped",
     "out-of-order": "message recorded after a later one, sorted back by stamp",
     "truth-quality": "ground-truth sample rejected by the quality gate dropped",
-    "delay-unknown": "log time is not 0 to 1 s after the stamps: the delay is unknown, arrival is taken as the stamp",
+    "delay-unknown": "log time is not 0 to 1 s after the stamps: the delay is unknown, the stamp is used as arrival",
 }
 LOST_KINDS = frozenset({"nan", "bad-stamp"})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedChannels:
-    """Channels of one window of log time; every mapped name is there, if need be with no samples.
+    """Channels of one window of log time; each mapped name has a channel, which may be empty.
 
-    ``counts`` has by ``role`` and name the messages ``read``, and those that were dropped, by reason. ``stamps``:
-    times of the topics for which they were asked for.
+    ``counts`` has the number of messages ``read`` and of dropped messages by reason, for each section and name.
+    ``stamps`` has the times of the requested topics.
     """
 
     signals: dict[str, Channel]
@@ -53,9 +53,9 @@ class MappedChannels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CleanSamples:
-    """Samples in ascending, unique stamps; ``*_at`` are the indices of the samples that were dropped.
+    """Samples with ascending, unique stamps; ``*_at`` are the indices of dropped samples.
 
-    ``same`` and ``other`` count the samples dropped for a stamp that another one has, by whether its value is the same.
+    ``same`` and ``other`` count samples dropped as duplicates of a stamp, with an equal and with a different value.
     """
 
     stamps_ns: IntArray
@@ -75,7 +75,7 @@ def clean_samples(
     valid_min: float | None = None,
     valid_max: float | None = None,
 ) -> CleanSamples:
-    """Drop values that are not finite, implausible or out of range, sort by stamp, and keep the first of each stamp.
+    """Drop values that are not finite or out of range, sort by stamp, and keep the first sample of each stamp.
 
     The result does not depend on the order of the samples: samples of one stamp and one arrival are distinguished by
     value, the smallest first.
@@ -96,7 +96,7 @@ def clean_samples(
         stamps_ns, arrival_ns, values, columns = stamps_ns[keep], arrival_ns[keep], values[keep], columns[keep]
     same = other = 0
     if stamps_ns.shape[0] > 1 and not np.all(stamps_ns[1:] > stamps_ns[:-1]):
-        # The values come last among the keys, so that even equal stamps and arrivals leave nothing to the order.
+        # With the values as last keys, the result does not depend on the input order.
         order = np.lexsort((*columns.T[::-1], arrival_ns, stamps_ns))
         ordered = stamps_ns[order]
         first = np.concatenate([[True], ordered[1:] > ordered[:-1]])
@@ -111,7 +111,7 @@ def clean_samples(
 def gate_mask(
     stamps_ns: IntArray, gate_stamps_ns: IntArray, gate_values: FloatArray, gate: QualityGate, hold_ns: int
 ) -> BoolArray:
-    """Return where ground truth may be used: the last gate sample passes and is at most ``hold_ns`` old.
+    """Return where ground truth is usable: the last gate sample passes and is at most ``hold_ns`` old.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def read_signals(
     Parameters
     ----------
     clocks : from :func:`pdhef_logtool.mapping.fit_clocks` over the whole span that is going to be read.
-    stamps : topics whose times are wanted too, mapped or not.
+    stamps : topics to read the times of, mapped or not.
     """
     resolved = resolve_mapping(log, mapping)
     log = with_can_signals(log, resolved)
@@ -181,7 +181,7 @@ def read_signals(
 
 
 def merge_losses(parts: Iterable[Iterable[Loss]]) -> tuple[Loss, ...]:
-    """Add up losses of one kind at one place, in order of first sight; spans are united."""
+    """Add up losses of one kind at one place, in order of first occurrence; spans are united."""
     merged: dict[tuple[str, str, str, str], Loss] = {}
     for loss in (x for part in parts for x in part):
         key = (loss.kind, loss.where, loss.what, loss.severity)
@@ -202,7 +202,7 @@ def merge_losses(parts: Iterable[Iterable[Loss]]) -> tuple[Loss, ...]:
 
 
 def dropped(kind: str, where: str, log_time_ns: IntArray) -> Loss:
-    """Return the loss of what was recorded at these times [N]."""
+    """Return the loss record of samples with these log times [N]."""
     return Loss(
         kind=kind,
         what=LOSS_TEXTS[kind],
@@ -217,7 +217,7 @@ def dropped(kind: str, where: str, log_time_ns: IntArray) -> Loss:
 def _topic_losses(
     log: DriveLog, mapping: Mapping, clocks: dict[str, ClockModel], columns: dict[str, Columns]
 ) -> list[Loss]:
-    """Count what concerns a topic's stamps once, however many signals the topic provides."""
+    """Count the losses by the stamps of each topic once, independent of its number of signals."""
     losses: list[Loss] = []
     seen: set[str] = set()
     for source in (*mapping.signals.values(), *mapping.truth.values()):
@@ -241,7 +241,7 @@ def _topic_losses(
             if repeated.any():
                 losses.append(dropped("duplicate-stamp", source.read_topic, times[order[repeated]]))
         if clock.unusable:
-            what = f"log time serves instead of {source.stamp}: {clock.unusable}"
+            what = f"log time is used instead of {source.stamp}: {clock.unusable}"
             losses.append(Loss("log-time-serves", what, source.read_topic, severity="note"))
         if not clock.delay_known:
             losses.append(Loss("delay-unknown", LOSS_TEXTS["delay-unknown"], source.read_topic, severity="note"))
@@ -257,7 +257,7 @@ def _channel(
     losses: list[Loss],
     count: Counter[str],
 ) -> Channel:
-    """Return the clean channel of a source; adds to ``losses``, and to ``count`` what became of its samples."""
+    """Return the clean channel of a source; append to ``losses`` and count its samples in ``count``."""
     topic = columns.get(source.read_topic)
     if topic is None or len(topic) == 0:
         empty = np.empty(0, np.int64)
@@ -284,7 +284,7 @@ def _channel(
 
 
 def signed(magnitude: FloatArray, sign: FloatArray) -> FloatArray:
-    """Return a magnitude [N] that is negative where its sign [N], in a field of its own, is 1."""
+    """Return a magnitude [N], negative where the separate sign field [N] is 1."""
     return np.where(sign > 0.5, -np.abs(magnitude), np.abs(magnitude))
 
 
@@ -294,12 +294,12 @@ def si_values(topic: Columns, source: SignalSource) -> FloatArray:
 
 
 def si_of(source: SignalSource, parts: Sequence[FloatArray]) -> FloatArray:
-    """Return what :func:`si_values` does, of the raw values of the source's fields."""
+    """Return :func:`si_values` for the raw values of a source's fields."""
     raw = parts[0] if len(parts) == 1 else np.stack(parts, axis=1)
     width = source.columns
     n = raw.shape[0]
     if width == 1 and len(parts) > 1 and raw.ndim == 2:
-        # Summed one by one: a matrix product may round differently with the number of rows, and windows must join.
+        # Summed one by one: a matrix product may round differently with the number of rows.
         scales = np.broadcast_to(np.asarray(source.scale), len(parts))
         if source.combine == "signed":
             return np.asarray(scales[0] * signed(raw[:, 0], raw[:, 1]) + source.offset, dtype=np.float64)
@@ -311,7 +311,7 @@ def si_of(source: SignalSource, parts: Sequence[FloatArray]) -> FloatArray:
             total = np.sqrt(np.maximum(total, 0.0))
         return np.asarray(total + source.offset, dtype=np.float64)
     if width > 1 and raw.ndim == 2 and raw.shape[1] != width:
-        raw = np.full((n, width), np.nan)  # Not the vector that the signal is: every sample is counted as lost.
+        raw = np.full((n, width), np.nan)  # Wrong number of columns: every sample is counted as lost.
     elif (width > 1 and raw.ndim == 1) or (width == 1 and raw.ndim == 2):
         raw = np.full((n, width) if width > 1 else n, np.nan)
     return np.asarray(raw * np.asarray(source.scale) + np.asarray(source.offset), dtype=np.float64)

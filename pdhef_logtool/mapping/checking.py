@@ -1,4 +1,4 @@
-"""What a mapping gives against what a log contains: names, near misses, and which stamp each source uses."""
+"""Check a mapping against a log: missing names with near matches, and the stamp of each source."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.records import AUTO_STAMP, RECORDER_STAMPS, Mapping, QualityGate, SignalSource
 from pdhef_logtool.records.errors import MappingError
 
-#: Where messages keep their measurement time, best first.
+#: Paths of the measurement time in messages, best first.
 STAMP_PATHS = ("header.stamp", "stamp", "timestamp")
 STAMP_NAMES = ("stamp", "timestamp")
 
-#: Names that seconds and nanoseconds have in encodings without a time type.
+#: Names of seconds and nanoseconds in encodings without a time type.
 SECONDS_NAMES = ("sec", "secs", "seconds")
 NANOSECONDS_NAMES = ("nanosec", "nsec", "nsecs", "nanos", "nanoseconds")
 
@@ -28,7 +28,7 @@ _INDEX = re.compile(r"\[\d*\]")
 
 
 def stamp_path_of(fields: tuple[FieldInfo, ...]) -> str:
-    """Return the measurement time's path in a schema, or ``log_time`` where the schema has none."""
+    """Return the path of the measurement time in a schema, or ``log_time`` without one."""
     times = {f.path for f in fields if f.kind == "time"}
     paths = {f.path for f in fields}
     for path in STAMP_PATHS:
@@ -38,7 +38,7 @@ def stamp_path_of(fields: tuple[FieldInfo, ...]) -> str:
 
 
 def stamp_paths(fields: tuple[FieldInfo, ...]) -> list[str]:
-    """Return the paths of all times of a schema, outermost first; those in arrays belong to no message."""
+    """Return the paths of all times of a schema, outermost first, except times in arrays."""
     paths = {f.path for f in fields}
     times = {f.path for f in fields if f.kind == "time"}
     pairs = {path.rpartition(".")[0] for path in paths if path.rpartition(".")[2] in SECONDS_NAMES}
@@ -47,18 +47,18 @@ def stamp_paths(fields: tuple[FieldInfo, ...]) -> list[str]:
 
 
 def has_path(fields: tuple[FieldInfo, ...], path: str) -> bool:
-    """Return whether a schema has a leaf at a path, or an array that the path names an element of."""
+    """Return whether a schema has a leaf at a path, or an array with the element that the path names."""
     return _kind_of(path, {f.path: f.kind for f in fields}) not in (None, "struct")
 
 
 def split_stamp(path: str, paths: set[str]) -> tuple[str, str] | None:
-    """Return the paths of a stamp's seconds and nanoseconds where a schema writes them as two numbers."""
+    """Return the paths of seconds and nanoseconds of a stamp that a schema stores as two numbers."""
     pairs = ((f"{path}.{s}", f"{path}.{ns}") for s, ns in product(SECONDS_NAMES, NANOSECONDS_NAMES))
     return next((pair for pair in pairs if paths.issuperset(pair)), None)
 
 
 def resolve_mapping(log: DriveLog, mapping: Mapping) -> Mapping:
-    """Return the mapping with every ``auto`` stamp replaced by what the log's schemas offer."""
+    """Return the mapping with every ``auto`` stamp replaced by the best stamp in the log's schema."""
     if all(s.stamp != AUTO_STAMP for s in mapping.sources()):
         return mapping
     names = {t.name for t in log.topics}
@@ -76,13 +76,13 @@ def resolve_mapping(log: DriveLog, mapping: Mapping) -> Mapping:
 
 
 def check_mapping(mapping: Mapping, log: DriveLog) -> None:
-    """Check that the log contains every topic and field that the mapping names.
+    """Check that the log contains every topic and field of the mapping.
 
     Raises
     ------
     MappingError
-        Topics, fields or stamps are not in the log, or messages or signals not in the DBC; all are named, with the
-        nearest that are.
+        Topics, fields or stamps are not in the log, or messages or signals not in the DBC. The error lists all of
+        them, each with the nearest existing name.
     """
     log = with_can_signals(log, mapping)
     topics = {t.name: t for t in log.topics}
@@ -94,7 +94,7 @@ def check_mapping(mapping: Mapping, log: DriveLog) -> None:
             continue
         fields = log.fields(source.read_topic)
         if not fields:
-            continue  # The encoding carries no schema: only reading can show it.
+            continue  # The encoding has no schema: the fields are unknown until messages are read.
         problems += [f"{source.name}: {text}" for text in _field_problems(source, fields)]
     if problems:
         raise MappingError(
@@ -121,7 +121,7 @@ def _path_problem(source: SignalSource, path: str, kinds: dict[str, str]) -> str
         return f"{source.topic}.{path} is a {kind}, not a number"
     if kind == "struct" and (source.columns == 1 or len(source.paths) > 1):
         below = next(p for p in kinds if p.startswith((f"{path}.", f"{path}[")))
-        return f"{source.topic}.{path} is no single number: name one, such as {below}"
+        return f"{source.topic}.{path} contains several numbers: name one, such as {below}"
     if kind != "struct" and source.columns > len(source.paths) == 1 and f"{path}[]" not in kinds:
         return f"{source.topic}.{path} is one number, {source.name} needs {source.columns}"
     return ""
@@ -142,7 +142,7 @@ def _stamp_problem(source: SignalSource, kinds: dict[str, str]) -> str:
 
 
 def _kind_of(path: str, kinds: dict[str, str]) -> str | None:
-    """Return the kind of a path: a leaf, an element of a sequence, or ``struct`` for what has leaves below it."""
+    """Return the kind of a path: the kind of a leaf or sequence element, or ``struct`` for a path with leaves below."""
     if path in kinds:
         return kinds[path]
     as_sequence = _INDEX.sub("[]", path)

@@ -1,4 +1,4 @@
-"""The mapping in effect for one log: the given mapping, or the recognised one with its ambiguities."""
+"""Choose the mapping for one log: the given mapping, or the recognised one with its ambiguities."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pdhef_logtool.records.signals import ALIGNED_SIGNALS
 
 @dataclass(frozen=True, slots=True)
 class ChosenMapping:
-    """The mapping in effect and its open points.
+    """The selected mapping and its open points.
 
     Attributes
     ----------
-    missing : signals that it lacks. ambiguities : what may be wrong. remarks : what else is worth knowing.
+    missing : signals without a source. ambiguities : possible errors. remarks : further information.
     """
 
     mapping: Mapping
@@ -31,11 +31,11 @@ class ChosenMapping:
 def choose_mapping(
     log: DriveLog, mapping: Mapping | None, *, prefer_truth: Literal["perfect", "rtk"], require_signals: bool = True
 ) -> ChosenMapping:
-    """Return the mapping in effect: the one given, or what is recognised. Ambiguities are never settled silently.
+    """Return the given mapping, or the recognised one; ambiguities are reported, never resolved silently.
 
     Raises
     ------
-    MappingError : The mapping names what the log lacks; or, with ``require_signals``, no type of the log is recognised.
+    MappingError : The log lacks a mapped source; or, with ``require_signals``, no type of the log is recognised.
     """
     if mapping is not None:
         mapping = mapping_for_recorder(log, mapping)
@@ -57,11 +57,11 @@ def choose_mapping(
 
 
 def mapping_for_recorder(log: DriveLog, mapping: Mapping) -> Mapping:
-    """Return the mapping of a folder whose topics, fields and types the log contains; of several the one with most.
+    """Return the mapping of a folder that fits the topics, fields and types of the log; of several the largest.
 
     Raises
     ------
-    MappingError : None is for this recorder, or several are and none contains all sources of the others.
+    MappingError : No mapping fits this recorder, or several do and none contains all sources of the others.
     """
     if not mapping.recorders:
         if mapping.recorder and (problem := _misfit(log, mapping)):
@@ -86,7 +86,7 @@ def mapping_for_recorder(log: DriveLog, mapping: Mapping) -> Mapping:
 
 
 def _misfit(log: DriveLog, mapping: Mapping) -> str:
-    """Return why a mapping is not for the recorder of a log; empty if it is."""
+    """Return why a mapping does not fit the recorder of a log; empty if it does."""
     types = {t.name: t.type_name.replace("/msg/", "/") for t in log.topics}
     for topic, kind in mapping.recorder:
         if types.get(topic) != kind.replace("/msg/", "/"):
@@ -99,7 +99,7 @@ def _misfit(log: DriveLog, mapping: Mapping) -> str:
 
 
 def _filled(mapping: Mapping, auto: Mapping) -> Mapping:
-    """Return the mapping with missing signals, or all of missing ground truth, from recognised types."""
+    """Return the mapping, with missing signals, or all ground truth if missing, filled in from recognised types."""
     return replace(
         mapping,
         signals={**auto.signals, **mapping.signals},
@@ -111,18 +111,18 @@ def _filled(mapping: Mapping, auto: Mapping) -> Mapping:
 
 
 def _borrowed(log: DriveLog, mapping: Mapping) -> list[str]:
-    """Report which topics are read by definitions of this machine, which may be another version's."""
+    """Return notes on topics read with definitions of this machine, which may differ from the recorder's version."""
     files = {source.topic: log.borrowed(source.topic) for source in mapping.sources()}
     return [
         f"{topic} is read by {', '.join(map(str, paths))} of this machine, as the log does not define its type: "
-        "right only if that is the version that was recorded"
+        "correct only if they match the recorded version"
         for topic, paths in files.items()
         if paths
     ]
 
 
 def _topics_there_are(log: DriveLog) -> str:
-    """Return what a log without sensors has instead: its types, and whether they have messages."""
+    """Return the types of a log without sensors, and its topics without messages."""
     if not log.topics:
         return "no topics"
     types = ", ".join(sorted({t.type_name.replace("/msg/", "/") or t.name for t in log.topics}))

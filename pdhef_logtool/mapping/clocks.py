@@ -1,4 +1,4 @@
-"""Stamps onto the log's clock: offset and drift of device clocks, and whether the transport delay is credible."""
+"""Convert stamps to the log's clock: offset and drift of device clocks, and plausibility of the transport delay."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _Stamps: TypeAlias = tuple[IntArray, IntArray, FloatArray]
 
 NANOSECONDS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
-#: A longer median delay is no transport delay but two clocks that disagree.
+#: A longer median delay is not a transport delay: the two clocks differ.
 MAX_CREDIBLE_DELAY_NS = 1_000_000_000
 
 #: Logs up to this length are surveyed as a whole, longer ones in evenly spread windows.
@@ -31,37 +31,37 @@ SURVEY_WHOLE_NS = 600_000_000_000
 SURVEY_WINDOWS = 30
 SURVEY_WINDOW_NS = 10_000_000_000
 
-#: The lower envelope is taken from this quantile of the delays in each of at most this many bins.
+#: The lower envelope is this quantile of the delays in each of at most this many bins.
 ENVELOPE_BINS = 64
 ENVELOPE_QUANTILE = 0.02
 MIN_BIN_SAMPLES = 20
 
-#: No transport takes longer, so that a stamp further off from log time than the others is no time at all.
+#: Longest transport delay: a stamp that differs more from log time than the other stamps is invalid.
 OUTLIER_STAMP_NS = 60_000_000_000
-#: From this share on of stamps that are wrong in one way, all of them are given up and log time serves.
+#: If at least this share of stamps has the same error, all stamps are replaced by log time.
 UNUSABLE_SHARE = 0.1
-#: Messages of one stamp were measured apart, by a clock too coarse for them, when they were recorded apart by at least
-#: this share of what messages are apart; else they came in one packet, or are one message recorded twice. Steps that
-#: vary by more than a share of the period give way to another stamp whose steps vary by so much less. A clock that is
-#: by so much faster or slower than log time is in another unit.
+#: If messages with equal stamps were recorded apart by at least COARSE_SPACING of the usual spacing, the clock is too
+#: coarse for them; otherwise they came in one packet, or one message was recorded twice. If the steps vary by more than
+#: IRREGULAR of the period, another stamp replaces them that varies by less than REGULAR_SHARE of that. If a clock is
+#: faster or slower than log time by the factor FASTEST, its unit is wrong.
 COARSE_SPACING, IRREGULAR, REGULAR_SHARE, FASTEST = 1.0 / 3.0, 0.3, 0.3, 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class ClockModel:
-    """How the stamps of one topic relate to the log's clock.
+    """Relation between the stamps of one topic and the log's clock.
 
-    ``log = reference_log_ns + (stamp - reference_stamp_ns) * (1 + drift)``; the identity for ``utc`` stamps. A
-    device clock's offset is only known up to the smallest transport delay: give that as ``latency_s``.
+    ``log = reference_log_ns + (stamp - reference_stamp_ns) * (1 + drift)``; the identity for ``utc`` stamps. The
+    offset of a device clock includes the smallest transport delay, to be given as ``latency_s``.
 
     Attributes
     ----------
-    delay_known : False where log time − stamp is systematically negative or above 1 s; the arrival is then the stamp.
+    delay_known : False where log time − stamp is systematically negative or above 1 s; the stamp then is the arrival.
     median_delay_s, p95_delay_s, min_delay_s : of log time − stamp on the log's clock; NaN without samples.
-    residual_s : largest deviation of the envelope from the fitted line; a clock that stepped shows here.
+    residual_s : largest deviation of the envelope from the fitted line; large if the clock stepped.
     median_period_s : median step between stamps; NaN with fewer than two.
-    samples : messages that the survey saw.
-    unusable : why the stamps are no measure of time, so that log time serves instead; empty where they are.
+    samples : number of messages in the survey.
+    unusable : why the stamps are replaced by log time; empty if they are usable.
     """
 
     reference_stamp_ns: int = 0
@@ -78,7 +78,7 @@ class ClockModel:
 
 
 def clock_key(source: SignalSource) -> str:
-    """Return the key of a source's clock: the topic and the stamp it uses."""
+    """Return the key of a source's clock: its topic and stamp."""
     return f"{source.read_topic}.{source.stamp}"
 
 
@@ -91,7 +91,7 @@ def sources_by_clock(mapping: Mapping) -> dict[str, SignalSource]:
 
 
 def apply_clock(stamps_ns: IntArray, clock: ClockModel) -> IntArray:
-    """Turn device stamps [N] into the log's clock [N]; the identity without offset and drift."""
+    """Convert device stamps [N] to the log's clock [N]; the identity without offset and drift."""
     since_ns = np.asarray(stamps_ns - np.int64(clock.reference_stamp_ns), dtype=np.int64)
     shifted = np.asarray(since_ns + np.int64(clock.reference_log_ns), dtype=np.int64)
     if clock.drift == 0.0:
@@ -102,9 +102,9 @@ def apply_clock(stamps_ns: IntArray, clock: ClockModel) -> IntArray:
 def fit_clock_line(stamps_ns: IntArray, log_time_ns: IntArray) -> tuple[int, int, float, float]:
     """Fit offset and drift of a device clock to the lower envelope of log time − stamp.
 
-    The delay of a message is never negative, so that the messages that came fastest show the clocks' relation. A
-    low quantile in each bin keeps single early messages from deciding; the slope is the median over pairs of bins
-    (Theil–Sen), which one bin without a fast message cannot turn.
+    Delays of messages are never negative, so that the fastest messages show the relation of the clocks. A low quantile
+    in each bin limits the influence of single early messages. The slope is the median over pairs of bins (Theil–Sen),
+    which a bin without a fast message does not distort.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def fit_clock_line(stamps_ns: IntArray, log_time_ns: IntArray) -> tuple[int, int
 
 
 def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> dict[str, ClockModel]:
-    """Survey the stamps of every mapped topic once, so that all windows of a log use the same clocks.
+    """Fit the clock of every mapped topic once, so that all windows of a log use the same clocks.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
         paths = requests.setdefault(source.read_topic, [])
         paths += [p for p in stamp_request(log, source) if p not in paths]
     parts, recorded = _survey(log, wanted, requests, survey_windows(start_ns, end_ns))
-    # Between the parts of a survey a clock may have stepped: then all of its stamps are looked at.
+    # A clock may have stepped between the parts of a survey: read all of its stamps.
     doubtful = {key: source for key, source in wanted.items() if _offset_changes(parts[key])}
     whole: dict[str, list[_Stamps]] = {}
     if doubtful and end_ns - start_ns > SURVEY_WHOLE_NS:
@@ -183,7 +183,7 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
             raw = log_time = times
         elif source.stamp != "log_time":
             unusable = why_unusable(seen, recorded_ns)
-        if unusable:  # they do not show the period either
+        if unusable:  # the stamps do not show the period either
             steps = np.diff(times) * 1e-9
         clocks[key] = _clock_of(source, raw, log_time, steps, unusable)
     for key, why in _of_other_clocks(clocks).items():
@@ -193,7 +193,7 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
 
 
 def _of_other_clocks(clocks: Mapped[str, ClockModel]) -> dict[str, str]:
-    """Return why the stamps of some topics cannot be set against those of the others, by key; all may be off as one."""
+    """Return why clocks disagree with the others, by key; a common offset of all clocks is accepted."""
     delays_s = {key: clock.median_delay_s for key, clock in clocks.items() if clock.samples}
     if not delays_s or max(delays_s.values()) - min(delays_s.values()) <= MAX_CREDIBLE_DELAY_NS * 1e-9:
         return {}
@@ -210,7 +210,7 @@ def _survey(
     requests: Mapped[str, Sequence[str]],
     spans: Iterable[tuple[int, int]],
 ) -> tuple[dict[str, list[_Stamps]], dict[str, list[IntArray]]]:
-    """Read the usable stamps of each clock, and the log times of all messages, window by window."""
+    """Read the usable stamps of each clock and the log times of all messages, window by window."""
     none = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
     parts: dict[str, list[_Stamps]] = {key: [none] for key in wanted}
     recorded: dict[str, list[IntArray]] = {key: [none[0]] for key in wanted}
@@ -227,22 +227,22 @@ def _survey(
 
 
 def _offset_changes(parts: Sequence[_Stamps]) -> bool:
-    """Return whether the least delay of one part differs from the next one's by more than clocks drift."""
+    """Return whether the smallest delays of successive parts differ by more than clock drift explains."""
     least = np.array([float((log_time - raw).min()) for raw, log_time, _ in parts if raw.shape[0]])
     return bool((np.abs(np.diff(least)) > STEP_BACK_NS).any())
 
 
 def why_missing(usable: int, messages: int) -> str:
-    """Return in words why too few messages have a stamp; empty where enough have one."""
+    """Return why too few messages have a stamp; empty if enough have one."""
     share = 1.0 - usable / messages if messages else 0.0
     return f"{share:.0%} of its stamps are zero or no time" if share > UNUSABLE_SHARE else ""
 
 
 def with_usable_stamps(log: DriveLog, mapping: Mapping) -> Mapping:
-    """Return the mapping with another time of a message where its own is worse: of a header, or of its publication.
+    """Return the mapping with bad stamps replaced by another header stamp or by the publication time.
 
-    The first ten seconds decide: gaps, steps back, rate, and how regular the steps are. If no stamp of a message is
-    usable, the source keeps its own: :func:`fit_clocks` then takes the recorder's time, and gives the reason.
+    The first ten seconds are examined for gaps, steps back, rate, and regularity of the steps. If no stamp of a message
+    is usable, the source keeps its stamp; :func:`fit_clocks` then uses log time and reports the reason.
     """
     keys = {(s.topic, s.stamp): s for s in reversed([*mapping.sources()]) if s.can_signal is None}
     better = {key: other for key, source in keys.items() if (other := _better_stamp(log, source)) is not None}
@@ -259,7 +259,7 @@ def with_usable_stamps(log: DriveLog, mapping: Mapping) -> Mapping:
 
 
 def _better_stamp(log: DriveLog, source: SignalSource) -> tuple[str, str] | None:
-    """Return a stamp of a source's messages that is better than its own, and why; None if none is."""
+    """Return a better stamp in a source's messages and the reason; None without one."""
     if source.stamp_unit != "ros" or source.stamp in ("publish_time", AUTO_STAMP):
         return None
     headers = [p for p in stamp_paths(log.fields(source.topic)) if source.stamp not in (p, "log_time")]
@@ -271,14 +271,14 @@ def _better_stamp(log: DriveLog, source: SignalSource) -> tuple[str, str] | None
     judged = {p: _judged_stamps(log, columns, s) for p, s in sources.items()}
     why, varies = judged[source.stamp]
     others = [p for p in headers if not judged[p][0]]
-    # The time of publication is one if a recorder kept it: more regular than when the messages were recorded.
+    # Some recorders store the publication time: it is used if it is more regular than log time.
     if not others and (why or source.stamp == "log_time") and judged["publish_time"][1] < judged["log_time"][1]:
         others = ["publish_time"]
     if not others:
         return None
     best = min(others, key=lambda p: judged[p][1])
     if not why and varies > IRREGULAR and judged[best][1] < REGULAR_SHARE * varies:
-        why = f"its steps vary by {varies:.0%} of its period, those of {best} by {judged[best][1]:.0%}"
+        why = f"its steps vary by {varies:.0%} of its period, the steps of {best} by {judged[best][1]:.0%}"
     return (best, why) if why else None
 
 
@@ -287,8 +287,8 @@ def _judged_stamps(log: DriveLog, columns: Columns, source: SignalSource) -> tup
 
     Returns
     -------
-    why they are no measure of time, empty where they are, and how much their steps vary, in periods; infinite for
-    stamps that are not on the log's clock.
+    str : why the stamps are unusable; empty if they are usable.
+    float : variation of their steps in periods; infinite for stamps that are not on the log's clock.
     """
     raw, usable = raw_stamps(log, columns, source)
     missing = why_missing(int(np.count_nonzero(usable)), len(columns))
@@ -311,7 +311,7 @@ def _judged_stamps(log: DriveLog, columns: Columns, source: SignalSource) -> tup
 
 
 def why_unusable(stamps_ns: IntArray, log_time_ns: IntArray) -> str:
-    """Return in words why stamps are no measure of time; empty where they are.
+    """Return why stamps are unusable; empty if they are usable.
 
     Parameters
     ----------
@@ -323,7 +323,7 @@ def why_unusable(stamps_ns: IntArray, log_time_ns: IntArray) -> str:
     back = steps_back(stamps_ns)
     if back.size:
         by_s = float(stamps_ns[back[0] - 1] - stamps_ns[back[0]]) * 1e-9
-        return f"its stamps step back by {by_s:.1f} s while log time goes on"
+        return f"its stamps step back by {by_s:.1f} s while log time continues"
     order = np.argsort(stamps_ns, kind="stable")
     repeats = np.flatnonzero(np.diff(stamps_ns[order]) == 0)
     if repeats.size > UNUSABLE_SHARE * n:
@@ -343,7 +343,7 @@ def why_unusable(stamps_ns: IntArray, log_time_ns: IntArray) -> str:
 def stamps_on_log_clock(
     log: DriveLog, columns: Columns, source: SignalSource, clock: ClockModel
 ) -> tuple[IntArray, NDArray[np.bool_]]:
-    """Return a topic's stamps on the log's clock [N], and where they are usable [N]."""
+    """Return a topic's stamps on the log's clock [N], and a mask of usable stamps [N]."""
     if clock.unusable:
         return columns.log_time_ns, columns.log_time_ns > 0
     raw, usable = raw_stamps(log, columns, source)
@@ -355,7 +355,7 @@ def stamps_on_log_clock(
 
 
 def stamp_request(log: DriveLog, source: SignalSource) -> tuple[str, ...]:
-    """Return the field paths to read for a source's stamp; none for the recorder's times."""
+    """Return the field paths of a source's stamp; empty for the recorder's times."""
     if source.stamp in RECORDER_STAMPS:
         return ()
     if source.stamp_unit == "ros":
@@ -368,13 +368,13 @@ def stamp_request(log: DriveLog, source: SignalSource) -> tuple[str, ...]:
 
 
 def request_source(log: DriveLog, source: SignalSource, requests: dict[str, list[str]]) -> None:
-    """Add the paths of a source and of its stamp to the requests of a read, by topic."""
+    """Add the paths of a source and of its stamp to the read requests, by topic."""
     paths = requests.setdefault(source.read_topic, [])
     paths += [p for p in (*stamp_request(log, source), *source.paths) if p not in paths]
 
 
 def raw_stamps(log: DriveLog, columns: Columns, source: SignalSource) -> tuple[IntArray, NDArray[np.bool_]]:
-    """Return a topic's stamps in nanoseconds [N] and where they are usable [N] (finite and positive)."""
+    """Return a topic's stamps in nanoseconds [N] and a mask of usable stamps [N] (finite and positive)."""
     if source.stamp == "log_time":
         return columns.log_time_ns, columns.log_time_ns > 0
     if source.stamp == "publish_time":
@@ -397,14 +397,14 @@ def _to_nanoseconds(parts: list[NDArray[np.generic]], units: tuple[str, ...]) ->
         finite = np.isfinite(part.astype(np.float64)) & (np.abs(part.astype(np.float64)) < 9.2e18 / scale)
         usable &= finite
         number = np.where(finite, part.astype(np.float64), 0.0)
-        # Whole and fractional parts apart: a float64 of nanoseconds since 1970 has steps of 256 ns.
+        # Convert whole and fractional parts separately: float64 nanoseconds since 1970 have a resolution of 256 ns.
         whole = np.floor(number)
         total += whole.astype(np.int64) * np.int64(scale) + np.rint((number - whole) * scale).astype(np.int64)
     return total, usable & (total > 0)
 
 
 def survey_windows(start_ns: int, end_ns: int) -> list[tuple[int, int]]:
-    """Return what :func:`fit_clocks` examines: all of a short log, windows of 10 s spread over a longer one."""
+    """Return the windows for :func:`fit_clocks`: all of a short log, windows of 10 s spread over a longer one."""
     if end_ns - start_ns <= SURVEY_WHOLE_NS:
         return [(start_ns, end_ns)] if start_ns < end_ns else []
     starts = np.linspace(start_ns, end_ns - SURVEY_WINDOW_NS, SURVEY_WINDOWS).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Recorded estimates of other estimators: flags ``[SIGNAL=]TOPIC[.FIELD]`` and tables."""
+"""Find recorded estimates of other estimators, by flags ``[SIGNAL=]TOPIC[.FIELD]`` or by tables."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pdhef_logtool.records.errors import MappingError, UsageError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS
 
 STATE_TYPE = "pdhef_msgs/VehicleStateEstimate"
-#: Quantities that set the estimate's stamps, best first; any other is interpolated to them.
+#: Quantities that provide the estimate's stamps, best first; the others are interpolated to them.
 BASE_ORDER = ("sideslip_rad", "vy_m_s", "vx_m_s", "yaw_rate_rad_s", "ay_m_s2")
 #: Standard deviations in the order of the covariance.
 STDS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
@@ -28,7 +28,7 @@ _TWIST = {"vx_m_s": ("linear", "x"), "vy_m_s": ("linear", "y"), "yaw_rate_rad_s"
 
 @dataclass(frozen=True, slots=True)
 class CovarianceSource:
-    """A covariance matrix of ``size`` rows in a message; ``planar`` are its places of v_x, v_y and yaw rate."""
+    """A covariance matrix of ``size`` rows in a message; ``planar`` has the indices of v_x, v_y and yaw rate."""
 
     topic: str
     field: str
@@ -38,7 +38,7 @@ class CovarianceSource:
 
 @dataclass(frozen=True, slots=True)
 class EstimateSource:
-    """Where one estimator's recorded state is: its name, its quantities (``ESTIMATE_UNITS``), its covariance if any."""
+    """Source of one estimator's recorded state: name, quantities (``ESTIMATE_UNITS``) and optional covariance."""
 
     name: str
     signals: Mapping[str, SignalSource]
@@ -46,18 +46,18 @@ class EstimateSource:
     can: CanSettings | None = None
 
     def as_mapping(self) -> SignalMapping:
-        """Return the sources as a mapping, for what works on mappings: checks, stamps, clocks."""
+        """Return the sources as a mapping, for checks, stamps and clocks."""
         return SignalMapping(signals=dict(self.signals), can=self.can)
 
 
 def choose_estimates(
     log: DriveLog, flags: Sequence[str], mapping: SignalMapping | None, name: str | None
 ) -> tuple[EstimateSource, ...]:
-    """Return the estimates to score: those of the flags, else of the mapping file's ``[estimates]`` tables.
+    """Return the estimates to score, from the flags if any, else from the mapping file's ``[estimates]`` tables.
 
     Raises
     ------
-    UsageError : There is none, or none called ``name``, or the flags contradict one another.
+    UsageError : No estimate exists or none has the name ``name``, or the flags contradict one another.
     MappingError : The log has no such topic.
     """
     tables = {} if mapping is None else mapping.estimates
@@ -68,7 +68,7 @@ def choose_estimates(
         signals, covariance = sources_of(log, flags, ESTIMATE_UNITS, "--estimate")
         base = _base(signals, "--estimate")
         if covariance is not None and (base.topic != covariance.topic or set(STDS) & set(signals)):
-            covariance = None  # its stamps are not those of the estimate, or the flags name standard deviations
+            covariance = None  # its stamps differ from the estimate's, or the flags name standard deviations
         return (EstimateSource(name or _name_of(base.topic), signals, covariance, can),)
     chosen = {n: dict(t) for n, t in tables.items() if name in (None, n)}
     if not chosen:
@@ -85,7 +85,7 @@ def choose_estimates(
 
 
 def _base(signals: Mapping[str, SignalSource], where: str) -> SignalSource:
-    """Return the quantity that sets the estimate's stamps. Raises UsageError without one."""
+    """Return the quantity that provides the estimate's stamps. Raises UsageError without one."""
     base = next((signals[s] for s in BASE_ORDER if s in signals), None)
     if base is None:
         got = ", ".join(signals) or "none"
@@ -96,7 +96,7 @@ def _base(signals: Mapping[str, SignalSource], where: str) -> SignalSource:
 def _name_of(topic: str) -> str:
     words = [w for w in re.split(r"[^A-Za-z0-9]+", topic) if w]
     if words[:1] == ["pdhef"] and len(words) > 2:
-        words = words[1:-1]  # our own /pdhef/<estimator>/state
+        words = words[1:-1]  # topic of this package: /pdhef/<estimator>/state
         return "-".join(words)
     name = "_".join(words) or "estimate"
     return f"{name}_" if name in RESERVED_NAMES else name
@@ -105,11 +105,11 @@ def _name_of(topic: str) -> str:
 def sources_of(
     log: DriveLog, texts: Sequence[str], units: Mapping[str, str], option: str
 ) -> tuple[dict[str, SignalSource], CovarianceSource | None]:
-    """Turn ``[SIGNAL=]TOPIC[.FIELD]`` texts into sources by name, and the covariance of a topic named as a whole.
+    """Convert ``[SIGNAL=]TOPIC[.FIELD]`` texts to sources by name, and find the covariance of a topic without a field.
 
     Raises
     ------
-    UsageError : The signal is not known or cannot be determined from the topic's type, or one is named twice.
+    UsageError : The signal is unknown or cannot be determined from the topic's type, or a signal is named twice.
     MappingError : The log has no such topic.
     """
     sources: dict[str, SignalSource] = {}
@@ -153,7 +153,7 @@ def _split_signal(text: str, units: Mapping[str, str], option: str) -> tuple[str
 
 
 def _split_topic(log: DriveLog, text: str, option: str) -> tuple[TopicInfo, str]:
-    """Split TOPIC.FIELD at the longest topic of the log that fits: outside of ROS 2, topics may contain dots."""
+    """Split TOPIC.FIELD at the longest matching topic of the log, as topics outside of ROS 2 may contain dots."""
     fitting = [t for t in log.topics if text == t.name or text.startswith(f"{t.name}.")]
     if fitting:
         topic = max(fitting, key=lambda t: len(t.name))
@@ -171,7 +171,7 @@ def _split_topic(log: DriveLog, text: str, option: str) -> tuple[TopicInfo, str]
 def _recognise(
     topic: TopicInfo, path: str, units: Mapping[str, str], text: str, option: str
 ) -> tuple[dict[str, str], list[CovarianceSource]]:
-    """Return the fields by signal that a topic's type shows, all of them or the one that was named."""
+    """Return the fields by signal that a topic's type provides, all of them or the one with this path."""
     kind = topic.type_name.replace("/msg/", "/")
     path_of: dict[str, str] = {}
     covariance: list[CovarianceSource] = []

@@ -1,4 +1,4 @@
-"""What short pieces of a log state of its fields: values on one grid of time, and how one follows another."""
+"""Statistics of fields in short pieces of a log: values on a common time grid, and relations between them."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
-#: Pieces of the log that are read, and how long each is; a shorter log is read whole.
+#: Number and length of the pieces of the log to read; a shorter log is read whole.
 PIECES = 8
 PIECE_NS = 10_000_000_000
-#: Cells of the grid; slower than this, a car's motion does not change much.
+#: Cell size of the grid; a car's motion changes little within it.
 CELL_NS = 100_000_000
-#: Beyond, a number is no measurement of a car.
+#: Larger numbers are no measurements of a car.
 LARGEST = 1e12
-#: A sensor of a few samples a second is joined up over so many cells.
+#: Longest gap that is interpolated, for sensors with a few samples per second.
 BRIDGED_CELLS = 5
-#: Columns of an array of unknown length that are looked at.
+#: Maximum number of columns to read of an array of unknown length.
 MOST_COLUMNS = 8
-#: Fewer cells than this give no information.
+#: Smallest number of cells that gives information.
 FEWEST_CELLS = 40
 
 
@@ -37,12 +37,12 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """A field in the pieces that were read.
+    """Values of a field in the pieces of the log.
 
     Attributes
     ----------
-    values : float64 [N], raw. cells : float64 [M], their means on the grid, NaN where there is none.
-    rate_hz : samples a second where it is sent.
+    values : float64 [N], raw. cells : float64 [M], means on the grid, NaN in empty cells.
+    rate_hz : sample rate while the field is recorded.
     """
 
     values: FloatArray
@@ -63,7 +63,7 @@ class Seen:
 
 
 class Pieces:
-    """A few pieces of a log, and a grid of 0.1 s over them."""
+    """A few pieces of a log on a common grid of 0.1 s."""
 
     def __init__(self, log: DriveLog) -> None:
         self.log = log
@@ -74,9 +74,9 @@ class Pieces:
         self.cells_a_piece = PIECE_NS // CELL_NS
 
     def read(self, requests: Mapping[str, Sequence[str]], most: int = MOST_COLUMNS) -> dict[tuple[str, str], Seen]:
-        """Read fields by topic; arrays come as one entry a column, ``name[i]``, ``most`` of them.
+        """Read fields by topic; an array becomes one entry per column, ``name[i]``, at most ``most``.
 
-        What cannot be read is left out.
+        Unreadable fields are omitted.
         """
         parts: dict[tuple[str, str], list[tuple[int, IntArray, FloatArray]]] = {}
         requests = {topic: [*dict.fromkeys(paths)] for topic, paths in requests.items()}
@@ -119,21 +119,21 @@ class Pieces:
         return Seen(values, cells, float(values.shape[0]) / (busy * CELL_NS * 1e-9))
 
     def rate_of(self, cells: FloatArray) -> FloatArray:
-        """Return the change a second of what is on the grid [M]; nothing crosses from one piece to the next."""
+        """Return the time derivative of values on the grid [M], within each piece."""
         rows = cells.reshape(len(self.starts), self.cells_a_piece)
         out = np.full_like(rows, np.nan)
         out[:, 2:-2] = (rows[:, 4:] - rows[:, :-4]) / (4.0 * CELL_NS * 1e-9)
         return out.ravel()
 
     def smooth(self, cells: FloatArray) -> FloatArray:
-        """Return the mean of five neighbouring cells [M], as :meth:`rate_of` sees them."""
+        """Return the mean of five neighbouring cells [M], to match the bandwidth of :meth:`rate_of`."""
         rows = cells.reshape(len(self.starts), self.cells_a_piece)
         out = np.full_like(rows, np.nan)
         out[:, 2:-2] = sum(rows[:, i : rows.shape[1] - 4 + i] for i in range(5)) / 5.0
         return out.ravel()
 
     def ahead_s(self, y: FloatArray, x: FloatArray) -> float:
-        """Return how far y is ahead of x, by the parabola through three correlations a cell apart; 0 if unknown."""
+        """Return by how many seconds y leads x (parabola through three cross-correlations); 0 if unknown."""
         rows = x.reshape(len(self.starts), self.cells_a_piece)
         correlations = []
         for shift in (-1, 0, 1):
@@ -147,7 +147,7 @@ class Pieces:
 
 
 def ratio(y: FloatArray, x: FloatArray, slow: float) -> float | None:
-    """Return how many times x goes into y where x is above ``slow``; None where this is not one number."""
+    """Return the ratio y/x where x is above ``slow``; None unless it is nearly constant."""
     use = np.isfinite(y) & np.isfinite(x)
     use[use] &= x[use] > slow
     if np.count_nonzero(use) < FEWEST_CELLS:
@@ -164,7 +164,7 @@ def is_of_one_sign(values: FloatArray) -> bool:
 
 
 def is_of_both_signs(values: FloatArray) -> bool:
-    """Return whether a good share of the values is on either side of zero, far beyond noise about it."""
+    """Return whether a significant share of the values, well beyond noise, is on either side of zero."""
     finite = values[np.isfinite(values)]
     if finite.shape[0] == 0:
         return False
@@ -173,13 +173,13 @@ def is_of_both_signs(values: FloatArray) -> bool:
 
 
 def spread(cells: FloatArray) -> float:
-    """Return the standard deviation of what is known; 0 without anything."""
+    """Return the standard deviation of the finite values; 0 without any."""
     finite_cells = cells[np.isfinite(cells)]
     return float(finite_cells.std()) if finite_cells.shape[0] else 0.0
 
 
 def _usual(values: FloatArray) -> tuple[float, float]:
-    """Return the range that a sensor's "invalid" lies outside of: it is no motion, however large."""
+    """Return the range of plausible values; a sensor's code for "invalid" lies outside."""
     finite = values[np.isfinite(values)]
     if finite.shape[0] == 0:
         return 0.0, 0.0
@@ -189,7 +189,7 @@ def _usual(values: FloatArray) -> tuple[float, float]:
 
 
 def _filled(rows: FloatArray) -> FloatArray:
-    """Join the neighbours of an empty cell by a line where one is at most ``BRIDGED_CELLS`` away [pieces, cells]."""
+    """Interpolate empty cells whose neighbours are at most ``BRIDGED_CELLS`` away [pieces, cells]."""
     cell = np.arange(rows.shape[1])
     for row in rows:
         finite_cells = np.flatnonzero(np.isfinite(row))
@@ -203,7 +203,7 @@ def _filled(rows: FloatArray) -> FloatArray:
 
 
 def fit(y: FloatArray, x: FloatArray, where: BoolArray | None = None) -> Fit | None:
-    """Fit a line through cells [M] where both are known; None where they are too few or one does not move."""
+    """Fit a line through the finite cells [M]; None if there are too few or one of the two is constant."""
     use = np.isfinite(y) & np.isfinite(x)
     if where is not None:
         use &= where
@@ -211,7 +211,7 @@ def fit(y: FloatArray, x: FloatArray, where: BoolArray | None = None) -> Fit | N
     if n < FEWEST_CELLS:
         return None
     a, b = y[use], x[use]
-    # A few wild samples (a sensor's "invalid") must not decide.
+    # Exclude a few outliers, such as a sensor's "invalid".
     low, high = np.quantile(a, [0.005, 0.995])
     a = np.clip(a, low, high)
     low, high = np.quantile(b, [0.005, 0.995])

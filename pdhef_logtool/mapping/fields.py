@@ -1,4 +1,4 @@
-"""The fields of a log while candidates are weighed: look-ups and relations."""
+"""Fields of a log during the evaluation of candidates: look-ups and relations."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, spread
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
-#: A relation counts from this correlation on.
+#: Smallest correlation that counts as a relation.
 CLEAR = 0.75
-#: Below (standard deviation) a drive does not excite a relation of accelerations.
+#: Smallest standard deviation of an acceleration that excites a relation.
 EXCITED_A_M_S2 = 0.25
 
 
 @dataclass(slots=True)
 class Fields:
-    """Candidates, what is mapped already (``anchors``, by signal), and positions, on one grid of time."""
+    """Candidates, mapped sources (``anchors``, by signal) and positions, on one time grid."""
 
     pieces: Pieces
     anchors: dict[str, Field]
@@ -35,15 +35,15 @@ class Fields:
         return sorted((f for f in every if part is None or f.meaning.part == part), key=lambda f: -f.score)
 
     def open(self, quantity: str, part: str | None = None) -> list[Field]:
-        """Return those of a quantity and part that change."""
+        """Return the fields of a quantity and part that are not constant."""
         return [f for f in self.all(quantity, part) if f.seen.changes]
 
     def best(self, quantity: str) -> Field | None:
-        """Return the surest of a quantity that changes."""
+        """Return the surest field of a quantity that is not constant."""
         return next(iter(self.open(quantity)), None)
 
     def wheel_mean(self) -> Field | None:
-        """Return the wheel speeds' mean as a speed, where their unit is one of speed and known."""
+        """Return the mean of the wheel speeds if their unit is a known unit of speed."""
         wheels = [f for f in self.candidates if f.meaning.quantity == "wheel speed" and (f.unit_known or f.fixed)]
         wheels += [f for n, f in self.anchors.items() if n.startswith("wheel_speed_") and n.endswith("m_s")]
         if not wheels:
@@ -51,21 +51,21 @@ class Fields:
         return wheels[0].standing_for(mean_of([f.si for f in wheels]))
 
     def wheel_turns(self) -> Field | None:
-        """Return how fast the wheels turn, which is a speed but for their radius."""
+        """Return the mean wheel rotation, which is a speed up to the wheel radius."""
         wheels = [
             f for f in (*self.candidates, *self.anchors.values()) if f.meaning.quantity == "wheel rate" and f.unit_known
         ]
         return wheels[0].standing_for(mean_of([f.si for f in wheels])) if wheels else None
 
     def turning(self, ay: FloatArray, rate: FloatArray, speed: FloatArray) -> Fit | None:
-        """Fit a_y to v r; None where the drive does not turn."""
+        """Fit a_y to v r; None if the car does not turn."""
         expected = rate * speed
         if not spread(expected) > EXCITED_A_M_S2:
             return None
         return fit(self.pieces.smooth(ay), self.pieces.smooth(expected))
 
     def settle(self, item: Field, slope: float, by: str, tolerance: float) -> None:
-        """Take the one unit that a slope is near to, if there is one."""
+        """Select the one unit that matches a slope within the tolerance, if any."""
         if item.unit_known or item.fixed:
             return
         near = [u for u, s in item.factors if abs(slope / s - 1.0) < tolerance]
@@ -81,7 +81,7 @@ def agree(a: FloatArray, b: FloatArray) -> bool:
 
 
 def mean_of(columns: Sequence[FloatArray]) -> FloatArray:
-    """Return the mean of columns [M] over those that are known in each cell."""
+    """Return the mean over the columns [M] that are finite in each cell."""
     stacked = np.stack(columns)
     finite = np.isfinite(stacked)
     with np.errstate(invalid="ignore"):

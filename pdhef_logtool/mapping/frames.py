@@ -1,4 +1,4 @@
-"""Where a recorded tree of frames (``/tf_static``) puts a sensor in the car."""
+"""Find the mounting of a sensor in a recorded frame tree (``/tf_static``)."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from pdhef_logtool.logs.message_schema import value_at
 from pdhef_logtool.records.geometry import rotation_from_quat
 from pdhef_logtool.records.signals import FloatArray
 
-#: Names of the frame of a car itself, without what is before a slash.
+#: Names of the vehicle frame, without the prefix before a slash.
 BASES = ("base_link", "base_footprint", "ego_vehicle", "vehicle", "base", "car", "chassis")
 _TYPES = frozenset({"tf2_msgs/TFMessage", "tf/tfMessage"})
-#: Messages of fixed frames that are read, and frames between a sensor and its car.
+#: Limits: messages of fixed frames to read, and frames between a sensor and its car.
 MOST_MESSAGES = 500
 MOST_STEPS = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placement:
-    """A sensor in a car's frame: the rotation [3, 3] of its axes to the frame's."""
+    """Mounting of a sensor: the rotation [3, 3] from its axes to the vehicle frame's."""
 
     frame: str
     base: str
@@ -39,7 +39,7 @@ class _Step:
 
 
 def placement_of(log: DriveLog, topic: str) -> Placement | None:
-    """Return where the recorded frames put what sends a topic; None where they do not reach from it to a car."""
+    """Return the mounting of a topic's sensor; None if no chain of recorded frames connects it to a car."""
     frame = next((f for m in log.first_messages(topic, 1) if (f := _name(m, "header", "frame_id"))), "")
     steps = _fixed_frames(log) if frame else {}
     if frame not in steps:
@@ -60,7 +60,7 @@ def holds_fixed_frames(topic: TopicInfo) -> bool:
 
 
 def _fixed_frames(log: DriveLog) -> Mapping[str, _Step]:
-    """Return the frames that never move, by name; one that is given twice in different places is none."""
+    """Return the fixed frames by name; a frame that is defined twice with different poses is excluded."""
     by_name: dict[str, _Step] = {}
     moved: set[str] = set()
     for topic in log.topics:

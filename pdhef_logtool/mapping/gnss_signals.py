@@ -1,7 +1,7 @@
-"""GNSS as a sensor: velocity over ground, position and their quality, of a receiver that has no heading.
+"""GNSS signals of a receiver without heading: velocity over ground, position and their quality.
 
-What also has a heading (two antennas, INS) or sideslip is ground truth, and never an input of an estimator. Messages
-of receivers are recognised by their fields, at any depth, so that types that contain such a message are recognised too.
+A source that also has a heading (two antennas, INS) or sideslip is ground truth, and never an input of an estimator.
+Messages of receivers are recognised by their fields at any depth, so that nested messages are recognised, too.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _DEGREE = 0.017453292519943295
 _COURSE = (-_DEGREE, 1.5707963267948966)
 _EAST, _NORTH = "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"
 _POSITION_ACCURACY = "gnss_position_accuracy_m"
-#: Ground truth with one of these states a heading, or motion that needs one.
+#: Ground truth with one of these contains a heading, or motion that needs one.
 HEADING = frozenset({"quat_wxyz", "yaw_rad", "vy_m_s", "sideslip_rad"})
 
 
@@ -42,16 +42,16 @@ def gnss_signals(signals: Mapping[str, SignalSource], truth: Mapping[str, Signal
 
 
 def component(vector: SignalSource, name: str, column: int) -> SignalSource:
-    """Return one column of a vector as a signal of its own."""
+    """Return one column of a vector as a separate signal."""
     scale, offset = (value[column] if isinstance(value, tuple) else value for value in (vector.scale, vector.offset))
     return replace(vector, name=name, field=vector.paths[column], scale=scale, offset=offset)
 
 
 @dataclass(frozen=True, slots=True)
 class Receiver:
-    """A documented message of a receiver: fields that recognise it, and signal, field, scale and offset of each.
+    """A documented message of a receiver: fields that identify it, and signal, field, scale and offset of each.
 
-    ``heading``: fields of an attitude: such a message is ground truth.
+    ``heading``: fields of an attitude. A message with one of them is ground truth.
     """
 
     fields: frozenset[str]
@@ -59,14 +59,14 @@ class Receiver:
     heading: frozenset[str] = frozenset()
 
 
-#: Signals by their letters in the table below.
+#: Signals by letter in the table below.
 _LETTERS = {
     "E": _EAST, "N": _NORTH, "V": "gnss_speed_m_s", "C": "gnss_course_rad", "F": "gnss_fix_type",
     "A": "gnss_latitude_deg", "O": "gnss_longitude_deg", "v": "gnss_velocity_accuracy_m_s", "p": _POSITION_ACCURACY,
 }  # fmt: skip
-#: Course of a single antenna beside the heading of two: a sensor, even of an instrument that is ground truth.
+#: Course of a single antenna in addition to a heading from two antennas: a sensor, even of a ground-truth instrument.
 RAW_COURSE = "heading_raw"
-#: A receiver a line: fields that recognise it, signals as letter=field*scale+offset, fields of a heading. Scales as
+#: One receiver per line: fields that identify it, signals as letter=field*scale+offset, fields of a heading. Scales as
 #: documented: mm/s, cm/s, km/h, 1e-7 deg, rad, mm, uncertainties of 95 % or twice the RMS; courses are in deg clockwise
 #: from north. gps_common/GPSFix; u-blox NAV-PVT in two spellings, NAV-VELNED, NAV-POSLLH; Piksi VelNed, PosLlh; raw
 #: columns of a VBO file; NovAtel BESTVEL in three spellings; Septentrio PVTGeodetic; NovAtel INSPVA; NavSatFix.
@@ -109,7 +109,7 @@ RECEIVERS = tuple(map(_receiver, _TABLE.strip().splitlines()))
 
 
 def receiver_signals(topic: str, stamp: str, paths: Collection[str]) -> dict[str, SignalSource]:
-    """Return the GNSS signals of a topic whose fields, below any struct, are those of a receiver; empty if none."""
+    """Return the GNSS signals of a topic if it contains, at any depth, the fields of a receiver; empty otherwise."""
     there = set(paths)
     for receiver in RECEIVERS:
         leaf = min(receiver.fields)

@@ -1,4 +1,4 @@
-"""The speed as the length of a velocity over ground, where nothing measures it forward: it is the same in any frame."""
+"""Vehicle speed as the length of a velocity over ground (independent of the frame), without a forward speed sensor."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.signals import FloatArray
 
-#: How near it must be to the speed of positions, and its change to a_x: the road climbs, the car pitches.
+#: Tolerances of its ratio to the speed from positions, and of its derivative's slope over a_x (slopes, pitching).
 NEAR_PATH = 0.08
 NEAR_A_X = (0.6, 1.6)
 SLOW_M_S = 1.0
-#: What is stated of every speed that is a length.
+#: Note on every speed that is a length.
 NEVER_NEGATIVE = "the length of a velocity over ground, which is never negative: in reverse it has the wrong sign"
 
 
 def length_of(velocity: SignalSource) -> SignalSource:
-    """Return the speed that a velocity of ground truth has: the length of its level part, of three in ECEF."""
+    """Return the speed from a ground-truth velocity: the length of its horizontal part, of all three axes in ECEF."""
     level = len(velocity.paths) if velocity.name == "ecef_velocity_m_s" else 2
     scale = velocity.scale[:level] if isinstance(velocity.scale, tuple) else (velocity.scale,) * level
     return replace(velocity, name="speed_m_s", field=velocity.paths[:level], scale=scale, offset=0.0, combine="norm")
@@ -39,12 +39,12 @@ def speed_over_ground(
     signals: Mapping[str, SignalSource],
     truth: Mapping[str, SignalSource],
 ) -> tuple[SignalSource, str] | None:
-    """Return a velocity whose length is the car's speed, as positions or a_x state, and the evidence.
+    """Return a velocity with a length that matches positions or a_x, and the evidence.
 
     Parameters
     ----------
-    topics : with the struct of a velocity's x and y where the type shows it, else empty: names give it then.
-    signals, truth : what is mapped already.
+    topics : each with the struct of a velocity's x and y if the type defines it, else "" to search by names.
+    signals, truth : the mapping so far.
     """
     vectors = [v for topic, base in topics for v in _vectors(log, topic, base)]
     references = [s for n, s in signals.items() if n == "ax_m_s2"]
@@ -72,7 +72,7 @@ def speed_over_ground(
 
 
 def _vectors(log: DriveLog, topic: TopicInfo, base: str) -> Iterator[SignalSource]:
-    """Yield the x and y of the velocities of a topic, or their names' north and east."""
+    """Yield the x and y, or north and east, of the velocities of a topic."""
     fields = log.fields(topic.name, quiet=True)
     bases, stamp = [base] if base else [], stamp_path_of(fields)
     sides = {side_of(*i.path.rpartition(".")[::2]): i.path for i in fields if i.kind == "number" and not base}

@@ -1,4 +1,4 @@
-"""Joints of a vehicle's model (``sensor_msgs/JointState``): the messages show which number is whose, not the type."""
+"""Joints of a vehicle model (``sensor_msgs/JointState``): the messages, not the type, give the joint of each number."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pdhef_logtool.logs.message_schema import value_at
 from pdhef_logtool.mapping.naming import Meaning, corner_of, words_of
 from pdhef_logtool.mapping.records import SignalSource
 
-#: Messages whose names are looked at: several nodes may send to one topic, each its own joints.
+#: Number of messages to read the names from: several nodes may send different joints to one topic.
 MESSAGES = 200
 _STEERS = frozenset({"steer", "steering", "steered"})
 _WHEELS = frozenset({"wheel", "wheels", "whl", "tire", "tyre"})
@@ -23,7 +23,7 @@ def is_joints(topic: TopicInfo) -> bool:
 
 
 def joint_names(log: DriveLog, topic: TopicInfo) -> tuple[str, ...]:
-    """Return the joints of a topic in their order; empty where messages differ in it."""
+    """Return the joints of a topic in their order; empty if the order varies between messages."""
     messages = log.first_messages(topic.name, MESSAGES)
     orders = {tuple(str(n) for n in names) for m in messages if (names := _listed(value_at(m, ("name",))))}
     return next(iter(orders)) if len(orders) == 1 else ()
@@ -34,7 +34,7 @@ def _listed(value: object) -> tuple[object, ...]:
 
 
 def joint_meanings(log: DriveLog, topic: TopicInfo) -> Iterator[tuple[str, Meaning]]:
-    """Yield path and meaning of the joints that are steered wheels (rad) or turning ones (rad/s)."""
+    """Yield path and meaning of steered wheels (rad) and rotating wheels (rad/s)."""
     for i, name in enumerate(joint_names(log, topic)):
         words = words_of(name)
         corner, why = corner_of(words), f"joint {name!r} names it"
@@ -46,7 +46,7 @@ def joint_meanings(log: DriveLog, topic: TopicInfo) -> Iterator[tuple[str, Meani
 
 
 def mean_of_sides(log: DriveLog, topics: Mapping[str, TopicInfo], steering: SignalSource) -> SignalSource | None:
-    """Return the mean of the left and the right steered wheel where a steering angle is one of the two."""
+    """Return the mean of the left and right steered wheel if a steering angle is one of the two."""
     topic = topics.get(steering.topic)
     if topic is None or not is_joints(topic) or not isinstance(steering.field, str):
         return None

@@ -33,10 +33,10 @@ from pdhef_logtool.storage.documents import checked, read_toml, unknown
 if TYPE_CHECKING:
     from pdhef_logtool.mapping.candidates import Candidate
 
-#: Alternatives of one signal that a written file shows, and the two signals that are each other's.
+#: Number of alternatives per signal in a written file, and the two steering signals, which can replace each other.
 ALTERNATIVES = 3
 _STEERING = ("steer_rad", "steering_wheel_rad")
-#: Names in the tables that are no estimator's.
+#: Table names that are not available for estimators.
 RESERVED_NAMES = ("truth", "sensors", "reference")
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -112,12 +112,12 @@ class _CanTable(BaseModel):
 
 
 def mapping_of(given: Mapping | Path | str | None) -> Mapping | None:
-    """Return a mapping that is given as it is or by its file; None stays None. Raises MappingFileError."""
+    """Return the mapping, read from its file if a path is given; None stays None. Raises MappingFileError."""
     return load_mapping(given) if isinstance(given, Path | str) else given
 
 
 def load_mapping(path: Path | str) -> Mapping:
-    """Read mapping.toml, or the mappings of a folder, from which each log takes that of its recorder.
+    """Read mapping.toml, or a folder of mappings, from which each log uses the one for its recorder.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
     recorder = _read_recorder(raw.get("recorder", {}), problems)
     mapping = Mapping(signals, truth, quality, can=can, estimates=estimates, fill_recognised=fill, recorder=recorder)
     if "can" not in raw:
-        # Others than estimators read the estimates, so that they are looked through as well.
+        # Other programs read the estimates: their sources are checked as well.
         every = (*mapping.sources(), *(s for e in estimates.values() for s in e.values()))
         names = [s.name for s in every if s.can_signal is not None]
         problems += [f"{name}: field = {CAN_PREFIX}... needs [can] with a dbc" for name in names]
@@ -259,7 +259,7 @@ def _scalar_problem(name: str, fields: int, model: _SourceTable) -> str:
         return f"offset must be a single value, {name} is no vector"
     if fields == 1 and isinstance(model.scale, list):
         return f"scale must be a single value, {name} is no vector and has one field"
-    # The sum of several fields: a component of a sensor whose axes are not the car's.
+    # Sum of several fields: one component of a sensor with rotated axes.
     if fields > 1 and not (isinstance(model.scale, list) and len(model.scale) == fields):
         return f"{name} is the sum of its fields, each times its scale: scale must have {fields} entries"
     return ""
@@ -274,7 +274,7 @@ def _read_gate(raw: object, problems: list[str]) -> QualityGate | None:
 
 
 def contradictions(mapping: Mapping) -> list[str]:
-    """Return why a mapping contradicts itself: two names of one signal, or one field for two signals of a section."""
+    """Return contradictions in a mapping: two names of one signal, or one field for two signals of a section."""
     problems = []
     pairs = [("steer_rad", "steering_wheel_rad")]
     pairs += [(f"wheel_speed_{w}_m_s", f"wheel_speed_{w}_rad_s") for w in WHEELS]
@@ -308,15 +308,15 @@ def contradictions(mapping: Mapping) -> list[str]:
 def mapping_to_toml(
     mapping: Mapping, comments: MappingABC[str, str] | None = None, alternatives: Sequence[Candidate] = ()
 ) -> str:
-    """Write a mapping as TOML that is ready to edit; ``load_mapping`` gives the same sources back.
+    """Write a mapping as TOML that is ready to edit; ``load_mapping`` returns the same sources.
 
     Parameters
     ----------
-    comments : text by name (``steer_rad``) or table (``truth.yaw_rate_rad_s``), by ``truth_quality``, or under ``""``
-        for the head of the file; it is above the entry as a comment.
-    alternatives : candidates; those that are not taken follow as comments, with score and reason.
+    comments : text by name (``steer_rad``) or table (``truth.yaw_rate_rad_s``), by ``truth_quality``, or ``""`` for the
+        head of the file; each is written above its entry.
+    alternatives : candidates; those that are not taken are written as comments, with score and reason.
 
-    Signals that the mapping lacks appear as commented examples, so that they only need a topic and a field.
+    Missing signals are written as commented examples that only need a topic and a field.
     """
     notes = dict(comments or {})
     lines = [
@@ -345,7 +345,7 @@ def mapping_to_toml(
 
 
 def _missing_lines(mapping: Mapping, notes: MappingABC[str, str], alternatives: Sequence[Candidate]) -> list[str]:
-    """Return what the mapping lacks as commented examples."""
+    """Return commented examples of the missing signals."""
     lines: list[str] = []
     missing = missing_signals(mapping)
     if missing:
@@ -368,7 +368,7 @@ def _header(section: str, name: str, width: int) -> str:
 
 
 def _example(section: str, name: str) -> list[str]:
-    """Return a commented table for a signal that is not mapped."""
+    """Return a commented table for a missing signal."""
     return [
         "#",
         f"# {_header(section, name, 30)}",
@@ -379,7 +379,7 @@ def _example(section: str, name: str) -> list[str]:
 
 
 def _alternative_lines(section: str, name: str, candidates: Sequence[Candidate]) -> list[str]:
-    """Return commented tables of the best candidates of a signal that are not taken."""
+    """Return commented tables of the best candidates that are not taken."""
     names = {"steer_rad": _STEERING, "steering_wheel_rad": _STEERING}.get(name, (name,))
     mine = [c for c in candidates if c.section == section and c.source.name in names and not c.taken]
     lines: list[str] = []
@@ -395,7 +395,7 @@ def _alternative_lines(section: str, name: str, candidates: Sequence[Candidate])
 
 
 def missing_signals(mapping: Mapping) -> tuple[str, ...]:
-    """Return the signals that an estimator searches for and the mapping lacks; the speed may come from any wheel."""
+    """Return the missing signals that an estimator can use; the speed may come from any wheel."""
     have = set(mapping.signals)
     out = []
     if not have & {"steer_rad", "steering_wheel_rad"}:
@@ -432,7 +432,7 @@ def _can_lines(can: CanSettings) -> list[str]:
 def _lines(
     record: SignalSource | QualityGate | CanSettings, names: MappingABC[str, str], always: tuple[str, ...] = ()
 ) -> list[str]:
-    """Return the entries that are not the record's defaults; ``names`` are those of the file by the record's."""
+    """Return the entries that differ from the defaults; ``names`` maps names of the record to names in the file."""
     default = {f.name: f.default for f in fields(record)}
     values = {n: getattr(record, n) for n in names}
     return [f"{names[n]} = {_toml(v)}" for n, v in values.items() if n in always or v != default[n]]
@@ -445,7 +445,7 @@ def entries_of(source: SignalSource, *names: str) -> str:
 
 def _toml(value: str | float | tuple[str, ...] | tuple[float, ...]) -> str:
     if isinstance(value, str):
-        # A JSON string is a TOML basic string, but for DEL, which TOML wants escaped.
+        # A JSON string is a TOML basic string, except that TOML requires DEL to be escaped.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, tuple):
         return "[" + ", ".join(_toml(v) for v in value) + "]"

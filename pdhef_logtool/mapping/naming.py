@@ -1,7 +1,7 @@
-"""Names of fields: their quantity, axis or wheel, and unit.
+"""Quantity, axis or wheel, and unit of a field by its name, without its values.
 
-Nothing here examines values. Names are cut into words (``WheelSpd_FL``, ``steeringangle``, ``latAccelG``) before they
-are looked up, so that the spelling of a recorder does not matter.
+Names are split into words (``WheelSpd_FL``, ``steeringangle``, ``latAccelG``) before the look-up, so that all
+spellings of recorders are accepted.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from typing import TypeAlias
 
 from pdhef_logtool.records.geometry import GRAVITY_M_S2
 
-#: Names whose words, units and meanings are kept: the drives of a fleet have the same ones.
+#: Size of the cache of meanings: the drives of a fleet have the same names.
 CACHED_NAMES = 8192
-#: Gravity by which accelerations in g are written.
+#: Standard gravity, the unit g of accelerations.
 G_M_S2 = GRAVITY_M_S2
 
-#: Words, units and rules that names are compared with.
+#: Words, units and rules for names.
 VOCABULARY = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 #: Factors to SI by kind of quantity and word of a unit.
 UNITS: dict[str, dict[str, float]] = VOCABULARY["units"]
-#: Units as they are written in reports.
+#: Spelling of units in reports.
 UNIT_TEXTS: dict[str, str] = VOCABULARY["unit_texts"]
 _UNIT_PHRASES: tuple[tuple[str, str], ...] = tuple(VOCABULARY["unit_phrases"].items())
 _SPELLED_UNITS = tuple((re.compile(pattern), sign) for pattern, sign in VOCABULARY["unit_parts"].items())
@@ -38,7 +38,7 @@ _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 
 @lru_cache(maxsize=CACHED_NAMES)
 def words_of(name: str) -> tuple[str, ...]:
-    """Cut a name into lower-case words: at signs, at capitals, and where known words are written as one."""
+    """Split a name into lower-case words: at punctuation, at capitals, and between known words written as one."""
     words: list[str] = []
     for letter, latin in (("ä", "ae"), ("ö", "oe"), ("ü", "ue"), ("Ä", "Ae"), ("Ö", "Oe"), ("Ü", "Ue")):
         name = name.replace(letter, latin)
@@ -55,18 +55,18 @@ def words_of(name: str) -> tuple[str, ...]:
     return tuple(words)
 
 
-#: A wheel as ``FrL``, and behind letters for a speed.
+#: A wheel as ``FrL`` after letters of a speed.
 _SIDES = re.compile(r"(?<=[a-z_])(Fr|Re)([LR])(?![a-z])")
-#: A wheel before or behind a word without a capital between: ``LFspeed``, ``WHEELSPEEDFL``.
+#: A wheel before or after a word without a capital between: ``LFspeed``, ``WHEELSPEEDFL``.
 _CORNER_AT_END = re.compile(
     r"(?<![A-Za-z])(?:[LR][FR]|[FR][LR])(?=[a-z]{2})|(?<=SPEED|speed)(?:[FR][LR]|[fr][lr])(?![A-Za-z])"
 )
-#: A wheel or an axis behind a word without a capital between: ``wsfl``, ``accx``.
+#: A wheel or an axis after a word without a capital between: ``wsfl``, ``accx``.
 _CORNER_SPEED = re.compile(r"(?:ws|vw|w|v|n)(?=(?:fl|fr|rl|rr)$)|(?:acc|accel|gyro?|vel|speed)(?=[xyz]$)")
 
 
 def _unglued(piece: str) -> list[str]:
-    """Return the known words that a piece consists of, or the piece itself."""
+    """Split a piece into known words; return the piece itself if it contains other letters."""
     if letters := _CORNER_SPEED.match(piece):
         return [letters[0], piece[letters.end() :]]
     if piece in _WORDS["lexicon"] or len(piece) < 5:
@@ -83,15 +83,15 @@ def _unglued(piece: str) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """Quantity of a field by its name.
+    """Quantity of a field according to its name.
 
     Attributes
     ----------
     quantity : ``acceleration``, ``rate``, ``steering``, ``speed``, ``wheel speed``, ``sideslip``, ``heading``,
         ``course``, ``velocity``, ``position``, ``latitude`` or ``longitude``.
     part : axis (x, y, z), wheel (fl, fr, rl, rr), frame of a velocity (``lateral``), or kind of a steering angle
-        (``wheel``, ``road``); empty where the name does not give it.
-    strength : 0 to 1; 1 where the field's name alone gives the quantity, less where its parents or its topic do.
+        (``wheel``, ``road``); empty if the name does not contain it.
+    strength : 0 to 1; 1 if the field's name alone defines the quantity, less if its parents or its topic do.
     unit : word of the unit, empty without one. scale : its factor to SI, None without one.
     why : the name, for reports.
     """
@@ -105,17 +105,17 @@ class Meaning:
 
 
 def is_command(*names: str) -> bool:
-    """Return whether the name of a topic, type or field is that of a command, not of a measurement."""
+    """Return whether the name of a topic, type or field describes a command, not a measurement."""
     return any(_WORDS["commands"] & set(words_of(n)) for n in names)
 
 
 def is_unlabelled(name: str) -> bool:
-    """Return whether a name consists of letters, numbers and counting words only; so does an empty name."""
+    """Return whether a name is empty or consists of letters, numbers and counting words only."""
     return all(len(w) == 1 or w.isdigit() or w in _WORDS["counting"] for w in words_of(name))
 
 
 def _plain_unit(text: str) -> str:
-    """Return a unit of a file as names of fields have it: ``Unit_DegrePerSecon`` becomes ``deg_per_s``."""
+    """Normalize a unit of a file to the form used in field names: ``Unit_DegrePerSecon`` becomes ``deg_per_s``."""
     text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", text.strip("[](){} ")).lower()
     for pattern, sign in _SPELLED_UNITS:
         text = pattern.sub(sign, text)
@@ -128,7 +128,7 @@ def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
 
     Parameters
     ----------
-    kind : of quantity, a key of ``UNITS``; units of other kinds are ignored (``g`` of a speed).
+    kind : kind of quantity, a key of ``UNITS``; units of other kinds are ignored (``g`` for a speed).
     """
     words = [w for w in re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", leaf).lower()) if w]
     # Integers in thousandths (``acc_y_mps2_e3``).
@@ -145,9 +145,9 @@ def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
 
 @lru_cache(maxsize=CACHED_NAMES)
 def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Meaning | None:
-    """Return the quantity that a field's name gives, with its parents' or topic's words where the leaf has none.
+    """Return the quantity of a field by its name; words of its parents or topic complete an incomplete leaf.
 
-    ``unit_text`` is the unit that the log gives (``km/h``, ``°/s``), empty where it gives none.
+    ``unit_text`` is the unit stored in the log (``km/h``, ``°/s``), empty without one.
     """
     *parents, leaf = path.split(".")
     leaf_words = words_of(f"r_{unit_text.replace('°', 'deg')}" if leaf == "r" else re.sub(r"\[\d*\]", "", leaf))
@@ -155,7 +155,7 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
     outer = (*words_of(topic), *words_of(type_name.rpartition("/")[2].rpartition(".")[2]))
     if not leaf_words or _WORDS["other_devices"] & set(outer):
         return None
-    # A current before other words is the present one, a state before them the topic of an export.
+    # "current" before other words is an adjective; "state" before them is the topic of an export.
     kept = {w for w in leaf_words[:-1] if w not in ("current", "state", "states", "status")} | {*leaf_words[-1:]}
     if _WORDS["not_values"] & kept or _WORDS["not_values"] & set(inner) - {"state", "status", "orientation"}:
         return None
@@ -167,7 +167,7 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
         return None
     scopes = [(of_leaf, leaf_words, leaf)] if of_leaf else []
     scopes.append((0.9, (*inner, *leaf_words), path))
-    # A topic's name describes each field only where the leaf identifies no quantity.
+    # The topic's name describes its fields only if the leaf identifies no quantity.
     if all(w in _WORDS["bare"] or not w.isalpha() for w in leaf_words):
         scopes.append((0.7, (*outer, *inner, *leaf_words), f"{topic} {path}"))
     for strength, words, where in scopes:
@@ -183,9 +183,9 @@ _TURNING = frozenset({"rate", "velocity", "gyro", "gyroscope"})
 def _strength_of_leaf(
     leaf_words: tuple[str, ...], inner: tuple[str, ...], named: str, *, has_unit: bool
 ) -> float | None:
-    """Return how much a leaf alone gives: less for a v without a unit, None for a voltage.
+    """Return the strength of a leaf alone: less for a v without a unit, None for a voltage.
 
-    The yaw of a rate and the v (values) of an inertial sensor give nothing: 0.
+    The yaw of a rate and the v (values) of an inertial sensor are no quantities: 0.
     """
     if leaf_words == ("v",) and (_TURNING | {"accel", "acceleration", "accelerometer"}) & set(inner):
         return 0.0
@@ -197,7 +197,7 @@ def _strength_of_leaf(
 def _with_unit(
     quantity: _Quantity, strength: float, where: str, inner: tuple[str, ...], names: tuple[str, ...]
 ) -> Meaning | None:
-    """Return the meaning with the unit that the leaf or its struct (``names``) gives; None for a rotational speed."""
+    """Return the meaning with the unit from the leaf or its struct (``names``); None for a rotational speed."""
     name, part, kind = quantity
     corner = _corner(inner, ())
     if name == "speed" and corner:
@@ -213,7 +213,7 @@ def _with_unit(
 
 #: Quantity, part and kind of unit.
 _Quantity: TypeAlias = tuple[str, str, str]
-#: A condition on tokens: of each pair any of the tokens is there, or, with False, none.
+#: Conjunction of conditions on tokens: (True, tokens) needs any of the tokens, (False, tokens) excludes all.
 _Rule: TypeAlias = tuple[tuple[bool, frozenset[str]], ...]
 
 
@@ -226,7 +226,7 @@ def _matches(rule: _Rule, tokens: set[str]) -> bool:
 
 
 _TRAITS = tuple((trait, _rule(text)) for trait, texts in VOCABULARY["traits"].items() for text in texts)
-#: Quantities by the first rule that matches; empty: no quantity. A part ``@axis`` or ``@corner`` is the name's.
+#: Quantities by the first matching rule; empty: no quantity. A part ``@axis`` or ``@corner`` is read from the name.
 _QUANTITIES: tuple[tuple[_Rule, tuple[str, ...]], ...] = tuple(
     (_rule(text), tuple(quantity)) for text, quantity in VOCABULARY["quantities"].items()
 )
@@ -236,7 +236,7 @@ _PLACE_WORDS = frozenset({"gps", "gnss", "ins", "pos", "position", "abs"})
 def _quantity(
     words: tuple[str, ...], leaf_words: tuple[str, ...], index: int | None, strength: float, named: str
 ) -> _Quantity | None:
-    """Return the quantity of the first rule that the words match; ``named`` is the leaf with its unit."""
+    """Return the quantity of the first rule that matches the words; ``named`` is the leaf with its unit."""
     axis = next((_AXES[w] for w in (*reversed(leaf_words), *reversed(words)) if w in _AXES), "")
     if not axis and index is not None and index < 3:
         axis = "xyz"[index]
@@ -283,5 +283,5 @@ def _corner(words: tuple[str, ...], leaf_words: tuple[str, ...]) -> str:
 
 
 def corner_of(words: tuple[str, ...]) -> str:
-    """Return the wheel (fl, fr, rl, rr) that words name; empty without one."""
+    """Return the wheel (fl, fr, rl, rr) in a list of words; empty without one."""
     return _corner(words, words)

@@ -1,7 +1,8 @@
-"""Ground truth of an undocumented navigation system: vectors by their names, a heading by the path.
+"""Ground truth of an undocumented navigation system: vectors by their names, the heading convention by the path.
 
-Names contain north, east and up, or ECEF; whether a heading counts clockwise from north or counter-clockwise from east,
-in degrees or radians, hardly ever does. The path shows it: a car mostly drives where it points.
+Names contain north, east and up, or ECEF. They rarely define whether a heading is clockwise from north or
+counter-clockwise from east, in degrees or radians. As a car mostly moves in the direction of its heading, the
+convention follows from a comparison with the path.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from pdhef_logtool.mapping.path import DEGREE_M
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.signals import FloatArray
 
-#: Slower, a course is no direction of the car.
+#: Minimum speed for the course to be the direction of the car.
 MOVING_M_S = 3.0
-#: A heading of the right convention is this near to the course (median), and every other one this far away.
+#: Median difference from the course: below NEAR_RAD for the right convention, above FAR_RAD for all others.
 NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
 #: Positions by quantity.
 _PLACES = {"lat_deg": "latitude", "lon_deg": "longitude"}
-#: Nobody drives further in a log.
+#: Largest plausible extent of a log.
 WIDEST_DEG = 10.0
 _SIDES = {
     "north": "n", "n": "n", "vn": "n", "veln": "n", "east": "e", "e": "e", "ve": "e", "vele": "e",
@@ -48,18 +49,18 @@ NavigationTruth: TypeAlias = tuple[dict[str, SignalSource], str]
 
 
 def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo]) -> NavigationTruth | None:
-    """Return the ground truth of the topic with most quantities of position, velocity and heading; None without any.
+    """Return the ground truth of the topic with most quantities of position, velocity and heading, or None.
 
     Parameters
     ----------
-    topics : of navigation systems and references whose types are not documented.
+    topics : of navigation systems and references with undocumented types.
     """
     truths = [truth for t in topics if (truth := _of_topic(log, t)) is not None]
     return max(truths, key=lambda t: len(t[0]), default=None)
 
 
 def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
-    """Return speed and course over ground of a receiver by the names of its fields if its path agrees."""
+    """Return a receiver's speed and course over ground by the names of its fields, if they agree with its path."""
     fields = log.fields(topic.name, quiet=True)
     meanings = {f.path: meaning_of(topic.name, topic.type_name, f.path, f.unit) for f in fields if f.kind == "number"}
     first = {m.quantity: (path, m.scale) for path, m in reversed([*meanings.items()]) if m is not None}
@@ -72,7 +73,7 @@ def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
         return {}
     (course, unit), (speed, scale) = first["course"], first["speed"]
     direction, seen = _course(places, samples, topic.name, pieces), samples.get((topic.name, course))
-    # A course over ground counts clockwise from north by definition; the path shows that it is one, and its unit.
+    # A course over ground is clockwise from north by definition; the path confirms this and determines the unit.
     clockwise = (c[1:] for c in _CONVENTIONS[:2] if unit is None or math.isclose(-c[1], unit))
     if seen is None or direction is None or scale is None:
         return {}
@@ -96,7 +97,7 @@ def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
     seen = [samples.get((topic.name, source.paths[0])) for source in places.values()]
     if len(seen) == 2 and all(map(_is_place, seen, (90.0, 180.0))):
         truth |= places
-    note = f"ground truth is taken from {topic.name}, by the names of its fields"
+    note = f"ground truth comes from {topic.name}, by the names of its fields"
     course = _course(truth, samples, topic.name, pieces)
     conventions = {p: _convention(samples.get((topic.name, p)), course, unit) for p, unit in headings.items()}
     for path, convention in conventions.items():
@@ -110,7 +111,7 @@ def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
 
 
 def _enu_velocities(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str) -> Iterator[SignalSource]:
-    """Yield the first velocity east, north, up (or down) that the names of one struct's fields give."""
+    """Yield the first velocity east, north, up (or down) by the field names of one struct."""
     structs: dict[str, dict[str, str]] = {}
     for info in fields:
         prefix, _, leaf = info.path.rpartition(".")
@@ -127,7 +128,7 @@ def _enu_velocities(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str)
 
 
 def side_of(struct: str, leaf: str) -> str:
-    """Return the direction (n, e, u, d) of a field's velocity; empty where its name is none of one."""
+    """Return the direction (n, e, u, d) of a velocity component by its name; empty for other fields."""
     words = words_of(leaf)
     short = "".join(words)
     side = next((_SIDES[w] for w in (*words, short) if w in _SIDES and len(w) > 1), "")
@@ -139,7 +140,7 @@ def side_of(struct: str, leaf: str) -> str:
 
 
 def _ecef_vectors(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str) -> Iterator[SignalSource]:
-    """Yield the arrays of three in ECEF whose names give a position or a velocity, in the order of the fields."""
+    """Yield the arrays of three in ECEF that are a position or a velocity by name, in the order of the fields."""
     paths = dict.fromkeys(f.path for f in fields)
     for base in dict.fromkeys(p.removesuffix("[0]") for p in paths if p.endswith("[0]") and "ecef" in p.lower()):
         words = set(words_of(base))
@@ -149,7 +150,7 @@ def _ecef_vectors(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str) -
 
 
 def _is_place(seen: Seen | None, most: float) -> bool:
-    """Return whether values can be degrees of a place that the car drives about."""
+    """Return whether values can be degrees of latitude or longitude of a moving car."""
     if seen is None or not seen.changes or not 0.01 < seen.largest <= most:
         return False
     return float(np.nanmax(seen.cells) - np.nanmin(seen.cells)) < WIDEST_DEG
@@ -175,11 +176,11 @@ def _course(
 
 
 def _convention(seen: Seen | None, course: FloatArray | None, unit: float | None) -> tuple[str, float, float] | None:
-    """Return the convention of a heading that the course shows, if there is one that is near alone.
+    """Return the convention in which a heading matches the course; None unless exactly one matches.
 
     Parameters
     ----------
-    unit : radians of its unit if its name gives it; else more than one turn in radians is degrees.
+    unit : radians per unit of the name; None without one: values beyond one turn in radians are then degrees.
     """
     if seen is None or course is None:
         return None

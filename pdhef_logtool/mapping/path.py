@@ -1,4 +1,4 @@
-"""How fast a car moved by its positions: this needs no unit of a sensor."""
+"""Speed of a car from its positions, independent of the units of its sensors."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from pdhef_logtool.mapping.evidence import CELL_NS
 from pdhef_logtool.mapping.fields import Fields
 from pdhef_logtool.records.signals import FloatArray
 
-#: Half of the time over which a course is taken from positions, in cells.
+#: Half of the window for a course from positions, in cells.
 _HALF = 5
-#: Metres of a degree of latitude.
+#: Length of a degree of latitude in m.
 DEGREE_M = 111_200.0
 
 
 def _path(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
-    """Return the steps north and east over a second, in m [M], of the first positions that move; None without any."""
+    """Return the steps north and east over a second, in m [M], of the first positions that change; None without any."""
     pairs = {"latitude": "longitude", "position": "position"}
     for north in (f for f in fields.positions if f.meaning.quantity in pairs and f.meaning.part in ("", "y")):
         wanted = (pairs[north.meaning.quantity], "x" if north.meaning.part else "")
         others = [f for f in fields.positions if (f.meaning.quantity, f.meaning.part) == wanted]
         same = [f for f in others if f.topic.name == north.topic.name]
-        # Recorders of one number a topic have latitude and longitude apart.
+        # Recorders with one number per topic store latitude and longitude in different topics.
         east = same[0] if same else others[0] if len(others) == 1 else None
         if east is None or not (north.seen.changes or east.seen.changes):
             continue
@@ -36,7 +36,7 @@ def _path(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
 
 
 def path_speed(fields: Fields) -> FloatArray | None:
-    """Return the speed along the positions' path, m/s [M]; None without positions."""
+    """Return the speed along the path of positions, m/s [M]; None without positions."""
     steps = _path(fields)
     return None if steps is None else np.hypot(*steps) / (2 * _HALF * CELL_NS * 1e-9)
 

@@ -28,26 +28,26 @@ from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
 TRUTH_WORDS, NAVIGATION_WORDS = _TOPICS["truth"], _TOPICS["navigation"]
 _FIELDS: dict[str, dict[str, str]] = VOCABULARY["types"]
-#: Where types keep their velocities, and first entries of the covariances whose −1 disowns a quantity (REP 145).
+#: Path of the velocity by type, and first covariance entries; −1 there marks a quantity as not provided (REP 145).
 TWIST_FIELDS, TWIST_COVARIANCES = _FIELDS["twist"], _FIELDS["twist_covariance"]
 NO_SENSORS = tuple(VOCABULARY["topics"]["no_sensors"].split())
-#: Start of the note on a steering angle that is a command.
+#: Start of the note on a steering angle that is a command instead of a measurement.
 FROM_COMMAND = "steer_rad comes from the command"
 PERFECT_PREFIX = "/truth/perfect"
 OWN_PREFIX = "/pdhef/"
 
 PROBE_NS = 2_000_000_000
 PROBE_AT = (0.0, 0.25, 0.5, 0.75, 1.0)
-#: How near to 1 the mean acceleration is where it is in g. Samples between the positions that give a course, the least
-#: way between them, and the mean of unit vectors of headings from which on they are of one direction.
+#: Largest difference of the mean acceleration from 1 for accelerations in g; samples between the positions of a course;
+#: shortest distance between them; length of the mean unit vector of headings above which a path is straight.
 NEAR_1_G, COURSE_SAMPLES, COURSE_M, STRAIGHT = 0.08, 10, 0.3, 0.995
 
-#: Types whose velocities are in the body frame by convention.
+#: Types with velocities in the body frame by convention.
 BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove.Odometry"})
 WHEEL_SPEED_TYPES = frozenset({"truthsim_msgs/WheelSpeeds"})
 IMU_TYPES = frozenset({"sensor_msgs/Imu"})
 FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove.LocationFix"})
-#: What a type must have to be what its name gives; of an IMU any of them, of others all.
+#: Required fields of known types; an IMU needs any of them, the others need all.
 _IMU_PATHS = ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
 _GRAVITY_PATHS = (*_IMU_PATHS[:2], "linear_acceleration.z")
 _TILT_RATE_PATHS = ("angular_velocity.x", "angular_velocity.y")
@@ -59,14 +59,14 @@ _Sources: TypeAlias = dict[str, SignalSource]
 
 @dataclass(frozen=True, slots=True)
 class Ambiguity:
-    """More than one reading of a log.
+    """Several readings of a log for one subject.
 
     Attributes
     ----------
-    subject : subject with several readings, for example ``imu``.
+    subject : name of the subject, for example ``imu``.
     candidates : topics (and fields).
-    chosen : candidate that is taken, None without one.
-    reason : why.
+    chosen : the selected candidate, or None.
+    reason : reason for the choice.
     remedy : how to decide.
     """
 
@@ -77,7 +77,7 @@ class Ambiguity:
     remedy: str = "name the topic in a mapping file (pdhef inspect --write-mapping writes one)"
 
     def __str__(self) -> str:
-        """One line for a report."""
+        """Return one line for a report."""
         taken = f"took {self.chosen}" if self.chosen else "took none"
         return f"{self.subject}: {', '.join(self.candidates)}; {taken}: {self.reason}; {self.remedy}"
 
@@ -88,8 +88,8 @@ class AutoMapping:
 
     Attributes
     ----------
-    ambiguities : what could be read in several ways. missing : signals that no topic provides.
-    candidates : fields that were weighed for what recognised types left open, those taken first.
+    ambiguities : subjects with several readings. missing : signals without a topic.
+    candidates : fields evaluated for signals without a recognised type, the taken ones first.
     """
 
     mapping: Mapping
@@ -100,7 +100,7 @@ class AutoMapping:
 
 @dataclass(slots=True)
 class _Draft:
-    """A mapping while :func:`auto_map` builds it."""
+    """A mapping under construction by :func:`auto_map`."""
 
     log: DriveLog
     samples: dict[str, dict[str, FloatArray]]
@@ -114,7 +114,7 @@ class _Draft:
         return self.samples.get(topic, {}).get(path, np.empty(0))
 
     def is_given(self, topic: str, path: str) -> bool:
-        """Return whether the type has a field whose samples, if any, are not all NaN."""
+        """Return whether the type has a field and its samples, if any, are not all NaN."""
         if not has_path(self.log.fields(topic), path):
             return False
         seen = self.values(topic, path)
@@ -134,7 +134,7 @@ class _Draft:
         scale: float = 1.0,
         offset: float = 0.0,
     ) -> None:
-        """Take a signal or a truth channel from a field."""
+        """Add a source for a signal or a truth channel."""
         into[name] = SignalSource(name, topic, path, stamp_path_of(self.log.fields(topic)), scale, offset)
 
     def doubt(self, subject: str, candidates: tuple[str, ...], chosen: str | None, reason: str) -> None:
@@ -142,14 +142,14 @@ class _Draft:
         self.ambiguities.append(Ambiguity(subject, candidates, chosen, reason))
 
     def replace_truth(self, truth: dict[str, SignalSource]) -> None:
-        """Take other ground truth in place of what there is, whose quality states nothing of it."""
+        """Replace the ground truth; drop the quality gate, which belongs to the previous one."""
         self.truth, self.quality = truth, None
         self.notes = [n for n in self.notes if not n.startswith("ground truth is used where")]
 
     def choose(
         self, subject: str, topics: list[TopicInfo], rank: Callable[[TopicInfo], tuple[object, ...]], why: str
     ) -> TopicInfo | None:
-        """Return the best topic, and record the choice when there was one."""
+        """Return the best topic; record an ambiguity if there are several."""
         if not topics:
             return None
         ordered = sorted(topics, key=lambda t: (*rank(t), -t.messages, len(t.name), t.name))
@@ -161,13 +161,13 @@ class _Draft:
 def auto_map(
     log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"] = "perfect", vendors: Vendors | None = None
 ) -> AutoMapping:
-    """Map a log's topics to signals and ground truth: by well-known types, and for what these leave open by candidates.
+    """Map a log's topics to signals and ground truth, by well-known types first, then by candidates.
 
     Parameters
     ----------
-    prefer_truth : which ground truth to take from a simulated log, the perfect one under ``/truth/perfect`` or the
-        RTK-like one; a log with only one of them gets that.
-    vendors : documented types; None takes those that are shipped and the user's.
+    prefer_truth : ground truth to use from a simulated log: the perfect one under ``/truth/perfect`` or the RTK-like
+        one. A log with only one of them uses that one.
+    vendors : documented types; by default the shipped ones and the user's.
     """
     vendors = load_vendors() if vendors is None else vendors
     there = [t for t in log.topics if t.messages > 0 and not _is_ours(t)]
@@ -205,7 +205,7 @@ def auto_map(
 
 
 def _decode(draft: _Draft, topics: list[TopicInfo]) -> tuple[list[TopicInfo], CanSignalLog | None]:
-    """Return the topics with messages of DBC files in place of raw CAN frames, and the log that offers these."""
+    """Replace topics of raw CAN frames by the messages of DBC files; return the topics and the log with these views."""
     log = draft.log
     frames = [
         t
@@ -228,9 +228,9 @@ def _decode(draft: _Draft, topics: list[TopicInfo]) -> tuple[list[TopicInfo], Ca
 
 
 def _why_unused(log: DriveLog, topic: TopicInfo) -> str:
-    """Return why a topic of a well-known type is not used: no definition, or another type's fields."""
+    """Return why a topic of a well-known type is not used: no definition, or fields of another type."""
     reason = log.unreadable(topic.name)
-    return f"{topic.name} is not used: {reason or f'its fields are not those of {topic.type_name}'}"
+    return f"{topic.name} is not used: {reason or f'its fields differ from {topic.type_name}'}"
 
 
 def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
@@ -247,9 +247,9 @@ def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
 
 
 def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> Weighed:
-    """Take candidates for what no well-known type gives."""
+    """Take candidates for signals without a well-known type."""
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
-    # A measured steering angle goes before a command, regardless of its type.
+    # A measured steering angle has priority over a command, regardless of its type.
     command = draft.signals.pop("steer_rad", None) if any(n.startswith(FROM_COMMAND) for n in draft.notes) else None
     weighed = weigh(draft.log, rest, draft.signals, draft.truth, vendors)
     if command is not None and not {"steer_rad", "steering_wheel_rad"} & set(weighed.signals):
@@ -275,7 +275,7 @@ def _weigh_the_rest(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
 
 
 def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
-    """Take ground truth from an INS whose type is documented, where recognised types give a position at most."""
+    """Take ground truth from an INS of a documented type if recognised types provide at most a position."""
     if {"vx_m_s", "enu_velocity_m_s", "quat_wxyz", "yaw_rad", "x_m"} & set(draft.truth):
         return
     whole: dict[str, dict[str, SignalSource]] = {}
@@ -296,12 +296,12 @@ def _map_documented_truth(draft: _Draft, topics: list[TopicInfo], vendors: Vendo
         return
     if draft.truth:
         others = ", ".join(sorted({s.topic for s in draft.truth.values()}))
-        draft.notes.append(f"ground truth is taken from {chosen.name}, which also has a velocity; {others} is not used")
+        draft.notes.append(f"ground truth comes from {chosen.name}, which also has a velocity; {others} is not used")
     draft.replace_truth(whole[chosen.name])
 
 
 def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
-    """Take ground truth from a navigation system by the names of its vectors, where there is a position at most."""
+    """Take ground truth from a navigation system by the names of its vectors, if there is at most a position so far."""
     if set(draft.truth) - {"lat_deg", "lon_deg", "alt_m", "course_rad"}:
         return
     unknown = [t for t in topics if not _is_well_known(t) and not vendors.of(t.type_name).fields]
@@ -313,7 +313,7 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
 
 
 def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Take GNSS as a sensor: of ground truth without heading, else of a receiver that is not ground truth."""
+    """Take GNSS as a sensor, from ground truth without heading, else from a receiver that is not ground truth."""
     draft.signals |= gnss_signals(draft.signals, draft.truth)
     instruments = {_device(source.topic) for source in draft.truth.values()} if has_heading(draft.truth) else set()
     topics = [t for t in topics if not _words(t.name) & TRUTH_WORDS]
@@ -329,7 +329,7 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
 
 
 def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo]) -> Iterator[dict[str, SignalSource]]:
-    """Yield the signals of receivers: those of ``others``, and of any topic with the course of a single antenna."""
+    """Yield the signals of each receiver among ``others``, and of any topic with the course of a single antenna."""
     for topic in topics:
         fields = () if _type(topic).startswith(NO_SENSORS) else draft.log.fields(topic.name, quiet=True)
         if fields and (topic in others or has_path(fields, RAW_COURSE)):
@@ -339,7 +339,7 @@ def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo]) 
 
 
 def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Take GNSS velocity of a twist over ground."""
+    """Take the GNSS velocity from a twist over ground."""
     for topic in topics:
         if _type(topic) not in TWIST_FIELDS or _type(topic) in BODY_TWIST_TYPES or not _is_truth(topic):
             continue
@@ -356,19 +356,19 @@ def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
 
 
 def _device(topic: str) -> str:
-    """Return the name that topics of one instrument share: all but its last element."""
+    """Return the common prefix of the topics of one instrument: the name without its last element."""
     return topic.rpartition("/")[0] or topic
 
 
 def _is_well_known(topic: TopicInfo) -> bool:
-    """Return whether a topic was judged by its type already."""
+    """Return whether a topic was mapped by its type already."""
     tables = (TWIST_FIELDS, _FIELDS["pose"], _FIELDS["steering"], _FIELDS["speed"], _FIELDS["several_positions"])
     kind = _type(topic)
     return kind in IMU_TYPES | FIX_TYPES | WHEEL_SPEED_TYPES or any(kind in table for table in tables)
 
 
 def _role(topic: TopicInfo) -> Role:
-    """Return what a topic's name makes of its fields; the device of a navigation system is a sensor as well."""
+    """Return the kind of data in a topic by its name; a device of a navigation system is a sensor, too."""
     words = _words(topic.name)
     if is_command(topic.name, topic.type_name.rpartition("/")[2]):
         return "command"
@@ -382,7 +382,7 @@ def _role(topic: TopicInfo) -> Role:
 
 
 def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Take yaw rate from an odometry and speed from a navigation system where no sensor gives them, with a note."""
+    """Without a sensor, take the yaw rate from an odometry and the speed from a navigation system, with a note."""
     twists = [t for t in topics if _type(t) in TWIST_FIELDS]
     twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | _TOPICS["command"] | _TOPICS["estimate"])]
     if "yaw_rate_rad_s" not in draft.signals:
@@ -401,7 +401,7 @@ def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
 
 
 def _speed_over_ground(draft: _Draft, topics: list[TopicInfo], twists: list[TopicInfo]) -> None:
-    """Take the speed as the length of a velocity; by north and east it is a receiver's, which is a signal too."""
+    """Take the speed as the length of a velocity; one with north and east is also a GNSS signal."""
     unsaid = (t for t in twists if not _words(t.name) & _TOPICS["vehicle"])
     other = (t for t in topics if _role(t) in ("sensor", "navigation") and not _is_well_known(t))
     vectors = [(t, TWIST_FIELDS[_type(t)].format("linear")) for t in unsaid]
@@ -419,7 +419,7 @@ def _speed_over_ground(draft: _Draft, topics: list[TopicInfo], twists: list[Topi
 
 
 def _speed_of_navigation(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Take the speed of a navigation system that is ground truth too."""
+    """Take the speed of a navigation system that is also the ground truth."""
     names = ("vx_m_s", "enu_velocity_m_s", "ecef_velocity_m_s")
     truth = next((draft.truth[n] for n in names if n in draft.truth), None)
     source = None if truth is None else next((t for t in topics if t.name == truth.topic), None)
@@ -430,15 +430,15 @@ def _speed_of_navigation(draft: _Draft, topics: list[TopicInfo]) -> None:
     forward = truth.name == "vx_m_s"
     draft.signals["speed_m_s"] = replace(truth, name="speed_m_s") if forward else length_of(truth)
     draft.notes.append(
-        f"speed_m_s comes from {source.name}, which is also the ground truth, as nothing else gives a speed: "
+        f"speed_m_s comes from {source.name}, which is also the ground truth, as no other source gives a speed: "
         "the estimator's input is the true speed" + ("" if forward else f"; it is {NEVER_NEGATIVE}")
     )
 
 
 def _type(topic: TopicInfo) -> str:
-    """Return a topic's type as the tables here spell it, regardless of its encoding.
+    """Return a topic's type in the spelling of the tables, independent of its encoding.
 
-    JSON and protobuf spell ROS types with dots too (``ros.sensor_msgs.Imu``), ROS spells Foxglove's with slashes.
+    JSON and protobuf spell ROS types with dots (``ros.sensor_msgs.Imu``), ROS spells Foxglove's with slashes.
     """
     name = topic.type_name.replace("::", "/").replace("/msg/", "/")
     if name.startswith(("foxglove_msgs/", "foxglove/")):
@@ -453,7 +453,7 @@ def _twist(topic: TopicInfo, part: str, axis: str) -> str:
 
 
 def _has_its_fields(log: DriveLog, topic: TopicInfo) -> bool:
-    """Return whether a topic of a known type can be read as that type; a name alone promises nothing."""
+    """Return whether a topic has the fields of its type; the name of the type alone is no proof."""
     kind = _type(topic)
     needed = ["latitude", "longitude"] if kind in FIX_TYPES else []
     needed += [table[kind] for table in (_FIELDS["steering"], _FIELDS["speed"]) if kind in table][:1]
@@ -485,7 +485,7 @@ def _join(prefix: str, path: str) -> str:
 
 
 def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[str, dict[str, FloatArray]]:
-    """Read a few seconds in five places of the fields that may be fillers."""
+    """Read a few seconds in five places of the log, for fields that may contain constant fillers."""
     requests: dict[str, list[str]] = {}
     for topic in topics:
         if paths := _probed_paths(topic):
@@ -503,7 +503,7 @@ def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[str, dict[str, FloatA
 
 
 def _probed_paths(topic: TopicInfo) -> list[str]:
-    """Return the paths of a well-known type that may be fillers."""
+    """Return the paths of a well-known type that may contain constant fillers."""
     kind = _type(topic)
     paths: list[str] = []
     if kind in IMU_TYPES:
@@ -583,10 +583,10 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
         if words & _TOPICS["vehicle"] and not words & _TOPICS["estimate"]:
             twists.append(topic)
             continue
-        neither = "that of a speed sensor nor of ground truth"
+        neither = "a speed sensor nor ground truth"
         if words & _TOPICS["estimate"]:
-            neither = "a sensor's nor ground truth's, but an estimate's"
-        draft.doubt("speed", (topic.name,), None, f"its name is neither {neither}")
+            neither = "a sensor nor ground truth, but an estimate"
+        draft.doubt("speed", (topic.name,), None, f"its name suggests neither {neither}")
     why = "a velocity report is preferred to an odometry or a twist"
     chosen = draft.choose("speed", [*reports, *twists], lambda t: (_type(t) not in _FIELDS["speed"],), why)
     if chosen is None:
@@ -596,7 +596,7 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
     draft.take(draft.signals, "speed_m_s", chosen.name, path)
     if kind in TWIST_FIELDS and _span(draft.values(chosen.name, _twist(chosen, "linear", "y"))) > 0.0:
         draft.notes.append(
-            f"{chosen.name} contains a lateral velocity, which is not used: its name is not that of ground truth"
+            f"{chosen.name} contains a lateral velocity, which is not used: its name does not suggest ground truth"
         )
 
 
@@ -621,10 +621,10 @@ def _map_truth(draft: _Draft, topics: list[TopicInfo], prefer: str) -> None:
     candidates = [t for t in topics if _type(t) in types and (_is_truth(t) or _type(t) in FIX_TYPES)]
     if not any(_type(t) in TWIST_FIELDS for t in candidates):
         odometry = [t for t in topics if _type(t) in BODY_TWIST_TYPES and _words(t.name) & _TOPICS["simulators"]]
-        # Wheels give no lateral velocity.
+        # An odometry from wheels has no lateral velocity.
         simulated = [t for t in odometry if _span(draft.values(t.name, _twist(t, "linear", "y"))) > 0.0]
         candidates += [t for t in simulated if t not in candidates]
-        draft.notes += [f"{t.name} is taken as ground truth: a simulator's, with a lateral velocity" for t in simulated]
+        draft.notes += [f"{t.name} is used as ground truth: a simulator's odometry with v_y" for t in simulated]
     groups = {_truth_group(t) for t in candidates}
     if len(groups) > 1:
         kept = [t for t in candidates if _truth_group(t) == prefer]
@@ -658,7 +658,7 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
     body, over_ground = _looks_like_body_frame(forward, left), _is_over_ground(draft, chosen, forward, left)
     receives = _type(chosen) not in BODY_TWIST_TYPES and bool(_words(chosen.name) & NAVIGATION_WORDS)
     if over_ground or (receives and body is not True):
-        # Receivers, and some simulators, publish their velocity in east, north, up under the same type.
+        # Receivers and some simulators publish their velocity in east, north, up with the same type.
         up = draft.values(chosen.name, _twist(chosen, "linear", "z"))
         readings = (f"{chosen.name} as body velocity", f"{chosen.name} as east, north, up")
         if not over_ground and (body is None or not np.isfinite(up).any()):
@@ -688,7 +688,7 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
 
 
 def _is_over_ground(draft: _Draft, topic: TopicInfo, x: FloatArray, y: FloatArray) -> bool:
-    """Return whether a twist is in the axes of its pose, as some simulators publish it, and not in the body's."""
+    """Return whether a twist is in the axes of its pose, as in some simulators, instead of the body's."""
     if not _has_pose(draft, topic):
         return False
     base = _FIELDS["pose"][_type(topic)]
@@ -700,7 +700,7 @@ def _is_over_ground(draft: _Draft, topic: TopicInfo, x: FloatArray, y: FloatArra
     middle = slice(COURSE_SAMPLES // 2, -(COURSE_SAMPLES - COURSE_SAMPLES // 2))
     twist = np.exp(1j * (np.arctan2(y, x)[middle] - np.arctan2(way[1], way[0])))
     heading = 2.0 * np.arctan2(z, w)[middle]
-    if not abs(np.mean(np.exp(1j * heading))) < STRAIGHT:  # a way straight on does not show it
+    if not abs(np.mean(np.exp(1j * heading))) < STRAIGHT:  # not observable on a straight path
         return False
     moves = np.isfinite(twist) & (np.hypot(*way) > COURSE_M)
     off_world, off_body = (np.abs(np.angle(t[moves])) for t in (twist, twist * np.exp(1j * heading)))
@@ -725,7 +725,7 @@ def _has_twist(draft: _Draft, topic: TopicInfo) -> bool:
         return False
     v = np.concatenate([draft.values(topic.name, forward), draft.values(topic.name, left)])
     if v.shape[0] and (v == 0.0).all() and _type(topic) in _FIELDS["pose"]:
-        # Converters from fixes to odometry leave the twist at zero while the pose moves.
+        # Converters from fixes to odometry leave the twist at zero while the pose changes.
         x = draft.values(topic.name, _join(_FIELDS["pose"][_type(topic)], "position.x"))
         y = draft.values(topic.name, _join(_FIELDS["pose"][_type(topic)], "position.y"))
         return not (_span(x) > 1.0 or _span(y) > 1.0)
@@ -750,7 +750,7 @@ def _has_pose(draft: _Draft, topic: TopicInfo) -> bool:
     base = _FIELDS["pose"][_type(topic)]
     if not all(draft.is_given(topic.name, _join(base, f"position.{a}")) for a in "xy"):
         return False
-    # A pose that stays at the origin while messages come is a filler.
+        # A pose that stays at the origin is a filler.
     xy = np.concatenate([draft.values(topic.name, _join(base, f"position.{a}")) for a in "xy"])
     return xy.shape[0] == 0 or bool((xy != 0.0).any())
 
@@ -788,7 +788,7 @@ def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
     for name, path in (("lat_deg", "latitude"), ("lon_deg", "longitude"), ("alt_m", "altitude")):
         if draft.is_given(fix.name, path):
             draft.take(draft.truth, name, fix.name, path)
-    # Foxglove's fixes may have angles, clockwise from north; those of vehicles count counter-clockwise from east.
+    # Angles of Foxglove's fixes are clockwise from north; angles of vehicles are counter-clockwise from east.
     angles = {p: draft.values(fix.name, p) for p in ("heading", "course")}
     given = {p for p, values in angles.items() if np.isfinite(values).any()}
     if given == {"heading", "course"} and np.array_equal(angles["heading"], angles["course"], equal_nan=True):
@@ -804,7 +804,7 @@ def _map_fix(draft: _Draft, fix: TopicInfo, *, alone: bool) -> None:
     status = draft.values(fix.name, "status.status")
     if not alone or status.shape[0] == 0:
         return
-    # 0 is any fix, 2 a ground-based augmented one, which receivers use for RTK.
+    # 0 is any fix; 2 is a ground-based augmented fix, which receivers report for RTK.
     lowest = 2.0 if "rtk" in _words(fix.name) and bool((status == 2.0).any()) else 0.0
     draft.quality = QualityGate(
         topic=fix.name, field="status.status", minimum=lowest, stamp=stamp_path_of(draft.log.fields(fix.name))

@@ -1,4 +1,4 @@
-"""The records of a mapping: where each signal of a log comes from, and how it becomes SI."""
+"""Records of a mapping: source of each signal of a log, and its conversion to SI."""
 
 from __future__ import annotations
 
@@ -17,40 +17,39 @@ StampUnit: TypeAlias = Literal["ros", "s", "ms", "us", "ns"]
 Clock: TypeAlias = Literal["utc", "device"]
 Combine: TypeAlias = Literal["sum", "norm", "root", "signed"]
 
-#: Encoding of a frame's bytes in a message: numbers, or a text of digits.
+#: Encoding of a frame's bytes in a message: numbers, or digits as text.
 CanDataEncoding: TypeAlias = Literal["bytes", "hex", "base64"]
 
-#: Start of a field that names a signal of a DBC: ``can:<message>.<signal>``.
+#: Prefix of a field that names a signal of a DBC: ``can:<message>.<signal>``.
 CAN_PREFIX = "can:"
 
-#: Values of ``stamp`` that name the recorder's times instead of a field of the message.
+#: Values of ``stamp`` for the recorder's times instead of a field of the message.
 RECORDER_STAMPS = ("log_time", "publish_time")
-#: ``stamp`` when a mapping file gives no information: the message's header.stamp or stamp if its schema has one, else
-#: log time.
+#: Default of ``stamp``: the message's header.stamp or stamp if its schema has one, else log time.
 AUTO_STAMP = "auto"
 
 
 @dataclass(frozen=True, slots=True)
 class SignalSource:
-    """Where one signal comes from: ``value_SI = scale * raw + offset``, measured at ``stamp - latency_s``.
+    """Source of one signal: ``value_SI = scale * raw + offset``, measured at ``stamp - latency_s``.
 
-    A scalar signal of several fields is their sum, each times its own scale: a component of a sensor that is mounted
-    askew. With ``combine`` ``norm`` it is the length of their vector, a speed of its components; with ``root`` the root
-    of their sum, a standard deviation of variances; with ``signed`` the first is a magnitude, negative where
-    the second, its sign, is 1.
+    A scalar signal of several fields is their weighted sum, one scale per field: a component of a sensor with rotated
+    axes. Other values of ``combine``: ``norm``, the length of the vector (a speed from components); ``root``, the root
+    of the sum (a standard deviation from variances); ``signed``, a magnitude that is negative where the second field,
+    its sign, is 1.
 
     Attributes
     ----------
     name : signal or ground truth name, a key of ``SIGNAL_UNITS`` or ``TRUTH_UNITS``.
     topic : topic name.
-    field : dotted path, ``[3]`` indexes an array; a tuple of paths gives a vector signal column by column,
-        or the sum of a scalar one.
+    field : dotted path; ``[3]`` indexes an array. A tuple of paths gives the columns of a vector signal, or the
+        summands of a scalar one.
     stamp : dotted path of the measurement time, ``log_time``, ``publish_time``, or ``auto``.
-    scale, offset : raw unit to SI; a tuple contains one entry a column of a vector signal, a scale also one a summand.
-    latency_s : what the stamp is late by.
+    scale, offset : raw unit to SI; a tuple has one entry per column of a vector signal, a scale also one per summand.
+    latency_s : delay of the stamp after the measurement.
     valid_min, valid_max : SI values outside are dropped and counted.
     stamp_unit : ``ros`` (a struct of seconds and nanoseconds) or the unit of a number.
-    clock : ``utc`` when the stamp is on the log's clock, ``device`` when offset and drift are fitted to log time.
+    clock : ``utc`` for stamps on the log's clock; ``device`` to fit offset and drift to log time.
     """
 
     name: str
@@ -68,12 +67,12 @@ class SignalSource:
 
     @property
     def paths(self) -> tuple[str, ...]:
-        """The field paths that the signal is made of."""
+        """The field paths of the signal."""
         return self.field if isinstance(self.field, tuple) else (self.field,)
 
     @property
     def can_signal(self) -> tuple[str, str] | None:
-        """Message and signal of the DBC if the source is one."""
+        """Message and signal of the DBC, for a CAN source."""
         if not isinstance(self.field, str) or not self.field.startswith(CAN_PREFIX):
             return None
         message, _, signal = self.field.removeprefix(CAN_PREFIX).partition(".")
@@ -81,12 +80,12 @@ class SignalSource:
 
     @property
     def read_topic(self) -> str:
-        """Topic that a log offers the source under: a CAN signal has a view of its own, with its frames only."""
+        """Topic to read the source from; for a CAN signal the view that contains only its frames."""
         return self.topic if self.can_signal is None else self.label
 
     @property
     def label(self) -> str:
-        """``/topic.field``, for texts and ``Channel.source``; sums of the same fields are distinguished by name."""
+        """``/topic.field``, for texts and ``Channel.source``; sums of the same fields differ by name."""
         if isinstance(self.field, str):
             return f"{self.topic}.{self.field}"
         return f"{self.topic}.{'' if self.columns > 1 else self.name}{{{','.join(self.field)}}}"
@@ -99,15 +98,15 @@ class SignalSource:
 
 @dataclass(frozen=True, slots=True)
 class CanSettings:
-    """How raw CAN frames are read.
+    """Settings for reading raw CAN frames.
 
     Attributes
     ----------
     dbc : the files that describe the frames.
-    id_field, data_field, length_field, extended_field : paths in the messages that contain frames; empty: found by
-    name.
+    id_field, data_field, length_field, extended_field : paths in the messages that contain frames; empty: search by
+        name.
     data_encoding : encoding of the bytes in ``data_field``.
-    bus_field, bus : frames of other buses are left out, where both are given.
+    bus_field, bus : if both are set, frames of other buses are ignored.
     id_mask : bits of the identifier that distinguish messages; all 29 by default.
     """
 
@@ -124,7 +123,7 @@ class CanSettings:
 
 @dataclass(frozen=True, slots=True)
 class QualityGate:
-    """When ground truth may be used: where the field is in [``minimum``, ``maximum``] or one of ``values``."""
+    """Condition for the use of ground truth: the field is in [``minimum``, ``maximum``] or one of ``values``."""
 
     topic: str
     field: str
@@ -166,18 +165,18 @@ class Mapping:
 
     Attributes
     ----------
-    signals, truth : by name; what an estimator may see, and what it is scored against.
+    signals, truth : by name; inputs of estimators, and ground truth for scoring.
     quality : gate on ground truth, if any.
     origin : ``file`` or ``auto`` (recognised types).
-    notes : sentences for the reader of a report about this mapping.
-    can : how raw CAN frames are read, for sources whose field is ``can:<message>.<signal>``.
-    estimates : estimates that somebody else recorded in the log, by estimator and quantity (``ESTIMATE_UNITS``). They
-        are no part of :meth:`sources`: only ``pdhef metrics`` reads them.
-    fill_recognised : what the file does not name is taken from recognised types.
-    checks : what stays undecided of fields that were taken by their names.
-    open_signs : signals (ground truth: ``truth.NAME``) whose sign nothing documents; those of a group share it.
-    file : it was read from. recorder : type by topic of the logs that it is for.
-    recorders : the mappings of a folder; a log takes that of its recorder.
+    notes : sentences about this mapping for the report.
+    can : settings for raw CAN frames, for sources with a field ``can:<message>.<signal>``.
+    estimates : estimates recorded by other programs, by estimator and quantity (``ESTIMATE_UNITS``). Only ``pdhef
+        metrics`` reads them; :meth:`sources` excludes them.
+    fill_recognised : signals missing in the file are taken from recognised types.
+    checks : undecided checks of fields that were taken by their names.
+    open_signs : groups of signals (ground truth: ``truth.NAME``) with an undocumented common sign.
+    file : name of the file. recorder : type by topic of the logs that it is for.
+    recorders : the mappings of a folder; each log uses the one that fits its recorder.
     """
 
     signals: dict[str, SignalSource] = field(default_factory=dict)
@@ -196,13 +195,13 @@ class Mapping:
 
     @property
     def dbc(self) -> tuple[Path, ...]:
-        """All DBC files that it names."""
+        """All DBC files of the mapping."""
         mine = () if self.can is None else self.can.dbc
         return (*mine, *(path for mapping in self.recorders for path in mapping.dbc))
 
     @property
     def sha256(self) -> str:
-        """Hash of what is read and how: sources, scales, stamps, latencies, limits and the ground-truth gate."""
+        """Hash of all sources with their scales, stamps, latencies and limits, and of the ground-truth gate."""
         return digest(jsonable({"signals": self.signals, "truth": self.truth, "quality": self.quality}))
 
     def sources(self) -> Iterator[SignalSource]:

@@ -1,4 +1,4 @@
-"""The three axes of an accelerometer and of a gyro: which fields are next to the one that a mapping names."""
+"""Find the three axes of an accelerometer and a gyro, starting from one mapped axis."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pdhef_logtool.records.signals import FloatArray
 
 #: Words for the axes of a rate, x first.
 _RATE_WORDS = ("roll", "pitch", "yaw")
-#: Names of the components while they are looked at; no signal is called so.
+#: Temporary names of the components; they differ from all signal names.
 ACCELERATIONS = tuple(f"triad.acceleration.{axis}" for axis in "xyz")
 RATES = tuple(f"triad.rate.{axis}" for axis in "xyz")
 #: Rows of a mounting: forward and left from the accelerometer, up from the gyro.
@@ -24,14 +24,14 @@ MOUNTED = ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
 
 @dataclass(frozen=True, slots=True)
 class Triad:
-    """Three fields of one message, x first, and the factor to SI that they share."""
+    """Three fields of one message, x first, and their common factor to SI."""
 
     source: SignalSource
     paths: tuple[str, str, str]
     unit: float
 
     def components(self, names: tuple[str, ...]) -> dict[str, SignalSource]:
-        """Return the three fields as sources of their own."""
+        """Return the three fields as separate sources."""
         return {
             n: replace(self.source, name=n, field=p, scale=self.unit, offset=0.0, valid_min=None, valid_max=None)
             for n, p in zip(names, self.paths, strict=True)
@@ -46,7 +46,7 @@ class Triad:
         return row
 
     def turned(self, source: SignalSource, row: FloatArray) -> SignalSource:
-        """Return the source of a signal in a direction [3] of the triad; one field where one is enough."""
+        """Return the source of a signal in a direction [3] of the triad; a single field if the direction is an axis."""
         used = [i for i in range(3) if abs(row[i]) > 1e-9]
         scales = tuple(float(np.round(row[i], 6)) * self.unit for i in used)
         if len(used) == 1:
@@ -55,7 +55,7 @@ class Triad:
 
 
 def find_triads(log: DriveLog, mapping: Mapping) -> tuple[Triad | None, Triad | None]:
-    """Return the triads of accelerations and of rates that a mapping reads one or more axes of; None: there is none."""
+    """Return the triads of accelerations and of rates with an axis in the mapping; None for a missing triad."""
     triads = [_triad(log, mapping, names) for names in (("ay_m_s2", "ax_m_s2"), ("yaw_rate_rad_s",))]
     return triads[0], triads[1]
 
@@ -71,13 +71,13 @@ def _triad(log: DriveLog, mapping: Mapping, names: tuple[str, ...]) -> Triad | N
         if inside and all(has_path(fields, p) for p in paths):
             scales = first.scale if isinstance(first.scale, tuple) else (first.scale,)
             unit = float(np.linalg.norm(scales))
-            # Rows of a rotation have length 1, so that the length of a row is the unit.
+            # Rows of a rotation have length 1, so that the length of the scales is the unit.
             return Triad(first, paths, unit)
     return None
 
 
 def _siblings(paths: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
-    """Yield the triples of paths that a path may be in."""
+    """Yield possible triples of paths that contain a path."""
     path = paths[0]
     if index := re.fullmatch(r"(.*)\[(\d+)\]", path):
         start = int(index[2]) - int(index[2]) % 3

@@ -1,4 +1,4 @@
-"""Units that no name gives: by gravity, by other speeds and by a_y ≈ v r."""
+"""Determine units that no name gives: by gravity, by other speeds and by a_y ≈ v r."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
-#: How near to 1 the slope of a_y over v r must be.
+#: Accepted range of the slope of a_y over v r.
 SLOPES = (0.7, 1.4)
 #: Radii of wheels, of model cars to lorries.
 RADII_M = (0.02, 0.7)
-#: Raw speeds below show no unit.
+#: Smaller raw speeds give no information on the unit.
 SLOWEST = 1.0
-#: Share of gravity along +z of an upright sensor.
+#: Minimum share of gravity along +z of an upright sensor.
 MOST_TILTED = 0.9
-#: Names that count a filtered or derived copy of a sensor from the sensor.
+#: Words in names of filtered or derived copies of a sensor.
 _SECOND_CHOICE = ("raw", "uncomp", "delta", "error", "offset", "relative")
 
 
 def decide_units(fields: Fields) -> None:
-    """Decide units that no name gives: gravity first, then one quantity against another."""
+    """Determine units that no name gives: by gravity first, then by relations between quantities."""
     _by_gravity(fields)
     _rank(fields)
     _speeds(fields)
@@ -58,7 +58,7 @@ def _by_gravity(fields: Fields) -> None:
 
 
 def _say_mounting(fields: Fields, z: Field, gravity: FloatArray) -> None:
-    """Report where gravity is not along +z of an accelerometer that names its axes: its axes are not the car's."""
+    """Report an accelerometer with named axes and gravity not along +z: its axes differ from the car's."""
     if z.fixed or gravity[2] > MOST_TILTED or z.role in ("command", "estimate", "truth"):
         return
     along = "xyz"[int(np.argmax(np.abs(gravity)))]
@@ -69,7 +69,7 @@ def _say_mounting(fields: Fields, z: Field, gravity: FloatArray) -> None:
 
 
 def _rank(fields: Fields) -> None:
-    """Prefer fields of a message that has both accelerations and rates, and the sensor to its copies."""
+    """Prefer fields of messages with both accelerations and rates, and a sensor over its copies."""
     kinds: dict[tuple[str, str], set[str]] = {}
     for item in fields.candidates:
         kinds.setdefault(leaf_group(item), set()).add(item.meaning.quantity)
@@ -81,7 +81,7 @@ def _rank(fields: Fields) -> None:
 
 
 def _speeds(fields: Fields) -> None:
-    """Find the units of speeds by a known speed, by positions, then by a_x."""
+    """Determine the units of speeds by a known speed, by positions, then by a_x."""
     settled = [f for f in fields.all("speed") if f.unit_known or f.fixed]
     reference = max(settled, key=lambda f: f.score, default=None)
     path = path_speed(fields)
@@ -94,10 +94,10 @@ def _speeds(fields: Fields) -> None:
 
 
 def _by_speeding_up(fields: Fields) -> None:
-    """Find the units of speeds and of a_x by a_x ≈ v̇, where one combination gives it."""
+    """Determine the units of speeds and of a_x by a_x ≈ v̇, if exactly one combination fits."""
     for speed, ax in itertools.product(fields.open("speed"), fields.open("acceleration", "x")):
         factors = [f.factors[:1] if f.unit_known or f.fixed else f.factors for f in (ax, speed)]
-        # With two open units a vector's x, which may be the world's, shows nothing.
+        # With two unknown units, x of a vector is ambiguous: it may be in the world frame.
         if len(factors[0]) > 1 < len(factors[1]) and speed.is_axis and speed.meaning.part == "x":
             continue
         relation = fit(fields.pieces.smooth(ax.seen.cells), fields.pieces.rate_of(speed.seen.cells))
@@ -111,7 +111,7 @@ def _by_speeding_up(fields: Fields) -> None:
 
 
 def _by_turning(fields: Fields) -> None:
-    """Find units of a_y, yaw rate and speed by a_y ≈ v r, where one combination alone gives it."""
+    """Determine the units of a_y, yaw rate and speed by a_y ≈ v r, if exactly one combination fits."""
     speed = fields.best("speed") or fields.wheel_mean()
     if speed is None:
         return
@@ -127,18 +127,18 @@ def _by_turning(fields: Fields) -> None:
 
 
 def _units_of_turning(fields: Fields, trio: tuple[Field, Field, Field]) -> tuple[str, ...]:
-    """Return the units of a_y, yaw rate and speed with a slope near 1; empty where several combinations have one."""
+    """Return the units of a_y, yaw rate and speed with a slope near 1; empty unless they are unique."""
     fits = []
     for units in itertools.product(*(f.factors[:1] if f.unit_known or f.fixed else f.factors for f in trio)):
         relation = fields.turning(*(f.seen.cells * factor for f, (_, factor) in zip(trio, units, strict=True)))
         if relation is not None and abs(relation.correlation) > CLEAR and SLOPES[0] < abs(relation.slope) < SLOPES[1]:
             fits.append(units)
-    # Combinations that differ in the unit of a_y alone: the first is by convention.
+    # Combinations that differ only in the unit of a_y: the conventional unit is first.
     return tuple(unit for unit, _ in fits[0]) if fits and all(f[1:] == fits[0][1:] for f in fits) else ()
 
 
 def _by_siblings(fields: Fields) -> None:
-    """Take the unit of the other accelerations, or velocities, of a message: nobody mixes them."""
+    """Use the unit of other accelerations, or velocities, of the same message."""
     for kinds in ({"acceleration"}, {"speed", "velocity"}):
         settled = {leaf_group(f): f for f in fields.candidates if f.meaning.quantity in kinds and f.unit_known}
         mine = (f for f in fields.candidates if f.meaning.quantity in kinds and f.meaning.strength > 0.6)

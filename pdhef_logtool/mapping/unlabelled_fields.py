@@ -1,9 +1,8 @@
-"""Unlabelled fields (``data[3]``, ``ch7``, ``k``): their quantities by physical relations between them.
+"""Identify unlabelled fields (``data[3]``, ``ch7``, ``k``) by physical relations.
 
-Speed, yaw rate and the accelerations are accepted where only one choice of columns satisfies a_y = v r and a_x = v̇ at
-once, with slopes that units explain: the second slope gives the units of speed and accelerations, the ratio of the two
-that of the yaw rate. A steering angle resembles a yaw rate over a speed too, but for that ratio. Left and
-right are not observable.
+Speed, yaw rate and accelerations are identified if exactly one choice of columns satisfies a_y = v r and a_x = v̇ with
+slopes that units explain. The slope of a_x = v̇ gives the units of speed and accelerations; the ratio of both slopes
+gives the unit of the yaw rate, and also separates a yaw rate from a steering angle. Left and right are not observable.
 """
 
 from __future__ import annotations
@@ -23,38 +22,38 @@ from pdhef_logtool.mapping.naming import G_M_S2, Meaning, is_command, is_unlabel
 from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.records.signals import FloatArray
 
-#: Columns that are looked at, and of one array.
+#: Maximum number of columns to examine, in total and per array.
 MOST_UNLABELLED = 40
 MOST_OF_ARRAY = 32
-#: Correlations of a_y with v r, and of a_x with v̇, that are accepted; rival choices may have lower ones.
+#: Minimum correlations of a_y with v r and of a_x with v̇; for competing choices, the loose ones.
 TURNS, SPEEDS_UP = 0.92, 0.75
 LOOSE_TURNS, LOOSE_SPEEDS_UP = 0.8, 0.6
-#: Factor by which their product must be closer to 1 than that of any other choice.
+#: Minimum lead of the product of the correlations over any other choice.
 CLEARER = 0.05
-#: v r leaves at most these shares of what r alone and what r √v leave of a_y: a steering angle makes more of a yaw rate
-#: the faster the car is, but less than in proportion, as cars understeer.
+#: Largest residual of a_y over v r, relative to the residuals over r alone and over r √v. A steering angle gives a yaw
+#: rate that increases with speed, but less than in proportion, as cars understeer.
 BY_SPEED, BY_ROOT = 0.6, 0.85
-#: a_y is ahead of v r by more than this, as a car's sideslip grows first; a yaw rate is behind its steering.
+#: Minimum lead of a_y over v r, as the sideslip of a car grows first; a yaw rate lags the steering.
 AHEAD_S = 0.05
-#: Slopes of a unit: roll and grade are in the accelerations.
+#: Tolerance factors of a slope: accelerations include roll and grade.
 SLOPE, LOOSE_SLOPE = 1.25, 1.6
-#: A yaw rate in rad/s that is taken for an acceleration is smaller (standard deviation).
+#: Smallest standard deviation of an acceleration; a yaw rate in rad/s is smaller.
 LEAST_AY_M_S2 = 0.4
-#: Correlations from here on make one column a copy of another.
+#: Minimum correlation between copies of a quantity.
 COPY = 0.98
-#: And from here on it is the same column sent twice.
+#: Minimum correlation of a column sent twice.
 ITSELF = 0.999
-#: A steering angle follows the path's curvature so well.
+#: Minimum correlation of a steering angle with the path's curvature.
 STEERS = 0.9
 _UNITS = HYPOTHESES | {"acceleration": (("m/s²", 1.0), ("g", G_M_S2))}
 
 
 @dataclass(frozen=True, slots=True)
 class _Choice:
-    """Columns that are speed, yaw rate, a_y and a_x, the relations between them, and the units of the first three.
+    """Columns chosen as speed, yaw rate, a_y and a_x, their relations, and the units of the first three.
 
-    ``is_strict``: both relations fit so well, with slopes so near to what units explain, and a_y is as large as one,
-    that it is accepted if no other is as near. ``ahead_s`` : how far a_y is ahead of v r.
+    ``is_strict``: both relations fit well enough, with plausible slopes and a large enough a_y, to be accepted unless
+    another choice fits almost as well. ``ahead_s``: lead of a_y over v r.
     """
 
     v: Field
@@ -69,24 +68,24 @@ class _Choice:
 
     @property
     def columns(self) -> tuple[Field, ...]:
-        """All that there are."""
+        """The four columns."""
         return (self.v, self.r, self.y, self.x)
 
     @property
     def score(self) -> float:
-        """How well the relations fit."""
+        """Product of the correlations."""
         return abs(self.turning.correlation * self.speeding.correlation)
 
     @property
     def evidence(self) -> str:
-        """The relations in words."""
-        first = f"{self.y.path} goes with {self.v.path} times {self.r.path} ({self.turning.correlation:.2f})"
-        second = f"{self.x.path} with the change of {self.v.path} ({self.speeding.correlation:.2f})"
+        """Description of the relations."""
+        first = f"{self.y.path} follows {self.v.path} times {self.r.path} ({self.turning.correlation:.2f})"
+        second = f"{self.x.path} the rate of change of {self.v.path} ({self.speeding.correlation:.2f})"
         return f"{first} and {second}, and units explain both slopes"
 
 
 def unlabelled_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], pieces: Pieces) -> list[Field]:
-    """Return the columns of sensors' topics whose names give no information, with what is in them."""
+    """Return the sensor columns without informative names, with their values."""
     requests: dict[str, list[str]] = {}
     for topic, role in topics:
         fields = log.fields(topic.name, quiet=True)
@@ -114,15 +113,15 @@ def unlabelled_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], 
 
 
 def identified(fields: Fields, unlabelled: Sequence[Field]) -> tuple[list[Field], str, str]:
-    """Return what unlabelled columns are, topic and evidence, where one choice is accepted and no other is as near.
+    """Return the identified columns, their topic and the evidence; empty unless one choice is clearly the best.
 
     Parameters
     ----------
-    unlabelled : columns with a meaning that is empty; fields that names give serve as what they are.
+    unlabelled : columns with an empty meaning; named fields keep their quantity.
     """
     order = sorted(_choices(fields, unlabelled), key=lambda c: (-c.score, -abs(c.turning.correlation)))
     best = next((c for c in order if c.is_strict), None)
-    # What is behind v r is no a_y, where there is one ahead of it.
+    # A column that lags v r is not a_y if another one leads it.
     others = (c for c in order if best is not None and c.ahead_s > 0.0 and not _same(best, c))
     if best is None or any(c.score > best.score - CLEARER for c in others):
         return [], "", ""
@@ -131,7 +130,7 @@ def identified(fields: Fields, unlabelled: Sequence[Field]) -> tuple[list[Field]
 
 
 def _as_chosen(fields: Fields, unlabelled: Sequence[Field], choice: _Choice, why: str) -> list[Field]:
-    """Return the columns of a choice as what they are in it, and the one that steers."""
+    """Return the columns of a choice with their quantities, and the steering column."""
     speed_unit, rate_unit, unit = choice.units
     speed_is_sure = _speed_is_sure(fields, choice.v, speed_unit)
     speed_why = why if speed_is_sure else f"{why}; a wheel that turns in rad/s may look the same"
@@ -148,7 +147,7 @@ def _as_chosen(fields: Fields, unlabelled: Sequence[Field], choice: _Choice, why
 
 
 def _choices(fields: Fields, unlabelled: Sequence[Field]) -> Iterator[_Choice]:
-    """Yield the choices that satisfy the relations with slopes that units explain."""
+    """Yield the choices that satisfy the relations with plausible slopes."""
     signed = [f for f in unlabelled if is_of_both_signs(f.seen.values)]
     forward = [f for f in unlabelled if _is_forward(f)]
     others = {"speed": forward, "rate": signed, "ay": signed, "ax": list(unlabelled)}
@@ -157,7 +156,7 @@ def _choices(fields: Fields, unlabelled: Sequence[Field]) -> Iterator[_Choice]:
     for v in speeds:
         change = fields.pieces.rate_of(_values(v))
         fits = [(x, fit(change, smooth[id(x)])) for x in axs if x is not v]
-        # The slope the way round in which grade and noise of a_x do not make it smaller.
+        # Regress in the direction in which grade and noise of a_x do not reduce the slope.
         ways = [
             (x, replace(relation, slope=relation.correlation**2 / relation.slope))
             for x, relation in fits
@@ -173,7 +172,7 @@ def _choices(fields: Fields, unlabelled: Sequence[Field]) -> Iterator[_Choice]:
 def _choices_of(
     fields: Fields, columns: tuple[Field, Field, Field], ay: FloatArray, ways: Sequence[tuple[Field, Fit]]
 ) -> Iterator[_Choice]:
-    """Yield the choices of one speed, yaw rate and a_y."""
+    """Yield the choices with a given speed, yaw rate and a_y."""
     turning, by_speed, ahead_s = _turning(fields, *columns[:2], ay)
     for x, speeding in ways if turning is not None else ():
         explained = None if turning is None else _explained((*columns, x), turning, speeding)
@@ -185,7 +184,7 @@ def _choices_of(
 
 
 def _turning(fields: Fields, v: Field, r: Field, ay: FloatArray) -> tuple[Fit | None, bool, float]:
-    """Fit a_y to v r; return whether it is as an a_y, not other powers of the speed, and how far it is ahead, s."""
+    """Fit a_y to v r; return the fit, whether other powers of the speed fit worse, and the lead of a_y in s."""
     smooth, speed = fields.pieces.smooth, _values(v)
     with np.errstate(invalid="ignore"):
         relation, root, alone = (fit(ay, smooth(np.maximum(speed, 0.0) ** p * _values(r))) for p in (1.0, 0.5, 0.0))
@@ -202,9 +201,9 @@ def _turning(fields: Fields, v: Field, r: Field, ay: FloatArray) -> tuple[Fit | 
 def _explained(
     columns: tuple[Field, Field, Field, Field], turning: Fit, speeding: Fit
 ) -> tuple[tuple[tuple[str, float], tuple[str, float], tuple[str, float]], float] | None:
-    """Return the units of speed, yaw rate and accelerations that explain the slopes, and the logarithm of how far off.
+    """Return the units of speed, yaw rate and accelerations that explain the slopes, and the log error of the slopes.
 
-    None where none do.
+    Return None if no units do.
     """
     v, r, y, x = columns
     ways = []
@@ -221,7 +220,7 @@ def _units(item: Field, quantity: str) -> tuple[tuple[str, float], ...]:
 
 
 def _open(item: Field) -> bool:
-    """Return whether a column is one without a name."""
+    """Return whether a column has no name."""
     return not item.meaning.quantity
 
 
@@ -230,14 +229,14 @@ def _values(item: Field) -> FloatArray:
 
 
 def _known(fields: Fields, what: str) -> list[Field]:
-    """Return the surest field that a name gives to be a quantity and whose unit is known."""
+    """Return the surest named field of a quantity with a known unit, as a list of at most one."""
     kind = {"speed": ("speed", None), "rate": ("rate", "z"), "ay": ("acceleration", "y"), "ax": ("acceleration", "x")}
     every = [f for f in fields.all(*kind[what]) if (f.unit_known or f.fixed) and f.seen.changes]
     return every[:1]
 
 
 def _is_forward(item: Field) -> bool:
-    """Return whether a column may be a speed: hardly ever negative, and never still for long."""
+    """Return whether a column may be a speed: rarely negative, and never constant for long."""
     finite = item.seen.values[np.isfinite(item.seen.values)]
     if finite.shape[0] == 0:
         return False
@@ -246,7 +245,7 @@ def _is_forward(item: Field) -> bool:
 
 
 def _same(a: _Choice, b: _Choice) -> bool:
-    """Return whether two choices are the same, or take copies of one another's columns."""
+    """Return whether two choices use the same columns or copies of them."""
     for item, other in zip(a.columns, b.columns, strict=True):
         relation = None if item is other else fit(_values(item), _values(other))
         if item is not other and (relation is None or abs(relation.correlation) < COPY):
@@ -255,14 +254,14 @@ def _same(a: _Choice, b: _Choice) -> bool:
 
 
 def _speed_is_sure(fields: Fields, speed: Field, unit: tuple[str, float]) -> bool:
-    """Return whether no wheel that turns in rad/s can be taken for a speed."""
+    """Return whether no wheel speed in rad/s can be mistaken for the speed."""
     path = path_speed(fields)
     times = None if path is None else ratio(path, _values(speed) * unit[1], 1.0)
     return unit[0] == "m/s" if times is None else abs(times - 1.0) < 0.08
 
 
 def _named(item: Field, meaning: Meaning, sign: float, *, sure: bool) -> Field:
-    """Return a column with its quantity; a weak one where it is not sure."""
+    """Return a column with its quantity, marked as weak if it is uncertain."""
     factors = ((meaning.unit, meaning.scale or 1.0),)
     named = replace(item, meaning=meaning, factors=factors, sign=sign, unit_known=sure, reasons=[], doubts=[])
     if not sure:
@@ -272,7 +271,7 @@ def _named(item: Field, meaning: Meaning, sign: float, *, sure: bool) -> Field:
 
 
 def _steering(fields: Fields, columns: Sequence[Field], speed: FloatArray, rate: FloatArray) -> list[Field]:
-    """Return the column that follows the path's curvature far better than others, as a steering angle."""
+    """Return the column that follows the path's curvature far better than all others, as a steering angle."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         slow = max(1.0, 0.25 * float(np.nanquantile(speed, 0.95)))
         curve = fields.pieces.smooth(np.where(speed > slow, rate / speed, np.nan))
@@ -297,7 +296,7 @@ def _is_copy(a: Field, b: Field) -> bool:
 
 
 def needs_unlabelled(signals: Mapping[str, object], named: Sequence[Meaning]) -> bool:
-    """Return whether neither what is mapped nor a name gives the speed, the yaw rate or an acceleration."""
+    """Return whether the speed, the yaw rate or an acceleration is neither mapped nor named."""
     kinds = {(m.quantity, m.part) for m in named}
     missing = {
         "yaw_rate_rad_s": ("rate", "z"), "ax_m_s2": ("acceleration", "x"), "ay_m_s2": ("acceleration", "y"),

@@ -1,4 +1,4 @@
-"""Message types of vendors whose documentation gives what their fields are: ``vendors.toml`` and files like it."""
+"""Documented message types of vendors: ``vendors.toml`` and user files in the same format."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pdhef_logtool.records.errors import MappingFileError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, WHEELS
 from pdhef_logtool.storage.documents import checked, read_toml
 
-#: Names a file like ``vendors.toml`` whose entries come before those that are shipped.
+#: Environment variable with the path of a user file, which has priority over the shipped types.
 USERS_FILE = "PDHEF_VENDORS"
 
 _QUANTITIES = {
@@ -82,7 +82,7 @@ class VendorField:
     Attributes
     ----------
     section, name : ``signals`` or ``truth``, and the quantity there.
-    unit : of the raw value in words, for reports. page : where it is documented.
+    unit : unit of the raw value, for reports. page : address of the documentation.
     """
 
     section: Literal["signals", "truth"]
@@ -94,7 +94,7 @@ class VendorField:
 
     @property
     def meaning(self) -> Meaning:
-        """What a name would have to state to mean the same."""
+        """The equivalent meaning of a name."""
         return replace(meaning_of_signal(self.name), unit=self.unit, scale=abs(self.scale))
 
 
@@ -104,19 +104,19 @@ def meaning_of_signal(name: str) -> Meaning:
 
 
 def names_of(quantity: str, part: str, among: Iterable[str] = SIGNAL_UNITS) -> tuple[str, ...]:
-    """Return the signals, or those of ``among``, that a quantity may be."""
+    """Return the signals among ``among`` that match a quantity and part."""
     parts = (part,) if part else {"speed": ("x",), "steering": ("road", "wheel")}.get(quantity, ("",))
     return tuple(n for n in among if any(_QUANTITIES.get(n) == (quantity, p) for p in parts))
 
 
 @dataclass(frozen=True, slots=True)
 class VendorType:
-    """A documented type: its fields by path, ground truth quantities that several fields make, with an empty topic.
+    """A documented type: its fields by path, and vectors of ground truth, with an empty topic.
 
     Attributes
     ----------
-    left_out : why nothing of it can be taken; empty where something can.
-    has : fields that count a recorder's export, which has no type of its own; other channels are next to them.
+    left_out : why no field is used; empty if fields are used.
+    has : fields that identify a recorder's export, which has no type name; it may contain other channels.
     """
 
     fields: Mapping[str, VendorField] = field(default_factory=dict)
@@ -127,12 +127,12 @@ class VendorType:
 
 @dataclass(frozen=True, slots=True)
 class Vendors:
-    """Documented types by name, as ROS 2 spells it without ``/msg``."""
+    """Documented types by name in the spelling of ROS 2 without ``/msg``."""
 
     types: Mapping[str, VendorType] = field(default_factory=dict)
 
     def typed(self, topic: TopicInfo, fields: Iterable[FieldInfo]) -> TopicInfo:
-        """Return a topic with the name of the export that its fields are, if it has no type and they are one."""
+        """Return an untyped topic with the type name of the export that its fields match, if any."""
         if topic.encoding != "json" or _plain(topic.type_name) in self.types:
             return topic
         there = {f.path for f in fields}
@@ -140,7 +140,7 @@ class Vendors:
         return next((replace(topic, type_name=name) for name in names), topic)
 
     def of(self, type_name: str) -> VendorType:
-        """Return a type, without anything where it is not documented here."""
+        """Return a type; an empty one if it is not documented here."""
         return self.types.get(_plain(type_name), VendorType())
 
 
@@ -149,7 +149,7 @@ def _plain(type_name: str) -> str:
 
 
 def load_vendors(path: Path | None = None) -> Vendors:
-    """Return the shipped types, and before them those of a user's file, which ``PDHEF_VENDORS`` may name as well.
+    """Return the shipped types and a user's types, which have priority (``path`` or ``PDHEF_VENDORS``).
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Choice among candidates by physics: gravity, a_y ≈ v r, a_x ≈ v̇, steering against curvature, wheels against yaw.
+"""Select candidates by physics: gravity, a_y ≈ v r, a_x ≈ v̇, steering against curvature, wheels against yaw rate.
 
-Signals of recognised types are anchors: candidates are compared with them, and they are never changed. Reports give
-the evidence for a unit or a sign; an open point becomes an undecided check with a remedy.
+Signals of recognised types are fixed anchors, to which candidates are compared. Reports give the evidence for a unit
+or a sign; an open point becomes an undecided check with a remedy.
 """
 
 from __future__ import annotations
@@ -36,28 +36,29 @@ from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray
 
-#: Ground truth that fields give one by one, and what shows the path.
+#: Ground truth quantities of a single field, and quantities that give the path.
 _TRUTH = ("vx_m_s", "vy_m_s", "sideslip_rad", "yaw_rate_rad_s", "lat_deg", "lon_deg", "course_rad", "yaw_rad")
 _POSITIONS = ("lat_deg", "lon_deg", "x_m", "y_m")
 _SLIP = frozenset({"vy_m_s", "sideslip_rad"})
-#: Words of a forward velocity that a lateral one is beside.
+#: Words of a forward velocity; the struct may contain a lateral velocity, too.
 _ALONG = frozenset({"lng", "long", "longitudinal", "forward"})
-#: Signals that one field gives: name, quantity and parts, in the order in which they are chosen.
+#: Signals of a single field: name, quantity and parts, in the order of their selection.
 _SENSORS = (
     ("speed_m_s", "speed", ("", "x")), ("ax_m_s2", "acceleration", ("x",)), ("ay_m_s2", "acceleration", ("y",)),
     ("yaw_rate_rad_s", "rate", ("z",)),
 )  # fmt: skip
-#: Below (standard deviation) the path is straight.
+#: Standard deviation of the curvature below which a path counts as straight.
 EXCITED_CURVATURE_1_M = 0.0001
-#: An acceleration (standard deviation) from which on a sensor must follow it, and the correlation that it must have.
+#: Standard deviation above which a sensor must follow an acceleration, and the required correlation.
 MOVING_M_S2 = 0.6
 FOLLOWS = 0.5
-#: How near wheels must be to a speed in a unit of speed; beyond they turn in rad/s.
+#: Relative tolerance between wheel speeds in a unit of speed and the speed; beyond, the wheel speeds are rotational.
 WHEEL_UNIT = 0.04
-#: Metres by which curvature becomes an angle: wheelbases of model cars to lorries, and those times a steering ratio.
+#: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
+#: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
-#: Signals to both sides, whose sign may be open; speeds below give no information; how far the length that a steering
-#: angle gives may be from cars' (logarithm) where it may be a share of the largest angle as well.
+#: Signals that may have an unknown sign; speed below which they give no information; largest log ratio between the
+#: length of a steering angle and a usual length if the signal could also be a share of the largest angle.
 _SIGNED = ("steer_rad", "steering_wheel_rad", "yaw_rate_rad_s", "ay_m_s2")
 SLOW_M_S, USUAL = 1.0, 0.6
 #: Units of rotational speeds, and the usual radius of a wheel.
@@ -67,7 +68,7 @@ USUAL_RADIUS_M = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Weighed:
-    """Result of weighing: sources to take, candidates, notes, undecided checks, signs that nothing documents."""
+    """Result of the selection: sources, candidates, notes, undecided checks, groups of signals with unknown signs."""
 
     signals: dict[str, SignalSource] = field(default_factory=dict)
     truth: dict[str, SignalSource] = field(default_factory=dict)
@@ -85,12 +86,12 @@ def weigh(
     truth: Mapping[str, SignalSource],
     vendors: Vendors,
 ) -> Weighed:
-    """Choose fields for the signals that are not mapped, and for ground truth if there is none.
+    """Select fields for the missing signals, and for ground truth if there is none.
 
     Parameters
     ----------
-    topics : those that may contain candidates, with what their names make of them.
-    signals, truth : what recognised types give already; a topic named as ground truth replaces one without heading.
+    topics : topics that may contain candidates, with their kinds of data.
+    signals, truth : sources of recognised types; a topic named as ground truth replaces ground truth without heading.
     """
     wanted = [
         n for n in named_fields(log, topics, vendors) if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)
@@ -118,7 +119,7 @@ def weigh(
 
 
 def _upward(log: DriveLog, signals: Mapping[str, SignalSource]) -> dict[str, SignalSource]:
-    """Return the third axis of a mapped accelerometer, which shows where gravity is."""
+    """Return the third axis of a mapped accelerometer, to locate gravity."""
     lateral = signals.get("ay_m_s2")
     path = "" if lateral is None else f"{lateral.paths[0].removesuffix('.y')}.z"
     if lateral is None or not has_path(log.fields(lateral.topic), path):
@@ -129,12 +130,12 @@ def _upward(log: DriveLog, signals: Mapping[str, SignalSource]) -> dict[str, Sig
 def _is_wanted(
     quantity: str, part: str, role: Role, signals: Mapping[str, SignalSource], truth: Mapping[str, SignalSource]
 ) -> bool:
-    """Return whether a field can fill a gap, or gives information on one that does."""
+    """Return whether a field can provide a missing signal, or information on one."""
     if quantity == "acceleration" and part == "z":  # shows gravity
         return not {"ax_m_s2", "ay_m_s2"} <= set(signals)
     if quantity in ("latitude", "longitude") and not {"lat_deg", "x_m"} & set(truth):  # show the path
         return True
-    if quantity == "rate" and part in ("x", "y"):  # a device's axes are not the car's
+    if quantity == "rate" and part in ("x", "y"):  # the axes of a device may differ from the car's
         return "yaw_rate_rad_s" not in signals
     names = names_of(quantity, part)
     steered = {"steer_rad", "steering_wheel_rad"} & set(signals)
@@ -177,17 +178,17 @@ class _Weighing:
         self._tell_mirrored()
 
     def _tell_mirrored(self) -> None:
-        """Report where steering and yaw rate alone, both by their names, show left and right: both may be turned."""
+        """Add checks if left and right depend on the names of steering and yaw rate only: both may be mirrored."""
         turning = [n for n in _SIGNED if self._chosen(n) is not None]
         is_open = {*turning} <= {n for group in self._open_signs() for n in group}
         others = [n for n in (*self.taken, *self.fields.anchors) if n == "ay_m_s2" or n.startswith("wheel_speed")]
         if len(turning) > 1 and is_open and not others and not self.fields.positions:
-            evidence = f"left and right may be exchanged in {' and '.join(turning)}: nothing shows which is positive"
+            evidence = f"left and right may be exchanged in {' and '.join(turning)}: no signal shows which is positive"
             remedy = 'name them in a mapping file, or --waive "mapping.names"'
             self.checks += [Check("mapping.names", name, "undecided", evidence, remedy) for name in turning]
 
     def _usable(self) -> list[Field]:
-        """Return candidates for signals; sensors beside ground truth come behind those of other messages."""
+        """Return candidates for signals; sensors in the ground-truth topic rank below sensors of other messages."""
         usable = [f for f in self.fields.candidates if f.role in ("sensor", "navigation", "device")]
         usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
         elsewhere = {f.meaning.quantity for f in usable if f.topic.name != self.truth_from}
@@ -196,7 +197,7 @@ class _Weighing:
         return usable
 
     def _drop_vectors_over_ground(self) -> None:
-        """Leave out velocities x, y that are not the body's."""
+        """Drop velocities x, y that are not in the body frame."""
         for y in [f for f in self.fields.candidates if f.meaning.quantity == "velocity" and f.is_axis and not f.fixed]:
             beside = (f for f in self.fields.candidates if f.meaning.quantity == "speed" and triad_of(f) == triad_of(y))
             x = next((f for f in beside if f.meaning.part == "x" and f.seen.changes), None)
@@ -205,7 +206,7 @@ class _Weighing:
                 self.notes.append(f"{x.topic.name}.{x.path} is not used: its vector is not in the car's axes")
 
     def _is_over_ground(self, x: Field, y: Field) -> bool:
-        """Return whether x is not where the car goes, or not the speed, as its length is, or it turns with the car."""
+        """Return whether a velocity is not in the body frame: x is not forward, or it rotates with the yaw rate."""
         length, rates = np.hypot(x.si, y.si), self.fields.open("rate", "z")[:1]
         speeds = (f.si for f in self.fields.open("speed") if f is not x)
         moving = length > SLOW_M_S
@@ -218,7 +219,7 @@ class _Weighing:
         return any(agree(v, length) and not agree(v, x.si) for v in speeds)
 
     def note_unlabelled(self, topic: str, evidence: str) -> None:
-        """Note that the fields of a topic are identified by values alone."""
+        """Add a note that the fields of a topic were identified by their values only."""
         self.notes.append(f"quantities of {topic} are identified by values alone: left and right may be exchanged")
         evidence = f"the names of {topic} give no quantities; {evidence}; left and right are not observable"
         remedy = 'look at them (pdhef inspect --fields), name them in a mapping file, or --waive "mapping.names"'
@@ -241,13 +242,13 @@ class _Weighing:
         self._choose(name, best, [f for f in (good[0], *near) if f is not best])
 
     def _choose(self, name: str, best: Field, rivals: Sequence[Field]) -> None:
-        """Take a field for a signal, and name the others that could be it."""
+        """Select a field for a signal, and record its rivals."""
         self.taken[name] = best
         if rivals:
             self.rivals.append((name, tuple(f"{f.topic.name}.{f.path}" for f in (best, *rivals))))
 
     def _follows_ax(self, item: Field) -> None:
-        """Raise the score of a speed with a weak name where its rate of change follows a_x."""
+        """Raise the score of a speed with a weak name if its rate of change follows a_x."""
         if item.score >= LEAST_SCORE or item.meaning.strength >= 0.7:
             return
         for ax in self.fields.all("acceleration", "x")[:2]:
@@ -259,7 +260,7 @@ class _Weighing:
                 return
 
     def _better(self, rivals: Sequence[Field]) -> Field:
-        """Return the one that follows the others' physics best; the first where nothing shows."""
+        """Return the rival that follows the other signals best; the first one without evidence."""
         speed = self._speed()
         if speed is None:
             return rivals[0]
@@ -281,7 +282,7 @@ class _Weighing:
         return best[1]
 
     def _turn_about(self) -> None:
-        """Take the yaw rate about the axis that a_y ≈ v r shows, where a_y names the car's axis and it a device's."""
+        """Select the yaw rate's axis by a_y ≈ v r if a_y names the car's axis and the yaw rate a device's."""
         rate, ay, speed = self.taken.get("yaw_rate_rad_s"), self._chosen("ay_m_s2"), self._speed()
         if rate is None or ay is None or speed is None or rate.fixed or not rate.is_axis or ay.is_axis:
             return
@@ -318,19 +319,19 @@ class _Weighing:
             self.taken[f"wheel_speed_{corner}_{'rad_s' if kind == 'wheel rate' else 'm_s'}"] = item
 
     def _wheel_unit_by_turning(self, mean: FloatArray) -> tuple[str, tuple[str, float], str, str]:
-        """Return what :func:`_wheel_unit` does, by a_y ≈ v r, which shows less: roll is in a_y."""
+        """Return :func:`_wheel_unit` by a_y ≈ v r, which is less accurate because a_y includes roll."""
         rate, ay = self._chosen("yaw_rate_rad_s"), self._chosen("ay_m_s2")
         relation = None if rate is None or ay is None else self.fields.turning(ay.si, rate.si, mean)
         if relation is None or abs(relation.correlation) < CLEAR:
             return _wheel_unit(None, None)
         metres = abs(relation.slope)
         ways = [(abs(math.log(metres / unit[1])) / math.log(1.3), "wheel speed", unit) for unit in SPEEDS]
-        for turning in TURNING:  # a name of a speed is a speed first
+        for turning in TURNING:  # speeds have priority if the name is that of a speed
             off = abs(math.log(metres / turning[1] / USUAL_RADIUS_M)) / math.log(1.3)
             ways.append((1.0 + off, "wheel rate", turning))
         (_, kind, taken), (_, _, other) = sorted(ways)[:2]
         said = f"{1.0 / metres:.4g} of it is 1 m/s by a_y ≈ v r"
-        doubt = f"the unit of the wheel speeds is not given: by a_y ≈ v r {taken[0]} is likeliest, then {other[0]}"
+        doubt = f"the unit of the wheel speeds is not given: by a_y ≈ v r {taken[0]} is most likely, then {other[0]}"
         return kind, taken, said, doubt
 
     # --------------------------------------------------------------------------------------------- steering
@@ -340,7 +341,7 @@ class _Weighing:
         rate = self._chosen("yaw_rate_rad_s")
         ay = self._chosen("ay_m_s2")
         wheels = [f for n, f in self.taken.items() if n.startswith("wheel_speed") and n.endswith("m_s")]
-        if speed is None and wheels:  # in their likeliest unit
+        if speed is None and wheels:  # in their most likely unit
             speed = wheels[0].standing_for(mean_of([f.si for f in wheels]))
         curvature = _curvature(speed, rate, ay)
         judged: list[tuple[float, str, Field]] = []
@@ -365,7 +366,7 @@ class _Weighing:
         self._choose(name, best, [f for f in near if not agree(best.si, f.si)])
 
     def _steering_kind(self, item: Field, relation: Fit | None) -> tuple[str, bool | None]:
-        """Return the signal that a steering angle is, and whether it follows the car's turning (None: unknown)."""
+        """Return the signal for a steering angle, and whether it follows the car's turning (None: unknown)."""
         kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(item.meaning.part, tuple(_STEERING_M))
         if relation is None or abs(relation.correlation) < CLEAR:
             return _steering_by_range(item, kinds, relation)
@@ -387,7 +388,7 @@ class _Weighing:
         return name, True
 
     def _open_signs(self) -> tuple[tuple[str, ...], ...]:
-        """Return the signals whose sign no documentation, name or mounting gives; those that share an axis together."""
+        """Return the signals with an unknown sign (documentation, name, mounting); signals of one axis as a group."""
         open_fields = {n: f for n, f in self.taken.items() if n in _SIGNED and _has_open_sign(f)}
         open_truth = {n: f for n, f in self.truth.items() if n in ("vy_m_s", "yaw_rate_rad_s") and not f.fixed}
         lateral, across = open_fields.get("ay_m_s2"), open_truth.get("vy_m_s")
@@ -398,16 +399,16 @@ class _Weighing:
         return tuple(groups)
 
     def _is_of_ours(self, check: Check) -> bool:
-        """Return whether a check is of an accelerometer that is taken."""
+        """Return whether a check concerns a selected accelerometer."""
         item = self.taken.get(check.subject)
         return item is not None and f" of {triad_of(item)}, " in check.evidence
 
     def _speed(self) -> Field | None:
-        """Return what shows others best how fast the car was, taken or not."""
+        """Return the best speed to compare other signals with, selected or not."""
         return self._chosen("speed_m_s") or self.fields.wheel_mean() or self.fields.best("speed")
 
     def _follow(self) -> None:
-        """Add a doubt to accelerations that do not follow the car's motion although the drive excites it."""
+        """Add a doubt to accelerations that do not follow the car's motion in a drive that excites them."""
         speed, rate = self._speed() or self.fields.wheel_turns(), self._chosen("yaw_rate_rad_s")
         self._both_signs()
         if speed is None:
@@ -423,7 +424,7 @@ class _Weighing:
                 item.doubts.append(f"its correlation with {words} is only {relation.correlation:.2f}")
 
     def _both_signs(self) -> None:
-        """Add a doubt to fields that are never negative although the car turns both ways: their sign is elsewhere."""
+        """Add a doubt to fields that are never negative although the car turns both ways."""
         names = ("yaw_rate_rad_s", "ay_m_s2", "steer_rad", "steering_wheel_rad")
         there = {n: f for n in names if (f := self._chosen(n)) is not None and f.seen.changes}
         if not any(is_of_both_signs(f.seen.values) for f in there.values()):
@@ -433,24 +434,24 @@ class _Weighing:
                 item.doubts.append("it is never negative although the car turns: its sign may be in another field")
 
     def _chosen(self, *names: str) -> Field | None:
-        """Return what is taken for the first of these signals that there is, or mapped already."""
+        """Return the field of the first of these signals that is selected or mapped."""
         return next((f for n in names if (f := self.taken.get(n) or self.fields.anchors.get(n)) is not None), None)
 
     # ------------------------------------------------------------------------------------------------ ground truth
 
     def choose_truth(self) -> None:
-        """Take ground truth from the topic chosen by :func:`truth_topic`."""
+        """Select the ground truth of the topic chosen by :func:`truth_topic`."""
         if not self.truth_from:
             return
         its = [f for f in self.fields.candidates if f.topic.name == self.truth_from and f.section != "signals"]
         documented, named = _truth_of([f for f in its if f.fixed]), _truth_of(its)
-        # Documented fields before names, unless names alone give a sideslip: channels of modules beside a receiver.
+        # Documented fields have priority unless only names provide a sideslip (modules of a receiver).
         self.truth = named if not documented or _SLIP & set(named) - set(documented) else documented
         if not self.truth:
             return
         first = its[0]
         if first.role == "sensor" and self.truth.get("yaw_rate_rad_s") is self.taken.get("yaw_rate_rad_s"):
-            self.truth.pop("yaw_rate_rad_s", None)  # the only gyro of a table of everything is a sensor
+            self.truth.pop("yaw_rate_rad_s", None)  # the only gyro of a combined table is a sensor
         agrees = self._truth_turns()
         # Fields of ground truth are no inputs, except the speed of a navigation system without another speed.
         mine = set(map(id, self.truth.values()))
@@ -461,20 +462,20 @@ class _Weighing:
             evidence = f"{first.topic.name} contains a sideslip, measured or estimated: its name does not give which"
             remedy = 'name it under [truth] in a mapping file, or --waive "truth.source"'
             self.checks.append(Check("truth.source", "truth", "undecided", evidence, remedy))
-        self.notes.append(f"ground truth is taken from {first.topic.name}, by the names of its fields")
+        self.notes.append(f"ground truth comes from {first.topic.name}, by the names of its fields")
         for name, item in self.truth.items():
             self._tell(f"truth.{name}", item)
 
     def _truth_turns(self) -> bool:
-        """Return whether the yaw rate of the ground truth is the sensor's, up to its sign."""
+        """Return whether the yaw rates of ground truth and sensor are equal up to the sign."""
         sensor, true = self._chosen("yaw_rate_rad_s"), self.truth.get("yaw_rate_rad_s")
         relation = None if sensor is None or true is None else fit(sensor.si, true.si)
         return relation is not None and abs(relation.correlation) > 0.97 and abs(abs(relation.slope) - 1.0) < 0.1
 
-    # ------------------------------------------------------------------------------------------- what is stated
+    # ------------------------------------------------------------------------------------------------- reporting
 
     def _tell(self, name: str, item: Field) -> None:
-        """Turn the doubts of a taken field into an undecided check; note a speed of the navigation system."""
+        """Add an undecided check for the doubts about a field; note a speed from the navigation system."""
         item.doubts = [d for d in item.doubts if d]
         if name == "speed_m_s" and item.role == "navigation":
             self.notes.append(
@@ -488,7 +489,7 @@ class _Weighing:
             self.checks.append(Check(f"{name}.candidate", name, "undecided", evidence, remedy))
 
     def result(self) -> Weighed:
-        """Return everything as records."""
+        """Return the result of the selection."""
         candidates = [f.candidate(n, "signals", taken=True) for n, f in self.taken.items()]
         candidates += [f.candidate(n, "truth", taken=True) for n, f in self.truth.items()]
         used = {(c.section, c.source.label) for c in candidates}
@@ -512,24 +513,24 @@ class _Weighing:
 
 
 def _has_open_sign(item: Field) -> bool:
-    """Return whether neither documentation nor a name gives the sign of a field, and no mounting shows it."""
+    """Return whether the sign of a field is unknown from documentation, name and mounting."""
     return not (item.fixed or item.is_downward) and (item.meaning.quantity == "steering" or not item.is_axis)
 
 
 def _same_but_axis(first: Field, second: Field) -> bool:
-    """Return whether names of one topic differ in the letter of their axis alone."""
+    """Return whether two names of one topic differ only in the letter of their axis."""
     words = ([w for w in words_of(f.path) if w not in {*"xyz"}] for f in (first, second))
     return first.topic.name == second.topic.name and next(words) == next(words)
 
 
 def _share_axis(first: Field, second: Field) -> bool:
-    """Return whether two fields of one topic, both without a documented sign, name their axis with the same word."""
+    """Return whether two undocumented fields of one topic name their axis with the same word."""
     axes = (set(words_of(f.path)) & {"lat", "lateral", "trans", "y", "right"} for f in (first, second))
     return first.topic.name == second.topic.name and bool(set.intersection(*axes)) and not (first.fixed or second.fixed)
 
 
 def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:
-    """Return ground truth quantities of one topic's fields; empty without sideslip, lateral velocity or a position."""
+    """Return the ground truth quantities of one topic; empty without sideslip, lateral velocity or a position."""
     truth: dict[str, Field] = {}
     for item in sorted(candidates, key=lambda f: (-f.score, not _ALONG & set(words_of(f.path)))):
         name = _truth_name(item)
@@ -545,7 +546,7 @@ def _truth_of(candidates: Sequence[Field]) -> dict[str, Field]:
 
 
 def _wheel_set(usable: Sequence[Field]) -> dict[str, Field]:
-    """Return the wheels of the struct with most of them, or else wheels of a struct each."""
+    """Return the wheels of the struct with most of them, or the wheels of separate structs."""
     sets: dict[tuple[str, str, str], dict[str, Field]] = {}
     for item in usable:
         if item.meaning.quantity in ("wheel speed", "wheel rate") and item.meaning.part in WHEELS:
@@ -560,7 +561,7 @@ def _wheel_set(usable: Sequence[Field]) -> dict[str, Field]:
 
 
 def _steering_by_range(item: Field, kinds: tuple[str, ...], relation: Fit | None) -> tuple[str, bool | None]:
-    """Return what :meth:`_Weighing._steering_kind` does, where the path's curvature does not decide."""
+    """Return :meth:`_Weighing._steering_kind` by the range of values, if the curvature is not conclusive."""
     name = kinds[-1] if item.seen.largest * item.factors[0][1] > 0.9 else kinds[0]
     if item.fixed:
         return name, None
@@ -573,7 +574,7 @@ def _steering_by_range(item: Field, kinds: tuple[str, ...], relation: Fit | None
 
 
 def truth_topic(weighable: Sequence[Field]) -> str:
-    """Return the topic with sideslip or a lateral velocity, reference topics first; empty without one."""
+    """Return the topic with sideslip or lateral velocity, reference topics first; empty without one."""
     topics: dict[str, list[Field]] = {}
     for item in weighable:
         if item.role in ("truth", "navigation", "sensor"):
@@ -591,7 +592,7 @@ def truth_topic(weighable: Sequence[Field]) -> str:
 
 
 def _curvature(speed: Field | None, rate: Field | None, ay: Field | None) -> FloatArray | None:
-    """Return the path's curvature in 1/m where the car drives, by yaw rate, else a_y; None if it goes straight."""
+    """Return the path's curvature in 1/m while moving, by yaw rate or else a_y; None if the path is straight."""
     if speed is None or (rate is None and ay is None):
         return None
     v = speed.si
@@ -604,19 +605,19 @@ def _curvature(speed: Field | None, rate: Field | None, ay: Field | None) -> Flo
 
 
 def _unlikely(name: str, metres: float) -> float:
-    """Return how far a length is from what cars have: 2.7 m, times 16 for a steering wheel; 0 is right there."""
+    """Return the log ratio of a length to the usual one: 2.7 m, times 16 for a steering wheel."""
     return abs(math.log(metres / (2.7 if name == "steer_rad" else 43.0)))
 
 
 def _wheel_unit(
     times: float | None, reference: Field | None, *, in_si: bool = False
 ) -> tuple[str, tuple[str, float], str, str]:
-    """Return quantity, unit, reason and doubt of wheel speeds whose name has no unit.
+    """Return quantity, unit, reason and doubt of wheel speeds without a unit in their name.
 
     Parameters
     ----------
-    times : how many of them are 1 m/s by the reference, a speed; None where there is none, or no one number.
-    in_si : the other signals of their topic are in SI units, although no name gives a unit.
+    times : raw value per 1 m/s of the reference speed; None without a reference or a constant ratio.
+    in_si : the other signals of the topic are in SI units, although no name contains a unit.
     """
     if times is None or reference is None:
         doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"

@@ -1,4 +1,4 @@
-"""One check of a log, its ground truth or its vehicle file: passed, failed, or undecided (not observable)."""
+"""Check of a log, its ground truth or its vehicle file: passed, failed, or undecided (not observable)."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ Verdict: TypeAlias = Literal["passed", "failed", "undecided"]
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of one relation for one signal.
+    """Result of one check of one signal.
 
     Attributes
     ----------
-    name : what a person waives it by, for example ``steering_wheel_angle_rad.sign``; no two of a log share one.
-    subject : signal, ground truth quantity or ``vehicle`` that is judged.
-    verdict : ``undecided`` where the drive does not excite what the relation needs.
+    name : unique name, also for ``--waive``, for example ``steering_wheel_angle_rad.sign``.
+    subject : signal, ground truth quantity or ``vehicle``.
+    verdict : ``undecided`` if the drive lacks the necessary excitation.
     evidence : one sentence with figures.
-    remedy : what to do about it; empty where it passed.
+    remedy : next step for the user; empty for a passed check.
     waived : the user has accepted it.
     """
 

@@ -1,4 +1,4 @@
-"""One exception tree; every error has the parts expected, got, where, and what to do."""
+"""Exceptions of the package; each error has the parts expected, got, where and remedy."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class PdhefError(Exception):
 
     Parameters
     ----------
-    expected : what would have been right.
-    got : what was found instead.
+    expected : valid input.
+    got : actual input.
     where : file, topic, field or option.
-    remedy : what the user can do; empty if nothing helps.
-    missing : a file or folder that the user named does not exist, which is a usage error.
+    remedy : action of the user; empty if there is none.
+    missing : a file or folder in the user's input does not exist, which is a usage error.
     """
 
     exit_code: int = EXIT_FAILURE
@@ -38,12 +38,12 @@ class PdhefError(Exception):
         super().__init__(str(self))
 
     def __reduce__(self) -> tuple[partial[PdhefError], tuple[()]]:
-        """Travel between processes with all parts."""
+        """Pickle all parts, for other processes."""
         parts = {"expected": self.expected, "got": self.got, "where": self.where, "remedy": self.remedy}
         return partial(type(self), missing=self.missing, **parts), ()
 
     def __str__(self) -> str:
-        """One line, without a traceback's noise and safe for a terminal, as its parts are escaped."""
+        """Return one line for the terminal; all parts are escaped."""
         where, expected, got, remedy = (
             printable(" ".join(str(part).split())) for part in (self.where, self.expected, self.got, self.remedy)
         )
@@ -57,7 +57,7 @@ class UsageError(PdhefError):
 
 
 class LogError(PdhefError):
-    """A file is no log, or nothing in it can be read."""
+    """A file is not a log, or its contents are not readable."""
 
 
 class MappingError(PdhefError):
@@ -81,13 +81,13 @@ class EstimatorError(PdhefError):
 
 
 class SimulationError(PdhefError):
-    """A drive cannot be simulated as asked."""
+    """The requested drive cannot be simulated."""
 
 
 class OutputError(PdhefError):
     """An output cannot be written, or an output folder cannot be read back.
 
-    ``ends_run``: no other output can be written either, because a disk is full or read-only.
+    ``ends_run``: the run ends, because a disk is full or read-only and other outputs would fail too.
     """
 
     ends_run = False

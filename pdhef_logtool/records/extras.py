@@ -1,4 +1,4 @@
-"""Packages that an extra of the installation brings."""
+"""Optional packages, which an extra of the installation contains."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ def required(module: str, extra: str, use: str, where: object) -> Any:
 
     Parameters
     ----------
-    use : what the package does, as ``reads MDF files``.
-    where : what needs it: a log, a command or an option.
+    use : purpose of the package, for example ``reads MDF files``.
+    where : log, command or option that needs the package.
     """
     try:
         return import_module(module)

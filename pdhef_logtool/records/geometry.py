@@ -16,15 +16,15 @@ WGS84_E2 = 6.69437999014e-3
 def wrap_angle(angle_rad: FloatArray) -> FloatArray:
     """Wrap angles to [−π, π); any shape, rad."""
     turned = angle_rad + np.pi
-    if ((turned < 0.0) | (turned >= 2.0 * np.pi)).any():  # the remainder is slow, and none within a turn
+    if ((turned < 0.0) | (turned >= 2.0 * np.pi)).any():  # the remainder is slow, and not needed within one turn
         turned = turned % (2.0 * np.pi)
     return np.asarray(turned - np.pi, dtype=np.float64)
 
 
 def rotation_from_quat(quat_wxyz: FloatArray) -> FloatArray:
-    """Turn Hamilton quaternions [N, 4] (w first, any norm > 0) into rotation matrices [N, 3, 3].
+    """Convert Hamilton quaternions [N, 4] (w first, any norm > 0) to rotation matrices [N, 3, 3].
 
-    The matrix turns body vectors into the frame that the quaternion is given in.
+    The matrix rotates body vectors to the reference frame of the quaternion.
     """
     q = quat_wxyz / np.linalg.norm(quat_wxyz, axis=1, keepdims=True)
     w, x, y, z = q.T
@@ -50,7 +50,7 @@ def quat_from_yaw(yaw_rad: FloatArray) -> FloatArray:
 
 
 def ecef_from_geodetic(lat_deg: FloatArray, lon_deg: FloatArray, alt_m: FloatArray) -> FloatArray:
-    """Turn WGS-84 latitude, longitude (deg) and ellipsoidal height (m), each [N], into ECEF [N, 3] in metres."""
+    """Convert WGS-84 latitude, longitude (deg) and ellipsoidal height (m), each [N], to ECEF [N, 3] in metres."""
     lat, lon = np.deg2rad(lat_deg), np.deg2rad(lon_deg)
     n = WGS84_A_M / np.sqrt(1.0 - WGS84_E2 * np.sin(lat) ** 2)
     return np.stack(
@@ -64,7 +64,7 @@ def ecef_from_geodetic(lat_deg: FloatArray, lon_deg: FloatArray, alt_m: FloatArr
 
 
 def geodetic_from_ecef(ecef_m: FloatArray) -> FloatArray:
-    """Turn ECEF [N, 3] in metres into latitude, longitude (rad) and height (m), [N, 3] (Bowring, then two steps)."""
+    """Convert ECEF [N, 3] in metres to latitude, longitude (rad) and height (m), [N, 3] (Bowring, then two steps)."""
     x, y, z = ecef_m.T
     lon = np.arctan2(y, x)
     p = np.hypot(x, y)
@@ -78,7 +78,7 @@ def geodetic_from_ecef(ecef_m: FloatArray) -> FloatArray:
 
 
 def enu_from_ecef_rotation(lat_rad: float, lon_rad: float) -> FloatArray:
-    """Return the matrix [3, 3] that turns ECEF vectors into east, north, up at a place."""
+    """Return the matrix [3, 3] that rotates ECEF vectors to east, north, up at a position."""
     sl, cl, so, co = np.sin(lat_rad), np.cos(lat_rad), np.sin(lon_rad), np.cos(lon_rad)
     return np.array([[-so, co, 0.0], [-sl * co, -sl * so, cl], [cl * co, cl * so, sl]])
 
@@ -127,7 +127,7 @@ def dead_reckon(
         return 0.5 * (a[1:] + a[:-1])
 
     def accumulate(first: float, steps: FloatArray) -> FloatArray:
-        # One running sum from the start value on, so that windows that carry their end on join bit for bit.
+        # One running sum that begins with the start value, so that joined windows are equal bit for bit.
         return np.cumsum(np.concatenate([[first], steps]))
 
     yaw = accumulate(start[2], mid(yaw_rate_rad_s) * dt)

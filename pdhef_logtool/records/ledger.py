@@ -1,4 +1,4 @@
-"""Account of every sample of a mapped signal in a log: used, or dropped for a named reason."""
+"""Counts of the samples of each mapped signal in a log: used, or dropped for a named reason."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from pdhef_logtool.records.signals import Loss
 
 Role = Literal["signal", "truth"]
 
-#: Reasons that mean damage: the recorder, a clock or a device failed. The others are choices of the user, or nothing
-#: is gone with them: ``out-of-range`` (limits of the mapping), ``truth-quality`` (its gate), ``outside-slice``,
-#: ``repeated`` (the same value under the same stamp), ``not-needed`` (another source is used).
+#: Reasons that mean damage by a failed recorder, clock or device. The other reasons are choices of the user or lose no
+#: information: ``out-of-range`` (limits of the mapping), ``truth-quality`` (its gate), ``outside-slice``, ``repeated``
+#: (the same value at the same stamp), ``not-needed`` (another source is used).
 DAMAGE = frozenset(
     {"nan", "bad-stamp", "duplicate-stamp", "late", "time-jump", "outlier", "other-epoch", "short-frame", "not-read"}
 )
-#: A larger share of a source's samples dropped for damage makes the exit code 3.
+#: If a source loses a larger share of its samples by damage, the exit code is 3.
 DAMAGED_SHARE = 0.01
 
 
@@ -26,8 +26,8 @@ class SampleCount:
 
     Attributes
     ----------
-    role, name : of the signal. source : ``/topic.field``. stamp : what gives its time, ``log_time`` where its own
-        stamps cannot be used.
+    role, name : of the signal. source : ``/topic.field``. stamp : source of the time stamps, ``log_time`` if the
+        message's stamps are unusable.
     total : messages of the topic in the log. used, dropped : samples; together they are the total.
     """
 
@@ -46,7 +46,7 @@ class SampleCount:
 
 
 def damage(samples: Iterable[SampleCount]) -> list[Loss]:
-    """Return the losses of sources that lost more than ``DAMAGED_SHARE``; those of the same kind become one."""
+    """Return the losses of sources that lost more than ``DAMAGED_SHARE``; losses of the same kind are merged."""
     by_reason: dict[str, list[SampleCount]] = {}
     for s in samples:
         if s.damaged > DAMAGED_SHARE * s.total:

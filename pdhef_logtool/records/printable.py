@@ -1,7 +1,7 @@
-"""Escaping of text from input files: no control character moves the cursor, starts a line or reverses text.
+"""Escaping of control characters in text from input files.
 
 Names of topics, files and cars and the content of documents are third-party data: a terminal escape could hide a
-warning, a line break could fake one. All results and errors for users are escaped here.
+warning, and a line break could fake one. All results and errors for users are escaped.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import PurePath
 from typing import Any, TypeVar
 
-#: Longer texts lose their middle.
+#: The middle of longer texts is omitted.
 MOST_SIGNS = 1000
 
 _T = TypeVar("_T")
@@ -30,12 +30,12 @@ def printable(text: object, most: int = MOST_SIGNS) -> str:
 
 
 def all_printable(value: _T) -> _T:
-    """Return a copy of a record, a document or a list of them in which every text is :func:`printable`."""
+    """Return a copy of a record, a document or a list of them with all texts :func:`printable`."""
     return _all_printable(value)  # type: ignore[no-any-return]
 
 
 def _all_printable(value: Any) -> Any:
-    if value is None or type(value) in (float, int, bool):  # in order of how many there are in a report
+    if value is None or type(value) in (float, int, bool):  # in the order of their frequency in a report
         return value
     if type(value) is str:
         return printable(value)

@@ -1,4 +1,4 @@
-"""Names of processes: that of this process, and whether another one is still alive."""
+"""Unique names of processes, and detection of dead processes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import psutil
 
 #: Result of :func:`process_name`, as a regular expression.
 NAME = r"[0-9a-f]{8}-\d+-\d+"
-#: Which worker of a command this process is, from 1; 0 in the command itself.
+#: Number of this worker process, from 1; 0 in the command itself.
 worker_number = 0
 
 
@@ -24,19 +24,19 @@ def process_name() -> str:
 
 
 def is_alive(name: str) -> bool | None:
-    """Return whether the process of an :func:`own_name` is alive; None for a process of another host or container."""
+    """Return whether the process of a :func:`process_name` is alive; None for another host or container."""
     host, pid, start = name.split("-")
     if host != _host():
         return None
     if _has_ended(int(pid)):
         return False
-    # The number may have been given to another process since.
+    # Another process may have the same id now.
     return _start(int(pid)) in (None, int(start))
 
 
 @cache
 def _host() -> str:
-    """Return a short hash of the host and of the space in which process ids count."""
+    """Return a short hash of the host and of the process id namespace."""
     try:
         space = str(Path("/proc/self/ns/pid").stat().st_ino)
     except OSError:
@@ -45,14 +45,14 @@ def _host() -> str:
 
 
 def wait_for_end(pid: int, most_s: float = 5.0) -> None:
-    """Wait until a process that was killed has ended; unlike ``os.waitpid``, it need not be a child of this one."""
+    """Wait until a killed process has ended, which need not be a child of this process."""
     until = time.monotonic() + most_s
     while not _has_ended(pid) and time.monotonic() < until:
         time.sleep(0.002)
 
 
 def _has_ended(pid: int) -> bool:
-    """Return whether a process is gone, or dead with its exit code not yet collected."""
+    """Return whether a process has ended, including zombies."""
     try:
         return psutil.Process(pid).status() in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
     except psutil.NoSuchProcess:
@@ -62,10 +62,10 @@ def _has_ended(pid: int) -> bool:
 
 
 def _start(pid: int) -> int | None:
-    """Return when a process started; None if this is unknown.
+    """Return the start time of a process; None if unknown.
 
-    On Linux in ticks since the system started, which a change of the system's clock does not affect; elsewhere in
-    milliseconds since 1970.
+    On Linux in ticks since boot, which a change of the system's clock does not affect; elsewhere in milliseconds since
+    1970.
     """
     try:
         # The name of the program, in brackets, can contain any character.

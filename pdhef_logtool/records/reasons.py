@@ -1,13 +1,13 @@
 """Reported faults of a_y and yaw rate: the bits of a track's ``reason``, and their names.
 
-The bits are written to estimates.parquet and ``pdhef_msgs/VehicleStateEstimate``: none may change its meaning.
+The bits are written to estimates.parquet and ``pdhef_msgs/VehicleStateEstimate``; their meaning must not change.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-# Those of the yaw rate are those of a_y, shifted left by one.
+# The bits of the yaw rate are the bits of a_y, shifted left by one.
 BURST_AY, BURST_YAW_RATE = 1, 2
 SPIKE_AY, SPIKE_YAW_RATE = 4, 8
 STUCK_AY, STUCK_YAW_RATE = 16, 32
@@ -17,7 +17,7 @@ MISSING_AY, MISSING_YAW_RATE = 256, 512
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """One bit, its name for programs, and its name for people."""
+    """One bit, its identifier, and its text for display."""
 
     bit: int
     name: str

@@ -1,4 +1,4 @@
-"""What a command reports while it works: progress, warnings and notes, each as a line for users."""
+"""Progress, warnings and notes of a running command, each as a line for users."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def _ignore_progress(_text: str, _share: float) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Reporter:
-    """Receiver of a command's lines; the default one ignores them.
+    """Receiver of a command's lines, which ignores them by default.
 
     Attributes
     ----------

@@ -10,7 +10,7 @@ from pdhef_logtool.records.signals import FloatArray
 def running_mean(columns: FloatArray, half: int, weights: FloatArray | float = 1.0) -> FloatArray:
     """Return the mean of columns [N] or [N, c] over the finite rows up to ``half`` before and after each.
 
-    ``weights`` of the rows [N]; where all are 0 the mean is 0.
+    ``weights`` of the rows [N]; if all are 0, the mean is 0.
     """
     rows, n = np.arange(len(columns)), len(columns)
     table = columns.reshape(n, -1)

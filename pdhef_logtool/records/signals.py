@@ -15,7 +15,7 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 
 WHEELS = ("fl", "fr", "rl", "rr")
 
-#: Every signal that a mapping may name, with its SI unit (ISO 8855: x forward, y left, z up, positive left).
+#: All signals of mappings, with their SI units (ISO 8855: x forward, y left, z up, positive left).
 SIGNAL_UNITS: dict[str, str] = {
     "steer_rad": "rad",  # mean road-wheel angle
     "steering_wheel_rad": "rad",
@@ -31,16 +31,16 @@ SIGNAL_UNITS: dict[str, str] = {
     "gnss_velocity_north_m_s": "m/s",
     "gnss_speed_m_s": "m/s",
     "gnss_course_rad": "rad",  # ENU: counter-clockwise from east
-    "gnss_velocity_accuracy_m_s": "m/s",  # as the receiver states it, 1-sigma
+    "gnss_velocity_accuracy_m_s": "m/s",  # from the receiver, 1-sigma
     "gnss_fix_type": "1",  # below 1: no position
     "gnss_latitude_deg": "deg",  # of the antenna
     "gnss_longitude_deg": "deg",
-    "gnss_position_accuracy_m": "m",  # horizontal, as the receiver states it, 1-sigma
+    "gnss_position_accuracy_m": "m",  # horizontal, from the receiver, 1-sigma
     "gnss_heading_rad": "rad",  # of two antennas, ENU: only if mapped by hand
     "friction": "1",
 }
 
-#: Every truth channel that a mapping may name, with its unit. ``*_ecef*``, ``enu_*`` have 3 columns, ``quat_wxyz`` 4.
+#: All truth channels of mappings, with their units. ``*_ecef*``, ``enu_*`` have 3 columns, ``quat_wxyz`` 4.
 TRUTH_UNITS: dict[str, str] = {
     "vx_m_s": "m/s",
     "vy_m_s": "m/s",
@@ -63,7 +63,7 @@ TRUTH_UNITS: dict[str, str] = {
     "friction": "1",
 }
 
-#: Every quantity that a recorded estimate may consist of, with its unit. ``valid`` is 0 where it must not be used.
+#: All quantities of recorded estimates, with their units. ``valid`` is 0 where the estimate must not be used.
 ESTIMATE_UNITS: dict[str, str] = {
     "vx_m_s": "m/s",
     "vy_m_s": "m/s",
@@ -78,25 +78,25 @@ ESTIMATE_UNITS: dict[str, str] = {
     "diverged": "1",
 }
 
-#: How the names of all GNSS signals begin.
+#: Prefix of the names of all GNSS signals.
 GNSS = "gnss_"
 #: GNSS velocity by its components, or as speed and course.
 GNSS_COMPONENTS = frozenset({"gnss_velocity_east_m_s", "gnss_velocity_north_m_s"})
 #: GNSS position.
 GNSS_POSITION = ("gnss_latitude_deg", "gnss_longitude_deg")
-#: Signals and ground truth that state a place.
+#: Signals and ground truth with a position on Earth.
 POSITIONS = frozenset({*GNSS_POSITION, "lat_deg", "lon_deg", "alt_m", "x_m", "y_m", "ecef_position_m"})
 _GNSS_POLAR = frozenset({"gnss_speed_m_s", "gnss_course_rad"})
-#: Signals the alignment's output carries as one column each.
+#: Signals with one column each in the output of the alignment.
 ALIGNED_SIGNALS = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")
 
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """Something in the input that was not used, and why.
+    """A part of the input that was not used, and the reason.
 
     ``severity`` ``"lost"`` means that data of the log are missing (exit code 3); ``"note"`` is information for the
-    reader of a report, with nothing missing.
+    report.
     """
 
     kind: str  # short slug: "truncated", "bad-chunk", "nan", "duplicate-stamp", "gap", ...
@@ -116,9 +116,9 @@ class Channel:
     ----------
     name : signal or ground truth name.
     unit : SI unit.
-    source : ``topic`` and dotted field it came from, as ``/topic.field``.
+    source : topic and dotted field, as ``/topic.field``.
     stamps_ns : int64 [N], measurement time (stamp − latency, in the log's clock), ascending and unique.
-    arrival_ns : int64 [N], when the recorder had it (log time); never before ``stamps_ns``.
+    arrival_ns : int64 [N], arrival at the recorder (log time); never before ``stamps_ns``.
     values : float64 [N] or [N, k]; finite.
     """
 
@@ -139,7 +139,7 @@ class Channel:
         return Channel(self.name, self.unit, self.source, stamps, arrival, values)
 
     def between(self, start_ns: int, end_ns: int | None = None) -> Channel:
-        """Return the samples with stamps in [start_ns, end_ns), to the last one when ``end_ns`` is None."""
+        """Return the samples with stamps in [start_ns, end_ns); ``end_ns`` None includes the last one."""
         first = int(np.searchsorted(self.stamps_ns, start_ns))
         return self.take(slice(first, None if end_ns is None else int(np.searchsorted(self.stamps_ns, end_ns))))
 
@@ -155,15 +155,15 @@ class Signals:
     Attributes
     ----------
     stamps_ns : int64 [N], strictly increasing, irregular steps kept.
-    ready_ns : int64 [N], non-decreasing: when everything used at this stamp had arrived.
+    ready_ns : int64 [N], non-decreasing: arrival of the last sample that is used up to this stamp.
     steer_rad, ax_m_s2, ay_m_s2, yaw_rate_rad_s, speed_m_s, friction : float64 [N].
     wheel_speed_m_s : float64 [N, 4] in the order fl, fr, rl, rr.
-    available : names of the signals that the log's mapping provides at all.
+    available : names of the signals that the log's mapping provides.
     gnss_velocity_m_s : float64 [N, 2], east and north, of the antenna, finite only at the first stamp after a new
-        sample. gnss_velocity_std_m_s : float64 [N], as the receiver states it. gnss_late_s : float64 [N], from the
-        stamp to the arrival of a velocity that ``ready_ns`` does not wait for. NaN where they are not given.
+        sample. gnss_velocity_std_m_s : float64 [N], from the receiver. gnss_late_s : float64 [N], time from the stamp
+        to the arrival of a velocity that ``ready_ns`` does not wait for.
     gnss_position_deg : float64 [N, 2], latitude and longitude; gnss_position_std_m, gnss_heading_rad : float64 [N].
-    roll_rate_rad_s, pitch_rate_rad_s : float64 [N]. All of these are NaN where they are not given.
+    roll_rate_rad_s, pitch_rate_rad_s : float64 [N]. Missing columns are filled with NaN.
     """
 
     stamps_ns: IntArray
@@ -186,7 +186,7 @@ class Signals:
     pitch_rate_rad_s: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
-        """Fill columns that are not given with NaN."""
+        """Fill missing columns with NaN."""
         for name in _COLUMNS:
             column = getattr(self, name)
             if len(column) != len(self):

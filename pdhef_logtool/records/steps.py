@@ -1,4 +1,4 @@
-"""Steps on measurement time, and what had arrived of them by a scored stamp: the rule that keeps estimates causal."""
+"""Steps on measurement time and their availability at scored stamps, which makes estimates causal."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
-#: An output is not predicted further than this beyond the newest processed step; the stamp is then not valid.
+#: Longest prediction of an output after the newest processed step; beyond it, the stamp is not valid.
 MAX_PREDICTION_S = 0.3
-#: A longer step between stamps is a gap: after it every filter and every monitor starts again.
+#: A longer step between stamps is a gap, after which all filters and monitors restart.
 RESTART_GAP_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepColumns:
-    """Base of records whose fields are arrays over the same steps, [K, ...], such records, or tuples of them."""
+    """Base of records with arrays over the same steps, [K, ...], such records, or tuples of them as fields."""
 
     def joined(self, other: Self) -> Self:
         """Append the steps of the next window."""
@@ -25,11 +25,11 @@ class StepColumns:
         return type(self)(*(_joined(a, b) for a, b in pairs))
 
     def since(self, index: int) -> Self:
-        """Keep the steps from ``index`` on."""
+        """Return the steps from ``index``."""
         return self._cut(slice(index, None))
 
     def until(self, index: int) -> Self:
-        """Keep the steps before ``index``."""
+        """Return the steps before ``index``."""
         return self._cut(slice(index))
 
     def _cut(self, part: slice) -> Self:
@@ -50,9 +50,9 @@ def _cut(column: Any, part: slice) -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Release:
-    """Newest available step at each scored stamp, [M]: ``arrived`` is whether there is any, ``row`` is 0 if not.
+    """Newest available step at each scored stamp, [M]: ``arrived`` is False without any, and ``row`` is then 0.
 
-    ``needed`` is the first step that a coming stamp may still ask for.
+    ``needed`` is the first step that later stamps may need.
     """
 
     arrived: BoolArray
@@ -61,7 +61,7 @@ class Release:
 
 
 def released_steps(ready_ns: IntArray, stamps_ns: IntArray) -> IntArray:
-    """Return for each scored stamp the newest step whose data had arrived by then, −1 for none.
+    """Return for each scored stamp the newest step with all data arrived by then, −1 without one.
 
     ``ready_ns`` [K] is non-decreasing, ``stamps_ns`` [M]; the result is int64 [M] (docs/method.md#delay).
     """
@@ -69,14 +69,14 @@ def released_steps(ready_ns: IntArray, stamps_ns: IntArray) -> IntArray:
 
 
 def release(ready_ns: IntArray, stamps_ns: IntArray) -> Release:
-    """Return the result of :func:`released_steps`, ready to index the steps with; [0] where there are no stamps."""
+    """Return the result of :func:`released_steps` as indices of the steps; [0] without stamps."""
     index = released_steps(ready_ns, stamps_ns)
     row = np.maximum(index, 0)
     return Release(index >= 0, row, int(row[-1]) if len(row) else 0)
 
 
 def step_durations_s(stamps_ns: IntArray, before_ns: int | None) -> FloatArray:
-    """Return the time that ends at each step, [K]; NaN at the first where nothing was before it (``before_ns``)."""
+    """Return the duration before each step, [K]; NaN at the first step without an earlier stamp ``before_ns``."""
     dt = np.empty(len(stamps_ns))
     if len(dt):
         dt[0] = np.nan if before_ns is None else (int(stamps_ns[0]) - before_ns) * 1e-9
@@ -85,7 +85,7 @@ def step_durations_s(stamps_ns: IntArray, before_ns: int | None) -> FloatArray:
 
 
 def last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
-    """Carry measurements [N], which are at one stamp only, forward for up to :data:`RESTART_GAP_S`."""
+    """Extend measurements [N], which are finite at single stamps, over up to :data:`RESTART_GAP_S`."""
     finite = np.isfinite(values)
     last = np.maximum.accumulate(np.where(finite, np.arange(values.shape[0]), -1))
     fresh = (last >= 0) & (stamps_ns - stamps_ns[np.maximum(last, 0)] <= RESTART_GAP_S * 1e9)
@@ -93,19 +93,19 @@ def last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
 
 
 def last_stamp_ns(stamps_ns: IntArray, before_ns: int | None) -> int | None:
-    """Return the last stamp of a window, or that of the window before where it is empty."""
+    """Return the last stamp of a window, or ``before_ns`` for an empty window."""
     return int(stamps_ns[-1]) if len(stamps_ns) else before_ns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extrapolation:
-    """From which step, and how far, the state at each scored stamp is extrapolated, [M].
+    """Start step and duration of the extrapolation to each scored stamp, [M].
 
     Attributes
     ----------
-    step : int64, newest step whose data had arrived by the stamp; 0 where there is none.
+    step : int64, newest step with all data arrived by the stamp; 0 without one.
     arrived : whether there is one.
-    horizon_s : from the step to the stamp; NaN where there is none.
+    horizon_s : time from the step to the stamp; NaN without one.
     usable : whether the step is valid and at most ``MAX_PREDICTION_S`` old.
     """
 

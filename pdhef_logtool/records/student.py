@@ -1,4 +1,4 @@
-"""Quantiles of Student's t without SciPy, which takes longer to import than a short log takes to process."""
+"""Quantiles of Student's t without SciPy, because its import takes longer than processing a short log."""
 
 from __future__ import annotations
 

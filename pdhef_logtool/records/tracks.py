@@ -12,7 +12,7 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 #: Name of the sideslip reference in tables, files and recordings.
 REFERENCE = "reference"
-#: Columns of estimates.parquet in order, ``estimator`` left out (it is the track's name).
+#: Columns of estimates.parquet in order, without ``estimator`` (the name of the track).
 TRACK_COLUMNS = (
     "stamp_ns",
     "vx_m_s",
@@ -53,7 +53,7 @@ SHARE_COLUMNS = TRACK_COLUMNS[-4:]
 ESTIMATED_COLUMNS = TRACK_COLUMNS[-10:-4]
 #: Above this share of GNSS in its information the reference is independent of estimators that use the same IMU.
 INDEPENDENT_SHARE = 0.5
-#: Those that a source may not have at all.
+#: Columns that a source may lack.
 OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUMNS, "measured_speed_m_s")
 
 
@@ -61,15 +61,14 @@ OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUM
 class StateTrack:
     """Planar vehicle state over time, at the CG, ISO 8855, SI; an estimate or the ground truth.
 
-    Every float column has shape [N]; NaN means "not known". ``covariance`` is [N, 3, 3] over [v_x, v_y, r] or of
-    length 0 when the source gives none. ``x_m``, ``y_m``, ``yaw_rad`` are in a local ENU frame.
-    ``valid`` is False where the source marks its state as invalid. ``diverged`` flags the stamps at
-    which the estimator itself reports divergence. ``nis`` has the degrees of freedom ``nis_dof`` at each stamp.
-    ``mixture_weight`` (of all filters of an adaptive estimator but its first) and ``reason`` (bits of
-    :mod:`pdhef_logtool.records.reasons`, what is reported of a_y and yaw rate) are [N], or of length 0 where the source
-    has none; so are roll and bank, the share by which all lateral forces are larger, the biases by which sensors
-    read too much, and the shares of axle law, kinematics and GNSS in the sideslip reference. ``measured_speed_m_s`` of
-    the ground truth is the speed of the log's sensors; it decides where sideslip is scored if v_x is not known.
+    Every float column has shape [N]; NaN means unknown. ``covariance`` is [N, 3, 3] over [v_x, v_y, r], or empty if the
+    source provides none. ``x_m``, ``y_m``, ``yaw_rad`` are in a local ENU frame. ``valid`` is False where the source
+    marks its state as invalid. ``diverged`` marks the stamps at which the estimator reports divergence. ``nis`` has the
+    degrees of freedom ``nis_dof`` at each stamp. ``mixture_weight`` (of all filters of an adaptive estimator except the
+    first) and ``reason`` (bits of :mod:`pdhef_logtool.records.reasons`, faults of a_y and yaw rate) are [N], or empty
+    if the source provides none; the same applies to roll and bank, the relative excess of all lateral forces, the
+    sensor biases, and the shares of axle law, kinematics and GNSS in the sideslip reference. ``measured_speed_m_s`` of
+    the ground truth is the speed of the log's sensors; it decides where sideslip is scored if v_x is unknown.
     """
 
     name: str
@@ -129,7 +128,7 @@ class StateTrack:
         return np.full(len(self), np.nan) if covariance.shape[0] == 0 else np.sqrt(covariance[:, i, i])
 
     def columns(self) -> dict[str, FloatArray | IntArray | BoolArray]:
-        """Return the columns of estimates.parquet by name, in order; without those that the source has not."""
+        """Return the columns of estimates.parquet by name, in order, without missing ones."""
         return {
             c: getattr(self, "stamps_ns" if c == "stamp_ns" else c)
             for c in TRACK_COLUMNS
@@ -143,12 +142,12 @@ class StateTrack:
         return StateTrack(name=self.name, **{c: v[start:end] if len(v) == n else v for c, v in columns.items()})
 
     def between(self, start_ns: int | None, end_ns: int) -> StateTrack:
-        """Return the stamps in [start_ns, end_ns), from the first one when ``start_ns`` is None."""
+        """Return the stamps in [start_ns, end_ns); ``start_ns`` None includes the first one."""
         first = 0 if start_ns is None else int(np.searchsorted(self.stamps_ns, start_ns))
         return self.rows(first, int(np.searchsorted(self.stamps_ns, end_ns)))
 
     def without_sideslip_below(self, speed_m_s: float) -> StateTrack:
-        """Return the track with its sideslip unknown (NaN) where its own speed is lower: it has no direction there."""
+        """Return the track with sideslip NaN where its speed is lower and has no direction."""
         vy = np.where(np.isfinite(self.vy_m_s), self.vy_m_s, 0.0)
         slow = np.hypot(self.vx_m_s, vy) < speed_m_s
         if not slow.any():
@@ -159,7 +158,7 @@ class StateTrack:
 
     @property
     def something_known(self) -> BoolArray:
-        """Mask of the stamps with a known quantity, [N]."""
+        """Mask of the stamps with any finite quantity, [N]."""
         finite = np.isfinite(self.vx_m_s) | np.isfinite(self.vy_m_s) | np.isfinite(self.yaw_rate_rad_s)
         return np.asarray(finite | np.isfinite(self.sideslip_rad) | np.isfinite(self.ay_m_s2), dtype=np.bool_)
 
@@ -169,9 +168,9 @@ class StateTrack:
 
 
 def make_track(name: str, stamps_ns: IntArray, **columns: FloatArray | IntArray | BoolArray) -> StateTrack:
-    """Build a track from the columns at hand; the rest is NaN (``valid`` True, ``diverged`` False).
+    """Build a track from some columns; the others are NaN (``valid`` True, ``diverged`` False).
 
-    ``sideslip_rad`` is derived as atan2(v_y, v_x) when it is not given.
+    ``sideslip_rad`` is atan2(v_y, v_x) by default.
     """
     n = int(stamps_ns.shape[0])
     needed = [f.name for f in fields(StateTrack) if f.name not in OPTIONAL_COLUMNS]
@@ -184,7 +183,7 @@ def make_track(name: str, stamps_ns: IntArray, **columns: FloatArray | IntArray 
 
 
 def diagonal_covariance(stds: Sequence[FloatArray]) -> FloatArray:
-    """Return [N, 3, 3] with the variances of v_x, v_y, r, [N] each, NaN beside them; [0, 3, 3] if none is known."""
+    """Return [N, 3, 3] with the variances of v_x, v_y, r and NaN off the diagonal; [0, 3, 3] if all are unknown."""
     std = np.stack(stds, axis=1)
     if not np.isfinite(std).any():
         return np.empty((0, 3, 3))

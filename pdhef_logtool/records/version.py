@@ -1,5 +1,5 @@
-"""The version, where every floor may read it."""
+"""Version of the package, importable from every layer."""
 
 __version__ = "0.2.0"
-#: Writer name in our files.
+#: Writer name in output files.
 LIBRARY = f"pdhef-logtool {__version__}"

@@ -1,4 +1,4 @@
-"""The figures of a page as records, and the document that the page's script draws them from."""
+"""Figures of a page as records, and the document from which the page's script draws them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pdhef_logtool.records.printable import all_printable
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.encoding import Grid, encode
 
-#: Intervals that a row of a strip shows at most; those closest to each other are joined for the picture.
+#: Maximum number of intervals in a row of a strip; beyond, the intervals closest to each other are joined.
 _MOST_SPANS = 1500
 _LABEL_SIGNS = 60
 
@@ -22,7 +22,7 @@ _LABEL_SIGNS = 60
 class Series:
     """A line over a page's grid: ``values`` [cells] or, from an envelope, [cells, 2].
 
-    ``dash``: lengths of strokes and gaps in pixels. A ``group`` is shown when its box on the page is ticked.
+    ``dash``: lengths of strokes and gaps in pixels. A ``group`` is visible if its box on the page is ticked.
     """
 
     label: str
@@ -46,7 +46,7 @@ class Band:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A numbered place on a time figure, in seconds from the log's start, at ``value`` of its unit."""
+    """A numbered point in a time figure, in seconds from the log's start, at ``value`` in the figure's unit."""
 
     label: str
     at_s: float
@@ -54,7 +54,7 @@ class Mark:
 
 
 class Span(NamedTuple):
-    """Something that lasted, in seconds from the log's start."""
+    """A time interval, in seconds from the log's start."""
 
     start_s: float
     end_s: float
@@ -72,7 +72,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
-    """Points ``x``, ``y`` [M]; those with ``at_s`` [M], seconds from the log's start, follow the page's zoom."""
+    """Points ``x``, ``y`` [M]; points with ``at_s`` [M], seconds from the log's start, follow the page's zoom."""
 
     label: str
     colour: str
@@ -95,20 +95,20 @@ class Interval:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Figure:
-    """What all figures have; ``kind`` decides what the page's script draws."""
+    """Base class of all figures; ``kind`` selects the drawing function of the page's script."""
 
     kind: ClassVar[str]
     title: str
 
     @property
     def heading(self) -> str:
-        """What is over the figure."""
+        """Heading of the figure."""
         return self.title
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeFigure(Figure):
-    """Lines over time. ``level``: a value that is drawn across; ``resolution``: what nobody sees, in the unit."""
+    """Lines over time. ``level``: value of a horizontal line; ``resolution``: storage resolution in the unit."""
 
     kind = "time"
     unit: str
@@ -122,7 +122,7 @@ class TimeFigure(Figure):
 
     @property
     def heading(self) -> str:
-        """What is over the figure."""
+        """Heading of the figure, with its unit."""
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
 
@@ -136,7 +136,7 @@ class StripFigure(Figure):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointsFigure(Figure):
-    """Points in a plane. ``equal``: one scale on both axes; ``log``: both are logarithmic."""
+    """Points in a plane. ``equal``: same scale on both axes; ``log``: logarithmic axes."""
 
     kind = "points"
     x_label: str
@@ -148,7 +148,7 @@ class PointsFigure(Figure):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IntervalsFigure(Figure):
-    """Figures with their intervals, one below the other; ``zero`` is drawn across."""
+    """Figures with their intervals, one below the other; ``zero``: value of a vertical line."""
 
     kind = "intervals"
     unit: str
@@ -169,14 +169,14 @@ class BarsFigure(Figure):
 
 @dataclass(slots=True, eq=False)
 class Charts:
-    """The figures of one page by key, in order. ``grid`` and ``origin_ns`` (0 s): of those over time, None without."""
+    """The figures of one page by key, in order. ``grid``, ``origin_ns`` (0 s): for figures over time; None without."""
 
     grid: Grid | None = None
     origin_ns: int = 0
     figures: dict[str, Figure] = field(default_factory=dict)
 
     def text(self, key: str) -> str:
-        """Return a figure in words: what it shows, and the range of each of its tracks."""
+        """Return a text description of a figure with the range of each track."""
         figure = self.figures[key]
         if isinstance(figure, TimeFigure):
             parts = [f"{s.label} {_range(s.values)}" for s in figure.series if not s.group]
@@ -201,7 +201,7 @@ class Charts:
         return 0.0 if self.grid is None else (self.grid.start_ns - self.origin_ns) * 1e-9
 
     def document(self) -> tuple[dict[str, Any], dict[str, str]]:
-        """Return what the page's script draws, and the blocks of text that it names, by name."""
+        """Return the document for the page's script, and the text blocks that it refers to, by name."""
         packed = _Blocks()
         figures = {
             key: {"kind": figure.kind, **packed.entries(figure, getattr(figure, "resolution", 0.0))}
@@ -213,14 +213,14 @@ class Charts:
 
 
 class _Blocks:
-    """The encoded series of a page; the same array is held once."""
+    """The encoded series of a page; equal arrays are stored once."""
 
     def __init__(self) -> None:
         self.texts: dict[str, str] = {}
         self._known: dict[tuple[int, float], dict[str, Any]] = {}
 
     def add(self, values: FloatArray, resolution: float = 0.0) -> dict[str, Any]:
-        """Return where the script finds a series."""
+        """Add a series and return its reference for the script."""
         key = (id(values), resolution)
         if key not in self._known:
             made = encode(values, resolution)
@@ -230,7 +230,7 @@ class _Blocks:
         return self._known[key]
 
     def entries(self, record: Any, resolution: float) -> dict[str, Any]:
-        """Return a record by its fields, as the page's script reads it."""
+        """Return a record by its fields for the page's script."""
         return {f.name: self._plain(getattr(record, f.name), resolution) for f in fields(record)}
 
     def _plain(self, value: Any, resolution: float) -> Any:
@@ -257,7 +257,7 @@ def _label(text: str) -> str:
 
 
 def joined(spans: Sequence[Span]) -> list[Span]:
-    """Return the spans in order of time, at most :data:`_MOST_SPANS`: the narrowest gaps between them are closed."""
+    """Return the spans in order of time, at most :data:`_MOST_SPANS`, by closing the narrowest gaps between them."""
     ordered = sorted(spans, key=lambda s: (s.start_s, s.end_s))
     if len(ordered) <= _MOST_SPANS:
         return ordered

@@ -1,4 +1,4 @@
-"""Colours of a page: those of every other output, dark enough for a white ground."""
+"""Colours of a page: the colours of all other outputs, darkened for a white background."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from pdhef_logtool.results.palette import colour_rgb
 from pdhef_logtool.results.sink import TRUTH
 
 INK = "#1a1a1a"
-#: Of what is wrong, of what is only given, and of what goes on; safe beside each other for the colour-blind.
+#: Colours of faults, notes and normal events, distinguishable for the colour-blind.
 FAULT, NOTE, PLAIN = "#b2182b", "#7a5195", "#6b7785"
-#: Of lines on white, as WCAG 2.1 asks of graphics.
+#: Minimum contrast of lines on white according to WCAG 2.1.
 _LEAST_CONTRAST = 3.0
 
 
 def colour(name: str) -> str:
-    """Return ``#rrggbb`` of an estimator or of the ground truth, the same on every page."""
+    """Return the colour ``#rrggbb`` of an estimator or of the ground truth, which is the same on every page."""
     if name == TRUTH:
         return INK
     rgb = colour_rgb(name, {s.name: s.colour for s in all_specs()})

@@ -22,14 +22,14 @@ from pdhef_logtool.results.comparison_words import (
     verdict_text,
 )
 
-#: Drives in the table, half of them from either end.
+#: Maximum number of drives in the table, half of them from either end.
 _MOST_DRIVES = 200
 _KIND = {"worse": "bad", "no figure": "bad", "better": "good", "not worse": "good", "equal": "good", "inconclusive": ""}
 _BLUE = "#0072b2"
 
 
 def comparison_page(comparison: Comparison) -> bytes:
-    """Return the page of a comparison, a whole HTML file."""
+    """Return the page of a comparison as a complete HTML file."""
     charts = Charts()
     if comparison.figures and not comparison.equal:
         _draw(comparison, charts)
@@ -92,7 +92,7 @@ def _interval(figure: ComparedFigure, colour: str) -> Interval:
 
 
 def _drives(figure: ComparedFigure) -> dict[str, Any]:
-    """Return the table of the drives of the first figure, those at both ends where there are many."""
+    """Return the table of the drives of the first figure; of many drives, only both ends."""
     unit, factor = read_unit(figure.unit)
     half = _MOST_DRIVES // 2
     shown = figure.drives if len(figure.drives) <= _MOST_DRIVES else (*figure.drives[:half], *figure.drives[-half:])

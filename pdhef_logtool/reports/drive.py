@@ -17,16 +17,16 @@ from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
 from pdhef_logtool.results.run_report import reasons_line
 
-#: The strongest filter on physics alone.
+#: The best filter with physics only.
 _PHYSICS = "physics"
-#: Of a shorter drive nothing can be stated with any certainty.
+#: Minimum duration of a drive for conclusions, in s.
 _SHORT_S = 10.0
-#: The figures of a page, in the order in which they are.
+#: Keys of the figures, in the order of the page.
 OVER_TIME = ("sideslip", "error", "trust", "r_scale", "nis", "speed", "ay", "strip")
 IN_PLANE = ("path", "ay_sideslip", "phase")
-#: Rows of tables that a log can make as long as it likes.
+#: Maximum number of rows of tables that grow with the length of the log.
 _MOST_ROWS = 200
-#: Outcomes of verdicts: a word, and the class of the style.
+#: Word and style class of each outcome.
 OUTCOMES = {
     "better": ("better", "good"),
     "same": ("as good", ""),
@@ -39,7 +39,7 @@ OUTCOMES = {
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A sentence on one signal, and the word that sums it up; ``kind``: class of the style."""
+    """A sentence on one signal, and its summary in a word; ``kind``: class of the style."""
 
     signal: str
     word: str
@@ -49,7 +49,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivePage:
-    """The page of a drive: the HTML, the figures in it, and what is wrong with a file that it lacks."""
+    """The page of a drive: the HTML, its figures, and the error of a file that could not be read."""
 
     html: bytes
     charts: Charts
@@ -57,7 +57,7 @@ class DrivePage:
 
 
 def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
-    """Return the page of a log of a run; one that failed has a page that states why.
+    """Return the page of a log of a run; for a failed log, a page with the reason.
 
     ``back``: address of the page of the whole run, empty without one. Raises OutputError for a damaged report.json.
     """
@@ -68,7 +68,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
     figures, why_none, wrong = None, "", ""
     roles = roles_of(report)
     if roles is None:
-        why_none = "Nothing was estimated, so that there is nothing to draw."
+        why_none = "No estimator ran, so that there are no figures."
     else:
         try:
             path = log.file(ESTIMATES_FILE)
@@ -78,7 +78,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
             why_none = f"{wrong[0].upper()}{wrong[1:]}"
         else:
             if path is None:
-                why_none = f"{ESTIMATES_FILE} is not in the folder of this log; the figures below are of report.json."
+                why_none = f"{ESTIMATES_FILE} is not in the folder of this log; the tables are from report.json."
             elif figures is None:
                 why_none = f"{ESTIMATES_FILE} has no row of {roles.main}."
     charts = Charts() if figures is None else figures.charts
@@ -117,7 +117,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
 
 
 def roles_of(report: Mapping[str, Any]) -> Roles | None:
-    """Return who is drawn how: the selected estimate, and what the verdict on sideslip compares it with, or physics."""
+    """Return the names to draw: the selected estimate, its rival in the verdict on sideslip (else physics), others."""
     names: list[str] = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
     if not names:
         return None
@@ -131,7 +131,7 @@ def roles_of(report: Mapping[str, Any]) -> Roles | None:
 
 
 def identical_to(report: Mapping[str, Any], main: str) -> list[str]:
-    """Return the estimators whose errors equal those of ``main`` bit for bit: the same filter under another name."""
+    """Return the estimators with bit-identical errors to ``main``: the same filter with another name."""
     figures: dict[str, dict[tuple[str, str], Any]] = {}
     for m in report["metrics"]:
         if m["segment"] == "all" and m["metric"] in ("rmse", "max_abs", "nis") and m["value"] is not None:
@@ -148,7 +148,7 @@ def _told(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 
 def verdicts_of(report: Mapping[str, Any]) -> list[Verdict]:
-    """Return the sentences at the head of a page; without verdicts, the words of the selected estimate."""
+    """Return the sentences at the head of a page; without verdicts, the text of the selected estimate."""
     signals: dict[tuple[str, str, str], list[str]] = {}
     for v in _told(report):
         word, kind = OUTCOMES.get(str(v.get("outcome")), (str(v.get("outcome")), ""))
@@ -162,25 +162,25 @@ def verdicts_of(report: Mapping[str, Any]) -> list[Verdict]:
 
 
 def _notices(report: Mapping[str, Any], figures: DriveFigures | None) -> list[str]:
-    """Return the warnings that a reader needs before the figures."""
+    """Return warnings that precede the figures."""
     said = []
     duration = report["log"]["duration_s"]
     if duration < _SHORT_S:
-        said.append(f"The log is only {duration:.1f} s long: too short to judge an estimator by.")
+        said.append(f"The log is only {duration:.1f} s long: too short to evaluate an estimator.")
     if figures is not None and not figures.moves:
-        said.append("The car is never fast enough for a sideslip: none is drawn.")
+        said.append("The car is never fast enough for a sideslip; no sideslip is drawn.")
     if not report["truth"]["available"]:
         said.append(
-            "The log has no ground truth: no error is known, and no estimate can be called good or bad. Shown instead: "
-            "how far the estimates disagree, and how much sensors surprise the filters."
+            "The log has no ground truth: no errors are available. The page shows instead "
+            "the disagreement of the estimates and the innovations of the filters."
         )
     elif figures is not None and not figures.scored and figures.moves:
         said.append(
             "The ground truth of this log does not score sideslip: "
-            "disagreement of the estimates is shown in place of errors."
+            "the page shows the disagreement of the estimates instead of errors."
         )
     if figures is not None and figures.absent:
-        said.append(f"Not in estimates.parquet, so not drawn: {', '.join(figures.absent)}.")
+        said.append(f"Not drawn, as estimates.parquet does not contain them: {', '.join(figures.absent)}.")
     return said
 
 

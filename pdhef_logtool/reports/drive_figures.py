@@ -33,16 +33,16 @@ from pdhef_logtool.reports.encoding import grid_of
 from pdhef_logtool.results.error_places import ErrorPlace
 from pdhef_logtool.results.sink import TRUTH
 
-#: What nobody sees on a page, in degrees, as a share, and in m/s or m/s².
+#: Storage resolution of figures: in degrees, of shares, and in m/s or m/s².
 _DEGREES_SEEN, _SHARE_SEEN, _SEEN = 0.001, 0.001, 0.002
-#: Stamps further apart are a gap, where they are also further apart than so many median steps.
+#: Minimum size of a gap between stamps, in s and in median steps.
 _GAP_S, _GAP_STEPS = 0.25, 5.0
 _MOST_POINTS = 12_000
-#: The first screen shows the sideslip so far around the largest error, with so many points.
+#: Half window around the largest error, and maximum number of points, in the figure of the first screen.
 _AROUND_NS, _MOST_AROUND = 4_000_000_000, 1000
-#: Small, medium and large errors along the path: Okabe and Ito (2008), dark enough for white.
+#: Colours for small, medium and large errors along the path: Okabe and Ito (2008), dark enough for white.
 _ERROR_COLOURS = ("#0072b2", "#b07800", "#c8400a")
-#: A shorter path is a point.
+#: Minimum extent of a path to be drawn.
 _LEAST_PATH_M = 1.0
 _DASHES: tuple[tuple[int, ...], ...] = ((6, 3), (2, 2), (8, 3, 2, 3), (4, 4), (10, 4))
 #: Figures in the plane: key, title, labels of the axes.
@@ -54,7 +54,7 @@ _PLANES = (
 
 @dataclass(frozen=True, slots=True)
 class Roles:
-    """Who is drawn how: the selected estimate, the best physics (empty without), and the others that ran."""
+    """Names of the selected estimate, the best physics (empty without), and the others that ran."""
 
     main: str
     rival: str
@@ -62,11 +62,11 @@ class Roles:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All of them, the selected estimate first."""
+        """All names, the selected estimate first."""
         return tuple(n for n in (self.main, self.rival, *self.others) if n)
 
     def series(self, name: str, values: FloatArray, width: float = 1.2) -> Series:
-        """Return a line as its estimator is drawn: selected, ground truth, best physics always, others by box."""
+        """Return the line of an estimator; lines other than selected, ground truth and best physics have a box."""
         if name == self.main:
             return Series(name, colour(name), values, width + 1.0)
         if name not in self.others:
@@ -77,7 +77,7 @@ class Roles:
 
 @dataclass(frozen=True, slots=True)
 class Peak(ErrorPlace):
-    """One of the largest errors with its seconds from the log's start, and the segments that it is in."""
+    """One of the largest errors with its seconds from the log's start, and the segments that contain it."""
 
     at_s: float
     during: str
@@ -85,10 +85,10 @@ class Peak(ErrorPlace):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveFigures:
-    """What is drawn of a drive, and what the page states beside it.
+    """The figures of a drive, and the related texts of the page.
 
-    ``scored``: whether any sideslip error is known. ``moves``: whether a sideslip is known at all above the low-speed
-    blend. ``absent``: estimators that the report names and the file has not.
+    ``scored``: whether any sideslip error is available. ``moves``: whether any sideslip is available above the
+    low-speed blend. ``absent``: estimators of the report that the file does not contain.
     """
 
     charts: Charts
@@ -105,11 +105,11 @@ class DriveFigures:
 
 
 def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveFigures | None:
-    """Return the figures of a drive, None where the file contains no row of its answer.
+    """Return the figures of a drive; None if the file contains no row of the selected estimate.
 
     Parameters
     ----------
-    path : estimates.parquet. Sideslip is a gap below the low-speed limit of the report.
+    path : estimates.parquet. The sideslip has gaps below the low-speed limit of the report.
 
     Raises
     ------
@@ -150,7 +150,7 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveF
 
 
 def _reference(tracks: Tracks, peaks: Sequence[Peak]) -> Reference | None:
-    """Return what the largest errors of the report are against; None where it has none."""
+    """Return the reference of the report's largest errors; None if it is not available."""
     against = peaks[0].against if peaks else ""
     return Reference(tracks.read(against), against == TRUTH, tracks) if against in tracks.names else None
 
@@ -174,7 +174,7 @@ def _peaks(report: Mapping[str, Any]) -> tuple[Peak, ...]:
 
 
 def _lines(series: Mapping[str, DriveSeries], roles: Roles, values: str, names: Sequence[str]) -> list[Series]:
-    """Return a line of each track that has any such value; the selected estimate, the widest, lies below the others."""
+    """Return a line for each track with any finite value; the selected estimate is the widest and lowest."""
     lines = []
     for name in sorted(names, key=lambda n: n != roles.main):
         if name in series:
@@ -203,7 +203,7 @@ def _add_error(
     lines = _lines(series, roles, "error", roles.names)
     if not lines:
         return
-    title = f"Disagreement: sideslip of the others less that of {roles.main}, absolute"
+    title = f"Disagreement: sideslip difference from {roles.main}, absolute"
     if scored:
         title = "Absolute error of sideslip, largest of each cell"
     marks = [Mark(str(i + 1), p.at_s, abs(p.error_rad) * DEGREES) for i, p in enumerate(peaks)]
@@ -234,7 +234,7 @@ def _add_motion(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles)
 def _rows(
     report: Mapping[str, Any], series: Mapping[str, DriveSeries], roles: Roles, stamps: IntArray, origin_ns: int
 ) -> list[Row]:
-    """Return the rows of the strip: what is missing or wrong, then what the car did."""
+    """Return the rows of the strip: missing or faulty signals first, then the driving segments."""
 
     def span(start_ns: int, end_ns: int, text: str) -> Span:
         return Span((int(start_ns) - origin_ns) * 1e-9, (int(end_ns) - origin_ns) * 1e-9, text)
@@ -282,7 +282,7 @@ def _cloud(name: str, points: FloatArray | None, origin_ns: int) -> Cloud | None
 def _add_worst(
     charts: Charts, answer: StateTrack, reference: Reference | None, peaks: Sequence[Peak], origin_ns: int
 ) -> None:
-    """Add the sideslip around the largest error: the one figure of the first screen."""
+    """Add the sideslip around the largest error, the only figure of the first screen."""
     if reference is None or not peaks:
         return
     worst = peaks[0]
@@ -304,7 +304,7 @@ def _add_worst(
 def _add_path(
     charts: Charts, series: Mapping[str, DriveSeries], roles: Roles, drift: Mapping[str, float] | None
 ) -> str:
-    """Add the dead-reckoned path, aligned with that of the ground truth; return its drift in words."""
+    """Add the dead-reckoned path, aligned with the ground truth's; return a text about its drift."""
     truth, estimate = (thinned(series[n].path, _MOST_POINTS) for n in (TRUTH, roles.main))
     if truth.shape[1] < 2 or max(np.ptp(truth[1]), np.ptp(truth[2])) < _LEAST_PATH_M:
         return ""

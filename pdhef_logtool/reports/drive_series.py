@@ -1,4 +1,4 @@
-"""The series of one drive from its estimates.parquet, one track after the other, as a page draws them."""
+"""Series of one drive for its page, read from estimates.parquet track by track."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from pdhef_logtool.reports.encoding import Grid, envelope, first_known, means
 from pdhef_logtool.results.parquet_sink import list_estimators, read_track
 from pdhef_logtool.results.sink import TRUTH
 
-#: NIS is shown as its mean over so long.
+#: Averaging window of NIS in the figure.
 _NIS_S = 1.0
-#: What is drawn of every track, and beside it of the ground truth and of the selected estimate.
+#: Columns to draw of every track, and further columns of the ground truth and the selected estimate.
 _COLUMNS = ("vx_m_s", "vy_m_s", "sideslip_rad", "network_trust", "r_scale", "nis", "valid", "reason")
 _MORE_COLUMNS = ("yaw_rate_rad_s", "ay_m_s2", "x_m", "y_m", "sideslip_std_rad")
-#: What errors and gaps of sideslip are given from.
+#: Columns that determine errors and gaps of the sideslip.
 OF_SIDESLIP = ("vx_m_s", "vy_m_s", "sideslip_rad", "valid")
 
 
 class Tracks:
-    """The tracks of a file. Each quantity of ground truth counts wherever it is known, as in the figures."""
+    """The tracks of a file. Ground truth is used wherever it is finite, as in the metrics."""
 
     def __init__(self, path: Path, low_speed_m_s: float) -> None:
         self._path, self.low_speed_m_s = path, low_speed_m_s
         self.names = list_estimators(path)
 
     def read(self, name: str, columns: tuple[str, ...] = OF_SIDESLIP) -> StateTrack:
-        """Read columns of a track; the others are NaN."""
+        """Read some columns of a track; the others are NaN."""
         track = read_track(self._path, name, columns)
         return replace(track, valid=np.ones(len(track), dtype=np.bool_)) if name == TRUTH else track
 
     def drawn(self, track: StateTrack) -> StateTrack:
-        """Return it with its sideslip unknown where it is not valid, or too slow for a direction."""
+        """Return the track with sideslip NaN where it is invalid or the speed is below the low-speed limit."""
         slow = track.without_sideslip_below(self.low_speed_m_s)
         beta, std = (np.where(track.valid, c, np.nan) for c in (slow.sideslip_rad, slow.sideslip_std_rad))
         return replace(slow, sideslip_rad=beta, sideslip_std_rad=std)
@@ -47,11 +47,11 @@ class Tracks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveSeries:
-    """What is drawn of one track; angles in degrees.
+    """Series of one track for the figures; angles in degrees.
 
     Envelopes [cells, 2] of sideslip, residual gain, speed and a_y; largest values [cells] of the absolute ``error`` and
     of ``r_scale``; NIS, mean over 1 s [cells]; the 95 % CI [cells]; points [3, K] in the planes: stamp, x and y.
-    ``invalid``, ``reason`` at each stamp [N]. Confidence interval, speed, a_y and planes are None but for the ground
+    ``invalid``, ``reason`` at each stamp [N]. Confidence interval, speed, a_y and planes are None except for the ground
     truth and the selected estimate.
     """
 
@@ -72,20 +72,20 @@ class DriveSeries:
 
 
 def thinned(points: FloatArray | None, most: int) -> FloatArray:
-    """Return at most so many points [3, K]."""
+    """Return points [3, K], thinned to at most ``most``."""
     return np.empty((3, 0)) if points is None else points[:, :: max(1, -(-points.shape[1] // most))]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """Reference of errors: ground truth as the figures have it (``scored``), or another estimate as drawn."""
+    """Reference of errors: ground truth as in the metrics (``scored``), or another estimate as drawn."""
 
     track: StateTrack
     scored: bool
     tracks: Tracks
 
     def error(self, track: StateTrack) -> FloatArray:
-        """Return track − reference [N] in rad; NaN where it is not known, or without the stamps of the track."""
+        """Return track − reference [N] in rad; NaN if unknown or if the reference lacks the stamps of the track."""
         known_ns, stamps_ns = self.track.stamps_ns, track.stamps_ns
         rows = np.minimum(np.searchsorted(known_ns, stamps_ns), max(len(known_ns) - 1, 0))
         if not len(known_ns) or not np.array_equal(known_ns[rows], stamps_ns):
@@ -111,8 +111,8 @@ def gather(
 
     Parameters
     ----------
-    reference : what its errors are given against; None: none are. nis_dof : mean degrees of freedom by estimator.
-    whole : whether confidence interval, motion and planes are drawn of it too.
+    reference : reference of the errors; None for no errors. nis_dof : mean degrees of freedom by estimator.
+    whole : also return confidence interval, motion and planes.
     """
     track = tracks.read(name, (*_COLUMNS, *_MORE_COLUMNS) if whole else _COLUMNS)
     drawn, stamps = tracks.drawn(track), track.stamps_ns
@@ -150,6 +150,6 @@ def gather(
 
 
 def sideslip_rate(track: StateTrack) -> FloatArray:
-    """Return a_y / v_x − yaw rate [N] in rad/s, which the rate of sideslip is where speed is nearly constant."""
+    """Return a_y / v_x − yaw rate [N] in rad/s, which is the rate of sideslip at nearly constant speed."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(track.ay_m_s2 / track.vx_m_s - track.yaw_rate_rad_s, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""The tables of one drive, from its report.json: figures over the whole drive, in the units that people read."""
+"""Tables of one drive, from its report.json: figures over the whole drive, in display units."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from pdhef_logtool.evaluation.units import LABELS, SCORED_SIGNALS, SIGNALS, read
 from pdhef_logtool.reports.drive_figures import Roles
 
 _Row = Mapping[str, Any]
-#: NIS and its degrees of freedom, which tables show as one ratio.
+#: NIS and its degrees of freedom, which tables show as a ratio.
 _RATIO = ("nis", "nis_dof")
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """The figures of one estimator: ``values`` by column in the unit that people read, and how many stamps."""
+    """The figures of one estimator: ``values`` by column in display units, and the number of stamps."""
 
     name: str
     causal: bool
@@ -28,7 +28,7 @@ class Score:
 
 @dataclass(frozen=True, slots=True)
 class ScoreTable:
-    """The figures of one signal in ``unit``; ``independent``: whether its ground truth is a check at all."""
+    """The figures of one signal in ``unit``; ``independent``: whether its ground truth is an independent check."""
 
     name: str
     unit: str
@@ -39,7 +39,7 @@ class ScoreTable:
 
 @dataclass(frozen=True, slots=True)
 class SegmentScore:
-    """RMSE of sideslip in one segment in rad, None where it is not known."""
+    """RMSE of sideslip in one segment in rad, None if unknown."""
 
     segment: str
     main: float | None
@@ -49,7 +49,7 @@ class SegmentScore:
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """Figures of estimators as a whole: ``rows`` of a name and its values, in the unit that people read."""
+    """Figures of whole estimators: ``rows`` of a name and its values, in display units."""
 
     heads: Sequence[str]
     rows: Sequence[tuple[str, Sequence[float | None]]]
@@ -57,7 +57,7 @@ class Consistency:
 
 @dataclass(frozen=True, slots=True)
 class Residual:
-    """What sensors state of each other, in ``unit``."""
+    """Residual between redundant sensors, in ``unit``."""
 
     signal: str
     rms: float | None
@@ -66,7 +66,7 @@ class Residual:
 
 
 def scores(report: Mapping[str, Any], roles: Roles) -> list[ScoreTable]:
-    """Return the errors over the whole drive, a table a signal, the selected estimate first."""
+    """Return the errors over the whole drive, one table per signal, the selected estimate first."""
     causal = {e["name"]: bool(e["causal"]) for e in report["estimators"]}
     tables = []
     for signal in SCORED_SIGNALS:
@@ -105,7 +105,7 @@ def by_segment(report: Mapping[str, Any], roles: Roles) -> list[SegmentScore]:
 
 
 def consistency(report: Mapping[str, Any], roles: Roles | None) -> Consistency | None:
-    """Return the figures that estimators have as a whole; None where no estimator has any."""
+    """Return the figures of whole estimators; None without any."""
     names = () if roles is None else (roles.main, roles.rival, *roles.others)
     by_signal = {signal: _by_estimator(report, signal) for signal in SIGNALS}
     shown = [
@@ -137,7 +137,7 @@ def residuals(report: Mapping[str, Any]) -> list[Residual]:
 
 
 def disagreements(report: Mapping[str, Any], roles: Roles) -> dict[str, float]:
-    """Return by how many rad RMS the sideslip of each other estimator and that of the selected estimate differ."""
+    """Return the RMS sideslip difference in rad between each other estimator and the selected estimate."""
     values = {}
     for m in report["metrics"]:
         first, _, second = m["estimator"].partition("~")
@@ -161,6 +161,6 @@ def _value(rows: Mapping[str, _Row], key: str) -> float | None:
 
 
 def _read(rows: Mapping[str, _Row], key: str) -> float | None:
-    """Return a figure in the unit that people read."""
+    """Return a figure in display units."""
     value = _value(rows, key)
     return None if value is None else value * read_unit(rows[key]["unit"])[1]

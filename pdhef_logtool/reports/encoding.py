@@ -1,6 +1,6 @@
-"""Series as a page contains them: envelopes on a grid of cells, quantised, as differences, deflated, in base64.
+"""Encode series for a page: envelopes on a grid of cells, quantised, as differences, deflated, in base64.
 
-The page undoes it (``decode`` of ``report.js``): 36,000 cells of two values cost 50 to 120 kB.
+The page decodes it (``decode`` of ``report.js``): 36,000 cells of two values take 50 to 120 kB.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
-#: Width of a cell: 10 Hz, finer for a drive below ten minutes, coarser for one above an hour.
+#: Width of a cell: 10 Hz, finer for a drive below ten minutes, coarser above an hour.
 CELL_NS = 100_000_000
 MOST_CELLS = 36_000
 _FINE_CELLS = 6_000
-#: A cell contains at least so many steps between stamps, so that stamps that come a little late leave none empty.
+#: Minimum cell width in steps between stamps, so that late stamps leave no cell empty.
 _STEPS_A_CELL = 2.5
-#: Quantised values are 0 to LEVELS; GAP represents "not known".
+#: Quantised values are 0 to LEVELS; GAP is the code for unknown values.
 LEVELS = 65_534
 GAP = 65_535
 
@@ -43,7 +43,7 @@ class Grid:
 
 
 def grid_of(stamps_ns: IntArray) -> Grid:
-    """Return the grid for stamps [N], N ≥ 1, in order of time."""
+    """Return the grid for ascending stamps [N], N ≥ 1."""
     start, end = int(stamps_ns[0]), int(stamps_ns[-1])
     duration = end - start
     step = float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0
@@ -53,7 +53,7 @@ def grid_of(stamps_ns: IntArray) -> Grid:
 
 
 def envelope(grid: Grid, stamps_ns: IntArray, values: FloatArray) -> FloatArray:
-    """Return the least and the largest of the values [N] in each cell, in the order in which they occur, [cells, 2].
+    """Return the smallest and largest value [N] in each cell, in the order of their occurrence, [cells, 2].
 
     A cell without a finite value is NaN.
     """
@@ -103,14 +103,14 @@ def _cells(grid: Grid, stamps_ns: IntArray, is_known: BoolArray) -> tuple[IntArr
 
 
 def _first(hit: BoolArray, begins: IntArray) -> IntArray:
-    """Return the place of the first hit of each group; each has one."""
+    """Return the index of the first hit of each group; each group has one."""
     places = np.flatnonzero(hit)
     return places[np.searchsorted(places, begins)]
 
 
 @dataclass(frozen=True, slots=True)
 class Encoded:
-    """A series as text: value = low + step q, with q of 0 to LEVELS, GAP where it is not known."""
+    """A series as text: value = low + step q, with q of 0 to LEVELS, or GAP for unknown values."""
 
     low: float
     step: float
@@ -121,7 +121,7 @@ class Encoded:
 def encode(values: FloatArray, resolution: float = 0.0) -> Encoded:
     """Return values [M] or [M, 2] (row by row) as text; NaN and infinities are gaps.
 
-    ``resolution``: what nobody sees in the unit of the values; noise below it is not stored.
+    ``resolution``: minimum quantisation step, so that invisible noise is not stored.
     """
     flat = np.ravel(values)
     is_finite = np.isfinite(flat)
@@ -131,7 +131,7 @@ def encode(values: FloatArray, resolution: float = 0.0) -> Encoded:
     step = max(span / LEVELS, resolution) or 1.0
     q = np.full(len(flat), GAP, dtype=np.uint16)
     q[is_finite] = np.clip(np.rint((inside - low) / step), 0, LEVELS).astype(np.uint16)
-    # Differences modulo 2¹⁶, their sign in the lowest bit, all low bytes before all high ones: zeros are together.
+    # Differences modulo 2¹⁶ with the sign in the lowest bit, and low bytes before high ones, compress better.
     steps = np.diff(q, prepend=np.uint16(0)).view(np.int16)
     folded = ((steps << 1) ^ (steps >> 15)).view(np.uint16)
     planes = (folded & 0xFF).astype(np.uint8).tobytes() + (folded >> 8).astype(np.uint8).tobytes()
@@ -139,7 +139,7 @@ def encode(values: FloatArray, resolution: float = 0.0) -> Encoded:
 
 
 def decode(encoded: Encoded) -> FloatArray:
-    """Return the values [M] of a text again, as the page does; gaps are NaN."""
+    """Decode a text to values [M] like the page does; gaps are NaN."""
     planes = np.frombuffer(zlib.decompress(base64.b64decode(encoded.base64)), dtype=np.uint8).astype(np.uint16)
     folded = planes[: encoded.count] | planes[encoded.count :] << 8
     steps = (folded >> 1) ^ -(folded & 1)

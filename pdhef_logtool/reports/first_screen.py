@@ -1,4 +1,4 @@
-"""The first screen of a page: verdict per requirement, what was tested, what to do next."""
+"""The first screen of a page: verdict per requirement, test conditions, next steps."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from pdhef_logtool.records.printable import printable
 
 #: Class of the style by outcome.
 _KINDS = {"PASS": "pass", "FAIL": "fail", "INCONCLUSIVE": "unknown"}
-#: Versions that a first screen names; the appendix has all.
+#: Versions on a first screen; the appendix lists all.
 _VERSIONS = ("pdhef-logtool", "python", "numpy")
-#: What follows a value: its interval in brackets.
+#: The interval in brackets after a value.
 _INTERVAL = re.compile(r"^\((.*?)\)")
 _UNIT = re.compile(r"_(rad_s|rad|m_s2|m_s)$")
 
 
 @dataclass(frozen=True, slots=True)
 class RequirementLine:
-    """A requirement as a reader sees it; all values are texts with their unit."""
+    """A requirement in display form; all values are texts with their unit."""
 
     id: str
     title: str
@@ -42,7 +42,7 @@ class RequirementLine:
 
 @dataclass(frozen=True, slots=True)
 class PlanHead:
-    """The verdicts of a plan: ``kind`` of the worst, one sentence, its requirements, and what limits the verdicts."""
+    """The verdicts of a plan: ``kind`` of the worst, one sentence, requirements, and limitations of the verdicts."""
 
     kind: str
     text: str
@@ -51,13 +51,13 @@ class PlanHead:
 
 
 def plan_head(plan: Mapping[str, Any] | None) -> PlanHead | None:
-    """Return the verdicts of a report.json or run.json, None where it has none."""
+    """Return the verdicts of a report.json or run.json; None without any."""
     if not plan or not plan.get("requirements"):
         return None
     requirements = plan["requirements"]
     counts = Counter(r["outcome"] for r in requirements)
     parts = [f"{counts[outcome]} {outcome}" for outcome in ("FAIL", "INCONCLUSIVE", "PASS") if counts[outcome]]
-    name = f"Plan {plan['file']}" if plan.get("file") else "Default plan (orientation, decides no exit code)"
+    name = f"Plan {plan['file']}" if plan.get("file") else "Default plan (for orientation; no effect on the exit code)"
     worst = next((k for o, k in (("FAIL", "fail"), ("INCONCLUSIVE", "unknown")) if counts[o]), "pass")
     order = [r for outcome in ("FAIL", "INCONCLUSIVE", "PASS") for r in of_documents(requirements, outcome)]
     notes = joint_notes({str(r["id"]): r.get("notes") or () for r in requirements})
@@ -97,13 +97,13 @@ def _exposure(exposure: Mapping[str, Any]) -> str:
 
 
 def steps_of(report: Mapping[str, Any]) -> list[str]:
-    """Return what to do by the report.json of a drive."""
+    """Return the recommended next steps from the report.json of a drive."""
     texts = (report.get("answer") or {}).get("texts") or {}
     return next_steps(report.get("plan"), (texts.get("next") or "").split("; "))
 
 
 def tested_drive(report: Mapping[str, Any], outcome: str = "") -> list[tuple[str, str]]:
-    """Return what was tested in one drive: term and text."""
+    """Return the test conditions of one drive as terms and texts."""
     log, vehicle, answer = report["log"], report["vehicle"], report.get("answer") or {}
     file = f" ({vehicle['file']})" if vehicle.get("file") else ""
     state = f"taught by {vehicle['taught']}" if vehicle.get("taught") else "parameters not validated"
@@ -128,7 +128,7 @@ def tested_drive(report: Mapping[str, Any], outcome: str = "") -> list[tuple[str
 
 
 def duration(seconds: float) -> str:
-    """Return a duration as people read it."""
+    """Return a duration for display."""
     if seconds < 120.0:
         return f"{seconds:.1f} s"
     hours = seconds / 3600.0
@@ -136,7 +136,7 @@ def duration(seconds: float) -> str:
 
 
 def versions(installed: Mapping[str, str]) -> str:
-    """Return the versions that a first screen names."""
+    """Return the versions for a first screen."""
     return ", ".join(f"{name} {installed[name]}" for name in _VERSIONS if name in installed)
 
 
@@ -187,7 +187,7 @@ def _reference(report: Mapping[str, Any]) -> str:
 
 
 def tested_run(run: Mapping[str, Any], hours: float) -> list[tuple[str, str]]:
-    """Return what was tested in a run of several drives: term and text."""
+    """Return the test conditions of a run of several drives as terms and texts."""
     logs = run.get("logs") or ()
     cars = Counter(str((log.get("car") or {}).get("name")) for log in logs if log.get("car"))
     mains = Counter(str(log["main"]) for log in logs if log.get("main"))

@@ -23,22 +23,22 @@ from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Spa
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
 from pdhef_logtool.storage.documents import jsonable
 
-#: Rows of tables that a run can make as long as it likes, keys that are given, and bars of a histogram at most.
+#: Maximum numbers of table rows, of requested keys, and of bars of a histogram.
 MOST_ROWS, _MOST_KEYS, _MOST_BARS = 1000, 12, 40
-#: Errors beyond this quantile of the drives are counted in the last bar.
+#: Quantile of the drives' errors that ends the histogram; larger errors are counted in the last bar.
 _MOST_SHARE = 0.98
 _LEVELS = 8
-#: Drives of the figure of the first screen.
+#: Maximum number of drives in the figure of the first screen.
 _WORST = 10
-#: Estimators with a median error beyond this many times the selected estimate's are left to the table.
+#: Maximum ratio of a median error to the selected estimate's in the figures; tables contain all estimators.
 _DRAWN = 5.0
-#: The table of the operating space shows at least this far, so that what a car can do and nobody did is seen.
+#: Minimum range of the table of the operating space, so that driving without data is visible.
 _SPEED_M_S, _AY_M_S2 = 40.0, 8.0
 
 
 @dataclass(frozen=True, slots=True)
 class SpaceCell:
-    """A cell of the table: its classes and what is in it, empty for one where nobody drove."""
+    """A cell of the table: its style classes and contents, empty for a cell without driving."""
 
     kind: str
     minutes: str
@@ -59,7 +59,7 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
 
     Parameters
     ----------
-    by : keys to break the drives down by; none: all that distinguish drives.
+    by : keys to break the drives down by; by default all that distinguish drives.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
 
 
 def _document(fleet: Fleet, texts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the page shows as JSON-able values."""
+    """Return the content of the page as JSON-able values."""
     more = {"worst_drives": fleet.worst, "without_truth": fleet.without_truth[:MOST_ROWS]}
     kept = ("logs", "ranking", "least_to_rank", "dependence", "breakdowns", "failed", "losses")
     whole = {key: getattr(fleet, key) for key in kept} | {"scored": len(fleet.scored)}
@@ -106,7 +106,7 @@ def _document(fleet: Fleet, texts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _worst(fleet: Fleet, charts: Charts) -> tuple[str, float | None] | None:
-    """Return the drive with the largest sideslip error; add the figure that shows it among the largest."""
+    """Return the drive with the largest sideslip error; add the figure of the largest errors."""
     ranked = sorted(((d.error(), d) for d in fleet.scored), key=lambda pair: -(pair[0] or 0.0))
     if not ranked:
         return (fleet.drives[0].label, None) if fleet.logs == 1 and fleet.drives else None
@@ -162,7 +162,7 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
 
 
 def _rival(fleet: Fleet) -> str | None:
-    """Return the estimator that the selected one is drawn against: physics if it ran, else the best of the others."""
+    """Return the estimator to compare with the selected one: physics if it ran, else the best of the others."""
     mains = {d.main for d in fleet.scored}
     judged = sorted((d for d in fleet.distributions if d.signal == JUDGED), key=lambda d: d.median.value)
     names = [d.estimator for d in judged if d.estimator != ANSWER and {d.estimator} != mains]
@@ -170,7 +170,7 @@ def _rival(fleet: Fleet) -> str | None:
 
 
 def _told(fleet: Fleet) -> list[Distribution]:
-    """Return the distributions, the selected estimate's first; an estimator that always is selected appears once."""
+    """Return the distributions, the selected estimate's first; an estimator that is always selected appears once."""
     mains = {d.main for d in fleet.scored}
     if len(mains) > 1:
         return list(fleet.distributions)
@@ -183,7 +183,7 @@ def _colour(distribution: Distribution) -> str:
 
 
 def _histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return edges [B + 1] and counts [B]; what lies beyond almost all drives is in the last bar."""
+    """Return edges [B + 1] and counts [B]; values beyond the quantile are in the last bar."""
     most = max(float(np.quantile(values, _MOST_SHARE)), 1e-6)
     bars = int(np.clip(2.0 * math.sqrt(len(values)), 5, _MOST_BARS))
     edges = np.linspace(0.0, most, bars + 1)
@@ -193,7 +193,7 @@ def _histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """Errors of an estimator in a signal over drives, in the unit that is shown."""
+    """Errors of an estimator in a signal over drives, in display units."""
 
     signal: str
     unit: str
@@ -203,7 +203,7 @@ class _Row:
 
 
 def _rows(distributions: Sequence[Distribution]) -> list[_Row]:
-    """Return rows with median, its bounds, the tenths at both ends, and the largest."""
+    """Return rows with the median and its bounds, 10th and 90th percentile, and the largest value."""
     rows = []
     for d in distributions:
         unit, factor = read_unit(d.unit)
@@ -213,7 +213,7 @@ def _rows(distributions: Sequence[Distribution]) -> list[_Row]:
 
 
 def _space_rows(space: Space) -> tuple[list[str], list[tuple[str, list[SpaceCell]]], int, int]:
-    """Return heads, rows from the fastest down, and how many cells are empty of how many."""
+    """Return heads, rows with the highest speed first, and the numbers of empty and of all cells."""
     rows = _reach(space.speed_edges_m_s, space.seconds.any(axis=1), _SPEED_M_S)
     columns = _reach(space.ay_edges_m_s2, space.seconds.any(axis=0), _AY_M_S2)
     seconds = space.seconds[:rows, :columns]
@@ -223,7 +223,7 @@ def _space_rows(space: Space) -> tuple[list[str], list[tuple[str, list[SpaceCell
         cells = []
         for j in range(columns):
             spent, rmse = float(seconds[i, j]), float(space.rmse_rad[i, j])
-            # Time differs by powers of ten: a level is a factor of three.
+            # Times differ by orders of magnitude: a level is a factor of three.
             level = max(0, _LEVELS + math.floor(math.log(spent / most, 3.0))) if spent else 0
             kind = f"h{min(level, _LEVELS)}" if spent else "empty"
             cells.append(SpaceCell(kind, _time(spent), rmse if math.isfinite(rmse) else None))

@@ -1,7 +1,7 @@
-"""A whole HTML file from a template and figures: nothing in it is fetched, and nothing of a log in it can run.
+"""Render a complete HTML file from a template and figures, without external resources and without content that can run.
 
-Texts go through jinja's escaping and :func:`~pdhef_logtool.records.printable.printable`, series are base64; the page's
-Content-Security-Policy allows its own scripts and its own style by their digests and forbids everything else.
+Texts are escaped by jinja and :func:`~pdhef_logtool.records.printable.printable`; series are base64. The page's
+Content-Security-Policy allows its own scripts and style by their digests and forbids everything else.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from pdhef_logtool.records.version import __version__
 from pdhef_logtool.reports.charts import Charts, StripFigure, TimeFigure
 
 _HERE = Path(__file__).parent
-#: Scripts in order: ours before uPlot shows it how fine to draw.
+#: Scripts in order: before.js sets the drawing resolution for uPlot.
 _SCRIPTS = ("before.js", "uplot.min.js", "report.js")
 _STYLES = ("uplot.min.css", "report.css")
-#: A text in a paragraph or a table's cell.
+#: Maximum length of a text in a paragraph or table cell.
 _MOST_SIGNS = 600
 DASH = "–"
 
@@ -36,8 +36,8 @@ def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
 
     Parameters
     ----------
-    template : file of ``templates/`` that extends ``base.html``. charts : what its ``figure(key)`` places show.
-    texts : what the template prints.
+    template : file of ``templates/`` that extends ``base.html``. charts : figures for its ``figure(key)`` places.
+    texts : variables of the template.
     """
     charts = Charts() if charts is None else charts
     document, blocks = charts.document()
@@ -89,7 +89,7 @@ def _asset(name: str) -> str:
 
 
 def _place(charts: Charts, key: str) -> Markup:
-    """Return where the script draws a figure; nothing where the page has none of the name."""
+    """Return the element in which the script draws a figure; empty if the page has no such figure."""
     if key not in charts.figures:
         return Markup()
     chart = charts.figures[key]
@@ -120,13 +120,13 @@ def _digest(text: str) -> str:
 
 
 def _embedded(document: dict[str, Any]) -> Markup:
-    """Return JSON that may be in a script element: it contains no character with a meaning in HTML."""
+    """Return JSON for a script element, without characters that have a meaning in HTML."""
     text = json.dumps(document, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))  # noqa: S704
 
 
 def _printed(value: Any) -> Any:
-    """Return what a template prints: a dash for nothing, texts in one line without signs that move others."""
+    """Return the printed form of a value: a dash for None, texts in one line without control characters."""
     if value is None:
         return DASH
     if isinstance(value, str) and not isinstance(value, Markup):
@@ -135,19 +135,19 @@ def _printed(value: Any) -> Any:
 
 
 def number(value: float | None, factor: float = 1.0) -> str:
-    """Return a figure with three digits, of large ones all before the point; a dash for none."""
+    """Return a figure with three significant digits, or all digits before the point; a dash for None."""
     if value is None or not math.isfinite(value):
         return DASH
     return f"{value * factor:.3g}" if abs(value * factor) < 1000.0 else f"{value * factor:.0f}"
 
 
 def unit(text: str) -> str:
-    """Return a unit as it is written: m/s² for m/s^2, nothing for a plain number."""
+    """Return a unit for display: m/s² for m/s^2, empty for a plain number."""
     return "" if text == "1" else text.replace("^2", "²")
 
 
 def degrees(value_rad: float | None) -> str:
-    """Return an angle with as many digits as a person reads."""
+    """Return an angle with a sensible number of digits."""
     if value_rad is None or not math.isfinite(value_rad):
         return DASH
     value = math.degrees(value_rad)
@@ -170,7 +170,7 @@ def seconds(value_s: float | None) -> str:
 
 
 def stamp(stamp_ns: int) -> str:
-    """Return a stamp in nanoseconds as RFC 3339 in UTC, exact; as its number where no calendar reaches."""
+    """Return a stamp in nanoseconds as RFC 3339 in UTC, exact; out of the range of dates as a number."""
     whole, rest = divmod(int(stamp_ns), 1_000_000_000)
     try:
         moment = dt.datetime.fromtimestamp(whole, dt.UTC)

@@ -1,4 +1,4 @@
-"""Writes the pages of a finished run."""
+"""Write the pages of a finished run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class WrittenPage:
-    """A page: its log (empty: that of the run), file (None: it could not be made), what is wrong."""
+    """A page: its log (empty for the page of the run), its file (None on failure), and its error."""
 
     log: str
     file: Path | None
@@ -30,7 +30,7 @@ class WrittenPage:
 
 @dataclass(frozen=True, slots=True)
 class WrittenPages:
-    """The pages of a run: of its logs, ``fleet`` of all of them, and ``pdf``, the document to sign."""
+    """The pages of a run: one per log, ``fleet`` for all of them, and the optional ``pdf``."""
 
     output: Path
     pages: tuple[WrittenPage, ...]
@@ -39,13 +39,13 @@ class WrittenPages:
 
     @property
     def wrong(self) -> tuple[str, ...]:
-        """A line for each page that could not be made, or not in full."""
+        """One line for each page that could not be made, or not completely."""
         pages = [p for p in (*self.pages, self.fleet) if p.wrong]
         return tuple(f"{'no ' if p.file is None else ''}page of {p.log or 'the run'}: {p.wrong}" for p in pages)
 
     @property
     def exit_code(self) -> int:
-        """0 if every page was made in full, 1 if none of a log was, else 3."""
+        """0 if every page is complete, 1 if no log has a page, else 3."""
         if self.pages and all(p.file is None for p in self.pages):
             return EXIT_FAILURE
         return EXIT_PARTIAL if self.wrong else EXIT_OK
@@ -75,10 +75,10 @@ def write_pages(
     by: Sequence[str] = (),
     logs: Sequence[OpenedLog] | None = None,
 ) -> WrittenPages:
-    """Write the page of each log of a run, then that of the run; one that cannot be made never stops the others.
+    """Write the page of each log of a run, then the page of the run; a failed page never stops the others.
 
-    The caller contains the folder. ``progress`` is given which log, and the share that is done;
-    ``by``: keys that the run's page breaks the drives down by, none: what it finds.
+    The caller must lock the folder. ``progress`` receives the log and the completed share;
+    ``by``: keys to break the drives down by; by default all that distinguish drives.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def write_drive_page(log: OpenedLog) -> WrittenPage:
 
 
 def remove_pages(run: OpenedRun) -> None:
-    """Remove the pages that an earlier run left in its folders: they are of other estimates."""
+    """Remove the pages of an earlier run, which show other estimates."""
     pages = [folder / PAGE_FILE for folder in (run.folder, *(log.folder for log in run.logs))]
     for path in (*pages, run.folder / REPORT_FILE):
         with suppress(OSError):
@@ -119,7 +119,7 @@ def _write(folder: Path, label: str, make: Callable[[], DrivePage | FleetPage]) 
     try:
         page = make()
         wrong = getattr(page, "wrong", "")
-    except Exception as error:  # noqa: BLE001 (for any defect of a report, the others get their pages)
+    except Exception as error:  # noqa: BLE001 (a defect of one report must not stop the other pages)
         shown = str(error) if isinstance(error, OutputError) else f"internal error, {type(error).__name__}: {error}"
         return WrittenPage(label, None, shown)
     path = folder / PAGE_FILE

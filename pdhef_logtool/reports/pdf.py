@@ -1,6 +1,6 @@
-"""The validation report of a run as one PDF to sign: cover, contents, verdicts, drives and input hashes.
+"""The validation report of a run as a PDF for signature: cover, contents, verdicts, drives and input hashes.
 
-The document is one HTML file with pictures of the figures, printed by a headless Chromium.
+The document is an HTML file with pictures of the figures, printed by a headless Chromium.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
 from pdhef_logtool.storage.files import write_bytes
 
 PDF_FILE = "report.pdf"
-#: Drives with a section of their own; those of the worst verdicts come first.
+#: Maximum number of drives with a section; drives with the worst verdicts come first.
 _MOST_DRIVES = 20
-#: Figures of a drive in the document. The path shows where the car drove.
+#: Figures of a drive in the document. The path contains the positions of the car.
 _FIGURES, _POSITIONS = ("worst", "sideslip", "error", "ay"), ("path",)
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _TIMEOUT_S = 180.0
@@ -49,11 +49,11 @@ class DriveSection:
 
 
 def write_pdf(run: OpenedRun, *, positions: bool = False) -> Path:
-    """Write the PDF of a run; ``positions``: with the paths of the drives.
+    """Write the PDF of a run; ``positions``: include the paths of the drives.
 
     Raises
     ------
-    OutputError : There is no Chromium, it fails, or the file cannot be written.
+    OutputError : Chromium is missing or fails, or the file cannot be written.
     """
     browser = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
     target = run.folder / PDF_FILE
@@ -76,7 +76,7 @@ def write_pdf(run: OpenedRun, *, positions: bool = False) -> Path:
 
 
 def _numbered(document: bytes, printed: Path) -> bytes:
-    """Return the document with the page of each section in its contents, as it was printed without."""
+    """Return the document with page numbers in its contents, as found in a print without them."""
     from pypdf import PdfReader
 
     reader = PdfReader(printed)
@@ -140,7 +140,7 @@ def _report(log: OpenedLog) -> dict[str, Any] | None:
 
 
 def _gravity(report: Mapping[str, Any] | None) -> tuple[int, float]:
-    """Return what drives are sorted by: failed requirements first, then the sideslip error."""
+    """Return the sort key of drives: failed requirements first, then the sideslip error."""
     if report is None:
         return (1, 0.0)
     fails = sum(r["outcome"] == "FAIL" for r in (report.get("plan") or {}).get("requirements") or ())

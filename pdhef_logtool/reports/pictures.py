@@ -13,12 +13,12 @@ from pdhef_logtool.reports.charts import Charts, Figure, PointsFigure, TimeFigur
 from pdhef_logtool.reports.encoding import Grid
 
 _Axes: TypeAlias = Any
-#: Inches, at _DPI a slide's width of 1600 points.
+#: Sizes in inches; at _DPI the width is 1600 pixels.
 _WIDTH, _HEIGHT, _SQUARE, _DPI = 10.0, 4.2, 6.0, 160
 
 
 def picture(figure: Figure, charts: Charts) -> bytes:
-    """Return a figure over time or in a plane as PNG; the same figure gives the same bytes."""
+    """Return a figure over time or in a plane as PNG; equal figures give equal bytes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
 
@@ -40,7 +40,7 @@ def picture(figure: Figure, charts: Charts) -> bytes:
 
 
 def _instants(grid: Grid, start_s: float, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return seconds and values of a series on the grid, two a cell as on the page."""
+    """Return seconds and values of a series on the grid, two per cell as on the page."""
     times = np.asarray(start_s + (np.arange(2 * grid.cells) * 0.5 + 0.25) * grid.cell_s, dtype=np.float64)
     return times, np.ravel(values) if values.ndim == 2 else np.repeat(values, 2)
 
@@ -96,6 +96,6 @@ def _legend(axes: _Axes) -> None:
 
 
 def _plain(text: str) -> str:
-    """Return a label in one line; a dollar begins no formula, an underscore hides nothing."""
+    """Return a label in one line, with dollar signs and a leading underscore escaped for matplotlib."""
     line = printable(text, 60).replace("$", r"\$")
     return f" {line}" if line.startswith("_") else line

@@ -1,1 +1,1 @@
-"""The learned residual: features, network, and the bundle that keeps them together."""
+"""Trained residual models: features, networks, and model bundles."""

@@ -1,4 +1,4 @@
-"""A model bundle: ``weights.safetensors`` and ``model.json`` in one folder; never pickle."""
+"""Model bundle: ``weights.safetensors`` and ``model.json`` in one folder, without pickle."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ FORMAT = "pdhef.residual-model"
 FORMAT_VERSION = 2
 WEIGHTS_FILE = "weights.safetensors"
 DOCUMENT_FILE = "model.json"
-#: Baselines that were trained on the same dataset are beside the network, where there are any.
+#: Optional baselines beside the network, trained on the same dataset.
 PURE_LSTM_FOLDER = "baselines/pure-lstm"
 LINEAR_REGRESSION_FILE = "baselines/linear-regression.json"
-#: The paper's network, six features and Table 1's size, for the paper's filter.
+#: The paper's network (six features, size of Table 1) for the paper's filter.
 PAPER_FOLDER = "baselines/paper-network"
 
-#: Names instead of a folder: the network that comes with the package, and no network.
+#: Names in place of a folder: the network of the package, and no network.
 SHIPPED, NO_MODEL = "default", "none"
 SHIPPED_FOLDERS = {SHIPPED: Path(__file__).parents[1] / "models" / "default" / "network"}
 
-#: Filters that features are made by and whose model a residual is of: the strongest one, and that of the paper, which
-#: the paper's network and the baselines have.
+#: Filters that provide features and the model of a residual: ``physics``, and the paper's filter for the paper's
+#: network and the baselines.
 PHYSICS_MODEL, NOMINAL_MODEL = "physics", "phy-ukf"
 MODELS = (PHYSICS_MODEL, NOMINAL_MODEL)
 
-#: What a network may predict, and how many numbers that is: rates of v_y and r that the model lacks, or v_y itself.
+#: Targets of a network with the number of outputs: residual rates of v_y and r, or v_y itself.
 RESIDUAL = "residual_rates"
 LATERAL_VELOCITY = "lateral_velocity"
 OUTPUT_COUNT = {RESIDUAL: 2, LATERAL_VELOCITY: 1}
@@ -54,19 +54,19 @@ class Normalisation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelBundle:
-    """Everything that service needs of a trained network.
+    """A trained network for service.
 
     Attributes
     ----------
     feature_names : in order; a subset of :data:`~.features.FEATURES`.
-    hidden, layers, head : architecture. period_s : step that the network was trained at.
+    hidden, layers, head : architecture. period_s : step of the training data.
     weights : by name, float32, as PyTorch names them.
-    provenance : training data hash, seeds, metrics and what else the model card states; JSON-able.
-    target : what it predicts, one of :data:`OUTPUT_COUNT`.
-    model : the filter that its features come from and that its residual is of, one of :data:`MODELS`.
-    physics_sha256 : digest of the physics of the car, or the cars, that it was trained on.
-    odd : mirrored left and right it is asked too, and half of the difference counts, so that it is exactly odd.
-    pure_lstm, linear_regression, paper_network : the baselines beside it, None where there are none.
+    provenance : training data hash, seeds, metrics and other entries of the model card; JSON-able.
+    target : predicted quantity, one of :data:`OUTPUT_COUNT`.
+    model : the filter of its features and its residual, one of :data:`MODELS`.
+    physics_sha256 : digest of the physics of the training car or cars.
+    odd : half of the difference between outputs for the input and its mirror image is used, which is exactly odd.
+    pure_lstm, linear_regression, paper_network : the baselines beside it, None without.
     """
 
     feature_names: tuple[str, ...]
@@ -95,12 +95,12 @@ class ModelBundle:
 
     @property
     def columns(self) -> list[int]:
-        """Where the bundle's features are in the full feature array."""
+        """Indices of the bundle's features in the full feature array."""
         return [FEATURES.index(name) for name in self.feature_names]
 
     @property
     def signs(self) -> FloatArray:
-        """Signs of the bundle's features where left and right are mirrored, [k]."""
+        """Signs of the bundle's features for an exchange of left and right, [k]."""
         return np.array([-1.0 if name in ODD_FEATURES else 1.0 for name in self.feature_names])
 
     @property
@@ -112,7 +112,7 @@ class ModelBundle:
             shapes |= {f"lstm.weight_ih_l{layer}": (rows, columns), f"lstm.weight_hh_l{layer}": (rows, self.hidden)}
             shapes |= {f"lstm.bias_ih_l{layer}": (rows,), f"lstm.bias_hh_l{layer}": (rows,)}
         for n, (columns, rows) in enumerate(pairwise((self.hidden, *self.head, OUTPUT_COUNT[self.target]))):
-            # Behind each layer of the head but the last are a ReLU and a dropout, which have a number too.
+            # A ReLU and a dropout follow each layer of the head except the last; they have numbers too.
             shapes |= {f"head.{3 * n}.weight": (rows, columns), f"head.{3 * n}.bias": (rows,)}
         return shapes
 
@@ -139,7 +139,7 @@ class ModelBundle:
         }
 
     def save(self, folder: Path) -> None:
-        """Write the bundle; both files are complete before either has its name, the document last.
+        """Write the bundle; both files are complete before they are renamed, the document last.
 
         Raises
         ------
@@ -149,7 +149,7 @@ class ModelBundle:
         from safetensors.numpy import save
 
         document = json.dumps({**self._document(), "sha256": self.sha256, "provenance": self.provenance}, indent=2)
-        # The inner one is committed first.
+        # The inner file is renamed first.
         with PendingFile(folder / DOCUMENT_FILE) as described, PendingFile(folder / WEIGHTS_FILE) as weights:
             for pending, data in ((described, (document + "\n").encode()), (weights, save(self.weights))):
                 with writing(pending.target), open_new(pending.path) as file:
@@ -157,7 +157,7 @@ class ModelBundle:
 
 
 def open_model(model: Path | None) -> ModelBundle | None:
-    """Return the network of a run: a shipped one by its name (None is ``default``), none for ``none``, or a folder's.
+    """Return the network of a run: a shipped one by name (None is ``default``) or of a folder; None for ``none``.
 
     Raises
     ------
@@ -199,7 +199,7 @@ def load_network(folder: Path, target: str) -> ModelBundle:
 
     Parameters
     ----------
-    target : what it must predict.
+    target : required target.
 
     Raises
     ------

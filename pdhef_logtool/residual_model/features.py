@@ -1,7 +1,7 @@
-"""The network's inputs, one piece of code for training and service (docs/method.md#network).
+"""Inputs of the network, the same code for training and service (docs/method.md#network).
 
-A filter on physics runs in parallel and gives the reference for ε_phy: Δr = r_m − r̂⁻ and Δβ = β̂⁺ − β̂⁻, prior and
-posterior of that filter. Nothing here depends on what the hybrid filter does, and nothing on ground truth.
+A filter on physics runs in parallel and provides ε_phy: Δr = r_m − r̂⁻ and Δβ = β̂⁺ − β̂⁻ from its prior and posterior.
+The inputs depend neither on the hybrid filter nor on ground truth.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ FEATURES = (
     "delta_sideslip_rad",
     "physics_vy_m_s",
     "physics_yaw_rate_rad_s",
-    "friction",  # as the model is given it
+    "friction",  # input of the model
     "ax_m_s2",  # measured; 0 where missing
     "utilisation",  # |a_y| / (μ g)
-    "roll_rad",  # of the physics filter; 0 where the car has no such state, as the next three
+    "roll_rad",  # of the physics filter; 0 without this state, as for the next three
     "roll_rate_rad_s",
     "front_force_per_mass",  # of the axle, m/s²
     "rear_force_per_mass",
 )
 PAPER_FEATURES = FEATURES[:6]
-#: Those of networks that were trained on what the nominal model misses.
+#: Features of networks for the residual of the nominal model.
 NOMINAL_FEATURES = FEATURES[:10]
-#: Features that change sign where left and right are mirrored.
+#: Features that change their sign when left and right are exchanged.
 ODD_FEATURES = frozenset(
     {
         "ay_m_s2",
@@ -65,15 +65,14 @@ def make_features(
     ax_m_s2: FloatArray,
     body: FloatArray,
 ) -> FloatArray:
-    """Return the features [K, 15] at each step; always finite where the filter's state is.
+    """Return the features [K, 15] at each step, finite where the filter's state is finite.
 
-    A missing measurement is replaced by what the physics filter predicts for it, so that to the network a dropped
-    channel is like one that agrees with physics.
+    A missing measurement is replaced by the prediction of the physics filter.
 
     Parameters
     ----------
     steer_rad : [K], held where missing. ay_m_s2, yaw_rate_rad_s : [K], NaN where missing.
-    posterior, prior : states of the physics filter, [K, ≥3] over v_x, v_y, r; the prior is NaN where it starts.
+    posterior, prior : states of the physics filter, [K, ≥3] over v_x, v_y, r; the prior is NaN at its start.
     predicted_ay_m_s2 : [K], the filter's a_y at the posterior.
     friction : [K]. ax_m_s2 : [K], NaN where missing.
     body : [K, 4], roll, roll rate and the axles' forces.

@@ -1,7 +1,7 @@
-"""The network's pass in compiled code: LSTM layers and head, in float32, a step's two sides at a time.
+"""Compiled forward pass of the network: LSTM layers and head, in float32, for an input and its mirror image at a time.
 
-Training has PyTorch; a run does without, and gives the same to 1e-5 (a test checks it). A step depends on those before
-it through the state alone, so that no window changes a bit. Sums are taken in one order with any BLAS.
+Training uses PyTorch; runs do not need it and agree to 1e-5 (a test checks this). A step depends on earlier ones only
+through the state, so that windows do not change the result. The order of sums does not depend on the BLAS.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from pdhef_logtool.compiled.cache import njit
 
 Float32Array: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
 
-#: A step is run for an input and its mirror image, or for an input and nothing.
+#: Inputs per step: an input and its mirror image (or zeros).
 SIDES = 2
-#: Steps that a layer takes before the next one does: its weights and what passes between stay in the cache.
+#: Number of steps per layer before the next layer, so that weights and intermediate values stay in the cache.
 _TILE_STEPS = 128
 
 _compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
 _inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
-# tanh(x) = x P(x²) / Q(x²) for |x| < 8, to 1e-8 of itself: the rational function of least error (iterated weighted
-# least squares). What is rounded of it in float32 is ten times as much.
+# tanh(x) = x P(x²) / Q(x²) for |x| < 8 with a relative error of 1e-8: the rational function of least error (iterated
+# weighted least squares). The rounding error of float32 is ten times larger.
 _LIMIT = np.float32(8.0)
 _P0, _P1, _P2, _P3, _P4 = (
     np.float32(p) for p in (0.99999999357, 0.13444496296, 0.003571596023773, 2.189462883168e-5, 1.5230371066748e-8)
@@ -45,7 +45,7 @@ def _tanh(x):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _multiply(x, weights, out):  # type: ignore[no-untyped-def]
-    """Add x [2, K] times weights [K, M] to out [2, M]; four rows of weights at a time, in their order."""
+    """Add x [2, K] times weights [K, M] to out [2, M], four rows of weights at a time, in order."""
     rows, columns = weights.shape
     whole = rows - rows % 4
     straight, mirrored = out[0], out[1]
@@ -64,7 +64,7 @@ def _multiply(x, weights, out):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _dense(x, weights, bias, cut, out):  # type: ignore[no-untyped-def]
-    """Write x [T, 2, K] times weights plus bias [M] to out [T, 2, M]; ``cut``: what is below 0 is 0."""
+    """Write x [T, 2, K] times weights plus bias [M] to out [T, 2, M]; ``cut`` applies a ReLU."""
     for t in range(x.shape[0]):
         out[t, 0] = bias
         out[t, 1] = bias
@@ -77,10 +77,10 @@ def _dense(x, weights, bias, cut, out):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _recur(gates, weights, h, c, out):  # type: ignore[no-untyped-def]
-    """Run one LSTM layer over what its inputs give to the gates [T, 2, 4 H], which are changed.
+    """Run one LSTM layer over the contributions of its inputs to the gates [T, 2, 4 H], which are overwritten.
 
-    The gates are input, forget, cell, output; those with a sigmoid come as half of what it is taken of, for
-    σ(x) = (1 + tanh(x/2)) / 2. ``h`` and ``c`` [2, H] are moved, ``h`` of each step goes to out [T, 2, H].
+    The gates are input, forget, cell, output. Arguments of sigmoid gates are halved, because
+    σ(x) = (1 + tanh(x/2)) / 2. ``h`` and ``c`` [2, H] are updated; ``h`` of each step is written to out [T, 2, H].
     """
     width = c.shape[1]
     for t in range(gates.shape[0]):
@@ -102,7 +102,7 @@ NetworkState: TypeAlias = Float32Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForwardPass:
-    """A network's weights as the compiled code takes them, [K, M] each.
+    """A network's weights in the layout of the compiled code, [K, M] each.
 
     ``layers`` are (of the input, of the state, bias), ``head`` is (weights, bias).
     """
@@ -113,7 +113,7 @@ class ForwardPass:
 
     @classmethod
     def of(cls, weights: dict[str, Float32Array], layers: int, head: Sequence[int]) -> ForwardPass:
-        """Take the weights of a bundle; ``layers`` of the LSTM, widths of the ``head``'s layers but the last."""
+        """Convert the weights of a bundle; ``layers`` of the LSTM, widths of the ``head`` without its last layer."""
         stacked = []
         for n in range(layers):
             bias = weights[f"lstm.bias_ih_l{n}"] + weights[f"lstm.bias_hh_l{n}"]

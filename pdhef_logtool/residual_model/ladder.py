@@ -1,12 +1,12 @@
-"""The ladder of residual models: what ``physics`` lacks in sideslip, linear in slow features or in random products.
+"""Linear residual models of increasing order for the sideslip error of ``physics``, from slow or random features.
 
-Rungs: ``none``; ``linear``, in the odd features; ``random``, with random Fourier features besides, √2 sin(w·z)
-cos(v·e + p) of the odd features z and the even ones e (Rahimi and Recht 2007). Each is exactly odd: it has no constant,
-and the mirrored drive has the mirrored residual. A rung is fitted by ridge regression (:mod:`~.ladder_fit`), whose
+Orders: ``none``; ``linear`` in the odd features; ``random`` with additional random Fourier features √2 sin(w·z)
+cos(v·e + p) of the odd features z and the even features e (Rahimi and Recht 2007). All are exactly odd: they have no
+constant, and a mirrored drive has the mirrored residual. They are fitted by ridge regression (:mod:`~.ladder_fit`); its
 posterior is part of the interval.
 
-Region of validity: a gain per step, 1 where the drives that it was fitted on have been and 0 outside. It is a function
-of the whitened distance of z, d² = zᵀ (Σ + ρ I)⁻¹ z over that of 98 % of these drives, and of the speed.
+Region of validity: a gain per step, 1 within the region of the training drives and 0 outside. It depends on the speed
+and on the whitened distance d² = zᵀ (Σ + ρ I)⁻¹ z, divided by its 98 % quantile over the training drives.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from pdhef_logtool.residual_model.ladder_kernels import LadderArrays
 
 NONE, LINEAR, RANDOM = RUNGS = ("none", "linear", "random")
-#: Squared distance, over that of 98 % of the drives, up to which the gain is 1, and from which on it is 0.
+#: Squared distance over its 98 % quantile up to which the gain is 1, and from which it is 0.
 FULL_WITHIN, NONE_BEYOND = 1.0, 3.0
 #: The same for the speed: factors on its range.
 SPEED_FULL, SPEED_NONE = 1.1, 1.5
 #: Ridge ρ of the distance, for features of variance 1.
 REGION_RIDGE = 0.5
-#: Share of a residual that its 1-sigma contains beside the posterior: a strong ridge takes about as much off it.
+#: Share of a residual in its 1-sigma, in addition to the posterior: a strong ridge reduces the residual by as much.
 SHRINKAGE = 0.5
-#: A residual is limited to this multiple of the largest one on the drives that it was fitted on.
+#: A residual is limited to this multiple of the largest one on the training drives.
 LARGEST = 1.5
 
 Row = Annotated[tuple[float, ...], Field(strict=False)]
@@ -41,7 +41,7 @@ Rows = Annotated[tuple[Row, ...], Field(strict=False)]
 
 
 class Correction(NamedTuple):
-    """Per step [K]: residual of the sideslip and its 1-sigma, rad, gain not yet applied; and the gain, 0 to 1."""
+    """Residual of the sideslip and its 1-sigma per step [K], rad, before the gain; and the gain, 0 to 1."""
 
     residual_rad: FloatArray
     std_rad: FloatArray
@@ -49,15 +49,15 @@ class Correction(NamedTuple):
 
 
 class LadderModel(BaseModel):
-    """A fitted rung, as ``taught.json`` contains it.
+    """A fitted residual model, as in ``taught.json``.
 
     Attributes
     ----------
-    scale : of the odd features [16]. even_mean, even_scale : of the even ones [8].
-    odd_directions, even_directions, phases : of the random features, none in the rung ``linear``.
+    scale : of the odd features [16]. even_mean, even_scale : of the even features [8].
+    odd_directions, even_directions, phases : of the random features, empty for ``linear``.
     weights : by feature, rad. factor : its product with its transpose is the posterior covariance of the weights.
-    whitening : d² is the squared norm of its product with z. speed_m_s : range of the fitted drives.
-    largest_rad : of the residual on them.
+    whitening : d² is the squared norm of its product with z. speed_m_s : range of the training drives.
+    largest_rad : largest residual on the training drives.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
@@ -87,14 +87,14 @@ class LadderModel(BaseModel):
             *((row, len(self.factor[0])) for row in self.factor),
         )  # fmt: skip
         if any(len(values) != size for values, size in shapes):
-            raise ValueError("the arrays of a residual model have other sizes than its features")
+            raise ValueError("the arrays of a residual model do not have the sizes of its features")
         if min(*self.scale, *self.even_scale, self.speed_m_s[0]) <= 0.0:
             raise ValueError("scales and speeds are positive")
         return self
 
     @property
     def sha256(self) -> str:
-        """Digest of all of it."""
+        """Digest of all entries."""
         return digest(self.model_dump(mode="json"))
 
     @cached_property
@@ -115,7 +115,7 @@ class LadderModel(BaseModel):
         )
 
     def evaluate(self, features: SlowFeatures) -> Correction:
-        """Return the residual at each step; where a feature is unknown it is 0 with gain 0."""
+        """Return the residual at each step; residual and gain are 0 where a feature is NaN."""
         from pdhef_logtool.residual_model.ladder_kernels import evaluate
 
         count = len(features.odd)
@@ -139,7 +139,7 @@ class LadderModel(BaseModel):
 
 
 def plain(values: Any) -> Any:
-    """Return arrays as nested tuples of floats with twelve digits, as :class:`LadderModel` takes them."""
+    """Convert arrays to nested tuples of floats with twelve digits, for :class:`LadderModel`."""
     if isinstance(values, np.ndarray) and values.ndim:
         return tuple(plain(row) for row in values)
     return float(f"{float(values):.12g}")

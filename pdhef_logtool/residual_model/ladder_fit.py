@@ -1,7 +1,7 @@
-"""Fit of the ladder of residual models: ridge regression, with rung and λ by nested cross-validation over blocks.
+"""Fit of residual models by ridge regression, with order and λ from nested cross-validation over blocks.
 
-A sideslip error of each drive is fitted up to a constant, which is not kept: it may be an offset of the ground truth or
-of a sensor. With sums over blocks instead of samples, all fits of the cross-validation are small linear systems.
+The fit includes one constant per drive, which is discarded, because it may be an offset of the ground truth or of a
+sensor. With sums over blocks instead of samples, all fits of the cross-validation are small linear systems.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ from pdhef_logtool.residual_model.ladder import (
 from pdhef_logtool.residual_model.ladder_kernels import expand
 from pdhef_logtool.residual_model.slow_features import EVEN_COUNT, ODD_COUNT, SPEED_COLUMN, SlowFeatures
 
-#: Ridge parameters that are tried, in seconds of driving with features of variance 1. Blocks of the same drive favour
-#: values down to 30 s; on other drives of the car a residual with less than 1000 s often increases the error.
+#: Ridge parameters, in seconds of driving with features of variance 1. Blocks of the same drive favour values down to
+#: 30 s, but on other drives of the car a residual with less than 1000 s often increases the error.
 LAMBDAS = (1000.0, 3000.0, 10000.0)
-#: Blocks of the cross-validation: most of them, the shortest one, and its end that counts in no fold, because the
-#: features of the next block remember it.
+#: Blocks of the cross-validation: largest number, shortest length, and time at the end that no fold uses, because the
+#: features of the next block depend on it.
 MOST_BLOCKS, LEAST_BLOCK_S, FORGET_S = 10, 4.0, 2.0
-#: A rung is taken where its squared error in blocks that it has not seen is below that of the simpler one by so many
-#: standard errors of the paired differences, and its RMSE by this share. λ: the largest within one standard error.
+#: A model replaces a simpler one if its squared error in held-out blocks is lower by at least this many standard errors
+#: of the paired differences, and its RMSE by this share. λ is the largest value within one standard error.
 STANDARD_ERRORS, LEAST_GAIN = 1.3, 0.02
-#: Random features, the length of their frequencies, and the driving that they need.
+#: Number of random features, scale of their frequencies, and least duration of driving for them.
 RANDOM_FEATURES, FREQUENCY, RANDOM_LEAST_S = 200, 0.4, 60.0
-#: Directions of the posterior that are kept.
+#: Number of directions of the posterior.
 DIRECTIONS = 16
-#: Mean over so many seconds that neither features nor errors have in a fit: a slow error may be due to bank.
+#: Features and errors of a fit are reduced by their means over this time, because slow errors may be due to bank.
 SLOW_S = 5.0
-#: Samples a second that a fit uses.
+#: Sample rate of a fit.
 FIT_RATE_HZ = 25.0
 QUANTILE = 0.98
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TaughtDrive:
-    """A drive with ground truth: features of its steps [K], the sideslip that ``physics`` lacks, NaN where unknown.
+    """A drive with ground truth: features of its steps [K] and the missing sideslip of ``physics``, NaN if unknown.
 
-    ``weight`` : of this sideslip, by the uncertainty of the ground truth.
+    ``weight`` : of this sideslip, from the uncertainty of the ground truth.
     """
 
     name: str
@@ -61,17 +61,17 @@ class TaughtDrive:
 
     @property
     def usable(self) -> BoolArray:
-        """Whether features and error are known, [K]."""
+        """Mask of steps with finite features and error, [K]."""
         usable = np.isfinite(self.lacking_rad) & np.isfinite(self.features.odd).all(axis=1)
         return np.asarray(usable & np.isfinite(self.features.even).all(axis=1), dtype=np.bool_)
 
 
 @dataclass(frozen=True, slots=True)
 class RungTrial:
-    """A rung in the nested cross-validation: RMSE in degrees in blocks that no choice has seen, without constants.
+    """A model in the nested cross-validation: RMSE in degrees over held-out blocks, without constants.
 
-    ``difference_deg2`` of the squared error to the rung ``against``, with its standard error. ``taken``: whether it is
-    better by enough.
+    ``difference_deg2``: difference of the squared error to the model ``against``, with its standard error. ``taken``:
+    whether the model is significantly better.
     """
 
     rung: str
@@ -84,7 +84,7 @@ class RungTrial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LadderFit:
-    """The model, None for the rung ``none``; λ; the rungs that were tried; driving in s; blocks."""
+    """The chosen model, None for ``none``; λ; all tested models; driving in s; number of blocks."""
 
     model: LadderModel | None
     ridge: float
@@ -94,13 +94,13 @@ class LadderFit:
 
     @property
     def rung(self) -> str:
-        """The rung that was chosen."""
+        """Name of the chosen model."""
         return NONE if self.model is None else self.model.rung
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sample:
-    """What a fit uses of a drive [K]: odd and even features, error, its weight in s; duration of a row."""
+    """Data of a drive for a fit [K]: odd and even features, error, its weight in s; duration of a row."""
 
     odd: FloatArray
     even: FloatArray
@@ -117,7 +117,7 @@ class _Sample:
 class _Problem:
     """Products of 1, features and error, summed over each block [B, c + 2, c + 2], in s; the drive of each block [B].
 
-    ``whole``: sums over drives, which also have the ends of the blocks.
+    ``whole``: sums over drives, which include the ends of the blocks.
     """
 
     blocks: FloatArray
@@ -125,7 +125,7 @@ class _Problem:
     whole: FloatArray
 
     def only(self, columns: int) -> _Problem:
-        """Return the problem with the first features alone."""
+        """Return the problem with only the first features."""
         kept = [*range(columns + 1), -1]
         return _Problem(self.blocks[:, kept][:, :, kept], self.drives, self.whole[:, kept][:, :, kept])
 
@@ -143,7 +143,7 @@ class _Problem:
 
 
 def _centred(sums: FloatArray) -> FloatArray:
-    """Return the products of features and error without their means: what a free constant leaves of them."""
+    """Return the products of features and error after subtraction of their means."""
     return np.asarray((sums - np.outer(sums[0], sums[0]) / sums[0, 0])[1:, 1:])
 
 
@@ -154,7 +154,7 @@ def _solve(drives: Sequence[FloatArray], ridge: float) -> FloatArray:
 
 
 def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR, RANDOM), seed: int = 0) -> LadderFit:
-    """Choose a rung and fit it; the result does not depend on a constant that is added to a drive's error."""
+    """Choose a model and fit it; a constant that is added to a drive's error does not change the result."""
     samples = [s for s in map(_thinned, drives) if s.seconds >= LEAST_BLOCK_S]
     seconds = math.fsum(s.seconds for s in samples)
     if not samples or seconds < 2.0 * LEAST_BLOCK_S:
@@ -200,7 +200,7 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
 
 
 def _thinned(drive: TaughtDrive) -> _Sample:
-    """Return what a fit uses of a drive, at most so many rows a second."""
+    """Return the data of a drive for a fit, at most :data:`FIT_RATE_HZ` rows per second."""
     step_s = float(np.median(np.diff(drive.stamps_ns))) * 1e-9 if len(drive.stamps_ns) > 1 else 1.0
     every = max(1, round(1.0 / (FIT_RATE_HZ * step_s)))
     rows = np.flatnonzero(drive.usable)[::every]
@@ -227,7 +227,7 @@ def _problem(samples: Sequence[_Sample], phi: Sequence[FloatArray], seconds: flo
 
 
 def _climb(problems: dict[str, _Problem]) -> tuple[tuple[RungTrial, ...], str]:
-    """Try the rungs in order; return what was tried, and the last one that was taken."""
+    """Test the models in order; return all trials and the last accepted model."""
     some = next(iter(problems.values()))
     count, seconds = len(some.blocks), some.blocks[:, 0, 0]
     errors = {NONE: np.array([some.block_error(k, (k,), None) for k in range(count)])}
@@ -253,7 +253,7 @@ def _rmse_deg(squares: FloatArray, seconds: FloatArray) -> float:
 
 
 def _best_ridge(problem: _Problem, without: tuple[int, ...]) -> float:
-    """Return the largest λ whose error in held-out blocks is within one standard error of the lowest."""
+    """Return the largest λ with a held-out error within one standard error of the lowest."""
     inner = [k for k in range(len(problem.blocks)) if k not in without]
     if len(inner) < 2:
         return LAMBDAS[-1]
@@ -266,7 +266,7 @@ def _best_ridge(problem: _Problem, without: tuple[int, ...]) -> float:
 
 
 def _factor(normal: FloatArray, phi: FloatArray, rmse_rad: float) -> FloatArray:
-    """Return L [k, m] whose product with its transpose is the posterior covariance in the directions that count."""
+    """Return L [k, m] with L Lᵀ the posterior covariance in its largest directions."""
     root = rmse_rad * np.linalg.inv(np.linalg.cholesky(normal)).T
     moved = phi @ root
     _, axes = np.linalg.eigh(moved.T @ moved)
@@ -274,7 +274,7 @@ def _factor(normal: FloatArray, phi: FloatArray, rmse_rad: float) -> FloatArray:
 
 
 def _whitening(z: FloatArray) -> FloatArray:
-    """Return the matrix of the distance, 1 at that of :data:`QUANTILE` of the drives."""
+    """Return the whitening matrix, with distance 1 at the :data:`QUANTILE` of the drives."""
     second = z.T @ z / len(z) + REGION_RIDGE * np.eye(z.shape[1])
     root = np.linalg.inv(np.linalg.cholesky(second))
     distance2 = np.sum((z @ root.T) ** 2, axis=1)

@@ -1,4 +1,4 @@
-"""Compiled code of the ladder: features, residual and distance of steps (:mod:`~.ladder`)."""
+"""Compiled code of residual models: features, residual and distance of steps (:mod:`~.ladder`)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pdhef_logtool.records.signals import FloatArray
 
 
 class LadderArrays(NamedTuple):
-    """A fitted rung as arrays; the fields of :class:`~.ladder.LadderModel`."""
+    """A fitted residual model as arrays, with the fields of :class:`~.ladder.LadderModel`."""
 
     scale: FloatArray
     odd_directions: FloatArray

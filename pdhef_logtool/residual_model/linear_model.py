@@ -1,7 +1,7 @@
-"""A sideslip that is linear in the network's features, smoothed by a causal low-pass: one small JSON file.
+"""Sideslip by linear regression on the network's features with a causal low pass, in a JSON file.
 
 β = low-pass(intercept + Σ coefficient · feature), first order, at ``low_pass_hz``. Both are linear, so that the fit
-sees low-passed features: the coefficients then make up for what the low-pass delays, as far as they can.
+uses low-passed features; its coefficients partly compensate the delay of the low pass.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class LinearModel:
 
     Attributes
     ----------
-    feature_names : out of :data:`~.features.FEATURES`. coefficients : rad per unit of each feature, [k].
+    feature_names : a subset of :data:`~.features.FEATURES`. coefficients : rad per unit of each feature, [k].
     intercept_rad : sideslip at features of zero. low_pass_hz : corner of the low-pass.
-    provenance : training data hash, errors and what else the model card states; JSON-able.
+    provenance : training data hash, errors and other entries of the model card; JSON-able.
     """
 
     feature_names: tuple[str, ...]
@@ -49,7 +49,7 @@ class LinearModel:
         """Return the sideslip before the low-pass, [N], of the full feature array."""
         columns = [FEATURES.index(name) for name in self.feature_names]
         weighted = features[:, columns] * np.array(self.coefficients)
-        # numpy's own sum of a row may depend on how many rows there are; a window must not change a bit
+        # numpy's sum of a row may depend on the number of rows; windows must not change the result
         total = np.full(features.shape[0], self.intercept_rad)
         for i in range(weighted.shape[1]):
             total += weighted[:, i]

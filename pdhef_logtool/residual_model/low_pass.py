@@ -1,4 +1,4 @@
-"""A causal first-order low-pass with carried memory, compiled."""
+"""Compiled causal first-order low pass with state."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pdhef_logtool.compiled.cache import njit
 
 @njit(cache=True)
 def low_pass(values, dt_s, corner_hz, memory, out):  # type: ignore[no-untyped-def]
-    """Write the first-order low-pass of ``values`` [N, k] to ``out``; exact for values held over each step.
+    """Write the low-passed ``values`` [N, k] to ``out``; exact for values that are constant over each step.
 
     Parameters
     ----------
-    dt_s : [N], step that ends at each value; NaN where a sequence starts, which takes the value as it is.
-    memory : [k], the last output, updated in place; rows with NaN are passed through and leave it.
+    dt_s : [N], step that ends at each value; NaN at the start of a sequence, where the output is the value.
+    memory : [k], the last output, updated in place; rows with NaN are passed through and do not change it.
     """
     for n in range(values.shape[0]):
         share = 1.0

@@ -1,4 +1,4 @@
-"""ST-ResNet: the LSTM with a fully connected head that predicts the nominal model's residual (Eq 11-17, Table 1)."""
+"""ST-ResNet: LSTM with a fully connected head that predicts the nominal model's residual (Eq 11-17, Table 1)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Architecture:
 
 
 class ResidualNetwork(nn.Module):
-    """Sequence of normalised features in, sequence of normalised residuals out; the state is carried by the caller."""
+    """Network from a sequence of normalised features to normalised residuals; the caller keeps the state."""
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()

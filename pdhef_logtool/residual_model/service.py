@@ -1,4 +1,4 @@
-"""The network over a whole log in one pass per window, with carried state (docs/method.md#network)."""
+"""Predictions of the network over a log, with one pass per window and its state (docs/method.md#network)."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, OUTPUT_COUNT, RESIDUAL, ModelBundle
 from pdhef_logtool.residual_model.forward_pass import SIDES, ForwardPass, NetworkState
 
-#: A residual beyond these is none: m/s² and rad/s².
+#: Limits of residuals, m/s² and rad/s².
 LIMITS = (4.0, 6.0)
 _LIMITS_OF = {RESIDUAL: LIMITS, LATERAL_VELOCITY: (30.0,)}  # m/s
 
 
-#: What the network takes from window to window; None: a sequence begins.
+#: State between windows; None at the start of a sequence.
 NetworkCarry: TypeAlias = NetworkState | None
 
 
 @dataclass(frozen=True)
 class NetworkService:
-    """What one bundle predicts, step by step."""
+    """Predictions of one bundle, step by step."""
 
     bundle: ModelBundle
 
@@ -39,12 +39,12 @@ class NetworkService:
         return ForwardPass.of(self.bundle.weights, self.bundle.layers, self.bundle.head)
 
     def run(self, features: FloatArray, starts: BoolArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkCarry]:
-        """Return residual rates [N, 2] in m/s² and rad/s² from each step on, or v_y [N, 1] in m/s; and the state.
+        """Return residual rates [N, 2] in m/s² and rad/s² after each step, or v_y [N, 1] in m/s; and the state.
 
         Parameters
         ----------
         features : [N, 15] as from :func:`~.features.make_features`; rows with NaN give 0 and end the sequence.
-        starts : [N], where a sequence begins again.
+        starts : [N], True at the start of a sequence.
         """
         out = np.zeros((features.shape[0], OUTPUT_COUNT[self.bundle.target]))
         usable = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
@@ -65,7 +65,7 @@ class NetworkService:
     def _sequence(self, scaled: FloatArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkState]:
         both = np.zeros((len(scaled), SIDES, scaled.shape[1]), dtype=np.float32)
         both[:, 0] = scaled
-        if self.bundle.odd:  # normalised, a mirrored feature has the other sign: the means of those that change are 0
+        if self.bundle.odd:  # features that change their sign have a mean of 0, so that normalised values change it too
             both[:, 1] = scaled * self.bundle.signs
         said, after = self._network.run(both, self._network.initial_state() if carry is None else carry)
         straight, mirrored = said[:, 0].astype(np.float64), said[:, 1]
@@ -74,12 +74,12 @@ class NetworkService:
 
 @dataclass(frozen=True)
 class RememberingNetwork(NetworkService):
-    """A network that answers the same question once: neither gain nor noise of a filter changes its features."""
+    """A network that caches its predictions, which do not depend on the gain or noise of a filter."""
 
     _known: dict[bytes, tuple[FloatArray, NetworkCarry]] = field(default_factory=dict, compare=False)
 
     def run(self, features: FloatArray, starts: BoolArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkCarry]:
-        """Return what the network states; what is remembered are whole drives, from their start."""
+        """Return the predictions; only predictions of whole drives, from their start, are cached."""
         if carry is not None:
             return super().run(features, starts, carry)
         key = hashlib.sha256(np.ascontiguousarray(features).tobytes() + starts.tobytes()).digest()

@@ -1,8 +1,8 @@
-"""Inputs of the ladder of residual models: signals of the physics pass through four causal low-pass filters.
+"""Inputs of residual models: signals of the physics filter after four causal low-pass filters.
 
-``odd`` signals change sign where left and right are mirrored: steering angle, yaw rate, a_y and the sideslip of
-``physics``. ``even`` signals do not: speed and a_x. A residual model takes even signals only as factors of odd ones, so
-that it is odd itself and has no constant. Nothing here depends on the residual, and nothing on ground truth.
+``odd`` signals change their sign when left and right are exchanged: steering angle, yaw rate, a_y and the sideslip of
+``physics``. ``even`` signals do not: speed and a_x. A residual model uses even signals only as factors of odd ones, so
+that it is odd and has no constant. The inputs depend neither on the residual nor on ground truth.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ EVEN = ("speed_m_s", "ax_m_s2")
 #: Time constants of the low-pass filters, s.
 TIME_CONSTANTS_S = (0.05, 0.3, 1.5, 6.0)
 ODD_COUNT, EVEN_COUNT = len(ODD) * len(TIME_CONSTANTS_S), len(EVEN) * len(TIME_CONSTANTS_S)
-#: Column of ``even`` with the speed that the region of validity is about: after the filter of 0.3 s.
+#: Column of ``even`` with the speed for the region of validity, filtered with 0.3 s.
 SPEED_COLUMN = len(EVEN)
 
 
@@ -37,7 +37,7 @@ def slow_features(signals: FloatArray, dt_s: FloatArray, memory: FloatArray | No
     ----------
     signals : [K, 6] over :data:`ODD` and :data:`EVEN`; NaN where unknown.
     dt_s : [K], duration before each step; NaN where a sequence starts.
-    memory : [4, 6], of the window before; None at the start of a log.
+    memory : [4, 6], from the previous window; None at the start of a log.
     """
     from pdhef_logtool.residual_model.low_pass import low_pass  # compiled
 

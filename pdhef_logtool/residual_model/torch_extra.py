@@ -1,4 +1,4 @@
-"""PyTorch, which trains networks and is an extra: everything else works without it."""
+"""Check for PyTorch, an optional package that only training needs."""
 
 from __future__ import annotations
 

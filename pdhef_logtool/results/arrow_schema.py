@@ -52,7 +52,7 @@ def arrow_schema(name: str) -> pa.Schema:
 
 
 def arrow_array(values: Any, kind: pa.DataType) -> pa.Array:
-    """Return numbers or strings [N] as ``pa.array`` does, NaN as null; that imports pandas where it is installed."""
+    """Return numbers or strings [N] as an array, NaN as null; ``pa.array`` would import an installed pandas."""
     import pyarrow as pa
 
     if pa.types.is_string(kind):

@@ -1,6 +1,6 @@
-"""Effects of what drives state of themselves (car, road, weather, month) on the error, with intervals.
+"""Effects of properties of a drive (car, road, weather, month) on the error, with intervals.
 
-An effect is the geometric mean error of the drives of one value over that of the other drives. Its interval is that of
+An effect is the ratio of geometric mean errors: drives with one value against the other drives. Its interval is from
 Welch's t-test of log errors, widened by the dependence of drives of one day, car and route; levels and p-values are
 corrected for the number of comparisons (Holm 1979).
 """
@@ -32,7 +32,7 @@ _LARGEST_LOG = 20.0
 
 @dataclass(frozen=True, slots=True)
 class BreakdownDrive:
-    """What a breakdown needs of a drive: ``error`` of the selected estimate in rad (NaN: not scored), keys, factors."""
+    """Input of a breakdown, per drive: ``error`` of the selected estimate in rad (NaN: not scored), keys, factors."""
 
     error: float
     keys: Mapping[str, str]
@@ -41,7 +41,7 @@ class BreakdownDrive:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """Error of the drives of a group over that of the others, less 1, with its interval and corrected p-value."""
+    """Ratio of the errors of a group and of the other drives, less 1, with its interval and corrected p-value."""
 
     share: float
     low: float
@@ -139,7 +139,7 @@ def _alike(drives: Sequence[BreakdownDrive], values: Mapping[str, Sequence[str |
 
 
 def _tests(key: str, drives: Sequence[BreakdownDrive], values: Sequence[str | None]) -> dict[str, _Test | str]:
-    """Return the comparison of each value with the other drives, or why there is none."""
+    """Return the comparison of each value with the other drives, or the reason why it is impossible."""
     scored = [i for i, d in enumerate(drives) if d.error > 0.0 and values[i] is not None]
     logs = np.log([drives[i].error for i in scored])
     names = np.array([values[i] for i in scored], dtype=object)

@@ -12,13 +12,13 @@ from pdhef_logtool.results.sink import TRUTH, resolution
 if TYPE_CHECKING:
     import polars as pl
 
-#: What is looked at of a track.
+#: Compared columns of a track.
 _SIGNALS = ("sideslip_rad", "vy_m_s", "vx_m_s", "yaw_rate_rad_s", "ay_m_s2", "sideslip_std_rad", "valid")
 
 
 @dataclass(frozen=True, slots=True)
 class ChangedSignal:
-    """A column of a track that is not the same; what files round off, which versions do differently, does not count.
+    """A column of a track that differs by more than the rounding of the files.
 
     ``track``: an estimator, or :data:`TRUTH`. ``first_ns``: first stamp that differs; ``first_s``: counted from the
     track's first. ``stamps``: how many differ, of ``of``; a stamp that one side lacks does too. ``largest``: largest
@@ -36,7 +36,7 @@ class ChangedSignal:
 
 
 def changed_signals(pair: Pair, estimator: str) -> Iterator[ChangedSignal]:
-    """Yield what differs of ground truth and of an estimator, by column; nothing where a side has no track.
+    """Yield the columns of ground truth and of an estimator that differ, if both sides have the track.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Events as clips: an MCAP each, with what the source recorded around it and our tracks."""
+"""Clips: one MCAP per event, with the messages of the source around it and our tracks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pdhef_logtool.results.parquet_sink import list_estimators, read_track
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
 
-#: Folder of the clips within those of a run; it contains those of the last search alone.
+#: Folder of clips in the outputs of a run; it contains the clips of the last search.
 CLIPS = "clips"
 _ANNOTATED = "annotated.mcap"
 
@@ -36,10 +36,10 @@ def write_clips(
 
     Parameters
     ----------
-    pad_s : what a clip has before and behind its event.
+    pad_s : seconds before and after the event.
     named : tracks that clips have beside the ground truth and those that the report shows.
     source : folder (or file) with the logs; None takes the full copies that the run wrote.
-    tell : called with what a drive's clips lack.
+    tell : called with a line for people on parts that a clip lacks.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def _span(log: DriveLog, event: FoundEvent, pad_s: float) -> tuple[int, int]:
 
 
 def _source_of(run: OpenedRun, log: OpenedLog, folder: Path | None) -> Path:
-    """Return a file with all that the source of a drive contains; raises OutputError where there is none."""
+    """Return a file with all messages of the source of a drive; raises OutputError if it does not exist."""
     sha256, name = log.entry.get("sha256"), str(log.entry.get("file", ""))
     if folder is not None:
         candidates = [folder] if folder.name == name else sorted(p for p in folder.rglob("*") if p.name == name)

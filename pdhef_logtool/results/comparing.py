@@ -1,4 +1,4 @@
-"""Two finished runs held against each other: what changed, by how much over drives that are in both, and the gate."""
+"""Comparison of two finished runs: changed figures of the drives that are in both, and the gate."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ FigureVerdict: TypeAlias = Verdict | Literal["no figure"]
 
 #: Value of ``cluster`` for drives that do not depend on one another.
 INDEPENDENT = "none"
-#: Of the drives whose figure changed most, so many are followed into their tracks.
+#: Number of drives with the largest changes for which tracks are compared.
 MOST_FOLLOWED = 10
-#: The graver verdict is that of the whole.
+#: Verdicts from grave to harmless; the gravest one is the overall verdict.
 _GRAVITY: tuple[FigureVerdict, ...] = ("worse", "no figure", "inconclusive", "not worse", "better", "equal")
 #: Rows of metrics.parquet that are in memory at once.
 _ROWS = 1 << 18
@@ -65,9 +65,9 @@ class ComparedFigure:
 
     Attributes
     ----------
-    drives : those that have it on both sides, the one that became worst first. unit : of it, that of metrics.parquet.
+    drives : with the figure on both sides, largest worsening first. unit : of the figure in metrics.parquet.
     only_a, only_b : drives of both runs that have it on one side. neither : how many have it on none.
-    notes : what makes it less than it seems.
+    notes : reservations.
     corrected_p : sign test, corrected for all figures that are shown beside those asked for; None for those.
     """
 
@@ -117,13 +117,13 @@ class Comparison:
 
     Attributes
     ----------
-    a, b : the folders. pairs : how many drives are in both, by what stated so. only_a, only_b : drives in one alone.
-    differences : what else may have changed figures, a line each. changed : drives with any figure that is not the
+    a, b : the folders. pairs : number of drives in both, by the way they were paired. only_a, only_b : other drives.
+    differences : other causes of changed figures, a line each. changed : drives with any figure that is not the
         same bit for bit.
-    figures : those that were asked for or that the gate has. others : shown beside them; none where nothing changed.
+    figures : requested, or of the gate. others : shown beside them; empty if all are equal.
     signals : where the tracks of the most changed drives part. followed : how many drives were looked at for it.
     damaged : files of drives that could not be read, a line each.
-    gated, allow_unpaired, strict : what closes the gate. requirements : verdicts of a validation plan on B.
+    gated, allow_unpaired, strict : rules of the gate. requirements : verdicts of a validation plan on B.
     """
 
     a: str
@@ -158,7 +158,7 @@ class Comparison:
 
     @property
     def unpaired(self) -> tuple[str, ...]:
-        """What is on one side only, a line a side and figure."""
+        """Drives and figures on one side only, a line per side and figure."""
         sides = [("drives", "", self.only_a, self.only_b)]
         sides += [("figures", f": {f.figure.label}", f.only_a, f.only_b) for f in self.figures]
         return tuple(
@@ -170,7 +170,7 @@ class Comparison:
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """Why the gate is closed, a line each; empty: it is open, or there is none."""
+        """Reasons why the gate is closed, a line each; empty without a gate or if it is open."""
         reasons = []
         if self.gated:
             reasons += [f"{f.figure.label}: {f.verdict}" for f in self.figures if f.verdict in ("worse", "no figure")]
@@ -292,7 +292,7 @@ class _Damaged:
 
     @contextmanager
     def noted(self, *logs: OpenedLog) -> Iterator[None]:
-        """Do without what is damaged of logs, and note it."""
+        """Skip damaged logs and note them."""
         try:
             with ExitStack() as stack:
                 for log in logs:
@@ -303,7 +303,7 @@ class _Damaged:
 
 
 class _Tables:
-    """The figures of two runs for their pairs; only what is asked for is read."""
+    """Figures of two runs for their pairs; only requested rows are read."""
 
     def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair], damaged: _Damaged) -> None:
         self._runs = (a, b)
@@ -314,7 +314,7 @@ class _Tables:
                 self._main[number] = pair.a.main()
 
     def name_of(self, pair: Pair, estimator: str) -> str:
-        """Return what ``estimator`` is called for a pair."""
+        """Return the name of ``estimator`` in a pair."""
         return self._main[self._pairs.index(pair)] if estimator == MAIN else estimator
 
     def changed(self) -> frozenset[str]:
@@ -337,7 +337,7 @@ class _Tables:
         return frozenset(both.filter(differs)["log"])
 
     def compared(self, figures: Sequence[Figure], grouping: _Grouping) -> list[ComparedFigure]:
-        """Return figures over all pairs; nothing else is read."""
+        """Return figures over all pairs; only their rows are read."""
         rows = self._rows(figures)
         return [self._compared(figure, rows, grouping) for figure in figures]
 
@@ -389,7 +389,7 @@ class _Tables:
             raise UsageError(expected=f"an estimator of these runs: {', '.join(single)}", got=got, where="--estimator")
 
     def _rows(self, figures: Sequence[Figure]) -> list[pl.DataFrame]:
-        """Return the rows of figures, and of what is stated of their ground truth, of both runs."""
+        """Return the rows of figures and of the independence of their ground truth, of both runs."""
         import polars as pl
 
         named = {f.estimator for f in figures} - {MAIN}
@@ -404,7 +404,7 @@ class _Tables:
 
 
 def _by_parts(run: OpenedRun, query: Callable[[pl.LazyFrame], pl.LazyFrame]) -> pl.DataFrame:
-    """Return a query over a run's figures, made of each part of the file by itself: few rows are in memory at once."""
+    """Return the results of a query over each part of a run's figures; few rows are in memory at once."""
     import polars as pl
     import pyarrow.parquet as pq
 
@@ -463,7 +463,7 @@ def _share(a: float, b: float) -> float | None:
 
 
 def _others() -> list[Figure]:
-    """Return what a change of an estimator shows in: RMSE by signal and segment, and what else tables show."""
+    """Return figures that an estimator influences: RMSE by signal and segment, and the other columns of tables."""
     shown = [
         Figure(signal=signal, metric=metric.name)
         for metric in registered().values()
@@ -494,7 +494,7 @@ def _corrected(figures: Sequence[ComparedFigure]) -> tuple[ComparedFigure, ...]:
 
 
 def _most_changed(pairs: Sequence[Pair], changed: frozenset[str], figure: ComparedFigure) -> list[Pair]:
-    """Return the changed pairs whose figure changed most, those without one last, at most :data:`MOST_FOLLOWED`."""
+    """Return the pairs with the largest changes of the figure, pairs without it last, at most :data:`MOST_FOLLOWED`."""
     by_drive = {d.drive: abs(float(log_ratios(np.array([d.a]), np.array([d.b]))[0])) for d in figure.drives}
     changed_pairs = [pair for pair in pairs if pair.a.label in changed]
     return sorted(changed_pairs, key=lambda pair: -by_drive.get(pair.a.label, -1.0))[:MOST_FOLLOWED]
@@ -502,7 +502,7 @@ def _most_changed(pairs: Sequence[Pair], changed: frozenset[str], figure: Compar
 
 @dataclass(frozen=True, slots=True)
 class _Grouping:
-    """What the pairs [N] share: ``clusters`` that the user named, or ``factors`` whose influence is estimated."""
+    """Dependence of the pairs [N]: ``clusters`` that the user named, or ``factors`` with estimated influence."""
 
     clusters: Sequence[object] | None = None
     factors: Mapping[str, Sequence[object]] = field(default_factory=dict)

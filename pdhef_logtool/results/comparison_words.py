@@ -15,7 +15,7 @@ _BY = {"signals": "the content of their signals", "content": "the hashes of thei
 
 
 def paired_text(comparison: Comparison) -> str:
-    """Return how many drives are in both runs, and by what they were known."""
+    """Return the number of drives in both runs, and how they were paired."""
     pairs = sum(comparison.pairs.values())
     by = ", ".join(f"{count} by {_BY[key]}" for key, count in comparison.pairs.items())
     if len(comparison.pairs) == 1:
@@ -43,9 +43,9 @@ def verdict_text(comparison: Comparison) -> str:
 
 
 def assumed_text(comparison: Comparison) -> str:
-    """Return what the verdict takes for granted."""
+    """Return the assumptions of the verdict."""
     dependence = next((dependence_text(f, comparison.cluster) for f in comparison.figures if f.drives), "")
-    differences = "what else differs (below) counts as part of B"
+    differences = "the other differences (below) count as part of B"
     return "; ".join(
         filter(None, [dependence.rstrip("."), paired_text(comparison), differences if comparison.differences else ""])
     )
@@ -73,7 +73,7 @@ def next_text(comparison: Comparison) -> str:
 
 
 def notes_of(comparison: Comparison) -> list[str]:
-    """Return what must be known of the figures that were asked for, a line each."""
+    """Return remarks on the requested figures, a line each."""
     asked = [f for f in comparison.figures if f.drives and not comparison.equal]
     texts = {f.figure.label: dependence_text(f, comparison.cluster) for f in asked}
     alike = len(set(texts.values())) == 1
@@ -95,10 +95,10 @@ def change_text(figure: ComparedFigure) -> str:
 
 
 def dependence_text(figure: ComparedFigure, cluster: str | None) -> str:
-    """Return the design effect of the drives and what is known of its causes."""
+    """Return the design effect of the drives and its known causes."""
     of = figure.change.dependence
     if cluster == INDEPENDENT:
-        return "Drives are taken as independent (--cluster none)."
+        return "Drives are assumed independent (--cluster none)."
     if cluster is not None:
         return f"Design effect {of.design_effect:.2g} of {figure.change.clusters} clusters by {cluster}."
     return of.text(figure.change.drives)

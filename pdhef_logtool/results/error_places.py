@@ -50,5 +50,5 @@ def largest_errors(
 
 
 def _known(track: StateTrack, low_speed_m_s: float) -> FloatArray:
-    """Return the sideslip [N], NaN where it is not valid or the car too slow for a direction."""
+    """Return the sideslip [N], NaN if it is invalid or the car is too slow for a direction."""
     return np.where(track.valid, track.without_sideslip_below(low_speed_m_s).sideslip_rad, np.nan)

@@ -1,8 +1,8 @@
 """The figures of a whole run: errors over drives, the order of estimators, effects of conditions, and coverage.
 
 Reports are read one after the other and metrics lazily: a few figures of each drive remain in memory, never a series.
-Scores use drives whose ground truth is independent of the estimator; drives without such a ground truth are listed
-separately. Intervals take the dependence of drives of one day, car or route into account.
+Scores use drives with ground truth that is independent of the estimator; other drives are listed separately.
+Intervals take the dependence of drives of one day, car or route into account.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from pdhef_logtool.results.paired_change import PairedChange, holm, log_ratios, 
 
 #: Name of the estimate that each drive's report calls its answer.
 ANSWER = "answer"
-#: Errors that are given, in order: signal and unit.
+#: Columns of errors: signal and unit.
 SIGNALS = {s: SCORED_SIGNALS[s] for s in ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s")}
 JUDGED = "sideslip_rad"
 WORST = 20
-#: Folders from the top that drives are given by.
+#: Levels of folders by which drives are grouped.
 _MOST_FOLDERS = 3
-#: Labels that a group of failures names, and groups that are given.
+#: Most labels of a group of failures, and most groups.
 NAMED, _MOST_GROUPS = 10, 50
-#: Remedies by the start of what a supervisor states of a worker.
+#: Remedies by the first words of a supervisor's reason.
 _REMEDIES = {
     "nothing heard": "Allow more time: --set log_timeout_s=SECONDS.",
     "the worker was killed": "If memory was short, use fewer --jobs; pdhef inspect LOG shows the size of the log.",
@@ -66,7 +66,7 @@ class FleetDrive:
     errors : RMSE by estimator and signal, where the ground truth is independent of both.
     nis, d2, naive_d2 : without ground truth: NIS and v̇_y residual of the selected estimate, v̇_y residual of sideslip 0.
     verdict : of sideslip: ``better``, ``worse`` and so on. coverage : of the 95 % confidence interval.
-    failed_checks : those that count. lost : what could not be used, empty for nothing. keys : what it can be given by.
+    failed_checks : that count. lost : data that could not be used. keys : for grouping.
     factors : day, car and route, None where not stated.
     """
 
@@ -87,7 +87,7 @@ class FleetDrive:
     factors: Mapping[str, str | None]
 
     def error(self, estimator: str = ANSWER, signal: str = JUDGED) -> float:
-        """Return the RMSE of an estimator; NaN where there is none."""
+        """Return the RMSE of an estimator, NaN if unknown."""
         return self.errors.get((self.main if estimator == ANSWER else estimator, signal), math.nan)
 
 
@@ -172,7 +172,7 @@ class Fleet:
 
     @property
     def scored(self) -> tuple[FleetDrive, ...]:
-        """Drives whose answer is scored."""
+        """Drives with a scored answer."""
         return tuple(d for d in self.drives if d.truth)
 
     @property
@@ -183,7 +183,7 @@ class Fleet:
 
     @property
     def without_truth(self) -> tuple[FleetDrive, ...]:
-        """The other ones; those first whose answer contradicts its sensors most."""
+        """The other drives, largest contradiction between answer and sensors first."""
 
         def contradiction(drive: FleetDrive) -> tuple[bool, float, str]:
             against = drive.d2 / drive.naive_d2 if drive.naive_d2 > 0.0 else math.nan
@@ -236,7 +236,7 @@ def least_to_rank(estimators: int) -> int:
 
 @dataclass(slots=True)
 class _Gathered:
-    """What reports leave behind, one after the other."""
+    """Accumulated contents of the reports."""
 
     drives: list[FleetDrive] = field(default_factory=list)
     failed: list[tuple[str, str]] = field(default_factory=list)
@@ -346,12 +346,12 @@ def _why_unscored(report: Mapping[str, Any], verdict: Mapping[str, Any]) -> str:
     if not report["truth"]["available"]:
         return "the log has no ground truth"
     if JUDGED in report["truth"]["not_independent"]:
-        return "its ground truth is no independent one"
-    return str(verdict.get("text", "nothing of it is scored")).partition(": ")[2] or "nothing of it is scored"
+        return "its ground truth is not independent"
+    return str(verdict.get("text", "no figure of it is scored")).partition(": ")[2] or "no figure of it is scored"
 
 
 def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str]:
-    """Return what a drive can be given by: what its log states of itself, and what the run has."""
+    """Return the keys for grouping of a drive: metadata of its log, and of the run."""
     friction = report.get("friction") or {}
     car = log.entry.get("car") or {}
     source = str(friction.get("source", ""))

@@ -16,10 +16,10 @@ MAIN = "main"
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure of metrics.parquet whose lower value is better.
+    """A figure of metrics.parquet; lower is better.
 
-    ``estimator``: a name on both sides, or :data:`MAIN`. ``limit``: the share by which it may become worse, None where
-    nothing is asked of it.
+    ``estimator``: a name on both sides, or :data:`MAIN`. ``limit``: the share by which it may become worse, None:
+    any.
     """
 
     signal: str = "sideslip_rad"
@@ -44,20 +44,20 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """What must not become worse; ``allow_unpaired``: drives on one side only do not break it."""
+    """Figures that must not become worse; ``allow_unpaired``: drives on one side only are accepted."""
 
     figures: tuple[Figure, ...]
     allow_unpaired: bool = False
 
 
 def figures_of(plan: ValidationPlan) -> tuple[Figure, ...]:
-    """Return what the requirements of a plan measure, where lower is better, without limits."""
+    """Return the figures of a plan's requirements for which lower is better, without limits."""
     figures = [Figure(r.signal, r.metric, r.segment, r.estimator or MAIN) for r in plan.requirements]
     return tuple(dict.fromkeys(f for f in figures if not figure_problems(f.signal, f.metric, f.segment))) or (Figure(),)
 
 
 def figure_problems(signal: str, metric: str, segment: str, where: str = "") -> list[str]:
-    """Return what is wrong with the words of a figure."""
+    """Return the error in the specification of a figure."""
     # Less is better, and 0 is best: those that a ratio states something of.
     compared = tuple(name for name, metric in registered().items() if metric.best == "lower")
     choices = (("signal", signal, tuple(SIGNALS)), ("metric", metric, compared), ("segment", segment, SEGMENTS))

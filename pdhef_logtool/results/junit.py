@@ -20,7 +20,7 @@ from pdhef_logtool.storage.files import write_bytes
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One testcase. ``suite``, ``subject``: what it is of; ``output``: its figures, shown in any case.
+    """One testcase. ``suite``, ``subject``: its classname and name; ``output``: figures, always shown.
 
     ``outcome`` is the type of a failure where it ``failed``; ``reason`` states why it failed or was skipped.
     """
@@ -138,5 +138,5 @@ def _add_case(suite: ET.Element, case: Case) -> None:
 
 
 def _text(text: str) -> str:
-    """Replace what XML 1.0 cannot contain."""
+    """Replace characters that XML 1.0 cannot contain."""
     return re.sub("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]", "?", text)

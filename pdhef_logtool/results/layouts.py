@@ -70,7 +70,7 @@ def write_layouts(
     Parameters
     ----------
     foxglove, plotjuggler : the finished files.
-    colours : 0xRRGGBB by estimator. shown : tracks whose lines and intervals are on at first.
+    colours : 0xRRGGBB by estimator. shown : tracks with lines and intervals that are visible at first.
     fixes : topics of satellite fixes in the log, for a map.
     """
     drawn = {t.name: "#{:02x}{:02x}{:02x}".format(*colour_rgb(t.name, colours)) for t in tracks}
@@ -85,7 +85,7 @@ def foxglove_layout(
     """Return a layout of Foxglove: plots in degrees, errors, maps, states and the log.
 
     ``tracks``: colour by name; ``shown``: those that are on at first, with their intervals; ``on_map``: those that
-    have poses; ``fixes``: topics. The settings are those of ``foxglove.layouts`` in Foxglove's SDK, under the names
+    have poses; ``fixes``: topics. The settings are as ``foxglove.layouts`` in Foxglove's SDK, under the names
     of panels that exported layouts have.
     """
     plots = [plot for tab in _TABS.values() for plot in tab if plot.field not in _STATES and _of(plot, tracks)]

@@ -1,4 +1,4 @@
-"""What happened in a drive as lines of a log, for the log panels of viewers."""
+"""Events of a drive as log lines, for the log panels of viewers."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ _PLANAR = np.array([0, 1, 5])
 _LEVEL = 1
 #: Between two poses of a track that is not shown first and between two plotted values; between two points of the map.
 _POSE_STEP_NS, _PATH_STEP_NS = 50_000_000, 1_000_000_000
-#: Steps of the tracks without a name in --estimators: the shortest that leaves the file small enough is taken.
+#: Steps of the tracks that --estimators does not name; the shortest one for which the file is small enough.
 _STEPS_NS = tuple(round(s * 1e9) for s in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0))
 #: The shortest one of a long drive.
 _LONG_STEP_NS = 200_000_000
@@ -74,7 +74,7 @@ _LONG_STEP_NS = 200_000_000
 _PIECE_NS = 60_000_000_000
 #: Of the map of a track.
 _MOST_POSES = 1000
-#: Bytes of a message with its index, and of report, figures and schemas: upper bounds of what simulated drives take.
+#: Bytes of a message with its index, and of report, figures and schemas: upper bounds over simulated drives.
 _MESSAGE_BYTES, _DOCUMENT_BYTES = 70, 180_000
 
 
@@ -115,11 +115,11 @@ class AnnotatedMcap:
     ----------
     path : the finished file.
     source : the log to copy in full; None, or a log without messages, for a sidecar that contains our topics alone.
-    shown : tracks whose pose is written at every stamp; of others every 50 ms. None: all.
+    shown : tracks with a pose at every stamp; others have one every 50 ms. None: all.
     others_step_ns : step of all topics of the others; those that are shown then have 10 poses a second, and the ground
         truth 20 states. None: as above.
     min_speed_m_s : sideslip is not plotted below.
-    span_ns : copy what the source recorded in [start, end) only; None: all of it.
+    span_ns : copy messages of the source in [start, end) only; None: all.
     left_out : topics of the source that are not copied; its attachments and metadata are not either. None: all are.
 
     Raises
@@ -156,7 +156,7 @@ class AnnotatedMcap:
     def write(self, tracks: Sequence[StateTrack]) -> tuple[Loss, ...]:
         """Write the tracks, merged with the messages of the source; return the losses of the copy.
 
-        Sound chunks of the source that contain nothing but what is kept are written as they are, others message by
+        Sound chunks that contain only kept messages are copied whole, others message by
         message. The losses of the source itself are complete afterwards.
         """
         lost: tuple[Loss, ...] = ()
@@ -285,7 +285,7 @@ def _until(raws: Iterator[_Raw], waiting: list[_Raw], end_ns: float) -> Iterator
 def metrics_record(report: Mapping[str, Any]) -> dict[str, str]:
     """Return the figures as ``estimator/signal/segment/metric`` → ``value unit n=samples`` (``null``: not computable).
 
-    ``log``, ``truth`` (``available``, ``no truth``) and ``estimator/algorithm`` (what ran, as JSON) are beside them.
+    Further entries: ``log``, ``truth`` (``available``, ``no truth``) and ``estimator/algorithm`` (resolved, as JSON).
     """
     record = {
         "log": str(report["log"]["name"]),
@@ -374,7 +374,7 @@ def _odometry_batch(track: StateTrack, use: IntArray) -> TopicBatch:
 
 
 def _twist_covariance(covariance: FloatArray, n: int) -> FloatArray:
-    """Place [N, 3, 3] over v_x, v_y, r into [N, 36]; all zero, ROS's sign for unknown, where it is not known."""
+    """Place [N, 3, 3] over v_x, v_y, r into [N, 36]; all zero (ROS: unknown) if it is unknown."""
     full = np.zeros((n, 6, 6))
     if covariance.shape[0]:
         is_finite: BoolArray = np.all(np.isfinite(covariance), axis=(1, 2))

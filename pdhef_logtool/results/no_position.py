@@ -102,7 +102,7 @@ def neutral_stem(identity: str | None) -> str:
 
 
 def without_names(document: _T, place: LogPlace, stem: str) -> _T:
-    """Replace the path of a log, its name and those of the files in its folder in all texts of a JSON-able document."""
+    """Replace the path and name of a log and the names of files in its folder in all texts of a JSON-able document."""
     name = stem + PurePath(place.name).suffix
     names = {str(place): name, f"{place.name}/": f"{name}/"}
     if str(place.parent) != ".":

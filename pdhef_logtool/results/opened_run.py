@@ -22,11 +22,11 @@ from pdhef_logtool.storage.object_store import Mirror, is_url
 if TYPE_CHECKING:
     import polars as pl
 
-#: Folder of a log's outputs within those of a run, the figures of all logs, and what lies in a log's folder.
+#: Folder of logs in the outputs of a run, the figures of all logs, and the files of a log's folder.
 LOGS = "logs"
 METRICS_FILE = "metrics.parquet"
 REPORT_FILE, SETUP_FILE = "report.json", "setup.toml"
-#: What a run of several logs has done, a line a drive; and the folder of the figures of each, by run and car.
+#: Journal of a run of several logs, a line per drive; and the folder of their figures, by run and car.
 JOURNAL_FILE = "journal.jsonl"
 PARTS = "metrics"
 ESTIMATES_FILE = "estimates.parquet"
@@ -75,9 +75,9 @@ class _Run(_Checked):
 
 @dataclass(frozen=True, slots=True)
 class OpenedLog:
-    """What a run left of one log. ``entry`` is its record in run.json; nothing is read before it is asked for.
+    """Outputs of a run for one log. ``entry`` is its record in run.json; files are read on demand.
 
-    Of a run at a URL files are fetched into a folder of this machine when they are asked for.
+    Files of a run at a URL are fetched into a local folder on demand.
     """
 
     label: str
@@ -116,7 +116,7 @@ class OpenedLog:
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Turn what a report without a checksum makes its readers raise into an OutputError: it is damaged."""
+        """Turn errors in reading a report without a checksum into an OutputError: it is damaged."""
         try:
             yield
         except PdhefError:
@@ -132,11 +132,11 @@ class OpenedLog:
             ) from error
 
     def main(self) -> str:
-        """Return the estimator that is the drive's answer; empty where there is none."""
+        """Return the selected estimator of the drive, or an empty string."""
         return str(self.entry.get("main") or "")
 
     def estimates(self) -> pl.LazyFrame | None:
-        """Return estimates.parquet lazily; None where there is none."""
+        """Return estimates.parquet lazily, or None if it does not exist."""
         import polars as pl
 
         path = self.file(ESTIMATES_FILE)
@@ -147,7 +147,7 @@ class OpenedLog:
 class OpenedRun:
     """A run's folder: ``document`` is run.json, ``logs`` are in its order, failed ones too.
 
-    Of a run at a URL the folder is one of this machine, which has of it what was asked for and goes with this.
+    For a run at a URL the folder is local and temporary and contains the fetched files.
     """
 
     folder: Path
@@ -199,7 +199,7 @@ def open_run(output: Path | str) -> OpenedRun:
 
     Parameters
     ----------
-    output : what ``-o`` named, a folder or a URL.
+    output : the argument of ``-o``, a folder or a URL.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """How much a figure of the same drives changed: the median paired log ratio with its interval, and a verdict.
 
 Each drive is compared with itself, because drives differ more from one another than runs do. The median limits the
-influence of single drives. Its bounds are order statistics, as in the sign test, whose variance is multiplied by the
+influence of single drives. Its bounds are order statistics, as in the sign test, with a variance multiplied by the
 design effect of drives of one day, car or route (:mod:`pdhef_logtool.evaluation.dependence`).
 """
 
@@ -37,7 +37,7 @@ class PairedChange:
     median : NaN without drives. low, high : its 95 % interval; NaN below :data:`LEAST_CLUSTERS`, or where the
         dependence leaves too little evidence.
     least, most : its one-sided 95 % bounds. error : its standard error, from their distance.
-    sign_p : two-sided p-value of "as many drives rise as fall"; 1 where nothing changed.
+    sign_p : two-sided p-value of "as many drives rise as fall"; 1 if all are equal.
     dependence : design effect and its causes.
     """
 
@@ -53,7 +53,7 @@ class PairedChange:
     dependence: Dependence = field(default_factory=Dependence)
 
     def verdict(self, limit: float = 0.0) -> Verdict:
-        """Return whether b is worse by more than ``limit`` (a share: 0.05) in a figure whose lower value is better.
+        """Return whether b is worse by more than ``limit`` (a share: 0.05) in a figure for which lower is better.
 
         ``worse``: the one-sided bound is above 0 and the median above the limit. ``better``: the bound the other way is
         below 0. ``not worse``: a change beyond the limit is excluded. Else the data do not decide.
@@ -85,8 +85,8 @@ def paired_change(
     Parameters
     ----------
     ratios : of :func:`log_ratios` [N]; infinite ones take part, by their sign.
-    clusters : what each drive is of [N]; fewer than :data:`LEAST_CLUSTERS` give no bounds.
-    factors : what may make drives depend on one another (day, car, route) where ``clusters`` is None.
+    clusters : cluster of each drive [N]; fewer than :data:`LEAST_CLUSTERS` give no bounds.
+    factors : possible causes of dependence (day, car, route), used if ``clusters`` is None.
     """
     n = len(ratios)
     groups = n if clusters is None else len(set(numbered(clusters).tolist()))

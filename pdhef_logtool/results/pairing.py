@@ -1,4 +1,4 @@
-"""Which drive of one run is which of another: by what their signals held, else by their files, else by their names."""
+"""Pairs of drives of two runs: by the hash of their signals, else of their files, else by name."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ _KEYS: tuple[tuple[PairedBy, Callable[[OpenedLog], object]], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """One drive in both runs, and what states that it is one."""
+    """One drive in both runs, and how it was recognised."""
 
     a: OpenedLog
     b: OpenedLog
     by: PairedBy
 
     def same(self, key: str) -> bool | None:
-        """Return whether an entry of run.json is the same on both sides; None where a side has none."""
+        """Return whether an entry of run.json is the same on both sides; None if one side lacks it."""
         left, other = self.a.entry.get(key), self.b.entry.get(key)
         return None if left is None or other is None else bool(left == other)
 
 
 @dataclass(frozen=True, slots=True)
 class Pairing:
-    """The drives of two runs: pairs in the order of A, and what has no partner."""
+    """The drives of two runs: pairs in the order of A, and drives without a partner."""
 
     pairs: tuple[Pair, ...]
     only_a: tuple[OpenedLog, ...]

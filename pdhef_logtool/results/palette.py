@@ -8,7 +8,7 @@ from collections.abc import Mapping
 _TRUTH = 0x8A8A8A
 #: The sideslip reference.
 REFERENCE_COLOUR = 0x999933
-#: For names without a colour of their own, such as recorded estimates: Okabe and Ito (2008) without black and yellow.
+#: For other names, such as recorded estimates: Okabe and Ito (2008) without black and yellow.
 _OTHERS = (0xD55E00, 0x0072B2, 0xE69F00, 0x009E73, 0xCC79A7, 0x56B4E9)
 
 

@@ -89,9 +89,9 @@ def write_estimates(
     Parameters
     ----------
     path : the finished file.
-    selected : estimators whose track is written a second time, as :data:`SELECTED`, each from a stamp on. Their tracks
-        have the same stamps.
-    causal_from_ns : first stamp from which the rows of an estimator depend on nothing later; an estimator without one
+    selected : estimators, each from a stamp on; their tracks have the same stamps and are also written as
+        :data:`SELECTED`.
+    causal_from_ns : first stamp from which the rows of an estimator depend on no later sample; an estimator without one
         is causal nowhere. None: unknown, and ``causal`` is null.
     rows_a_group : rows of one row group.
 
@@ -138,7 +138,7 @@ def _write_group(
 def track_table(track: StateTrack, *, as_written: bool = False, causal: BoolArray | None = None) -> pa.Table:
     """Return a track [N] as rows of estimates.parquet, rounded as they are in the file if ``as_written``.
 
-    ``causal`` [N]: whether a row depends on nothing later; None: unknown.
+    ``causal`` [N]: whether a row depends on no later sample; None: unknown.
     """
     schema = arrow_schema("estimates.parquet.json")
     columns: dict[str, Any] = dict(track.columns())
@@ -306,7 +306,7 @@ def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
 
 
 def join_metrics(path: Path, parts: Sequence[Path]) -> None:
-    """Write metrics.parquet from those of drives, in their order, a few at a time; raises OutputError."""
+    """Concatenate metrics.parquet of drives in their order, a few at a time; raises OutputError."""
     schema = arrow_schema("metrics.parquet.json")
     with (
         PendingFile(path) as pending,

@@ -21,7 +21,7 @@ from pdhef_logtool.results.sink import TRUTH
 if TYPE_CHECKING:
     import polars as pl
 
-#: Figures beside that of the requirement: exposure, independence, and the estimated reference.
+#: Figures beside the requirement's own: exposure, independence, and the estimated reference.
 _BESIDE = ("exposure_s", "exposure_m", NOT_INDEPENDENT, "reference_rms", "reference_std")
 #: Log, estimator, signal, segment and metric.
 _Key = tuple[str, str, str, str, str]
@@ -98,7 +98,7 @@ def _figures(rows: Iterable[tuple[str, str, str, str, str, float | None, int]]) 
 
 
 def figures_of_file(metrics: pl.LazyFrame, plan: ValidationPlan, mains: Iterable[str | None]) -> Figures:
-    """Return what a plan needs of metrics.parquet; only these rows are read."""
+    """Return the rows of metrics.parquet that a plan needs; only these are read."""
     import polars as pl
 
     named = {SENSORS, *names_of(plan.requirements), *(m for m in mains if m is not None)}
@@ -232,7 +232,7 @@ def _with_space(value: DriveValue, report: Mapping[str, Any]) -> DriveValue:
 
 
 def _exposure(requirement: Requirement, figures: Figures, drive: JudgedDrive, n: int) -> tuple[float, float]:
-    """Return seconds and metres behind a figure: those of the segment, in proportion to its scored stamps."""
+    """Return seconds and metres behind a figure: the segment's, in proportion to the scored stamps."""
     amounts = []
     for metric in ("exposure_s", "exposure_m"):
         whole = figures.values.get((drive.log, SENSORS, "state", requirement.segment, metric))
@@ -241,7 +241,7 @@ def _exposure(requirement: Requirement, figures: Figures, drive: JudgedDrive, n:
 
 
 def _paired(blocks: RequirementBlocks | None, theirs: RequirementBlocks | None) -> RequirementBlocks | None:
-    """Return blocks with those of run A as baseline, where both have them."""
+    """Return blocks with the blocks of run A as baseline, if both have them."""
     if blocks is None or theirs is None or blocks.block_s != theirs.block_s:
         return None
     by_number = dict(zip(theirs.number, theirs.value, strict=True))

@@ -1,4 +1,4 @@
-"""What viewers draw of a track: angles in degrees, limits of the 95 % interval, errors against the ground truth."""
+"""Drawn values of a track: angles in degrees, limits of the 95 % interval, errors against the ground truth."""
 
 from __future__ import annotations
 

@@ -32,7 +32,6 @@ from pdhef_logtool.results.sink import (
     LONGEST_WHOLE_NS,
     TRUTH,
     Event,
-    Shown,
     first_of_slots,
     is_finished_recording,
 )
@@ -41,22 +40,22 @@ from pdhef_logtool.storage.files import cannot_write, open_new, writing
 #: Estimators beside the selected estimate and the baseline that the blueprint has places for, hidden until asked for.
 MOST_OTHERS = 12
 
-#: A line is broken where nothing is known for longer than this.
+#: A line is broken at gaps longer than this.
 LONGEST_BRIDGE_NS = 1_000_000_000
 
 #: Points of one trajectory in the plan view; it is thinned when it would grow beyond.
 MOST_TRAJECTORY_POINTS = 20_000
 
-#: Steps of the moving dot in the plan view, and in that of a long drive.
+#: Steps of the moving dot in the plan view, for short and long drives.
 DOT_STEP_NS, LONG_DOT_STEP_NS = 50_000_000, 500_000_000
 
-#: Between the rows of a long drive: of what the recording opens on, and of the others.
+#: Steps between rows of a long drive, for tracks visible at first and for others.
 LONG_STEP_NS, OTHERS_STEP_NS = 100_000_000, 200_000_000
 
 #: Rows of a chunk.
 _CHUNK_ROWS = 6000
 
-#: How long Rerun may keep one call waiting before the recording is given up.
+#: Longest wait for one call of Rerun before the recording is abandoned.
 LONGEST_WAIT_S = 60.0
 
 
@@ -112,7 +111,7 @@ def write_recording(
     input_hash: str,
     start_ns: int,
     end_ns: int | None = None,
-    shown: Shown,
+    shown: Sequence[str],
     min_speed_m_s: float = 1.0,
     colours: Mapping[str, int] | None = None,
 ) -> None:
@@ -130,8 +129,8 @@ def write_recording(
     log_name : the recording's name.
     input_hash : hexadecimal hash of the log, which distinguishes the recordings of a run.
     start_ns : zero of the timeline ``elapsed``. end_ns : of the drive, which decides whether it is long; None: not.
-    shown : which estimators the recording opens on.
-    min_speed_m_s : sideslip is not drawn below, where it has no meaning. colours : 0xRRGGBB by estimator.
+    shown : estimators of ``/main`` and ``/baseline``, on which the recording opens.
+    min_speed_m_s : sideslip is not drawn below it. colours : 0xRRGGBB by estimator.
 
     Raises
     ------
@@ -172,11 +171,9 @@ def write_recording(
         )
 
 
-def _places(names: Sequence[str], shown: Shown) -> dict[str, str]:
+def _places(names: Sequence[str], shown: Sequence[str]) -> dict[str, str]:
     """Return the entity of each track."""
-    places = {TRUTH: "truth", shown.main: "main"}
-    if shown.baseline is not None:
-        places[shown.baseline] = "baseline"
+    places = {TRUTH: "truth", **dict(zip(shown, ("main", "baseline"), strict=False))}
     others = [name for name in names if name not in places]
     return places | {name: f"other/{number}" for number, name in enumerate(others, start=1)}
 
@@ -277,7 +274,7 @@ class _Drawing:
         self.stream.flush()
 
     def _columns(self, track: StateTrack, plots: Sequence[_Plot]) -> dict[str, FloatArray]:
-        """Return by component what is drawn of a track, [N, 1] or, with its 95 % interval, [N, 3]; NaN where unknown.
+        """Return the drawn values of a track by component, [N, 1] or, with a 95 % interval, [N, 3]; NaN if unknown.
 
         The blueprint needs all components: those that a track does not have are NaN.
         """
@@ -366,10 +363,10 @@ class _Drawing:
 
 
 class _Outlet:
-    """Writes to a file what Rerun sends into a pipe, so that Rerun itself never meets a disk that is full or hangs.
+    """Copies Rerun's output from a pipe to a file, so that Rerun itself never meets a full or hanging disk.
 
-    Rerun writes from a thread of its own that ends on an error, and others may then wait for it without end. Here
-    what cannot be written is read and dropped, and the error kept.
+    Rerun's writer thread ends on an error, and other threads may then wait for it forever. Here
+    bytes that cannot be written are read and dropped, and the error is kept.
 
     Attributes
     ----------
@@ -399,11 +396,11 @@ class _Outlet:
             self._to = -1
 
     def drop(self) -> None:
-        """Write no more of what comes."""
+        """Write no further bytes."""
         self._dropped = True
 
     def give_up(self) -> None:
-        """Wait no longer for the disk: the thread that does is left alone, and another one drops what comes."""
+        """Stop waiting for the disk: abandon the waiting thread; another one drops further bytes."""
         if self.error is None:
             self.error = TimeoutError(errno.ETIMEDOUT, f"nothing could be written for {LONGEST_WAIT_S:g} s")
             self._dropped = True
@@ -411,7 +408,7 @@ class _Outlet:
                 self._start_thread()
 
     def close(self) -> None:
-        """Wait until all is written that Rerun has sent, whose own end must be closed by then."""
+        """Wait until all of Rerun's output is written; its end of the pipe must be closed."""
         self.opened()
         if self._thread is not None:
             self._thread.join(LONGEST_WAIT_S)
@@ -430,7 +427,7 @@ class _Outlet:
             os.close(self._from)
 
     def _write(self, data: bytes | None) -> None:
-        """Write, or at the end (None) close the file; what cannot be written is dropped from then on."""
+        """Write, or at the end (None) close the file; after an error all bytes are dropped."""
         try:
             if data is not None:
                 self._file.write(data)
@@ -482,7 +479,7 @@ def _strips(points: FloatArray) -> list[FloatArray]:
 def _blueprint() -> rrb.Blueprint:
     """Open on the drive: sideslip with intervals, yaw rate, a_y, inputs, the plan; errors, filter and report as tabs.
 
-    It names what tracks are for and no estimator, so that it suits every drive.
+    It refers to main, baseline and others, not to estimators, so that it suits every drive.
     """
     states = ("truth", "baseline", "main", *(f"other/{number}" for number in range(1, MOST_OTHERS + 1)))
     drive = rrb.Horizontal(
@@ -547,7 +544,7 @@ def _plot_view(title: str, overrides: dict[str, list[Any]], *, legend: bool) -> 
 
 
 def _line_of(component: str, style: rr.SeriesLines | None = None) -> rrb.Visualizer:
-    """Draw a component as lines; names and colours are those of the entity where no style is given."""
+    """Draw a component as lines; without a style, names and colours are the entity's."""
     source = ComponentSourceKind.SourceComponent
     mapping = VisualizerComponentMapping("Scalars:scalars", source, source_component=component)
     return (style or rr.SeriesLines()).visualizer(mappings=[mapping])

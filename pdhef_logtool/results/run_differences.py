@@ -1,4 +1,4 @@
-"""What differs between two runs before any figure: cars, mappings, signals, ground truth, configuration, versions."""
+"""Differences of two runs besides figures: cars, mappings, signals, ground truth, configuration, versions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DIGITS = 8
 
 
 def run_differences(a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair]) -> tuple[str, ...]:
-    """Return, a line each, what else may have changed the figures of two runs' pairs."""
+    """Return other possible causes of changed figures of two runs' pairs, a line each."""
     return (
         *_car(pairs),
         *_changed(pairs, "mapping_sha256", "mapping", "sources, scales, stamps, latencies or limits"),
@@ -91,7 +91,7 @@ def _example(pair: Pair, what: str) -> str:
 def _main(pairs: Sequence[Pair]) -> Iterator[str]:
     changes = Counter((p.a.entry["main"], p.b.entry["main"]) for p in pairs if p.same("main") is False)
     for (before, other), count in changes.most_common(_MOST_NAMED):
-        yield f"selected estimate: {before} → {other}{_of(count, len(pairs))}; that of A is compared on both sides"
+        yield f"selected estimate: {before} → {other}{_of(count, len(pairs))}; the one of A is compared on both sides"
 
 
 def _entries(what: str, before: object, other: object) -> Iterator[str]:

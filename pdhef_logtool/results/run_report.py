@@ -4,29 +4,19 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-import math
 import platform
 from collections.abc import Container, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
-from pdhef_logtool.evaluation.dead_reckoned import PathDrift
-from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.registry import registered
-from pdhef_logtool.evaluation.operating_space import OperatingSpace
-from pdhef_logtool.evaluation.reasons import ReasonFacts, SensorFault
 from pdhef_logtool.evaluation.standing import Standing
-from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.ledger import SampleCount
-from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.results.error_places import ErrorPlace
 from pdhef_logtool.results.selected_estimate import MainFacts, answer_of
-from pdhef_logtool.results.sink import Event
 from pdhef_logtool.results.verdicts import verdicts_of
 from pdhef_logtool.storage.documents import jsonable, seal
 from pdhef_logtool.storage.files import write_bytes
@@ -34,196 +24,22 @@ from pdhef_logtool.storage.files import write_bytes
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pdhef_logtool.car.assumed_values import AssumedValue
-    from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 #: Columns of a figure in the report.
 _METRIC_COLUMNS = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
 #: Entries that a brief report keeps of a list.
 _MOST_LISTED = 5
-#: Distributions whose version decides what a run computes or writes.
+#: Distributions that affect the results of a run; their versions are recorded.
 VERSIONED = ("pdhef-logtool", "mcap", "numba", "numpy", "polars", "pyarrow", "rerun-sdk", "rosbags", "scipy", "torch")
 
 
 @dataclass(frozen=True, slots=True)
-class TopicFacts:
-    """One topic of the log, and whether a signal or a truth channel is read from it."""
-
-    name: str
-    type_name: str
-    encoding: str
-    messages: int
-    mapped: bool
-
-
-@dataclass(frozen=True, slots=True)
-class LogFacts:
-    """The log that was read; ``file`` is its file name without folders, [start_ns, end_ns) its log times.
-
-    ``signals_sha256``, ``truth_sha256``: of what was read of it, None where nothing was.
-    """
-
-    name: str
-    file: str
-    kind: str
-    sha256: str
-    start_ns: int
-    end_ns: int
-    topics: Sequence[TopicFacts] = ()
-    signals_sha256: str | None = None
-    truth_sha256: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class SourceFacts:
-    """Where one signal or ground truth quantity came from.
-
-    ``source`` is ``/topic.field``; ``derivation`` states how it was computed, empty if it was read directly.
-    """
-
-    name: str
-    source: str
-    unit: str
-    samples: int
-    derivation: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class EstimatorFacts:
-    """One estimator that was asked for.
-
-    ``skipped`` is the reason if it did not run, ``failed`` the reason if its estimates are not used.
-    ``notes``: what it has to state of itself. ``intervals``: what its 95 % intervals are made of, empty without.
-    ``reasons``: why it did not use its sensors as usual; None if it does not look. ``algorithm``: what ran under the
-    name, with its digest; None if it did not run.
-    """
-
-    name: str
-    causal: bool
-    skipped: str | None = None
-    failed: str | None = None
-    notes: Sequence[str] = ()
-    intervals: Sequence[str] = ()
-    reasons: Sequence[ReasonFacts] | None = None
-    algorithm: Mapping[str, Any] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class TruthFacts:
-    """What was compared with: quantities (with their derivation), its latency, and what is no independent check."""
-
-    quantities: Sequence[SourceFacts] = ()
-    latency_s: float | None = None
-    not_independent: Sequence[str] = ()
-    notes: Sequence[str] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class FrictionFacts:
-    """The friction that every estimator was given: ``source`` in words, and what an estimate of it was worth.
-
-    ``observable_share`` of the stamps, ``observable_std`` the median 1-sigma there; NaN where nothing was estimated.
-    """
-
-    source: str
-    estimated: bool = False
-    observable_share: float = math.nan
-    observable_std: float = math.nan
-    summary: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class DriveDetails:
-    """What a report's page shows and no table contains, of a drive that a run estimated.
-
-    ``faults`` of the sensors, None where no estimator detects them.
-    ``standings`` of the selected estimate, empty without ground truth.
-    ``metadata`` : what the log states of itself.
-    """
-
-    faults: Sequence[SensorFault] | None
-    standings: Sequence[Standing]
-    metadata: Mapping[str, str]
-    path_drift: PathDrift | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class RequirementFacts:
-    """The verdicts of the validation plan on one drive alone, and the blocks of time that they are drawn from."""
-
-    verdicts: PlanVerdicts
-    blocks: Sequence[RequirementBlocks] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class ReportFacts:
-    """Everything that report.json states about one log.
-
-    ``vehicle_file``: the car's folder or file, None where none was given; ``vehicle_proven``: whether driving with
-    ground truth showed it to be right; ``vehicle_taught``: what taught it, None without. ``low_speed_m_s``: below it
-    sideslip is not scored.
-    ``main``: the estimator of the selected estimate, None where nothing was estimated.
-    ``warnings``: what may be wrong; ``remarks``: what else is worth knowing.
-    ``calibration``: what the drive stated of its car without ground truth, None where it was not asked.
-    ``reference``: what came of the sideslip reference, None where it was not asked for.
-    ``samples``: what became of the samples of each mapped source.
-    ``checks``: plausibility of signals, ground truth and vehicle file. ``details``: None where nothing was estimated.
-    ``requirements``: None where there is nothing to judge. ``space``: where the drive went.
-    ``largest_errors``: of sideslip, the largest first.
-    """
-
-    log: LogFacts
-    signals: Sequence[SourceFacts]
-    missing_signals: Sequence[str]
-    vehicle_name: str
-    vehicle_sha256: str
-    estimators: Sequence[EstimatorFacts]
-    truth: TruthFacts
-    vehicle_file: str | None = None
-    vehicle_proven: bool = False
-    vehicle_taught: str | None = None
-    sensors: Mapping[str, float] = field(default_factory=dict)
-    assumed: Sequence[AssumedValue] = ()
-    setup: Mapping[str, Any] | None = None
-    low_speed_m_s: float | None = None
-    friction: FrictionFacts | None = None
-    calibration: Mapping[str, Any] | None = None
-    reference: Mapping[str, Any] | None = None
-    metrics: Sequence[MetricRow] = ()
-    segments: Sequence[Event] = ()
-    losses: Sequence[Loss] = ()
-    samples: Sequence[SampleCount] = ()
-    warnings: Sequence[str] = ()
-    remarks: Sequence[str] = ()
-    main: MainFacts | None = None
-    checks: Sequence[Check] = ()
-    requirements: RequirementFacts | None = None
-    space: OperatingSpace | None = None
-    largest_errors: Sequence[ErrorPlace] = ()
-    details: DriveDetails | None = None
-    versions: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class CarFacts:
-    """The car that a log of a run had: folder or file (None: none was given), vehicle, digests of physics, network.
-
-    ``sensors``: the entries of its sensor profile that differ from the default.
-    """
-
-    file: str | None
-    name: str
-    sha256: str
-    network_sha256: str | None
-    sensors: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
 class LogOutcome:
-    """How one log of a run ended, with which car; None where it was not read or nothing was estimated.
+    """Outcome of one log of a run, with its car; None: the log was not read, or no estimator ran.
 
-    ``failed`` is the one-line reason if nothing came out; ``lost`` states what of the log could not be used.
+    ``failed`` is the one-line reason if there is no result; ``lost`` lists the parts of the log that are not used.
+    ``car``: see :func:`car_entry`.
     ``main``: the estimator of the selected estimate. ``folder`` of the log, below the folder of the run.
     ``algorithms``: the identity of each estimator that ran. ``files``: sha256 by name of the files in the log's folder
     that commands read back. ``day`` (UTC) and ``route``: drives that share them depend on one another.
@@ -234,7 +50,7 @@ class LogOutcome:
     sha256: str | None
     failed: str | None = None
     lost: Sequence[str] = ()
-    car: CarFacts | None = None
+    car: Mapping[str, Any] | None = None
     signals_sha256: str | None = None
     truth_sha256: str | None = None
     mapping_sha256: str | None = None
@@ -254,7 +70,7 @@ class LogOutcome:
 
 
 def tool_versions() -> dict[str, str]:
-    """Return the versions of Python and of the installed distributions that decide what a run computes."""
+    """Return the versions of Python and of the installed distributions that affect results."""
     return {"python": platform.python_version(), **{name: v for name in VERSIONED if (v := _installed(name))}}
 
 
@@ -265,98 +81,39 @@ def run_versions() -> dict[str, str]:
 
 @cache
 def _installed(distribution: str) -> str | None:
-    """Return the version of a distribution, None where it is not installed; the file is read once a process."""
+    """Return the version of a distribution, None if it is not installed; the file is read once per process."""
     with suppress(importlib.metadata.PackageNotFoundError):
         return importlib.metadata.version(distribution)
     return None
 
 
-def build_report(facts: ReportFacts) -> dict[str, Any]:
-    """Return the document of report.json (schemas/report.schema.json); NaN has become None."""
-    log, about = facts.log, jsonable(facts.log)
-    topics = about.pop("topics")
-    document: dict[str, Any] = {
-        "format": "pdhef.report",
-        "version": 1,
-        "log": {
-            **about,
-            "file": PurePath(log.file).name,
-            "duration_s": (log.end_ns - log.start_ns) * 1e-9,
-            "topics": [{"type" if k == "type_name" else k: v for k, v in topic.items()} for topic in topics],
-        },
-        "mapping": {"signals": list(facts.signals), "missing": list(facts.missing_signals)},
-        "vehicle": {
-            "name": facts.vehicle_name,
-            "sha256": facts.vehicle_sha256,
-            "file": facts.vehicle_file,
-            "proven": facts.vehicle_proven,
-            "taught": facts.vehicle_taught,
-            "sensors": dict(facts.sensors),
-            "assumed": list(facts.assumed),
-            "low_speed_blend_m_s": facts.low_speed_m_s,
-        },
-        "estimators": [_estimator(e) for e in facts.estimators],
-        "truth": {
-            "available": bool(facts.truth.quantities),
-            **jsonable(facts.truth),
-            "not_independent": sorted(facts.truth.not_independent),
-        },
-        "setup": facts.setup,
-        "friction": facts.friction,
-        "self_calibration": facts.calibration,
-        "reference": facts.reference,
-        "metrics": [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in facts.metrics],
-        "segments": list(facts.segments),
-        "losses": list(facts.losses),
-        "ledger": {
-            "samples": list(facts.samples),
-        },
-        "warnings": list(facts.warnings),
-        "remarks": list(facts.remarks),
-        "checks": list(facts.checks),
-        "versions": dict(facts.versions),
-    }
-    if facts.requirements is not None:
-        document["plan"] = facts.requirements.verdicts.to_dict()
-        document["requirement_blocks"] = list(facts.requirements.blocks)
-    if facts.space is not None:
-        document |= {"operating_space": facts.space, "largest_errors": list(facts.largest_errors)}
-    document = {key: jsonable(value) for key, value in document.items()}
-    return document | _selected(document, facts.main, facts.details)
+def estimator_entry(name: str, *, causal: bool, outcome: str = "ran", **stated: Any) -> dict[str, Any]:
+    """Return the entry of an estimator in a report.
+
+    ``stated``: ``reason`` if it was skipped or failed, ``notes`` on itself, ``intervals`` (origin of its 95 %
+    intervals), ``reasons`` why it did not use its sensors as usual (None: it does not monitor them), ``algorithm``.
+    """
+    unstated = {"reason": None, "algorithm": None, "notes": (), "intervals": (), "reasons": None}
+    return {"name": name, "causal": causal, "outcome": outcome, **unstated, **stated}
 
 
-def _estimator(facts: EstimatorFacts) -> dict[str, Any]:
-    return {
-        "name": facts.name,
-        "causal": facts.causal,
-        "outcome": "failed" if facts.failed else "ran" if facts.skipped is None else "skipped",
-        "reason": facts.failed or facts.skipped,
-        "algorithm": facts.algorithm,
-        "notes": list(facts.notes),
-        "intervals": list(facts.intervals),
-        "reasons": None if facts.reasons is None else list(facts.reasons),
-    }
+def build_report(
+    content: Mapping[str, Any], main: MainFacts | None = None, standings: Sequence[Standing] = ()
+) -> dict[str, Any]:
+    """Return the document of report.json (schemas/report.schema.json); NaN becomes None.
 
-
-def _selected(document: Mapping[str, Any], main: MainFacts | None, details: DriveDetails | None) -> dict[str, Any]:
-    """Return the selected estimate, its sentences, and the keys that only a run writes."""
+    Parameters
+    ----------
+    content : entries of the document as records or JSON-able values, ``metrics`` as rows of metrics.parquet.
+    main : the selected estimate, None without one. standings : its errors beside the errors of other physics.
+    """
+    metrics = [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in content["metrics"]]
+    entries = {"format": "pdhef.report", "version": 1, **content, "metrics": metrics}
+    document = {key: jsonable(value) for key, value in entries.items()}
     if main is None:
-        return {"selected_estimate": None, "answer": None}
-    chosen: dict[str, Any] = {"selected_estimate": main.name, "answer": answer_of(document, main)}
-    if details is None:
-        return chosen
-    chosen |= _detailed(details)
-    return chosen | {"verdicts": verdicts_of({**document, **chosen}, main.name, details.standings)}
-
-
-def _detailed(details: DriveDetails) -> dict[str, Any]:
-    """Return the keys that only a run writes."""
-    values = {
-        "faults": details.faults,
-        "path_drift": details.path_drift,
-        "metadata": dict(details.metadata),
-    }
-    return {key: jsonable(value) for key, value in values.items()}
+        return document | {"selected_estimate": None, "answer": None}
+    document |= {"selected_estimate": main.name, "answer": answer_of(document, main)}
+    return document | {"verdicts": verdicts_of(document, main.name, standings)}
 
 
 def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
@@ -409,10 +166,10 @@ def _with_drops(report: Mapping[str, Any]) -> list[Any]:
 
 
 def build_run(
-    versions: Mapping[str, str],
     config: Mapping[str, Any],
-    model: Mapping[str, str] | None,
+    network: tuple[str, str] | None,
     outcomes: Iterable[LogOutcome],
+    *,
     remaining: int = 0,
     files: Mapping[str, str] | None = None,
     plan: PlanVerdicts | None = None,
@@ -421,42 +178,28 @@ def build_run(
 
     Parameters
     ----------
-    versions : by distribution, see :func:`tool_versions`.
     config : the configuration in effect, as JSON-able values.
-    model : ``name`` and ``sha256`` of the network; None when none ran, or not the same for all.
-    outcomes : one a log. remaining : logs that are not done, for the run was ended.
-    files : sha256 by name of the files beside run.json that commands read back. plan : verdicts on all logs.
+    network : name and digest; None when none ran, or if the logs have different ones.
+    outcomes : one per log. remaining : number of logs that are not done, because the run was interrupted.
+    files : sha256 by name of the files beside run.json that commands read. plan : verdicts on all logs.
     """
     document = {
         "format": "pdhef.run",
         "version": 1,
-        "versions": dict(versions),
+        "versions": run_versions(),
         "config": dict(config),
-        "model": None if model is None else dict(model),
+        "model": None if network is None else dict(zip(("name", "sha256"), network, strict=True)),
         **({"remaining": remaining} if remaining else {}),
         "files": dict(files or {}),
         "plan": None if plan is None else plan.to_dict(),
-        "logs": [
-            {
-                "log": o.log,
-                "file": PurePath(o.file).name,
-                "folder": o.folder,
-                "sha256": o.sha256,
-                "signals_sha256": o.signals_sha256,
-                "truth_sha256": o.truth_sha256,
-                "mapping_sha256": o.mapping_sha256,
-                "outcome": o.outcome,
-                "main": o.main,
-                "algorithms": o.algorithms,
-                "car": o.car,
-                "files": o.files,
-                "day": o.day,
-                "route": o.route,
-            }
-            for o in outcomes
-        ],
+        "logs": [_run_entry(o) for o in outcomes],
     }
     return seal(document)
+
+
+def _run_entry(outcome: LogOutcome) -> dict[str, Any]:
+    entry = asdict(outcome) | {"file": PurePath(outcome.file).name, "outcome": outcome.outcome}
+    return {key: value for key, value in entry.items() if key not in ("failed", "lost")}
 
 
 def json_bytes(document: Mapping[str, Any], *, brief: bool = False) -> bytes:
@@ -512,7 +255,7 @@ _THROUGHOUT = 0.9
 
 
 def reasons_line(estimator: Mapping[str, Any], start_ns: int) -> str:
-    """Return why an estimator of a report did not use its sensors as usual, and when; empty if there is nothing.
+    """Return why an estimator of a report did not use its sensors as usual, and when; empty without a reason.
 
     ``a_y spike 1.20 s, 3.45 s, 7.00 s and 9 more; gyro stuck 12.3-16.3 s``: in order of time, the longest intervals.
     """

@@ -6,14 +6,14 @@ The report's document is the only source, so that terminal, report.json, Markdow
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, TypeAlias
 
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.tracks import REFERENCE
 
 Report: TypeAlias = Mapping[str, Any]
-#: Figures of the whole drive by estimator, signal and metric; None where there is none.
+#: Figures of the whole drive by estimator, signal and metric; None if absent.
 _Figures: TypeAlias = Mapping[tuple[str, str, str], float | None]
 
 #: Coverage of the 95 % interval from which on it is as stated, nearly, and wider than necessary.
@@ -23,9 +23,9 @@ _WIDE = 0.995
 SAME = 0.03
 #: A ratio below this is printed with a decimal.
 _FEW = 10.0
-#: rad; ground truth whose RMS sideslip is below this does not measure it.
+#: rad; ground truth with an RMS sideslip below this does not measure it.
 NO_SIDESLIP_RAD = 1e-5
-#: Ratio of the lateral consistency residual to that of zero sideslip above which it shows nothing.
+#: Ratio of the lateral consistency residual to the one of zero sideslip; above it the residual is not conclusive.
 _LESS = 0.8
 #: Range of the NIS per degree of freedom (expected value 1) that is reported as consistent.
 _NIS_RANGE = (0.5, 2.0)
@@ -36,14 +36,14 @@ _MOST_STEPS = 2
 
 @dataclass(frozen=True, slots=True)
 class MainFacts:
-    """The estimator of the selected estimate, chosen without ground truth, and what it is shown with.
+    """The selected estimator, chosen without ground truth, and the tracks shown with it.
 
     Attributes
     ----------
     name : of it. chosen_by : evidence of the car's driving, consistency, or estimator order. why : in words.
     distrusted : whether the lateral consistency contradicts the preferred one.
-    naive : what an estimate is worth anything against, None if it did not run. shown : what a person is shown; all that
-        ran where the estimators were ``named``.
+    naive : the estimator to beat, None if it did not run. shown : displayed tracks; all if the estimators were
+        ``named``.
     over_time : estimators selected on line with the stamp, ns, from which on each is; empty: ``name`` throughout.
     """
 
@@ -75,18 +75,10 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
         "next": "; ".join(_next_steps(report, main, figures)[:_MOST_STEPS]),
     }
     best = _best_in_hindsight(report, main, figures)
-    return {
-        "main": main.name,
-        "chosen_by": main.chosen_by,
-        "why": main.why,
-        "distrusted": main.distrusted,
-        "naive": main.naive,
-        "shown": list(main.shown),
-        "named": main.named,
-        **({"over_time": [{"since_ns": t, "name": name} for t, name in main.over_time]} if main.over_time else {}),
-        "best_in_hindsight": best,
-        "texts": texts,
-    }
+    chosen = {"main" if key == "name" else key: value for key, value in asdict(main).items() if key != "over_time"}
+    if main.over_time:
+        chosen["over_time"] = [{"since_ns": t, "name": name} for t, name in main.over_time]
+    return {**chosen, "shown": list(main.shown), "best_in_hindsight": best, "texts": texts}
 
 
 def degrees(value_rad: float) -> str:
@@ -253,7 +245,7 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
 
 
 def _model(report: Report, causal: bool) -> list[str]:
-    """Return the car of an estimator with a vehicle model, and what it is based on."""
+    """Return the car of an estimator with a vehicle model, and its evidence."""
     vehicle, calibration = report["vehicle"], report["self_calibration"]
     used = calibration is not None and not calibration["refused"]
     taught = f", taught by {vehicle['taught']}" if vehicle.get("taught") else ""
@@ -279,7 +271,7 @@ def _car(vehicle: Mapping[str, Any]) -> str:
 
 
 def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]:
-    """Return what would help, the most important first."""
+    """Return the remedies, most important first."""
     vehicle, steps = report["vehicle"], []
     if any(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks", ())):
         steps.append("correct the failed checks below, or waive them by name")
@@ -303,7 +295,7 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
 
 
 def _best_in_hindsight(report: Report, main: MainFacts, figures: _Figures) -> dict[str, Any] | None:
-    """Return the estimator with the least error against ground truth, None without it; nothing is chosen by it."""
+    """Return the estimator with the least error against ground truth, None without it; for display only."""
     ran = [e["name"] for e in report["estimators"] if e["outcome"] == "ran" and e["name"] != REFERENCE]
     errors = {name: error for name in ran if (error := _error(figures, name)) is not None}
     if not errors:

@@ -59,14 +59,6 @@ class ManoeuvreEvent(Event):
     lowest_ax_m_s2: float
 
 
-@dataclass(frozen=True, slots=True)
-class Shown:
-    """Estimators that recordings show first: the selected one, and its baseline or None."""
-
-    main: str
-    baseline: str | None = None
-
-
 def rounded(name: str, values: FloatArray) -> FloatArray:
     """Round a column for files: motion to a step, given values to single precision, others to a relative 1.2e-4.
 

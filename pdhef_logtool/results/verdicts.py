@@ -1,7 +1,7 @@
 """The verdict of a drive, a sentence a signal: the selected estimate against the best physics.
 
 Written from the figures of a report, like :mod:`~pdhef_logtool.results.selected_estimate`, which has the other
-sentences: how the estimate was selected, its interval, what was assumed, what to do next.
+sentences: how the estimate was selected, its interval, assumptions, and next steps.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pdhef_logtool.results.selected_estimate import NO_SIDESLIP_RAD, SAME
 
 #: ``same``: the interval of the difference lies within
 #: :data:`~pdhef_logtool.results.selected_estimate.SAME` of the rival's error.
-#: ``undecided``: it contains 0, or there is none. ``alone``: no other physics ran.
+#: ``undecided``: it contains 0, or is unknown. ``alone``: no other physics ran.
 Outcome: TypeAlias = Literal["better", "worse", "same", "undecided", "alone", "none"]
 
 

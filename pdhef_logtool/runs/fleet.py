@@ -23,23 +23,16 @@ from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, Wo
 from pdhef_logtool.records.processes import process_name
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.results.no_position import neutral_stem
-from pdhef_logtool.results.opened_run import JOURNAL_FILE, LOGS
+from pdhef_logtool.results.opened_run import JOURNAL_FILE, LOGS, METRICS_FILE
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import Keep, RunConfig
+from pdhef_logtool.runs.drive_outputs import check_places, write_run
 from pdhef_logtool.runs.journal import Entry, Journal
-from pdhef_logtool.runs.pipeline import (
-    FEW_LOGS,
-    LogResult,
-    RunResult,
-    check_places,
-    judge,
-    read_validation_plan,
-    run_log,
-    write_run,
-    write_verdicts,
-)
+from pdhef_logtool.runs.judging import judge, read_validation_plan, write_verdicts
 from pdhef_logtool.runs.planning import Plan, PlannedLog, calibrate_pools, plan_logs, settings_of, sweep_parts
 from pdhef_logtool.runs.reporting import FleetProgress, collect, write_run_pages
+from pdhef_logtool.runs.run_drive import run_log
+from pdhef_logtool.runs.run_result import FEW_LOGS, LogResult, RunResult
 from pdhef_logtool.runs.self_calibrating import calibrate_pool
 from pdhef_logtool.runs.stored_output import StoredEnd, StoredOutput, stored_drive
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work, failed_outcome, log_identity, run_drive, run_on_node
@@ -107,10 +100,6 @@ class _Job:
     report: bool
     strict: bool
 
-    def check_places(self, logs: Sequence[LogInput], output: Path) -> None:
-        """Refuse to write over an input; raises UsageError."""
-        check_places(logs, output, self.config, self.mapping, self.junit, self.cars.paths)
-
 
 def run_logs(
     arguments: Logs,
@@ -145,7 +134,7 @@ def run_logs(
     """
     inputs = find_logs(arguments, private_redirects=config.allow_private_redirects)
     junit = None if junit is None else Path(junit)
-    validation = read_validation_plan(config, junit)
+    validation = read_validation_plan(config.plan, junit)
     job = _Job(config, RunCars.of(config, reporter.warn), mapping_of(config.mapping), validation, junit, report, strict)
     alone = len(inputs) == 1 and schedule == Schedule() and work is run_drive and not is_url(output)
     if alone and _given_limits(config) is None:
@@ -158,7 +147,7 @@ def run_logs(
 
 def _check_names(logs: Sequence[LogInput], output: Path, job: _Job, reporter: Reporter) -> None:
     """Note neutral names of logs; raises UsageError if an output would replace an input, or has names of logs."""
-    job.check_places(logs, output)
+    check_places(logs, output, job.config, job.mapping, job.junit, job.cars.paths)
     if not job.config.no_position:
         return
     with suppress(OSError, ValueError):
@@ -183,6 +172,8 @@ def _given_limits(config: RunConfig) -> Limits | None:
 
 def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> RunResult:
     """Run one log in this process; its error ends the run."""
+    from pdhef_logtool.results.parquet_sink import write_metrics
+
     config, car = job.config, job.cars.of_log(log)
     log = replace(log, stem=neutral_stem(log_identity(log))) if config.no_position else log
     _check_names([log], output, job, reporter)
@@ -199,7 +190,9 @@ def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> Ru
             stop.add_note("0 of 1 logs are done")
             raise
         verdicts = judge(job.validation, [result], job.strict)
-        write_run(output, config.to_dict(), result, verdicts, car)
+        write_metrics(output / METRICS_FILE, result.rows)
+        network = None if car.network is None else (Path(car.network_name).name, car.network.sha256)
+        write_run(output, config.to_dict(), [result], verdicts, network)
         journal = Journal.of(output)  # of a run that this one replaces
         journal.path.unlink(missing_ok=True)
         sweep_parts(journal, output)

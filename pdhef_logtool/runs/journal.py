@@ -21,7 +21,7 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.opened_run import JOURNAL_FILE
-from pdhef_logtool.results.run_report import CarFacts, LogOutcome
+from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.storage.documents import digest, file_sha256, jsonable
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
@@ -194,9 +194,7 @@ class Journal:
 
     def outcome(self, entry: Entry) -> LogOutcome:
         """Return how a drive ended; raises OutputError where its line was damaged since it was read."""
-        outcome = self._document_of(entry)["outcome"]
-        car = None if outcome["car"] is None else CarFacts(**outcome["car"])
-        return LogOutcome(**{**outcome, "car": car, "lost": tuple(outcome["lost"])})
+        return LogOutcome(**self._document_of(entry)["outcome"])
 
     def outputs(self, entry: Entry) -> dict[str, str]:
         """Return the :func:`states_of` a drive's files; raises OutputError as :meth:`outcome` does."""

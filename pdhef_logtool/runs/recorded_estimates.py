@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdhef_logtool.car.car import NO_INTERVALS, Car
-from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
@@ -29,6 +28,11 @@ from pdhef_logtool.drive.truth import (
     truth_at,
     valid_as_a_whole,
 )
+from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
+from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, EvaluatedDrive, evaluate_drive
+from pdhef_logtool.evaluation.operating_space import operating_space
+from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS
+from pdhef_logtool.evaluation.segments import segment_masks
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -52,36 +56,27 @@ from pdhef_logtool.records.signals import (
 )
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
-from pdhef_logtool.results.run_report import EstimatorFacts, build_report, write_json
+from pdhef_logtool.results.error_places import largest_errors
+from pdhef_logtool.results.opened_run import LOGS, METRICS_FILE, PAGE_FILE
+from pdhef_logtool.results.run_report import build_report, estimator_entry
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.drive_outputs import check_places, files_of, log_place, write_run, write_tables
+from pdhef_logtool.runs.drive_report import drive_entries, outcome_of
 from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
 from pdhef_logtool.runs.estimating import dead_reckoned, first_pose
-from pdhef_logtool.runs.pipeline import (
-    LogResult,
-    RunResult,
-    check_places,
-    files_of,
-    judge,
-    judged_alone,
-    log_place,
-    outcome_of,
-    read_validation_plan,
-    report_facts,
-    write_run,
-    write_verdicts,
-)
+from pdhef_logtool.runs.judging import drive_blocks, judge, judge_drive, read_validation_plan, write_verdicts
+from pdhef_logtool.runs.referencing import reference_of
+from pdhef_logtool.runs.run_result import LogResult, RunResult
 from pdhef_logtool.runs.scoring import drive_events
-from pdhef_logtool.storage.outputs import FolderTransaction, OutputFolder
+from pdhef_logtool.storage.outputs import OutputFolder
 
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
     from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
-    from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
+    from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
-
 
 _RECORDED = "read from the log: not recorded whether it is causal, or what it was computed from"
 
@@ -110,7 +105,7 @@ def score_log(
 
     Raises
     ------
-    PdhefError : There is no estimate, no ground truth, or nothing of the log can be used.
+    PdhefError : There is no estimate or no ground truth, or the log cannot be used.
     """
     log_input = one_log(argument, config.read_options)
     car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS, sensors=config.sensor_profile)
@@ -119,218 +114,215 @@ def score_log(
         reading = config.read_options
         with closing(open_log(log_input.path, reading.limits, reading.msgs, Wanted(frozenset()))) as log:
             mapping = mapping_for_recorder(log, mapping)
-    validation = read_validation_plan(config, junit)
+    plan = read_validation_plan(config.plan, junit)
     check_places([log_input], output, config, mapping, junit)
-    scoring = _Scoring(config, car, reporter, estimates, truth, name, validation)
     with nullcontext() if output is None else OutputFolder(output, (LOGS,)) as outputs:
-        with scoring.read(log_input, mapping) as drive:
-            result = scoring.score(drive, outputs)
-        verdicts = judge(validation, [result], strict)
+        drive, sources = _open(log_input, car, mapping, config, (estimates, truth, name), reporter)
+        with drive:
+            result = _score_drive(drive, sources, config, plan, outputs, reporter)
+        verdicts = judge(plan, [result], strict)
         if output is not None:
-            document = _config_document(config, drive, scoring.estimates)
-            write_run(output, document, result, verdicts)
+            from pdhef_logtool.results.parquet_sink import write_metrics
+
+            write_metrics(output / METRICS_FILE, result.rows)
+            write_run(output, _config_document(config, drive, sources), [result], verdicts)
         write_verdicts(junit, verdicts, [result])
     return RunResult(output, (result,), requirements=verdicts)
 
 
-def _config_document(config: RunConfig, drive: Drive, estimates: Sequence[EstimateSource]) -> dict[str, Any]:
+def _config_document(config: RunConfig, drive: Drive, sources: Sequence[EstimateSource]) -> dict[str, Any]:
     document = config.to_dict()
     for key in ("estimators", "annotate", "keep", "sensors"):
         del document[key]
-    document["estimates"] = {e.name: {name: source.label for name, source in e.signals.items()} for e in estimates}
+    document["estimates"] = {e.name: {name: source.label for name, source in e.signals.items()} for e in sources}
     document["truth"] = {name: source.label for name, source in drive.mapping.truth.items()}
     return document
 
 
-@dataclass(slots=True)
-class _Scoring:
-    """One log being scored: what was asked for, and which fields were chosen."""
+def _open(
+    log_input: LogInput,
+    car: Car,
+    given: SignalMapping | None,
+    config: RunConfig,
+    asked: tuple[Sequence[str], Sequence[str], str | None],
+    reporter: Reporter,
+) -> tuple[Drive, Sequence[EstimateSource]]:
+    """Open the log; return it with the fields of its estimates. ``asked`` : estimates, ground truth and name."""
+    estimates, truth, name = asked
+    sources: list[EstimateSource] = []
+    mapping = given
+    if given is not None and not given.signals and not given.truth:
+        mapping = None  # a file of estimates alone leaves the rest to recognition
+    elif given is not None and truth:
+        mapping = replace(given, truth={}, quality=None)
 
-    config: RunConfig
-    car: Car
-    reporter: Reporter
-    asked: Sequence[str]
-    truth: Sequence[str]
-    name: str | None
-    validation: ValidationPlan
-    estimates: tuple[EstimateSource, ...] = ()
+    def choose(log: DriveLog, chosen: SignalMapping, tell: Tell) -> SignalMapping:
+        sources.extend(choose_estimates(log, estimates, given, name))
+        for estimate in sources:
+            check_mapping(estimate.as_mapping(), log)
+        if truth:
+            quality = chosen.quality if given is None else given.quality
+            if quality is not None:
+                tell(f"--truth replaces the mapped ground truth and its gate on {quality.describe()}")
+            named = sources_of(log, truth, TRUTH_UNITS, "--truth")[0]
+            chosen = replace(chosen, truth=named, quality=None, can=None if given is None else given.can)
+        if not chosen.truth and config.reference == "off":
+            raise _nothing_to_score_against("none mapped and none recognised", str(log.path))
+        return chosen
 
-    def read(self, log_input: LogInput, mapping: SignalMapping | None) -> Drive:
-        """Open the log; decide which fields are estimate, ground truth and sensors."""
-        given = mapping
-        if mapping is not None and not mapping.signals and not mapping.truth:
-            mapping = None  # a file of estimates alone leaves the rest to recognition
-        elif mapping is not None and self.truth:
-            mapping = replace(mapping, truth={}, quality=None)
+    options = replace(config.read_options, friction=None)
+    return (
+        read_drive(log_input, car, mapping, options, tell=reporter.warn, adjust=choose, require_sensors=False),
+        sources,
+    )
 
-        def choose(log: DriveLog, chosen: SignalMapping, tell: Tell) -> SignalMapping:
-            self.estimates = choose_estimates(log, self.asked, given, self.name)
-            for estimate in self.estimates:
-                check_mapping(estimate.as_mapping(), log)
-            if self.truth:
-                quality = chosen.quality if given is None else given.quality
-                if quality is not None:
-                    tell(f"--truth replaces the mapped ground truth and its gate on {quality.describe()}")
-                named = sources_of(log, self.truth, TRUTH_UNITS, "--truth")[0]
-                can = None if given is None else given.can
-                chosen = replace(chosen, truth=named, quality=None, can=can)
-            if not chosen.truth and self.config.reference == "off":
-                raise _nothing_to_score_against("none mapped and none recognised", str(log.path))
-            return chosen
 
-        options = replace(self.config.read_options, friction=None)
-        return read_drive(
-            log_input, self.car, mapping, options, tell=self.reporter.warn, adjust=choose, require_sensors=False
-        )
+def _score_drive(
+    drive: Drive,
+    sources: Sequence[EstimateSource],
+    config: RunConfig,
+    plan: ValidationPlan,
+    outputs: OutputFolder | None,
+    reporter: Reporter,
+) -> LogResult:
+    """Read, score and judge the recorded estimates; write the files of the log where there is a folder."""
+    reporter.progress(drive.name, 0.1)
+    log = _read(drive, sources, config, reporter)
+    reporter.progress(drive.name, 0.8)
+    rows, blocks = _score(log, plan)
+    scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in log.recorded]))
+    whole, seen = log.at(scored_ns)
+    report = build_report(_entries(log, plan, rows, blocks, whole, seen, sources))
+    folder, files = None, dict[str, str]()
+    if outputs is not None:
+        tracks = [*(r.track for r in log.recorded), *whole.tracks.values()]
+        if whole.truth is not None:
+            standstill_m_s = drive.car.vehicle.standstill_m_s
+            tracks.insert(0, valid_as_a_whole(whole.truth, drive.plan.derivation, standstill_m_s))
+        with outputs.begin(log_place(drive.name), stale=(PAGE_FILE,)) as change:
+            write_tables(change, report, rows, _drawn(tracks, drive.plan))
+        folder = change.target
+        files = files_of(folder)
+    reporter.progress(drive.name, 1.0)
+    return LogResult(outcome_of(drive, log.losses, files=files), folder, report, tuple(rows))
 
-    def score(self, drive: Drive, outputs: OutputFolder | None) -> LogResult:
-        """Read, compare and, with a folder, write."""
-        from pdhef_logtool.evaluation.operating_space import operating_space
-        from pdhef_logtool.results.error_places import largest_errors
 
-        self.reporter.progress(drive.name, 0.1)
-        log = self._read(drive)
-        self.reporter.progress(drive.name, 0.8)
-        rows, blocks = self._figures(log)
-        scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in log.recorded]))
-        whole, seen = log.at(scored_ns)
-        others = [*whole.tracks.values()]
-        alone = log.recorded[0].track if len(log.recorded) == 1 else None
-        space = operating_space(seen, whole.truth, alone, log.vehicle)
-        places = [] if alone is None else largest_errors(alone, whole.truth, others, whole.low_speed_m_s)
-        facts = report_facts(
-            drive,
-            self.car,
-            [EstimatorFacts(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in log.recorded],
-            rows,
-            drive_events(seen, whole.masks, log.manoeuvres, [r.track for r in log.recorded]),
-            log.losses,
-            drive.samples | log.samples,
-            (*drive.sample_ledger, *log.ledger),
-        )
-        read = {s.topic for e in self.estimates for s in e.signals.values()}
-        topics = [replace(t, mapped=t.mapped or t.name in read) for t in facts.log.topics]
-        unknown = log.truth is not None and drive.plan.latency is None
-        latency = ["no gyro to measure the ground truth's latency with: taken as 0"] if unknown else []
-        facts = replace(
-            facts,
-            log=replace(facts.log, topics=topics),
-            truth=replace(facts.truth, notes=[*latency, *facts.truth.notes]),
-            space=space,
-            largest_errors=places,
-            requirements=judged_alone(self.validation, drive, None, rows, blocks, space),
-        )
-        report = build_report(facts)
-        folder = None
-        if outputs is not None:
-            tracks = [*(r.track for r in log.recorded), *others]
-            if whole.truth is not None:
-                tracks.insert(0, valid_as_a_whole(whole.truth, drive.plan.derivation, log.vehicle.standstill_m_s))
-            with outputs.begin(log_place(drive.name), stale=(PAGE_FILE,)) as change:
-                _write(change, report, rows, tracks, drive.plan)
-            folder = change.target
-        self.reporter.progress(drive.name, 1.0)
-        files = {} if folder is None else files_of(folder)
-        return LogResult(replace(outcome_of(drive, log.losses), files=files), folder, report, tuple(rows))
+def _drawn(tracks: Sequence[StateTrack], plan: DrivePlan) -> list[StateTrack]:
+    """Return the tracks with their poses; ground truth is the first if there is any."""
+    start = first_pose(tracks[0] if tracks[0].name == TRUTH else None)
+    return [track if track.name == TRUTH and plan.has_truth_pose else dead_reckoned(track, start) for track in tracks]
 
-    def _read(self, drive: Drive) -> _Recording:
-        """Read estimates, ground truth and sensors; add to the plan which ground truth depends on an estimate."""
-        from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
 
-        plan, samples, losses = drive.plan, dict[str, int](), list[Loss]()
-        recorded, dependent = [], dict(plan.dependent)
-        for source in self.estimates:
-            estimate, lost = read_estimate(drive.log, source, plan.start_ns, plan.end_ns)
-            for note in estimate.notes:
-                drive.tell(f"{source.name}: {note}")
-            recorded.append(estimate)
-            losses += lost
-            samples |= estimate.samples
-            same = dependent_signals(estimate.channels, plan.survey_truth, role=f"estimate {source.name}'s")
-            dependent |= {name: why for name, why in same.items() if name not in dependent}
-        truth: TruthTrack | None = None
-        ledger: tuple[SampleCount, ...] = ()
-        if drive.mapping.truth:
-            part = read_signals(drive.log, replace(plan.mapping, signals={}), plan.clocks, plan.start_ns, plan.end_ns)
-            truth = _truth_of(part.truth, drive)
-            samples |= {c.source: len(c) for c in part.truth.values()}
-            losses += part.losses
-            ledger = sample_ledger(drive.log, plan, part.counts)
-        self.reporter.progress(drive.name, 0.6)
-        signals = _read_sensors(drive)
-        drive.plan = replace(plan, dependent=dependent)
-        manoeuvres = [] if signals is None else find_manoeuvres(signals, self.car.vehicle)
-        reference = self._reference(drive, scored=truth is not None)
-        every_loss = merge_losses([drive.losses, losses, damage(ledger)])
-        return _Recording(
-            drive, self.car.vehicle, recorded, truth, reference, signals, manoeuvres, every_loss, samples, ledger
-        )
+def _entries(
+    log: _Recording,
+    plan: ValidationPlan,
+    rows: Sequence[MetricRow],
+    blocks: Sequence[RequirementBlocks],
+    whole: EvaluatedDrive,
+    seen: Signals,
+    sources: Sequence[EstimateSource],
+) -> dict[str, Any]:
+    """Judge the drive; return the content of report.json. ``whole``, ``seen`` : at the stamps of all estimates."""
+    drive, estimates = log.drive, [r.track for r in log.recorded]
+    alone = estimates[0] if len(estimates) == 1 else None
+    space = operating_space(seen, whole.truth, alone, drive.car.vehicle)
+    others = [*whole.tracks.values()]
+    places = [] if alone is None else largest_errors(alone, whole.truth, others, whole.low_speed_m_s)
+    entries = drive_entries(drive, drive.car, log.losses, drive.samples | log.samples, log.ledger)
+    read = {s.topic for e in sources for s in e.signals.values()}
+    for topic in entries["log"]["topics"]:
+        topic["mapped"] |= topic["name"] in read
+    if log.truth is not None and drive.plan.latency is None:
+        entries["truth"]["notes"].insert(0, "no gyro to measure the ground truth's latency with: taken as 0")
+    entries |= judge_drive(plan, drive, None, rows, blocks, space)
+    return entries | {
+        "estimators": [estimator_entry(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in log.recorded],
+        "metrics": rows,
+        "segments": drive_events(seen, whole.masks, log.manoeuvres, estimates),
+        "largest_errors": places,
+    }
 
-    def _reference(self, drive: Drive, *, scored: bool) -> ReferenceEstimator | None:
-        """Return the sideslip reference of the sensors: without ground truth, or beside it where asked for."""
-        if self.config.reference == "off" or (scored and self.config.reference == "auto"):
-            return None
-        from pdhef_logtool.runs.referencing import reference_of
 
-        made = reference_of(drive, None, self.config)
-        if made is None or made.estimator is None:
-            why = "the log has no IMU" if made is None else str(made.document["refused"])
-            if not scored:
-                raise _nothing_to_score_against(f"none, and no sideslip reference: {why}", drive.file)
-            drive.tell(f"no sideslip reference: {why}")
-            return None
-        drive.tell("estimated sideslip reference: differences from it are no errors (docs/estimators.md#reference)")
-        return made.estimator
+def _read(drive: Drive, sources: Sequence[EstimateSource], config: RunConfig, reporter: Reporter) -> _Recording:
+    """Read estimates, ground truth and sensors; add to the plan which ground truth depends on an estimate."""
+    plan, samples, losses = drive.plan, dict[str, int](), list[Loss]()
+    recorded, dependent = [], dict(plan.dependent)
+    for source in sources:
+        estimate, lost = read_estimate(drive.log, source, plan.start_ns, plan.end_ns)
+        for note in estimate.notes:
+            drive.tell(f"{source.name}: {note}")
+        recorded.append(estimate)
+        losses += lost
+        samples |= estimate.samples
+        same = dependent_signals(estimate.channels, plan.survey_truth, role=f"estimate {source.name}'s")
+        dependent |= {name: why for name, why in same.items() if name not in dependent}
+    truth: TruthTrack | None = None
+    ledger: tuple[SampleCount, ...] = ()
+    if drive.mapping.truth:
+        part = read_signals(drive.log, replace(plan.mapping, signals={}), plan.clocks, plan.start_ns, plan.end_ns)
+        truth = _truth_of(part.truth, drive)
+        samples |= {c.source: len(c) for c in part.truth.values()}
+        losses += part.losses
+        ledger = sample_ledger(drive.log, plan, part.counts)
+    reporter.progress(drive.name, 0.6)
+    signals = _read_sensors(drive)
+    drive.plan = replace(plan, dependent=dependent)
+    manoeuvres = [] if signals is None else find_manoeuvres(signals, drive.car.vehicle)
+    reference = _reference(drive, config, scored=truth is not None)
+    every_loss = merge_losses([drive.losses, losses, damage(ledger)])
+    every_sample = (*drive.sample_ledger, *ledger)
+    return _Recording(drive, recorded, truth, reference, signals, manoeuvres, every_loss, samples, every_sample)
 
-    def _figures(self, log: _Recording) -> tuple[list[MetricRow], list[RequirementBlocks]]:
-        """Score each estimate at its own stamps; add to the plan which derived ground truth equals an estimate."""
-        from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, evaluate_drive
-        from pdhef_logtool.evaluation.requirement_blocks import ScoredDrive, requirement_blocks
 
-        rows: list[MetricRow] = []
-        blocks: dict[tuple[str, str], RequirementBlocks] = {}
-        drive, equal = log.drive, dict[str, str]()
-        alone = len(log.recorded) == 1
-        for r in log.recorded:
-            track, name = r.track, r.track.name
-            scored, _ = log.at(track.stamps_ns)
-            same = {
-                signal: f"the ground truth's {signal} equals that of the estimate {name}"
-                for signal in SCORED_SIGNALS
-                if scored.truth is not None and _same_column(getattr(track, signal), getattr(scored.truth, signal))
-            }
-            tainted = frozenset({**drive.plan.dependent, **same})
-            equal |= same
-            asked = [q for q in self.validation.requirements if q.estimator in (name, None if alone else name)]
-            for base in (b for b in (scored.truth, scored.tracks.get(REFERENCE)) if b is not None):
-                blocked = ScoredDrive(
-                    {name: track}.get,
-                    base,
-                    scored.masks,
-                    scored.low_speed_m_s,
-                    tainted,
-                    estimated=base is not scored.truth,
-                )
-                for block in requirement_blocks(asked, name if alone else None, blocked):
-                    blocks.setdefault((block.of, block.estimator), block)
-            figures = evaluate_drive(replace(scored, tracks={name: track, **scored.tracks}, dependent=tainted))
-            figures = [row for row in figures if row.estimator == name]
-            if not any(row.metric in ("rmse", "reference_rms") for row in figures):
-                drive.tell(f"{name}: nowhere are estimate and ground truth known together, so there are no errors")
-            # A quantity that the estimate does not contain has no availability, and so no row.
-            silent = {n for n in SCORED_SIGNALS if n not in r.claimed and not np.isfinite(getattr(track, n)).any()}
-            silent |= {"diverged"} - r.claimed
-            rows += [row for row in figures if silent.isdisjoint((row.signal, row.metric))]
-        drive.plan = replace(drive.plan, dependent={**equal, **drive.plan.dependent})
-        return rows, [*blocks.values()]
+def _reference(drive: Drive, config: RunConfig, *, scored: bool) -> ReferenceEstimator | None:
+    """Return the sideslip reference of the sensors: without ground truth, or beside it where asked for."""
+    if config.reference == "off" or (scored and config.reference == "auto"):
+        return None
+    reference = reference_of(drive, None, config)
+    if reference is None or reference.estimator is None:
+        why = "the log has no IMU" if reference is None else str(reference.document["refused"])
+        if not scored:
+            raise _nothing_to_score_against(f"none, and no sideslip reference: {why}", drive.file)
+        drive.tell(f"no sideslip reference: {why}")
+        return None
+    drive.tell("estimated sideslip reference: differences from it are no errors (docs/estimators.md#reference)")
+    return reference.estimator
+
+
+def _score(log: _Recording, plan: ValidationPlan) -> tuple[list[MetricRow], list[RequirementBlocks]]:
+    """Score each estimate at its own stamps; add to the plan which derived ground truth equals an estimate."""
+    rows: list[MetricRow] = []
+    blocks: list[RequirementBlocks] = []
+    drive, equal = log.drive, dict[str, str]()
+    alone = len(log.recorded) == 1
+    for r in log.recorded:
+        track, name = r.track, r.track.name
+        scored, _ = log.at(track.stamps_ns)
+        same = {
+            signal: f"the ground truth's {signal} equals that of the estimate {name}"
+            for signal in SCORED_SIGNALS
+            if scored.truth is not None and _same_column(getattr(track, signal), getattr(scored.truth, signal))
+        }
+        equal |= same
+        scored = replace(scored, tracks={name: track, **scored.tracks}, dependent={**drive.plan.dependent, **same})
+        asked = [q for q in plan.requirements if q.estimator in (name, None if alone else name)]
+        blocks += drive_blocks(asked, name if alone else None, scored, MOST_BLOCKS)
+        figures = [row for row in evaluate_drive(scored) if row.estimator == name]
+        if not any(row.metric in ("rmse", "reference_rms") for row in figures):
+            drive.tell(f"{name}: nowhere are estimate and ground truth known together, so there are no errors")
+        # A quantity that the estimate does not contain has no availability, and so no row.
+        silent = {n for n in SCORED_SIGNALS if n not in r.claimed and not np.isfinite(getattr(track, n)).any()}
+        silent |= {"diverged"} - r.claimed
+        rows += [row for row in figures if silent.isdisjoint((row.signal, row.metric))]
+    drive.plan = replace(drive.plan, dependent={**equal, **drive.plan.dependent})
+    return rows, blocks
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Recording:
-    """What a log states: estimates, ground truth, reference and signals, each at its own stamps."""
+    """The content of a log: estimates, ground truth, reference and signals, each at its own stamps."""
 
     drive: Drive
-    vehicle: VehicleParameters
     recorded: Sequence[RecordedEstimate]
     truth: TruthTrack | None
     reference: ReferenceEstimator | None
@@ -342,17 +334,13 @@ class _Recording:
 
     def at(self, stamps_ns: IntArray) -> tuple[EvaluatedDrive, Signals]:
         """Return ground truth, reference and segments at stamps [N], and the signals interpolated to them."""
-        from pdhef_logtool.evaluation.metrics import EvaluatedDrive
-        from pdhef_logtool.evaluation.segments import segment_masks
-
-        latency_s, standstill_m_s = self.drive.plan.truth_latency_s, self.vehicle.standstill_m_s
-        truth = None
+        latency_s, vehicle, truth = self.drive.plan.truth_latency_s, self.drive.car.vehicle, None
         if self.truth is not None:
-            truth = truth_at(self.truth, stamps_ns, latency_s, standstill_m_s=standstill_m_s)
+            truth = truth_at(self.truth, stamps_ns, latency_s, standstill_m_s=vehicle.standstill_m_s)
         tracks = {} if self.reference is None else {REFERENCE: self.reference.at(stamps_ns)}
         seen = signals_at(self.signals, stamps_ns)
-        masks = segment_masks(seen, truth, self.vehicle, self.manoeuvres)
-        return EvaluatedDrive(self.drive.name, tracks, truth, None, masks, self.vehicle.low_speed_blend_m_s), seen
+        masks = segment_masks(seen, truth, vehicle, self.manoeuvres)
+        return EvaluatedDrive(self.drive.name, tracks, truth, None, masks, vehicle.low_speed_blend_m_s), seen
 
 
 def _nothing_to_score_against(got: str, where: str) -> MappingError:
@@ -365,7 +353,7 @@ def _nothing_to_score_against(got: str, where: str) -> MappingError:
 
 
 def _read_sensors(drive: Drive) -> Signals | None:
-    """Return what the mapped sensors state, None without any; the drive then has the losses and samples of that."""
+    """Return the signals of the mapped sensors, None without any; the drive then has their losses and samples."""
     if not drive.plan.alignment.channels:
         drive.tell("no IMU in the mapping: segments come from the ground truth alone")
         return None
@@ -377,22 +365,6 @@ def _read_sensors(drive: Drive) -> Signals | None:
 def _same_column(estimate: FloatArray, truth: FloatArray) -> bool:
     usable = np.isfinite(estimate) & np.isfinite(truth)
     return int(np.count_nonzero(usable)) >= 10 and share_equal(estimate[usable], truth[usable]) >= SAME_SHARE
-
-
-def _write(
-    change: FolderTransaction,
-    report: dict[str, Any],
-    rows: Sequence[MetricRow],
-    tracks: Sequence[StateTrack],
-    plan: DrivePlan,
-) -> None:
-    from pdhef_logtool.results.parquet_sink import write_estimates, write_metrics
-
-    start = first_pose(tracks[0] if tracks[0].name == TRUTH else None)
-    drawn = [track if track.name == TRUTH and plan.has_truth_pose else dead_reckoned(track, start) for track in tracks]
-    write_estimates(change.file("estimates.parquet"), drawn)
-    write_metrics(change.file("metrics.parquet"), rows)
-    write_json(change.file("report.json"), report)
 
 
 def _truth_of(channels: Mapping[str, Channel], drive: Drive) -> TruthTrack:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pdhef_logtool.records.geometry import wrap_angle
@@ -16,31 +14,21 @@ BLOCK_S, LEAST_BLOCKS, BEYOND_STD = 1.0, 3, 3.0
 HELD_SHARE, DRIFT_CORRELATION = 0.8, 0.8
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Blocks:
-    """Per block [B]: start in s, mean difference and mean 1-sigma in rad, share of ground truth that repeats."""
-
-    start_s: FloatArray
-    difference_rad: FloatArray
-    std_rad: FloatArray
-    held: FloatArray
-
-
 def audit_truth(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) -> tuple[str, ...]:
     """Return what contradicts ground truth [N] in sentences; empty where the reference contains it."""
-    blocks = _blocks(truth, reference, low_speed_m_s)
-    if len(blocks.start_s) < LEAST_BLOCKS:
+    seconds, difference, std, held = _blocks(truth, reference, low_speed_m_s)
+    if len(seconds) < LEAST_BLOCKS:
         return ()
-    beyond = np.abs(blocks.difference_rad) > BEYOND_STD * blocks.std_rad
-    beyond &= _runs(beyond, blocks.start_s) >= LEAST_BLOCKS
+    beyond = np.abs(difference) > BEYOND_STD * std
+    beyond &= _runs(beyond, seconds) >= LEAST_BLOCKS
     if not beyond.any():
         return ()
-    difference, seconds = np.degrees(blocks.difference_rad), blocks.start_s
+    difference = np.degrees(difference)
     where = f"from {seconds[beyond][0]:.0f} to {seconds[beyond][-1] + BLOCK_S:.0f} s of the log"
-    uncertain = f"reference ± {np.degrees(np.sqrt(np.mean(blocks.std_rad[beyond] ** 2))):.2f}°"
+    uncertain = f"reference ± {np.degrees(np.sqrt(np.mean(std[beyond] ** 2))):.2f}°"
     share = f"{beyond.sum() * BLOCK_S:.0f} of {len(beyond) * BLOCK_S:.0f} s"
     contradiction = f"ground truth contradicts the estimated sideslip reference ({share}, {where}, {uncertain})"
-    if np.median(blocks.held[beyond]) > HELD_SHARE:
+    if np.median(held[beyond]) > HELD_SHARE:
         return (f"{contradiction}: it repeats its values there",)
     mean, spread = float(np.mean(difference)), float(np.std(difference))
     slope, _ = np.polyfit(seconds, difference, 1)
@@ -51,9 +39,10 @@ def audit_truth(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) 
     return (f"{contradiction}: mean difference {float(np.mean(difference[beyond])):+.2f}° there",)
 
 
-def _blocks(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) -> _Blocks:
+def _blocks(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) -> FloatArray:
+    """Return by block [4, B]: start in s, mean difference and mean 1-sigma in rad, share of repeated ground truth."""
     if not len(reference):
-        return _Blocks(*(np.empty(0) for _ in range(4)))
+        return np.empty((4, 0))
     used = truth.valid & reference.valid & (truth.vx_m_s > low_speed_m_s) & (reference.vx_m_s > low_speed_m_s)
     used &= np.isfinite(truth.sideslip_rad) & np.isfinite(reference.sideslip_std_rad)
     same = (np.diff(truth.vy_m_s, prepend=np.nan) == 0.0).astype(np.float64)
@@ -62,8 +51,7 @@ def _blocks(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) -> _
     ids, inverse, counts = np.unique(number, return_inverse=True, return_counts=True)
     sums = np.zeros((len(ids), 3))
     np.add.at(sums, inverse, np.stack([c[used] for c in columns], axis=1))
-    means = sums / counts[:, None]
-    return _Blocks(np.asarray(ids * BLOCK_S, dtype=np.float64), means[:, 0], means[:, 1], means[:, 2])
+    return np.vstack([ids * BLOCK_S, sums.T / counts])
 
 
 def _runs(flags: BoolArray, start_s: FloatArray) -> IntArray:

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pdhef_logtool.logs.discovery import RUN_FILE, folders_of
+from pdhef_logtool.logs.discovery import folders_of
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.opened_run import METRICS_FILE, PAGE_FILE, open_run
-from pdhef_logtool.results.run_report import build_run, run_versions, write_json
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.drive_outputs import log_place, write_run
 from pdhef_logtool.runs.journal import Entry
-from pdhef_logtool.runs.pipeline import FEW_LOGS, LogResult, judge, log_place
+from pdhef_logtool.runs.judging import judge
 from pdhef_logtool.runs.planning import Plan
-from pdhef_logtool.storage.documents import file_sha256
+from pdhef_logtool.runs.run_result import FEW_LOGS, LogResult
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
@@ -42,17 +42,10 @@ def collect(
     metrics = output / METRICS_FILE
     join_metrics(metrics, [r.figures_file for r in results if r.figures_file is not None])
     cars = plan.journal.described["car"] | plan.cars_of_run()  # the journal's line of a car may be damaged
-    networks = {
-        None if (network := cars[e.car]["network"]) is None else (network[0], network[1])
-        for e, _ in entries
-        if e.car is not None
-    }
-    only = networks.pop() if len(networks) == 1 else None
-    network = None if only is None else {"name": only[0], "sha256": only[1]}
-    files, outcomes = {METRICS_FILE: file_sha256(metrics)}, [r.outcome for r in results]
+    networks = {cars[e.car]["network"] and tuple(cars[e.car]["network"]) for e, _ in entries if e.car is not None}
     verdicts = judge(validation, results, strict, metrics)
-    document = build_run(run_versions(), config.to_dict(), network, outcomes, remaining, files, verdicts)
-    write_json(output / RUN_FILE, document)
+    network = networks.pop() if len(networks) == 1 else None
+    write_run(output, config.to_dict(), results, verdicts, network, remaining)
     if remaining:
         (output / PAGE_FILE).unlink(missing_ok=True)  # it shows other drives
     return results, verdicts

@@ -32,7 +32,7 @@ SIMPLE = ("open-loop", "open-loop:calibrated", "phy-ukf", "physics")
 #: The two tests: lateral consistency within this factor of the lowest one, yaw consistency within the other. On
 #: simulated drives with right and wrong files this selection has the lowest error (docs/method.md#selection).
 FACTOR, YAW_FACTOR = 1.2, 3.0
-#: Its lateral figure shows nothing, for it integrates the residual that ``d2`` measures.
+#: Its lateral figure is meaningless, because it integrates the residual that ``d2`` measures.
 _NOT_JUDGED = "kinematic"
 #: Longest driving before a choice on line that decides it.
 _LOOK_BACK_NS = 3600 * 10**9
@@ -46,24 +46,10 @@ _LAST = (NAIVE, "zero:no-lateral", REFERENCE)
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """An estimate that fails a test, and the ``best`` one that passes both.
-
-    ``figures``, ``other`` : lateral consistency in m/s and yaw consistency in rad/s of the two, NaN where unknown.
-    """
+    """An estimate that fails a test: the ``best`` one that passes both, and the warning of the report."""
 
     best: str
-    figures: tuple[float, float]
-    other: tuple[float, float]
-    name: str = PREFERRED
-
-    @property
-    def text(self) -> str:
-        """The warning of the report."""
-        (d2, yaw), (of_best, yaw_of_best) = self.figures, self.other
-        return (
-            f"{self.name} contradicts the sensors: its lateral consistency is {d2:.3g} m/s and its yaw consistency "
-            f"{yaw:.3g} rad/s, those of {self.best} {of_best:.3g} and {yaw_of_best:.3g}; the vehicle file may be wrong"
-        )
+    text: str
 
 
 def contradiction(rows: Iterable[MetricRow], name: str = PREFERRED) -> Contradiction | None:
@@ -76,9 +62,14 @@ def contradiction(rows: Iterable[MetricRow], name: str = PREFERRED) -> Contradic
     best = min((n for n in explain if n not in (name, _NOT_JUDGED)), key=lambda n: d2[n], default=None)
     if name not in d2 or best is None:
         return None
-    passes = d2[name] <= FACTOR * d2[best] and (name in explain or name not in yaw)
-    figures = d2[name], yaw.get(name, math.nan)
-    return None if passes else Contradiction(best, figures, (d2[best], yaw[best]), name)
+    if d2[name] <= FACTOR * d2[best] and (name in explain or name not in yaw):
+        return None
+    return Contradiction(
+        best,
+        f"{name} contradicts the sensors: its lateral consistency is {d2[name]:.3g} m/s and its yaw consistency "
+        f"{yaw.get(name, math.nan):.3g} rad/s, those of {best} {d2[best]:.3g} and {yaw[best]:.3g}; "
+        "the vehicle file may be wrong",
+    )
 
 
 def _figures(rows: Iterable[MetricRow]) -> tuple[dict[str, float], dict[str, float]]:
@@ -111,15 +102,14 @@ def default_names(car: Car, available: frozenset[str]) -> tuple[str, ...]:
     return tuple(name for name in all_names(car) if name in {PREFERRED, PHYSICS, NAIVE, *able})
 
 
-def choose_main(ran: Sequence[Estimator], rows: Iterable[MetricRow], *, proven: bool, named: bool) -> MainFacts:
+def choose_main(names: Sequence[str], rows: Iterable[MetricRow], *, proven: bool, named: bool) -> MainFacts:
     """Return the selected estimator of a log and why; of the figures the consistencies count, without ground truth.
 
     Parameters
     ----------
-    ran : the estimators, at least one. rows : figures of them. validated : whether the car has evidence of driving.
+    names : of the estimators that ran, at least one. rows : their figures. proven : whether driving validates the car.
     named : whether a person named the estimators; all of them are then shown.
     """
-    names = [e.name for e in ran]
     others = [n for n in names if n not in (*_BEST_FIRST, *_LAST)]
     name = next(n for n in (*_BEST_FIRST, *others, *_LAST) if n in names)
     rows = list(rows)
@@ -157,7 +147,7 @@ def choose_over_time(
 ) -> list[tuple[int, str]]:
     """Return the selected estimators of a calibration on line, each with the stamp from which on it is selected.
 
-    Each stage of the calibration chooses among the causal estimators by their tests on what came before it.
+    Each stage of the calibration chooses among the causal estimators by their tests on earlier driving.
 
     Parameters
     ----------
@@ -165,11 +155,11 @@ def choose_over_time(
     """
     from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
 
-    causal = [e for e in ran if e.causal]
+    causal = [e.name for e in ran if e.causal]
     chosen = [(0, choose_main(causal, (), proven=False, named=False).name)]
     for stage in (*calibration.earlier, calibration)[1:]:
         first, last = np.searchsorted(signals.stamps_ns, [stage.since_ns - _LOOK_BACK_NS, stage.since_ns]).tolist()
-        tracks = {e.name: track.rows(first, last) for e in causal if (track := read(e.name)) is not None}
+        tracks = {name: track.rows(first, last) for name in causal if (track := read(name)) is not None}
         slow = stage.vehicle_file.low_speed_blend_m_s
         drive = EvaluatedDrive("", tracks, None, signals.rows(first, last), {}, slow, sensors_of(stage))
         rows = evaluate_drive(drive, ("d2", "yaw_consistency"))

@@ -17,7 +17,7 @@ from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, LOGS, METRICS_FILE, PAGE_FILE, PARTS, REPORT_FILE
-from pdhef_logtool.runs.pipeline import STALE_FILES
+from pdhef_logtool.runs.drive_outputs import STALE_FILES
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work
 from pdhef_logtool.storage.files import open_new, scratch_folder
 from pdhef_logtool.storage.object_store import HeldError, Mirror, ObjectFolder

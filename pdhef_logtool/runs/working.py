@@ -24,8 +24,10 @@ from pdhef_logtool.results.opened_run import JOURNAL_FILE, PARTS, OpenedLog
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.drive_outputs import LOG_FILES, log_place
 from pdhef_logtool.runs.journal import digest_of, states_of
-from pdhef_logtool.runs.pipeline import LOG_FILES, LogResult, log_place, run_log
+from pdhef_logtool.runs.run_drive import run_log
+from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.outputs import OutputFolder
 from pdhef_logtool.workers.supervisor import Tell
 

@@ -122,7 +122,7 @@ def read_text(path: Path, max_bytes: int = MAX_BYTES) -> str:
 
 
 def _oddity(document: object) -> str:
-    """Return what no document of ours has and what would break its reader, empty if nothing."""
+    """Return the part that makes a document unreadable for us, or an empty string."""
     if not isinstance(document, dict):
         return f"a {type(document).__name__} instead of named entries"
     level: list[object] = [document]

@@ -19,7 +19,7 @@ from pdhef_logtool.records.processes import NAME, is_alive, process_name
 WINDOWS = os.name == "nt"
 _PARTIAL = re.compile(rf"\..+\.({NAME})\.partial")
 _SCRATCH = re.compile(rf"pdhef-({NAME})-.+")
-#: Bytes of a name that leave room for what a temporary one adds; file systems take 255.
+#: Most bytes of a name, so that temporary names fit the 255 of file systems.
 _LONGEST_NAME = 200
 #: Folders in which this process has searched for files of killed processes.
 _swept: set[Path] = set()
@@ -96,7 +96,7 @@ class PendingFile:
 
 
 def open_new(path: Path, mode: Literal["wb", "ab"] = "wb") -> IO[bytes]:
-    """Open a file to write or to go on with; all content of our outputs goes through files that this opens."""
+    """Open a file to write or to append; all our outputs are written by files that this opens."""
     return path.open(mode)
 
 
@@ -139,7 +139,7 @@ def sync(path: Path) -> None:
         os.fsync(descriptor)
     except OSError as error:
         if path.is_dir() and error.errno in (errno.EINVAL, errno.ENOTSUP, errno.EBADF):
-            return  # a file system whose folders cannot be waited for
+            return  # a file system that cannot flush folders
         raise
     finally:
         os.close(descriptor)
@@ -160,7 +160,7 @@ def sweep_files(folder: Path, *, held: bool = False) -> None:
 
 
 def scratch_folder() -> tempfile.TemporaryDirectory[str]:
-    """Return a new temporary folder; those of killed processes are removed."""
+    """Return a new temporary folder; remove folders of killed processes."""
     root = Path(tempfile.gettempdir())
     if root not in _swept:
         _swept.add(root)

@@ -101,7 +101,7 @@ class FolderTransaction:
         return self._new / name
 
     def commit(self) -> None:
-        """Flush all files, link those that are kept, exchange the folders; raises OutputError, then nothing changes."""
+        """Flush all files, link those that are kept, exchange the folders; OutputError leaves all unchanged."""
         try:
             with writing(self.target):
                 shutil.rmtree(self.scratch)
@@ -116,7 +116,7 @@ class FolderTransaction:
             self.discard()
 
     def discard(self) -> None:
-        """Remove what was written, or what was replaced; harmless after :meth:`commit` and when called twice."""
+        """Remove new files, or replaced ones; harmless after :meth:`commit` and when called twice."""
         with contextlib.suppress(OSError):
             _repair(self._work, self._place)
         with contextlib.suppress(OSError):
@@ -128,7 +128,7 @@ class OutputFolder:
 
     Parameters
     ----------
-    path : the folder. parts : names of folders in it with outputs of their own.
+    path : the folder. parts : names of folders in it that are outputs themselves.
 
     Raises
     ------
@@ -174,7 +174,7 @@ class OutputFolder:
 class FolderLock:
     """Lock of a folder until it is released or this process ends; the folder is created if it is missing.
 
-    The kernel's lock on the folder itself, which no child process inherits. If the file system has none, or on Windows,
+    The kernel's lock on the folder itself, which no child process inherits. If the file system lacks it, or on Windows,
     a file in the folder names the process; it is void when the process has ended.
     """
 
@@ -214,7 +214,7 @@ class FolderLock:
             _locked(descriptor)
 
     def release(self) -> None:
-        """Release the lock; harmless if there is none."""
+        """Release the lock, if any."""
         if self._file is not None:
             with contextlib.suppress(OSError):
                 self._file.unlink(missing_ok=True)
@@ -242,7 +242,7 @@ class FolderLock:
         return True
 
     def _try_file(self) -> bool:
-        """Create the lock file, complete with its content; that of a dead process is removed first."""
+        """Create the complete lock file; remove a dead process's first."""
         file, prepared = self._folder / LOCK_FILE, self._folder / f"{LOCK_FILE}.{process_name()}.partial"
         if (holder := _holder(file)) is not None and is_alive(holder) is False:
             stale = self._folder / f"{LOCK_FILE}.stale.{process_name()}.partial"
@@ -311,7 +311,7 @@ def check_no_input(inputs: Iterable[Path | None], files: Iterable[Path], folders
 
 
 def _identities(path: Path) -> Iterator[tuple[tuple[int, int], Path]]:
-    """Yield what identifies a file, or a folder and the files in it."""
+    """Yield the identity of a file, or of a folder and the files in it."""
     for member in [path, *(p for p in path.iterdir() if p.is_file())] if path.is_dir() else [path]:
         if (identity := _identity(member)) is not None:
             yield identity, member
@@ -331,7 +331,7 @@ def _lineage(path: Path) -> Iterator[Path]:
 
 
 def _locked(descriptor: int) -> bool:
-    """Take the kernel's lock; False if another has it. Raises OSError where there is none."""
+    """Take the kernel's lock; False if another process has it. Raises OSError if the file system has no locks."""
     try:
         import fcntl
     except ImportError:
@@ -344,7 +344,7 @@ def _locked(descriptor: int) -> bool:
 
 
 def _holder(file: Path) -> str | None:
-    """Return whose lock file this is, None if it is none."""
+    """Return the owner of a lock file; None for another file."""
     try:
         name = file.read_text(encoding="ascii")
         is_alive(name)

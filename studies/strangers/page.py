@@ -30,7 +30,7 @@ names do not count. Items: steering, a_x, a_y, yaw rate, speed, wheel speeds, an
 truth. *Reported* means that a failed or undecided check, or a remark, names the wrong channel. Logs of one kind count
 as one, with the worst result of each item: the 24 mountings in steps of 90 degrees are one log. A cause counts as named
 if a message contains a word of it. Layouts have the fields, units and axes of their published definitions, without
-device status. The motion is that of truthsim: drives of three cars with noise, bias and delay of its usual sensors.
+device status. The motion comes from truthsim: drives of three cars with noise, bias and delay of its usual sensors.
 """
 
 

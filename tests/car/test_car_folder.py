@@ -567,7 +567,7 @@ def test_what_is_no_place_for_a_car_is_refused_and_untouched(folder: Path, tmp_p
     file.write_text("x")
     before = files_of(tmp_path)
     for output, said in (
-        (another, r"got another, whose vehicle\.toml is another; name another folder, or give --car"),
+        (another, r"got another, which contains a different vehicle\.toml; name another folder, or give --car"),
         (full, "a new folder or a car's folder"),
         (file, "a new folder or a car's folder"),
         (tmp_path / "new.toml", r"a new folder or a car's folder, got new\.toml"),

@@ -208,7 +208,7 @@ def test_interrupt_is_one_line_and_exit_code_130() -> None:
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 130
-    assert "interrupted; nothing half-written" in _one_line_error(result)
+    assert "interrupted; no output file was left incomplete" in _one_line_error(result)
 
 
 def test_settings_are_those_of_the_file_and_options_win(tmp_path: Path) -> None:

@@ -9,16 +9,14 @@ from typing import Any
 
 import pytest
 from rich.console import Console
-from run_report import MAIN, MODEL, SHA, errors_deg, figures, report
+from run_report import MAIN, SHA, errors_deg, figures, friction, ran, report, truth
 
 from pdhef_logtool.cli.run_tables import render_fleet, render_run
 from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.results.fleet import Failures
-from pdhef_logtool.results.run_report import EstimatorFacts, FrictionFacts, LogFacts, LogOutcome, TruthFacts
+from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.results.sink import Event
-from pdhef_logtool.results.summary import ErrorsOf, RunSummary, WorstDrive
-from pdhef_logtool.runs.pipeline import LogResult, RunResult
+from pdhef_logtool.runs.run_result import LogResult, RunResult
 
 NAMES = [s.name for s in SPECS]
 GOOD = [
@@ -50,8 +48,7 @@ def shown(*reports: dict[str, Any], width: int = 80, failed: str = "") -> str:
 
 
 def named(name: str, **changes: Any) -> dict[str, Any]:
-    log = LogFacts(name, "a.mcap", "mcap", SHA, 0, 10_000_000_000)
-    return report(**{"metrics": GOOD, **changes}, log=log)
+    return report(**{"metrics": GOOD, **changes}, name=name)
 
 
 def rows(text: str, *names: str) -> list[str]:
@@ -61,7 +58,7 @@ def rows(text: str, *names: str) -> list[str]:
 
 @pytest.mark.parametrize("width", [80, 120])
 def test_every_estimator_fits_and_keeps_its_whole_name(width: int) -> None:
-    every = [EstimatorFacts(n, causal=n != "pd-hef-smoothed", algorithm=MODEL) for n in NAMES]
+    every = [ran(n, causal=n != "pd-hef-smoothed") for n in NAMES]
     main = replace(MAIN, shown=NAMES, named=True)
     text = shown(report(main, estimators=every, metrics=ALL_METRICS), width=width)
     assert all(len(line) <= width for line in text.splitlines())
@@ -84,11 +81,11 @@ def test_the_answer_stands_first_then_three_rows() -> None:
 def test_hindsight_is_one_line_and_only_where_another_was_better() -> None:
     assert "In hindsight" not in shown(named("drive"))
     text = shown(named("drive", metrics=errors_deg(pd_hef=0.3, zero=0.1)))
-    assert "In hindsight by this log's ground truth zero was best, 0.100° RMSE; nothing was" in " ".join(text.split())
+    assert "In hindsight zero has the lowest error by ground truth, 0.100° RMSE; not used" in " ".join(text.split())
 
 
 def test_hashes_and_notes_stay_in_the_report() -> None:
-    estimators = [EstimatorFacts("pd-hef", causal=True, notes=[f"network {SHA}"], algorithm=MODEL)]
+    estimators = [ran("pd-hef", notes=[f"network {SHA}"])]
     assert SHA[:12] not in shown(report(replace(MAIN, shown=["pd-hef"]), estimators=estimators))
 
 
@@ -98,7 +95,7 @@ def test_without_truth_there_is_no_column_of_errors() -> None:
         ("zero", "vy_m_s", "d2", 1.0),
         ("physics~pd-hef", "sideslip_rad", "disagreement_rms", 0.01),
     )
-    text = shown(named("drive", truth=TruthFacts(), metrics=metrics))
+    text = shown(named("drive", truth=truth(), metrics=metrics))
     assert "Consistency" in text
     assert "RMSE" not in text
     assert "from pd-hef °" in text
@@ -118,7 +115,7 @@ def test_failed_checks_stand_above_the_table_and_undecided_ones_are_named() -> N
 
 
 def test_several_logs_have_one_table_and_say_once_what_holds_for_all() -> None:
-    first, second = named("monday"), named("tuesday", truth=TruthFacts(), metrics=[], remarks=["a remark"])
+    first, second = named("monday"), named("tuesday", truth=truth(), metrics=[], remarks=["a remark"])
     lost = named("wednesday", losses=[Loss("gap", "0.4 s without samples", "/imu")], remarks=["a remark"])
     text = shown(first, second, lost, failed="no log")
     assert all(len(line) <= 80 for line in text.splitlines())
@@ -143,7 +140,7 @@ def test_the_joint_table_says_who_answers_and_what_to_look_at() -> None:
 
 
 def test_what_is_assumed_of_all_logs_is_said_once_and_the_rest_with_each() -> None:
-    told = named("tuesday", friction=FrictionFacts("estimate", estimated=True, observable_share=1.0, summary="seen"))
+    told = named("tuesday", friction=friction("estimate", estimated=True, observable_share=1.0, summary="seen"))
     text = shown(named("monday"), told)
     assert text.count("car golf") == text.count("residual gain") == 1
     assert text.index("car golf") < text.index("friction given (option, 0.9)") < text.index("friction estimated (seen)")
@@ -181,12 +178,16 @@ def test_long_names_of_logs_stay_whole() -> None:
 
 def test_a_fleet_is_told_in_a_few_lines_within_80_columns() -> None:
     console = Console(width=80, record=True, file=io.StringIO(), highlight=False, markup=False)
-    errors = (ErrorsOf("answer", 290, 0.001, 0.003, 0.01), ErrorsOf("zero", 290, 0.01, 0.05, 0.2))
-    worst = tuple(
-        WorstDrive(f"a_day_in_may__drive_{i:05d}", "pd-hef", {"pd-hef": 0.01, "zero": 0.2}) for i in range(10)
-    )
-    failed = (Failures("expected a log, got a FIFO", 12, tuple(f"drive_{i}" for i in range(10))),)
-    summary = RunSummary(Path("out"), 3, 312, 300, 8, 290, 4, errors, worst, failed, ("drive_7",))
+    spread = {"drives": 290, "median_rad": 0.001, "p90_rad": 0.003, "max_rad": 0.01}
+    errors_rad = {"pd-hef": 0.01, "zero": 0.2}
+    worst = [{"log": f"a_day_in_may__drive_{i:05d}", "main": "pd-hef", "errors_rad": errors_rad} for i in range(10)]
+    labels = [f"drive_{i}" for i in range(10)]
+    summary = {
+        "output": "out", "exit_code": 3, "logs": 312, "done": 300, "lost": 8, "scored": 290, "remaining": 4,
+        "errors": [{"estimator": "answer", **spread}, {"estimator": "zero", **spread}], "worst": worst,
+        "failed": [{"reason": "expected a log, got a FIFO", "count": 12, "labels": labels}],
+        "checks_failed": ["drive_7"], "plan": None,
+    }  # fmt: skip
     render_fleet(summary, console)
     text = console.export_text()
     assert all(len(line) <= 80 for line in text.splitlines())

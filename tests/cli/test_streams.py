@@ -76,7 +76,7 @@ def test_a_request_to_end_is_one_line_whatever_becomes_of_it(name: str, code: in
     script = STOP.format(name=name, way=way)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (code, "")
-    assert done.stderr == f"pdhef: {said}; nothing half-written was left under its final name\n"
+    assert done.stderr == f"pdhef: {said}; no output file was left incomplete\n"
 
 
 def test_the_second_request_ends_at_once_and_what_is_ignored_stays_so() -> None:

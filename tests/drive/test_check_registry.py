@@ -85,7 +85,7 @@ def test_the_documentation_lists_it(toy: str) -> None:
     found = on_page_markdown((DOCS / "formats.md").read_text(encoding="utf-8"))
     for kind in registered().values():
         assert f"| `{kind.name}` | {kind.compares} | {kind.fails} |" in found
-    assert f"| `{toy}` | the fastest speed with what road cars reach |" in found
+    assert f"| `{toy}` | the fastest speed with the top speed of road cars |" in found
 
 
 def test_a_name_is_registered_once(toy: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,7 +26,7 @@ from pdhef_logtool.results.gate import Figure, Gate
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.pipeline import RunResult
+from pdhef_logtool.runs.run_result import RunResult
 from studies.documentation_tables import on_page_markdown
 
 NAME, LABEL = "interval_width", "interval width"

@@ -76,7 +76,7 @@ def test_everything_that_lacks_is_named_with_the_nearest() -> None:
     for part in (
         "ax_m_s2: no topic /imu/dat (did you mean /imu/data?)",
         "ay_m_s2: /imu/data has no field linear_accel.y (did you mean linear_acceleration.y?)",
-        "yaw_rate_rad_s: /imu/data.angular_velocity is no single number: name one, such as angular_velocity.z",
+        "yaw_rate_rad_s: /imu/data.angular_velocity contains several numbers: name one, such as angular_velocity.z",
         "steer_rad: /steer has no stamp header.stamp (did you mean stamp?)",
         "friction: /imu/data.header.frame_id is a string, not a number",
         "speed_m_s: /steer has no field gyro[3]",

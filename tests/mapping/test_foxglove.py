@@ -218,7 +218,7 @@ def test_a_name_without_the_fields_is_said_and_spoils_nothing(tmp_path: Path) ->
     found, _ = _map(_write(tmp_path / "a.mcap", {"/imu": _json("sensor_msgs/Imu", [_IMU]), "/x": other, "/gps": fix}))
     assert found.mapping.signals["ax_m_s2"].topic == "/imu"
     assert not found.ambiguities
-    assert sorted(n.partition(" ")[0] for n in found.mapping.notes if "not those of" in n) == ["/gps", "/x"]
+    assert sorted(n.partition(" ")[0] for n in found.mapping.notes if "fields differ from" in n) == ["/gps", "/x"]
 
 
 def test_recordings_of_other_tools_are_inspected(shared_dir: Path) -> None:

@@ -317,7 +317,7 @@ def test_a_types_name_promises_nothing(type_name: str, lacks: str, has: dict[str
     assert {s.topic for s in (*auto.mapping.signals.values(), *auto.mapping.truth.values())} == {"/truth/odometry"}, (
         lacks
     )
-    assert f"{name} is not used: its fields are not those of {type_name}" in auto.mapping.notes
+    assert f"{name} is not used: its fields differ from {type_name}" in auto.mapping.notes
     assert auto.ambiguities == ()
 
 

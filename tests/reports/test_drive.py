@@ -340,7 +340,7 @@ def test_the_command_says_what_it_wrote_and_where_no_browser_is(tmp_path, monkey
     assert result.returncode == 0
     document = json.loads(result.stdout)
     assert document["logs"] == [{"log": "drive", "page": str(folder / "logs" / "drive" / "report.html"), "wrong": None}]
-    assert "there is no browser" in result.stderr
+    assert "no browser is available" in result.stderr
 
 
 @pytest.mark.slow

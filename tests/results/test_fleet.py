@@ -126,7 +126,7 @@ def test_drives_without_independent_truth_stand_apart_and_score_nothing(run: Run
     assert [d.label for d in found.scored] == ["good"]
     assert [(d.label, d.unscored) for d in found.without_truth] == [
         ("none", "the log has no ground truth"),
-        ("own", "its ground truth is no independent one"),
+        ("own", "its ground truth is not independent"),
     ]
     (answer, _) = found.distributions
     assert (answer.estimator, answer.drives) == (ANSWER, 1)

@@ -27,9 +27,9 @@ from pdhef_logtool.results.plan_verdicts import (
     figures_of_rows,
     plan_verdicts,
 )
-from pdhef_logtool.results.run_report import CarFacts, LogOutcome
-from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import LogResult, judge, read_validation_plan
+from pdhef_logtool.results.run_report import LogOutcome
+from pdhef_logtool.runs.judging import judge, read_validation_plan
+from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import jsonable
 from tests.results.made_run import entry, write_run
 
@@ -215,7 +215,7 @@ def test_run_metrics_and_compare_give_the_same_verdict_on_an_earlier_run(tmp_pat
         of_compare = plan_verdicts_against(plan, *map(open_run, runs), strict=False)
         results = []
         for e, (log, value) in zip(entries, b.items(), strict=True):
-            car, known = CarFacts(None, "golf", "0", None), {"signals_sha256": e["signals_sha256"], "day": e["day"]}
+            car, known = {"name": "golf"}, {"signals_sha256": e["signals_sha256"], "day": e["day"]}
             outcome = LogOutcome(log, f"{log}.mcap", e["sha256"], main="pd-hef", car=car, **known)
             results.append(LogResult(outcome, None, {}, (row(log, "rmse", value, 99),)))
         of_run = judge(plan, results, strict=False)
@@ -227,7 +227,7 @@ def test_run_metrics_and_compare_give_the_same_verdict_on_an_earlier_run(tmp_pat
 def test_a_missing_earlier_run_ends_the_command_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "plan.toml").write_text(EARLIER.format("gone/run"))
     with pytest.raises(OutputError, match="no such folder") as raised:
-        read_validation_plan(RunConfig(plan=tmp_path / "plan.toml"), None)
+        read_validation_plan(tmp_path / "plan.toml", None)
     assert raised.value.exit_code == 2 and "gone/run" in str(raised.value)
 
 

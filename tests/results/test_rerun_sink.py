@@ -20,13 +20,13 @@ from pdhef_logtool.records.tracks import concatenate, make_track
 from pdhef_logtool.results import rerun_sink as rerun
 from pdhef_logtool.results.palette import colour_rgb
 from pdhef_logtool.results.rerun_sink import LONGEST_BRIDGE_NS, MOST_OTHERS, write_recording
-from pdhef_logtool.results.sink import Event, Shown
+from pdhef_logtool.results.sink import Event
 
 HASH = "0123456789abcdef" * 4
 #: Of one track only: the others have those of the palette.
 COLOURS = {"phy-ukf": 0x123456}
 #: The third track that is written, zero, is neither.
-SHOWN = Shown("phy-ukf")
+SHOWN = ["phy-ukf"]
 START_NS = 1_700_000_000_000_000_123
 REPORT = {
     "log": {"name": "drive", "file": "drive.mcap", "kind": "mcap", "duration_s": 6.0, "sha256": HASH},
@@ -220,7 +220,7 @@ def test_events_and_report_are_text(recording):
 def test_weights_and_reasons_are_drawn(tmp_path, circle):
     path = tmp_path / "recording.rrd"
     track = circle("pd-hef", 0, 600, adaptive=True)
-    record(path, [track, circle("zero", 0, 600)], shown=Shown("pd-hef", "zero"))
+    record(path, [track, circle("zero", 0, 600)], shown=["pd-hef", "zero"])
     timed, _ = tables(path)
     _, weights = series(timed["/main"], "mixture_weight")
     expected = np.where(track.valid, track.mixture_weight, np.nan)
@@ -250,7 +250,7 @@ def test_same_input_gives_the_same_content(tmp_path, circle, circle_signals):
 def test_slow_sideslip_is_not_drawn(tmp_path, circle):
     path = tmp_path / "recording.rrd"
     tracks = [circle("zero"), circle("truth")]
-    record(path, tracks, shown=Shown("phy-ukf", "zero"), min_speed_m_s=11.0)
+    record(path, tracks, shown=["phy-ukf", "zero"], min_speed_m_s=11.0)
     timed, _ = tables(path)
     assert np.isfinite(series(timed["/baseline"], "vx_m_s")[1]).any()
     for component in ("sideslip_deg", "error_sideslip_deg"):
@@ -280,11 +280,10 @@ SCRIPT = """
 import sys
 from pathlib import Path
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.results.sink import Shown
 from pdhef_logtool.results.rerun_sink import write_recording
 try:
     write_recording(
-        Path(sys.argv[1]), None, [], {}, application_id="x", shown=Shown("zero"), log_name="d", input_hash="ab" * 32,
+        Path(sys.argv[1]), None, [], {}, application_id="x", shown=["zero"], log_name="d", input_hash="ab" * 32,
         start_ns=0,
     )
 except OutputError as error:
@@ -345,7 +344,6 @@ import numpy as np
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.results import rerun_sink as rerun
-from pdhef_logtool.results.sink import Shown
 
 class Hangs:
     left = int(sys.argv[2])
@@ -364,7 +362,7 @@ track = make_track("zero", stamps_ns, vx_m_s=10 + vy, vy_m_s=vy, valid=np.ones(l
 rerun.report_markdown = lambda _: ""
 try:
     rerun.write_recording(
-        Path(sys.argv[1]), None, [track], {"log": {}}, application_id="x", shown=Shown("zero"), log_name="d",
+        Path(sys.argv[1]), None, [track], {"log": {}}, application_id="x", shown=["zero"], log_name="d",
         input_hash="ab" * 32, start_ns=0,
     )
 except OutputError as error:
@@ -430,7 +428,7 @@ def test_of_a_long_drive_ten_rows_a_second_are_drawn_with_the_largest_nis_and_fi
         make_track(name, stamps, vx_m_s=speed, vy_m_s=0 * speed, nis=nis).with_pose(speed, speed, 0 * speed)
         for name in ("zero", "zero:no-lateral")
     ]
-    record(path, tracks, shown=Shown("zero"), end_ns=int(stamps[-1]) + 1)
+    record(path, tracks, shown=["zero"], end_ns=int(stamps[-1]) + 1)
     timed, _ = tables(path)
     assert timed["/main"].num_rows == n // 10
     assert timed["/other/1"].num_rows == n // 20

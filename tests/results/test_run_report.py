@@ -13,59 +13,28 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.results.run_report import (
-    EstimatorFacts,
-    LogFacts,
     LogOutcome,
-    ReportFacts,
-    SourceFacts,
-    TopicFacts,
-    TruthFacts,
-    build_report,
     build_run,
-    jsonable,
     report_markdown,
-    tool_versions,
     write_json,
 )
 from pdhef_logtool.results.sink import Event
+from pdhef_logtool.storage.documents import jsonable
+from tests.run_report import SHA, VELOCITY, ran, report, truth
 
-SHA = "ab" * 32
-
-
-def facts(**changes) -> ReportFacts:
-    values = {
-        "log": LogFacts(
-            name="drive",
-            file="/somewhere/deep/drive.mcap",
-            kind="mcap",
-            sha256=SHA,
-            start_ns=1_700_000_000_000_000_001,
-            end_ns=1_700_000_010_000_000_001,
-            topics=[TopicFacts("/imu", "sensor_msgs/msg/Imu", "cdr", 1000, True)],
-        ),
-        "signals": [SourceFacts("ay_m_s2", "/imu.linear_acceleration.y", "m/s^2", 1000)],
-        "missing_signals": ["friction"],
-        "vehicle_name": "sedan",
-        "vehicle_sha256": SHA,
-        "estimators": [
-            EstimatorFacts("phy-ukf", causal=True),
-            EstimatorFacts("pd-hef", causal=True, skipped="no model", notes=["needs --model"]),
-        ],
-        "truth": TruthFacts(
-            quantities=[SourceFacts("vy_m_s", "/ins.pose", "m/s", 990, "from position and heading")],
-            latency_s=0.012,
-            not_independent=["yaw_rate_rad_s"],
-        ),
-        "metrics": [
-            MetricRow("drive", "phy-ukf", "sideslip_rad", "all", "rmse", np.deg2rad(0.5), "rad", 990),
-            MetricRow("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", float("nan"), "rad", 0),
-        ],
-        "segments": [Event("nonlinear", 1, 2, "|ay| above 0.5 g")],
-        "losses": [Loss(kind="gap", what="0.4 s without samples", where="/imu", start_ns=5, end_ns=6, count=1)],
-        "warnings": ["steering contradicts the yaw rate"],
-        "versions": tool_versions(),
-    }
-    return ReportFacts(**{**values, **changes})
+SKIPPED = ran("pd-hef", algorithm=None, outcome="skipped", reason="no model", notes=["needs --model"])
+CONTENT = {
+    "main": None,
+    "estimators": [ran("phy-ukf", algorithm=None), SKIPPED],
+    "truth": truth(*VELOCITY, latency_s=0.012, not_independent=["yaw_rate_rad_s"]),
+    "metrics": [
+        MetricRow("drive", "phy-ukf", "sideslip_rad", "all", "rmse", np.deg2rad(0.5), "rad", 990),
+        MetricRow("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", float("nan"), "rad", 0),
+    ],
+    "segments": [Event("nonlinear", 1, 2, "|ay| above 0.5 g")],
+    "losses": [Loss(kind="gap", what="0.4 s without samples", where="/imu", start_ns=5, end_ns=6, count=1)],
+    "warnings": ["steering contradicts the yaw rate"],
+}
 
 
 def validate(document, name: str) -> None:
@@ -81,100 +50,70 @@ def read(path: Path):
     return json.loads(path.read_text(encoding="utf-8"), parse_constant=no_constant)
 
 
-def test_report_follows_its_schema_and_keeps_what_it_was_told(tmp_path):
+def test_report_follows_its_schema(tmp_path):
     path = tmp_path / "report.json"
-    write_json(path, build_report(facts()))
-    report = read(path)
-    validate(report, "report.schema.json")
-    assert report["log"]["file"] == "drive.mcap"
-    assert report["log"]["start_ns"] == 1_700_000_000_000_000_001
-    assert report["log"]["duration_s"] == 10.0
-    assert report["log"]["topics"] == [
-        {"name": "/imu", "type": "sensor_msgs/msg/Imu", "encoding": "cdr", "messages": 1000, "mapped": True}
-    ]
-    assert report["mapping"]["missing"] == ["friction"]
-    assert report["mapping"]["signals"][0]["source"] == "/imu.linear_acceleration.y"
-    assert report["vehicle"] == {
-        "name": "sedan",
-        "sha256": SHA,
-        "file": None,
-        "proven": False,
-        "taught": None,
-        "sensors": {},
-        "assumed": [],
-        "low_speed_blend_m_s": None,
-    }
-    assert [(e["name"], e["outcome"], e["reason"]) for e in report["estimators"]] == [
+    write_json(path, report(**CONTENT))
+    document = read(path)
+    validate(document, "report.schema.json")
+    assert [(e["name"], e["outcome"], e["reason"]) for e in document["estimators"]] == [
         ("phy-ukf", "ran", None),
         ("pd-hef", "skipped", "no model"),
     ]
-    assert report["truth"]["available"] is True
-    assert report["truth"]["latency_s"] == 0.012
-    assert report["truth"]["not_independent"] == ["yaw_rate_rad_s"]
-    assert report["truth"]["quantities"][0]["derivation"] == "from position and heading"
-    assert [m["value"] for m in report["metrics"]] == [np.deg2rad(0.5), None]
-    assert report["segments"] == [{"name": "nonlinear", "start_ns": 1, "end_ns": 2, "text": "|ay| above 0.5 g"}]
-    assert report["losses"][0]["severity"] == "lost"
-    assert report["warnings"] == ["steering contradicts the yaw rate"]
-    assert report["versions"]["pdhef-logtool"]
+    assert [m["value"] for m in document["metrics"]] == [np.deg2rad(0.5), None]
+    assert document["segments"] == [{"name": "nonlinear", "start_ns": 1, "end_ns": 2, "text": "|ay| above 0.5 g"}]
+    assert document["losses"][0]["severity"] == "lost"
 
 
 def test_reasons_are_in_the_document_and_in_words():
-    start_ns = 1_700_000_000_000_000_001
+    start_ns = 0
     spans = [Interval(start_ns + int(a * 1e9), start_ns + int(b * 1e9)) for a, b in ((1.2, 1.21), (3.45, 3.46), (7, 8))]
     stuck = ReasonFacts("stuck_yaw_rate", "gyro stuck", 0.4, 1.0, 1, spans[2].start_ns, spans[2].end_ns, (spans[2],))
     spike = ReasonFacts("spike_ay", "a_y spike", 0.1, 0.5, 12, spans[0].start_ns, spans[2].end_ns, tuple(spans))
     some = [
-        EstimatorFacts("pd-hef", causal=True, notes=["a note"], reasons=(stuck, spike)),
-        EstimatorFacts("pd-hef-smoothed", causal=False, reasons=()),
-        EstimatorFacts("phy-ukf", causal=True),
+        ran("pd-hef", notes=["a note"], reasons=(stuck, spike)),
+        ran("pd-hef-smoothed", causal=False, reasons=()),
+        ran("phy-ukf"),
     ]
-    report = build_report(facts(estimators=some))
-    validate(report, "report.schema.json")
-    assert [e["reasons"] and len(e["reasons"]) for e in report["estimators"]] == [2, [], None]
-    assert report["estimators"][0]["reasons"][0]["longest"] == [
+    document = report(None, estimators=[e | {"algorithm": None} for e in some])
+    validate(document, "report.schema.json")
+    assert [e["reasons"] and len(e["reasons"]) for e in document["estimators"]] == [2, [], None]
+    assert document["estimators"][0]["reasons"][0]["longest"] == [
         {"start_ns": spans[2].start_ns, "end_ns": spans[2].end_ns}
     ]
-    lines = report_markdown(report).splitlines()
+    lines = report_markdown(document).splitlines()
     words = "a_y spike 1.20 s, 3.45 s, 7.0-8.0 s and 9 more (50% of it); gyro stuck 7.0-8.0 s"
     assert f"- **pd-hef** (causal): a note; {words}" in lines
     assert "- **phy-ukf** (causal)" in lines
-    report["estimators"][0]["reasons"][0]["name"] = "stuck_steer"
+    document["estimators"][0]["reasons"][0]["name"] = "stuck_steer"
     with pytest.raises(jsonschema.ValidationError, match="stuck_steer"):
-        validate(report, "report.schema.json")
+        validate(document, "report.schema.json")
 
 
 def test_report_without_truth_follows_its_schema_too():
-    report = build_report(facts(truth=TruthFacts(), metrics=[], segments=[], losses=[], warnings=[]))
-    validate(report, "report.schema.json")
-    assert report["truth"]["available"] is False
+    validate(report(None, truth=truth(), estimators=[]), "report.schema.json")
 
 
 @pytest.mark.slow
 def test_schema_misses_every_part():
     parts = "log mapping vehicle estimators truth metrics segments losses warnings remarks answer versions"
     for part in parts.split():
-        report = build_report(facts())
-        del report[part]
+        document = report(**CONTENT)
+        del document[part]
         with pytest.raises(jsonschema.ValidationError, match=part):
-            validate(report, "report.schema.json")
+            validate(document, "report.schema.json")
 
 
 @pytest.mark.slow
 def test_schema_refuses_a_skip_without_reason_and_a_path():
-    report = build_report(facts())
-    report["estimators"][1]["reason"] = None
-    with pytest.raises(jsonschema.ValidationError):
-        validate(report, "report.schema.json")
-    report = build_report(facts())
-    report["log"]["file"] = "/somewhere/drive.mcap"
-    with pytest.raises(jsonschema.ValidationError):
-        validate(report, "report.schema.json")
+    for part, place, wrong in (("estimators", 1, {"reason": None}), ("log", "file", "/somewhere/drive.mcap")):
+        document = report(**CONTENT)
+        document[part][place] = document[part][place] | wrong if isinstance(wrong, dict) else wrong
+        with pytest.raises(jsonschema.ValidationError):
+            validate(document, "report.schema.json")
 
 
 def test_run_says_how_each_log_ended(tmp_path):
     run = build_run(
-        tool_versions(),
         {"estimators": ["phy-ukf"], "start": None},
         None,
         [
@@ -192,7 +131,7 @@ def test_run_says_how_each_log_ended(tmp_path):
     run["logs"][0]["outcome"] = "fine"
     with pytest.raises(jsonschema.ValidationError):
         validate(run, "run.schema.json")
-    validate(build_run(tool_versions(), {}, {"name": "st-resnet", "sha256": SHA}, []), "run.schema.json")
+    validate(build_run({}, ("st-resnet", SHA), []), "run.schema.json")
 
 
 def test_json_is_sorted_and_the_same_each_time(tmp_path):

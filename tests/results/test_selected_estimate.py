@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from run_report import GNSS, MAIN, MODEL, SHA, TRUTH, errors_deg, figures, report
+from run_report import GNSS, MAIN, SHA, TRUTH, errors_deg, figures, friction, ran, report, truth
 
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.results.run_report import EstimatorFacts, FrictionFacts, TruthFacts, report_markdown
+from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.results.selected_estimate import MainFacts
+
+UNKNOWN = {"file": None, "proven": False}
 
 
 def texts(main: MainFacts = MAIN, **changes: Any) -> dict[str, str]:
@@ -52,7 +54,7 @@ def test_a_truth_that_is_an_input_is_no_independent_check() -> None:
     metrics = errors_deg(pd_hef=0.1)
     assert (
         "not an independent check"
-        in texts(metrics=metrics, truth=replace(TRUTH, not_independent=["sideslip_rad"]))["result"]
+        in texts(metrics=metrics, truth=TRUTH | {"not_independent": ["sideslip_rad"]})["result"]
     )
     assert "not an independent check" not in texts(metrics=metrics)["result"]
 
@@ -89,7 +91,7 @@ def test_without_truth_the_consistency_is_put_in_words(d2: float, proof: str) ->
         ("pd-hef", "vy_m_s", "d2", d2), ("zero", "vy_m_s", "d2", 1.0),
         ("pd-hef", "state", "nis", 6.0), ("pd-hef", "state", "nis_dof", 2.0),
     )  # fmt: skip
-    said = texts(truth=TruthFacts(), metrics=metrics)
+    said = texts(truth=truth(), metrics=metrics)
     assert "is unknown" in said["result"]
     assert proof in said["consistency"]
     assert "NIS per degree of freedom 3.00 (expected value 1): model or noise are wrong" in said["consistency"]
@@ -101,36 +103,36 @@ def test_what_was_assumed_of_car_friction_and_network() -> None:
         "car golf, validated on drives with ground truth; friction given (option, 0.9); "
         "residual gain of the network 0.5, from the car's validation data"
     )
-    unknown = texts(vehicle_file=None, vehicle_proven=False)
+    unknown = texts(vehicle=UNKNOWN)
     assert unknown["assumed"].startswith("default sedan (no car given)")
     assert unknown["next"].startswith("give your car")
-    estimated = FrictionFacts("estimate", estimated=True, observable_share=0.01, summary="observable 1 % of the time")
+    estimated = friction("estimate", estimated=True, observable_share=0.01, summary="observable 1 % of the time")
     assert "friction estimated (observable 1 %" in texts(friction=estimated)["assumed"]
     assert "--friction" in texts(friction=estimated)["next"]
-    assert "friction assumed, 1;" in texts(friction=FrictionFacts("assumed, 1"))["assumed"]
+    assert "friction assumed, 1;" in texts(friction=friction("assumed, 1"))["assumed"]
     assert texts(replace(MAIN, name="zero"))["assumed"] == "no vehicle model (zero needs none)"
 
 
 def test_a_calibrated_car_is_said_to_be_and_a_refusal_with_its_reason() -> None:
-    estimators = [EstimatorFacts("pd-hef", causal=False, algorithm={"physics_sha256": SHA, "options": {}})]
+    estimators = [ran("pd-hef", causal=False, algorithm={"physics_sha256": SHA, "options": {}})]
     told = {"refused": None, "logs": 1, "parameters": [{}], "understeer": {"contradicts": True}}
-    said = texts(vehicle_proven=False, estimators=estimators, calibration=told)
+    said = texts(vehicle={"proven": False}, estimators=estimators, self_calibration=told)
     assert "car golf; calibrated on this log without ground truth, therefore not causal" in said["assumed"]
     assert "the understeer gradient of the drive contradicts the file" in said["assumed"]
-    said = texts(vehicle_proven=False, calibration={"refused": "too short", "logs": 1, "understeer": None})
+    said = texts(vehicle={"proven": False}, self_calibration={"refused": "too short", "logs": 1, "understeer": None})
     assert "parameters of its file, not validated; not calibrated on this log: too short" in said["assumed"]
 
 
 def test_the_next_steps_are_few_and_the_most_important_first() -> None:
     lacking = [
-        EstimatorFacts("physics", causal=True, skipped="the log has no steer_rad"),
-        EstimatorFacts("zero", causal=True),
+        ran("physics", outcome="skipped", reason="the log has no steer_rad", algorithm=None),
+        ran("zero", algorithm=None),
     ]
-    said = texts(replace(MAIN, name="zero"), estimators=lacking, vehicle_file=None, vehicle_proven=False)["next"]
+    said = texts(replace(MAIN, name="zero"), estimators=lacking, vehicle=UNKNOWN)["next"]
     assert said.startswith("map the missing signals (the log has no steer_rad)")
     assert said.count("; ") == 1
     distrusted = replace(MAIN, name="open-loop", chosen_by="d2", why="pd-hef contradicts", distrusted=True)
-    estimators = [EstimatorFacts("open-loop", causal=True, algorithm=MODEL)]
+    estimators = [ran("open-loop")]
     said = texts(distrusted, estimators=estimators)
     assert "pd-hef contradicts" in said["assumed"]
     assert said["next"].startswith("check the vehicle file")
@@ -138,8 +140,8 @@ def test_the_next_steps_are_few_and_the_most_important_first() -> None:
 
 
 def test_a_taught_car_is_called_taught_and_is_not_to_be_taught_again() -> None:
-    untaught = texts(metrics=errors_deg(pd_hef=0.1), vehicle_proven=False)
-    taught = texts(metrics=errors_deg(pd_hef=0.1), vehicle_proven=False, vehicle_taught="ground truth")
+    untaught = texts(metrics=errors_deg(pd_hef=0.1), vehicle={"proven": False})
+    taught = texts(metrics=errors_deg(pd_hef=0.1), vehicle={"proven": False, "taught": "ground truth"})
     assert "teach the car with this ground truth: pdhef learn LOG --car golf" in untaught["next"]
     assert "pdhef learn" not in taught["next"]
     assert "car golf, taught by ground truth" in taught["assumed"] and "not validated" not in taught["assumed"]
@@ -149,7 +151,7 @@ def test_hindsight_is_said_apart_and_chooses_nothing() -> None:
     answer = report(metrics=errors_deg(pd_hef=0.3, physics=0.2, zero=0.1))["answer"]
     assert answer["main"] == "pd-hef"
     assert answer["best_in_hindsight"] == {"name": "zero", "causal": True, "sideslip_rmse_rad": np.deg2rad(0.1)}
-    assert report(truth=TruthFacts())["answer"]["best_in_hindsight"] is None
+    assert report(truth=truth())["answer"]["best_in_hindsight"] is None
 
 
 def test_the_words_stand_in_the_markdown() -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any
 
 import jsonschema
 import numpy as np
 import pytest
-from run_report import MAIN, TRUTH, errors_deg, report
+from run_report import MAIN, TRUTH, VELOCITY, errors_deg, report, truth
 
 from pdhef_logtool.evaluation.bootstrap import Interval
 from pdhef_logtool.evaluation.operating_space import Cell, OperatingSpace
@@ -16,7 +16,6 @@ from pdhef_logtool.evaluation.reasons import Interval as Span
 from pdhef_logtool.evaluation.reasons import SensorFault
 from pdhef_logtool.evaluation.standing import Standing
 from pdhef_logtool.results.arrow_schema import load_schema
-from pdhef_logtool.results.run_report import DriveDetails, TruthFacts, tool_versions
 
 NAN = float("nan")
 METRICS = errors_deg(pd_hef=0.1, physics=0.12, zero=1.0)
@@ -32,17 +31,12 @@ def standing(difference: Interval | None, rival: str | None = "physics", own: In
     return Standing("sideslip_rad", "pd-hef", own, rival, rival_rmse, difference, 10.0)
 
 
-def details(*standings: Standing, **changes: Any) -> DriveDetails:
-    empty = DriveDetails([], standings, {})
-    return replace(empty, **changes)
+def verdicts(*standings: Standing, **changes: Any) -> list[dict[str, Any]]:
+    return list(valid(standings, **{"metrics": METRICS, **changes})["verdicts"])
 
 
-def verdicts(found: DriveDetails, **changes: Any) -> list[dict[str, Any]]:
-    return list(valid(details=found, **{"metrics": METRICS, **changes})["verdicts"])
-
-
-def valid(**facts: Any) -> dict[str, Any]:
-    document = report(MAIN, versions=tool_versions(), **facts)
+def valid(standings: Sequence[Standing] = (), **changes: Any) -> dict[str, Any]:
+    document = report(MAIN, standings, **changes)
     jsonschema.validate({**document, "estimators": []}, load_schema("report.schema.json"))
     return document
 
@@ -60,13 +54,13 @@ def valid(**facts: Any) -> dict[str, Any]:
     ],
 )  # fmt: skip
 def test_the_sentence_claims_what_the_interval_holds(difference: Interval, outcome: str, said: str) -> None:
-    first = verdicts(details(standing(difference)))[0]
+    first = verdicts(standing(difference))[0]
     assert (first["signal"], first["outcome"]) == ("sideslip_rad", outcome)
     assert first["text"].startswith("RMSE of pd-hef: 0.1° (95 % CI 0.09° to 0.11°); " + said)
 
 
 def test_without_a_rival_or_an_interval_that_is_said() -> None:
-    first = verdicts(details(standing(None, None, interval(0.1))))[0]
+    first = verdicts(standing(None, None, interval(0.1)))[0]
     assert first["outcome"] == "alone"
     assert "no CI: it needs 6 blocks of 10 s" in first["text"]
     assert first["text"].endswith("no other filter without a network ran for comparison")
@@ -77,27 +71,26 @@ def test_without_a_rival_or_an_interval_that_is_said() -> None:
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"truth": TruthFacts()}, "the log contains no ground truth"),
-        ({"truth": replace(TRUTH, not_independent=["sideslip_rad"])}, "is an input of the estimator"),
-        ({"truth": replace(TRUTH, quantities=TRUTH.quantities[:2])}, "the ground truth does not contain it"),
+        ({"truth": truth()}, "the log contains no ground truth"),
+        ({"truth": TRUTH | {"not_independent": ["sideslip_rad"]}}, "is an input of the estimator"),
+        ({"truth": truth(*VELOCITY)}, "the ground truth does not contain it"),
         ({}, "its ground truth and pd-hef are never valid at the same time"),
     ],
 )
 def test_no_verdict_without_independent_truth_and_why(changes: dict[str, Any], why: str) -> None:
-    first = verdicts(details(), **changes)[0]
+    first = verdicts(**changes)[0]
     assert first["outcome"] == "none" and first["rmse"] is None
     assert first["text"] == f"no verdict: {why}" or why in first["text"]
 
 
 def test_a_truth_that_never_slips_gives_no_verdict() -> None:
-    first = verdicts(details(standing(None)), metrics=errors_deg(pd_hef=0.1, zero=1e-6))[0]
+    first = verdicts(standing(None), metrics=errors_deg(pd_hef=0.1, zero=1e-6))[0]
     assert first["outcome"] == "none" and "0 throughout" in first["text"]
 
 
-def test_the_other_details_follow_the_schema_and_an_older_report_does_without() -> None:
+def test_records_of_a_drive_follow_the_schema() -> None:
     fault = SensorFault("ay_m_s2", "spike", 70, 1.0, (Span(1, 2),))
-    found = details(faults=[fault], metadata={"vehicle": "a"})
-    document = valid(details=found, space=OperatingSpace([Cell(3, 2, 1.5, 0, NAN)], 0.9))
+    space = OperatingSpace([Cell(3, 2, 1.5, 0, NAN)], 0.9)
+    document = valid(faults=[fault], metadata={"vehicle": "a"}, operating_space=space)
     assert document["operating_space"]["cells"][0]["sideslip_mse_rad2"] is None
-    assert valid(details=details(faults=None))["faults"] is None
-    assert "verdicts" not in valid()
+    assert valid(faults=None)["faults"] is None

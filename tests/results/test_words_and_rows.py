@@ -6,11 +6,13 @@ import importlib.metadata
 import json
 from typing import Any
 
+from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.results.palette import colour_rgb
 from pdhef_logtool.results.run_report import diverged_line, json_bytes, report_markdown, tool_versions
+from pdhef_logtool.results.sink import Event
+from tests.run_report import ran, report
 
 SECOND = 10**9
-START_NS = 1_700_000_000 * SECOND
 
 
 def test_colours_are_red_green_blue_and_a_names_own() -> None:
@@ -30,70 +32,26 @@ def test_colours_are_red_green_blue_and_a_names_own() -> None:
 
 
 def _report(**changes: Any) -> dict[str, Any]:
-    rows = [
-        {"estimator": e, "signal": s, "segment": "all", "metric": m, "value": v, "unit": u, "n": 9}
-        for e in ("smooth", "ukf")
-        for s, m, v, u in (
-            ("vx_m_s", "rmse", 0.25, "m/s"), ("sideslip_rad", "rmse", 0.01, "rad"),
-            ("sideslip_rad", "coverage", 0.9, "1"), ("yaw_rate_rad_s", "rmse", 0.02, "rad/s"),
-        )
-    ]  # fmt: skip
-    base = {
-        "log": {
-            "name": "drive",
-            "file": "d.mcap",
-            "kind": "mcap",
-            "duration_s": 6.04,
-            "sha256": "ab" * 32,
-            "start_ns": START_NS,
-        },
-        "vehicle": {"name": "sedan"},
-        "warnings": ["careful"],
-        "losses": [{"what": "a gap", "where": "/imu"}],
-        "truth": {
-            "available": True,
-            "quantities": [{"name": "vy_m_s", "source": "/ins.v", "samples": 7, "derivation": "moved"}],
-            "latency_s": 0.0125,
-            "not_independent": ["vx_m_s"],
-            "notes": ["smoothed"],
-        },
-        "friction": {"source": "vehicle file, 0.85", "summary": "observable"},
-        "metrics": rows,
-        "segments": [],
-        "estimators": [
-            {"name": "ukf", "causal": True, "reason": None, "notes": ["a", "b"], "reasons": None},
-            {"name": "smooth", "causal": False, "reason": None, "notes": [], "reasons": []},
-        ],
-        "mapping": {
-            "signals": [{"name": "ay_m_s2", "source": "/imu.y", "samples": 600, "derivation": ""}],
-            "missing": ["friction"],
-        },
-        "versions": {"python": "3", "numpy": "2"},
-    }
-    return {**base, **changes}
+    estimators = [ran("ukf", notes=["a", "b"]), ran("smooth", causal=False, reasons=())]
+    content = {"estimators": estimators, "warnings": ["careful"], "losses": [Loss("gap", "a gap", "/imu")], **changes}
+    return report(None, **content)
 
 
 def test_the_report_for_people_is_this() -> None:
     spans = [
-        {"name": "ukf diverged", "start_ns": START_NS + 5 * SECOND, "end_ns": START_NS + 6 * SECOND, "text": ""},
-        {
-            "name": "ukf diverged",
-            "start_ns": START_NS + 2 * SECOND,
-            "end_ns": START_NS + 2 * SECOND + 250_000_000,
-            "text": "",
-        },
+        Event("ukf diverged", 5 * SECOND, 6 * SECOND, ""),
+        Event("ukf diverged", 2 * SECOND, 2 * SECOND + 250_000_000, ""),
     ]
-    report = _report(segments=spans)
-    assert report_markdown(report).splitlines() == [
-        "# drive", "", "d.mcap (mcap), 6.0 s", "",
+    assert report_markdown(_report(segments=spans)).splitlines() == [
+        "# drive", "", "drive.mcap (mcap), 10.0 s", "",
         "## Warnings", "", "- careful", "",
         "## Losses", "", "- a gap (/imu)", "",
         "## Estimators", "",
         "- **ukf** (causal): a; b; diverged for 1.25 s in 2 intervals, first at 2.00 s",
         "- **smooth** (not causal)",
     ]  # fmt: skip
-    assert diverged_line({**report, "segments": spans[:1]}, "ukf") == "diverged for 1.00 s, first at 5.00 s"
-    assert diverged_line(report, "smooth") == ""
+    assert diverged_line(_report(segments=spans[:1]), "ukf") == "diverged for 1.00 s, first at 5.00 s"
+    assert diverged_line(_report(segments=spans), "smooth") == ""
     assert "Warnings" not in report_markdown(_report(warnings=[], losses=[]))
     verdict = {"outcome": "FAIL", "label": "sideslip RMSE ≤ 1°", "reason": "1.2° (95 % CI 1.1° to 1.3°)"}
     text = report_markdown(_report(plan={"requirements": [verdict]}))

@@ -10,10 +10,11 @@ from pathlib import Path
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.logs.discovery import identity_of
 from pdhef_logtool.results.parquet_sink import write_metrics
-from pdhef_logtool.results.run_report import CarFacts, LogOutcome, write_json
+from pdhef_logtool.results.run_report import LogOutcome, write_json
 from pdhef_logtool.runs.cars import RunCars, car_record
+from pdhef_logtool.runs.drive_outputs import files_of
+from pdhef_logtool.runs.drive_report import car_entry
 from pdhef_logtool.runs.journal import digest_of, states_of
-from pdhef_logtool.runs.pipeline import files_of
 from pdhef_logtool.runs.working import DriveEnd, DriveTask
 from pdhef_logtool.storage.files import PendingFile
 from pdhef_logtool.workers.supervisor import Tell
@@ -33,9 +34,8 @@ def stub_drive(task: DriveTask, tell: Tell) -> DriveEnd:
     write_json(report, {"format": "pdhef.report", "log": {"name": log.stem}})
     (report.parent / "metrics.parquet").write_text(log.stem)
     identity = identity_of(log)
-    facts = CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, None)
     outcome = LogOutcome(
-        log.stem, Path(str(log.path)).name, identity, car=facts, main="physics", files=files_of(report.parent)
+        log.stem, Path(str(log.path)).name, identity, car=car_entry(car), main="physics", files=files_of(report.parent)
     )
     outputs = states_of(task.output, [part, *(f"logs/{log.stem}/{p.name}" for p in report.parent.iterdir())])
     record = {"digest": digest_of(record["parts"]), **record}

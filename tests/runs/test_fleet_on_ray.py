@@ -8,15 +8,16 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
+from pdhef_logtool.evaluation.validation_plan import default_plan
+from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.results.opened_run import METRICS_FILE, open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import Schedule, run_logs
-from pdhef_logtool.runs.working import run_on_node
+from pdhef_logtool.runs.working import DriveTask, run_on_node
 from pdhef_logtool.workers.supervisor import Limits
 from tests.runs.stub_drives import stub_drive, waiting_drive
 from tests.runs.test_fleet_runs import named_logs
@@ -96,8 +97,9 @@ def test_a_fleet_on_a_cluster_whose_output_is_in_a_store_equals_one_here(
 
 def test_an_output_that_a_node_does_not_see_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    task = SimpleNamespace(output=Path("out"))
-    told = run_on_node(stub_drive, tmp_path, True, task, lambda *_: None)  # type: ignore[arg-type]
+    (log,) = find_logs([str(named_logs(tmp_path / "logs", "a"))])
+    task = DriveTask(log, Path("out"), RunConfig(), "", default_plan(), None, page=False, run="")
+    told = run_on_node(stub_drive, tmp_path, True, task, lambda *_: None)
     assert isinstance(told, OutputError)
     assert "a folder that all nodes of the cluster see" in str(told)
 

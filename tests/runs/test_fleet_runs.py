@@ -153,7 +153,7 @@ def test_more_is_kept_when_it_is_asked_for_and_never_less(tmp_path: Path) -> Non
 def test_many_logs_keep_metrics_and_the_worst_in_full_and_say_so_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("fleet", "pipeline"):
+    for module in ("fleet", "run_result"):
         monkeypatch.setattr(f"pdhef_logtool.runs.{module}.FEW_LOGS", 7)
     logs = named_logs(tmp_path / "logs", *(f"drive{i:02d}" for i in range(8)))
     work, said = Counted(), list[str]()
@@ -288,7 +288,7 @@ def test_a_fleets_summary_counts_what_the_figures_say(tmp_path: Path) -> None:
         return stub_drive(task, tell)
 
     result = run(logs, out, work=failing)
-    told = summarise(open_run(out), result.exit_code, ["c"]).to_dict()
+    told = summarise(open_run(out), result.exit_code, ["c"])
     values = {log: zlib.crc32(log.encode()) / 2**32 for log in "ac"}
     assert (told["logs"], told["done"], told["scored"], told["exit_code"]) == (3, 2, 2, 3)
     assert told["errors"][0]["median_rad"] == pytest.approx(sum(values.values()) / 2)

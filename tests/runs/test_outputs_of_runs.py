@@ -16,8 +16,8 @@ import pytest
 
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.drive_outputs import LOG_FILES
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.pipeline import LOG_FILES
 from pdhef_logtool.runs.recorded_estimates import score_log
 from studies.torture.killing import contents, faults, kill_many, kill_run, leftovers
 from tests.command_line import called
@@ -209,7 +209,7 @@ def test_kills_leave_whole_logs_and_the_next_run_the_same_results(sample_logs_di
         if out.is_dir():
             assert faults(out) == [], killed
         if killed.exit_code == 130:
-            said = "pdhef: interrupted; nothing half-written was left under its final name"
+            said = "pdhef: interrupted; no output file was left incomplete"
             assert killed.said.splitlines()[-1].startswith(said)
             assert not out.is_dir() or leftovers(out) == []
         else:
@@ -227,7 +227,7 @@ def test_an_interrupted_run_says_how_far_it_came(sample_logs_dir: Path, tmp_path
     arguments = [str(sample_logs_dir / "dlc.mcap"), str(sample_logs_dir / "sweep.mcap"), "-e", "zero", *SLICE]
     killed = kill_run(arguments, tmp_path, after_s=0.0, number=signal.SIGTERM, writing=True)
     assert killed.exit_code == 143
-    assert killed.said.splitlines()[-1].startswith("pdhef: terminated; nothing half-written")
+    assert killed.said.splitlines()[-1].startswith("pdhef: terminated; no output file was left incomplete")
     assert killed.said.splitlines()[-1].endswith("; 0 of 2 logs are done")
     assert leftovers(tmp_path) == []
 

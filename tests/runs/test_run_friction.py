@@ -21,7 +21,7 @@ from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs.config import RunConfig, load_config
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.pipeline import RunResult
+from pdhef_logtool.runs.run_result import RunResult
 
 pytestmark = pytest.mark.slow
 
@@ -76,7 +76,7 @@ def test_a_slippery_road_is_found(slippery: Any) -> None:
 
 def test_the_terminal_and_the_warnings_say_it(slippery: Any) -> None:
     result, report, _ = slippery
-    assert any("estimated on line" in r for r in report["remarks"])
+    assert any("estimated online" in r for r in report["remarks"])
     console = Console(file=io.StringIO(), width=200)
     render_run(result, console)
     said = " ".join(console.file.getvalue().split())  # type: ignore[attr-defined]

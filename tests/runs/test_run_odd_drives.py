@@ -16,10 +16,10 @@ from pdhef_logtool.cli.running import _finish
 from pdhef_logtool.estimators import table
 from pdhef_logtool.estimators.base import Steps
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.runs import pipeline
+from pdhef_logtool.runs import preparing
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.pipeline import RunResult
+from pdhef_logtool.runs.run_result import RunResult
 from studies.torture.hours import Drive, read_samples, write_samples
 from tests.runs.numeric_drives import NUMERICS
 
@@ -47,7 +47,7 @@ def silenced(monkeypatch: pytest.MonkeyPatch) -> None:
         ready, skipped = table.runnable(*arguments)
         return [_Silent() if e.name == "phy-ukf" else e for e in ready], skipped
 
-    monkeypatch.setattr(pipeline, "runnable", runnable)
+    monkeypatch.setattr(preparing, "runnable", runnable)
 
 
 def _run(change: Callable[[Drive], Drive], folder: Path, sample_logs_dir: Path, *estimators: str) -> RunResult:
@@ -79,7 +79,7 @@ def test_an_estimator_without_a_valid_row_while_the_car_moves(tmp_path: Path, sa
 def test_no_valid_row_of_any_estimator_fails_and_keeps_the_report(
     tmp_path: Path, sample_logs_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "default_names", lambda _car, _available: ())  # physics has valid rows
+    monkeypatch.setattr(preparing, "default_names", lambda _car, _available: ())  # physics has valid rows
     result = _run(dict, tmp_path, sample_logs_dir, "phy-ukf")
     assert result.exit_code == 1
     report = json.loads((tmp_path / "out" / "logs" / "odd" / "report.json").read_text())

@@ -25,7 +25,7 @@ from pdhef_logtool.results.parquet_sink import read_track
 from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.pipeline import RunResult
+from pdhef_logtool.runs.run_result import RunResult
 from truthsim.drive import simulate_drive, write_drive
 from truthsim.faults import parse_fault
 

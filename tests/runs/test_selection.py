@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,14 +13,12 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.calibration.calibration import calibrate_online
 from pdhef_logtool.estimators.calibration.driving import driving_of
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
-from pdhef_logtool.evaluation.metrics.metric import SensorErrors
-from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS
 from pdhef_logtool.results.selected_estimate import MainFacts
 from pdhef_logtool.runs import frames, selection
 from pdhef_logtool.runs.config import RunConfig
@@ -43,10 +40,6 @@ field = "twist.twist.linear.y"
 SHUFFLED = TRUTH.replace('linear.y"', 'angular.z"\nscale = -7.0').replace('linear.x"', 'linear.x"\nscale = 0.5')
 
 
-def ran(*names: str) -> list[Estimator]:
-    return [cast(Estimator, SimpleNamespace(name=name)) for name in names]
-
-
 def d2(**values: float) -> list[MetricRow]:
     """Return figures of estimators that explain the yaw rate; ``zero`` does not."""
     rows = []
@@ -58,8 +51,8 @@ def d2(**values: float) -> list[MetricRow]:
     return rows
 
 
-def main(names: list[Estimator], rows: list[MetricRow], *, proven: bool = False, named: bool = False) -> MainFacts:
-    return choose_main(names, rows, proven=proven, named=named)
+def main(names: str, rows: Sequence[MetricRow] = (), *, proven: bool = False, named: bool = False) -> MainFacts:
+    return choose_main(names.split(), rows, proven=proven, named=named)
 
 
 def test_a_proven_car_runs_three_and_an_unproven_one_what_guards_it_as_well() -> None:
@@ -83,16 +76,16 @@ def test_physics_runs_without_a_measurement(lacks: set[str]) -> None:
 
 
 def test_the_main_one_is_the_best_of_its_kind_whatever_the_order() -> None:
-    assert main(ran("zero", "kinematic", "physics", "pd-hef"), [], proven=True).name == "pd-hef"
-    assert main(ran("zero", "phy-ukf", "open-loop"), []).name == "phy-ukf"
-    assert main(ran("zero", "kinematic"), []).name == "kinematic"
-    assert main(ran("zero", "pure-lstm", "zero:no-lateral"), []).name == "pure-lstm"
-    assert main(ran("zero:no-lateral", "zero"), []).name == "zero"
+    assert main("zero kinematic physics pd-hef", proven=True).name == "pd-hef"
+    assert main("zero phy-ukf open-loop").name == "phy-ukf"
+    assert main("zero kinematic").name == "kinematic"
+    assert main("zero pure-lstm zero:no-lateral").name == "pure-lstm"
+    assert main("zero:no-lateral zero").name == "zero"
 
 
 def test_evidence_goes_before_d2_and_d2_before_the_order() -> None:
     rows = d2(pd_hef=0.5, physics=0.5, open_loop=0.1, zero=0.9)
-    names = ran("zero", "open-loop", "physics", "pd-hef")
+    names = "zero open-loop physics pd-hef"
     proven = main(names, rows, proven=True)
     assert (proven.name, proven.chosen_by, proven.distrusted) == ("pd-hef", "evidence", False)
     found = main(names, rows)
@@ -100,12 +93,12 @@ def test_evidence_goes_before_d2_and_d2_before_the_order() -> None:
     assert "pd-hef contradicts the sensors more than open-loop" in found.why
     within = main(names, d2(pd_hef=0.11, open_loop=0.1, zero=0.9))
     assert (within.name, within.chosen_by, within.distrusted) == ("pd-hef", "d2", False)
-    assert main(names, []).chosen_by == "order"
+    assert main(names).chosen_by == "order"
 
 
 def test_zero_sideslip_is_a_baseline_and_never_chosen_by_its_agreement() -> None:
     """At the rear axle of a car the lateral velocity is small: an accelerometer there agrees with ``zero``."""
-    names = ran("zero", "open-loop", "physics", "pd-hef")
+    names = "zero open-loop physics pd-hef"
     least_bad = main(names, d2(pd_hef=0.5, physics=0.5, open_loop=0.6, zero=0.1))
     assert (least_bad.name, least_bad.distrusted) == ("pd-hef", True)
     assert least_bad.why.endswith("as well as sideslip 0 does; pd-hef is the least bad one")
@@ -114,9 +107,9 @@ def test_zero_sideslip_is_a_baseline_and_never_chosen_by_its_agreement() -> None
 
 
 def test_three_are_shown_the_answer_first_unless_they_were_named() -> None:
-    names = ran("zero", "open-loop", "phy-ukf", "physics", "pd-hef")
-    assert list(main(names, []).shown) == ["pd-hef", "physics", "zero"]
-    assert list(main(names, [], named=True).shown) == [e.name for e in names]
+    names = "zero open-loop phy-ukf physics pd-hef"
+    assert list(main(names).shown) == ["pd-hef", "physics", "zero"]
+    assert list(main(names, named=True).shown) == names.split()
     assert list(main(names, d2(pd_hef=1.0, phy_ukf=0.1)).shown) == ["phy-ukf", "physics", "zero"]
 
 
@@ -180,23 +173,3 @@ def test_a_choice_on_line_depends_on_nothing_that_follows(sample_logs_dir: Path)
         figures.append(sum(since <= limit for (since,) in looked))
     assert chosen[0] == chosen[1]
     assert figures[0] == figures[1] > 1
-
-
-def test_a_choice_on_line_can_change(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first stages contradict ``pd-hef``, the last one does not."""
-    stamps = np.arange(100)
-    nan = np.full(100, np.nan)
-    signals = Signals(stamps, stamps, nan, nan, nan, nan, nan, nan, np.full((100, 4), np.nan))
-    bad = {10: 5.0, 20: 5.0, 30: 0.5}
-
-    def figures(drive: EvaluatedDrive, _names: Sequence[str]) -> list[MetricRow]:
-        assert drive.signals is not None
-        return d2(open_loop=0.5, pd_hef=bad[int(drive.signals.stamps_ns[-1]) + 1])
-
-    monkeypatch.setattr("pdhef_logtool.evaluation.metrics.evaluate_drive", figures)
-    stages = [SimpleNamespace(since_ns=t, vehicle_file=default_vehicle()) for t in (0, 10, 20, 30)]
-    calibration: Any = SimpleNamespace(**vars(stages[-1]), earlier=tuple(stages[:-1]))
-    causal = [cast(Estimator, SimpleNamespace(name=n, causal=c)) for n, c in (("pd-hef", True), ("open-loop", True))]
-    later = cast(Estimator, SimpleNamespace(name="pd-hef-smoothed", causal=False))
-    spans = choose_over_time([*causal, later], calibration, lambda _: None, signals, lambda _: SensorErrors())
-    assert spans == [(0, "pd-hef"), (10, "open-loop"), (30, "pd-hef")]

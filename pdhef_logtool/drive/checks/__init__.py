@@ -1,8 +1,8 @@
 """Checks: whether mapped signals, ground truth and vehicle file agree with physics and with one another.
 
-Each check is registered by one file, from which report.json, terminal, pages, ``--waive``, JUnit and documentation
-derive it. A new check is a file that exports ``CHECKS`` (:class:`~.kind.CheckKind`) and its name in ``MODULES`` of
-:mod:`~.registry`. ``speed_range.py`` would be::
+One file registers each check; report.json, terminal, pages, ``--waive``, JUnit and documentation use this entry. To add
+a check, write a file that exports ``CHECKS`` (:class:`~.kind.CheckKind`) and add its name to ``MODULES`` of
+:mod:`~.registry`. Example, ``speed_range.py``::
 
     from collections.abc import Iterator
 
@@ -24,7 +24,7 @@ derive it. A new check is a file that exports ``CHECKS`` (:class:`~.kind.CheckKi
 
     SPEED_RANGE = CheckKind(
         "speed_m_s.range",
-        compares="the fastest speed with what road cars reach",
+        compares="the fastest speed with the top speed of road cars",
         fails="it is above 100 m/s",
         remedy="check the scale of the speed, which should be in {unit}",
         function=_check,

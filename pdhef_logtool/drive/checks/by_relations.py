@@ -1,6 +1,6 @@
 """``SIGNAL.sign``, ``unit``, ``axis``: each signal by relations to others (:mod:`~pdhef_logtool.drive.relations`).
 
-The posterior of all mistakes (:mod:`~pdhef_logtool.drive.hypotheses`) states which signals fail.
+The posterior of all mistakes (:mod:`~pdhef_logtool.drive.hypotheses`) decides which signals fail.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from pdhef_logtool.drive.relations import COURSE_RATE
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import GNSS
 
-#: Probability of a mistake from which on a check fails, below which it passes, and from which on it is undone at once;
-#: share of a signal's mistakes from which on one is named.
+#: Probability of a mistake at which a check fails, below which it passes, and at which the mistake is corrected; least
+#: share of a mistake in all mistakes of a signal to be named.
 FAILS, DOUBTED, CERTAIN, NAMED = 0.85, 0.005, 0.97, 0.05
-#: What an undecided check states of a signal that the drive contradicts and no unit or sign explains.
+#: Remedy of an undecided check if the drive contradicts the signal and no unit or sign explains it.
 UNEXPLAINED = "no unit or sign explains it: the car may slide, a sensor may fail for a while, or the field is another"
-#: What the remedies of mistakes begin with that are certain or suspected.
+#: Beginnings of the remedies of certain or suspected mistakes.
 SUSPICIONS = ("perhaps ", "no single mistake explains it", UNEXPLAINED)
 _LACKS_WHEELBASE = "the wheelbase of a vehicle file, or speeds that only full-size vehicles reach"
 _LACKS_SIDESLIP = "sideslip that changes fast"
-#: What a drive lacks that shows the sign of a signal and not its unit.
+#: Missing excitation if a drive shows the sign of a signal but not its unit.
 _LACKS_FOR_UNIT = {
     **dict.fromkeys(("steer_rad", "steering_wheel_rad"), _LACKS_WHEELBASE),
     **dict.fromkeys(("truth.vy_m_s", "truth.sideslip_rad"), _LACKS_SIDESLIP),
@@ -38,9 +38,9 @@ _BENDS = "bends to both sides at speed"
 
 
 def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int = 2) -> dict[str, tuple[float, str]]:
-    """Return by signal the factor that undoes its wrong unit or sign, with the evidence, where one is certain.
+    """Return by signal the certain correction factor of its wrong unit or sign, with the evidence.
 
-    ``most``: mistakes at once that are accepted.
+    ``most``: largest number of simultaneous mistakes.
     """
     probability, chosen = measured.posterior(mounting_is_known=mounting_is_known).sets[0]
     if probability < CERTAIN or len(chosen) > most or not all(h.is_exact for h in chosen):
@@ -55,35 +55,35 @@ def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int 
 
 
 def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Check, ...]:
-    """Judge sign, unit and field of every signal that a relation is about."""
+    """Check sign, unit and field of every signal with a relation."""
     columns, relations = measured.columns, measured.relations
-    # The sideslip reference compares GNSS velocity with gyro and speed itself.
+    # GNSS velocity is excluded: the sideslip reference compares it with gyro and speed.
     names = [n for n in columns if (n in measured.topics and not n.startswith(GNSS)) or n in _JUDGED_TRUTH]
-    if "truth.sideslip_rad" in names and "truth.vy_m_s" in names:  # which is v_x times its tangent
+    if "truth.sideslip_rad" in names and "truth.vy_m_s" in names:  # v_y is v_x times tan(sideslip)
         names.remove("truth.vy_m_s")
     probable = measured.posterior(mounting_is_known=mounting_is_known)
     checks: list[Check] = []
     for name in names:
-        # A wheel that contradicts others does so through the mean of the wheels, which is the speed.
+        # A wrong wheel contradicts other signals through the mean of the wheels, which is the speed.
         through = WHEEL_SPEEDS if probable.of(name) and name.startswith("wheel_speed_") else name
         mine = [r for r in relations if name in r.powers or through in r.powers]
         unrelated = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
         judged = _judged(name, [r for r in mine if r.tells], probable, measured)
         for r in unrelated[:1]:
-            evidence = f"{r.text}: one moves and the other does not with it, correlation {r.correlation:.2f}"
+            evidence = f"{r.text}: only one of them moves, correlation {r.correlation:.2f}"
             checks.append(AXIS.failed(evidence, name, signal_name=name))
         checks += judged or ([] if unrelated else [_not_excited(name, mine)])
     return tuple(_of_place(c, *measured.positions) if c.subject == COURSE_RATE else c for c in checks)
 
 
 def _of_place(check: Check, east: str, north: str) -> Check:
-    """Return the check of the path's turning with the names of the mapped positions."""
+    """Return the check of the path's course rate with the names of the mapped positions."""
     remedy = check.remedy.replace("truth.x_m", east).replace(COURSE_RATE, north)
     return replace(check, name=check.name.replace(COURSE_RATE, north), subject=north, remedy=remedy)
 
 
 def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measured: Measured) -> list[Check]:
-    """Return sign and unit checks of a signal by the relations that count; empty without any."""
+    """Return sign and unit checks of a signal from its informative relations; empty without any."""
     if not relations:
         return []
     mistakes, chosen = probable.of(name), probable.sets[0][1]
@@ -109,7 +109,7 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
 
 def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float]) -> list[Check]:
     best = max(usable, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
-    # Radii of wheels and wheelbases differ by more; a speed separates mph from km/h, tyres do not.
+    # Wheel radii and wheelbases vary by more; a speed separates mph from km/h, tyres do not.
     foreign = () if name.startswith(("steer", "wheel")) else FOREIGN
     units = {f for f, said in units_of(name.removeprefix("truth.")) if said not in ("is in m/s", "is in rad/s")}
     units |= {f**p for f in foreign for p in (1.0, -1.0)}
@@ -125,7 +125,7 @@ _JUDGED_TRUTH = (*(f"truth.{n}" for n in _JUDGED.split()),)
 
 
 def _is_cleared(name: str, unrelated: Relation, relations: Sequence[Relation]) -> bool:
-    """Return whether another relation shows the signal to be right, and none does so for the others of the pair."""
+    """Return whether another relation confirms the signal but not the other signals of the pair."""
 
     def shown(signal: str) -> bool:
         return any(r.tells and r.accepts() and signal in r.powers and r.powers != unrelated.powers for r in relations)
@@ -195,8 +195,8 @@ UNIT = CheckKind(
 )
 AXIS = CheckKind(
     "SIGNAL.axis",
-    compares="the signal with what it must go with, and an accelerometer's mean with gravity",
-    fails="it does not go with it, or gravity is in it",
+    compares="the signal with correlated signals, and an accelerometer's mean with gravity",
+    fails="it does not correlate, or it contains gravity",
     remedy="map another field or axis to {signal_name}",
 )
 CHECKS = (SIGN, UNIT, AXIS)

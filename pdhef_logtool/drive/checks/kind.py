@@ -1,4 +1,4 @@
-"""What a check is: a record that one file of this package exports, its words, and the drive that it judges."""
+"""Definition of a check with its texts, and the data of the drive that checks use."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from pdhef_logtool.drive.truth import LatencyEstimate
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
-#: Placeholder in a name for each signal that the check judges.
+#: Placeholder for the signal in the name of a check.
 SIGNAL = "SIGNAL"
 _T = TypeVar("_T")
-#: A figure of a fit counts from this many standard errors on.
+#: A fitted value is significant from this many standard errors.
 SURE = 4.0
 
 
 def is_beyond(value: float, error: float, plausible: tuple[float, float]) -> bool:
-    """Return whether a figure is so many standard errors outside of what is plausible."""
+    """Return whether a value is at least ``SURE`` standard errors outside of the plausible range."""
     low, high = plausible
     return value + SURE * error < low or value - SURE * error > high
 
@@ -32,12 +32,11 @@ class CheckKind:
 
     Attributes
     ----------
-    name : by which a person waives it, ``SUBJECT.ASPECT``; the subject is :data:`SIGNAL` where it judges several.
-    compares, fails : what is compared, and where it fails, for the documentation.
-    remedy : what to do where it fails; fields in braces are filled in.
-    lacks : what a drive lacks that leaves it undecided.
-    function : yields the checks of a drive; none where the drive has nothing that it compares. None: it is called from
-        elsewhere, or the function of another kind of its file yields both.
+    name : ``SUBJECT.ASPECT``, also for ``--waive``; the subject is :data:`SIGNAL` for a check of several signals.
+    compares, fails : the comparison and the condition of failure, for the documentation.
+    remedy : remedy of a failed check; fields in braces are filled in.
+    lacks : data that an undecided check needs.
+    function : yields the checks of a drive, none without the data to compare. None: another function yields them.
     """
 
     name: str
@@ -48,28 +47,28 @@ class CheckKind:
     function: Callable[[CheckedDrive], Iterable[Check]] | None = None
 
     def passed(self, evidence: str, signal: str = "") -> Check:
-        """Return that it passed; ``signal``: which one, where it judges several."""
+        """Return a passed check; ``signal``: its signal, for a check of several."""
         name = self._name(signal)
         return Check(name, name.rpartition(".")[0], "passed", evidence)
 
     def failed(self, evidence: str, signal: str = "", **fields: object) -> Check:
-        """Return that it failed, with its remedy."""
+        """Return a failed check with its remedy."""
         name = self._name(signal)
         return Check(name, name.rpartition(".")[0], "failed", evidence, self.remedy.format(**fields))
 
     def undecided(self, evidence: str, signal: str = "", lacks: str = "") -> Check:
-        """Return that the drive does not decide it; ``lacks``: other words for what it lacks."""
+        """Return an undecided check; ``lacks`` replaces the text of missing data."""
         name = self._name(signal)
         return Check(name, name.rpartition(".")[0], "undecided", evidence, lacks or self.lacks)
 
     def judged(self, good: bool, evidence: str, signal: str = "", **fields: object) -> Check:
-        """Return that it passed or failed."""
+        """Return a passed or failed check."""
         return self.passed(evidence, signal) if good else self.failed(evidence, signal, **fields)
 
     def of_figure(
         self, value: float, error: float, plausible: tuple[float, float], evidence: str, **fields: object
     ) -> Check:
-        """Judge a figure by its standard error: failed so many errors beyond what is plausible, passed two inside."""
+        """Return the check of a value: failed ``SURE`` standard errors outside the range, passed two inside."""
         low, high = plausible
         if is_beyond(value, error, plausible):
             return self.failed(evidence, "", **fields)
@@ -82,15 +81,15 @@ class CheckKind:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedDrive:
-    """What checks judge.
+    """Data of a drive for the checks.
 
     Attributes
     ----------
-    measured : columns [N] on one grid, SI, by signal; those of ground truth begin with ``truth.``.
-    vehicle : of the file, or the default one, which is no ``has_file``.
-    latency : of ground truth against the gyro, or the gyro's own. late : sensors that are late without ground truth.
-    has_truth : whether ground truth at the CG is known.
-    related : checks of signals by the relations between them. judged : the checks so far.
+    measured : columns [N] on one grid, SI, by signal; names of ground truth begin with ``truth.``.
+    vehicle : from the file, or the default vehicle (``has_file`` False).
+    latency : of ground truth against the gyro, or of the gyro. late : late sensors, detected without ground truth.
+    has_truth : whether ground truth at the CG is available.
+    related : checks of signals by their relations. judged : the checks so far.
     """
 
     measured: Measured
@@ -105,18 +104,18 @@ class CheckedDrive:
 
     @property
     def speed(self) -> FloatArray | None:
-        """The column used as the speed [N]; None if relations show it to be wrong."""
+        """The column used as the speed [N]; None if it is wrong."""
         name = self.measured.speed_name
         return None if name is None or name in self.wrong else self.measured.columns[name]
 
     @property
     def wrong(self) -> set[str]:
-        """The signals that relations, or their size, show to be wrong."""
+        """Signals with a failed check of relation or magnitude."""
         sizes = (c for c in self.judged if c.name.endswith(".magnitude"))
         return {c.subject for c in (*self.related, *sizes) if c.verdict == "failed"}
 
     def once(self, make: Callable[[CheckedDrive], _T]) -> _T:
-        """Return what ``make`` returns for this drive; it is called once."""
+        """Return ``make(self)``, computed at the first call."""
         if make not in self._shared:
             self._shared[make] = make(self)
         return self._shared[make]  # type: ignore[return-value]

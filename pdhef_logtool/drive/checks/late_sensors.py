@@ -1,4 +1,4 @@
-"""``SIGNAL.delay``: of two sensors that must go together one is late, which needs no ground truth."""
+"""``SIGNAL.delay``: late sensors, from pairs of sensors that follow one motion, without ground truth."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def delay_checks(late: Sequence[LateSensor]) -> list[Check]:
 
 DELAY = CheckKind(
     "SIGNAL.delay",
-    compares="the stamps of two sensors that go together",
+    compares="the stamps of two sensors that follow one motion",
     fails="one of them is late",
     remedy="latency_s = {delay:.3f} more in the mapping{more}",
     function=_checks,

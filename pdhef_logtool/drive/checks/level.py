@@ -15,11 +15,11 @@ from pdhef_logtool.drive.relations import gentle_at
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
-#: What of an accelerometer's mean driving does not explain. Grade and crossfall of a whole drive are 3 % at most
-#: (0.3 m/s^2), a production sensor's bias less than that; 0.8 m/s^2 is a tilt of 4.7 degrees, half of g another axis.
+#: Limits of an accelerometer's mean that driving does not explain. Grade and crossfall of a whole drive are 3 % at most
+#: (0.3 m/s^2), a production sensor's bias less. 0.8 m/s^2 is a tilt of 4.7 degrees; half of g means another axis.
 LEVEL_M_S2 = 0.8
 OTHER_AXIS_M_S2 = 5.0
-#: Independent samples of gentle driving from which on a mean is a tilt or a bias, and no manoeuvre: 10 s.
+#: Least number of independent samples of gentle driving, so that a mean is not due to a manoeuvre: 10 s.
 LEVEL_SAMPLES = 20.0
 
 
@@ -43,12 +43,12 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
         use = finite & at_ease if is_gentle_enough else finite
         bias = sensors.ax_bias_m_s2 if name == "ax_m_s2" else sensors.ay_bias_m_s2
         left, error = float(np.mean(rest[use])), 0.0
-        # Roll, and tyres near their limit, change the gain: what is left in the middle of no driving is a tilt.
+        # Roll and tyres near their limit change the gain; the tilt is the intercept at zero acceleration.
         line = fit(columns[name], [np.ones_like(driven), driven], use)
         if line is not None:
             left, error = min(left, float(line[0][0]), key=abs), float(line[1][0])
         check = _level(name, left - bias, error, float(np.mean(columns[name][use])) - bias)
-        # A drive in circles has a mean too: without the yaw rate and the speed only all of gravity is gravity.
+        # A drive in circles has a mean too: without yaw rate and speed, only a mean of about 1 g is gravity.
         is_known |= name == "ax_m_s2" and speed is not None
         is_gravity = is_known or abs(float(np.mean(rest[use]))) > IS_GRAVITY_M_S2[0]
         if (driving_is_known and is_known and is_gentle_enough) or (check.name == f"{name}.axis" and is_gravity):
@@ -58,10 +58,10 @@ def _levels(drive: CheckedDrive) -> Iterator[Check]:
 def _driven(
     name: str, measured: FloatArray, speed: FloatArray | None, yaw_rate: FloatArray | None
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the acceleration that speed and yaw rate show [N], 0 without them, and where the driving is gentle [N]."""
+    """Return the acceleration [N] from speed and yaw rate, 0 without them, and where the driving is gentle [N]."""
     driven, at_ease = np.zeros_like(measured), np.ones(measured.shape[0], np.bool_)
     if speed is not None and yaw_rate is not None:
-        # Where the car slides, speed and yaw rate no longer show what accelerates it.
+        # Speed and yaw rate do not explain the acceleration of a sliding car.
         at_ease = gentle_at(yaw_rate * speed, at_ease) & gentle_at(measured - median_known(measured), at_ease)
     if speed is not None and name == "ax_m_s2":
         driven = derivative(speed)
@@ -71,7 +71,7 @@ def _driven(
 
 
 def _level(name: str, rest: float, error: float, mean: float) -> Check:
-    # A wrong sign or unit of the speed makes the rest wrong, not the mean: both must exceed the limit.
+    # A wrong sign or unit of the speed changes the rest, but not the mean: both must exceed the limit.
     size = min(abs(rest), abs(mean))
     evidence = f"mean {mean:.2f} m/s^2, after removal of the driving {rest:.2f} +- {error:.2f}"
     if size > OTHER_AXIS_M_S2:
@@ -83,10 +83,10 @@ def _level(name: str, rest: float, error: float, mean: float) -> Check:
 
 LEVEL = CheckKind(
     "SIGNAL.level",
-    compares="the mean of an accelerometer with what driving explains of it",
-    fails="more than 0.8 m/s² are left: a tilt of 4.7 degrees, or a bias; beyond 5 m/s² `axis` fails",
-    remedy="the sensor is tilted by {tilt:.1f} deg, which belongs in the mapping, or has a bias: a fit's matter",
-    lacks="needs gentle driving: a car that slides accelerates by more than speed and yaw rate show",
+    compares="the mean of an accelerometer with the mean acceleration of the driving",
+    fails="they differ by more than 0.8 m/s²: a tilt of 4.7 degrees, or a bias; beyond 5 m/s² `axis` fails",
+    remedy="the sensor is tilted by {tilt:.1f} deg (correct it in the mapping), or has a bias (run pdhef learn)",
+    lacks="needs gentle driving: speed and yaw rate do not explain the acceleration of a sliding car",
     function=_levels,
 )
 CHECKS = (LEVEL,)

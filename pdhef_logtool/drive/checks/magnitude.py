@@ -1,4 +1,4 @@
-"""``SIGNAL.magnitude``: values that no vehicle has; needs no second signal, and applies to model cars too."""
+"""``SIGNAL.magnitude``: values that no vehicle reaches; needs no second signal, and applies to model cars too."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pdhef_logtool.drive.hypotheses import FOREIGN, is_odd, units_of
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS
 
-#: Above what a road car, a race car or a model car reaches for longer than a second: model cars spin at 5 rad/s and
-#: corner at 15 m/s²; a body that keeps rolling at 4 rad/s overturns; a wheel of 5 cm at 30 m/s turns with 600 rad/s;
+#: Values that no road car, race car or model car exceeds for more than a second: model cars spin at 5 rad/s and corner
+#: at 15 m/s²; a body that keeps rolling at 4 rad/s overturns; a wheel of 5 cm radius turns with 600 rad/s at 30 m/s;
 #: trucks have five turns of the steering wheel.
 MOST = {
     "ax_m_s2": 30.0,
@@ -30,9 +30,9 @@ MOST = {
     "truth.yaw_rate_rad_s": 10.0,
     "truth.sideslip_rad": float(np.pi),
 }
-#: This share of the low-passed values must be below it: shocks and spins are short.
+#: Least share of the low-passed values below the limit: shocks and spins are short.
 SHARE = 0.95
-#: A wheel in the air spins.
+#: The same for a wheel, which spins in the air.
 WHEEL_SHARE = 0.5
 
 
@@ -66,7 +66,7 @@ def _remedy(drive: CheckedDrive, name: str, large: float, most: float) -> str:
 
 MAGNITUDE = CheckKind(
     "SIGNAL.magnitude",
-    compares="the low-passed values of the signal with what vehicles reach, model cars included",
+    compares="the low-passed values of the signal with the limits of all vehicles, including model cars",
     fails="5 % of them are above (yaw rate 10 rad/s, accelerations 30 m/s², speed 120 m/s, road-wheel angle 1.3 rad)",
     remedy="{remedy}",
     function=_checks,

@@ -1,16 +1,16 @@
-"""``SIGNAL.fault``, ``mounting``, ``corrected``: sensors that fail, the axes of the IMU, and what is read otherwise."""
+"""``SIGNAL.fault``, ``mounting``, ``corrected``: faulty sensors, axes of the IMU, and corrected signals."""
 
 from __future__ import annotations
 
 from pdhef_logtool.drive.checks.kind import CheckKind
 
-#: A sensor whose silent samples held so much of the drive's motion is itself a failed check.
+#: The check of a sensor fails if more than this share of the drive's motion is during its silent samples.
 FAULTY_SHARE = 0.5
 
 FAULT = CheckKind(
     "SIGNAL.fault",
-    compares="samples that are stuck or dead with what the car does meanwhile",
-    fails="more than half of what the drive does falls into them; other signals are judged without those samples",
+    compares="samples that are stuck or dead with the motion of the car at the same time",
+    fails="more than half of the motion is during such samples; other signals are checked without them",
     remedy="look at the sensor, its cable and its power",
 )
 MOUNTING = CheckKind(
@@ -21,8 +21,8 @@ MOUNTING = CheckKind(
 )
 CORRECTED = CheckKind(
     "SIGNAL.corrected",
-    compares="unit, sign and axis that recognition reads, without a mapping file, with what the drive shows",
-    fails="the drive contradicts them with certainty: the run reads what it shows",
+    compares="recognised unit, sign and axis (without a mapping file) with the drive",
+    fails="the drive contradicts them with certainty; the run uses the corrected values",
     remedy="confirm it in a mapping file: {entries}",
 )
 CHECKS = (FAULT, MOUNTING, CORRECTED)

@@ -1,4 +1,4 @@
-"""Every check of signals, ground truth and vehicle file, in the order in which they are made."""
+"""All checks of signals, ground truth and vehicle file, in the order of their execution."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 from pdhef_logtool.drive.checks.kind import CheckKind
 
-#: Files of this package that export ``CHECKS``. A new check: a file, and its name here.
+#: Modules of this package that export ``CHECKS``. Add the name of a new one here.
 MODULES = (
     "mounting",
     "by_relations",

@@ -1,4 +1,4 @@
-"""Makes all registered checks of a drive."""
+"""Execution of all registered checks of a drive."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pdhef_logtool.drive.truth import LatencyEstimate, TruthTrack
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import Channel
 
-#: Aspects whose failure means that a channel is not the signal that it is mapped to.
+#: If a check of one of these aspects fails, the channel is not the signal that it is mapped to.
 _MISREAD = frozenset({"sign", "unit", "scale", "axis", "mounting", "magnitude"})
 _BADNESS = {"passed": 0, "undecided": 1, "failed": 2}
 
@@ -35,15 +35,15 @@ def check_drive(
 ) -> tuple[Check, ...]:
     """Return the checks of mapped signals, of ground truth and of the vehicle file.
 
-    If a check fails, they are repeated without the samples that a sensor fault has spoilt.
+    If a check fails, the checks are repeated without faulty samples.
 
     Parameters
     ----------
     signals, truth : by name, SI, as mapped. derived : ground truth at the CG.
-    vehicle : from a file; None or the default car: without a file.
-    latency : of ground truth against the gyro, or the gyro's own. late : sensors that are late without ground truth.
-    mounting_is_known : gravity has shown that the IMU is not upside down.
-    measured : what :func:`~pdhef_logtool.drive.measured.measure` makes of the channels, where that is known.
+    vehicle : from a file; None or the default car without a file.
+    latency : of ground truth against the gyro, or of the gyro. late : late sensors, detected without ground truth.
+    mounting_is_known : the mounting of the IMU is confirmed.
+    measured : result of :func:`~pdhef_logtool.drive.measured.measure` for the channels; computed by default.
     """
 
     def checks_of(measured: Measured) -> tuple[Check, ...]:
@@ -63,13 +63,13 @@ def check_drive(
     if all(check.verdict != "failed" for check in checks):
         return checks
     sound, shares = without_faulty_samples(signals, vehicle or default_vehicle())
-    # A detector of faults cannot distinguish a dead channel from one in another unit; the whole drive can.
+    # The fault detector cannot distinguish a dead channel from a channel in another unit; the whole drive can.
     if not shares or not shares.keys() - explained_factors(whole, mounting_is_known=mounting_is_known).keys():
         return checks
-    evidence = "{:.0%} of what the car did fell into samples of it that are stuck or dead"
+    evidence = "{:.0%} of the car's motion is during its stuck or dead samples"
     faults = [FAULT.failed(evidence.format(share), n) for n, share in shares.items() if share > FAULTY_SHARE]
     again = replace(measure(sound, truth, derived, vehicle), scales=whole.scales)
-    # What passes only without samples of its own sensor is not known to be right.
+    # A check of a faulty sensor that passes only without the faulty samples is undecided.
     doubted = {c.name: c.remedy for c in checks if c.verdict == "failed" and c.subject in shares}
     checks = checks_of(again)
     for n in (c.name for c in checks if c.verdict == "passed" and c.name in doubted):
@@ -79,7 +79,7 @@ def check_drive(
 
 
 def misread_channels(checks: Sequence[Check], waived: Sequence[str] = ()) -> dict[str, str]:
-    """Return by subject why nothing may be computed from it: a failed check that no one has waived, and its remedy."""
+    """Return the subjects that must not be used, with the reason: a failed check that is not waived, and its remedy."""
     misread: dict[str, str] = {}
     for check in checks:
         subject, _, aspect = check.name.rpartition(".")
@@ -93,7 +93,7 @@ def _all_checks(drive: CheckedDrive) -> tuple[Check, ...]:
         if kind.function is not None:
             drive.judged.extend(kind.function(drive))
     unique: dict[str, Check] = {}
-    for check in drive.judged:  # of two of a name the worse counts
+    for check in drive.judged:  # the worse of two checks with one name counts
         if check.name not in unique or _BADNESS[check.verdict] > _BADNESS[unique[check.name].verdict]:
             unique[check.name] = check
     return tuple(unique.values())

@@ -16,7 +16,7 @@ from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import FloatArray
 
-#: Plausible gain of an accelerometer in lateral acceleration: roll adds 10 %, banked bends take 25 %.
+#: Plausible gain of an accelerometer in lateral acceleration: roll adds 10 %, banked bends subtract 25 %.
 AY_GAIN_RANGE = (0.65, 1.3)
 #: Crossfall alone moves an accelerometer by half a metre per second squared.
 LEAST_LATERAL_M_S2 = 0.7
@@ -24,13 +24,13 @@ LEAST_LATERAL_M_S2 = 0.7
 GAIN_ERROR, RESAMPLED_GAIN = 0.05, 0.0015
 #: A sensor's filter and a bus take 10 to 20 ms; at 0.5 Hz, 30 ms are 5 degrees of phase.
 SENSOR_DELAY_S = 0.03
-#: A sensor is mounted elsewhere than the vehicle file gives if the distance is larger, m. Beyond the second value no
-#: sensor is inside a car: another quantity correlates with the yaw acceleration.
+#: Largest distance between a sensor and its position in the vehicle file, m. Beyond the second value, the sensor is
+#: outside of the car: another quantity correlates with the yaw acceleration.
 LEVER_M, MOST_LEVER_M = 0.5, 5.0
 #: Steps to find the delay of a_y, the largest last step, and the largest delay.
 DELAY_STEPS, DELAY_KNOWN_S, MOST_DELAY_S = 4, 0.005, 0.3
-#: Lateral acceleration that changes slower is also a bank of the road; a body rolls so much later than it is
-#: accelerated, and the gain shows how far.
+#: Lateral acceleration that changes more slowly may be a bank of the road. Delay of body roll after the acceleration;
+#: the gain gives the roll angle.
 SLOW_S, ROLL_LAG_S = 4.0, 0.08
 _TRUTH = {"truth.vx_m_s", "truth.vy_m_s", "truth.yaw_rate_rad_s"}
 
@@ -75,7 +75,7 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
         slow = running_mean(lateral, round(0.5 * SLOW_S / GRID_S))
         regressors = [derivative(rate), lateral, derivative(lateral), np.ones_like(rate), slow]
         late_s = 0.0
-        for _ in range(DELAY_STEPS):  # the part of the lever arm is late too: one step is not enough
+        for _ in range(DELAY_STEPS):  # iterates, because the lever-arm term is late too
             result = fit(earlier(ay, late_s), regressors, moving_at(vx))
             if result is None or result[0][1] <= 0.0:
                 break
@@ -184,7 +184,7 @@ def _ay_delay(drive: CheckedDrive) -> Iterator[Check]:
 
 AY_DELAY = CheckKind(
     "ay_m_s2.delay",
-    compares="the stamps of a_y with those of ground truth",
+    compares="the stamps of a_y with the stamps of ground truth",
     fails="a_y is 30 ms late",
     remedy="latency_s = {delay:.4f} more in the mapping",
     lacks="needs quick bends to both sides",
@@ -224,7 +224,7 @@ def _gyro_delay(drive: CheckedDrive) -> Iterator[Check]:
 
 GYRO_DELAY = CheckKind(
     "yaw_rate_rad_s.delay",
-    compares="the stamps of the gyro with those of ground truth",
+    compares="the stamps of the gyro with the stamps of ground truth",
     fails="the gyro is 30 ms late",
     remedy="latency_s = {delay:.4f} more in the mapping",
     function=_gyro_delay,

@@ -14,7 +14,7 @@ def _checks(drive: CheckedDrive) -> Iterator[Check]:
     if drive.wrong & {"truth.vx_m_s", "truth.vy_m_s"}:
         return
     for name, factor in zip(drive.measured.positions, position_factors(drive.measured.columns), strict=True):
-        evidence = f"the ground-truth velocity is {factor:.3g} times what its positions change by along this axis"
+        evidence = f"the ground-truth velocity is {factor:.3g} times the derivative of its positions along this axis"
         scale = drive.measured.scales.get(name)
         line = f", scale = {scale * factor:.3g}" if isinstance(scale, float | int) else ""
         if not math.isnan(factor):

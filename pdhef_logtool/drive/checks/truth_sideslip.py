@@ -1,4 +1,4 @@
-"""``truth.sideslip_rad``: whether the ground-truth heading and velocity belong together; sideslip is 0 on straights."""
+"""``truth.sideslip_rad``: whether ground-truth heading and velocity are consistent; sideslip is 0 on straights."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from pdhef_logtool.drive.relations import SAME_RANGE, gentle_at
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
-#: A larger sideslip on straights is an error of ground truth, not of tyres and crossfall.
+#: A larger sideslip on straights is an error of ground truth; tyres and crossfall cause less.
 SIDESLIP_OFFSET_RAD = math.radians(0.15)
-#: Bias of an accelerometer, 1-sigma: tyres with a lateral force have a sideslip that it shifts.
+#: Bias of an accelerometer, 1-sigma, which shifts the sideslip due to lateral tyre forces.
 AY_BIAS_M_S2 = 0.1
-#: No car drives sideways: so much of its moving time beyond that, the heading and the velocity do not belong together.
+#: No car drives sideways: if sideslip exceeds this angle for this share of the moving time, heading and velocity are
+#: inconsistent.
 SIDEWAYS_RAD, SIDEWAYS_SHARE = math.radians(20.0), 0.75
 
 
@@ -43,7 +44,7 @@ def _checks(drive: CheckedDrive) -> list[Check]:
 
 
 def _is_speed(drive: CheckedDrive, column: FloatArray) -> bool:
-    """Return whether a column is the speed that the sensors show."""
+    """Return whether a column equals the speed of the sensors."""
     if drive.speed is None or str(drive.measured.speed_name).startswith("truth."):
         return False
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -80,7 +81,7 @@ def _offset_check(columns: Mapping[str, FloatArray]) -> Check | None:
         for p in halves(len(columns["ay_m_s2"]))
     ]
     shown = " and ".join(f"{math.degrees(p[0]):.2f}" for p in parts if p is not None)
-    evidence = f"{math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg are left where the car goes straight"
+    evidence = f"sideslip is {math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg in straight driving"
     evidence += f" ({shown} in alternate parts of the drive)" if " and " in shown else ""
     return OFFSET.of_figure(offset, error, (-SIDESLIP_OFFSET_RAD, SIDESLIP_OFFSET_RAD), evidence)
 
@@ -89,15 +90,15 @@ FRAME = CheckKind(
     "truth.sideslip_rad.frame",
     compares="the heading of ground truth with its velocity",
     fails="its sideslip is above 20 degrees for 75 % of the moving time",
-    remedy="heading and velocity do not belong together: look at frames, signs and units of ground truth",
+    remedy="heading and velocity are inconsistent: check frames, signs and units of ground truth",
     function=_checks,
 )
 OFFSET = CheckKind(
     "truth.sideslip_rad.offset",
     compares="ground-truth sideslip on straights with 0",
     fails="it is off by 0.15 degrees",
-    remedy="the heading of ground truth is turned against the car (a tyre, a crossfall or a bias of a_y makes less of "
-    "that): pdhef inspect --write-mapping takes it off",
+    remedy="the heading of ground truth is rotated against the car (tyres, crossfall or a bias of a_y cause less): "
+    "correct it by pdhef inspect --write-mapping",
     lacks="needs straights and bends",
 )
 CHECKS = (FRAME, OFFSET)

@@ -1,4 +1,4 @@
-"""``vehicle.*``: whether wheels, steering and tyres of the car are as its file has them."""
+"""``vehicle.*``: whether wheels, steering and tyres of the car agree with its vehicle file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pdhef_logtool.drive.relations import gentle_at
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS
 
-#: Effective radius over the file's: tyres wear by 3 %, sizes of one car differ by 5 %.
+#: Effective radius over the file's radius: tyres wear by 3 %, sizes of one car differ by 5 %.
 RADIUS_RANGE = (0.85, 1.18)
 
 
@@ -35,24 +35,24 @@ def _radius(drive: CheckedDrive) -> Iterator[Check]:
 
 RADIUS = CheckKind(
     "vehicle.wheel_radius",
-    compares="the speed over that of the wheels with the radius in the vehicle file",
-    fails="it is below 0.85 or above 1.18 of it",
+    compares="the ratio of speed and wheel speed with the wheel radius in the vehicle file",
+    fails="it is below 0.85 or above 1.18 of the radius",
     remedy="set wheel_radius_m = {radius:.3f}",
     function=_radius,
 )
 
 #: Understeer gradients that have opposite signs and are this far from neutral; rad per m/s^2. Cars have 0.002 to 0.006.
 NEUTRAL_RAD_PER_M_S2 = 0.0006
-#: Steering angle over what the file's ratio and wheelbase make of the curvature.
+#: Steering angle over the angle that follows from curvature, ratio and wheelbase of the file.
 STEERING_RANGE = (0.75, 1.33)
-#: Share of the steering's spread that curvature and lateral acceleration may leave.
+#: Largest share of the steering's spread that curvature and lateral acceleration do not explain.
 UNEXPLAINED_STEERING = 0.5
 #: Highest over lowest speed from which wheelbase and understeer can be distinguished.
 SPEED_SPREAD = 1.4
 
 
 def _steering(drive: CheckedDrive) -> list[Check]:
-    """Judge wheelbase with steering ratio, and under- or oversteer, by delta = s L r / v + K v r + offset."""
+    """Check wheelbase with steering ratio, and under- or oversteer, by delta = s L r / v + K v r + offset."""
     columns, speed, vehicle = drive.measured.columns, drive.speed, drive.vehicle
     rate, steer = columns.get("yaw_rate_rad_s"), columns.get("steer_rad")
     if steer is None and "steering_wheel_rad" in columns:
@@ -66,7 +66,7 @@ def _steering(drive: CheckedDrive) -> list[Check]:
     gentle = gentle_at(lateral, moving_at(speed))
     result = fit(steer, [curved, lateral, np.ones_like(steer)], gentle)
     speeds = np.abs(speed[gentle & np.isfinite(speed)])
-    # At one speed curvature and lateral acceleration are one regressor.
+    # At constant speed, curvature and lateral acceleration are proportional.
     if result is None or np.quantile(speeds, 0.9) < SPEED_SPREAD * np.quantile(speeds, 0.1):
         lacks = "needs bends to both sides at low and at high speed"
         return [kind.undecided("too little driving in bends", lacks=lacks) for kind in (STEERING, UNDERSTEER)]
@@ -102,20 +102,20 @@ _LACKS = "needs bends at low and at high speed"
 STEERING = CheckKind(
     "vehicle.steering",
     compares="the steering in slow bends with the steering ratio and the wheelbase of the vehicle file",
-    fails="less than 0.75 or more than 1.33 of what the file gives is used",
+    fails="it is less than 0.75 or more than 1.33 of the value from the file",
     remedy="steering_ratio is off by {share:.2f}, or the wheelbase",
     lacks=_LACKS,
     function=_steering,
 )
 UNDERSTEER = CheckKind(
     "vehicle.understeer",
-    compares="the understeer gradient of the drive with that of the vehicle file",
+    compares="the understeer gradient of the drive with the gradient of the vehicle file",
     fails="their signs are opposite, and both are far from neutral",
-    remedy="the car {behaves}: check tyre stiffness and place of the CG, or run pdhef learn",
+    remedy="the car {behaves}: check tyre stiffness and position of the CG, or run pdhef learn",
     lacks=_LACKS,
 )
 
-#: Lateral acceleration driven over what the file's tyres carry at friction 1: summer tyres reach 1.15 of it.
+#: Driven lateral acceleration over the limit of the file's tyres at friction 1: summer tyres reach 1.15.
 MAX_GRIP_USE = 1.25
 
 
@@ -124,21 +124,21 @@ def _mass(drive: CheckedDrive) -> Iterator[Check]:
     rate, ay = columns.get("yaw_rate_rad_s"), columns.get("ay_m_s2")
     if not drive.has_file or speed is None or rate is None or ay is None:
         return
-    # Roll makes a_y too large, and a car that begins to spin its yaw rate.
+    # Roll increases a_y, and the yaw rate is too high when a car begins to spin.
     lateral = np.minimum(np.abs(ay), np.abs(rate * speed))
     finite = lateral[np.isfinite(lateral)]
     friction = max(1.0, vehicle.assumed_friction)
     carried = [vehicle.magic_formula(front, friction)[2] / vehicle.axle_load_n(front) for front in (True, False)]
     most = GRAVITY_M_S2 * min(carried)
     seen = float(np.quantile(finite, 0.99)) if finite.size else 0.0
-    evidence = f"{seen:.1f} m/s^2 were driven, the file's tyres carry its mass up to {most:.1f} m/s^2"
+    evidence = f"{seen:.1f} m/s^2 were driven, the limit by tyres and mass of the file is {most:.1f} m/s^2"
     yield MASS.judged(seen <= MAX_GRIP_USE * most, evidence)
 
 
 MASS = CheckKind(
     "vehicle.mass",
-    compares="the lateral acceleration that was driven with what the file's tyres carry of its mass",
-    fails="it is above 1.25 of that at friction 1",
+    compares="the driven lateral acceleration with the limit by tyres and mass of the vehicle file",
+    fails="it is above 1.25 of the limit at friction 1",
     remedy="mass_kg is too large, or friction and the tyres' peak are too small",
     function=_mass,
 )

@@ -3,7 +3,7 @@
 See docs/method.md#self-calibration.
 
 A calibration belongs to the log, or the pool of logs, that it was fitted to. Mass and position of the centre of gravity
-come from the file. Parameters that the driving does not excite keep their prior and widen the interval.
+come from the file. Parameters that are not observable in the driving keep their prior and widen the interval.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ from pdhef_logtool.estimators.calibration.joint import (
 from pdhef_logtool.estimators.calibration.single_track import AY, OF_AY, OF_RATE, YAW_RATE
 from pdhef_logtool.records.signals import FloatArray
 
-#: Standard deviation of a_y in ``physics`` on a calibrated car, m/s²: the model's error, not the sensor's noise.
+#: Standard deviation of a_y in ``physics`` on a calibrated car, m/s²: model error, larger than the sensor's noise.
 AY_STD = 1.0
 #: Process noise of ``physics`` on a calibrated car: PHYSICS_Q_STD with more for the axle forces, so that kinematics
 #: have more influence beyond the linear range, where the fitted tyres are least certain.
 Q_STD = (0.085, 0.12, 0.012, 0.086, 1.0, 1.0)
-#: Least driving above the low-speed limit; on line, growth of the driving from one calibration to the next, and the
-#: delay after which it applies, for gaps before its last sample may be interpolated.
+#: Minimum driving above the low-speed limit; for the online calibration, growth of the driving from one calibration to
+#: the next, and the delay of its use, because gaps before its last sample may be interpolated.
 LEAST_S, ONLINE_GROWTH, ONLINE_DELAY_NS = 5.0, 1.5, 1_000_000_000
-#: A fit is refused if it leaves more than this share of the RMS of yaw rate or of a_y, and more than this many
+#: A fit is rejected if its error exceeds this share of the RMS of yaw rate or of a_y, and this multiple of
 #: ``ERROR_STD``: sign or topic of a signal may be wrong, or the car spins.
 LARGEST_SHARE, LARGEST_ERROR = 0.5, 1.0
-#: A fit is refused if the rear axle slides for so long and in so large a share of the driving: beyond this slip angle
-#: longitudinal slip, which the model lacks, decides the lateral force.
+#: A fit is rejected if the rear axle slides for this time and this share of the driving: beyond this slip angle the
+#: lateral force depends on longitudinal slip, which the model lacks.
 SLIDING_RAD, SLIDING_S, SLIDING_SHARE = math.radians(8.0), 10.0, 0.2
-#: A stiffness is written to a car if the standard deviation of its logarithm is at most this.
+#: Largest standard deviation of a log stiffness for a car file.
 EXPORTED_STD = 0.16
-#: Directions of the posterior that an interval follows, at most.
+#: Maximum number of posterior directions in an interval.
 VARIED = 5
 #: Smallest difference of understeer gradients that is reported as a contradiction, rad/(m/s²).
 LEAST_CONTRADICTION = 1.5e-3
@@ -85,12 +85,12 @@ class Understeer:
 
     @property
     def contradicts(self) -> bool:
-        """Whether file and drive cannot both be right."""
+        """Whether file and drive contradict each other."""
         return abs(self.drive - self.file) > max(3.0 * self.drive_sd, LEAST_CONTRADICTION)
 
     @property
     def text(self) -> str:
-        """In words, deg/g."""
+        """Description in deg/g."""
         unit = math.degrees(GRAVITY_M_S2)
         verdict = "contradicts" if self.contradicts else "agrees with"
         return f"understeer {self.drive * unit:.1f} deg/g {verdict} the file's {self.file * unit:.1f} deg/g"
@@ -102,13 +102,13 @@ class SelfCalibration:
 
     Attributes
     ----------
-    vehicle_file : the file. vehicle : the file with the fitted parameters, whether or not the fit is refused.
-    refused : why the file stays as it is; empty if it does not.
-    rms : of yaw rate, rad/s, and a_y, m/s², that the model leaves; of_file : that the file's leaves.
-    seconds : of driving that counted. logs : in the pool.
-    varied : the vehicle one posterior 1-sigma away in each of the directions that move its sideslip most.
+    vehicle_file : the file. vehicle : the file with the fitted parameters, also if the fit is rejected.
+    refused : why the file is used unchanged; empty if the fit is accepted.
+    rms : RMS error of yaw rate in rad/s and of a_y in m/s²; of_file : the same of the vehicle file.
+    seconds : used driving. logs : number of logs in the pool.
+    varied : vehicles one posterior 1-sigma away, one per direction with a large effect on the sideslip.
     driven_d2_m_s : part of the v̇_y residual of ``physics`` that correlates with the driving, NaN without a run.
-    since_ns, earlier : of a calibration on line: from when on it applies, and what applied before, in time order.
+    since_ns, earlier : start of the use of an online calibration, and the earlier calibrations, in time order.
     """
 
     vehicle_file: VehicleParameters
@@ -127,13 +127,13 @@ class SelfCalibration:
 
     @property
     def noise(self) -> FilterNoise:
-        """The noise of ``physics`` that belongs to it."""
+        """Noise of ``physics`` for the calibrated car."""
         ay_std = max(AY_STD, self.vehicle_file.sensors.ay_std_m_s2)
         return FilterNoise(q_std=Q_STD, r_std={"ay_m_s2": ay_std}, limit_gain=LIMIT_GAIN)
 
     @property
     def error_scale(self) -> float:
-        """RMS of what the model leaves of the sensors over ``ERROR_STD``, at least 1: a good fit proves no more."""
+        """RMS of the model error over ``ERROR_STD``, at least 1, as a good fit is no proof of a better model."""
         return float(np.fmax(1.0, np.sqrt(np.mean((np.array(self.rms) / np.array(ERROR_STD)) ** 2))))
 
     @property
@@ -159,7 +159,7 @@ class SelfCalibration:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all of it as JSON-able values."""
+        """Return the calibration as JSON-able values."""
         u = self.understeer
         return {
             "refused": self.refused or None,
@@ -196,9 +196,9 @@ def self_calibrate(
 
     Parameters
     ----------
-    taught : prior that drives with ground truth gave. It makes no calibration plausible that is refused without it: the
-        model does not explain such driving with any parameters. It is not used where the fit is refused with it alone.
-    exported : whether it is written to a car, for which the driving must excite both cornering stiffnesses.
+    taught : prior from drives with ground truth. It cannot make a rejected calibration acceptable, as the model
+        explains such driving with no parameters. It is omitted if the fit is rejected only with it.
+    exported : whether the result is for a car file, for which both cornering stiffnesses must be observable.
     """
     drives = [d for d in drives if len(d.stretches)]
     seconds = sum(d.seconds for d in drives)
@@ -247,7 +247,7 @@ def _without_fit(
 
 
 def prior_calibration(vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()) -> SelfCalibration:
-    """Return the calibration before any driving: prior means, varied by the prior in what moves the sideslip most."""
+    """Return the calibration before any driving: prior means, with the prior variations that affect sideslip most."""
     centre, priors = prior_vehicle(vehicle_file, taught), with_taught(parameters_of(vehicle_file), taught)
     return replace(_without_fit(vehicle_file, centre), varied=prior_variations(centre, priors))
 
@@ -255,10 +255,10 @@ def prior_calibration(vehicle_file: VehicleParameters, taught: Sequence[TaughtPa
 def calibrate_online(
     driving: Driving, vehicle_file: VehicleParameters, *, taught: Sequence[TaughtParameter] = ()
 ) -> SelfCalibration:
-    """Calibrate a car again and again as its log goes on; before the first calibration it has the prior means.
+    """Calibrate a car repeatedly during its log; the first calibration consists of the prior means.
 
-    Each calibration takes half as much driving again as the one before it, so that all take three times as long as the
-    last one.
+    Each calibration uses 1.5 times the driving of the previous one, so that all together take three times as long as
+    the last one.
     """
     inside = np.zeros(driving.columns.shape[1])
     for first, last in driving.stretches:
@@ -289,7 +289,7 @@ def _understeer(
 
 
 def _refusal(problem: JointProblem, theta: FloatArray, drives: Sequence[Driving]) -> str:
-    """Return why a fit is not used: it explains too little, or the car slides."""
+    """Return why a fit is rejected: its error is too large, or the car slides."""
     rms = problem.rms(theta)
     for name, column, row in (("yaw rate", YAW_RATE, OF_RATE), ("lateral acceleration", AY, OF_AY)):
         measured = driven(drives, column)

@@ -1,6 +1,6 @@
-"""What a log gives to its calibration: sensors on an even grid, in stretches of driving; no ground truth.
+"""Data of a log for its calibration: sensors on an even grid, in stretches of driving, without ground truth.
 
-A log of any length is taken window by window and thinned at once: of ten hours 72 MB remain. Windows change no bit.
+A log is read and thinned window by window: ten hours take 72 MB. The result does not depend on the windows.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from pdhef_logtool.estimators.calibration.single_track import AY, FRICTION, SPEE
 from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 
-#: Step of the grid. The model follows 4 Hz, and the lag of a tyre at 40 m/s is 12 ms, which its step takes exactly.
+#: Step of the grid. The model is valid to 4 Hz; the integration is exact for tyre lags (12 ms at 40 m/s).
 STEP_S = 0.02
-#: Shortest stretch. Gaps of this length are interpolated; longer ones of the speed, which is slow.
+#: Minimum length of a stretch; longest gap to interpolate, in general and for the speed, which varies slowly.
 LEAST_STRETCH_S, BRIDGED_S, SPEED_BRIDGED_S = 2.0, 0.3, 0.6
 
 _COLUMNS = 5
@@ -25,14 +25,14 @@ _PAUSE_CELLS = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Driving:
-    """The driving of one log that can be calibrated on.
+    """Driving of one log for a calibration.
 
     Attributes
     ----------
     columns : float64 [5, N], steering, speed, yaw rate, a_y and friction on the grid, as ``read_with`` reads them.
     stamps_ns : int64 [N], end of each cell of the grid.
     stretches : int64 [k, 2], [first, last) of each stretch without a gap above the vehicle's low-speed limit.
-    has_ay : whether a_y was measured; if not, it is v_x r here, and is not compared.
+    has_ay : whether a_y was measured; if not, the column contains v_x r, which is not compared with the model.
     """
 
     columns: FloatArray
@@ -57,7 +57,7 @@ class Driving:
 
 
 def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
-    """Thin the signals of a drive [N] to a grid, whose cells have the mean of their samples."""
+    """Thin the signals of a drive [N] to a grid of cell means."""
     if not len(signals):
         none = np.empty(0, dtype=np.int64)
         return Driving(np.empty((_COLUMNS, 0)), none, none.reshape(0, 2), vehicle)
@@ -96,7 +96,7 @@ def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
 
 
 def _bridged(values: FloatArray, most: int) -> FloatArray:
-    """Return values [N] with gaps of at most so many steps filled in, linear; longer ones stay NaN."""
+    """Return values [N] with gaps of at most ``most`` steps interpolated; longer ones stay NaN."""
     finite_index = np.flatnonzero(np.isfinite(values))
     if finite_index.size < 2:
         return values

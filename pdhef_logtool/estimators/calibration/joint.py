@@ -7,14 +7,14 @@ from the prior mean in prior standard deviations) the cost is
 
     Σ_channels Σ_k (Δt / T) 2 (√(1 + (e_k / σ)²) − 1) + |θ|²
 
-with errors e after a zero-phase low pass, so that T = 1 s of driving counts as one sample. σ is the RMS of the errors
-of each channel, at least :data:`ERROR_STD`: where the model explains little, the prior decides. Friction and peak force
-are observable as a product only: friction stays at the file's value, the peak force is fitted.
+with errors e after a zero-phase low pass, so that T = 1 s of driving is equivalent to one sample. σ is the RMS of the
+errors of each channel, at least :data:`ERROR_STD`: with a poor model the prior dominates. Only the product of friction
+and peak force is observable: friction keeps the file's value, the peak force is fitted.
 
-The covariance of θ has three parts: the curvature of the cost, the spread of the cost's gradient between blocks of the
-drives (sandwich estimator, White 1982), which includes model error that changes within a drive, and the model error
-that all of a drive has in common, estimated on simulated cars (:data:`SHARED_SHARES`). That of a pool is for the
-parameters of one of its drives: what these differ in is added (random effects by moments, DerSimonian and Laird 1986).
+The covariance of θ has three parts: the curvature of the cost; the spread of the cost's gradient between blocks of the
+drives (sandwich estimator, White 1982), which includes model error that changes within a drive; and the model error
+that is common to a whole drive, estimated on simulated cars (:data:`SHARED_SHARES`). The covariance of a pool refers to
+a single drive of it: the variation between drives is added (random effects by moments, DerSimonian and Laird 1986).
 """
 
 from __future__ import annotations
@@ -44,40 +44,40 @@ from pdhef_logtool.estimators.calibration.single_track import (
 )
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
-#: Model and sensors are compared below this frequency.
+#: Frequency limit of the comparison of model and sensors.
 CUTOFF_HZ = 4.0
-#: Least standard deviation of the errors of yaw rate (rad/s) and a_y (m/s²); larger errors count linearly.
+#: Smallest standard deviation of the errors of yaw rate (rad/s) and a_y (m/s²); larger errors have a linear cost.
 ERROR_STD = (0.02, 0.3)
-#: Most repetitions of a fit with the standard deviation of its errors; change of it at which they end.
+#: Maximum number of fits with updated standard deviations of the errors; relative change at which they end.
 SCALES, SAME_SCALE = 8, 0.05
-#: Driving that counts as one independent sample of each channel; start of each stretch that does not count, because the
-#: initial state is a guess.
+#: Driving equivalent to one independent sample of each channel; excluded start of each stretch, where the initial state
+#: is unknown.
 CORRELATION_S, SETTLE_S = 1.0, 1.0
-#: Errors are kept every so many steps of the grid: 12.5 Hz, three times the cutoff.
+#: Subsampling of the errors, in steps of the grid: 12.5 Hz, three times the cutoff.
 KEPT_STEPS = 4
-#: Length of the blocks whose gradients are compared: longer than a bend, so that blocks are nearly independent.
+#: Length of the blocks for the spread of gradients: longer than a bend, so that blocks are nearly independent.
 BLOCK_S = 3.0
 ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
-#: The peak force is at least this share of what this quantile of a_y needs: a bank and the body's roll are in it.
+#: Lower limit of the peak force, as a share of this quantile of a_y, which includes bank and body roll.
 REACHED_SHARE, REACHED_QUANTILE = 0.8, 0.98
-#: Parts of ``physics`` on a calibrated car; on simulated cars with wrong files the lowest sideslip error.
+#: Parts of ``physics`` on a calibrated car: the set with the lowest sideslip error on simulated cars with wrong files.
 PARTS = ("lag", "roll", "bank")
-#: Cornering stiffness over axle load of any car, 1/rad, front and rear, and the standard deviations of the logarithm
-#: about it and about the file's value; the last also of the peak force, for the road may be wet or icy. The compliance
-#: of the steering makes front axles softer.
+#: Usual cornering stiffness over axle load, 1/rad, front (softer by the steering compliance) and rear, its log standard
+#: deviation, and the log standard deviation of the file's value, which also applies to the peak force (wet or icy
+#: roads).
 USUAL_STIFFNESS, USUAL_STIFFNESS_STD, FILE_TYRE_STD = (13.5, 18.0), 0.35, 0.5
-#: Ratio of the levels of a_y of two drives up to which one teaches the other nothing, and from which on all.
+#: Ratio of the a_y levels of two drives: below the first, no information is shared; above the second, all of it.
 LIKE = (0.3, 0.5)
-#: Usual share of gravity in a_y by body roll, rad/(m/s²), where the file has none (3 degrees per g), and 1-sigma of the
-#: accelerometer's position, wheelbases.
+#: Usual share of gravity in a_y by body roll, rad/(m/s²), for files without one (3 degrees per g), and 1-sigma of the
+#: accelerometer's position in wheelbases.
 USUAL_ROLL_GRADIENT, IMU_X_REACH = 0.005, 0.4
 
 FRONT_STIFFNESS, REAR_STIFFNESS = "front cornering stiffness", "rear cornering stiffness"
 PEAK, INERTIA, RELAXATION = "peak force over the file's", "yaw inertia", "relaxation length"
 STEER_OFFSET, STEER_RATIO, STEER_DELAY = "steering offset", "steering ratio", "steering delay"
 AY_GAIN, AY_BIAS, IMU_X, RATE_BIAS = "roll gain", "a_y bias", "lever of a_y", "yaw rate bias"
-#: Model error that all of a drive has in common, as a share of each prior's standard deviation: with it at least 95 %
-#: of the parameters of simulated cars are within 1.96 standard deviations. The lag of tyres and body moves the delay.
+#: Model error common to a whole drive, as a share of each prior's standard deviation: with it at least 95 % of the
+#: parameters of simulated cars are within 1.96 standard deviations. The lag of tyres and body affects the delay.
 SHARED_SHARE, SHARED_SHARES = 0.2, {STEER_DELAY: 0.4}
 
 
@@ -94,12 +94,12 @@ class Parameter:
     log: bool = False
 
     def value(self, theta: float) -> float:
-        """Return the parameter at a normalised distance from the prior mean, within its range."""
+        """Return the parameter for a normalised distance from the prior mean, limited to its range."""
         free = self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
         return min(max(free, self.low), self.high)
 
     def theta(self, value: float) -> float:
-        """Return the normalised distance of a value from the prior mean, also outside the range."""
+        """Return the normalised distance of a value from the prior mean, without limits."""
         return (math.log(value / self.mean) if self.log else value - self.mean) / self.std
 
 
@@ -114,7 +114,7 @@ def _around(name: str, unit: str, mean: float, std: float, most: float) -> Param
 
 
 def _stiffness(vehicle_file: VehicleParameters, name: str, *, front: bool) -> Parameter:
-    """Return a cornering stiffness whose prior combines the file's value with that of any car."""
+    """Return a cornering stiffness with a prior that combines the file's value with the usual value of cars."""
     of_file, of_usual = FILE_TYRE_STD**-2, USUAL_STIFFNESS_STD**-2
     file = vehicle_file.cornering_stiffness_n_per_rad(front, vehicle_file.assumed_friction)
     usual = USUAL_STIFFNESS[0 if front else 1] * vehicle_file.axle_load_n(front)
@@ -125,8 +125,8 @@ def _stiffness(vehicle_file: VehicleParameters, name: str, *, front: bool) -> Pa
 def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
     """Return the parameters of a fit about a vehicle file.
 
-    Stiffness in published files differs from the driven car's by up to a factor of two; steering gains by −15 to +18 %
-    because of compliance, toe and wrong ratios. An accelerometer may be at either axle.
+    The stiffness in published files differs from the driven car's by up to a factor of two, the steering gain by −15 to
+    +18 % (compliance, toe, wrong ratios). An accelerometer may be at either axle.
     """
     sensors = vehicle_file.sensors
     gradient = vehicle_file.roll_gradient_rad_per_m_s2 or USUAL_ROLL_GRADIENT
@@ -150,10 +150,10 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
 def with_taught(
     parameters: Sequence[Parameter], taught: Sequence[TaughtParameter], level_m_s2: float = 0.0
 ) -> tuple[Parameter, ...]:
-    """Return the parameters with the prior that drives with ground truth gave them, for driving at a level of a_y.
+    """Return the parameters with the prior from drives with ground truth, for driving at a level of a_y.
 
-    Tyres at 8 m/s² are others than on a road: of several levels, the nearest one counts, and of what unlike driving
-    taught only a part.
+    Tyres behave differently at 8 m/s² than in normal driving: the prior of the nearest level is used, and with less
+    weight the more the levels differ.
     """
 
     def likeness(t: TaughtParameter) -> float:
@@ -171,7 +171,7 @@ def with_taught(
 
 
 def like_drives(levels_m_s2: Sequence[float]) -> list[list[int]]:
-    """Return drives by their level of a_y in groups, in which each teaches the others all; the lowest level first."""
+    """Return groups of drives with similar levels of a_y, which share all information; the lowest level first."""
     groups: list[list[int]] = []
     for k in sorted(range(len(levels_m_s2)), key=lambda k: -levels_m_s2[k]):
         if not groups or levels_m_s2[k] < LIKE[1] * levels_m_s2[groups[-1][0]]:
@@ -181,7 +181,7 @@ def like_drives(levels_m_s2: Sequence[float]) -> list[list[int]]:
 
 
 def level_of(drives: Sequence[Driving]) -> float:
-    """Return the RMS of a_y, m/s², weighted by its square: straight driving hardly counts."""
+    """Return the RMS of a_y, m/s², weighted by its square, so that straight driving hardly contributes."""
     ay2 = driven(drives, AY) ** 2
     return math.sqrt(float(np.nansum(ay2**2)) / max(float(np.nansum(ay2)), 1e-9))
 
@@ -218,7 +218,7 @@ class JointProblem:
         self._least_std = self._error_std = np.array(ERROR_STD)
 
     def taught(self, taught: Sequence[TaughtParameter]) -> JointProblem:
-        """Return the fit with the prior that drives with ground truth gave."""
+        """Return the fit with the prior from drives with ground truth."""
         problem = copy(self)
         problem.parameters = with_taught(self.parameters, taught, level_of(self._drives))
         return problem
@@ -226,8 +226,8 @@ class JointProblem:
     def solve(self) -> FloatArray:
         """Return the parameters of the lowest cost, with the standard deviation of their errors.
 
-        From a dry road, a descent does not find the minimum of one on which the tyres saturate: there are two starts.
-        Both are of the prior, for from the fit without a taught one, the taught fit often remains in its minimum.
+        A descent from a dry road does not find a minimum with saturated tyres: there are two starts. Both are prior
+        values: starting from the fit without the taught prior, the taught fit often stays in the same minimum.
         """
         self._error_std = self._least_std
         slippery = [p.theta(p.low) if p.name == PEAK else 0.0 for p in self.parameters]
@@ -259,18 +259,18 @@ class JointProblem:
         return self._errors(self._track(theta))
 
     def rms(self, theta: FloatArray | None) -> tuple[float, float]:
-        """Return the RMS error of yaw rate and a_y; without θ that of the vehicle file."""
+        """Return the RMS error of yaw rate and a_y for θ, or for the vehicle file if θ is None."""
         rms = self._rms(self._errors(track_of(self._file, self._file)) if theta is None else self.errors_of(theta))
         return float(rms[OF_RATE]), float(rms[OF_AY])
 
     def sideslip(self, theta: FloatArray) -> FloatArray:
-        """Return the model's v_y / v_x of all samples that count [K]."""
+        """Return the model's v_y / v_x of all used samples [K]."""
         self._errors(self._track(theta))
         parts = zip(self._drives, self._out, self._kept, strict=True)
         return np.concatenate([out[2, k] / d.columns[SPEED, k] for d, out, k in parts])
 
     def rear_slip(self, theta: FloatArray) -> FloatArray:
-        """Return (l_r r − v_y) / v_x of the model and the gyro, of all samples that count [K]."""
+        """Return (l_r r − v_y) / v_x of the model with the gyro's r, of all used samples [K]."""
         drives = zip(self._drives, self._kept, strict=True)
         turning = np.concatenate([d.columns[YAW_RATE, k] / d.columns[SPEED, k] for d, k in drives])
         return self._file.cg_to_rear_axle_m * turning - self.sideslip(theta)
@@ -281,7 +281,7 @@ class JointProblem:
         return {p.name: float(f"{p.value(float(t)):.{digits}g}") for p, t in pairs}
 
     def vehicle(self, theta: FloatArray, *, digits: int = 17) -> VehicleParameters:
-        """Return the vehicle file with the parameters; friction is the file's, the peak force takes the rest."""
+        """Return the vehicle file with the parameters; friction is the file's, the peak force includes its error."""
         return _vehicle_with(self._file, self.values(theta, digits=digits), digits)
 
     def _track(self, theta: FloatArray) -> TrackParameters:
@@ -304,7 +304,7 @@ class JointProblem:
         return float(self._weight**2 * np.sum(robust) + theta @ theta)
 
     def _residuals(self, scaled: FloatArray, centre: FloatArray) -> FloatArray:
-        """Return residuals [2 K] with the weights that soft L1 gives to the errors ``centre``."""
+        """Return residuals [2 K] with the soft L1 weights of the errors ``centre``."""
         return np.asarray(self._weight * scaled / (1.0 + centre**2) ** 0.25, dtype=np.float64).ravel()
 
     def _curvature(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -326,7 +326,7 @@ class JointProblem:
         inverse, gradients = self._curvature(theta)
         of_drives = np.add.reduceat(gradients, self._first_block[:-1])
         spread = _spread(gradients)
-        # What drives of a pool differ in beyond the spread of their blocks; its parameters are used for one drive.
+        # Add the variation between the drives of a pool beyond block variation: the parameters are for a single drive.
         more, axes = np.linalg.eigh(_spread(of_drives) - spread)
         spread += len(of_drives) * (axes * np.maximum(more, 0.0)) @ axes.T
         shared = np.diag([SHARED_SHARES.get(p.name, SHARED_SHARE) ** 2 for p in self.parameters])
@@ -340,7 +340,7 @@ def _spread(gradients: FloatArray) -> FloatArray:
 
 
 def counted(drive: Driving) -> BoolArray:
-    """Return which samples [N] of a drive count: those of its stretches without their start."""
+    """Return the mask [N] of used samples of a drive: its stretches without their start."""
     inside = np.zeros(drive.columns.shape[1], dtype=np.bool_)
     for first, last in drive.stretches:
         inside[first + round(SETTLE_S / STEP_S) : last] = True
@@ -348,7 +348,7 @@ def counted(drive: Driving) -> BoolArray:
 
 
 def driven(drives: Sequence[Driving], column: int) -> FloatArray:
-    """Return a column of all samples that count [K]."""
+    """Return a column of all used samples [K]."""
     return np.concatenate([d.columns[column, counted(d)] for d in drives])
 
 
@@ -389,10 +389,10 @@ def prior_vehicle(vehicle_file: VehicleParameters, taught: Sequence[TaughtParame
 def prior_variations(
     vehicle: VehicleParameters, priors: Sequence[Parameter] | None = None
 ) -> tuple[VehicleParameters, ...]:
-    """Return a vehicle with one error of a prior's 1-sigma each, in the parameters that move the sideslip most.
+    """Return vehicles with a prior 1-sigma error in one parameter each, those with the most effect on the sideslip.
 
     Stiffness of each axle, friction in place of peak force, steering ratio and offset, position of the accelerometer.
-    Without ``priors`` the vehicle is a file.
+    Without ``priors``, ``vehicle`` is a vehicle file.
     """
     std, (x, y, z) = {p.name: p.std for p in priors or parameters_of(vehicle)}, vehicle.imu_position_m
     if priors is None:
@@ -437,11 +437,11 @@ def track_of(
 def varied_parameters(
     theta: FloatArray, root: FloatArray, sideslip: Callable[[FloatArray], FloatArray], most: int
 ) -> list[FloatArray]:
-    """Return parameters 1-sigma away from θ [n] along the directions of their posterior that move the sideslip most.
+    """Return parameters 1-sigma away from θ [n] along the posterior directions with most effect on the sideslip.
 
-    ``root`` [n, m]: its product with its transpose is the posterior's covariance. ``sideslip`` of parameters, or errors
-    of it, [K]. The directions, at most ``most`` and the largest first, are uncorrelated in the posterior and in their
-    effect on the sideslip.
+    ``root`` [n, m]: matrix root of the posterior covariance (root rootᵀ). ``sideslip``: function of parameters that
+    returns sideslip, or its errors, [K]. The directions, at most ``most`` and the largest first, are uncorrelated in
+    the posterior and in their effect on the sideslip.
     """
     centre = sideslip(theta)
     moved = np.stack([sideslip(theta + step) - centre for step in root.T])

@@ -1,11 +1,11 @@
-"""Single track that a log calibrates: relaxing axle forces from steering, speed and measured yaw rate.
+"""Single-track model for the calibration by a log: axle forces with relaxation from steering, speed and yaw rate.
 
 See docs/method.md#self-calibration.
 
-State [v_y, r, f_f, f_r] with f = F_y / m of an axle; (σ / v_x) ḟ + f = f_ss(α). The measured yaw rate moves v_y and the
-model's yaw rate moves the slip angles (series-parallel model, Ljung 1999, chapter 7): v_y and r are each damped by the
-tyres at any speed, so that the model cannot spin, and low frequencies of both errors remain informative. The yaw rate
-is corrected slowly, which forgets disturbances that the driver steers against.
+State [v_y, r, f_f, f_r] with f = F_y / m of an axle; (σ / v_x) ḟ + f = f_ss(α). The measured yaw rate enters the v_y
+equation, and the model's yaw rate enters the slip angles (series-parallel model, Ljung 1999, chapter 7): the tyres damp
+v_y and r separately at any speed, so that the model cannot spin, and low frequencies of both errors remain informative.
+The yaw rate is slowly corrected, so that the effect of disturbances that the driver compensates decays.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from pdhef_logtool.compiled.cache import njit
 STEER, SPEED, YAW_RATE, AY, FRICTION = range(5)
 #: Rows of the errors.
 OF_RATE, OF_AY = range(2)
-#: Cutoff of the bank of the road; share that slides have in a_y beyond the linear range, m/s².
+#: Cutoff for the road bank; share of a_y beyond the linear range that slides may contribute, m/s².
 BANK_HZ, BANK_SHARE, LINEAR_AY = 0.1, 0.25, 3.0
-#: Gain of the correction of the yaw rate, 1/s; simulated cars with wrong files have the lowest error with it.
+#: Gain of the yaw-rate correction, 1/s, with the lowest error on simulated cars with wrong files.
 RATE_GAIN = 2.0
-#: An axle starts at most at this share of its peak force.
+#: Limit of the initial force of an axle, as a share of its peak force.
 _LARGEST_START_SHARE = 0.9
 
 
@@ -61,7 +61,7 @@ class LowPass(NamedTuple):
 
 
 def low_pass(cutoff_hz: float, step_s: float) -> LowPass:
-    """Return the filter of a cutoff frequency; bilinear, warped to be exact at the cutoff."""
+    """Return the filter for a cutoff frequency; bilinear with prewarping, exact at the cutoff."""
     k = math.tan(math.pi * cutoff_hz * step_s)
     norm = 1.0 / (1.0 + math.sqrt(2.0) * k + k * k)
     b0 = k * k * norm
@@ -70,7 +70,7 @@ def low_pass(cutoff_hz: float, step_s: float) -> LowPass:
 
 @njit(cache=True)
 def _sample(column, place, first, last):  # type: ignore[no-untyped-def]
-    """Return a column at a place between its samples [first, last)."""
+    """Return the interpolated value of a column at a fractional index in [first, last)."""
     place = min(max(place, float(first)), float(last - 1))
     i = min(int(place), last - 2)
     w = place - i
@@ -95,7 +95,7 @@ def _start_force(force, peak):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _filter(values, first, last, backwards, passed):  # type: ignore[no-untyped-def]
-    """Filter the values [first, last) in place, as if the value at the start had lasted forever."""
+    """Filter the values [first, last) in place, with the steady state of the first value as initial state."""
     step = -1 if backwards else 1
     k = last - 1 if backwards else first
     z1, z2 = (1.0 - passed.b0) * values[k], (passed.b2 - passed.a2) * values[k]
@@ -110,10 +110,10 @@ def _filter(values, first, last, backwards, passed):  # type: ignore[no-untyped-
 
 @njit(cache=True)
 def disturbance(turn_low, ay_low, speed, p):  # type: ignore[no-untyped-def]
-    """Return the lateral acceleration by the bank of the road: what a_y lacks of v_x r for long, but for slides.
+    """Return the lateral acceleration due to road bank: low-passed v_x r − a_y, without the part that slides explain.
 
-    Crossfall is as large as errors of a_y, and superelevation goes with a_y as body roll does: no drive
-    distinguishes them, and bias and roll gain keep their priors.
+    Crossfall is as large as errors of a_y, and superelevation increases with a_y like body roll: they are not
+    distinguishable within a drive, and bias and roll gain keep their priors.
     """
     lacks = turn_low - speed * p.rate_bias - (ay_low - p.ay_bias) / p.ay_gain
     return math.copysign(max(0.0, abs(lacks) - BANK_SHARE * max(0.0, abs(ay_low) - LINEAR_AY)), lacks)
@@ -132,10 +132,10 @@ def slow_parts(columns, stretches, passed):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def simulate(columns, stretches, step_s, p, out):  # type: ignore[no-untyped-def]
-    """Run the model through the stretches [k, 2] of a grid, [first, last) each.
+    """Simulate the model over the stretches [k, 2] of a grid, [first, last) each.
 
-    ``columns`` [7, N] as named above, then low-passed v_x r and a_y. ``out`` [3, N] receives yaw rate and a_y as
-    sensors would read them, and v_y.
+    ``columns`` [7, N] as named above, then low-passed v_x r and a_y. ``out`` [3, N] receives simulated yaw rate and a_y
+    of the sensors, and v_y.
     """
     steer, speed, rate, ay, friction = columns[0], columns[1], columns[2], columns[3], columns[4]
     length = p.front_m + p.rear_m
@@ -162,7 +162,7 @@ def simulate(columns, stretches, step_s, p, out):  # type: ignore[no-untyped-def
             mu = friction[k] / p.friction
             x = step_s * middle / p.relaxation_m
             kept = math.exp(-x)
-            # t: instant that the exponential kernel of the lag weighs; the slip angles are those at this instant
+            # t: centroid of the exponential kernel of the lag; the slip angles are evaluated at this instant
             t = step_s * (1.0 - (1.0 - x * kept / (1.0 - kept)) / x) if x > 1e-3 else 0.5 * step_s
             measured = rate[k] - p.rate_bias
             turning = r + t * r_dot

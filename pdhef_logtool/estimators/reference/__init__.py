@@ -1,1 +1,1 @@
-"""The sideslip reference: a smoother over kinematics and the linear law of the rear axle, without tyre data."""
+"""The sideslip reference: a smoother with kinematics and the linear rear-axle compliance model, without tyre data."""

@@ -1,4 +1,4 @@
-"""The sideslip reference of one drive: priors, smoothing with and without GNSS, and refusal."""
+"""The sideslip reference of one drive: priors, smoothing with and without GNSS, and rejection."""
 
 from __future__ import annotations
 
@@ -19,31 +19,30 @@ from pdhef_logtool.estimators.reference.gnss import (
 from pdhef_logtool.estimators.reference.inputs import ANTENNA_Y_STD_M, LINEAR_FRICTION, RATE_HZ, knots, sensor_noise
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 
-#: Wheelbase of the priors of lengths; those of smaller cars are proportional to theirs.
+#: Wheelbase for the priors of lengths; for smaller cars they are scaled by the wheelbase.
 WHEELBASE_M = 2.7
 #: 1-sigma of the distance of the rear axle, and of the gain of the gyro.
 REAR_AXLE_STD_M, YAW_RATE_GAIN_STD = 0.1, 0.003
-#: 1-sigma of the gains of accelerometers whose tilt is known; of the IMU's mounting; of the first position.
+#: 1-sigma of the gains of accelerometers with known tilt; of the IMU's mounting; of the first position.
 TILT_GAIN_STD, IMU_YAW_STD_RAD, FIRST_POSITION_M = 0.02, 0.015, 10.0
 MAX_ITERATIONS, TOLERANCE_M_S, UNSETTLED_M_S = 8, 2e-3, 0.05
-#: A parameter further than this from its prior mean, in 1-sigmas of the prior, refuses the drive. Lengths and the gain
-#: of the gyro have narrow priors (bank in bends has the same effect) and limits of 0.45 m, 0.3 m and 3 %.
+#: The drive is rejected if a parameter is further than this from its prior mean, in prior 1-sigmas. Lengths and the
+#: gain of the gyro have narrow priors (bank in bends has the same effect) and limits of 0.45 m, 0.3 m and 3 %.
 FAR_STD = 3.0
 FAR_STD_OF = {s.REAR_AXLE: 4.5, s.IMU_X: 6.0, s.YAW_RATE_GAIN: 10.0}
-#: The reference is valid where its 1-sigma of sideslip is smaller.
+#: Largest 1-sigma of sideslip of a valid reference.
 LARGEST_STD_RAD = math.radians(0.5)
 
 
 @dataclass(frozen=True, slots=True)
 class ReferencePrior:
-    """What is known of the car and its sensors before the drive; all but the axle is of the sensors.
+    """Prior knowledge on the car and its sensors; all entries but the axle's refer to the sensors.
 
     ``rear_m``, ``wheelbase_m``: geometry. ``friction``: of the road, for the end of the linear range. ``imu_x_m``,
     ``ay_gain``, ``ay_bias_m_s2``, ``yaw_rate_bias_rad_s``: errors of the sensors as the log was read, with 1-sigmas of
-    the first two. ``unknown_imu_x_m``: 1-sigma of a position that the drive does not show; it counts in the intervals
-    alone, for a free one explains what the law lacks. ``antenna_m``: position x, y of the antenna from the CG, NaN if
-    unknown.
-    ``speed_over_ground``: the speed is the length of a velocity over ground, not that of wheels.
+    the first two. ``unknown_imu_x_m``: 1-sigma of a position that is not observable in the drive; it only widens the
+    intervals, as a free position would absorb errors of the axle law. ``antenna_m``: position x, y of the antenna from
+    the CG, NaN if unknown. ``speed_over_ground``: the speed is the length of a velocity over ground, not a wheel speed.
     """
 
     rear_m: float
@@ -62,7 +61,7 @@ class ReferencePrior:
 
 @dataclass(frozen=True, slots=True)
 class ReferenceParameter:
-    """A parameter that the smoother estimated of the drive, with its prior and the error that refuses."""
+    """An estimated parameter, with its prior and the deviation that rejects the drive."""
 
     name: str
     unit: str
@@ -77,9 +76,9 @@ class ReferenceParameter:
 class SideslipReference:
     """The reference of a drive at its knots [K].
 
-    ``vx_m_s``, ``vy_m_s`` at the CG and their kinematic derivatives; ``covariance`` [K, 3] of them (xx, xy, yy);
-    ``law_share``, ``gnss_share`` of the information on v_y, the rest is that of kinematics; ``valid``: where it may be
-    used; ``refused``: why it is not used at all, empty if it is.
+    ``vx_m_s``, ``vy_m_s`` at the CG and their kinematic derivatives; ``covariance`` [K, 3] (xx, xy, yy);
+    ``law_share``, ``gnss_share`` of the information on v_y, kinematics has the rest; ``valid``: usable knots;
+    ``refused``: why the drive is rejected, empty if it is accepted.
     """
 
     stamps_ns: IntArray
@@ -97,7 +96,7 @@ class SideslipReference:
     refused: str = ""
 
     def between(self, start_ns: int | None, end_ns: int | None) -> SideslipReference:
-        """Return the knots in [start_ns, end_ns], from the first or to the last where that is None."""
+        """Return the knots in [start_ns, end_ns]; None for an open end."""
         first = 0 if start_ns is None else int(np.searchsorted(self.stamps_ns, start_ns))
         last = len(self.stamps_ns) if end_ns is None else int(np.searchsorted(self.stamps_ns, end_ns, side="right"))
         columns: dict[str, Any] = {
@@ -128,9 +127,9 @@ _PARAMETERS = (
 
 
 def _priors(prior: ReferencePrior, n: int, *, tilts: bool) -> tuple[FloatArray, FloatArray]:
-    """Return mean and 1-sigma of the first state, [n] each; what :func:`_smooth` sets is left.
+    """Return mean and 1-sigma of the first state, [n] each, except entries that :func:`_smooth` sets.
 
-    ``tilts``: roll and pitch rate give the tilt of the accelerometers, so that a_y and a_x have no gain.
+    ``tilts``: roll and pitch rate provide the tilt of the accelerometers, so that a_y and a_x have no gain.
     """
     small = min(1.0, prior.wheelbase_m / WHEELBASE_M)
     mean, std = np.zeros(s.WITH_POSITION), np.zeros(s.WITH_POSITION)
@@ -164,7 +163,7 @@ def _priors(prior: ReferencePrior, n: int, *, tilts: bool) -> tuple[FloatArray, 
 
 
 def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> SideslipReference:
-    """Estimate v_x and v_y of a whole drive with all of its samples, later ones too; without tyre data.
+    """Estimate v_x and v_y of a whole drive from all of its samples, including later ones, without tyre data.
 
     ``signals`` [N] need a_y and yaw rate, and speed or GNSS velocity.
     """
@@ -217,7 +216,7 @@ class _Smoothed:
 
 
 def _solve(rows: FloatArray, prior: ReferencePrior, noise: FloatArray, *, gnss: bool) -> tuple[_Smoothed, _Smoothed]:
-    """Return what is smoothed without GNSS, and with it where it is used."""
+    """Return the smoothed states without GNSS, and with GNSS if it is used."""
     alone = _smooth(rows, prior, noise, s.WITHOUT_GNSS)
     if not gnss:
         return alone, alone
@@ -228,7 +227,7 @@ def _solve(rows: FloatArray, prior: ReferencePrior, noise: FloatArray, *, gnss: 
 def _smooth(
     rows: FloatArray, prior: ReferencePrior, noise: FloatArray, n: int, velocity: FloatArray | None = None
 ) -> _Smoothed:
-    """Smooth with n states; ``velocity`` [K, 3], if given, is a first estimate of v_x, v_y and heading."""
+    """Smooth with n states; ``velocity`` [K, 3] is an optional first estimate of v_x, v_y and heading."""
     mean, std = _priors(prior, n, tilts=bool(rows[0, s.TILT]))
     speed = rows[:, s.SPEED]
     first = np.flatnonzero(np.isfinite(speed))

@@ -26,7 +26,7 @@ class ReferenceSteps(StepColumns):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceEstimator:
-    """Gives back the reference of spans of a drive, between the knots by cubics with the kinematics' slopes."""
+    """Returns the reference of spans of a drive, interpolated between knots by cubics with kinematic slopes."""
 
     algorithm = "sideslip-reference"
     version = 1
@@ -74,7 +74,7 @@ class ReferenceEstimator:
 
 
 def steps_at(spans: Sequence[SideslipReference], stamps_ns: IntArray) -> ReferenceSteps:
-    """Return the reference at stamps [N]: of each the first span that contains it, NaN outside of all."""
+    """Return the reference at stamps [N], from the first span that contains the stamp; NaN outside of all spans."""
     n = len(stamps_ns)
     values, covariance, shares = (np.full((n, 3), np.nan) for _ in range(3))
     valid, filled = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
@@ -102,7 +102,7 @@ def steps_at(spans: Sequence[SideslipReference], stamps_ns: IntArray) -> Referen
 
 
 def _cubic(y: FloatArray, slope: FloatArray, left: IntArray, share: FloatArray, step_s: FloatArray) -> FloatArray:
-    """Return the cubic through two knots with their slopes (Hermite) at a share [N] of the way."""
+    """Return the cubic through two knots with their slopes (Hermite) at a share [N] of the interval."""
     y0, y1, m0, m1 = y[left], y[left + 1], slope[left] * step_s, slope[left + 1] * step_s
     s, s2, s3 = share, share**2, share**3
     return np.asarray(

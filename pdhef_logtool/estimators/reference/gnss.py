@@ -1,4 +1,4 @@
-"""GNSS of the sideslip reference: whether it may be used, how late it is, where it is wrong, and a first estimate."""
+"""GNSS for the sideslip reference: its plausibility, its delay, its multipath errors, and a first estimate."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 ComplexArray: TypeAlias = NDArray[np.complex128]
 
-#: Speed from which on a course is known.
+#: Minimum speed for a course.
 LEAST_COURSE_SPEED_M_S = 3.0
-#: Time over which GNSS and IMU change, and the change below which they may differ.
+#: Interval for changes of GNSS and IMU velocity, and the change below which they may differ.
 CHANGE_S, LEAST_CHANGE_M_S = 0.5, 0.5
-#: Uncertainty of the axle law up to which a course is that of the car, but for some degrees.
+#: Uncertainty of the axle law up to which the course equals the heading within some degrees.
 COURSE_LAW_RAD = math.radians(1.5)
-#: A jump of GNSS velocity against the IMU within one interval, m/s, that is rejected if one back follows in this time.
+#: Jump of GNSS velocity against the IMU in one interval, m/s, that is rejected if a jump back follows within this time.
 JUMP_M_S, JUMP_BACK_S = 0.3, 60.0
-#: Delays of GNSS that are tried, and the share of the cost of none that proves one; time of an unknown heading.
+#: Candidate delays of GNSS; cost ratio to no delay below which a delay is accepted; time of an unknown heading.
 DELAYS_S = tuple(round(0.02 * i, 2) for i in range(-5, 31))
 CLEAR_COST, HEADING_WINDOW_S = 0.7, 20.0
-#: Smaller delays are left to the smoother. Half of the time over which a course is averaged.
+#: Smaller delays are left to the smoother. Half of the averaging window of a course.
 SMALL_DELAY_S, COURSE_S = 0.06, 10.0
-#: Wheel speed that GNSS contradicts by more is that of a wheel that locks, spins or is dragged across.
+#: Difference from GNSS above which a wheel is locked, spinning or dragged sideways.
 WHEEL_ERROR_M_S = 2.0
 
 
 def with_gnss_speed(rows: FloatArray) -> FloatArray:
-    """Return the inputs with the speed left out where it is that of GNSS, or less certain where GNSS differs.
+    """Return the inputs without speeds that are GNSS speeds, and with a larger uncertainty where GNSS differs.
 
-    Wheels that lock, spin or roll across the direction of travel show another speed than GNSS.
+    The speed of locked, spinning or sideways rolling wheels differs from GNSS.
     """
     aided = rows.copy()
     aided[aided[:, s.LENGTH] > 0.0, s.SPEED] = np.nan
@@ -51,10 +51,10 @@ def with_gnss_speed(rows: FloatArray) -> FloatArray:
 
 
 def first_guess(rows: FloatArray, alone: FloatArray) -> FloatArray:
-    """Return v_x, v_y and heading [K, 3] by GNSS, gyro and course; where there is no GNSS, those without it.
+    """Return v_x, v_y and heading [K, 3] by GNSS, gyro and course; without GNSS, the states ``alone``.
 
-    The heading is that of the gyro and turned to the course where the car rolls without much slip. ``alone`` [K, n]:
-    states without GNSS.
+    The heading is the integrated gyro, rotated to the course in low-slip intervals. ``alone`` [K, n]: states without
+    GNSS.
     """
     k = np.arange(len(rows))
     gyro = np.cumsum(rows[:, s.MEAN_YAW_RATE] - alone[:, s.YAW_RATE_BIAS]) / RATE_HZ
@@ -76,9 +76,9 @@ def first_guess(rows: FloatArray, alone: FloatArray) -> FloatArray:
 
 
 def rolls_freely(rows: FloatArray) -> BoolArray:
-    """Return where the car moves forward with little slip [K], so that its course is its heading but for some degrees.
+    """Return the mask [K] of forward motion with little slip, where course and heading differ by a few degrees only.
 
-    Wheel speed, where there is one, agrees with GNSS: it is not sideways.
+    Wheel speeds, if available, must agree with GNSS, which excludes sideways motion.
     """
     over_ground = np.hypot(rows[:, s.GNSS_EAST], rows[:, s.GNSS_NORTH])
     rolls = (over_ground > LEAST_COURSE_SPEED_M_S) & (rows[:, s.LAW_STD] > 0.0) & (rows[:, s.LAW_STD] < COURSE_LAW_RAD)
@@ -86,9 +86,9 @@ def rolls_freely(rows: FloatArray) -> BoolArray:
 
 
 def gnss_follows_imu(rows: FloatArray) -> bool:
-    """Return whether GNSS velocity changes as the IMU has it; not if its axes are swapped or those of the body.
+    """Return whether changes of GNSS velocity match the IMU; they do not if axes are exchanged or in the body frame.
 
-    Where the car hardly accelerates there is no contradiction.
+    Without significant accelerations the result is True.
     """
     sampled = np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
     sampled = sampled[np.diff(sampled // round(CHANGE_S * RATE_HZ), prepend=-1) > 0]
@@ -103,8 +103,8 @@ def gnss_follows_imu(rows: FloatArray) -> bool:
 def increments(rows: FloatArray, sampled: IntArray, delay_s: float) -> tuple[ComplexArray, ComplexArray]:
     """Return the changes of velocity between GNSS samples [M − 1], east + i north: of GNSS, and of the IMU.
 
-    ``sampled`` [M]: knots with a sample, of a velocity ``delay_s`` old. The IMU's are turned by the angle, slowly
-    varying, that fits best: its heading is unknown.
+    ``sampled`` [M]: knots with a sample, of a velocity ``delay_s`` old. The unknown heading of the IMU is replaced by
+    the slowly varying rotation with the best fit.
     """
     heading = np.cumsum(rows[:, s.MEAN_YAW_RATE]) / RATE_HZ
     turned = np.exp(1j * (heading - 0.5 * rows[:, s.MEAN_YAW_RATE] / RATE_HZ))
@@ -122,7 +122,7 @@ def increments(rows: FloatArray, sampled: IntArray, delay_s: float) -> tuple[Com
 
 
 def scanned_delay(rows: FloatArray) -> float:
-    """Return how late GNSS velocity is in s: changes of the IMU's velocity that old fit its changes best."""
+    """Return the delay of GNSS velocity in s for which changes of GNSS and IMU velocity match best."""
     sampled = np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
     if sampled.size < 8:
         return 0.0
@@ -136,7 +136,7 @@ def scanned_delay(rows: FloatArray) -> float:
 
 
 def without_jumps(rows: FloatArray) -> FloatArray:
-    """Return the inputs without GNSS velocities between a jump against the IMU and one back (multipath)."""
+    """Return the inputs without GNSS velocities between a jump against the IMU and a jump back (multipath)."""
     sampled = np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
     if sampled.size < 3:
         return rows

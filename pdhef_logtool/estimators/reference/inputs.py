@@ -1,4 +1,4 @@
-"""Inputs of the sideslip reference at its knots: means and values of the sensors, their noise, the axle law's error."""
+"""Inputs of the sideslip reference at its knots: sensor means, values and noise, and the error of the axle law."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ RATE_HZ = 20.0
 LINEAR_AY_M_S2, LINEAR_FRICTION = 3.5, 0.85
 #: 1-sigma of the axle law in degrees: constant, per m/s², per m/s³, per (m/s²)² beyond the linear range.
 LAW_DEG = (0.15, 0.06, 0.04, 1.5)
-#: An interval without a sample this long has no IMU.
+#: Gap after which the IMU is considered missing.
 LONGEST_IMU_GAP_S = 0.25
-#: White noise of accelerometers, m/s²/√Hz, and of the gyro, rad/s/√Hz, at least.
+#: Minimum white noise of accelerometers, m/s²/√Hz, and of the gyro, rad/s/√Hz.
 LEAST_NOISE_M_S2, LEAST_NOISE_RAD_S = 0.02, 0.0007
 #: Speed of standstill.
 STANDSTILL_M_S = 0.1
-#: At standstill, yaw rate, acceleration (bank and grade) and speed over ground are smaller.
+#: Upper limits of yaw rate, acceleration (bank and grade) and speed over ground at standstill.
 STILL_RAD_S, STILL_M_S2, STILL_GNSS_M_S = 0.03, 2.0, 1.0
-#: 1-sigma of GNSS velocity without a stated accuracy, its growth with acceleration (receivers filter), and with roll
-#: rate, whose antenna moves on an arm of this uncertainty.
+#: 1-sigma of GNSS velocity without a reported accuracy; its increase with acceleration (filtering in receivers) and
+#: with roll rate (unknown lever arm of the antenna).
 GNSS_STD_M_S, GNSS_LAG_S, ROLL_ARM_M = 0.05, 0.01, 0.3
-#: Roll per lateral acceleration and pitch per longitudinal one of a usual car.
+#: Roll per lateral acceleration and pitch per longitudinal acceleration of a usual car.
 ROLL_PER_AY_RAD_S2_M, PITCH_PER_AX_RAD_S2_M = 0.0075, 0.004
-#: Correlation of roll and pitch rate with those of a usual car that decides their signs.
+#: Minimum correlation of roll and pitch rate with a usual car's to determine their signs.
 LEAST_SIGN_CORRELATION = 0.3
-#: 1-sigma of the lateral position of an antenna, and its factor in a speed over ground: the error lasts.
+#: 1-sigma of the lateral position of an antenna, and its factor in a speed over ground: the error is persistent.
 ANTENNA_Y_STD_M, LENGTH_FACTOR = 0.5, 4.0
 #: White and correlated 1-sigma of a position: with carrier phase, and of a single receiver.
 RTK_M, SINGLE_M, RTK_ACCURACY_M = (0.01, 0.01), (0.3, 2.0), 0.1
-#: Half of the time over which accelerations are averaged that gains multiply, s.
+#: Half of the averaging window of accelerations that are multiplied by gains, s.
 SLOW_S = 0.25
 
 
 def sensor_noise(signals: Signals, rows: FloatArray) -> FloatArray:
     """Return the white noise of a_x, a_y in m/s²/√Hz, at least 0.02, and of the gyro in rad/s/√Hz, at least 0.0007.
 
-    The larger of the samples' and that of the means between knots: vibration of the body is not white.
+    The larger of the noise of the samples and of the means between knots, as vibration of the body is not white.
     """
     columns = (
         (signals.ax_m_s2, s.MEAN_AX, LEAST_NOISE_M_S2),
@@ -62,7 +62,7 @@ def sensor_noise(signals: Signals, rows: FloatArray) -> FloatArray:
 def white_noise(stamps_ns: IntArray, values: FloatArray, least: float) -> float:
     """Return the white noise of a sensor [N] per √Hz from its third differences.
 
-    Samples that repeat the one before are left out: sensors may repeat values.
+    Samples that repeat the previous one are excluded, as sensors may repeat values.
     """
     good = np.isfinite(values)
     values, stamps = values[good], stamps_ns[good]
@@ -80,7 +80,7 @@ def knots(
 ) -> tuple[IntArray, FloatArray]:
     """Return the stamps of the knots [K] and the smoother's inputs [K, INPUTS] there; a_y without its known bias.
 
-    ``speed_over_ground``: the speed is the length of a velocity, as it is where it equals that of GNSS.
+    ``speed_over_ground``: the speed is the length of a velocity; this is assumed if it equals the GNSS speed.
     """
     t = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
     h = 1.0 / RATE_HZ
@@ -126,7 +126,7 @@ def law_std(rows: FloatArray, friction: float) -> FloatArray:
 
 
 def standstill(rows: FloatArray) -> BoolArray:
-    """Return the knots at standstill [K]: no speed, as wheels that lock show too, and no motion."""
+    """Return the mask [K] of standstill: zero speed (also of locked wheels) and no motion in the other sensors."""
     still = rows[:, s.SPEED] < STANDSTILL_M_S
     still &= np.abs(rows[:, s.YAW_RATE]) < STILL_RAD_S
     still &= np.hypot(rows[:, s.SLOW_AX], rows[:, s.SLOW_AY]) < STILL_M_S2
@@ -134,14 +134,14 @@ def standstill(rows: FloatArray) -> BoolArray:
 
 
 def is_length(signals: Signals) -> bool:
-    """Return whether the speed is the length of GNSS velocity, and no measurement of its own."""
+    """Return whether the speed is the length of the GNSS velocity instead of an independent measurement."""
     length = np.hypot(*signals.gnss_velocity_m_s.T)
     both = np.isfinite(length) & np.isfinite(signals.speed_m_s)
     return bool(both.any()) and bool(np.abs(length - signals.speed_m_s)[both].max() < 1e-6)
 
 
 def _add_tilt(rows: FloatArray, signals: Signals, t: FloatArray, knot_s: FloatArray) -> None:
-    """Put roll and pitch rate into the rows with the signs that a body has which leans out of a turn and dives."""
+    """Add roll and pitch rate to the rows, with signs for a body that leans outwards in turns and dives in braking."""
     h = 1.0 / RATE_HZ
     rows[:, [s.TILT, s.MEAN_ROLL_RATE, s.MEAN_PITCH_RATE]] = 0.0
     rows[:, s.ROLL_RATE] = ROLL_PER_AY_RAD_S2_M * rows[:, s.AY_RATE]
@@ -171,14 +171,14 @@ def slow(values: FloatArray) -> FloatArray:
 
 
 def correlation(rate: FloatArray, change: FloatArray) -> float:
-    """Return the correlation of an angular rate [K] with a change of acceleration [K], 0 where one is constant."""
+    """Return the correlation of an angular rate [K] with a change of acceleration [K], 0 if one is constant."""
     return 0.0 if rate.std() == 0.0 or change.std() == 0.0 else float(np.corrcoef(rate, change)[0, 1])
 
 
 def _integral(
     t: FloatArray, values: FloatArray
 ) -> tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], BoolArray]]:
-    """Return the integral of a column over time as a function, and where an interval of it has no sample."""
+    """Return the integral of a column over time as a function, and a function for intervals without a sample."""
     good = np.isfinite(values)
     if good.sum() < 2:
         return (lambda knot_s: np.zeros_like(knot_s)), (lambda knot_s: np.ones(len(knot_s), dtype=np.bool_))
@@ -203,7 +203,7 @@ def _integral(
 
 
 def _from_speed(t: FloatArray, speed: FloatArray) -> FloatArray:
-    """Return a longitudinal acceleration [N] from the speed where the log has no sensor of it."""
+    """Return a longitudinal acceleration [N] from the speed, for logs without an accelerometer."""
     good = np.isfinite(speed)
     if good.sum() < 3:
         return np.zeros(len(t))
@@ -212,7 +212,7 @@ def _from_speed(t: FloatArray, speed: FloatArray) -> FloatArray:
 
 
 def _speed(t: FloatArray, speed: FloatArray, knot_s: FloatArray) -> FloatArray:
-    """Return the speed at the knots [K], NaN further than a knot from a sample."""
+    """Return the speed at the knots [K], NaN if no sample is within a knot."""
     good = np.isfinite(speed)
     if not good.any():
         return np.full(len(knot_s), np.nan)
@@ -224,7 +224,7 @@ def _speed(t: FloatArray, speed: FloatArray, knot_s: FloatArray) -> FloatArray:
 
 
 def _add_gnss(rows: FloatArray, signals: Signals, knot_s: FloatArray) -> None:
-    """Put each new GNSS velocity at its nearest knot with its offset in time; the last one of several."""
+    """Assign each new GNSS velocity to its nearest knot with its time offset; the last one of several."""
     velocity = signals.gnss_velocity_m_s
     good = np.flatnonzero(np.isfinite(velocity).all(axis=1))
     if not good.size:
@@ -244,7 +244,7 @@ def _add_gnss(rows: FloatArray, signals: Signals, knot_s: FloatArray) -> None:
 
 
 def _add_position(rows: FloatArray, signals: Signals, knot_s: FloatArray) -> None:
-    """Put positions, in m from the first, at their nearest knots; they share the delay of the velocity."""
+    """Assign positions, in m from the first, to their nearest knots; they have the delay of the velocity."""
     good = np.flatnonzero(np.isfinite(signals.gnss_position_deg).all(axis=1))
     if not good.size:
         return

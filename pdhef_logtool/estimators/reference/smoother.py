@@ -1,18 +1,18 @@
-"""Kinematic smoother between stretches of linear driving, with or without GNSS velocity (docs/method.md#reference).
+"""Kinematic smoother with linear driving as reference, with or without GNSS velocity (docs/method.md#reference).
 
 States at the knots, in body axes at the CG: v_x, v_y, biases b of the accelerometers, error d of the axle law;
 constants: compliance of the rear axle and the parameters of the sensors; with GNSS also heading, error of the receiver,
-antenna; with positions also those and their error.
+antenna; with positions also position and its error.
 
     v̇_x = a_x + v_y r,   v̇_y = a_y − v_x r                               (kinematics of a plane body)
-    ḃ_x = −g q + r b_y,  ḃ_y = g p − r b_x                                (tilt, where roll rate p, pitch rate q exist)
+    ḃ_x = −g q + r b_y,  ḃ_y = g p − r b_x                                (tilt, if roll rate p, pitch rate q exist)
     v_y − l_r r = −(κ a_r + k₂ ṙ) |v_x| − k₃ ȧ_y + β₀ v_x + S |v| (d + w)  (axle law in the linear range)
 
 with the rear axle's lateral acceleration a_r, the lag k₃ of tyre relaxation and body roll, and S, the law's
-uncertainty, which grows beyond the linear range. Gains multiply accelerations after a low pass: their noise would pass
-for a gain. Each iteration linearises about the last smoothed states (Gauss–Newton): a Kalman filter with scalar
-updates, then the modified Bryson–Frazier smoother (Bierman, "Fixed interval smoothing with discrete measurements",
-1973), which inverts no matrix. Measurements with large residuals count less (Cauchy, k = 3).
+uncertainty, which increases beyond the linear range. Gains multiply low-passed accelerations, so that noise does not
+bias them. Each iteration linearises about the last smoothed states (Gauss–Newton): a Kalman filter with scalar updates,
+then the modified Bryson–Frazier smoother (Bierman, "Fixed interval smoothing with discrete measurements", 1973), which
+needs no matrix inversion. Measurements with large residuals have a reduced weight (Cauchy, k = 3).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from pdhef_logtool.compiled.cache import njit
     EAST, NORTH, EAST_OFFSET, NORTH_OFFSET,
 ) = range(31)  # fmt: skip
 WITHOUT_GNSS, WITH_GNSS, WITH_POSITION = HEADING, EAST, NORTH_OFFSET + 1
-#: Entries whose transition is more than a decay, by their row of the Jacobian.
+#: Entries with a full row in the Jacobian; all others only decay.
 DENSE = (VX, VY, AX_BIAS, AY_BIAS, HEADING, EAST, NORTH)
 #: Columns of the inputs at the knots: means over the interval before the knot, values at it, and 1-sigmas.
 (
@@ -50,9 +50,9 @@ INPUTS = UNSIGNED + 1
 BIAS_S, LAW_S, RECEIVER_S = 6.0, 2.0, 5.0
 #: Their stationary 1-sigmas (the law's is LAW_STD), m/s² and m/s.
 BIAS_M_S2, RECEIVER_M_S = 0.35, 0.02
-#: Share of a change of a_x, a_y that changes their bias: pitch and roll; the same where roll and pitch rate are known.
+#: Share of a change of a_x, a_y that changes their bias by pitch and roll; the same with known roll and pitch rate.
 TILT_SHARE, KNOWN_TILT_SHARE = 0.05, 0.01
-#: Time constant of the tilt that roll and pitch rate give, and what their errors add, m/s²/√s.
+#: Time constant of the tilt from roll and pitch rate, and noise by their errors, m/s²/√s.
 TILT_S, TILT_NOISE = 30.0, 0.03
 #: White noise of a stretch without IMU, m/s²/√Hz.
 GAP_NOISE = 3.0
@@ -97,7 +97,7 @@ def correct(x, p, h, e, r):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _update(x, p, h, e, r, store, k, m):  # type: ignore[no-untyped-def]
-    """Update with a scalar measurement of residual e; keep what the backward pass needs in slot m of knot k."""
+    """Update with a scalar measurement of residual e; store the data for the backward pass in slot m of knot k."""
     n = x.shape[0]
     gain, s = correct(x, p, h, e, r)
     store[k, m, :n] = h
@@ -159,7 +159,7 @@ def _pull_back(f, lam, dense, dense_row, decay):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _corrected(point, ax, ay, slow_ax, slow_ay, rate, yaw_acceleration):  # type: ignore[no-untyped-def]
-    """Return the accelerations of the CG of accelerometers that read a_x, a_y, at a state."""
+    """Return the accelerations of the CG from accelerometers that read a_x, a_y, at a state."""
     x, y, yaw = point[IMU_X], point[IMU_Y], point[IMU_YAW]
     corrected_ax = ax - point[AX_GAIN] * slow_ax - yaw * slow_ay - point[AX_BIAS] + x * rate**2 + y * yaw_acceleration
     corrected_ay = ay - point[ROLL_GAIN] * slow_ay + yaw * slow_ax - point[AY_BIAS] - x * yaw_acceleration + y * rate**2
@@ -168,7 +168,7 @@ def _corrected(point, ax, ay, slow_ax, slow_ay, rate, yaw_acceleration):  # type
 
 @njit(cache=True)
 def _transition(x, point, step_s, row, dense):  # type: ignore[no-untyped-def]
-    """Put f(x), linearised about ``point``, into x, and the Jacobian's rows of ``DENSE`` into ``dense``."""
+    """Write f(x), linearised about ``point``, to x, and the rows of ``DENSE`` of the Jacobian to ``dense``."""
     h = step_s
     n = x.shape[0]
     rate = row[MEAN_YAW_RATE] * (1.0 - point[YAW_RATE_GAIN]) - point[YAW_RATE_BIAS]
@@ -225,7 +225,7 @@ def _transition(x, point, step_s, row, dense):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _move(point, h, ax, ay, dense, new):  # type: ignore[no-untyped-def]
-    """Put the new position of the CG and its Jacobian into rows 5 and 6."""
+    """Write the new position of the CG and its Jacobian to rows 5 and 6."""
     c, s = math.cos(point[HEADING]), math.sin(point[HEADING])
     forward, left = point[VX], point[VY]
     new[5] = point[EAST] + h * (c * forward - s * left) + 0.5 * h * h * (c * ax - s * ay)
@@ -237,7 +237,7 @@ def _move(point, h, ax, ay, dense, new):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _add_process_noise(p, point, step_s, row, before, noise):  # type: ignore[no-untyped-def]
-    """Add what the interval adds; ``noise``: white, of a_x, a_y in m/s²/√Hz, of the gyro in rad/s/√Hz."""
+    """Add the process noise of an interval; ``noise``: white, a_x, a_y in m/s²/√Hz, gyro in rad/s/√Hz."""
     h = step_s
     gap = GAP_NOISE * GAP_NOISE * h if row[GAP] > 0.0 else 0.0
     gyro = noise[2] * noise[2] * h
@@ -269,7 +269,7 @@ def _add_process_noise(p, point, step_s, row, before, noise):  # type: ignore[no
 
 @njit(cache=True)
 def _axle_law(point, row, rear_m, h):  # type: ignore[no-untyped-def]
-    """Return the law's left side minus its right side at a state, and its Jacobian in h."""
+    """Return the residual of the axle law (left minus right side) at a state, and its Jacobian in h."""
     length = rear_m + point[REAR_AXLE]
     rate = row[YAW_RATE] * (1.0 - point[YAW_RATE_GAIN]) - point[YAW_RATE_BIAS]
     acceleration = REAR_SHARE * row[AY] - length * row[YAW_ACCELERATION]
@@ -294,7 +294,7 @@ def _axle_law(point, row, rear_m, h):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _gnss(point, row, east, h):  # type: ignore[no-untyped-def]
-    """Return the velocity of the antenna to the east or north that a receiver shows at a state; Jacobian in h."""
+    """Return the predicted GNSS velocity of the antenna to the east or north at a state; Jacobian in h."""
     rate = row[YAW_RATE] * (1.0 - point[YAW_RATE_GAIN]) - point[YAW_RATE_BIAS]
     forward = point[VX] - point[ANTENNA_Y] * rate
     left = point[VY] + point[ANTENNA_X] * rate - point[ANTENNA_HEIGHT] * row[ROLL_RATE]
@@ -316,7 +316,7 @@ def _gnss(point, row, east, h):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _position(point, row, east, h):  # type: ignore[no-untyped-def]
-    """Return the place of the antenna to the east or north that a receiver shows at a state; Jacobian in h."""
+    """Return the predicted GNSS position of the antenna to the east or north at a state; Jacobian in h."""
     later = row[GNSS_OFFSET] + point[GNSS_DELAY]
     forward, left = point[ANTENNA_X] + later * point[VX], point[ANTENNA_Y] + later * point[VY]
     c, s = math.cos(point[HEADING]), math.sin(point[HEADING])
@@ -334,13 +334,13 @@ def _position(point, row, east, h):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _cauchy(variance, residual, trusted):  # type: ignore[no-untyped-def]
-    """Return the variance, enlarged for a large residual unless the linearisation is not yet ``trusted``."""
+    """Return the variance, enlarged for a large residual if the linearisation is ``trusted``."""
     return variance * (1.0 + residual * residual / (variance * CAUCHY * CAUCHY)) if trusted else variance
 
 
 @njit(cache=True)
 def structure(n, step_s):  # type: ignore[no-untyped-def]
-    """Return the row in ``DENSE`` of each state, −1 for those that only decay, and the decay over a step, [n] each."""
+    """Return the row in ``DENSE`` of each state, −1 for states that only decay, and the decay over a step, [n] each."""
     dense_row, decay = np.full(n, -1), np.ones(n)
     for q in range(len(DENSE)):
         if DENSE[q] < n:
@@ -353,10 +353,10 @@ def structure(n, step_s):  # type: ignore[no-untyped-def]
     return dense_row, decay
 
 
-# positional: compiled code takes no keywords at no cost.
+# positional: keyword arguments of compiled code have a cost.
 @njit(cache=True)
 def _measure(x, p, point, row, rear_m, store, k, used, trusted):  # type: ignore[no-untyped-def]
-    """Update with all measurements of a knot; ``point``, where they are linearised, is ``trusted`` to judge them."""
+    """Update with all measurements of a knot, linearised about ``point``; if ``trusted``, outliers are downweighted."""
     n = x.shape[0]
     h = np.zeros(n)
     m = 0
@@ -415,8 +415,8 @@ def smooth(step_s, rows, rear_m, start, start_variance, noise, guess, iterations
     step_s : between knots. rows : inputs [K, INPUTS]. rear_m : distance of the rear axle from the CG.
     start, start_variance : first state and its variances [n], of ``WITHOUT_GNSS``, ``WITH_GNSS`` or ``WITH_POSITION``.
     noise : white, of a_x, a_y in m/s²/√Hz, of the gyro in rad/s/√Hz.
-    guess : states [K, n] about which the first iteration linearises; [0, n]: about its own.
-    iterations : at most. tolerance_m_s : of v_y between iterations, rms.
+    guess : states [K, n] for the first linearisation; [0, n]: the predicted states.
+    iterations : maximum number. tolerance_m_s : rms change of v_y between iterations.
 
     Returns
     -------
@@ -495,7 +495,7 @@ def smooth(step_s, rows, rear_m, start, start_variance, noise, guess, iterations
 
 @njit(cache=True)
 def _pull_vector(pull, dense, dense_row, decay):  # type: ignore[no-untyped-def]
-    """Put Fᵀ λ into λ."""
+    """Replace λ by Fᵀ λ."""
     n = pull.shape[0]
     out = np.zeros(n)
     for m in range(n):

@@ -1,7 +1,7 @@
-"""Metrics: each is a formula over columns of a drive; files, terminal, pages, plans and documentation derive from it.
+"""Metrics: formulas over columns of a drive. Files, terminal, pages, plans and documentation use these entries.
 
-A new metric is a file that exports ``METRICS`` (:class:`~.metric.Metric`) and its name in ``MODULES`` of
-:mod:`~.registry`. ``interval_width.py`` would be::
+To add a metric, write a file that exports ``METRICS`` (:class:`~.metric.Metric`) and add its name to ``MODULES`` of
+:mod:`~.registry`. Example, ``interval_width.py``::
 
     from pdhef_logtool.evaluation.metrics.errors import errors_of_drive
     from pdhef_logtool.evaluation.metrics.metric import Metric

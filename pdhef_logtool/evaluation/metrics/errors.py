@@ -1,8 +1,8 @@
 """Errors e = estimate − ground truth (angles wrapped) where both are valid and finite.
 
-Sideslip counts only where the ground-truth speed exceeds the low-speed blend. a_y is the lateral specific force at the
-CG in the road plane (:data:`~pdhef_logtool.evaluation.units.AY_NOTE`), of estimates and of ground truth; a ground truth
-that lacks it is not scored.
+Sideslip is scored only where the ground-truth speed exceeds the low-speed blend. a_y is the lateral specific force at
+the CG in the road plane (:data:`~pdhef_logtool.evaluation.units.AY_NOTE`), for estimates and for ground truth; ground
+truth without it is not scored.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ def errors_of_drive(drive: EvaluatedDrive) -> Iterator[Columns]:
 def _errors(
     track: StateTrack, truth: StateTrack, signal: str, has_truth: BoolArray, since_start_ns: IntArray
 ) -> Columns:
-    """Return ``available`` (0 or 1 where ground truth is known) and, where the estimate is scored, the other columns.
+    """Return ``available`` (0 or 1 where ground truth is known) and the other columns at the scored stamps.
 
-    ``std`` is the 1-sigma of the error; it is absent where the estimate has none.
+    ``std`` is the 1-sigma of the error; it is absent if the estimate provides none.
     """
     error = raw_error(track, truth, signal)
     scored = track.valid & has_truth & np.isfinite(error)
@@ -110,7 +110,7 @@ METRICS = (
     _ERROR(
         "coverage95",
         "in 95 % CI",
-        "share of stamps with abs e ≤ 1.96 σ; σ² is the estimate's variance plus that of ground truth if known",
+        "share of stamps with abs e ≤ 1.96 σ; σ² is the variance of the estimate plus, if known, of ground truth",
         formula=lambda std, e: float(np.mean(np.abs(e) <= NORMAL_95 * std)),
         over=("std", "error"),
         best=0.95,

@@ -1,4 +1,4 @@
-"""``not_independent``: the mark of signals whose ground truth is one of the estimators' inputs."""
+"""``not_independent``: mark of signals with an estimator input as their ground truth."""
 
 from __future__ import annotations
 

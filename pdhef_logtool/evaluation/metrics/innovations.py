@@ -1,4 +1,4 @@
-"""Whether the covariance that a filter reports fits its errors and its innovations, signal ``state``."""
+"""Consistency of a filter's covariance with its errors and innovations, signal ``state``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Met
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
-#: Fewer pairs of stamps have no autocorrelation.
+#: Least number of pairs of stamps for an autocorrelation.
 LEAST_PAIRS = 10
 
 

@@ -1,4 +1,4 @@
-"""``lag_s``: by how much an estimate is late."""
+"""``lag_s``: delay of an estimate after ground truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LAG_SPAN_NS = 3_600_000_000_000
 
 
 def lag_s(stamps_ns: IntArray, estimate: FloatArray, truth: FloatArray) -> float:
-    """Return by how many seconds the estimate [N] follows the ground truth [N]; NaN when there is no clear peak."""
+    """Return the delay of the estimate [N] after the ground truth [N] in s; NaN without a clear peak."""
     finite = np.isfinite(estimate) & np.isfinite(truth)
     if np.count_nonzero(finite) < 2:
         return float("nan")

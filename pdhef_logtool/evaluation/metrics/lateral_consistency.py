@@ -24,7 +24,7 @@ def _columns(drive: EvaluatedDrive) -> Iterator[Columns]:
 def driving_products(
     track: StateTrack, signals: Signals, *, low_speed_m_s: float, sensors: SensorErrors
 ) -> tuple[FloatArray, float]:
-    """Return the inputs of :func:`driven_consistency` from a window; windows are added up.
+    """Return the inputs of :func:`driven_consistency` from a window; sums over windows are allowed.
 
     Returns
     -------
@@ -43,8 +43,8 @@ def driving_products(
 def driven_consistency(products: FloatArray, seconds: float) -> float:
     """Return the part of the residual in m/s that correlates with v_y, v_x r and a_y: the error of the model in turns.
 
-    The remaining part comes from the road: a bank changes a_y and is no error of the estimate. The share that the
-    remaining part would explain by chance, with 2 s as one sample, is taken off. NaN below five samples.
+    The remaining part comes from the road: a bank changes a_y and is not an error of the estimate. The share that the
+    remaining part explains by chance, with 2 s as one sample, is subtracted. NaN below five samples.
     """
     if seconds < 5.0 * SPAN_S:
         return float("nan")
@@ -82,7 +82,7 @@ class _Driven:
         self._gained = gained - gained[i]
 
     def carried_vy(self, track: StateTrack) -> FloatArray:
-        """Return v_y [N] of an estimate plus the share of ∫ a_y due to the lever arm; NaN where it is not scored."""
+        """Return v_y [N] of an estimate plus the lever-arm term of ∫ a_y; NaN at stamps that are not scored."""
         return np.where(track.valid & self._fast, track.vy_m_s, np.nan) + self._of_lever
 
     def change(self, values: FloatArray) -> FloatArray:
@@ -100,7 +100,7 @@ METRICS = (
         "consistency",
         "signal `vy_m_s`: RMS of the change of the estimated v_y over 2 s minus the integral of a_y − v_x r, above the "
         "low-speed blend; a_y without bias, roll gain and lever arm as the log has them; large with a wrong "
-        "model. `kinematic` integrates the same, so that its figure shows nothing",
+        "model. Not meaningful for `kinematic`, which integrates the same quantities",
         columns=_columns,
         formula=rms,
         best="lower",

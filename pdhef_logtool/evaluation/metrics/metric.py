@@ -1,4 +1,4 @@
-"""What a metric is: columns of a drive and a formula over the values that lie in a segment."""
+"""Definition of a metric: columns of a drive and a formula over their values in a segment."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ ALL = "all"
 
 @dataclass(frozen=True, slots=True)
 class MetricRow:
-    """One figure. The first eight fields and ``algorithm`` are the columns of metrics.parquet.
+    """One value of a metric. The first eight fields and ``algorithm`` are the columns of metrics.parquet.
 
     ``algorithm`` is the digest of the algorithm that ran under the estimator's name; empty for recorded estimates.
 
-    ``independent`` is False when ground truth of this signal is one of the estimators' inputs; tables and rankings
-    leave such rows out. In the file a row with metric ``not_independent`` shows it for its estimator and signal.
+    ``independent`` is False if ground truth of this signal is one of the estimators' inputs; tables and rankings omit
+    such rows. In the file, a row with metric ``not_independent`` marks its estimator and signal.
     """
 
     log: str
@@ -47,8 +47,8 @@ class SensorErrors:
     ----------
     ay_bias_m_s2, yaw_rate_bias_rad_s : reading minus true value. ay_gain : of a_y, by body roll. lever_m : position of
         the accelerometer ahead of the centre of gravity.
-    vehicle, read_with : calibrated vehicle, and the vehicle that the signals were read with; None: unknown.
-    steer_delay_s : of the steering angle. friction : of the road; None: that of the signals.
+    vehicle, read_with : calibrated vehicle, and the vehicle that the signals were read with; None if unknown.
+    steer_delay_s : of the steering angle. friction : of the road; None uses the friction of the signals.
     """
 
     ay_bias_m_s2: float = 0.0
@@ -67,9 +67,9 @@ class EvaluatedDrive:
 
     Attributes
     ----------
-    masks : bool [N] by segment. truth, signals : None: metrics that need them have no figures.
+    masks : bool [N] by segment. truth, signals : None omits the metrics that need them.
     low_speed_m_s : sideslip is scored above this ground-truth speed. sensors : errors of the sensors.
-    dependent : signals whose ground truth is one of the estimators' inputs.
+    dependent : signals with an estimator input as their ground truth.
     """
 
     log: str
@@ -82,7 +82,7 @@ class EvaluatedDrive:
     dependent: Collection[str] = ()
 
     def __post_init__(self) -> None:
-        """Add segment ``all``; raises ValueError where tracks or masks are not at the same stamps."""
+        """Add segment ``all``; raises ValueError unless tracks and masks are at the same stamps."""
         records = [r for r in (self.truth, self.signals, *self.tracks.values()) if r is not None]
         stamps_ns = records[0].stamps_ns
         if not all(np.array_equal(record.stamps_ns, stamps_ns) for record in records):
@@ -99,7 +99,7 @@ class Columns:
     """Columns [N] of one signal of one estimator, by name; a stamp counts where a column is finite.
 
     Columns ``of_steps`` have N − 1 rows, the steps between stamps: a segment contains a step if it contains both ends.
-    Columns of the ``whole`` drive may have any length; only segment ``all`` has figures.
+    Columns of the ``whole`` drive may have any length; only segment ``all`` has values.
     """
 
     estimator: str
@@ -114,7 +114,7 @@ Formula: TypeAlias = Callable[..., "float | None"]
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One metric, as its file registers it; every output is derived from this record.
+    """One metric, as its file registers it; all outputs use this record.
 
     Attributes
     ----------
@@ -122,14 +122,14 @@ class Metric:
     label : head of a column, without the unit.
     definition : one or two sentences for the documentation and for pages.
     columns : returns the columns of a drive; metrics with the same function share its columns.
-    formula : returns the figure of a segment from the values of its columns; None: the segment has no figure.
-    over : names of these columns; values count where the first one is finite. Empty: the name of the metric.
-    best : ``lower``, ``higher``, the value at which it is best, or None where no value is better than another.
-    unit : of its figures; None: that of the signal.
-    whole : only segment ``all`` has a figure. of_truth : it compares with ground truth.
-    digits : decimal places in the terminal, in the unit that people read.
-    terminal : signals whose figure has a column in the terminal's table; narrow terminals leave it out.
-    brief : signals whose figure the report.json of a run with ``--keep metrics`` retains.
+    formula : returns the value for a segment from the values of its columns, or None.
+    over : names of these columns; stamps at which the first one is finite are used. Empty: the name of the metric.
+    best : ``lower``, ``higher``, the best value, or None if no value is better than another.
+    unit : of its values; None for the unit of the signal.
+    whole : only segment ``all`` has a value. of_truth : it compares with ground truth.
+    digits : decimal places in the terminal, in the unit for display.
+    terminal : signals with a column in the terminal's table, which narrow terminals omit.
+    brief : signals that the report.json of a run with ``--keep metrics`` contains.
     """
 
     name: str
@@ -147,17 +147,17 @@ class Metric:
     brief: tuple[str, ...] = ()
 
     def unit_of(self, signal: str) -> str:
-        """Return the unit of its figures of a signal in metrics.parquet."""
+        """Return the unit of a signal's values in metrics.parquet."""
         return SIGNALS[signal] if self.unit is None else self.unit
 
     def head(self, signal: str | None = None) -> str:
-        """Return the head of a column: the label with the unit that people read; ``signal``: whose unit it may be."""
+        """Return the head of a column: the label with the unit for display, which may depend on ``signal``."""
         unit = self.unit if signal is None else self.unit_of(signal)
         return f"{self.label} {read_unit(unit)[0]}".strip() if unit else self.label
 
     @property
     def direction(self) -> str:
-        """Which values are better, in words; empty where none is."""
+        """Text of the better direction; empty without one."""
         if self.best is None or isinstance(self.best, str):
             return self.best or ""
         return f"closest to {self.best:g}"
@@ -174,7 +174,7 @@ def mean(values: NDArray[Any], *_: FloatArray) -> float:
 
 
 def figures(drive: EvaluatedDrive, metrics: Iterable[Metric]) -> list[MetricRow]:
-    """Return the rows of metrics: by estimator in the order of the tracks, then by metric, signal and segment."""
+    """Return the rows of metrics by estimator, in the order of the tracks, then by metric, signal and segment."""
     families: dict[Callable[[EvaluatedDrive], Iterable[Columns]], list[Metric]] = {}
     for metric in metrics:
         families.setdefault(metric.columns, []).append(metric)

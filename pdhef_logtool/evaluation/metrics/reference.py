@@ -1,4 +1,4 @@
-"""Estimates against one another and against the sideslip reference, where no ground truth states their error."""
+"""Comparison of estimates with one another and with the sideslip reference, for drives without ground truth."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 
-#: Time within which the error of the reference is taken to be the same, s.
+#: Time within which the error of the reference is assumed constant, s.
 BLOCK_S = 10.0
 
 
@@ -121,7 +121,7 @@ METRICS = (
     _REFERENCE(
         "reference_std",
         "reference ±",
-        "RMS of the 1-sigma of the sideslip reference at these stamps: smaller differences state nothing",
+        "RMS of the 1-sigma of the sideslip reference at these stamps: smaller differences are not significant",
         formula=lambda _, std: rms(std),
         over=("difference", "std"),
     ),
@@ -137,9 +137,9 @@ METRICS = (
     Metric(
         "reference_further",
         "further from reference",
-        "by how much the first of two estimates `a~b` is further from the sideslip reference, as RMS, than the second. "
-        "Only where the difference of their mean squares exceeds 1.96 of its standard deviation, which follows from "
-        "the reference's own, with one error in each 10 s: other pairs are not ranked",
+        "RMS difference of estimate `a` from the sideslip reference minus the one of `b`, for pairs `a~b`. Only "
+        "if the difference of their mean squares exceeds 1.96 of its standard deviations, which follows from the "
+        "1-sigma of the reference with one error in each 10 s: other pairs are not ranked",
         columns=_ranked,
         formula=_further,
         over=("of_a", "of_b", "std", "block"),

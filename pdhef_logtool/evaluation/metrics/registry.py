@@ -1,4 +1,4 @@
-"""Every metric of the tool, in the order in which figures are written."""
+"""All metrics of the tool, in the order of output."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, Metr
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.records.tracks import StateTrack
 
-#: Files of this package that export ``METRICS``. A new metric: a file, and its name here.
+#: Modules of this package that export ``METRICS``. Add the name of a new one here.
 MODULES = (
     "errors",
     "lag",
@@ -41,14 +41,14 @@ def _load(modules: tuple[str, ...]) -> Mapping[str, Metric]:
 
 
 def evaluate_drive(drive: EvaluatedDrive, names: Collection[str] | None = None) -> list[MetricRow]:
-    """Return the figures of all metrics, or of those with these names."""
+    """Return the values of all metrics, or of the metrics with these names."""
     return figures(drive, [m for m in registered().values() if names is None or m.name in names])
 
 
 def score_track(
     estimate: StateTrack, truth: StateTrack, masks: Mapping[str, BoolArray], *, log: str, low_speed_m_s: float
 ) -> list[MetricRow]:
-    """Return the figures of one estimate against ground truth at the same stamps [N].
+    """Return the metrics of one estimate against ground truth at the same stamps [N].
 
     ``masks``: bool [N] by segment; ``all`` is added when it is absent. ``low_speed_m_s``: sideslip is scored above
     this ground-truth speed.

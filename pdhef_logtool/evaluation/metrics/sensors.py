@@ -1,4 +1,4 @@
-"""The sensors against one another and how long and how far a drive was in each segment, estimator ``sensors``."""
+"""Consistency of the sensors, and duration and distance of each segment of a drive, estimator ``sensors``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pdhef_logtool.records.signals import FloatArray, Signals
 SENSORS = "sensors"
 SMOOTHING_HZ = 1.0
 SPEED_SPAN_S = 1.0
-#: Speed is interpolated over missing stamps for this long; a_x is integrated over no longer step.
+#: Longest gap over which speed is interpolated, and longest step over which a_x is integrated.
 MAX_STEP_S = 0.2
 
 
@@ -31,7 +31,7 @@ def _residuals(drive: EvaluatedDrive) -> Iterator[Columns]:
 
 
 def carried_speed(signals: Signals) -> FloatArray:
-    """Return the speed [N] between its measurements, linear, not across gaps."""
+    """Return the speed [N], interpolated linearly between its measurements except across gaps."""
     finite = np.isfinite(signals.speed_m_s)
     bracket = Bracket(signals.stamps_ns[finite], signals.stamps_ns, round(MAX_STEP_S * 1e9))
     return bracket.linear(signals.speed_m_s[finite])
@@ -92,7 +92,7 @@ METRICS = (
     Metric(
         "exposure_m",
         "way",
-        f"way {_WORDS}",
+        f"distance {_WORDS}",
         columns=_exposure,
         formula=lambda way_m: float(np.sum(way_m)),
         over=("way_m",),

@@ -29,7 +29,7 @@ def _columns(drive: EvaluatedDrive) -> Iterator[Columns]:
 class YawModel:
     """The inputs of the yaw model that do not depend on the estimate, for signals [N].
 
-    The steering, its delay, the gyro's bias and the tyres are those of the calibrated ``vehicle``.
+    Steering, its delay, gyro bias and tyres are from the calibrated ``vehicle``.
     """
 
     def __init__(self, signals: Signals, vehicle: VehicleParameters, sensors: SensorErrors) -> None:
@@ -54,7 +54,7 @@ class YawModel:
 class _Tyres(NamedTuple):
     """Axle distances and radius of gyration over them, low-speed limit, relaxation, and the axles' formulas (Eq 2).
 
-    B, C and D / m in m/s² of a formula are those at friction 1; ``keeps`` : the stiffness does not depend on friction.
+    B, C and D / m in m/s² of a formula are for friction 1; ``keeps`` : the stiffness does not depend on friction.
     """
 
     front_m: float
@@ -89,10 +89,10 @@ def _force(slip, formula, keeps, friction):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _yaw_rates(inputs, tyres, out):  # type: ignore[no-untyped-def]
-    """Write the yaw rate [N] that the tyres cause at a given v_y, where all inputs are known.
+    """Write the yaw rate [N] that the tyres cause at a given v_y, where all inputs are finite.
 
     ``inputs`` [N] each: step before the sample, v_x, v_y, steering, friction and measured yaw rate, from which the
-    model starts. The yaw moment follows that of the tyres with their relaxation length.
+    model starts. The yaw moment follows the static moment of the tyres with their relaxation length.
     """
     dt, vx, vy, steer, friction, measured = inputs
     r, r_dot = math.nan, 0.0

@@ -1,9 +1,9 @@
-"""Prior of a car's calibration from drives with ground truth: the calibration's own fit, with their sideslip besides.
+"""Prior of a car's calibration: the calibration fit with ground-truth sideslip as an additional output.
 
-The sideslip of the model is a third channel beside yaw rate and a_y, without its mean over a few seconds: offsets of
-the ground truth are 0.2 to 0.3 degrees and differ between days, and the bank of the road, which the model lacks, would
-be taken for the tyres. Only the tyres are taught: biases, gains and delays of sensors are those of a drive, and the
-bank of a road enters them.
+The sideslip of the model is fitted together with yaw rate and a_y, after removal of its mean over a few seconds:
+offsets of the ground truth are 0.2 to 0.3 degrees and differ between days, and the road bank, which the model lacks,
+would be attributed to the tyres. Only tyre parameters are trained: biases, gains and delays of sensors belong to one
+drive and include the effect of the road bank.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
-#: What ground truth teaches.
+#: Parameters trained with ground truth.
 TYRES = (FRONT_STIFFNESS, REAR_STIFFNESS, PEAK, RELAXATION)
 #: Correlation of a parameter between two drives of a car, about the mean of its prior (docs/teaching.md).
 CORRELATION = 0.6
-#: Mean over so many seconds that does not count. On simulated roads with bank, a constant alone doubles the sideslip
-#: error of other drives.
+#: Window of the mean to remove, in s. If only a constant is removed, the bank of simulated roads doubles the sideslip
+#: error on other drives.
 SLOW_S = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TaughtDriving:
-    """Driving for a calibration; on its grid [N] v_y / v_x of the ground truth, NaN where unknown, and its weight."""
+    """Driving for a calibration, with v_y / v_x of the ground truth and weights on its grid [N]; NaN where unknown."""
 
     driving: Driving
     slopes: FloatArray
@@ -52,7 +52,7 @@ class TaughtDriving:
 
 
 class TaughtProblem(JointProblem):
-    """The joint fit with v_y / v_x of the ground truth besides."""
+    """Joint fit of yaw rate, a_y, and v_y / v_x of the ground truth."""
 
     def __init__(self, drives: Sequence[TaughtDriving], vehicle_file: VehicleParameters) -> None:
         super().__init__([d.driving for d in drives], vehicle_file)
@@ -72,10 +72,10 @@ class TaughtProblem(JointProblem):
 def taught_parameters(
     drives: Sequence[TaughtDriving], vehicle_file: VehicleParameters, support: float = 1.0
 ) -> tuple[TaughtParameter, ...]:
-    """Return the prior of a car's calibration from its drives, which were read with ``vehicle_file``.
+    """Return the prior of a car's calibration from drives that were read with ``vehicle_file``.
 
-    Of the correlation between drives the share ``support`` counts: the spread between drives is the least width of the
-    prior, so that the sensors of a later drive can overrule it.
+    ``support`` scales the correlation between drives. The prior is at least as wide as the spread between drives, so
+    that the sensors of a later drive can overrule it.
     """
     correlation = support * CORRELATION
     problem = TaughtProblem(drives, vehicle_file)
@@ -95,7 +95,7 @@ def taught_parameters(
 
 
 def taught_driving(driving: Driving, truth: StateTrack) -> TaughtDriving:
-    """Return driving with a ground truth of any stamps, unknown between stamps where it is and outside of stretches."""
+    """Interpolate ground truth to the grid of driving; NaN in gaps of the ground truth and outside of stretches."""
     start = int(driving.stamps_ns[0]) if len(driving.stamps_ns) else 0
     middle_ns = driving.stamps_ns - round(0.5 * STEP_S * 1e9)  # a cell has the mean of its samples
     seconds, grid = ((s - start).astype(np.float64) for s in (truth.stamps_ns, middle_ns))

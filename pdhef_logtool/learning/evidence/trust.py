@@ -1,8 +1,8 @@
-"""Rule that turns errors at several residual gains into the gain limit of a car (docs/method.md#gain). Pure functions.
+"""Gain limit of a car from errors at several residual gains (docs/method.md#gain). Pure functions.
 
-On a car that a network has never seen it may help or hurt. So a residual gain above 0 needs driving with ground truth
-that neither the network nor the vehicle file was fitted to; one above one half needs more than a mean: a paired
-bootstrap of blocks.
+A network may increase the errors on a new car. A residual gain above 0 therefore needs driving with ground truth
+that neither the network nor the vehicle file was fitted to, and a gain above 0.5 needs a significant result of a paired
+block bootstrap.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ import numpy as np
 
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
-#: Residual gains that are tried; the first is physics alone.
+#: Residual gains to evaluate; the first is physics alone.
 TRUSTS = (0.0, 0.25, 0.5, 0.75, 1.0)
-#: Largest cap on a mean gain alone (docs/method.md#gain).
+#: Largest gain limit without a significant result (docs/method.md#gain).
 UNCONFIRMED_CAP = 0.5
-#: Errors are correlated over seconds: a block is at least this long, a shorter drive is one block
+#: Minimum block length, as errors are correlated over seconds; a shorter drive is one block
 #: (docs/method.md#evaluation).
 BLOCK_S = 10.0
-#: Below so many blocks a percentile interval is too narrow to confirm anything.
+#: Minimum number of blocks; with fewer, a percentile interval is too narrow.
 MIN_BLOCKS = 8
-#: Seconds of scored driving with a lateral acceleration above this, without which nothing is decided.
+#: Lateral acceleration of excited driving, and its minimum duration for a decision.
 EXCITED_M_S2, MIN_EXCITED_S = 2.0, 20.0
-#: Gain 1 is "not worse" than a lower one if its RMSE is by no more than this share above it, with the same confidence.
+#: Largest relative increase of the RMSE over a lower gain that counts as "not worse".
 TOLERANCE = 0.05
 RESAMPLES = 4000
 LEVEL = 0.95
@@ -33,13 +33,13 @@ LEVEL = 0.95
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockErrors:
-    """Squared sideslip errors in blocks, paired: every stamp counts at all gains.
+    """Squared sideslip errors in blocks, paired: every stamp is used at all gains.
 
     Attributes
     ----------
     squares : [T, B], sums in rad², rows as in :data:`TRUSTS`. counts : [B], stamps.
-    scored_s, excited_s : seconds that were scored, and those of them above :data:`EXCITED_M_S2`.
-    lost : stamps at which a gain above 0 gave no estimate and gain 0 did.
+    scored_s, excited_s : scored seconds, and scored seconds above :data:`EXCITED_M_S2`.
+    lost : number of stamps with an estimate at gain 0 but not at a higher gain.
     """
 
     squares: FloatArray
@@ -60,11 +60,11 @@ class Bound:
 
 @dataclass(frozen=True, slots=True)
 class TrustDecision:
-    """The gain limit, why, and the figures behind it.
+    """The gain limit, its reason, and the figures for it.
 
     Attributes
     ----------
-    rmse_deg : by gain as in :data:`TRUSTS`. against_zero : squared error of each less that of gain 0.
+    rmse_deg : by gain as in :data:`TRUSTS`. against_zero : squared error minus the squared error of gain 0.
     """
 
     cap: float
@@ -83,9 +83,9 @@ def block_errors(
 
     Parameters
     ----------
-    errors : [T, N] in rad, NaN where not scored; where gain 0 has none the stamp does not count. A gain that gives no
-        estimate where gain 0 does is charged with the larger of gain 0's error and the sideslip itself: leaving hard
-        stamps out gains nothing.
+    errors : [T, N] in rad, NaN where not scored; only stamps with an estimate at gain 0 are used. For a stamp without
+        an estimate at another gain, its error is the larger of gain 0's error and the sideslip, so that missing
+        estimates at difficult stamps do not reduce the RMSE.
     truth_sideslip : [N] in rad. stamps_ns : int64 [N]. excited : [N].
     """
     scored = np.isfinite(errors[0])
@@ -111,7 +111,7 @@ def block_errors(
 
 
 def join_blocks(drives: list[BlockErrors]) -> BlockErrors:
-    """Return the blocks of several drives together."""
+    """Concatenate the blocks of several drives."""
     return BlockErrors(
         squares=np.concatenate([d.squares for d in drives], axis=1),
         counts=np.concatenate([d.counts for d in drives]),
@@ -122,12 +122,12 @@ def join_blocks(drives: list[BlockErrors]) -> BlockErrors:
 
 
 def decide_cap(errors: BlockErrors, *, seed: int = 0) -> TrustDecision:
-    """Return the cap that the errors allow.
+    """Return the gain limit that the errors support.
 
     - Too little excited driving: 0.
-    - The largest gain for which the 95 % bounds of a paired block bootstrap confirm that its squared error is below
-      that at gain 0, and that it is no more than :data:`TOLERANCE` of the RMSE above that of the best lower gain.
-    - Else the largest gain up to :data:`UNCONFIRMED_CAP` whose squared error is below that at gain 0.
+    - The largest gain with a squared error significantly lower than at gain 0 and an RMSE at most :data:`TOLERANCE`
+      above the best lower gain's, both by the 95 % bounds of a paired block bootstrap.
+    - Else the largest gain up to :data:`UNCONFIRMED_CAP` with a lower squared error than gain 0.
     - Else 0.
     """
     squares, counts = errors.squares * math.degrees(1.0) ** 2, errors.counts
@@ -167,7 +167,7 @@ def decide_cap(errors: BlockErrors, *, seed: int = 0) -> TrustDecision:
 def _rule(
     errors: BlockErrors, mean: FloatArray, gain: Bound, confirmed: float, best: float, blocks: int
 ) -> tuple[float, str]:
-    """Return cap and reason; bounds that are NaN confirm nothing. ``gain`` is that of gain 1."""
+    """Return gain limit and reason; NaN bounds count as not significant. ``gain`` is the bound of gain 1."""
     if not errors.excited_s >= MIN_EXCITED_S:
         return 0.0, (
             f"too little to decide on: {errors.excited_s:.1f} s above {EXCITED_M_S2:g} m/s², at least "

@@ -1,7 +1,7 @@
-"""``pdhef train --baselines``: pure LSTM and linear regression, on the dataset that the residual network is trained on.
+"""``pdhef train --baselines``: pure LSTM and linear regression on the dataset of the residual network.
 
-Same drives, same split, same rows, same recipe: what differs is what is identified. The regression is ordinary least
-squares of the true sideslip on low-passed features (see :mod:`pdhef_logtool.residual_model.linear_model`).
+Drives, split, rows and recipe are the same; only the target differs. The regression is ordinary least squares of the
+true sideslip on low-passed features (see :mod:`pdhef_logtool.residual_model.linear_model`).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.outputs import OutputFolder
 
 LOW_PASS_HZ = 2.0
-#: A feature that varies by less than this share of its size is a constant, which the intercept already is.
+#: Relative variation below which a feature is constant, and thus redundant beside the intercept.
 CONSTANT_SHARE = 1e-5
 
 
@@ -46,7 +46,7 @@ CONSTANT_SHARE = 1e-5
 class SideslipSequence:
     """One gap-free run: features [N, f], the step that ends at each row [N] (NaN at the first), true sideslip [N].
 
-    The sideslip is NaN on rows that are no part of the fit.
+    The sideslip is NaN on rows that are excluded from the fit.
     """
 
     features: FloatArray
@@ -56,7 +56,7 @@ class SideslipSequence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BaselinesResult:
-    """What the command trained and wrote; the regression's errors are in its provenance."""
+    """Result of the command; the regression's errors are in its provenance."""
 
     pure_lstm: TrainResult
     regression_file: Path
@@ -89,7 +89,7 @@ def run_baselines(
     Raises
     ------
     UsageError
-        The device is not there, or the number of epochs is none.
+        The device does not exist, or the number of epochs is not positive.
     ModelError
         The dataset has no usable drives, or another training's checkpoint is in the way.
     """
@@ -178,7 +178,7 @@ def _rmse_deg(model: LinearModel, sequences: Sequence[SideslipSequence]) -> floa
 
 
 def _sequences(data: Dataset, split: str) -> Iterable[SideslipSequence]:
-    """Yield the runs of a split; rows count where the network's do and ground truth is above the low-speed blend."""
+    """Yield the runs of a split, with the network's rows where ground truth is above the low-speed blend."""
     for drive in data.drives:
         if drive.split != split:
             continue

@@ -1,8 +1,8 @@
-"""Which driving a dataset contains, in cells of speed x |a_y| x friction, and a choice of at most so much of each.
+"""Cells of speed x |a_y| x friction in a dataset, and a selection with limited driving time per cell.
 
-A row lies in the cell of its own features. What is chosen of a cell is drawn by seconds: each second of a drive draws a
-number by the hash of its log, the seed and itself, and the smallest ones are taken. So the choice depends on no order,
-and a set that grows gives up what it had chosen only for what draws less.
+A row belongs to the cell of its features. Each second of a drive has a pseudo-random number from the hash of log, seed
+and second; in each cell, the seconds with the smallest numbers are selected. The selection is therefore independent of
+the order of the drives, and an added drive replaces only seconds with larger numbers.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.results.condition import Condition, parse_condition
 
-#: Lower ends of the bins; the last of each has no upper end.
+#: Lower bin edges; the last bin of each has no upper edge.
 SPEED_M_S, AY_M_S2, FRICTION = (0.0, 10.0, 20.0, 30.0), (0.0, 2.0, 4.0, 6.0), (0.0, 0.35, 0.65)
 EDGES = {"speed_m_s": SPEED_M_S, "abs_ay_m_s2": AY_M_S2, "friction": FRICTION}
 COUNT = len(SPEED_M_S) * len(AY_M_S2) * len(FRICTION)
-#: Of rows without features.
+#: Cell number of rows without features.
 NO_CELL = -1
-#: Draws are multiples of this, which float32 contains exactly.
+#: Resolution of the random numbers, exact in float32.
 _STEP = 2.0**-24
 
 
-#: Columns of a condition of ``--where``; ground truth is never an input, but may select training data.
+#: Columns for conditions of ``--where``; ground truth is never an input, but may select training data.
 COLUMNS = (*FEATURES, "truth_vx_m_s", "truth_vy_m_s")
 
 
@@ -43,13 +43,13 @@ def condition_of(text: str) -> Condition:
 
 @dataclass(frozen=True, slots=True)
 class Picking:
-    """What states which rows of a drive are identified from: a condition (None: all), and the key of its draws."""
+    """Selection of the rows to train on: a condition (None: all rows), and the key of the random numbers."""
 
     condition: Condition | None = None
     key: str = ""
 
     def of(self, rows: ResidualRows) -> Picked:
-        """Return what is kept of rows beside them."""
+        """Return condition, cell and random number of the rows."""
         chosen = np.ones(len(rows), dtype=np.bool_)
         if self.condition is not None:
             columns = dict(zip(COLUMNS, [*rows.features.T, *rows.truth_velocity.T], strict=True))
@@ -62,7 +62,7 @@ EVERYTHING = Picking()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picked:
-    """Of each row whether the condition is true, its cell, and what its second drew; all [N]."""
+    """Condition, cell and random number of each row [N]."""
 
     chosen: BoolArray
     cell: NDArray[np.int16]
@@ -71,19 +71,19 @@ class Picked:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One cell: lower ends of its speed, |a_y| and friction; their upper ends, infinite for the last."""
+    """One cell: lower edges of speed, |a_y| and friction, and their upper edges, infinite for the last bin."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
     @property
     def in_reach(self) -> bool:
-        """Whether its grip allows its lateral acceleration at all."""
+        """Whether the friction allows its lateral acceleration."""
         return self.low[1] < self.high[2] * GRAVITY_M_S2
 
 
 def cells() -> list[Cell]:
-    """Return all cells in the order of their numbers: speed changes first, friction last."""
+    """Return all cells in numerical order: speed changes first, friction last."""
     bins = [list(zip(edges, (*edges[1:], math.inf), strict=True)) for edges in EDGES.values()]
     speed, ay, friction = bins
     return [
@@ -92,7 +92,7 @@ def cells() -> list[Cell]:
 
 
 def cell_of(features: FloatArray) -> NDArray[np.int16]:
-    """Return the cell of each row of features [N, 15]; :data:`NO_CELL` where they are not known."""
+    """Return the cell of each row of features [N, 15]; :data:`NO_CELL` for unknown features."""
     speed, ay, friction = (features[:, FEATURES.index(n)] for n in ("vx_m_s", "ay_m_s2", "friction"))
     is_finite = np.isfinite(speed) & np.isfinite(ay) & np.isfinite(friction)
     number = np.zeros(len(features), dtype=np.int16)
@@ -102,25 +102,25 @@ def cell_of(features: FloatArray) -> NDArray[np.int16]:
 
 
 def draw_of(stamps_ns: IntArray, key: str) -> NDArray[np.float32]:
-    """Return what the second of each stamp draws, in [0, 1)."""
+    """Return the pseudo-random number in [0, 1) of the second of each stamp."""
     seconds, inverse = np.unique(stamps_ns // 1_000_000_000, return_inverse=True)
     drawn = [int.from_bytes(hashlib.sha256(f"{key}:{s}".encode()).digest()[:3], "big") * _STEP for s in seconds]
     return np.array(drawn, dtype=np.float32)[inverse]
 
 
 def rows_by_cell(cell: NDArray[np.int16], used: BoolArray) -> IntArray:
-    """Return how many rows that are used lie in each cell."""
+    """Return the number of used rows in each cell."""
     return np.bincount(cell[used & (cell >= 0)], minlength=COUNT).astype(np.int64)
 
 
 def draw_limits(
     drives: Iterable[tuple[NDArray[np.int16], NDArray[np.float32], float]], per_cell_s: float
 ) -> list[float]:
-    """Return for each cell the draw below which its seconds are chosen, so that they last ``per_cell_s`` at most.
+    """Return for each cell the largest random number to select, so that the selection lasts at most ``per_cell_s``.
 
     Parameters
     ----------
-    drives : cell and draw of the usable rows of each drive, and its period in seconds; in any order.
+    drives : cell and random number of the usable rows of each drive, and its period in seconds; in any order.
     """
     draws = [np.empty(0, dtype=np.float32) for _ in range(COUNT)]
     lasts = [np.empty(0) for _ in range(COUNT)]
@@ -140,13 +140,13 @@ def draw_limits(
 
 
 def is_chosen(cell: NDArray[np.int16], draw: NDArray[np.float32], limits: Sequence[float]) -> BoolArray:
-    """Return which rows are chosen by the limits of their cells."""
+    """Return the rows below the limits of their cells."""
     chosen: BoolArray = (cell >= 0) & (draw < np.asarray(limits, dtype=np.float32)[cell])
     return chosen
 
 
 def table_of(seconds: Mapping[str, Sequence[float]]) -> dict[str, Any]:
-    """Return the part of the manifest that shows of cells: edges, and the seconds of each cell by split."""
+    """Return the entry of the manifest for cells: edges, and the seconds of each cell by split."""
     return {
         "edges": {name: list(edges) for name, edges in EDGES.items()},
         "order": "speed changes first, friction last",

@@ -1,12 +1,11 @@
-"""A residual dataset on disk: one Parquet file a drive, and manifest.json that makes them one dataset.
+"""A residual dataset on disk: one Parquet file per drive, and manifest.json.
 
 See docs/formats.md#residual-dataset.
 
 Files are in ``split=SPLIT/car=CAR/part-DRIVE.parquet``: ``polars.scan_parquet`` and others read them as one table.
-Features, targets and weights are stored as float32: a relative error of 6e-8, which no network sees. Each file carries
-its own entry of the manifest in its footer, so that what an interrupted command had finished can be kept. Files in the
-folder that the manifest does not name are no part of the dataset. Calls add up: the manifest keeps what earlier ones
-wrote, and what is extracted again takes its place, by log and slice.
+Features, targets and weights are stored as float32, with a relative error of 6e-8. The footer of each file contains its
+entry of the manifest, so that the files of an interrupted command remain usable. Files that the manifest does not name
+do not belong to the dataset. A later call extends the manifest and replaces entries with the same log and slice.
 """
 
 from __future__ import annotations
@@ -41,16 +40,16 @@ from pdhef_logtool.storage.documents import DIGEST, digest, is_sealed, read_seal
 FORMAT = "pdhef.residual-dataset"
 FORMAT_VERSION = 6
 MANIFEST = "manifest.json"
-#: Of more vehicles a bundle names the number.
+#: Maximum number of vehicles that a bundle names; beyond, it contains their number.
 NAMED_VEHICLES = 4
-#: All files of a dataset that may be drives, by a pattern of its folder.
+#: Glob pattern of the drives' files in a dataset.
 FILES = "split=*/car=*/part-*.parquet"
 TARGETS = (("target_dvy_m_s", "m/s"), ("target_dyaw_rate_rad_s", "rad/s"))
 TRUTH = ("truth_vx_m_s", "truth_vy_m_s")
 SPLITS = ("train", "validation", "test")
-#: The split that --per-cell chooses from: the others stay as the fleet drives.
+#: Split that --per-cell selects from; the others keep the distribution of the fleet.
 CHOSEN_SPLIT = "train"
-#: Rows of a row group: what waits stays below 2 MB.
+#: Rows of a row group, which takes less than 2 MB.
 ROWS_A_GROUP = 32768
 
 _ENTRY = b"pdhef.drive"
@@ -70,9 +69,10 @@ def write_drive(
     truth_source: str = "",
     rows_a_group: int = ROWS_A_GROUP,
 ) -> None:
-    """Write the Parquet file of one drive with the drive's entry.
+    """Write the Parquet file of one drive, with the drive's entry.
 
-    ``picked`` states which rows are identified from, ``truth_source`` what gave their true sideslip.
+    ``picked`` has the condition, cell and random number of each row; ``truth_source`` is the source of the true
+    sideslip.
 
     Raises
     ------
@@ -98,9 +98,9 @@ def _table(rows: ResidualRows, picked: Picked, truth_source: str, schema: pa.Sch
 
 
 def read_entry(path: Path) -> dict[str, Any] | None:
-    """Return the manifest's entry that a drive's file carries.
+    """Return the manifest's entry in a drive's file.
 
-    Returns None if there is no such file, or if it is not as it was written: all of it is read, by its checksums.
+    Return None if the file is missing or damaged: all of it is read to verify its checksums.
     """
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
@@ -121,13 +121,13 @@ def read_entry(path: Path) -> dict[str, Any] | None:
 
 
 def drive_file(folder: Path, entry: Mapping[str, Any]) -> Path:
-    """Return where a drive is in a dataset, by its entry: split, car and the name of its log and slice."""
+    """Return the path of a drive in a dataset, by the split, car, log and slice of its entry."""
     car = car_folder(entry["car"], entry["vehicle_sha256"])
     return folder / split_folder(entry["split"]) / car / f"part-{entry['name']}.parquet"
 
 
 def split_folder(split: str) -> str:
-    """Return the name of the folder of a split; readers of such folders take back the quoting."""
+    """Return the folder name of a split, quoted; readers of partitioned datasets unquote it."""
     return f"split={quote(split, safe='')}"
 
 
@@ -141,20 +141,20 @@ def write_manifest(
     vehicles: Mapping[str, Mapping[str, Any]],
     duplicates: Sequence[Mapping[str, str]] = (),
 ) -> dict[str, Any]:
-    """Write manifest.json over the drives' files that are there, and return it.
+    """Write manifest.json for the given drives, and return it.
 
     Parameters
     ----------
-    entries : one a drive, as in its file or an earlier manifest.
-    failed : log, file and reason of the logs that gave none.
-    duplicates : log, file and the name of the drive that contains the same, of the logs that were left out for it.
-    settings, seed : of the call that wrote last; with ``per_cell_s`` so much of each cell is chosen of split train.
-    vehicles : by the digest of their physics; those that no drive names are left out.
+    entries : one per drive, from its file or an earlier manifest.
+    failed : log, file and reason of the logs without a drive.
+    duplicates : log, file and name of the equal drive, for the logs that were excluded as duplicates.
+    settings, seed : of the latest call; ``per_cell_s`` limits the selected seconds of each cell of split train.
+    vehicles : by the digest of their physics; unused vehicles are omitted.
 
     Raises
     ------
     OutputError
-        It cannot be written, or a drive's file is missing or not the one that the earlier manifest named.
+        It cannot be written, or a drive's file is missing or differs from the earlier manifest.
     """
     drives = []
     for entry in sorted(entries, key=lambda e: str(e["name"])):
@@ -215,18 +215,18 @@ def _limits(folder: Path, drives: Sequence[Mapping[str, Any]], per_cell_s: float
 
 
 def remove_unnamed(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Remove the files of drives that the manifest does not name: they would be read with the others."""
+    """Remove drive files that the manifest does not name, as readers of the folder would include them."""
     named = {d["file"] for d in manifest["drives"]}
     for path in sorted(folder.glob(FILES)):
         if path.relative_to(folder).as_posix() not in named:
             path.unlink()
             for parent in (path.parent, path.parent.parent):
-                with suppress(OSError):  # it contains others
+                with suppress(OSError):  # not empty
                     parent.rmdir()
 
 
 def vehicle_entry(sha256: str, vehicle: VehicleParameters) -> dict[str, Any]:
-    """Return what the manifest states of a vehicle."""
+    """Return the manifest's entry for a vehicle."""
     return {"name": vehicle.name, "sha256": sha256, "parameters": vehicle.model_dump(mode="json")}
 
 
@@ -255,16 +255,17 @@ def _check_content(path: Path, named: str, actual: str) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveArrays:
-    """One drive for training, in time order; rows on which the parallel filter has no state are left out.
+    """One drive for training, in time order, without rows at which the parallel filter has no state.
 
     Attributes
     ----------
     stamps_ns : int64 [N]. features : float32 [N, 15], finite.
     targets : float32 [N, 2], increments to the next stamp in m/s and rad/s; 0 where ``weight`` is 0.
-    step_s : float64 [N], time that a target covers: target / step is the residual rate; the period at the last row.
-    weight : float32 [N]. segment : int64 [N]; recurrent state starts again where it changes.
+    step_s : float64 [N], duration of a target's increment: target / step is the residual rate; the period at the last
+        row.
+    weight : float32 [N]. segment : int64 [N]; the recurrent state is reset where it changes.
     truth_velocity : float32 [N, 2], true v_x and v_y; NaN where unknown.
-    chosen : bool [N], which rows are identified from where the weight allows it; None: all.
+    chosen : bool [N], rows selected for training, in addition to a weight above 0; None: all.
     """
 
     stamps_ns: IntArray
@@ -279,9 +280,9 @@ class DriveArrays:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DatasetDrive:
-    """One drive of a dataset, whose arrays are read each time that they are asked for: a set may not fit the memory.
+    """One drive of a dataset. Its arrays are read on every access, as a dataset may exceed the memory.
 
-    ``entry`` is what the manifest states of it; ``limits`` are those of the cells, None: all is chosen.
+    ``entry`` is its entry in the manifest; ``limits`` are the limits of the cells, None for no limits.
     """
 
     name: str
@@ -297,7 +298,7 @@ class DatasetDrive:
         Raises
         ------
         OutputError
-            The file is missing, or not the one that the manifest names.
+            The file is missing or differs from the manifest.
         """
         _check_content(self.path, self.entry["file_sha256"], _sha256(self.path))
         table = pq.read_table(self.path, partitioning=None)
@@ -327,10 +328,9 @@ class DatasetDrive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dataset:
-    """A residual dataset: what its manifest states, and its drives, each read on first access.
+    """A residual dataset with its manifest and drives.
 
-    ``sha256`` identifies the content; ``model`` is the filter that features come from and residuals are of
-    (:data:`~.bundle.MODELS`).
+    ``sha256`` identifies the content; ``model`` is the filter of features and residuals (:data:`~.bundle.MODELS`).
     """
 
     folder: Path
@@ -341,18 +341,18 @@ class Dataset:
 
     @property
     def physics_sha256(self) -> str:
-        """Digest of the physics that residuals were taken against: that of the vehicle, or of all of them."""
+        """Digest of the physics behind the residuals; of several vehicles, the digest of their digests."""
         hashes = [str(v["sha256"]) for v in self.manifest["vehicles"]]
         return hashes[0] if len(hashes) == 1 else digest(hashes)
 
     @property
     def vehicle_name(self) -> str:
-        """Names of the vehicles whose models the residuals were taken against."""
+        """Names of the vehicles behind the residuals."""
         names = sorted({str(v["name"]) for v in self.manifest["vehicles"]})
         return ", ".join(names) if len(names) <= NAMED_VEHICLES else f"{len(names)} vehicles"
 
     def vehicle(self, drive: DatasetDrive) -> VehicleParameters:
-        """Return the vehicle whose model a drive's residuals were taken against."""
+        """Return the vehicle behind the residuals of a drive."""
         wanted = drive.entry["vehicle_sha256"]
         parameters = next((v["parameters"] for v in self.manifest["vehicles"] if v["sha256"] == wanted), None)
         where, expected = str(self.folder / MANIFEST), "the parameters of a vehicle"
@@ -396,12 +396,12 @@ def read_dataset(folder: Path) -> Dataset:
             ),
             manifest=document,
         )
-    except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:  # without a digest
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:  # format without a digest
         raise OutputError(
             expected=_EXPECTED, got=str(error) or type(error).__name__, where=str(folder), remedy=_REMEDY
         ) from None
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Return a dataset's manifest; raises OutputError where there is none or it is not as it was written."""
+    """Return a dataset's manifest; raises OutputError if it is missing or damaged."""
     return read_sealed(folder / MANIFEST, _EXPECTED, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)

@@ -1,4 +1,4 @@
-"""``pdhef extract`` from logs to a residual dataset: read, take residuals, split by drive, write."""
+"""``pdhef extract``: read logs, compute residuals, split by drive, and write a residual dataset."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ from pdhef_logtool.storage.files import writing
 from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path
 from pdhef_logtool.workers.supervisor import supervise
 
-#: Upper ends of the shares of train and validation in [0, 1); the rest is test.
+#: Upper bounds of train and validation in [0, 1); the rest is test.
 SPLIT_ENDS = (0.70, 0.85)
 MAX_SMOOTHING_HALF_S = 1.0
 
@@ -89,18 +89,18 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True, slots=True)
 class ExtractSettings:
-    """What decides the content of a dataset, beside the logs.
+    """Settings that determine, together with the logs, the content of a dataset.
 
     Attributes
     ----------
-    config : vehicle, mapping, slice, sensors, friction, which ground truth; the other entries are not used.
-    truth_smoothing : ``auto`` (per drive from the noise of ground truth), ``none``, or a half window in seconds.
-    split : for all drives; None = what a set's manifest states of a drive, else 70/15/15 by a hash of its content.
-    seed : of that hash, and of the variation.
-    vary : spread by which friction and vehicle are made wrong for a part of the drives (``variation.vary``).
-    model : whose residuals, one of :data:`~.bundle.MODELS`.
-    where : condition on the columns of a row (``cells.COLUMNS``); rows without it are not learned from.
-    per_cell_s : at most so many seconds of each cell of driving are chosen of split train; None = all.
+    config : vehicle, mapping, slice, sensors, friction, truth channel; the other entries are not used.
+    truth_smoothing : ``auto`` (per drive, by the noise of ground truth), ``none``, or a half window in seconds.
+    split : split of all drives; None = the split in a set's manifest, else 70/15/15 by a hash of the content.
+    seed : seed of that hash, and of the variation.
+    vary : spread of the errors of friction and vehicle in a part of the drives (``variation.vary``).
+    model : filter of the residuals, one of :data:`~.bundle.MODELS`.
+    where : condition on the columns of a row (``cells.COLUMNS``) for its use in training.
+    per_cell_s : maximum number of seconds per cell of driving in split train; None = all.
     """
 
     config: RunConfig
@@ -113,15 +113,15 @@ class ExtractSettings:
     per_cell_s: float | None = None
 
     def name_of(self, log: str) -> str:
-        """Return what the slice of a log is called in the dataset."""
+        """Return the name of a log's slice in the dataset."""
         start, end = self.config.start, self.config.end
         if start is None and end is None:
             return log
-        # Times of day have colons, which no file name has everywhere.
+        # Times of day contain colons, which some file systems reject in file names.
         return f"{log}.{start or 0}-{'' if end is None else end}".replace(":", "")
 
     def smoothing_half_s(self) -> float | None:
-        """Return the half window that was asked for, 0 for none, None for ``auto``; raises UsageError."""
+        """Return the requested half window, 0 for none, None for ``auto``; raises UsageError."""
         if self.truth_smoothing == "auto":
             return None
         if self.truth_smoothing == "none":
@@ -156,9 +156,9 @@ class ExtractSettings:
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """What came of one log: its entry in the manifest, None if it is left out. ``kept``: from an earlier command.
+    """Result of one log: its entry in the manifest, None if excluded. ``kept``: written by an earlier command.
 
-    ``copy_of``: the drive in the dataset whose signals it contains too, empty without.
+    ``copy_of``: name of a drive in the dataset with equal signals, empty without one.
     """
 
     record: DriveRecord
@@ -169,7 +169,7 @@ class DriveResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExtractResult:
-    """What the command wrote: the manifest's document, and one result a log."""
+    """Result of the command: the manifest, and one result per log."""
 
     output: Path
     manifest: dict[str, Any]
@@ -177,12 +177,12 @@ class ExtractResult:
 
     @property
     def records(self) -> tuple[DriveRecord, ...]:
-        """Of all logs."""
+        """Records of all logs."""
         return tuple(r.record for r in self.results)
 
     @property
     def exit_code(self) -> int:
-        """0 if all is well, 3 if input was lost or some logs gave nothing, 1 if all gave nothing."""
+        """0 for success, 3 if input was lost or some logs gave no drive, 1 if no log gave one."""
         return exit_code(self.records)
 
     def to_dict(self) -> dict[str, Any]:
@@ -198,7 +198,7 @@ class ExtractResult:
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """Everything that a process needs to extract one drive."""
+    """Input of a process for the extraction of one drive."""
 
     log_input: LogInput
     output: Path
@@ -210,17 +210,17 @@ class _Job:
 
     @property
     def name(self) -> str:
-        """What the drive is called in the dataset."""
+        """Name of the drive in the dataset."""
         return self.settings.name_of(self.log_input.stem)
 
     def target(self, split: str) -> Path:
-        """Where the drive is in the dataset."""
+        """Return the path of the drive in the dataset."""
         sha, vehicle = self.physics
         return drive_file(self.output, {"name": self.name, "split": split, "car": vehicle.name, "vehicle_sha256": sha})
 
     @property
     def physics(self) -> tuple[str, VehicleParameters]:
-        """The vehicle whose model residuals are of, and its digest."""
+        """Digest and parameters of the vehicle behind the residuals."""
         car = self.car
         vehicle = car.physics_vehicle if self.settings.model == PHYSICS_MODEL else car.vehicle
         return physics_sha256(vehicle), vehicle
@@ -241,13 +241,13 @@ def extract(
 
     Parameters
     ----------
-    arguments : logs, folders, glob patterns. jobs : processes at work; changes nothing that is written.
-    resume : keep drives whose log and settings are as they were.
+    arguments : logs, folders, glob patterns. jobs : number of processes; the output does not depend on it.
+    resume : keep drives with unchanged log and settings.
 
     Raises
     ------
     UsageError, VehicleError, MappingError
-        What applies to all logs is wrong.
+        An error that concerns all logs.
     PdhefError
         The only log cannot be used.
     """
@@ -266,7 +266,7 @@ def extract(
     write = partial(_write, output, settings, kept, vehicles)
     folders = {split_folder(s) for s in (*SPLITS, settings.split, *(job.listed_split for job in work)) if s}
     with OutputFolder(output, sorted(folders)):
-        # Until the new manifest is, what the old one states of the files that change is no longer true.
+        # Until the new manifest is written, the old one must not name files that may change.
         if kept:
             write([])
         else:
@@ -281,7 +281,7 @@ def extract(
             remove_unnamed(output, manifest)
     empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
     if empty and manifest["drives"] and settings.split is None:
-        reporter.warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
+        reporter.warn(f"no drive is in {' and '.join(empty)}: with few drives choose with --split, or another --seed")
     return ExtractResult(output, manifest, results)
 
 
@@ -312,7 +312,7 @@ def _write(
 
 
 def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveResult, ...]:
-    """Leave out all but the first by name of drives with equal signals: it would count twice, or test itself."""
+    """Exclude drives with equal signals, except the first by name: they could be both in training and in test."""
     first: dict[str, str] = {}
     for entry in sorted((r.entry for r in results if r.entry is not None), key=lambda e: str(e["name"])):
         first.setdefault(str(entry["signals_sha256"]), entry["name"])
@@ -331,7 +331,7 @@ def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveRe
 
 
 def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
-    """Raise UsageError where two drives are slices of the same log that overlap: one may train what the other tests."""
+    """Raise UsageError if overlapping slices of one log are in different splits: training data would be in the test."""
     by_source: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for entry in entries:
         by_source.setdefault((entry["log"], entry["source"]["sha256"]), []).append(entry)
@@ -357,12 +357,12 @@ def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[D
 
 
 def _earlier(output: Path, settings: ExtractSettings) -> dict[str, Any]:
-    """Return the manifest of the dataset that this call adds to; nothing for a new one.
+    """Return the manifest of the dataset to extend; empty for a new dataset.
 
     Raises
     ------
     UsageError
-        The folder contains another manifest, or a dataset that this one cannot add to.
+        The folder contains another manifest, or an incompatible dataset.
     """
     path = output / MANIFEST
     remedy = "choose another folder with -o"
@@ -374,7 +374,7 @@ def _earlier(output: Path, settings: ExtractSettings) -> dict[str, Any]:
     except OutputError as error:
         got = f"a folder with another {MANIFEST}: {error.got}"
     if got:
-        expected = "a new folder, or that of a residual dataset"
+        expected = "a new folder, or the folder of a residual dataset"
         raise UsageError(expected=expected, got=got, where=str(output), remedy=remedy)
     wanted = (FORMAT_VERSION, settings.model)
     if (format_of_file := (document.get("version"), document.get("model"))) != wanted:
@@ -419,7 +419,7 @@ def _plan_jobs(
         car = cars(settings.config.car or entry.vehicle)
         yield _Job(log_input, output, settings, car, mapping, entry.split, resume)
     if settings.config.car is None and any(entry.vehicle is None for entry in listed):
-        warn(f"no --car: residuals are those of the default {cars(None).vehicle.name}")
+        warn(f"no --car: residuals refer to the default {cars(None).vehicle.name}")
 
 
 def _car(path: Path | None) -> Car:
@@ -427,7 +427,7 @@ def _car(path: Path | None) -> Car:
 
 
 def _run_jobs(work: Sequence[_Job], jobs: int, reporter: Reporter) -> Iterator[DriveResult]:
-    """Yield one result a job, in any order; a process that dies costs its own drive only."""
+    """Yield one result per job, in any order; a crashed process loses only its own drive."""
     if len(work) == 1:
         yield _extract(work[0], partial(reporter.progress, work[0].log_input.stem))
         return
@@ -453,8 +453,8 @@ def _extract_guarded(job: _Job, progress: Progress) -> DriveResult:
     except PdhefError as error:
         return _failure(job, str(error))
     except MemoryError:
-        raise  # it may have been another's: tried again, alone
-    except Exception as error:  # noqa: BLE001 (one bad log never stops the others, for any error)
+        raise  # another process may have caused it: repeated alone
+    except Exception as error:  # noqa: BLE001 (no error in one log may stop the others)
         return _failure(job, f"internal error, {type(error).__name__}: {error}")
 
 
@@ -518,7 +518,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Service:
-    """The car as a run has it on a drive; how it reads the signals; its calibration; the taught residual that acts."""
+    """Settings of a run on a drive: car, conversion of the signals, calibration, active residual model."""
 
     car: Car
     read: Callable[[Signals], Signals]
@@ -527,7 +527,7 @@ class _Service:
 
 
 def _in_service(drive: Drive, job: _Job) -> _Service:
-    """Return how a drive uses the car: one that was taught is calibrated on each drive."""
+    """Return the car settings of a run on this drive; a trained car is calibrated on each drive."""
     car, taught = job.car, job.car.taught
     if taught is None or job.settings.model != PHYSICS_MODEL:
         return _Service(car, lambda signals: signals, "", None)
@@ -542,7 +542,7 @@ def _in_service(drive: Drive, job: _Job) -> _Service:
 
 
 def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) -> DriveResult | None:
-    """Return the drive that an earlier command has written, None if its log or settings have changed."""
+    """Return the drive written by an earlier command; None if its log or settings have changed."""
     entry, name = read_entry(target), job.log_input.path.name
     if (
         entry is None
@@ -585,9 +585,9 @@ def _residuals(
 def choose_split(
     source_sha256: str, seed: int, *, chosen: str | None = None, listed: str | None = None
 ) -> tuple[str, str]:
-    """Return a drive's split and where it is from: option, a set's manifest, or a hash of content and seed.
+    """Return a drive's split and its source: option, a set's manifest, or a hash of content and seed.
 
-    The hash does not depend on other drives, on names or on order: copies of a drive never are on both sides.
+    The hash does not depend on other drives, names or order, so that copies of a drive are in the same split.
     """
     if chosen is not None:
         return chosen, "option"
@@ -605,7 +605,7 @@ class _Listed:
 
 
 def _listed(log: LogInput, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed:
-    """Return what the manifest of a simulated set beside a log states of it: its split and its vehicle file."""
+    """Return split and vehicle file of a log from the manifest of its simulated set."""
     entry = manifest.get(log.path.name, {})
     split, vehicle = entry.get("split"), entry.get("vehicle_file", entry.get("vehicle"))
     car = log.folder / vehicle if log.folder is not None and isinstance(vehicle, str) else None
@@ -616,7 +616,7 @@ def _listed(log: LogInput, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed
 
 
 def _strict_truth(plan: DrivePlan) -> DrivePlan:
-    """Bridge no ground truth gap: a line across a few lost samples is good enough to score on, not to differentiate."""
+    """Disable the interpolation of ground truth gaps: it is accurate enough for scoring, but not for derivatives."""
     if plan.truth is None:
         return plan
     gaps = {name: gap * GAP_PERIODS / TRUTH_GAP_PERIODS for name, gap in plan.truth.max_gap_s.items()}
@@ -651,7 +651,7 @@ class _Smoothing:
 
 
 def _choose_smoothing(plan: DrivePlan, settings: ExtractSettings) -> _Smoothing:
-    """Decide from the survey whether one-step differences of the ground truth are usable as they are."""
+    """Decide by the survey whether one-step differences of the ground truth need smoothing."""
     truth = derive_truth(plan.survey_truth, plan=plan.truth).track
     noise = (
         difference_noise(truth.stamps_ns, truth.vy_m_s),
@@ -662,7 +662,7 @@ def _choose_smoothing(plan: DrivePlan, settings: ExtractSettings) -> _Smoothing:
         return _Smoothing(asked, "as asked for", noise)
     said = f"one-step noise of the ground truth {noise[0]:.3g} m/s² and {noise[1]:.3g} rad/s²"
     limits = f"{NEGLIGIBLE_NOISE[0]:g} m/s² and {NEGLIGIBLE_NOISE[1]:g} rad/s²"
-    if all(n <= limit for n, limit in zip(noise, NEGLIGIBLE_NOISE, strict=True)):  # NaN is not
+    if all(n <= limit for n, limit in zip(noise, NEGLIGIBLE_NOISE, strict=True)):  # False for NaN
         return _Smoothing(0.0, f"{said}: within {limits}", noise)
     return _Smoothing(SMOOTHING_HALF_S, f"{said}: not within {limits}", noise)
 
@@ -687,7 +687,7 @@ def _pair(values: Sequence[float]) -> dict[str, float | None]:
 
 
 def _counts(rows: ResidualRows, picked: Picked, log_start_ns: int) -> dict[str, Any]:
-    """Return the span of the rows of a drive in seconds from the log's start, and their sums."""
+    """Return the span of a drive's rows in seconds from the log's start, and counts of rows."""
     use = rows.weight > 0.0
     first, last = int(rows.stamps_ns[0]), int(rows.stamps_ns[-1])
     squares = np.square(rows.targets[use] / rows.step_s[use, None])
@@ -706,7 +706,7 @@ def _counts(rows: ResidualRows, picked: Picked, log_start_ns: int) -> dict[str, 
 
 
 def _fingerprint(job: _Job, split: str) -> str:
-    """Return the hash of everything beside the log that decides a drive's file."""
+    """Return the hash of all inputs of a drive's file except the log."""
     mapping = job.settings.config.mapping
     document = {
         "format": FORMAT_VERSION,

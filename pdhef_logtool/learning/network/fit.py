@@ -1,12 +1,12 @@
 """Training of the residual network: stateful truncated back-propagation through time, resumable at every epoch.
 
-Sequences run in order through chunks of ``chunk_steps``; the LSTM state is carried from chunk to chunk and detached
-(docs/method.md#network). The loss is the weighted mean square of the normalised residual rates; a piece counts by the
-inverse of its own mean square, so that calm driving is not drowned by the limit. Every epoch is a pure function of the
-state before it, the seed and its number, so that an interrupted training goes on as if nothing had happened.
+Sequences are processed in chunks of ``chunk_steps``; the LSTM state is carried from chunk to chunk and detached
+(docs/method.md#network). The loss is the weighted mean square of the normalised residual rates. Each piece is weighted
+by the inverse of its mean square, so that driving at the limit does not dominate calm driving. Every epoch is a pure
+function of the previous state, the seed and the epoch number, so that a resumed training gives the same result.
 
-A set may be larger than the memory: sequences come one by one, and the pieces that they are cut into wait in a file on
-the disk of the output, from which a batch reads its own. What is held is one sequence and one batch.
+A dataset may exceed the memory: sequences are read one by one, and their pieces are stored in a temporary file, from
+which batches are read. Only one sequence and one batch are in memory at a time.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.files import write_bytes, writing
 
 # isort: split
-# Behind the network, which checks that PyTorch is installed.
+# After the network, which checks that PyTorch is installed.
 import torch
 
 CHECKPOINT = "checkpoint.safetensors"
 
 
-#: Longer sequences are cut into pieces for training; validation runs over them whole.
+#: Maximum length of a training piece; validation uses whole sequences.
 PIECE_STEPS = 1500
-#: Steps that validation runs at once, its state carried on: an hour at once would take a gigabyte.
+#: Maximum number of validation steps at once, with the state carried on; an hour at once would need a gigabyte.
 VALIDATION_STEPS = 60_000
 GRADIENT_CLIP = 1.0
-#: Mean square of normalised targets that is added before a piece is weighted by its inverse.
+#: Added to the mean square of a piece before its inverse becomes the weight.
 WEIGHT_FLOOR = 0.1
-#: What a recipe and the bundle made by it have in common.
+#: Common entries of a recipe and the bundle trained with it.
 _SHAPE = ("feature_names", "hidden", "layers", "head", "odd")
 
 
@@ -64,10 +64,10 @@ class FeatureSequence:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How to train. The defaults are the recipe of docs/method.md#network; :data:`PAPER_RECIPE` is the paper's Table 1.
+    """Training recipe. The defaults are the recipe of docs/method.md#network; :data:`PAPER_RECIPE` is Table 1's.
 
-    64 units a layer were as good as 96 after the same number of epochs (``docs/model_card.md``) in two thirds of the
-    time, in training and in service.
+    64 units per layer reach the accuracy of 96 after the same number of epochs (``docs/model_card.md``) in
+    two thirds of the time, in training and in operation.
     """
 
     feature_names: tuple[str, ...] = FEATURES
@@ -84,7 +84,7 @@ class Recipe:
     seed: int = 0
     period_s: float = 0.01
     target: str = RESIDUAL
-    odd: bool = True  # mirrored pieces are drawn as often, and the network is made exactly odd
+    odd: bool = True  # mirrored pieces are as frequent as originals, and the network is made exactly odd
 
 
 PAPER_RECIPE = Recipe(
@@ -116,10 +116,9 @@ Progress = Callable[[Epoch, int], None]
 def normalisation_of(
     sequences: Iterable[FeatureSequence], names: tuple[str, ...], *, odd: bool = False
 ) -> Normalisation:
-    """Return mean and standard deviation of features and targets over the training sequences, by weight.
+    """Return weighted mean and standard deviation of features and targets over the training sequences.
 
-    ``sequences`` are gone through twice. With ``odd`` features that change sign where left and right are mirrored are
-    taken to have a mean of 0.
+    ``sequences`` is iterated twice. With ``odd``, features that change sign under mirroring have a mean of 0.
     """
     columns = [FEATURES.index(n) for n in names]
     count, total, squares = 0, np.zeros(len(columns)), np.zeros(0)
@@ -146,7 +145,7 @@ def normalisation_of(
 
 
 def _summed(before: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return a sum [k] with rows [N, k] added one after the other: it does not matter how they come in sequences."""
+    """Add rows [N, k] one by one to a sum [k], so that rounding does not depend on the split into sequences."""
     total: FloatArray = np.add.reduce(np.ascontiguousarray(np.concatenate([before[None], rows])), axis=0)
     return total
 
@@ -165,14 +164,14 @@ def train(
 
     Parameters
     ----------
-    training, validation : gone through up to three times, one by one, before the first epoch.
-    work : folder of the checkpoint; one of an earlier, interrupted call with the same recipe and data is resumed.
-    init : bundle to start from (fine-tuning); it decides features, architecture and normalisation.
+    training, validation : iterated up to three times before the first epoch.
+    work : folder of the checkpoint; a checkpoint with the same recipe and data is resumed.
+    init : bundle to start from (fine-tuning), with its features, architecture and normalisation.
 
     Raises
     ------
     ModelError
-        There is nothing to train or to validate on, or a checkpoint of another recipe is in the way.
+        There are no sequences to train or validate on, or a checkpoint of another recipe exists.
     """
     for sequences, aim in ((training, "train"), (validation, "validate")):
         if next(iter(sequences), None) is None:
@@ -235,15 +234,15 @@ class _Piece:
 
 
 class PieceFile:
-    """Pieces in a file without a name, which is gone with the process; each is read when it is asked for.
+    """Pieces in an anonymous temporary file; each is read on access.
 
     Parameters
     ----------
-    folder : on whose disk it lies; made when it is missing.
+    folder : folder on the disk to use; created if missing.
 
     Attributes
     ----------
-    sequences, steps : that it was filled from. sha256 : of all that it contains.
+    sequences, steps : number of stored sequences and steps. sha256 : hash of the content.
 
     Raises
     ------
@@ -253,7 +252,7 @@ class PieceFile:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._places: list[tuple[int, int]] = []  # of each piece its place in the file and its steps
+        self._places: list[tuple[int, int]] = []  # offset in the file and number of steps of each piece
         self._shape = (0, 0)
         self._hash = hashlib.sha256()
         self.sequences = self.steps = 0
@@ -266,7 +265,7 @@ class PieceFile:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Let the file go."""
+        """Close and thereby delete the file."""
         self._file.close()
 
     @property
@@ -275,7 +274,7 @@ class PieceFile:
         return self._hash.hexdigest()
 
     def fill(self, sequences: Iterable[FeatureSequence], cut: Callable[[FeatureSequence], Iterable[_Piece]]) -> None:
-        """Take the pieces of sequences, one sequence at a time."""
+        """Store the pieces of sequences, one sequence at a time."""
         for s in sequences:
             self.sequences += 1
             self.steps += len(s.weight)
@@ -297,7 +296,7 @@ class PieceFile:
         return len(self._places)
 
     def __getitem__(self, number: int) -> _Piece:
-        """Read a piece; raises IndexError behind the last."""
+        """Read a piece; raises IndexError after the last."""
         offset, steps = self._places[number]
         k, m = self._shape
         self._file.seek(offset)
@@ -307,7 +306,7 @@ class PieceFile:
         return _Piece(features, target, values[steps * (k + m) :])
 
     def __iter__(self) -> Iterator[_Piece]:
-        """Read all of them, one by one."""
+        """Read all pieces, one by one."""
         return (self[number] for number in range(len(self)))
 
 
@@ -337,7 +336,7 @@ def _pieces(sequence: FeatureSequence, recipe: Recipe, n: Normalisation) -> Iter
 
 
 def _balanced(piece: _Piece) -> _Piece:
-    """Return a piece whose weights are over the mean square of its target."""
+    """Divide the weights of a piece by the mean square of its target."""
     square = (piece.target**2).mean(dim=1)
     mean = float((square * piece.weight).sum() / piece.weight.sum())
     return _Piece(piece.features, piece.target, piece.weight / (mean + WEIGHT_FLOOR))
@@ -361,8 +360,8 @@ def _train_epoch(
     epoch: int,
     device: str,
 ) -> tuple[float, float]:
-    """Go once through all pieces in an order that follows from the seed; return mean loss and last learning rate."""
-    # Everything random in an epoch follows from seed and number, or a resumed training would differ.
+    """Train once on all pieces in a seeded random order; return mean loss and last learning rate."""
+    # All randomness of an epoch depends on seed and epoch number only, so that a resumed training is identical.
     torch.manual_seed(recipe.seed * 1_000_003 + epoch)
     order = torch.randperm(len(pieces)).tolist()
     batches, signs = max(1, math.ceil(len(pieces) / recipe.batch)), _signs(recipe)
@@ -407,7 +406,7 @@ def _train_batch(
 
 
 def _validate(network: ResidualNetwork, pieces: Iterable[_Piece], device: str, signs: torch.Tensor | None) -> float:
-    """Return the loss as service has it; with ``signs`` the network is made odd."""
+    """Return the loss of the network in operation; with ``signs`` the network is made odd."""
     network.eval()
     total, weight = 0.0, 0.0
     with torch.inference_mode():
@@ -426,7 +425,7 @@ def _validate(network: ResidualNetwork, pieces: Iterable[_Piece], device: str, s
 
 
 def _learning_rate(recipe: Recipe, share: float) -> float:
-    """Return the rate at a share of the training: one cycle up in the first 30 % and down, or exponential decay."""
+    """Return the learning rate at a share of the training: one cycle with 30 % warm-up, or exponential decay."""
     if recipe.schedule == "exponential":
         return recipe.learning_rate * math.exp(-3.0 * share)
     if share < 0.3:
@@ -491,7 +490,7 @@ def _write_checkpoint(
         for key, value in state.items():
             tensors[f"optimiser.{i}.{key}"] = np.asarray(value.cpu().numpy()).copy()
     document = seal({"identity": identity, "history": [asdict(e) for e in history], "sha256": _sha256(tensors)})
-    # One file contains tensors and document, so that a kill between two writes cannot leave a pair that disagrees.
+    # Tensors and document are in one file, so that an interrupted write cannot leave an inconsistent pair.
     data = save(tensors, metadata={"document": json.dumps(document)})
     write_bytes(work / CHECKPOINT, data)
 

@@ -1,21 +1,21 @@
-"""What the model of ``physics`` misses, step by step, with ground truth (docs/method.md#residual, Eq 8-10, 18).
+"""Residuals of the model of ``physics`` per step, from ground truth (docs/method.md#residual, Eq 8-10, 18).
 
 From one stamp of the IMU to the next the residual is the increment
 
     Δx_net[k] = (x_true(t_k+1) − x_true(t_k)) − (step of the model from x_true(t_k) − x_true(t_k))
 
-with the model at the *true* v_x, v_y and r (at an estimated state the filter's own error would be identified), and the
-inputs of the same measurement times as the filter takes them. Ground truth lacks axle forces and roll: the model
-runs them along the true motion. Bank, biases and force scale are 0: at the filter's estimate of them, which
-changes while it learns, a residual would fit no other filter. The row of v_x is 0 by definition and not stored.
+with the model at the *true* v_x, v_y and r (an estimated state would add the filter's own error to the residual), and
+inputs of the measurement times that the filter uses. Ground truth lacks axle forces and roll; the model integrates them
+along the true motion. Bank, biases and force scale are 0: with the estimates of one filter, the residual would be
+specific to this filter. The row of v_x is 0 by definition and not stored.
 
 For the paper's network and the baselines the model is the nominal one, by the trapezoidal rule between two true states.
 
-Recorded ground truth is noisy, and differences over one step are mostly noise. Then the *residual* is smoothed, not the
-ground truth: increments are added up to a curve, a cubic is fitted by least squares to ± half a window about each step
-over the true stamps (Savitzky-Golay), and its increment over the step is the target. All of it is linear in the
-increments, so that what the nominal model explains, fast as it may be, is not damped; only the residual is, 1 % at 1 Hz
-and ± 0.2 s. No target where the window contains a gap.
+Recorded ground truth is noisy, and one-step differences are mostly noise. In this case the *residual* is smoothed, not
+the ground truth: increments are added up to a curve, a cubic is fitted by least squares to ± half a window about each
+step over the true stamps (Savitzky-Golay), and its increment over the step is the target. All steps are linear in the
+increments, so that fast motion explained by the nominal model is not attenuated; only the residual is, by 1 % at 1 Hz
+and ± 0.2 s. There is no target where the window contains a gap.
 """
 
 from __future__ import annotations
@@ -48,21 +48,21 @@ from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
-#: A step of more than this many periods is a gap: no increment is taken across it.
+#: Steps longer than this many periods are gaps without an increment.
 GAP_PERIODS = 1.5
-#: Beyond this the car slides backwards rather than drives, and a single-track residual means nothing.
+#: Beyond this the car slides backwards, and a single-track residual is meaningless.
 MAX_SIDESLIP_RAD = math.radians(45.0)
-#: Half window of the smoothing when ground truth is noisy: on simulated RTK drives the targets were closest to
-#: those of the perfect ground truth at 0.13 to 0.16 s (lane change, sweep).
+#: Half window of the smoothing for noisy ground truth: on simulated RTK drives, targets were closest to the targets
+#: from perfect ground truth at 0.13 to 0.16 s (lane change, sweep).
 SMOOTHING_HALF_S = 0.15
-#: Noise of ground truth in a one-step difference, of v̇_y in m/s² and ṙ in rad/s², up to which nothing is smoothed:
-#: well below what a training target varies by (0.2 and more).
+#: Noise of one-step differences of ground truth (v̇_y in m/s², ṙ in rad/s²) up to which no smoothing is needed: far
+#: below the variation of training targets (0.2 and more).
 NEGLIGIBLE_NOISE = (0.05, 0.05)
 
 _CHUNK = 16384
-#: Third differences of white noise have 20 times its variance.
+#: Variance of third differences of white noise, as a multiple of its variance.
 _THIRD_DIFFERENCE_GAIN = 20.0
-#: The 80 % point of |N(0, 1)|: robust against manoeuvres, and not blind to values that repeat from sample to sample.
+#: The 80 % point of |N(0, 1)|: robust against manoeuvres, and valid for signals with repeated values.
 _NOISE_QUANTILE, _NOISE_POINT = 0.8, 1.2815515655446004
 
 
@@ -75,10 +75,10 @@ class ResidualRows:
     stamps_ns : int64 [N]. features : [N, 15] at the stamp, NaN where the parallel filter has no state.
     targets : [N, 2], increments of v_y in m/s and of r in rad/s from this stamp to the next; NaN where unknown.
     step_s : [N], time to the next stamp; NaN at the last row.
-    weight : [N], 0 unless target and features can be used and the next row carries on from this one; 1 with exact
-        ground truth, 1/2 where its sideslip is as uncertain as that of a single track (:func:`~..truth.weight_of`).
-    segment : int64 [N], a new number wherever the parallel filter starts again: sequences must not cross it.
-    truth_velocity : [N, 2], true v_x and v_y at the stamp, for networks that learn them; NaN where unknown.
+    weight : [N], 0 unless target and features are usable and the next row is in the same segment; 1 for exact ground
+        truth, 1/2 if the uncertainty of its sideslip equals the error of a single track (:func:`~..truth.weight_of`).
+    segment : int64 [N], changes wherever the parallel filter restarts: sequences must not cross it.
+    truth_velocity : [N, 2], true v_x and v_y at the stamp, as targets of other networks; NaN where unknown.
     truth_std_rad : [N], 1-sigma of the true sideslip. region : [N], gain of the region of validity of the car's taught
         residual; NaN without one.
     """
@@ -100,9 +100,9 @@ class ResidualRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelSteps:
-    """What a model is asked with: states of the parallel filter [N, n] and inputs [N, 5] of its steps.
+    """Model inputs: states of the parallel filter [N, n] and inputs [N, 5] of its steps.
 
-    The steering of ``inputs`` is NaN where it was not measured: the filter's guess of it must not become a residual.
+    The steering of ``inputs`` is NaN where it was not measured: a predicted steering angle must not affect a residual.
     """
 
     x: FloatArray
@@ -127,7 +127,7 @@ def residual_increments(
     *,
     max_step_s: float,
 ) -> FloatArray:
-    """Return what ground truth moves by and the nominal model does not, from each stamp to the next, [N − 1, 2].
+    """Return the motion of the ground truth minus the nominal model's between stamps, [N − 1, 2].
 
     Parameters
     ----------
@@ -136,8 +136,8 @@ def residual_increments(
 
     Returns
     -------
-    Increments of v_y in m/s and r in rad/s; NaN across gaps, where anything is missing, where the speed is below the
-    low-speed limit (the nominal model is then not the dynamic one), and where |β| > 45°.
+    Increments of v_y in m/s and r in rad/s; NaN across gaps, for missing values, for |β| > 45°, and below the low-speed
+    limit, where the nominal model is not dynamic.
     """
     n = int(stamps_ns.shape[0])
     if n < 2:
@@ -152,13 +152,13 @@ def residual_increments(
     return increments
 
 
-#: What the model's run along the ground truth keeps from step to step: whether it runs, forces, roll and roll rate.
+#: Number of entries carried along the ground truth between steps: a run flag, forces, roll and roll rate.
 _RUN = 5
 
 
 @njit(cache=True)
 def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  # type: ignore[no-untyped-def]
-    """Write what the model moves v_y and r by [N − 1, 2] from each true state; NaN where that is not known."""
+    """Write the model's change of v_y and r [N − 1, 2] from each true state; NaN where that state is unknown."""
     layout, p, f = model
     points = np.zeros((states.shape[1], 2 * states.shape[1] + 1))
     for k in range(states.shape[0] - 1):
@@ -198,7 +198,7 @@ def physics_increments(
     *,
     max_step_s: float,
 ) -> FloatArray:
-    """Return what ground truth moves by and the model of ``physics`` does not, from each stamp to the next, [N − 1, 2].
+    """Return the motion of the ground truth minus the motion of the ``physics`` model between stamps, [N − 1, 2].
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def physics_increments(
 
     Returns
     -------
-    Increments of v_y in m/s and r in rad/s; NaN as of :func:`residual_increments`.
+    Increments of v_y in m/s and r in rad/s; NaN as in :func:`residual_increments`.
     """
     layout, p, f = physics.parameters
     good = _dynamic(state, p) & np.isfinite(model.x).all(axis=1) & np.isfinite(model.inputs).all(axis=1)
@@ -221,7 +221,7 @@ def physics_increments(
 
 
 def _dynamic(state: FloatArray, parameters: ModelParameters) -> BoolArray:
-    """Return where the true state [N, 3] is known, the model is the dynamic one, and the car drives forward."""
+    """Return a mask: true state [N, 3] finite, model in its dynamic range, and the car moves forward."""
     is_complete = np.isfinite(state).all(axis=1)
     forward = np.abs(np.arctan2(state[:, 1], state[:, 0])) <= MAX_SIDESLIP_RAD
     return np.asarray(is_complete & forward & (state[:, 0] >= parameters.blend_high_m_s), dtype=np.bool_)
@@ -230,8 +230,8 @@ def _dynamic(state: FloatArray, parameters: ModelParameters) -> BoolArray:
 def smooth_increments(stamps_ns: IntArray, increments: FloatArray, half_window: int) -> FloatArray:
     """Smooth increments [N − 1, c] between stamps [N] by local cubics; the same array for a half window of 0.
 
-    The curve of the added-up increments over 2 · half_window + 1 steps is fitted; the result is the fit's increment
-    over the middle step. NaN where the window contains NaN or the end of the data.
+    A cubic is fitted to the cumulative increments over 2 · half_window + 1 steps; the result is its increment over the
+    middle step. NaN if the window contains NaN or exceeds the data.
     """
     if half_window == 0:
         return increments
@@ -264,8 +264,8 @@ def smooth_increments(stamps_ns: IntArray, increments: FloatArray, half_window: 
 def difference_noise(stamps_ns: IntArray, values: FloatArray) -> float:
     """Return the 1-sigma of white noise in the derivative of ``values`` [N] by one-step differences; NaN if unknown.
 
-    From third differences, to which motion adds next to nothing at usual rates. Noise that an INS has filtered
-    over several samples is not seen.
+    Computed from third differences, which contain hardly any motion at usual rates. Noise that an INS has filtered
+    over several samples is not detected.
     """
     if stamps_ns.shape[0] < 8:
         return math.nan
@@ -295,9 +295,9 @@ def residual_rows(
     Parameters
     ----------
     signals, truth : at the same stamps [N], less biases of the vehicle file; targets need ground truth.
-    physics : the parallel filter as it shall run in service; its model is what the residual is of.
-    period_s : of the IMU. half_window : steps on each side that a target is smoothed over.
-    truth_std_m_s : 1-sigma of the true v_y where ground truth has none of its own. taught : the car's taught residual.
+    physics : the parallel filter with the settings of operation; residuals refer to its model.
+    period_s : of the IMU. half_window : steps on each side of the smoothing of targets.
+    truth_std_m_s : 1-sigma of the true v_y for ground truth without an uncertainty. taught : the car's taught residual.
     """
     count = len(signals)
     features, filtered, _ = run_features(physics, signals, None)
@@ -316,7 +316,7 @@ def residual_rows(
     targets[:-1] = smooth_increments(signals.stamps_ns, increments, half_window)
     step_s[:-1] = np.diff(signals.stamps_ns) * 1e-9
     usable = _complete(targets) & complete
-    # Where the next row starts again, in service nothing is carried over to it either.
+    # If the filter restarts at the next row, the network starts without a state in operation, too.
     usable[:-1] &= complete[1:] & (segment[1:] == segment[:-1])
     truth_std = _truth_std(truth, state, truth_std_m_s)
     return ResidualRows(
@@ -335,7 +335,7 @@ def residual_rows(
 def _increments(
     stamps_ns: IntArray, state: FloatArray, model: ModelSteps, physics: PhysicsFilter | PhysicsUkf, max_step_s: float
 ) -> FloatArray:
-    """Return what the parallel filter's model misses from each step to the next, [N − 1, 2]."""
+    """Return the residual of the parallel filter's model between stamps, [N − 1, 2]."""
     if isinstance(physics, PhysicsFilter):
         return physics_increments(stamps_ns, state, model, physics, max_step_s=max_step_s)
     parameters, inputs = model_parameters(physics.vehicle), model.inputs
@@ -349,7 +349,7 @@ def _complete(values: FloatArray) -> BoolArray:
 
 
 def _truth_std(truth: StateTrack | None, state: FloatArray, std_m_s: float) -> FloatArray:
-    """Return the 1-sigma of the true sideslip [N] in rad: that of the ground truth's track, else of its v_y."""
+    """Return the 1-sigma of the true sideslip [N] in rad, from the ground truth if finite, else from its v_y."""
     of_noise = std_m_s / np.maximum(np.abs(state[:, 0]), 1.0)
     of_track = of_noise if truth is None else truth.sideslip_std_rad
     return np.where(np.isfinite(of_track), of_track, of_noise)

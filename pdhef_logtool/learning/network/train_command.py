@@ -1,4 +1,4 @@
-"""``pdhef train`` from dataset to model bundle, with loss history, plot and resumption."""
+"""``pdhef train``: train a model bundle on a dataset, with loss history, plot and resumption."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_pa
 
 HISTORY_FILE = "history.parquet"
 PLOT_FILE = "history.png"
-#: Shorter runs between two restarts teach nothing.
+#: Minimum length of a training sequence between two restarts.
 MIN_SEQUENCE_STEPS = 50
-#: What recurrent state is built up from before a stretch that is chosen.
+#: Length of the warm-up of the recurrent state before a selected stretch.
 LEAD_STEPS = 200
-#: Utilisation up to which tyres answer to the steering angle in proportion, and driving by which an offset is shrunk.
+#: Utilisation limit of the linear tyre range, and time constant of the shrinkage of a steering offset.
 CALM_UTILISATION, OFFSET_SHRINK_S = 0.4, 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainResult:
-    """What the command trained and wrote; ``test_loss`` is on drives that took no part, None without any."""
+    """Result of the command; ``test_loss`` is the loss on the test drives, None without any."""
 
     model: Path
     bundle: ModelBundle
@@ -74,7 +74,7 @@ def run_training(
 ) -> TrainResult:
     """Train on a residual dataset and write the bundle, ``history.parquet`` and its plot to ``output``.
 
-    A call that was interrupted, even by kill -9, goes on from its last whole epoch when it is repeated.
+    If an interrupted call (even by kill -9) is repeated, it continues after its last complete epoch.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def run_training(
     Raises
     ------
     UsageError
-        The device is not there, the number of epochs is none, or ``output`` is ``init`` itself.
+        The device does not exist, the number of epochs is not positive, or ``output`` is ``init`` itself.
     OutputError
         The folder cannot be written, or another command is writing to it.
     ModelError
@@ -104,18 +104,18 @@ def run_training(
 
 
 def dataset_for(folder: Path, model: str) -> Dataset:
-    """Open a dataset whose residuals are those of a model.
+    """Open a dataset with the residuals of a model.
 
     Raises
     ------
     OutputError
-        It is none, or one of another model.
+        It is no dataset, or one of another model.
     """
     data = read_dataset(folder)
     if data.model != model:
         raise OutputError(
             expected=f"residuals of {model}",
-            got=f"those of {data.model}",
+            got=f"residuals of {data.model}",
             where=str(folder),
             remedy=f"pdhef extract LOG... -o DATASET --filter {model} writes them, into another folder",
         )
@@ -123,7 +123,7 @@ def dataset_for(folder: Path, model: str) -> Dataset:
 
 
 def make_recipe(*, paper: bool, seed: int, epochs: int | None, device: str) -> Recipe:
-    """Return the recipe of a call; raises UsageError where it cannot be followed."""
+    """Return the recipe of a call; raises UsageError for invalid values."""
     import torch
 
     if device != "cpu" and not torch.cuda.is_available():
@@ -143,7 +143,7 @@ def train_on(
     device: str = "cpu",
     progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> TrainResult:
-    """Train one network by a recipe, whose target states what it learns; the rest as :func:`run_training`."""
+    """Train one network by a recipe, which contains the target; otherwise as :func:`run_training`."""
     splits = {
         name: SplitSequences(tuple(d for d in data.drives if d.split == name), recipe.target, recipe.odd, data.vehicle)
         for name in SPLITS
@@ -176,7 +176,7 @@ def train_on(
 
 
 def mean_square(bundle: ModelBundle, sequences: Iterable[FeatureSequence]) -> float:
-    """Return the weighted mean square of the normalised targets, as service computes them."""
+    """Return the weighted mean square error of the normalised targets, computed as in operation."""
     from pdhef_logtool.residual_model.service import NetworkService
 
     service = NetworkService(bundle)
@@ -192,9 +192,9 @@ def mean_square(bundle: ModelBundle, sequences: Iterable[FeatureSequence]) -> fl
 
 
 def gap_free_runs(drive: DriveArrays) -> Iterable[slice]:
-    """Yield the runs of a drive that no restart of the parallel filter cuts and that are long enough to learn from.
+    """Yield the runs between restarts of the parallel filter that are long enough for training.
 
-    Where not all of it is chosen they end with a chosen stretch, and begin :data:`LEAD_STEPS` before it.
+    With a selection of rows, runs end with a selected stretch and begin :data:`LEAD_STEPS` before it.
     """
     piece = drive.segment
     if drive.chosen is not None:
@@ -208,22 +208,22 @@ def gap_free_runs(drive: DriveArrays) -> Iterable[slice]:
 
 
 def weights_of(drive: DriveArrays, part: slice) -> FloatArray:
-    """Return the weights of a part of a drive, 0 where it is not chosen."""
+    """Return the weights of a part of a drive, 0 for rows that are not selected."""
     weight = drive.weight[part].astype(np.float64)
     return weight if drive.chosen is None else weight * drive.chosen[part]
 
 
 def _near(chosen: BoolArray) -> BoolArray:
-    """Return which rows are chosen, or come at most :data:`LEAD_STEPS` before one that is."""
+    """Return the rows that are selected or at most :data:`LEAD_STEPS` before a selected row."""
     index = np.arange(len(chosen))
     following = np.minimum.accumulate(np.where(chosen, index, len(chosen) + LEAD_STEPS)[::-1])[::-1]
     return np.asarray(following - index <= LEAD_STEPS, dtype=np.bool_)
 
 
 def steering_offset(rows: DriveArrays, vehicle: VehicleParameters) -> FloatArray:
-    """Return the residual rates [2] that an offset of the steering angle makes in a drive: no network can predict it.
+    """Return the residual rates [2] due to an offset of the steering angle, which no network can predict.
 
-    The offset is constant over the drive, fitted to calm driving, and shrunk where there is little of it.
+    The offset is constant over the drive, fitted to calm driving, and shrunk if there is little of it.
     """
     friction, used = (rows.features[:, FEATURES.index(n)].astype(np.float64) for n in ("friction", "utilisation"))
     calm = (rows.weight > 0.0) & (used < CALM_UTILISATION)
@@ -242,7 +242,7 @@ def steering_offset(rows: DriveArrays, vehicle: VehicleParameters) -> FloatArray
 
 @dataclass(frozen=True, slots=True)
 class SplitSequences:
-    """The sequences of the drives of a split, read again each time that they are gone through."""
+    """The sequences of the drives of a split, read again on each iteration."""
 
     drives: tuple[DatasetDrive, ...]
     target: str
@@ -250,7 +250,7 @@ class SplitSequences:
     vehicle_of: Callable[[DatasetDrive], VehicleParameters]
 
     def __iter__(self) -> Iterator[FeatureSequence]:
-        """Yield them in the order of the drives; one drive is held at a time."""
+        """Yield the sequences in the order of the drives; one drive is in memory at a time."""
         yield from _sequences(self.drives, self.target, vehicle_of=self.vehicle_of if self.odd else None)
 
 
@@ -260,7 +260,7 @@ def _sequences(
     *,
     vehicle_of: Callable[[DatasetDrive], VehicleParameters] | None = None,
 ) -> Iterable[FeatureSequence]:
-    """Yield the gap-free runs of the drives: residual increments as rates by the true step, or the true v_y."""
+    """Yield the gap-free runs of the drives: residual increments divided by the true step, or the true v_y."""
     for drive in drives:
         rows = drive.load()
         offset = np.zeros(2) if vehicle_of is None else steering_offset(rows, vehicle_of(drive))
@@ -280,7 +280,7 @@ def _sequences(
 def _history_table(history: Iterable[Epoch]) -> bytes:
     import polars as pl
 
-    whole = io.BytesIO()  # polars has errors of its own for a disk that is full
+    whole = io.BytesIO()  # polars raises errors of other types for a full disk
     pl.DataFrame([asdict(e) for e in history]).write_parquet(whole)
     return whole.getvalue()
 

@@ -1,1 +1,1 @@
-"""The stages of `pdhef learn`: each finds one part of a car on drives."""
+"""The stages of `pdhef learn`: each determines one part of a car from drives."""

@@ -1,7 +1,7 @@
-"""Stage ``calibrate``: several logs calibrate their car by the sensors alone (``fit.toml``).
+"""Stage ``calibrate``: calibrate a car on several logs by the sensors alone (``fit.toml``).
 
-See docs/method.md#self-calibration. One log's calibration serves that log, and on another it can be absurd: only the
-result of several logs is written.
+See docs/method.md#self-calibration. The calibration of a single log may be wrong on other logs, so that only a
+calibration on several logs is written.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.runs.self_calibrating import lacking, read_driving
 
-#: Least number of logs.
+#: Minimum number of logs.
 LEAST_LOGS = 2
 
 
 def calibrate(task: Task) -> StageOutput:
-    """Calibrate a car on its logs without looking at a ground truth.
+    """Calibrate a car on its logs without ground truth.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Stage ``gain``: how far a network may be followed on a car, and why (``network.toml``)."""
+"""Stage ``gain``: gain limit of a network on a car, with its reason (``network.toml``)."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ from pdhef_logtool.results.run_report import json_bytes
 
 FORMAT = "pdhef-trust"
 FORMAT_VERSION = 2
-#: A drive with fewer scored stamps does not count.
+#: Minimum number of scored stamps of a drive.
 MIN_SCORED_STAMPS = 100
-#: Two slices that meet share a sample or two.
+#: Tolerance of the overlap of slices; adjacent slices may share a sample or two.
 EDGE_S = 0.05
 
 
@@ -106,8 +106,8 @@ def find_gain(task: Task) -> StageOutput:
 def errors_by_trust(car: Car, drive: WholeDrive, *, use_speed: bool) -> BlockErrors:
     """Return the sideslip errors of ``pd-hef`` on a drive with ground truth at every residual gain, in blocks.
 
-    The true v_x times the gyro's yaw rate is the lateral acceleration that defines excited driving: no
-    bank, bias or vibration is in it.
+    The true v_x times the gyro's yaw rate is the lateral acceleration that defines excited driving; it contains no
+    bank, bias or vibration.
     """
     signals, truth = drive.signals, drive.truth
     assert car.network is not None and truth is not None
@@ -136,7 +136,7 @@ def seen_by_identification(car: Car, drives: Sequence[DriveRecord]) -> list[str]
 
 
 def evidence(decision: TrustDecision, drives: int, network_sha256: str) -> str:
-    """Return the sentence that the car keeps, with its figures."""
+    """Return the sentence for the car file, with its figures."""
     d = decision
     rmse = dict(zip(TRUSTS, d.rmse_deg, strict=True))
     shown = ", ".join(f"{rmse[t]:.3f}° at gain {t:g}" for t in sorted({0.0, 0.5, 1.0, d.cap}))

@@ -25,7 +25,7 @@ class Task:
     ----------
     car : car to start from.
     settings : their configuration names this car and the network to start from.
-    logs : drives of the stage. set_splits : by log name, the split that its simulated set assigns to it.
+    logs : drives of the stage. set_splits : split of each log in its simulated set, by log name.
     """
 
     car: Car
@@ -37,15 +37,15 @@ class Task:
 
     @property
     def options(self) -> ReadOptions:
-        """How logs are read."""
+        """Options for reading logs."""
         return self.settings.config.read_options
 
     def read(
         self, read: Callable[[LogInput], tuple[DriveRecord, _Read | None]], share: float = 1.0
     ) -> tuple[tuple[DriveRecord, ...], list[_Read]]:
-        """Read the logs in order; return a record of each and the content of those that can be used.
+        """Read the logs in order; return a record of each, and the contents of usable logs.
 
-        ``share`` : of the stage's progress that reading takes.
+        ``share`` : share of the reading in the stage's progress.
         """
         records, drives = [], list[_Read]()
         for number, log in enumerate(self.logs):

@@ -1,8 +1,8 @@
 """Stage ``teach``: prior and residual of a car from drives with ground truth (``taught.json``).
 
-All driving with ground truth counts, at any speed above the car's low-speed limit. First the prior of the calibration
-of every later drive is fitted; then the drives calibrate the car as later drives will, without ground truth, and the
-ladder of residual models is fitted to the sideslip that ``physics`` then lacks (docs/learn.md).
+All driving with ground truth above the car's low-speed limit is used. First, the prior for the calibration of later
+drives is fitted. Then the drives calibrate the car like later drives, without ground truth, and residual models of
+increasing order are fitted to the sideslip error of ``physics`` (docs/learn.md).
 """
 
 from __future__ import annotations
@@ -51,21 +51,21 @@ from pdhef_logtool.residual_model.slow_features import SlowFeatures
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.self_calibrating import lacking, read_driving, self_calibrated
 
-#: Least driving with ground truth, and length from which on little more is gained (docs/learn.md).
+#: Minimum driving with ground truth, and length beyond which the gain is small (docs/learn.md).
 LEAST_S, ENOUGH_S = 20.0, 150.0
-#: A filter settles before its error counts.
+#: Settling time of a filter, which is excluded from scoring.
 SETTLE_NS = 3_000_000_000
-#: Shortest half of a drive that teaches the other one in a test, and length of the blocks of a test.
+#: Minimum length of each half of a drive that is split for a test, and block length of a test.
 LEAST_HALF_S, TEST_BLOCK_S = 8.0, 5.0
-#: The prior is tested with each drive left out, on at most this number of drives.
+#: Maximum number of drives for the leave-one-out test of the prior.
 MOST_LEFT_OUT = 8
-#: Lateral acceleration below which driving does not teach the tyres, and lateral acceleration near the limit, m/s².
+#: Lateral acceleration above which driving gives information on tyres, and that near the limit, m/s².
 BENDS_M_S2, LIMIT_M_S2 = 2.0, 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenedDrive:
-    """A drive in memory: its reading, signals with the sideslip that teaches, and the driving with it."""
+    """A drive in memory: its reader, its signals with the true sideslip, and the driving for the calibration."""
 
     drive: Drive
     whole: WholeDrive
@@ -73,19 +73,19 @@ class OpenedDrive:
 
     @property
     def truth(self) -> StateTrack:
-        """The sideslip that teaches."""
+        """The true sideslip."""
         assert self.whole.truth is not None
         return self.whole.truth
 
     @property
     def seconds(self) -> float:
-        """Driving with it."""
+        """Duration of usable driving."""
         return float(np.count_nonzero(np.isfinite(self.taught.slopes))) * STEP_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TestedPrior:
-    """Prior of like driving at a level of a_y, its test, and the probability that it lowers other drives' errors."""
+    """Prior from similar driving at a level of a_y, its test, and the probability that it reduces errors elsewhere."""
 
     level_m_s2: float
     test: Interval | None
@@ -95,7 +95,7 @@ class TestedPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Teaching:
-    """Result of teaching: priors, parameters, residual, whether the drives calibrated their car, next drives."""
+    """Result of teaching: priors, parameters, residual, whether the drives calibrated their car, recommended drives."""
 
     priors: tuple[TestedPrior, ...]
     parameters: tuple[TaughtParameter, ...]
@@ -107,7 +107,7 @@ class Teaching:
 
     @property
     def evidence(self) -> str:
-        """In one line."""
+        """The evidence in one line."""
         tried = ", ".join(f"{t.rung} {t.rmse_deg:.3f}°" for t in self.ladder.trials)
         rung = "no residual" if self.ladder.rung == NONE else f"residual model {self.ladder.rung}"
         return (
@@ -116,7 +116,7 @@ class Teaching:
         )
 
     def part(self, car: Car, records: Sequence[DriveRecord] = ()) -> Taught:
-        """Return the part of a car that it is, from drives with these records."""
+        """Return the part of a car file, from drives with these records."""
         return Taught(
             physics_sha256=car.physics_sha256,
             parameters=self.parameters,
@@ -158,7 +158,7 @@ def teach(task: Task) -> StageOutput:
 
 
 def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDrive | None]:
-    """Return the record of an open drive and its content for teaching; None with the reason in the record."""
+    """Return the record of an open drive and its content for teaching, or None with the reason in the record."""
     missing = sorted({*lacking(drive), *(FEATURES - drive.available)})
     truth_at, lacks = (None, f"the log has no {', '.join(missing)}") if missing else teaching_reference(drive, config)
     if lacks:
@@ -205,7 +205,7 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
 
 
 def _prior_of(drives: Sequence[OpenedDrive], progress: Any) -> TestedPrior:
-    """Return the prior of like drives with its test; without parameters if the test does not support it."""
+    """Return the prior from similar drives with its test; without parameters if the test does not support it."""
     test, taught = _prior_test(drives, progress), [d.taught for d in drives]
     support, level = _support(test), float(f"{level_of([d.driving for d in taught]):.4g}")
     parameters = taught_parameters(taught, drives[0].drive.car.vehicle, support) if support > 0.0 else ()
@@ -218,7 +218,7 @@ def _calibration(drive: OpenedDrive, parameters: Sequence[TaughtParameter]) -> S
 
 
 def lacking_of(drive: OpenedDrive, calibration: SelfCalibration) -> TaughtDrive:
-    """Return the features of a drive and the sideslip that ``physics`` lacks on its calibrated car, at its stamps."""
+    """Return the features of a drive and the sideslip error of ``physics`` on its calibrated car, at its stamps."""
     car = self_calibrated(drive.drive, calibration)
     estimator = make_estimator(PHYSICS, car)
     physics, signals = estimator, drive.whole.signals
@@ -240,7 +240,7 @@ def lacking_of(drive: OpenedDrive, calibration: SelfCalibration) -> TaughtDrive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fold:
-    """Drives that teach, and the part of another one, or of the same, that is scored."""
+    """Training drives, and the scored part of another drive or of the same drive."""
 
     taught: tuple[TaughtDriving, ...]
     scored: OpenedDrive
@@ -248,7 +248,7 @@ class _Fold:
 
 
 def _folds(drives: Sequence[OpenedDrive]) -> list[_Fold]:
-    """Return folds with each drive left out; of one drive each half."""
+    """Return folds that leave out one drive each; a single drive is split into halves."""
     if len(drives) > 1:
         left_out = drives[:MOST_LEFT_OUT]
         return [_Fold(tuple(d.taught for d in drives if d is not drive), drive, slice(None)) for drive in left_out]
@@ -265,9 +265,9 @@ def _folds(drives: Sequence[OpenedDrive]) -> list[_Fold]:
 
 
 def _prior_test(drives: Sequence[OpenedDrive], progress: Any) -> Interval | None:
-    """Return RMSE with the prior of other driving less that without, in blocks, each without its constant, in rad.
+    """Return the RMSE change by the prior of other drives, over blocks with their means removed, in rad.
 
-    None where there is too little driving for a test.
+    Return None if there is too little driving for a test.
     """
     errors: tuple[list[FloatArray], list[FloatArray]] = ([], [])
     stamps, folds = [], _folds(drives)
@@ -287,7 +287,7 @@ def _prior_test(drives: Sequence[OpenedDrive], progress: Any) -> Interval | None
 
 
 def _end_to_end(stamps_ns: Sequence[IntArray]) -> IntArray:
-    """Return the stamps of several slices, each shifted behind the previous one: no block contains two slices."""
+    """Return the stamps of several slices, shifted one after the other so that no block contains two slices."""
     moved: list[IntArray] = []
     begin = 0
     for stamps in (s for s in stamps_ns if s.size):
@@ -297,14 +297,14 @@ def _end_to_end(stamps_ns: Sequence[IntArray]) -> IntArray:
 
 
 def _support(test: Interval | None) -> float:
-    """Return the probability that the prior lowers the error on other driving, by its test; 0 without evidence."""
+    """Return the probability that the prior reduces the error on other driving, by its test; 0 without evidence."""
     if test is None or not test.high > test.value:
         return 0.0
     return 0.5 * math.erfc(test.value * NORMAL_95 / (test.high - test.value) / math.sqrt(2.0))
 
 
 def _more(drives: Sequence[OpenedDrive], ladder: LadderFit) -> tuple[str, ...]:
-    """Return what to drive next, in sentences."""
+    """Return sentences that recommend further drives."""
     texts = []
     ay = np.concatenate([d.truth.vx_m_s * d.truth.yaw_rate_rad_s for d in drives])
     ay = ay[np.isfinite(ay)]

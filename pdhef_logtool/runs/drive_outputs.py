@@ -1,0 +1,240 @@
+"""The output files of a drive, and run.json."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pdhef_logtool.car.car import SHOWN_DIGITS
+from pdhef_logtool.car.parts import PHYSICS
+from pdhef_logtool.drive.plan import setup_of
+from pdhef_logtool.drive.setup import setup_toml
+from pdhef_logtool.estimators.table import ALL_ESTIMATORS, all_specs
+from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
+from pdhef_logtool.records.tracks import REFERENCE, StateTrack
+from pdhef_logtool.results.no_position import topics_with_position, without_pose
+from pdhef_logtool.results.opened_run import (
+    ESTIMATES_FILE,
+    LOGS,
+    METRICS_FILE,
+    PAGE_FILE,
+    RECORDING_FILE,
+    REPORT_FILE,
+    SETUP_FILE,
+)
+from pdhef_logtool.results.palette import REFERENCE_COLOUR
+from pdhef_logtool.results.run_report import brief_report, build_run, tool_versions, write_json
+from pdhef_logtool.results.sink import TRUTH, Event
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.run_result import LogResult
+from pdhef_logtool.storage.documents import file_sha256
+from pdhef_logtool.storage.files import write_bytes
+from pdhef_logtool.storage.outputs import FolderTransaction, check_no_input
+
+if TYPE_CHECKING:
+    from pdhef_logtool.evaluation.metrics import MetricRow
+    from pdhef_logtool.mapping import Mapping as SignalMapping
+    from pdhef_logtool.results.mcap_sink import AnnotatedMcap
+    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
+    from pdhef_logtool.results.selected_estimate import MainFacts
+    from pdhef_logtool.runs.estimating import Estimated
+    from pdhef_logtool.runs.preparing import PreparedDrive
+
+_ANNOTATED, _FOXGLOVE, _PLOTJUGGLER = "annotated.mcap", "foxglove.json", "plotjuggler.xml"
+#: Files of an earlier run, deleted unless the new run writes them.
+STALE_FILES = (SETUP_FILE, PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
+#: All files that a run writes into the folder of a log.
+LOG_FILES = (
+    SETUP_FILE,
+    _ANNOTATED,
+    _FOXGLOVE,
+    _PLOTJUGGLER,
+    ESTIMATES_FILE,
+    METRICS_FILE,
+    RECORDING_FILE,
+    REPORT_FILE,
+    PAGE_FILE,
+)
+
+_NO_COPY = "annotated.mcap contains the tool's topics only: a log of kind {} has no messages to copy"
+
+
+class DriveOutputs:
+    """The output files of an estimated drive, as far as its configuration keeps them.
+
+    Parameters
+    ----------
+    folders : of the log and of the run. run : the estimators that are written. main : selected estimate.
+    """
+
+    def __init__(
+        self, folders: tuple[FolderTransaction, Path], run: PreparedDrive, estimated: Estimated, main: MainFacts
+    ) -> None:
+        (self._change, self._run_folder), self._run, self._main = folders, run, main
+        self._signals, names = estimated.signals, run.names
+        tracks = [estimated.tracks[name] for name in names]
+        if estimated.drawn_truth is not None:
+            tracks.insert(0, estimated.drawn_truth)
+        self.tracks = [without_pose(track) for track in tracks] if run.config.no_position else tracks
+        # Recordings show the selected estimate beside physics alone, otherwise beside the naive estimate.
+        order = dict.fromkeys([main.name, PHYSICS, *filter(None, [main.naive]), *main.shown])
+        self._shown = [name for name in order if name in names][:2]
+        self._min_speed_m_s = run.car.vehicle.low_speed_blend_m_s
+
+    def annotated(self) -> AbstractContextManager[AnnotatedMcap | None]:
+        """Return the annotated log as a context, None if it is not asked for; add remarks of the drive."""
+        from pdhef_logtool.results.mcap_sink import AnnotatedMcap, thinned_step_ns
+
+        config, drive = self._run.config, self._run.drive
+        left_out = self._left_out() if config.no_position else None
+        if config.annotation == "none":
+            return nullcontext()
+        if self._is_copy and drive.log.messages is None:
+            drive.remarks.append(_NO_COPY.format(drive.log.kind))
+        is_named = bool(config.estimators) and config.estimators != (ALL_ESTIMATORS,)
+        span_ns = drive.plan.end_ns - drive.plan.start_ns
+        step_ns = thinned_step_ns(
+            drive.log.size, rows=len(self._signals), others=len(self._run.estimators) - 1, span_ns=span_ns
+        )
+        return AnnotatedMcap(
+            self._change.file(_ANNOTATED),
+            drive.log if self._is_copy else None,
+            shown={self._main.name, TRUTH},
+            others_step_ns=None if is_named else step_ns,
+            min_speed_m_s=self._min_speed_m_s,
+            left_out=left_out,
+        )
+
+    @property
+    def _is_copy(self) -> bool:
+        return self._run.config.annotation == "full"
+
+    def _left_out(self) -> frozenset[str]:
+        """Return the topics that ``--no-position`` keeps out of the copy, if there is one; add a remark."""
+        drive = self._run.drive
+        topics = topics_with_position(drive.log, drive.plan.mapping) if self._is_copy else frozenset()
+        names = f"topics {', '.join(sorted(topics))}, " if topics else ""
+        drive.remarks.append(f"--no-position leaves out {names}attachments, metadata and file names")
+        return topics
+
+    def write(self, report: dict[str, Any], rows: Sequence[MetricRow], events: Sequence[Event]) -> dict[str, Any]:
+        """Write all files but the annotated log; return the report as written."""
+        config, drive = self._run.config, self._run.drive
+        colours = {REFERENCE: REFERENCE_COLOUR, **{s.name: s.colour for s in all_specs()}}
+        if config.annotation != "none":
+            self._write_layouts(colours)
+        if config.kept == "full":
+            self._write_recording(report, events, colours)
+        head = f"Mounting, units, delays and clocks of {drive.name}, for pdhef run --setup."
+        write_bytes(self._change.file(SETUP_FILE), setup_toml(setup_of(drive.plan), head).encode())
+        if config.kept == "metrics":
+            report = brief_report(report)
+            write_json(self._change.file(REPORT_FILE), report, brief=True)
+        else:
+            write_tables(self._change, report, rows, self.tracks, self._main.spans, self._causal_from_ns())
+        return report
+
+    def _causal_from_ns(self) -> dict[str, int]:
+        """Return the first stamp from which the rows of each causal estimator depend on past samples only."""
+        drive = self._run.drive
+        after_s = drive.plan.decided_s if drive.causal_from_s is None else drive.causal_from_s
+        first_ns = drive.plan.start_ns + round(after_s * 1e9)
+        return {e.name: first_ns for e in self._run.estimators if e.causal and not drive.not_causal}
+
+    def _write_layouts(self, colours: dict[str, int]) -> None:
+        from pdhef_logtool.mapping.recognition import FIX_TYPES
+        from pdhef_logtool.results.layouts import write_layouts
+
+        fixes = [t.name for t in self._run.drive.log.topics if t.type_name.replace("/msg/", "/") in FIX_TYPES]
+        write_layouts(
+            self._change.file(_FOXGLOVE),
+            self._change.file(_PLOTJUGGLER),
+            self.tracks,
+            colours,
+            shown={self._main.name, TRUTH},
+            fixes=fixes if self._is_copy and not self._run.config.no_position else (),
+        )
+
+    def _write_recording(self, report: dict[str, Any], events: Sequence[Event], colours: dict[str, int]) -> None:
+        from pdhef_logtool.results.rerun_sink import write_recording
+
+        drive = self._run.drive
+        # Recordings of a run have the same application, by which a viewer shows them as one dataset.
+        identity = json.dumps([self._run.config.to_dict(), tool_versions()], sort_keys=True)
+        run = f"pdhef-{self._run_folder.resolve().name}-{sha256(identity.encode()).hexdigest()[:SHOWN_DIGITS]}"
+        write_recording(
+            self._change.file(RECORDING_FILE),
+            self._signals,
+            self.tracks,
+            report,
+            events,
+            application_id=run,
+            log_name=drive.name,
+            input_hash=sha256(f"{run} {drive.sha256} {drive.name}".encode()).hexdigest(),
+            start_ns=drive.plan.start_ns,
+            end_ns=drive.plan.end_ns,
+            shown=self._shown,
+            min_speed_m_s=self._min_speed_m_s,
+            colours=colours,
+        )
+
+
+def write_tables(
+    change: FolderTransaction,
+    report: dict[str, Any],
+    rows: Sequence[MetricRow],
+    tracks: Sequence[StateTrack],
+    selected: Sequence[tuple[int, str]] = (),
+    causal_from_ns: Mapping[str, int] | None = None,
+) -> None:
+    """Write estimates.parquet, metrics.parquet and report.json of a drive."""
+    from pdhef_logtool.results.parquet_sink import write_estimates, write_metrics
+
+    write_estimates(change.file(ESTIMATES_FILE), tracks, selected=selected, causal_from_ns=causal_from_ns)
+    write_metrics(change.file(METRICS_FILE), rows)
+    write_json(change.file(REPORT_FILE), report)
+
+
+def files_of(folder: Path) -> dict[str, str]:
+    """Return the sha256 of the files in a log's folder that commands read back, by name."""
+    paths = (folder / name for name in (REPORT_FILE, ESTIMATES_FILE))
+    return {path.name: file_sha256(path) for path in paths if path.is_file()}
+
+
+def write_run(
+    output: Path,
+    config: dict[str, Any],
+    results: Sequence[LogResult],
+    verdicts: PlanVerdicts,
+    network: tuple[str, str] | None = None,
+    remaining: int = 0,
+) -> None:
+    """Write run.json beside metrics.parquet, with the configuration as JSON-able values; arguments as of build_run."""
+    files, outcomes = {METRICS_FILE: file_sha256(output / METRICS_FILE)}, [r.outcome for r in results]
+    write_json(output / RUN_FILE, build_run(config, network, outcomes, remaining=remaining, files=files, plan=verdicts))
+
+
+def log_place(stem: str) -> str:
+    """Return the folder of a log within the outputs."""
+    return f"{LOGS}/{stem}"
+
+
+def check_places(
+    inputs: Sequence[LogInput],
+    output: Path | None,
+    config: RunConfig,
+    mapping: SignalMapping | None,
+    junit: Path | None,
+    cars: Sequence[Path | None] = (),
+) -> None:
+    """Refuse to write over an input; raises UsageError."""
+    can = () if mapping is None else mapping.dbc
+    files = [] if output is None else [output / name for name in (METRICS_FILE, RUN_FILE, PAGE_FILE)]
+    folders = [] if output is None else [output / log_place(i.stem) for i in inputs]
+    files += [folder / name for folder in folders for name in LOG_FILES]
+    read = [*(i.local for i in inputs), *config.files, *cars, *can]
+    check_no_input(read, files if junit is None else [*files, junit], folders)

@@ -1,0 +1,277 @@
+"""The content of report.json of a drive, and its entry in run.json."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pdhef_logtool.car.car import SHOWN_DIGITS, Car
+from pdhef_logtool.car.parts import PHYSICS
+from pdhef_logtool.drive.friction import FrictionSource
+from pdhef_logtool.drive.plan import DrivePlan
+from pdhef_logtool.drive.reading import Drive, lost_texts
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.base import notes_of
+from pdhef_logtool.evaluation.dead_reckoned import path_drift
+from pdhef_logtool.evaluation.dependence import day_and_route
+from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
+from pdhef_logtool.evaluation.standing import standings
+from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.records.ledger import SampleCount
+from pdhef_logtool.records.printable import printable
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
+from pdhef_logtool.records.tracks import REFERENCE, StateTrack
+from pdhef_logtool.results.error_places import largest_errors
+from pdhef_logtool.results.no_position import without_names
+from pdhef_logtool.results.run_report import LogOutcome, build_report, estimator_entry, run_versions
+from pdhef_logtool.runs.estimating import Estimated
+from pdhef_logtool.runs.preparing import PreparedDrive
+from pdhef_logtool.runs.scoring import Evaluation
+from pdhef_logtool.storage.documents import digest
+
+if TYPE_CHECKING:
+    from pdhef_logtool.results.selected_estimate import MainFacts
+
+#: Units of ground truth quantities without a channel of the same name.
+_DERIVED_UNITS = {"position_m": "m"}
+#: Entries of a log's metadata that a report keeps, and signs of each.
+_MOST_METADATA, _MOST_SIGNS = 64, 200
+
+
+def report_drive(
+    run: PreparedDrive,
+    estimated: Estimated,
+    scored: Evaluation,
+    main: MainFacts,
+    judged: dict[str, Any],
+    losses: Sequence[Loss],
+) -> dict[str, Any]:
+    """Return the document of report.json; ``judged`` : its entries by :func:`~.judging.judge_drive`."""
+    drive, config, truth, selected = run.drive, run.config, estimated.truth, estimated.read(main.name)
+    preferred = dict.fromkeys((REFERENCE, PHYSICS, *run.names))
+    others = [t for n in preferred if n != main.name and (t := estimated.read(n)) is not None]
+    slow = run.car.vehicle.low_speed_blend_m_s
+    content = drive_entries(drive, run.car, losses) | judged
+    content |= {
+        "estimators": [*_estimator_entries(run, scored)],
+        "metrics": scored.rows,
+        "segments": scored.events,
+        "friction": _friction(drive.friction),
+        "self_calibration": None if run.calibration is None else run.calibration.to_dict(),
+        "reference": None if run.reference is None else run.reference.document,
+        "largest_errors": [] if selected is None else largest_errors(selected, truth, others, slow),
+        "faults": _faults(run, main.name, estimated.read),
+        "path_drift": None if truth is None or selected is None else path_drift(selected, truth),
+        "metadata": {} if config.no_position else _metadata(drive),
+    }
+    compared = (
+        [] if truth is None else standings(main.name, _rivals(run, main.name, estimated), estimated.read, truth, slow)
+    )
+    report = build_report(content, main, compared)
+    return without_names(report, drive.path, drive.name) if config.no_position else report
+
+
+def _estimator_entries(run: PreparedDrive, scored: Evaluation) -> Iterator[dict[str, Any]]:
+    """Yield the entries of the estimators that ran, failed or were skipped."""
+    not_causal = run.drive.not_causal
+    for e in run.estimators:
+        algorithm = resolve(e)
+        yield estimator_entry(
+            e.name,
+            causal=e.causal and not not_causal,
+            notes=(*notes_of(e), *filter(None, [not_causal])),
+            intervals=run.intervals.notes(e.name),
+            reasons=scored.reasons[e.name],
+            algorithm={"sha256": algorithm.sha256, **algorithm.model_dump(mode="json")},
+        )
+    for name, reason in run.failed.items():
+        yield estimator_entry(name, causal=False, outcome="failed", reason=reason)
+    for s in run.skipped:
+        if not s.is_error:
+            yield estimator_entry(s.name, causal=s.spec.causal, outcome="skipped", reason=s.reason)
+
+
+def _faults(run: PreparedDrive, main: str, read: Callable[[str], StateTrack | None]) -> tuple[SensorFault, ...] | None:
+    """Return the sensor faults that the selected estimate detects, or else physics; None where neither detects any."""
+    tracks = [read(name) for name in dict.fromkeys((main, PHYSICS)) if name in run.names]
+    detected = (sensor_faults(track) for track in tracks if track is not None)
+    return next((faults for faults in detected if faults is not None), None)
+
+
+def _rivals(run: PreparedDrive, name: str, estimated: Estimated) -> list[str]:
+    """Return the estimators on the car's model alone to compare the selected one with; none sees more of the log."""
+    rivals, read = [], estimated.read
+    main = next(e for e in run.estimators if e.name == name)
+    for estimator in run.estimators:
+        algorithm = resolve(estimator)
+        physics = algorithm.physics_sha256 is not None and algorithm.network_sha256 is None
+        other = physics and estimator.name != main.name and (estimator.causal or not main.causal)
+        if other and not _is_same(read(estimator.name), read(main.name)):
+            rivals.append(estimator.name)
+    return rivals
+
+
+def _is_same(track: StateTrack | None, main: StateTrack | None) -> bool:
+    """Whether two tracks [N] have the same sideslip bit for bit: one filter under two names (residual gain 0)."""
+    if track is None or main is None or len(track) != len(main):
+        return False
+    return np.array_equal(track.sideslip_rad, main.sideslip_rad, equal_nan=True)
+
+
+def _metadata(drive: Drive) -> dict[str, str]:
+    """Return the log's metadata by key, and by ``record.key`` where records differ, as far as it is short."""
+    texts = drive.log.metadata()
+    texts = {k: v for k, v in texts.items() if k.partition(".")[2] not in texts or texts[k.partition(".")[2]] != v}
+    short = {printable(k, _MOST_SIGNS): v for k, v in sorted(texts.items()) if len(v) <= _MOST_SIGNS}
+    return {k: printable(v) for k, v in [*short.items()][:_MOST_METADATA]}
+
+
+def drive_entries(
+    drive: Drive,
+    car: Car,
+    losses: Sequence[Loss],
+    samples: dict[str, int] | None = None,
+    ledger: Sequence[SampleCount] | None = None,
+) -> dict[str, Any]:
+    """Return the entries of report.json that do not depend on an estimate.
+
+    Parameters
+    ----------
+    car : as calibrated on the drive. samples : messages by source; ledger : of all samples; None: of the drive.
+    """
+    plan = drive.plan
+    samples = drive.samples if samples is None else samples
+    sources = [_source(n, s.label, SIGNAL_UNITS[n], samples) for n, s in plan.mapping.signals.items()]
+    return {
+        "log": _log(drive),
+        "mapping": {"signals": sources, "missing": drive.missing},
+        "vehicle": {
+            "name": car.vehicle.name,
+            "sha256": car.physics_sha256,
+            "file": car.file_name,
+            "proven": car.has_evidence,
+            "taught": None if car.taught is None else car.taught.truth,
+            "sensors": car.vehicle.sensors.model_dump(),
+            "assumed": drive.car.assumed,
+            "low_speed_blend_m_s": car.vehicle.low_speed_blend_m_s,
+        },
+        "truth": _truth(plan, samples),
+        "setup": {"source": drive.setup_source, "decided_s": plan.decided_s, "causal_from_s": drive.causal_from_s},
+        "friction": None,
+        "self_calibration": None,
+        "reference": None,
+        "losses": losses,
+        "ledger": {"samples": drive.sample_ledger if ledger is None else ledger},
+        "warnings": drive.notes,
+        "remarks": drive.remarks,
+        "checks": drive.checks,
+        "versions": run_versions(),
+    }
+
+
+def _log(drive: Drive) -> dict[str, Any]:
+    plan, mapped = drive.plan, set(drive.plan.mapping.topics)
+    topics = [
+        {"name": t.name, "type": t.type_name, "encoding": t.encoding, "messages": t.messages} for t in drive.log.topics
+    ]
+    return {
+        "name": drive.name,
+        "file": PurePath(drive.file).name,
+        "kind": drive.log.kind,
+        "sha256": drive.sha256,
+        "signals_sha256": drive.signals_sha256,
+        "truth_sha256": drive.truth_sha256,
+        "start_ns": plan.start_ns,
+        "end_ns": plan.end_ns,
+        "duration_s": (plan.end_ns - plan.start_ns) * 1e-9,
+        "topics": [{**topic, "mapped": topic["name"] in mapped} for topic in topics],
+    }
+
+
+def _source(name: str, source: str, unit: str, samples: dict[str, int], derivation: str = "") -> dict[str, Any]:
+    count = samples.get(source, 0)
+    return {"name": name, "source": source, "unit": unit, "samples": count, "derivation": derivation}
+
+
+def _truth(plan: DrivePlan, samples: dict[str, int]) -> dict[str, Any]:
+    derivation = {name: how for name, how in plan.derivation.items() if name != "cg"}
+    return {
+        "available": bool(derivation),
+        "quantities": [_truth_quantity(name, how, plan.mapping, samples) for name, how in derivation.items()],
+        "latency_s": None if plan.latency is None else plan.truth_latency_s,
+        "not_independent": sorted(plan.dependent),
+        "notes": _truth_notes(plan),
+    }
+
+
+def _truth_quantity(name: str, how: str, mapping: Mapping, samples: dict[str, int]) -> dict[str, Any]:
+    source = mapping.truth.get(name)
+    if source is None:
+        return _source(name, "derived", _DERIVED_UNITS.get(name) or TRUTH_UNITS[name], {}, how)
+    return _source(name, source.label, TRUTH_UNITS[name], samples, "" if how == source.label else how)
+
+
+def _truth_notes(plan: DrivePlan) -> list[str]:
+    """Return remarks on the ground truth: its latency, its dependence on signals, and its position."""
+    notes = []
+    if (latency := plan.latency) is not None:
+        std = f" ± {latency.std_error_s * 1e3:.1f} ms"
+        measured = f"{latency.latency_s * 1e3:.1f} ms{std}" if latency.reliable else "unknown"
+        verdict = "applied" if plan.truth_latency_s else "not applied: it is within its uncertainty"
+        if latency.gyro_delay_s:
+            verdict = "so that the ground truth is not moved"
+        notes.append(f"latency {measured} ({latency.reason}), {verdict}")
+    notes += [f"{signal} is not independent: {reason}" for signal, reason in plan.dependent.items()]
+    if "cg" in plan.derivation:
+        notes.append(plan.derivation["cg"])
+    if plan.truth is not None and not plan.has_truth_pose:
+        notes.append("no true position: the drawn ground truth trajectory is its velocity dead-reckoned")
+    return notes
+
+
+def _friction(friction: FrictionSource) -> dict[str, Any]:
+    """Return the friction that the estimators used, after they ran; figures are NaN where none was estimated."""
+    return {
+        "source": friction.label,
+        "estimated": friction.bank is not None,
+        "observable_share": friction.observable_share,
+        "observable_std": friction.observable_std,
+        "summary": friction.summary,
+    }
+
+
+def car_entry(car: Car) -> dict[str, Any]:
+    """Return the car of a log in run.json.
+
+    It has its folder or file (None: none was given), vehicle, digests of physics and network, and the entries of its
+    sensor profile that differ from the default.
+    """
+    return {
+        "file": car.file_name,
+        "name": car.vehicle.name,
+        "sha256": car.physics_sha256,
+        "network_sha256": None if car.network is None else car.network.sha256,
+        "sensors": car.vehicle.sensors.model_dump(exclude_defaults=True),
+    }
+
+
+def outcome_of(drive: Drive, losses: Sequence[Loss], *, neutral: bool = False, **changes: Any) -> LogOutcome:
+    """Return the record of a log in run.json; ``neutral``: without names and metadata of its file."""
+    day, route = day_and_route(drive.plan.start_ns, drive.log.metadata())
+    texts: dict[str, Any] = {"file": drive.file, "lost": lost_texts(losses)}
+    if neutral:
+        texts, route = without_names(texts, drive.path, drive.name), route and digest(route)[:SHOWN_DIGITS]
+    return LogOutcome(
+        log=drive.name,
+        sha256=drive.sha256,
+        signals_sha256=drive.signals_sha256,
+        truth_sha256=drive.truth_sha256,
+        mapping_sha256=drive.mapping.sha256,
+        day=day,
+        route=route,
+        **texts,
+        **changes,
+    )

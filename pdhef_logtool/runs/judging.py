@@ -1,0 +1,119 @@
+"""The verdicts of a validation plan on one drive and on all drives of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pdhef_logtool.evaluation.dependence import factors_of
+from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
+from pdhef_logtool.evaluation.validation_plan import default_plan
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.tracks import REFERENCE
+from pdhef_logtool.results.opened_run import OpenedLog
+from pdhef_logtool.runs.run_result import LogResult
+from pdhef_logtool.storage.documents import jsonable
+
+if TYPE_CHECKING:
+    from pdhef_logtool.drive.reading import Drive
+    from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
+    from pdhef_logtool.evaluation.operating_space import OperatingSpace
+    from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
+    from pdhef_logtool.evaluation.validation_plan import Requirement, ValidationPlan
+    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
+
+#: Blocks of a requirement in a brief report.
+BRIEF_BLOCKS = 12
+
+
+def read_validation_plan(file: Path | None, junit: Path | None) -> ValidationPlan:
+    """Return the plan of a file or the default one; raises UsageError when it is wrong or missing for ``junit``."""
+    from pdhef_logtool.evaluation.validation_plan import load_plan
+    from pdhef_logtool.results.plan_against import other_runs
+
+    if file is not None:
+        plan = load_plan(file)
+        other_runs(plan, ())  # a missing one ends the command before the work
+        return plan
+    if junit is not None:
+        raise UsageError(
+            expected="a validation plan to give verdicts on", got="none", where="--junit", remedy="--plan FILE"
+        )
+    return default_plan()
+
+
+def drive_blocks(
+    requirements: Sequence[Requirement], main: str | None, drive: EvaluatedDrive, most: int
+) -> list[RequirementBlocks]:
+    """Return the blocks of time of requirements, against the reference where ground truth does not score them.
+
+    ``main`` : the selected estimate, for requirements that name no estimator. ``most`` : blocks of a requirement.
+    """
+    from pdhef_logtool.evaluation.requirement_blocks import ScoredDrive, requirement_blocks
+
+    blocks: list[RequirementBlocks] = []
+    read, slow, dependent = drive.tracks.get, drive.low_speed_m_s, frozenset(drive.dependent)
+    for base in (drive.truth, read(REFERENCE)):
+        if base is not None:
+            scored = ScoredDrive(read, base, drive.masks, slow, dependent, estimated=base is not drive.truth)
+            left = [r for r in requirements if all(b.of != r.measured for b in blocks)]
+            blocks += requirement_blocks(left, main, scored, most)
+    return blocks
+
+
+def judge_drive(
+    plan: ValidationPlan,
+    drive: Drive,
+    main: str | None,
+    rows: Sequence[MetricRow],
+    blocks: Sequence[RequirementBlocks],
+    space: OperatingSpace,
+) -> dict[str, Any]:
+    """Return the entries of report.json on one drive alone: verdicts of a plan, blocks of time and operating space."""
+    from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
+
+    entries = {"requirement_blocks": jsonable(blocks), "operating_space": jsonable(space)}
+    judged = JudgedDrive(drive.name, main, lambda: entries, {"car": drive.car.vehicle.name})
+    return {"plan": plan_verdicts(plan, figures_of_rows(rows), [judged]).to_dict(), **entries}
+
+
+def judge(
+    plan: ValidationPlan, results: Sequence[LogResult], strict: bool, metrics: Path | None = None
+) -> PlanVerdicts:
+    """Return the verdicts of a plan on logs; a log that failed has no figures.
+
+    ``metrics``: the file with the figures of all logs, None: they are in memory.
+    """
+    from pdhef_logtool.results.plan_against import other_runs
+    from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_file, figures_of_rows, plan_verdicts
+
+    done = [r for r in results if r.outcome.failed is None or r.document is not None]
+    drives = [
+        JudgedDrive(r.outcome.log, r.outcome.main, partial(_report, r), factors_of(asdict(r.outcome), None))
+        for r in done
+    ]
+    if metrics is None:
+        figures = figures_of_rows(row for r in done for row in r.rows)
+    else:
+        import polars as pl
+
+        figures = figures_of_file(pl.scan_parquet(metrics), plan, [d.main for d in drives])
+    logs = [OpenedLog(o.log, o.outcome, Path(), asdict(o)) for o in (r.outcome for r in done)]
+    return plan_verdicts(plan, figures, drives, strict=strict, against=other_runs(plan, logs))
+
+
+@lru_cache(maxsize=LEAST_DRIVES)
+def _report(result: LogResult) -> Mapping[str, Any] | None:
+    return result.report
+
+
+def write_verdicts(junit: Path | None, verdicts: PlanVerdicts, results: Sequence[LogResult]) -> None:
+    """Write JUnit XML if ``junit`` is a file; raises OutputError."""
+    from pdhef_logtool.results.junit import write_junit
+
+    if junit is not None:
+        checks = {r.outcome.log: (r.report or {}).get("checks", ()) for r in results}
+        write_junit(junit, verdicts, checks)

@@ -1,0 +1,93 @@
+"""Preparation of a drive: calibration of its car, sideslip reference, choice of estimators."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.reading import Drive
+from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.intervals import TrackCalibrator
+from pdhef_logtool.estimators.table import Options, Skipped, runnable
+from pdhef_logtool.records.errors import EstimatorError
+from pdhef_logtool.records.tracks import REFERENCE
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.estimating import calibrator
+from pdhef_logtool.runs.referencing import DriveReference, reference_of
+from pdhef_logtool.runs.selection import default_names
+from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
+
+if TYPE_CHECKING:
+    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
+    from pdhef_logtool.evaluation.metrics.metric import SensorErrors
+
+_MAP_THEM = "map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedDrive:
+    """A drive, the car as calibrated on it, and the estimators that run on it.
+
+    Estimators that are not ``requested`` are candidates for the selected estimate: of these only the selected one is in
+    the outputs. ``failed``: reasons of estimators without a result, by name.
+    """
+
+    drive: Drive
+    config: RunConfig
+    car: Car
+    calibration: SelfCalibration | None
+    reference: DriveReference | None
+    estimators: Sequence[Estimator]
+    skipped: Sequence[Skipped]
+    requested: frozenset[str]
+    intervals: TrackCalibrator
+    failed: Mapping[str, str]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the estimators."""
+        return [e.name for e in self.estimators]
+
+    def sensors(self, calibration: SelfCalibration | None) -> SensorErrors:
+        """Return the errors of the log's sensors according to a calibration."""
+        return log_sensors(self.drive.car.vehicle, calibration, told_friction=self.drive.friction.bank is None)
+
+
+def prepare(drive: Drive, config: RunConfig, pool: SelfCalibration | None) -> PreparedDrive:
+    """Calibrate the car on the drive unless ``pool`` is its calibration, make the reference, choose the estimators.
+
+    Raises EstimatorError if no requested estimator can run.
+    """
+    calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
+    car = self_calibrated(drive, calibration)
+    estimators, skipped, requested = _choose_estimators(drive, config, car)
+    reference = reference_of(drive, calibration, config)
+    if reference is not None and reference.estimator is not None:
+        estimators, requested = [*estimators, reference.estimator], requested | {REFERENCE}
+    intervals, failed = calibrator(car, estimators), {s.name: s.reason for s in skipped if s.is_error}
+    return PreparedDrive(drive, config, car, calibration, reference, estimators, skipped, requested, intervals, failed)
+
+
+def _choose_estimators(
+    drive: Drive, config: RunConfig, car: Car
+) -> tuple[list[Estimator], list[Skipped], frozenset[str]]:
+    """Return the estimators that run, those that cannot, and the names of the requested ones that run.
+
+    Candidates for the selected estimate always run. Raises EstimatorError if no requested estimator can run.
+    """
+    names = config.estimators or default_names(car, drive.available)
+    options, refused = Options(drive.options.use_speed, gnss=config.gnss == "auto"), drive.plan.refused
+    estimators, skipped = runnable(names, car, drive.available, options, refused)
+    requested = frozenset(e.name for e in estimators)
+    more = [name for name in default_names(car, drive.available) if name not in requested]
+    estimators += runnable(more, car, drive.available, options, refused)[0] if more else []
+    if not requested:
+        raise EstimatorError(
+            expected="at least one estimator that can run",
+            got="; ".join(f"{s.name}: {s.reason}" for s in skipped),
+            where=str(drive.path),
+            remedy=next((f"{reason} (or --waive it)" for reason in refused.values()), _MAP_THEM),
+        )
+    return estimators, skipped, requested

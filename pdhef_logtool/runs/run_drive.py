@@ -1,0 +1,193 @@
+"""One log from start to end: read, estimate, score, judge, write. Several logs: :mod:`~.fleet`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from pdhef_logtool.car.car import SHOWN_DIGITS, Car
+from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.estimators.plug_ins import package_of
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive
+from pdhef_logtool.evaluation.operating_space import operating_space
+from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS
+from pdhef_logtool.evaluation.segments import find_intervals
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.mapping import merge_losses
+from pdhef_logtool.records.errors import EstimatorError
+from pdhef_logtool.records.reporter import SILENT, Reporter
+from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.tracks import REFERENCE
+from pdhef_logtool.results.sink import Event
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.drive_outputs import STALE_FILES, DriveOutputs, files_of, log_place
+from pdhef_logtool.runs.drive_report import car_entry, outcome_of, report_drive
+from pdhef_logtool.runs.estimating import Estimated, estimate_drive
+from pdhef_logtool.runs.judging import BRIEF_BLOCKS, drive_blocks, judge_drive
+from pdhef_logtool.runs.preparing import PreparedDrive, prepare
+from pdhef_logtool.runs.reference_audit import audit_truth
+from pdhef_logtool.runs.run_result import LogResult
+from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
+from pdhef_logtool.runs.selection import choose_main, choose_over_time, contradiction
+from pdhef_logtool.storage.outputs import OutputFolder
+
+if TYPE_CHECKING:
+    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
+    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
+    from pdhef_logtool.results.selected_estimate import MainFacts
+
+_SILENT = "{} has no valid row although the car moves"
+_ALL_SILENT = "no estimator has a valid row although the car moves"
+_NEVER_MOVES = "the car is never faster than {:g} m/s: there is nothing to score"
+
+
+def run_log(
+    log_input: LogInput,
+    outputs: OutputFolder,
+    config: RunConfig,
+    car: Car,
+    mapping: SignalMapping | None,
+    *,
+    pool: SelfCalibration | None,
+    validation: ValidationPlan,
+    is_first: bool = True,
+    reporter: Reporter = SILENT,
+) -> LogResult:
+    """Run one log and replace its folder ``logs/<stem>`` of the outputs.
+
+    Parameters
+    ----------
+    pool : calibration of the car from all logs of the run; None: from this log, if the configuration asks for it.
+    validation : plan of the verdicts in the report.
+    is_first : whether it is the run's first log; its estimators get the full causality check.
+
+    Raises
+    ------
+    PdhefError
+        The log cannot be used; its files of an earlier run are kept.
+    """
+    reporter.progress(log_input.stem, 0.0)
+    with read_drive(log_input, car, mapping, config.read_options, tell=reporter.warn) as drive:
+        run = prepare(drive, config, pool)
+        with outputs.begin(log_place(drive.name), stale=STALE_FILES) as change:
+            run, estimated = _estimate(run, CausalityCheck(is_first), reporter)
+            run, scored, main = _select(run, estimated, _score(run, estimated))
+            judged = _judge(run, estimated, scored, main, validation)
+            files = DriveOutputs((change, outputs.path), run, estimated, main)
+            with files.annotated() as annotated:
+                lost = () if annotated is None else annotated.write(files.tracks)
+                losses = merge_losses([drive.losses, lost, *_losses(run, scored)])
+                report = report_drive(run, estimated, scored, main, judged, losses)
+                if annotated is not None:
+                    annotated.finish(report, files.tracks, scored.events)
+            report = files.write(report, scored.rows, scored.events)
+        outcome = outcome_of(
+            drive,
+            losses,
+            neutral=config.no_position,
+            car=car_entry(drive.car),
+            main=main.name,
+            algorithms={e.name: resolve(e).identity for e in run.estimators},
+            files=files_of(change.target),
+            failed=_ALL_SILENT if len(scored.silent) == len(run.estimators) else None,
+        )
+        failed_checks = sum(c.verdict == "failed" and not c.waived for c in drive.checks)
+    reporter.progress(drive.name, 1.0)
+    return LogResult(outcome, change.target, report, tuple(scored.rows), failed_checks=failed_checks)
+
+
+def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter) -> tuple[PreparedDrive, Estimated]:
+    """Run all estimators over the drive; raises EstimatorError if none has a result."""
+    drive, plug_ins = run.drive, ", ".join(filter(None, map(package_of, run.estimators)))
+    label = f"{drive.name} (plug-ins: {plug_ins})" if plug_ins else drive.name
+    causality.failed |= run.failed
+    estimated = estimate_drive(
+        drive.whole(),
+        run.estimators,
+        intervals=run.intervals,
+        causality=causality,
+        progress=lambda share: reporter.progress(label, 0.8 * share),
+    )
+    reporter.progress(drive.name, 0.8)
+    texts = [f"{name} {text}" for name, text in causality.failed.items()]
+    for text in texts:
+        drive.tell(text)
+    left = [e for e in run.estimators if e.name not in causality.failed]
+    if not left:
+        raise EstimatorError(
+            expected="an estimator that runs as it declares", got="; ".join(texts), where=str(drive.path)
+        )
+    return replace(run, estimators=left, failed=causality.failed), estimated
+
+
+def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
+    """Score the tracks; add the events of an estimated friction, and contradictions as notes of the drive."""
+    drive, signals = run.drive, estimated.signals
+    scored = evaluate(drive, run.names, estimated.read, signals, run.sensors(run.calibration))
+    if drive.friction.bank is not None:
+        observable = find_intervals(signals, {"friction observable": drive.friction.observable})
+        events = [Event(s.name, s.start_ns, s.end_ns, "the estimate of friction can be relied on") for s in observable]
+        scored = replace(scored, events=sorted([*scored.events, *events], key=in_time))
+    truth, reference = estimated.truth, estimated.read(REFERENCE)
+    if truth is not None and reference is not None and run.reference is not None:
+        contradictions = audit_truth(truth, reference, drive.car.vehicle.low_speed_blend_m_s)
+        run.reference.document["ground_truth"] = list(contradictions)
+        for text in contradictions:
+            drive.tell(text)
+    if against := contradiction(scored.rows):
+        drive.notes.append(f"WARNING: {against.text}")  # the text of the selected estimate gives the consequence
+    if run.intervals.warning:
+        drive.tell(run.intervals.warning)
+    if not scored.moves:
+        drive.tell(_NEVER_MOVES.format(run.car.vehicle.low_speed_blend_m_s))
+    return scored
+
+
+def _select(
+    run: PreparedDrive, estimated: Estimated, scored: Evaluation
+) -> tuple[PreparedDrive, Evaluation, MainFacts]:
+    """Choose the selected estimate; leave out other estimators and figures that were not requested."""
+    validated, online = run.drive.car.has_evidence, run.config.calibrate == "online"
+    main = choose_main(run.names, scored.rows, proven=validated, named=run.config.estimators is not None)
+    if online and run.calibration is not None and not validated:
+        over_time = choose_over_time(run.estimators, run.calibration, estimated.read, estimated.signals, run.sensors)
+        main = replace(main, over_time=over_time, name=over_time[-1][1])
+    digests = {e.name: resolve(e).sha256[:SHOWN_DIGITS] for e in run.estimators}
+    left_out = frozenset(run.names) - run.requested - {name for _, name in main.spans}
+    shown = [name for name in main.shown if name not in left_out]
+    return (
+        replace(run, estimators=[e for e in run.estimators if e.name not in left_out]),
+        replace(
+            scored,
+            rows=[
+                replace(r, algorithm=digests.get(r.estimator, ""))
+                for r in scored.rows
+                if left_out.isdisjoint(r.estimator.split("~"))
+            ],
+            silent=tuple(name for name in scored.silent if name not in left_out),
+        ),
+        replace(main, shown=shown, naive=None if main.naive in left_out else main.naive),
+    )
+
+
+def _losses(run: PreparedDrive, scored: Evaluation) -> Iterator[list[Loss]]:
+    """Yield the estimators without a valid row and those that failed, as losses."""
+    yield [Loss("no-valid-row", _SILENT.format(name), run.drive.name) for name in scored.silent]
+    yield [Loss("estimator-failed", f"{name} {text}", run.drive.name) for name, text in run.failed.items()]
+
+
+def _judge(
+    run: PreparedDrive, estimated: Estimated, scored: Evaluation, main: MainFacts, plan: ValidationPlan
+) -> dict[str, Any]:
+    """Return the entries of the report on the requirements of a plan."""
+    drive, vehicle, truth = run.drive, run.car.vehicle, estimated.truth
+    slow, dependent = vehicle.low_speed_blend_m_s, drive.plan.dependent
+    of_drive = EvaluatedDrive(drive.name, estimated.tracks, truth, None, scored.masks, slow, dependent=dependent)
+    most = BRIEF_BLOCKS if run.config.kept == "metrics" else MOST_BLOCKS
+    blocks = drive_blocks(plan.requirements, main.name, of_drive, most)
+    space = operating_space(estimated.signals, truth, estimated.read(main.name), vehicle)
+    return judge_drive(plan, drive, main.name, scored.rows, blocks, space)

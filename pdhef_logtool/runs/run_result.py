@@ -1,0 +1,115 @@
+"""The result of a run and of each of its logs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_GATE, EXIT_OK, EXIT_PARTIAL
+from pdhef_logtool.results.opened_run import OpenedLog
+from pdhef_logtool.results.run_report import LogOutcome
+from pdhef_logtool.storage.documents import jsonable
+
+if TYPE_CHECKING:
+    from pdhef_logtool.evaluation.metrics import MetricRow
+    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
+    from pdhef_logtool.storage.object_store import Mirror
+
+#: Largest number of logs that are reported one by one and keep all files.
+FEW_LOGS = 50
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogResult:
+    """Result of one log. Values that are no longer in memory are read from the output files.
+
+    Attributes
+    ----------
+    output : folder of the log, None if no file was written.
+    document, figures : report and rows in memory, None: in files; ``figures_file`` contains the rows.
+    failed_checks : number of failed checks that are not waived.
+    """
+
+    outcome: LogOutcome
+    output: Path | None
+    document: dict[str, Any] | None = None
+    figures: tuple[MetricRow, ...] | None = ()
+    failed_checks: int = 0
+    figures_file: Path | None = None
+
+    @property
+    def report(self) -> dict[str, Any] | None:
+        """The document of report.json, None if the log failed; raises OutputError for a damaged file."""
+        if self.document is not None or self.output is None:
+            return self.document
+        return OpenedLog(self.outcome.log, self.outcome.outcome, self.output, {"files": self.outcome.files}).report()
+
+    @property
+    def rows(self) -> tuple[MetricRow, ...]:
+        """The figures; raises OutputError for a damaged file."""
+        from pdhef_logtool.results.parquet_sink import read_metrics
+
+        if self.figures is not None:
+            return self.figures
+        return () if self.figures_file is None else tuple(read_metrics(self.figures_file))
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all of the log was used and no check failed without a waiver."""
+        return self.outcome.outcome == "ok" and not self.failed_checks
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResult:
+    """Result of a run; ``output`` is None without an output folder.
+
+    ``requirements``: the verdicts of the validation plan on all logs.
+
+    ``stored``: the outputs at a URL; ``output`` is then a local folder with reports and figures, which is deleted with
+    this result.
+    """
+
+    output: Path | None
+    results: tuple[LogResult, ...]
+    stored: Mirror | None = None
+    requirements: PlanVerdicts | None = None
+
+    @property
+    def place(self) -> Path | str | None:
+        """Folder or URL of the outputs."""
+        return self.output if self.stored is None else self.stored.objects.shown
+
+    @property
+    def is_fleet(self) -> bool:
+        """Whether there are too many logs to report each."""
+        return len(self.results) > FEW_LOGS
+
+    @property
+    def exit_code(self) -> int:
+        """0: success, 4: a requirement failed, 3: input was lost, a check or some logs failed, 1: all logs failed."""
+        if all(r.outcome.failed is not None for r in self.results):
+            return EXIT_FAILURE
+        if self.requirements is not None and self.requirements.closes_gate:
+            return EXIT_GATE
+        return EXIT_OK if all(r.is_whole for r in self.results) else EXIT_PARTIAL
+
+    def _shown(self, folder: Path) -> str:
+        return str(folder) if self.output is None else str(folder).replace(str(self.output), str(self.place), 1)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as one JSON-able document; of many logs without their reports."""
+        return {
+            "output": None if self.place is None else str(self.place),
+            "exit_code": self.exit_code,
+            "plan": None if self.requirements is None else jsonable(self.requirements.to_dict()),
+            "logs": [
+                {
+                    "log": r.outcome.log,
+                    "outcome": r.outcome.outcome,
+                    "output": None if r.output is None else self._shown(r.output),
+                    "report": None if self.is_fleet else r.report,
+                }
+                for r in self.results
+            ],
+        }
