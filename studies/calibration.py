@@ -206,16 +206,8 @@ def runs_of(
     """Run the estimators on the drives of a car; return the results by log."""
     file = write_toml(tool.work / "cars" / f"{name}.toml", vehicle)
     mode = "log" if is_calibrated else "off"
-    given = (
-        "--car",
-        file,
-        "--calibrate",
-        mode,
-        "--keep",
-        "estimates",
-        "--estimators",
-        "zero,open-loop,phy-ukf,physics",
-    )
+    names = "zero,open-loop,phy-ukf,physics"
+    given = ("--car", file, "--calibrate", mode, "--keep", "estimates", "--estimators", names)
     folder = tool.run(f"{name}-{mode}", *logs, *given)
     metrics = pl.read_parquet(folder / "metrics.parquet").filter(segment="all")
     runs = {}
@@ -225,12 +217,9 @@ def runs_of(
             for signal, metric in (("sideslip_rad", "rmse"), ("vy_m_s", "d2"), ("sideslip_rad", "coverage95"))
         }
         rmse = {estimator: math.degrees(value) for estimator, value in of["rmse"].items()}
-        track = pl.read_parquet(folder / "logs" / log / "estimates.parquet").filter(
-            pl.col("valid"), estimator="physics"
-        )
-        width = (
-            2.0 * NORMAL_95 * math.degrees(float(np.nanmean(track["sideslip_std_rad"].to_numpy()))) / rmse["physics"]
-        )
+        tracks = pl.read_parquet(folder / "logs" / log / "estimates.parquet")
+        stds = tracks.filter(pl.col("valid"), estimator="physics")["sideslip_std_rad"].to_numpy()
+        width = 2.0 * NORMAL_95 * math.degrees(float(np.nanmean(stds))) / rmse["physics"]
         runs[log] = Run(rmse, of["d2"], report, of["coverage95"]["physics"], width)
     return runs
 

@@ -7,7 +7,6 @@ fitted to a ramp steer (``fit_vehicle``), as after a measurement.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -26,7 +25,6 @@ from truthsim.sensors import SensorNoise
 from truthsim.vehicle import GRAVITY_M_S2, Vehicle
 from truthsim.vehicle_choice import choose_vehicle
 
-BASE = Path("sample_logs/vehicle.toml")
 KINDS = ("sedan", "suv")
 #: Share of the cars that get the tyres of the other kind.
 OTHER_TYRES_SHARE = 0.3

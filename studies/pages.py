@@ -28,20 +28,6 @@ def table(head: Iterable[str], body: Iterable[Iterable[str]], *, right_from: int
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (names, rule, *body))
 
 
-def table_rows(text: str) -> dict[str, list[list[str]]]:
-    """Return the cells of the first table below each heading of a Markdown text, without head and rule."""
-    tables: dict[str, list[list[str]]] = {}
-    heading, rows, ended = "", list[list[str]](), False
-    for line in text.splitlines():
-        if line.startswith("#"):
-            heading, rows, ended = line.lstrip("# "), tables.setdefault(line.lstrip("# "), []), False
-        elif line.startswith("|") and heading and not ended:
-            rows.append([cell.strip() for cell in line.strip("|").split("|")])
-        else:
-            ended = bool(rows)
-    return {name: rows[2:] for name, rows in tables.items() if rows}
-
-
 def number(value: float, digits: int = 3) -> str:
     """Return a figure, a dash for what is not finite."""
     return "–" if not math.isfinite(value) else f"{value:.{digits}f}"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 
 #: Time constant of the approach to the kinematic model, s: short for a car, long compared to a 10 ms step.
@@ -72,7 +72,7 @@ def model_parameters(vehicle: VehicleParameters, *, roll_correction: bool = Fals
         blend_high_m_s=vehicle.low_speed_blend_m_s,
         imu_x_m=vehicle.imu_position_m[0],
         imu_y_m=vehicle.imu_position_m[1],
-        ay_roll_gain=9.80665 * vehicle.roll_gradient_rad_per_m_s2 if roll_correction else 0.0,
+        ay_roll_gain=GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2 if roll_correction else 0.0,
     )
 
 

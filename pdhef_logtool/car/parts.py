@@ -188,7 +188,7 @@ class FittedPhysics(Record):
 
 
 class Fit(Record):
-    """``fit.toml``, written by ``pdhef learn --without-truth``: identified physics of the car.
+    """``fit.toml``, written by ``pdhef learn --stages calibrate``: identified physics of the car.
 
     The noise in ``filter`` was identified together with the values (docs/method.md#identification). ``physics``
     contains the values and noise of the filter ``physics``, which has other model parts and is identified separately.

@@ -12,12 +12,12 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from pdhef_logtool.records.geometry import GRAVITY_M_S2 as GRAVITY_M_S2
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.records.signals import Signals
 
 #: A car is at a standstill below this share of its low-speed blend.
 STANDSTILL_SHARE = 0.1
-GRAVITY_M_S2 = 9.80665
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]

@@ -17,7 +17,7 @@ commands = typer.Typer()
     notes="A second call has no effect.",
     name="compile",
 )
-def compile_(as_json: options.JsonFlag = False) -> None:
+def compile_() -> None:
     """Compile the filters in advance, so that the first run starts at once."""
     import time
     from pathlib import Path
@@ -37,8 +37,5 @@ def compile_(as_json: options.JsonFlag = False) -> None:
         write_drive(simulate_drive("banked-road"), log)
         for config in (saloon, sedan):
             run_logs([str(log)], Path(folder) / "out", config, report=False)
-    facts = {"seconds": round(time.perf_counter() - began_s, 1), "compiled": compiled_digest()}
-    if as_json:
-        console.print_json(facts)
-    else:
-        console.say(f"all code of runs is compiled ({facts['seconds']:.0f} s, {facts['compiled']})")
+    seconds = time.perf_counter() - began_s
+    console.say(f"all code of runs is compiled ({seconds:.0f} s, {compiled_digest()})")

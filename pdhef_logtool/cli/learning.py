@@ -20,16 +20,16 @@ commands = typer.Typer()
 @options.command(
     commands,
     "pdhef learn drives/ --car guess.toml -o mycar",
-    "pdhef learn logs/ --car guess.toml -o mycar --without-truth",
+    "pdhef learn logs/ --car guess.toml -o mycar --stages calibrate",
     "pdhef learn lap.mcap --car mycar -o mycar --start 155 --stages gain",
     panel=panels.LEARN,
     notes="""The default stage, teach, uses all driving with ground truth, at least 20 s: it learns the prior for the
 calibration of later drives, and the residual of physics after the calibration (taught.json in the car's folder). With
 --set reference=on, the sideslip reference replaces missing ground truth.
 
-Stage calibrate calibrates the car by the sensors of several logs, as --without-truth does; stage gain finds the
-residual gain of a network (--network). Drives of the splits test and extrapolation of a simulated set are rejected; for
-gain, drives of train and validation (docs/learn.md).""",
+Stage calibrate calibrates the car by the sensors of several logs without ground truth; stage gain finds the residual
+gain of a network (--network). Drives of the splits test and extrapolation of a simulated set are rejected; for gain,
+drives of train and validation; --split any permits them (docs/learn.md).""",
     shared="sensors friction network",
     car="Car to start from (mass, geometry, sensor noise, priors)",
 )
@@ -41,27 +41,18 @@ def learn(
     ],
     config: RunConfig,
     stages: Annotated[str, Option(help="Stage: teach, calibrate or gain.")] = "teach",
-    without_truth: Annotated[
-        bool, Option("--without-truth", help="Stage calibrate: the sensors of several logs; ground truth is not read.")
-    ] = False,
     seed: Annotated[int, Option(help="Seed of the residual's random features and of bootstraps.")] = 0,
-    split: options.Split = None,
-    any_split: options.AnySplit = False,
+    split: Annotated[
+        str | None,
+        Option(help="Only drives of this split of a simulated set; any: also of splits that are refused by default."),
+    ] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Learn the prior and the residual of a car, calibrate it, or find the residual gain of its network."""
-    from pdhef_logtool.learning.drives import CALIBRATE, TEACH, LearnSettings
+    from pdhef_logtool.learning.drives import LearnSettings
     from pdhef_logtool.learning.engine import learn as run_stage
 
-    if without_truth and stages not in (TEACH, CALIBRATE):
-        raise UsageError(expected=f"stage {CALIBRATE}", got=stages, where="--without-truth")
-    settings = LearnSettings(
-        config=config,
-        stage=CALIBRATE if without_truth else stages,
-        seed=seed,
-        split=split,
-        any_split=any_split,
-    )
+    settings = LearnSettings(config=config, stage=stages, seed=seed, split=split)
     with console.reporter() as reporter:
         result = run_stage(logs, output, settings, reporter=reporter)
     console.finish(result, learning_tables.render_learning, as_json)

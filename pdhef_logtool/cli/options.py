@@ -36,10 +36,6 @@ JunitFile = Annotated[Path | None, Option(help="JUnit XML file for the verdicts 
 Strict = Annotated[
     bool, Option("--strict", help="INCONCLUSIVE requirements fail, too (exit code 4).", rich_help_panel=OUTPUT)
 ]
-Split = Annotated[str | None, Option(help="Only drives of this split of a simulated set.", rich_help_panel=INPUT)]
-AnySplit = Annotated[
-    bool, Option("--any-split", help="Accept drives of splits that are refused by default.", rich_help_panel=INPUT)
-]
 Jobs = Annotated[
     int,
     Option("--jobs", "-j", help="Number of worker processes. Results do not depend on it.", rich_help_panel=WORK),

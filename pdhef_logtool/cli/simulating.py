@@ -58,7 +58,6 @@ def simulate(
     without: Annotated[
         _Many, Option(metavar="WHAT", help="Omit imu, steering, wheels, rtk, perfect or events. Repeatable.")
     ] = None,
-    steering_wheel: Annotated[bool, Option("--steering-wheel", help="Record the steering-wheel angle too.")] = False,
     rtk_rate_hz: Annotated[
         int | None,
         Option("--rtk-rate", help="Rate of the ground truth in Hz: 10, 20, 50 or 100. Default: from the manoeuvre."),
@@ -93,7 +92,7 @@ def simulate(
         rtk_rate_hz=rtk_rate_hz,
         keep_spins=keep_spins,
     )
-    write_drive(drive, output, without=without or (), steering_wheel=steering_wheel)
+    write_drive(drive, output, without=without or ())
     (console.print_json if as_json else console.print_facts)({"output": str(output), **drive.facts()})
 
 

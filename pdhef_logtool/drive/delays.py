@@ -65,10 +65,8 @@ def late_sensors(signals: Mapping[str, Channel]) -> tuple[LateSensor, ...]:
             continue
         name = pair.names[shift.latency_s >= low]
         beyond_s = max(low - shift.latency_s, shift.latency_s - high)
-        evidence = (
-            f"{pair.text} by {shift.latency_s * 1e3:.0f} +- {shift.std_error_s * 1e3:.0f} ms where {low * 1e3:.0f} to "
-            f"{high * 1e3:.0f} are plausible"
-        )
+        late_ms, sd_ms, low_ms, high_ms = (1e3 * x for x in (shift.latency_s, shift.std_error_s, low, high))
+        evidence = f"{pair.text} by {late_ms:.0f} +- {sd_ms:.0f} ms where {low_ms:.0f} to {high_ms:.0f} are plausible"
         delay_s = abs(shift.latency_s) if pair.exact else beyond_s
         wheels = tuple(n for n in signals if n.startswith("wheel_speed_")) if name.startswith("wheel_speed_") else ()
         sensor = LateSensor(wheels or (name,), delay_s, pair.exact, evidence)

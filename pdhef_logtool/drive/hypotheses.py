@@ -290,8 +290,9 @@ def _together(names: Sequence[str]) -> str:
 def units_of(name: str) -> list[tuple[float, str]]:
     """Return the correction factors for the units in which a signal may be recorded, each with its text."""
     to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
-    of_speeds = [(1.0 / 3.6, "is in km/h"), (3.6, "was converted from km/h twice")]
-    of_speeds += [(0.44704, "is in mph"), (1.0 / 0.44704, "was converted from mph twice")]
+    km_h, mph = 3.6, 0.44704
+    of_speeds = [(1.0 / km_h, "is in km/h"), (km_h, "was converted from km/h twice")]
+    of_speeds += [(mph, "is in mph"), (1.0 / mph, "was converted from mph twice")]
     if name in ("yaw_rate_rad_s", "roll_rate_rad_s", "pitch_rate_rad_s", "sideslip_rad", "yaw_rad"):
         return to_radians
     if name == "steer_rad":

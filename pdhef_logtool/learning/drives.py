@@ -37,6 +37,8 @@ HELD_OUT, SEEN = ("test", "extrapolation"), ("train", "validation")
 _SETTINGS = (
     "car", "mapping", "network", "start", "end", "sensors", "friction", "prefer_truth", "reference", "gnss",
 )  # fmt: skip
+#: Value of ``split`` that accepts every drive.
+ANY_SPLIT = "any"
 #: Maximum number of drives to name in an error.
 _NAMED = 3
 
@@ -50,15 +52,14 @@ class LearnSettings:
     config : car, network, mapping, slice, sensors, truth channel.
     stage : one of :data:`STAGES`.
     seed : seed of every random draw.
-    split : use only drives that their set's manifest assigns to this split.
-    any_split : accept drives of splits that the stage otherwise rejects.
+    split : use only drives that their set's manifest assigns to this split; "any" accepts drives of all splits, also
+        of those that the stage otherwise rejects.
     """
 
     config: RunConfig
     stage: str = TEACH
     seed: int = 0
     split: str | None = None
-    any_split: bool = False
 
     def __post_init__(self) -> None:
         """Check the values; raises UsageError."""
@@ -69,7 +70,7 @@ class LearnSettings:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON-able values; files by name only."""
-        values = {"stages": [self.stage], "seed": self.seed, "split": self.split, "any_split": self.any_split}
+        values = {"stages": [self.stage], "seed": self.seed, "split": self.split}
         return {**config_document(self.config), **values}
 
 
@@ -122,7 +123,7 @@ def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInp
     inputs = find_logs(arguments, private_redirects=settings.config.allow_private_redirects)
     manifests = cache(set_manifest)
     splits = {i.stem: str(manifests(i.folder).get(i.path.name, {}).get("split") or "") for i in inputs}
-    if settings.split is not None:
+    if settings.split not in (None, ANY_SPLIT):
         inputs = [i for i in inputs if splits[i.stem] == settings.split]
         if not inputs:
             there = ", ".join(sorted({s for s in splits.values() if s}))
@@ -133,15 +134,15 @@ def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInp
             )
     gain_only = settings.stage == GAIN
     refused = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in (SEEN if gain_only else HELD_OUT)]
-    if refused and not settings.any_split and settings.stage != CALIBRATE:
+    if refused and settings.split != ANY_SPLIT and settings.stage != CALIBRATE:
         more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
         raise UsageError(
             expected="drives that no network was trained on" if gain_only else "drives that no result is reported on",
             got=", ".join(refused[:_NAMED]) + more,
             where="learn",
-            remedy="use --split test, or --any-split if this network was not trained on them"
+            remedy="use --split test, or --split any if this network was not trained on them"
             if gain_only
-            else "drives used by a stage are no longer test drives: use --split validation, or --any-split",
+            else "drives used by a stage are no longer test drives: use --split validation, or --split any",
         )
     return list(inputs), {i.stem: splits[i.stem] for i in inputs if splits[i.stem]}
 
@@ -253,7 +254,7 @@ def no_drive(expected: str, where: str) -> EstimatorError:
         got="none",
         where=where,
         remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference; "
-        "--without-truth calibrates a car by its sensors alone",
+        "--stages calibrate calibrates a car by its sensors alone",
     )
 
 

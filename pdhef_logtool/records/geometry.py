@@ -6,8 +6,8 @@ import numpy as np
 
 from pdhef_logtool.records.signals import FloatArray, IntArray
 
-#: Degrees of a radian.
-DEGREES = 180.0 / np.pi
+#: Degrees of a radian, and standard gravity.
+DEGREES, GRAVITY_M_S2 = 180.0 / np.pi, 9.80665
 
 WGS84_A_M = 6378137.0
 WGS84_E2 = 6.69437999014e-3

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pdhef_logtool.records.geometry import GRAVITY_M_S2
 from pdhef_logtool.records.signals import FloatArray
 
 #: Name and order of the features. The paper's six come first.
@@ -48,8 +49,6 @@ ODD_FEATURES = frozenset(
     }
 )
 
-#: As in car.vehicle, which this layer cannot import.
-_GRAVITY_M_S2 = 9.80665
 # Entries of the filter's state, as in estimators.filter_base.
 _VX, _VY, _YAW_RATE = 0, 1, 2
 
@@ -96,7 +95,7 @@ def make_features(
             posterior[:, _YAW_RATE],
             friction,
             np.where(np.isfinite(ax_m_s2), ax_m_s2, 0.0),
-            np.abs(ay) / (friction * _GRAVITY_M_S2),
+            np.abs(ay) / (friction * GRAVITY_M_S2),
         ],
         axis=1,
     )

@@ -286,7 +286,7 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
         steps.append(
             f"teach the car with this ground truth: pdhef learn LOG {given}"
             if _error(figures, main.name) is not None
-            else f"calibrate the car with several logs: pdhef learn LOGS {given} --without-truth"
+            else f"calibrate the car with several logs: pdhef learn LOGS {given} --stages calibrate"
         )
     friction = report["friction"]
     if friction is not None and friction["estimated"] and (friction["observable_share"] or 0.0) < _FRICTION_SHOWN:

@@ -168,7 +168,7 @@ def noise(t: Training) -> None:
 
 def gain(t: Training) -> None:
     """Evaluate on other drives how far the network helps on this car."""
-    pdhef("learn", t.work / "evidence", *t.with_network, "--stages", "gain", "--any-split", "-o", t.car)
+    pdhef("learn", t.work / "evidence", *t.with_network, "--stages", "gain", "--split", "any", "-o", t.car)
 
 
 def intervals(t: Training) -> None:

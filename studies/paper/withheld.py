@@ -51,7 +51,7 @@ def train_withheld(work: Path, output: Path) -> None:
     network = output.with_name(f"{output.name}-network")  # learn copies it into the car
     train_on(replace(data, drives=kept), network, Recipe(seed=0, epochs=EPOCHS))
     of_car = ["--car", output, "--mapping", work / "mapping.toml", "--network", network]
-    pdhef("learn", work / "evidence", *of_car, "--stages", "gain", "--any-split", "-o", output)
+    pdhef("learn", work / "evidence", *of_car, "--stages", "gain", "--split", "any", "-o", output)
 
 
 def withheld_car(work: Path, output: Path) -> Car:

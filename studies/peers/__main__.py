@@ -11,27 +11,30 @@ from __future__ import annotations
 
 import json
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 
-from pdhef_logtool.car.toml_files import vehicle_toml
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.mapping import Mapping, mapping_to_toml
-from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.results.opened_run import ESTIMATES_FILE
-from pdhef_logtool.runs.config import Calibrate, RunConfig
-from pdhef_logtool.runs.fleet import run_logs
-from studies.pages import DOCS, DRIVES, RESULTS, options, write
-from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_of, read_peer_drive, vehicle_of
+from studies.gates.tool import Tool, reports
+from studies.pages import DOCS, DRIVES, RESULTS, ROOT, options, write, write_toml
+from studies.peers.drives import (
+    PEER_DRIVES,
+    PeerDrive,
+    mapping_of,
+    mapping_table,
+    read_peer_drive,
+    vehicle_of,
+    vehicle_table,
+)
 from studies.peers.models import Peer, open_loop, peers_of
 from studies.peers.page import OURS, page
-from studies.peers.parameters import pairs_table, parameters_of_drive
+from studies.peers.parameters import pairs_table
 from studies.peers.scoring import DriveErrors, score, usable_sideslip
 
 SEDAN = "open-loop-sedan"
@@ -44,36 +47,44 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--results", type=Path, default=RESULTS / "peers", help="folder of errors.json and parameters.json"
     )
+    parser.add_argument("--work", type=Path, default=ROOT / "out" / "peers")
     given = parser.parse_args(arguments)
     if not DRIVES.is_dir():
         print("nothing is compared: needs ../shared beside the repository")
         return 0
-    documents = [drive_errors(drive).document() for drive in PEER_DRIVES]
+    tool, parameters, documents = Tool(ROOT, given.work.resolve()), list[dict[str, Any]](), []
+    for drive in PEER_DRIVES:
+        errors, calibration = drive_errors(drive, tool)
+        documents.append(errors.document())
+        if calibration and not calibration["refused"]:
+            parameters.append({"log": drive.log, "parameters": calibration["parameters"]})
     write(given.results / "errors.json", json.dumps(documents, indent=1) + "\n")
-    parameters = [found for drive in PEER_DRIVES if (found := parameters_of_drive(drive)) is not None]
     write(given.results / "parameters.json", json.dumps(parameters, indent=1) + "\n")
     write(given.out / "peers.md", page([DriveErrors.of(document) for document in documents], pairs_table(parameters)))
     return 0
 
 
-def drive_errors(drive: PeerDrive) -> DriveErrors:
-    """Run all estimators on a drive and score them."""
+def drive_errors(drive: PeerDrive, tool: Tool) -> tuple[DriveErrors, dict[str, Any] | None]:
+    """Run all estimators on a drive; return their errors and the calibration with the published vehicle file."""
     log, mapping, vehicle = DRIVES / drive.log, mapping_of(drive), vehicle_of(drive)
     read = read_peer_drive(log, vehicle, mapping)
     with_sedan = read_peer_drive(log, default_vehicle(), mapping)
     estimates = peer_estimates(read.signals, with_sedan.signals, vehicle)
-    runs: dict[tuple[Calibrate, str], dict[str, tuple[FloatArray, FloatArray]]] = {}
+    runs: dict[tuple[str, str], dict[str, tuple[FloatArray, FloatArray]]] = {}
     stds: dict[str, FloatArray] = {}
-    missing = np.full(len(read.signals), np.nan)
+    missing, calibration = np.full(len(read.signals), np.nan), None
     for name, (calibrate, car, preset) in OURS.items():
         if (calibrate, car) not in runs:
-            given = vehicle if car == "file" else None
-            runs[calibrate, car] = tool_estimates(log, mapping, given, calibrate, read.signals.stamps_ns)
+            folder = tool_run(tool, drive, calibrate, car)
+            runs[calibrate, car] = {} if folder is None else tracks_of(folder, read.signals.stamps_ns)
+            if folder is not None and (calibrate, car) == ("log", "file"):
+                (report,) = reports(folder).values()
+                calibration = report["self_calibration"]
         estimates[name], stds[name] = runs[calibrate, car].get(preset, (missing, missing))
     assert read.truth is not None
     errors = score(drive, estimates, read.truth, stds)
     print(drive.log, {name: round(value, 3) for name, value in errors.rmse_deg.items()}, file=sys.stderr)
-    return errors
+    return errors, calibration
 
 
 def peer_estimates(signals: Signals, with_sedan: Signals, vehicle: VehicleParameters) -> dict[str, FloatArray]:
@@ -83,36 +94,24 @@ def peer_estimates(signals: Signals, with_sedan: Signals, vehicle: VehicleParame
     return {peer.name: usable_sideslip(run_window(peer, given)[0]) for peer, given in runs}
 
 
-def tool_estimates(
-    log: Path, mapping: Mapping, vehicle: VehicleParameters | None, calibrate: Calibrate, stamps_ns: IntArray
-) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return sideslip and its standard deviation of a default ``pdhef run`` by estimator, at the stamps [N].
+def tool_run(tool: Tool, drive: PeerDrive, calibrate: str, car: str) -> Path | None:
+    """Run the default estimators with the published mapping and vehicle file; None if the run refuses."""
+    name = f"{drive.log.partition('.')[0]}-{calibrate}-{car}"
+    mapping = write_toml(tool.work / "mappings" / f"{name}.toml", mapping_table(drive))
+    given: tuple[str | Path, ...] = ("--mapping", mapping, "--keep", "estimates", "--calibrate", calibrate)
+    if car == "file":
+        given += ("--car", write_toml(tool.work / "cars" / f"{name}.toml", vehicle_table(drive)))
+    try:
+        return tool.run(name, DRIVES / drive.log, *given)
+    except RuntimeError as error:
+        print(error, file=sys.stderr)
+        return None
 
-    Nothing if the run refuses.
-    """
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "mapping.toml").write_text(mapping_to_toml(mapping), encoding="utf-8")
-        car = None
-        if vehicle is not None:
-            car = folder / "vehicle.toml"
-            car.write_text(vehicle_toml(vehicle), encoding="utf-8")
-        config = RunConfig(
-            car=car,
-            mapping=folder / "mapping.toml",
-            annotate="none",
-            keep="estimates",
-            calibrate=calibrate,
-        )
-        try:
-            result = run_logs([str(log)], folder / "out", config, report=False).results[0]
-        except PdhefError as error:
-            print(f"{log.name}: {error}", file=sys.stderr)
-            return {}
-        if result.output is None:
-            print(f"{log.name}: {result.outcome.failed}", file=sys.stderr)
-            return {}
-        table = pl.read_parquet(result.output / ESTIMATES_FILE)
+
+def tracks_of(folder: Path, stamps_ns: IntArray) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return sideslip and its standard deviation of the estimators of a run at the stamps [N]."""
+    (file,) = folder.glob("logs/*/estimates.parquet")
+    table = pl.read_parquet(file)
     tracks = {}
     for (estimator,), rows in table.group_by("estimator"):
         usable = rows.filter(pl.col("valid"))

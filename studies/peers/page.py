@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from pdhef_logtool.runs.config import Calibrate
 from studies.pages import number, table
 from studies.peers.drives import FULL_SIZE, OFFSET, SMALL
 from studies.peers.scoring import (
@@ -19,7 +18,7 @@ from studies.peers.scoring import (
 )
 
 #: The presets of the tool: calibration, car and track.
-OURS: dict[str, tuple[Calibrate, str, str]] = {
+OURS: dict[str, tuple[str, str, str]] = {
     "phy-ukf": ("log", "file", "phy-ukf"),
     "physics": ("log", "file", "physics"),
     "pd-hef": ("log", "file", "pd-hef"),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_network_parts import arrays, made_rows
+from test_network_parts import arrays
 
 from pdhef_logtool.learning.network.cells import (
     COUNT,
@@ -26,6 +26,7 @@ from pdhef_logtool.learning.network.cells import (
 )
 from pdhef_logtool.learning.network.dataset import MANIFEST, read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
+from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.learning.network.train_command import LEAD_STEPS, gap_free_runs, weights_of
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.records.reporter import Reporter
@@ -81,7 +82,9 @@ def test_a_second_draws_by_its_log_the_seed_and_itself() -> None:
 
 
 def test_conditions_are_on_the_columns_of_a_row() -> None:
-    rows = made_rows(50)
+    made, none = arrays(50), np.full(50, np.nan)
+    columns = [made.stamps_ns, made.features, made.targets, made.step_s, made.weight, made.segment, made.truth_velocity]
+    rows = ResidualRows(*columns, none, none)
     vx, ay = (rows.features[:, FEATURES.index(n)] for n in ("vx_m_s", "ay_m_s2"))
     holds = Picking(condition_of("abs(ay_m_s2) > 0.5 and not vx_km_h < 1.8 or truth_vx_m_s < 0")).of(rows).chosen
     np.testing.assert_array_equal(holds, (np.abs(ay) > 0.5) & ~(vx * 3.6 < 1.8))

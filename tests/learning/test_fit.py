@@ -21,6 +21,7 @@ from pdhef_logtool.learning.network.fit import (
     normalisation_of,
     train,
 )
+from pdhef_logtool.learning.network.train_command import mean_square
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.service import NetworkService
@@ -123,6 +124,18 @@ def test_fine_tuning_starts_where_the_other_model_ended(tmp_path: Path) -> None:
     )
     assert after[0].validation_loss == pytest.approx(min(e.validation_loss for e in history), rel=0.05)
     assert tuned.normalisation == first.normalisation
+
+
+def test_training_stops_when_patience_ends_and_keeps_the_best_epoch(tmp_path: Path) -> None:
+    """Validation targets have the other sign, so that their error grows while the network learns."""
+    training = make_sequences(0, 6)
+    validation = [replace(s, target=-s.target) for s in make_sequences(1, 2)]
+    bundle, history = train(training, validation, replace(SMALL, epochs=20, patience=2), tmp_path)
+    losses = [e.validation_loss for e in history]
+    best = losses.index(min(losses))
+    assert len(losses) == best + 3 < 20
+    assert (bundle.provenance["best_epoch"], bundle.provenance["validation_loss"]) == (best + 1, losses[best])
+    assert mean_square(bundle, validation) == pytest.approx(losses[best], rel=0.5)
 
 
 def test_samples_without_weight_teach_nothing(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""``pdhef learn --without-truth``: a pool of logs makes a car, and what cannot carry one is refused."""
+"""``pdhef learn --stages calibrate``: a pool of logs makes a car, and what cannot carry one is refused."""
 
 from __future__ import annotations
 

@@ -25,6 +25,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return work
 
 
+@pytest.mark.fleet
 @pytest.mark.slow
 def test_the_page_has_every_row_and_its_pooled_figure_is_that_of_the_samples(made: Path) -> None:
     page = (made / "docs" / "conditions.md").read_text(encoding="utf-8")
@@ -38,6 +39,7 @@ def test_the_page_has_every_row_and_its_pooled_figure_is_that_of_the_samples(mad
     assert line.split("|")[2].strip() == f"{math.degrees(pooled):.3f}"
 
 
+@pytest.mark.fleet
 @pytest.mark.slow
 def test_wrong_friction_reaches_the_model_and_nothing_else(made: Path) -> None:
     for estimator, is_equal in (("zero", True), ("phy-ukf", False)):

@@ -15,7 +15,6 @@ from studies.defaults.interval_fit import (
     FOLDS,
     Samples,
     bin_numbers,
-    bin_weights,
     coverage_rows,
     covering_factor,
     fit_coefficients,
@@ -193,14 +192,6 @@ def test_the_fit_minimises_the_pinball_loss_of_the_files_head() -> None:
         aside = np.maximum(k, 0.05)
         aside[i] *= factor
         assert loss(aside) > loss(k)
-
-
-def test_drives_of_a_bin_count_alike_but_for_those_that_hardly_see_it() -> None:
-    drive = np.repeat([4, 7, 9], [600, 60, 5])
-    weight = bin_weights(np.zeros(665, dtype=np.int64), drive)
-    shares = [weight[drive == d].sum() for d in (4, 7, 9)]
-    assert shares[0] == pytest.approx(shares[1])
-    assert shares[2] == pytest.approx(shares[1] * 5 / 20)
 
 
 def test_a_drive_is_never_on_both_sides() -> None:

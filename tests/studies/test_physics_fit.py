@@ -11,9 +11,7 @@ import pytest
 from physics_oracle import Oracle, parts
 from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, Drive, drive, keep, with_noise
 
-from pdhef_logtool.car.parts import FittedPhysics
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
-from pdhef_logtool.estimators.calibration.calibration import VARIED
 from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD
 from pdhef_logtool.records.tracks import make_track
 from studies.defaults import physics_fit
@@ -24,12 +22,10 @@ from studies.defaults.physics_fit import (
     build_car,
     choose_parts,
     drive_errors,
-    find_physics,
     fit_physics,
     make_folds,
     make_priors,
     usable_seconds,
-    varied_vehicles,
 )
 
 STATIC = PhysicsParts()
@@ -99,54 +95,6 @@ def test_stiffness_is_found_within_the_posteriors_interval(static: FitDrive) -> 
     (unseen,) = drive_errors([static_drive(2)], start, found.vehicle, found.noise)
     assert math.degrees(unseen.rms) < 0.1
     assert 0.3 < after.nis < 3.0
-
-
-def test_what_is_kept_of_the_posterior_is_what_moves_the_sideslip_most(static: FitDrive) -> None:
-    """Each kept direction is a 1-sigma of the posterior; noise has none."""
-    short = part_of(static, 0, 500)
-    found = fit_physics([short], guess(), STATIC, starts=STARTS[:1], iterations=1)
-    moved = []
-    for number, vehicle in enumerate(kept := varied_vehicles([short], guess(), found)):
-        theta = np.array([p.theta(_entry(vehicle, p.name)) for p in found.priors if not p.tuning])
-        at = np.array([p.theta(_entry(found.vehicle, p.name)) for p in found.priors if not p.tuning])
-        free = [i for i, p in enumerate(found.priors) if not p.tuning]
-        away = theta - at
-        mahalanobis = away @ np.linalg.solve(found.covariance[np.ix_(free, free)], away)
-        assert mahalanobis == pytest.approx(1.0, abs=0.02), number
-        (there,) = drive_errors([short], guess(), vehicle, found.noise)
-        (here,) = drive_errors([short], guess(), found.vehicle, found.noise)
-        moved.append(float(np.sqrt(np.mean((there.error - here.error) ** 2))))
-    assert len(kept) == VARIED
-    assert moved[0] == max(moved)
-    assert moved[0] > 1e-5
-
-
-def _entry(vehicle: VehicleParameters, name: str) -> float:
-    """Return a parameter of the static car by the name of its prior."""
-    axle, _, what = name.partition(" ")
-    if axle in ("front", "rear"):
-        tyre = vehicle.tyres.front if axle == "front" else vehicle.tyres.rear
-        stiffness, peak = vehicle.cornering_stiffness_n_per_rad(axle == "front", 0.85), 0.85 * tyre.D_n
-        return {"cornering stiffness": stiffness, "peak force": peak, "shape": tyre.C}[what]
-    return {
-        "yaw inertia": vehicle.yaw_inertia_kg_m2,
-        "steering offset": vehicle.steer_offset_rad,
-        "roll gradient": vehicle.roll_gradient_rad_per_m_s2,
-        "a_y bias": vehicle.sensors.ay_bias_m_s2,
-        "yaw rate bias": vehicle.sensors.yaw_rate_bias_rad_s,
-    }[name]
-
-
-@pytest.mark.slow
-def test_of_two_starts_of_the_noise_the_better_end_counts(static: FitDrive) -> None:
-    short = part_of(static, 0, 500)
-    ends = [fit_physics([short], guess(), STATIC, starts=[s], iterations=2) for s in STARTS]
-    both = fit_physics([short], guess(), STATIC, iterations=2)
-    assert ends[0].cost != ends[1].cost
-    assert both.cost == min(e.cost for e in ends)
-    assert {name for start in STARTS for name in start} <= {p.name for p in both.priors if p.tuning}
-    none = fit_physics([short], guess(), STATIC, starts=STARTS[1:], iterations=0)
-    assert none.noise.r_std["ay_m_s2"] == pytest.approx(0.3 * math.exp(1.5 * physics_fit.NOISE_LOG_STD), rel=1e-4)
 
 
 def test_errors_count_where_truth_is_usable_and_the_filter_has_settled(static: FitDrive) -> None:
@@ -258,7 +206,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize(("make", "kept"), [(rolling_car, {"roll"}), (static_drive, set())])
+@pytest.mark.parametrize(
+    ("make", "kept"), [pytest.param(rolling_car, {"roll"}, marks=pytest.mark.fleet), (static_drive, set())]
+)
 def test_a_car_keeps_the_parts_that_it_has(make, kept: set[str]) -> None:
     one, other = [make(1, 12.0)], [make(2, 12.0)]
     told: list[tuple[str, float]] = []
@@ -273,33 +223,3 @@ def test_a_car_keeps_the_parts_that_it_has(make, kept: set[str]) -> None:
         assert not without_roll.taken
     assert [share for _, share in told] == [0.4, 0.6, 0.8]
     assert told[0][0] == "is biases worth having"
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("quick")
-def test_what_is_found_puts_the_car_right(static: FitDrive, monkeypatch: pytest.MonkeyPatch) -> None:
-    fits: list[PhysicsParts] = []
-
-    def fit(drives, start, has, **settings):
-        fits.append(has)
-        return fit_physics(drives, start, has, **settings | {"starts": STARTS[:1], "iterations": 2})
-
-    monkeypatch.setattr(physics_fit, "fit_physics", fit)
-    start, told = guess(0.8, 1.2, name="mine"), []
-    short = part_of(static, 0, 600)
-    found, held = find_physics([short], start, parts=parts("lag"), progress=lambda *x: told.append(x))
-    assert fits == [parts("lag")]
-    assert held.values.applied_to(start) == found.vehicle != start
-    assert found.vehicle.physics == parts("lag")
-    assert (held.noise, held.tried) == (found.noise, ())
-    assert told == [("fitting the physics filter's sideslip to the ground truth", 0.7)]
-    assert FittedPhysics.model_validate(held.model_dump(mode="json")) == held
-    assert find_physics([short], start)[1].values.physics == STATIC, "too little driving to choose by"
-    assert fits[1:] == [STATIC]
-    monkeypatch.setattr(physics_fit, "LEAST_FOLD_S", 8.0)
-    fits.clear()
-    _, held = find_physics([static], start)
-    assert held.tried[0].parts == ()
-    assert len(held.tried) == 5
-    assert fits[:2] == [STATIC, STATIC]
-    assert held.values.physics == fits[-1]

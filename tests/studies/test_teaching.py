@@ -45,6 +45,7 @@ def test_the_stored_results_have_every_pair_and_only_one_of_a_small_car_is_worse
     assert worse == [("5 runs", "f1tenth_xray_0")]
 
 
+@pytest.mark.fleet
 @pytest.mark.slow
 @pytest.mark.usefixtures("shared_dir")
 def test_a_car_that_was_taught_on_one_drive_is_better_on_the_other(tmp_path: Path) -> None:

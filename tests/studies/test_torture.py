@@ -70,8 +70,11 @@ _LARGE = ("GiB", "MB", "channels", "million")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bomb", [b for b in BOMBS if not any(w in b.name for w in _LARGE)][::3], ids=lambda b: b.name)
-def test_a_bomb_ends_in_time_with_its_exit_code(bomb: Bomb, tmp_path: Path) -> None:
+@pytest.mark.parametrize("bomb", [b for b in BOMBS if not any(w in b.name for w in _LARGE)][::6], ids=lambda b: b.name)
+def test_a_bomb_ends_in_time_with_its_exit_code(bomb: Bomb, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "studies.torture.bombs.LIMIT_S", 120.0
+    )  # only ends a hang: other processes may load the machine
     assert judge_bomb(bomb, tmp_path).problem == ""
 
 
@@ -190,7 +193,7 @@ def test_what_counts_as_wrong(ended: Ended, wrong: bool) -> None:
 
 @pytest.mark.slow
 def test_the_memory_of_a_command_is_its_own() -> None:
-    kept = bytearray(b"x") * (1 << 30)
+    kept = bytearray(b"x") * (300 << 20)
     process = outside.measured("--version")
     assert 10 << 20 < process.peak_bytes < len(kept)
     assert not process.late and not process.left

@@ -11,7 +11,7 @@ import pytest
 from pdhef_logtool.car.car import HISTORY_FILE, INTERVALS_FILE, NOISE_FILE, UNSURE_FILE, Car
 from studies.defaults import train_default
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.fleet, pytest.mark.slow]
 
 #: ``again`` is a copy of ``dlc``: intervals need five drives.
 LOGS = ("again", "dlc", "step", "fishhook", "sweep")

@@ -84,8 +84,9 @@ def _steering(drive: CheckedDrive) -> list[Check]:
 
 
 def _understeer_check(gradient: float, error: float, file: float) -> Check:
+    drive_mrad, error_mrad, file_mrad = (1e3 * x for x in (gradient, error, file))
     evidence = (
-        f"understeer gradient {gradient * 1e3:.2f} +- {error * 1e3:.2f} mrad per m/s^2 in the drive, {file * 1e3:.2f} "
+        f"understeer gradient {drive_mrad:.2f} +- {error_mrad:.2f} mrad per m/s^2 in the drive, {file_mrad:.2f} "
         "in the file"
     )
     opposite = gradient * file < 0.0 and min(abs(gradient), abs(file)) > NEUTRAL_RAD_PER_M_S2

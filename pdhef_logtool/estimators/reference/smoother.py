@@ -21,6 +21,7 @@ import math
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.compiled.cache import njit
 
 #: Entries of the state: up to PITCH_RATE_BIAS always, to ANTENNA_HEIGHT with GNSS velocity, all with positions.
@@ -52,7 +53,7 @@ BIAS_M_S2, RECEIVER_M_S = 0.35, 0.02
 #: Share of a change of a_x, a_y that changes their bias by pitch and roll; the same with known roll and pitch rate.
 TILT_SHARE, KNOWN_TILT_SHARE = 0.05, 0.01
 #: Time constant of the tilt from roll and pitch rate, and noise by their errors, m/s²/√s.
-TILT_S, TILT_NOISE, GRAVITY_M_S2 = 30.0, 0.03, 9.80665
+TILT_S, TILT_NOISE = 30.0, 0.03
 #: White noise of a stretch without IMU, m/s²/√Hz.
 GAP_NOISE = 3.0
 #: Time constant of the error of a position.

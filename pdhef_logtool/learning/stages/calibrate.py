@@ -59,7 +59,7 @@ def calibrate(task: Task) -> StageOutput:
     if calibration.refused:
         raise _refused(calibration.refused, "logs with bends and lane changes that calibrate the car")
     part = fit_part(calibration, [r.learnt_on for r in records if not r.left_out])
-    head = f"Written by pdhef learn --without-truth: no ground truth was used.\n{calibration.text}."
+    head = f"Written by pdhef learn --stages calibrate: no ground truth was used.\n{calibration.text}."
     files = {FIT_FILE: part_toml(part, head).encode()}
     settings = task.settings.to_dict()
     change = Change(f"learn --stages {CALIBRATE}", FIT_FILE, files, settings=settings, drives=part.drives)
@@ -87,6 +87,6 @@ def _refused(got: str, expected: str) -> EstimatorError:
     return EstimatorError(
         expected=expected,
         got=got,
-        where="learn --without-truth",
+        where="learn --stages calibrate",
         remedy="give more logs of this car, or one with ground truth without this option",
     )
