@@ -71,7 +71,7 @@ def derivative(column: FloatArray) -> FloatArray:
 
 
 def earlier(column: FloatArray, by_s: float) -> FloatArray:
-    """Return a column of the grid shifted to an earlier time; NaN where it is unknown."""
+    """Return a column of the grid shifted to an earlier time; NaN if unknown."""
     cell = np.arange(column.shape[0]) + by_s / GRID_S
     return column if by_s == 0.0 else np.interp(cell, np.arange(column.shape[0]), column, left=np.nan, right=np.nan)
 

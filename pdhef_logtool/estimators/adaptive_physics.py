@@ -1,20 +1,20 @@
 """``physics`` and ``pd-hef``: the physics filter with residual gain times a network's residual, adaptive.
 
-There is one set of noise, that of the car's physics: the gain scales the residual only, and ``physics`` has gain 0 and
-no network. The mechanism (docs/method.md#adaptation) does not read model error as noise.
+All gains use the noise of the car's physics: the gain scales the residual only, and ``physics`` has gain 0 and no
+network. The mechanism (docs/method.md#adaptation) does not treat model error as noise.
 
-Bottom layer: :mod:`~.sensor_faults` checks a_y and yaw rate alone. What it finds goes into every filter here, the
-parallel one too, and keeps bad samples from the network.
+Bottom layer: :mod:`~.sensor_faults` checks a_y and yaw rate. Its findings apply to every filter here and to the
+parallel one, and keep bad samples from the network.
 
-Top layer: a bank of filters on one pass of the network, each a hypothesis of what the car's model lacks. F1 lacks
-nothing; of the others each has one cure: a state that scales all forces, or one for the bank of the road. Both at once
-trade the same error to and fro, and cost more than they find. With Λ the sum of a filter's log-likelihood of its
+Top layer: a bank of filters with the same network output, each a hypothesis about the car's model. F1 assumes that it
+is complete; each other filter adds one state: a scale of all forces, or the bank of the road. With both at once, the
+same error moves between them, and the estimate is worse. With Λ the sum of a filter's log-likelihood of its
 measurements, forgotten within seconds, the weight of filter i is
 
     w_i ∝ exp(Λ_i)
 
-which is multiple-model estimation (Magill 1965) for what comes and goes. A cure has a filter where the car's driving
-has shown that it is worth having, and nowhere else: a state more always fits something. A car without identified parts
+which is multiple-model estimation (Magill 1965) for temporary effects. A state has a filter only if drives of the car
+have shown its benefit, because an additional state always fits something. A car without identified parts
 has F1 alone. The output is the mixture of all, its covariance with their differences.
 """
 
@@ -41,12 +41,12 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.presets import Options
 
-#: What a model may lack, as parts of ``physics``; each is the state of one filter.
+#: Possible deficiencies of a model, as parts of ``physics``; each is the state of one filter.
 CURES = ("force_scale", "bank")
 #: Time constant with which the likelihood is forgotten, s. Chosen on simulated drives that no table contains; from 1 to
 #: 5 s little changes.
 FORGET_S = 2.0
-#: A smaller weight is none.
+#: Smaller weights are set to 0.
 LEAST_WEIGHT = 1e-6
 
 
@@ -77,7 +77,7 @@ class AdaptiveState:
 
 @njit(cache=True)
 def _gather(dt, likelihood, starts, evidence, out):  # type: ignore[no-untyped-def]
-    """Write Λ [K, H] of each step; ``evidence`` [H] is that of the step before the first, and updated in place."""
+    """Write Λ [K, H] of each step; ``evidence`` [H] belongs to the step before the first, and is updated in place."""
     for k in range(dt.shape[0]):
         forgets = starts[k] or not dt[k] <= RESTART_GAP_S
         kept = 0.0 if forgets else math.exp(-dt[k] / FORGET_S)
@@ -143,7 +143,7 @@ def _share(weights):  # type: ignore[no-untyped-def]
 def _mix(weights, valid, states, covariances, w, x, P):  # type: ignore[no-untyped-def]
     """Write the mixtures of states [H, N, 4] and covariances [H, N, 3, 3]; the first three states have a covariance.
 
-    ``w`` [N, H] becomes the weights of what is valid; where all weight is lost so, what is valid has equal ones.
+    ``w`` [N, H] becomes the weights of valid states; if all their weights are 0, they have equal ones.
     """
     for k in range(w.shape[0]):
         total = 0.0
@@ -175,7 +175,7 @@ def _mix(weights, valid, states, covariances, w, x, P):  # type: ignore[no-untyp
 def mix(weights: FloatArray, tracks: Sequence[StateTrack]) -> StateTrack:
     """Return tracks [H] with weights [N, H] as one Gaussian: x = Σ w x_i, P = Σ w (P_i + (x_i − x)(x_i − x)ᵀ).
 
-    What is not valid has no weight; where all weight is lost so, what is valid has equal ones.
+    Invalid states have weight 0; if all weights of valid ones are 0, these have equal weights.
     """
     valid = np.stack([t.valid for t in tracks], axis=1)
     count = len(valid)
@@ -205,7 +205,7 @@ def mix(weights: FloatArray, tracks: Sequence[StateTrack]) -> StateTrack:
 
 
 def _mixed_columns(w: FloatArray, tracks: Sequence[StateTrack]) -> dict[str, Any]:
-    """Return what tracks estimate beside the motion, mixed; to a filter without such a state it is 0."""
+    """Return the mixed estimates beside the motion; a filter without such a state counts as 0."""
     mixed = {}
     for name in ESTIMATED_COLUMNS:
         columns = [getattr(t, name) for t in tracks]
@@ -222,9 +222,9 @@ class AdaptivePhysics:
     Parameters
     ----------
     physics : the car's filter with its parts and noise.
-    network : what its model lacks, None without; trust : residual gain of all filters, in [0, 1].
+    network : of the model's residual, None without; trust : residual gain of all filters, in [0, 1].
     adaptive : False leaves the mechanism out: no detector, and the car's filter alone, with its cures as states.
-    notes : what the report states of it, such as the reason for its residual gain.
+    notes : texts for the report, such as the reason for its residual gain.
     """
 
     algorithm = "adaptive-physics"
@@ -251,7 +251,7 @@ class AdaptivePhysics:
         return tuple(replace(self.physics, vehicle=v, read_with=self.physics.read_with or vehicle) for v in vehicles)
 
     def inputs(self, signals: Signals, state: InputState | None) -> tuple[CheckedInputs, InputState]:
-        """Return what the filters take: checked signals with the residual at gain 1; and the state."""
+        """Return the inputs of the filters, checked signals with the residual at gain 1, and the state."""
         if self.adaptive:
             return check_inputs(self.physics, self.network, signals, state)
         rate, after = residual_rate(self.physics, self.network, signals, state)

@@ -68,7 +68,7 @@ DIVERGED_NIS_RATIO = 25.0
 DIVERGED_NIS_CAP = 4.0 * GATE_SIGMA**2
 DIVERGED_AVERAGE_S = 1.0
 DIVERGED_SIDESLIP_RAD = math.radians(60.0)
-#: A car whose speed sensor last read more than this does not roll backwards: a v_x below zero is then no estimate.
+#: If the speed sensor last read more than this, the car does not roll backwards: a v_x below zero is divergence.
 FORWARD_M_S = 0.5
 
 # Entries of the scalar memory of a filter.
@@ -79,14 +79,14 @@ M_SPEED = 14  # last speed sample
 M_GRIP = 15  # largest recent share of the grip that is used, decaying (``physics`` only)
 M_STEER_ROW = 16  # and those behind it: covariance of an unknown steering angle with the state (``physics`` only)
 MEMORY = 32
-#: What M_REJECTED contains at the first rejected sample itself; 0 is "the last sample was accepted".
+#: Value of M_REJECTED at the first rejected sample; 0 is "the last sample was accepted".
 JUST_REJECTED_S = 1e-9
 
 
 class Window(NamedTuple):
     """Samples of a window, [K], NaN where missing. ``dt_s`` is the duration before each step, NaN at the start.
 
-    ``residual_rate`` [K, 2] is what is added to v̇_y and ṙ from the step on, m/s² and rad/s²; ``extra_r`` [K, 2] the
+    ``residual_rate`` [K, 2] is added to v̇_y and ṙ from the step on, m/s² and rad/s²; ``extra_r`` [K, 2] the
     variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
     """
 
@@ -181,7 +181,7 @@ class Sample(NamedTuple):
 
 
 class StepInputs(NamedTuple):
-    """Inputs at step k, held where they are missing, and its measurements.
+    """Inputs at step k, held if missing, and its measurements.
 
     ``steers`` states that the filter may start with the steering, ``steer_ok`` that it may go on with it.
     """
@@ -302,7 +302,7 @@ def begin_step(sample, rules, memory):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def held_over_step(now, memory):  # type: ignore[no-untyped-def]
-    """Return the mean of the inputs at both ends of a step; where a_x is missing at one end, that of the other."""
+    """Return the mean of the inputs at both ends of a step; if a_x is missing at one end, the other end counts."""
     ax = now.ax
     if not now.has_ax:
         ax = memory[M_AX]
@@ -344,7 +344,7 @@ def starts(now, rear_m, initial_std, x, P, memory):  # type: ignore[no-untyped-d
 
 @njit(cache=True)
 def add_process_noise(P, q_std, ax_known, dt):  # type: ignore[no-untyped-def]
-    """Add what random walks of ``q_std`` [n] make uncertain in ``dt`` s; without a_x the speed is one too."""
+    """Add the variance of random walks of ``q_std`` [n] over ``dt`` s; without a_x the speed is a random walk too."""
     for i in range(P.shape[0]):
         q = q_std[i] if i != VX or ax_known else NO_AX_Q_STD
         P[i, i] += q * q * dt
@@ -401,11 +401,11 @@ def open_gate(use, memory):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def settle(now, gated, rules, standstill_std, x, P, memory):  # type: ignore[no-untyped-def]
-    """Average how far innovations are from what the filter expects, and contain a car that is."""
+    """Average the normalised squared innovations, and contain the motion at a standstill."""
     if gated.seen > 0:
         share = min(1.0, now.dt / DIVERGED_AVERAGE_S)
         memory[M_NIS] += share * (gated.squares / gated.seen - memory[M_NIS])
-    # Standstill: the speed sensor reads zero and nothing turns, for a while.
+    # Standstill: for a while the speed sensor reads zero and the car does not turn.
     turns = abs(now.yaw_rate) > rules.still_yaw_rate_rad_s
     if math.isfinite(now.speed):
         memory[M_SPEED_AGE] = 0.0
@@ -428,7 +428,7 @@ def settle(now, gated, rules, standstill_std, x, P, memory):  # type: ignore[no-
 
 @njit(cache=True)
 def diverges(rules, x, memory):  # type: ignore[no-untyped-def]
-    """Return whether innovations stay far from what the filter expects, or the sideslip is none to drive with."""
+    """Return whether innovations stay far beyond their covariance, or the sideslip is impossible."""
     return memory[M_NIS] > DIVERGED_NIS_RATIO or (
         x[VX] > rules.dynamic_speed_m_s and abs(math.atan2(x[VY], x[VX])) > DIVERGED_SIDESLIP_RAD
     )
@@ -462,7 +462,7 @@ class PosteriorSteps(StepColumns):
     """Filter posteriors on measurement time: [K] each, state [K, n], covariance [K, n, n], inputs [K, 6].
 
     ``prior`` [K, n] is the state before the update, NaN where the filter starts. ``residual_rate``
-    [K, 2] is what is added to v̇_y and ṙ from the step on; 0 in the pure physics filter.
+    [K, 2] is added to v̇_y and ṙ from the step on; 0 in the pure physics filter.
     """
 
     stamps_ns: IntArray
@@ -489,16 +489,16 @@ class FilterState:
 
 
 #: How a step hangs together with the one before it: not at all (start, failure), through the whole state, or through
-#: what a standstill does not overwrite (the entries from AX_BIAS on).
+#: entries that a standstill does not overwrite (from AX_BIAS on).
 LINK_NONE, LINK_WHOLE, LINK_BIASES = 0, 1, 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepLinks(StepColumns):
-    """What a smoother needs beside the posteriors, one row a step, or of length 0 where nobody asked.
+    """Further inputs of a smoother, one row per step; length 0 if not requested.
 
     ``kind`` [K] is one of LINK_NONE, LINK_WHOLE, LINK_BIASES; ``predicted_P`` [K, n, n] the covariance before the
-    update, with what an opened gate added to it; ``cross`` [K, n, n] the covariance between the state of the step
+    update, with the inflation by an opened gate; ``cross`` [K, n, n] the covariance between the state of the step
     before (rows) and the predicted state (columns), from the sigma points before Q is added and they are drawn again.
     """
 
@@ -595,7 +595,7 @@ def no_posterior(count: int, n: int) -> Posterior:
 
 
 def no_prediction(count: int, n: int) -> Predicted:
-    """Return what predictions of ``n`` states are written to, with none in it."""
+    """Return empty arrays for predictions of ``n`` states."""
     return Predicted(*(np.full((count, *shape), np.nan) for shape in ((n,), (MOTION, MOTION), ())))
 
 
@@ -659,7 +659,7 @@ def sideslip_std(vx_m_s: FloatArray, vy_m_s: FloatArray, covariance: FloatArray)
 
 
 class LinkedFilter:
-    """Interface of a filter whose kernels work on :class:`Window` and write :class:`Posterior` and :class:`StepLinks`.
+    """Interface of a filter with kernels that read :class:`Window` and write :class:`Posterior` and :class:`StepLinks`.
 
     A filter is a dataclass with the fields below. It adds its noise and its two kernels.
     """
@@ -706,7 +706,7 @@ class LinkedFilter:
     ) -> tuple[PosteriorSteps, FilterState]:
         """Filter one window (see :class:`~.base.Estimator`).
 
-        ``residual_rate`` [N, 2]: what is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
+        ``residual_rate`` [N, 2] is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
         ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
         """
         steps, after, _ = self._steps(signals, state, residual_rate, extra_r, linked=False)
@@ -719,7 +719,7 @@ class LinkedFilter:
         residual_rate: FloatArray | None = None,
         extra_r: FloatArray | None = None,
     ) -> tuple[PosteriorSteps, FilterState, StepLinks]:
-        """Return what :meth:`run` returns, bit for bit, and the links between the steps."""
+        """Return the result of :meth:`run`, bit for bit, and the links between the steps."""
         return self._steps(signals, state, residual_rate, extra_r, linked=True)
 
     def predict(self, steps: PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:

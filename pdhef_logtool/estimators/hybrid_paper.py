@@ -11,8 +11,8 @@ k:
 - h_ay = ΣF/m + β_k Δx_net[v_y]/Δt: the residual belongs to the predicted a_y too (docs/method.md#hybrid).
 - C_k = θ C_{k−1} + (1 − θ) ν νᵀ and R_k = max(R_0, C_k − P_zz) on the diagonal (Eq 22, 23). C starts at P_zz + R_0.
 
-What the paper does not state is as in ``phy-ukf``: state [v_x, v_y, r, b_ax], Q_0, wheel speed as a measurement, start
-and gaps. It has no gate of innovations, no standstill and no roll correction: the paper has none.
+Details that the paper omits are as in ``phy-ukf``: state [v_x, v_y, r, b_ax], Q_0, wheel speed as a measurement, start
+and gaps. It has no gate of innovations, no standstill and no roll correction, as in the paper.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class PaperSteps(base.PosteriorSteps):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaperState:
-    """What the parallel filter, the network and this filter take from window to window."""
+    """States of the parallel filter, the network and this filter between windows."""
 
     physics: FilterState
     network: NetworkCarry
@@ -100,7 +100,7 @@ class Parallel(NamedTuple):
 def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
     """Move sigma points [s, 4] by ``dt`` and add the increment of the residual ``rate`` whole at the end (Eq 19).
 
-    A residual counts where the model is dynamic: it has nothing of the kinematic range. ``points`` is work space.
+    A residual counts in the dynamic range of the model, not in the kinematic one. ``points`` is work space.
     """
     rate_vy, rate_r = rate
     share = dynamic_share(chi[0, base.VX], p) * dt
@@ -288,7 +288,7 @@ class PaperHybridUkf:
 
     @property
     def measurement_variance(self) -> FloatArray:
-        """R_0 of [a_y, r, v_x], [3]: the sensors', that of a_y at least the paper's norm."""
+        """R_0 of [a_y, r, v_x], [3]: the sensors'; a_y has at least the paper's norm."""
         s = self.vehicle.sensors
         std = np.array([s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s])
         variance: FloatArray = std**2

@@ -50,11 +50,11 @@ class TrackCalibrator:
 
     Attributes
     ----------
-    algorithms : by name, the algorithm that ran, then others whose intervals apply to it. Intervals are looked up by
+    algorithms : by name, the algorithm that ran, then those with intervals that apply to it. Intervals are looked up by
         the identity of the algorithm; differences of noise, parameters and network are reported.
     of_car : whether the intervals were calibrated for this car, not for the shipped one.
     fixed_notes : by name, the note for intervals that are not changed.
-    posterior : by name, the function that widens intervals where the car has none.
+    posterior : by name, the function that widens intervals if the car has no intervals.
     """
 
     intervals: Intervals | None

@@ -1,7 +1,7 @@
 """Latency compensation of all estimators: which step had arrived by a scored stamp, and its extrapolation to it.
 
-A sample arrives later than it was measured. What a receiver has at a scored stamp t is the newest step k whose data,
-and those of all steps before it, had arrived by t (``Signals.ready_ns``). The estimate at t is that step extrapolated
+A sample arrives later than it was measured. At a scored stamp t a receiver has the newest step k for which the data
+of this and all earlier steps had arrived by t (``Signals.ready_ns``). The estimate at t is that step extrapolated
 over the whole latency t - t_k. An estimator returns steps and has no part in this choice.
 
 An estimator that reads later samples is not causal: it has each step at the step's own stamp.
@@ -23,7 +23,7 @@ from pdhef_logtool.records.signals import IntArray, Signals
 from pdhef_logtool.records.steps import StepColumns, extrapolation, release
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
-#: Steps that an estimator makes at a time: those of an hour with their covariances take 350 MB per filter.
+#: Steps that an estimator makes at a time; an hour of steps with covariances would take 350 MB per filter.
 PIECE_STEPS = 8192
 
 
@@ -38,7 +38,7 @@ class PendingSteps(StepColumns):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowState:
-    """What passes from window to window: the estimator's own state, and its pending steps."""
+    """State between windows: the estimator's, and its pending steps."""
 
     estimator: Any
     pending: PendingSteps

@@ -61,9 +61,9 @@ PHY_UKF_Q_STD = (0.089, 0.31, 0.062, 0.021)
 def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
     """Move sigma points [s, n] by ``dt`` s through the nominal model and add the residual (Eq 19), in place.
 
-    Half of the residual's increment goes in before the model's step and half after it: all of it at the end, as Eq 19
+    Half of the residual's increment is added before the model's step and half after it: all of it at the end, as Eq 19
     has it, would leave the tyres' answer to it out of the step, 3 % of a residual at 25 m/s and 10 ms. A residual
-    counts where the model is dynamic: it has nothing of the kinematic range. ``over`` are the inputs
+    counts in the dynamic range of the model, not in the kinematic one. ``over`` are the inputs
     (:class:`~.filter_base.HeldInputs`), ``rate`` the residual of v̇_y and ṙ, ``points`` [work_size(s)] is work space.
     """
     rate_vy, rate_r = rate
@@ -81,7 +81,7 @@ def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
 def set_points(chi, steer, ax, more, points):  # type: ignore[no-untyped-def]
     """Write sigma points [s, n] to ``points``, with increments of v_y and r; the rest is filled.
 
-    What is left of the last block is the first point again: numbers that cannot overflow.
+    The rest of the last block repeats the first point: numbers that cannot overflow.
     """
     more_vy, more_r = more
     s = chi.shape[0]
@@ -97,7 +97,7 @@ def set_points(chi, steer, ax, more, points):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def measure_sigma_points(chi, steer, friction, rate_vy, p, points, zeta):  # type: ignore[no-untyped-def]
-    """Write what the sensors would read at sigma points chi [s, n] to zeta [s, 3]; the residual belongs to a_y too."""
+    """Write the sensor readings at sigma points chi [s, n] to zeta [s, 3]; a_y includes the residual."""
     residual = (1.0 + p.ay_roll_gain) * dynamic_share(chi[0, 0], p) * rate_vy
     set_points(chi, steer, 0.0, (0.0, 0.0), points)
     measure_points(points, friction, p)
@@ -110,7 +110,7 @@ def measure_sigma_points(chi, steer, friction, rate_vy, p, points, zeta):  # typ
 
 @njit(cache=True)
 def _cross_covariance(chi_before, chi, x_after, wc, out):  # type: ignore[no-untyped-def]
-    """Write the covariance [n, n] between the sigma points before a step (rows) and after it, whose mean is x_after.
+    """Write the covariance [n, n] between the sigma points before a step (rows) and after it (mean x_after).
 
     Those before it lie in pairs about their first, which is their mean.
     """

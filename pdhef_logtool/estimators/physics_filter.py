@@ -8,7 +8,7 @@ with their centre.
 A residual rate of v̇_y and ṙ enters as in ``phy-ukf``: half before and half after the model's step, and in the
 predicted a_y, times the force scale where that is a state. Zeros change no bit.
 
-Inputs, gate, standstill, restart, wheel speed and delay are those of ``phy-ukf``. Where the steering is missing for
+Inputs, gate, standstill, restart, wheel speed and delay are as in ``phy-ukf``. Where the steering is missing for
 longer than it may be held, its error is a state that walks at random, with the place of the steering bias: the rear
 axle's tyres, a_y and yaw rate then determine v_y.
 """
@@ -63,9 +63,9 @@ from pdhef_logtool.records.signals import Signals
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
 
-#: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r] where the car has none of its own,
-#: and where identification searches it. By innovation likelihood over simulated drives, as that of ``phy-ukf``, with
-#: lag, load transfer and biases, and frozen. The present simulator gives 0.078, 0.13, 0.01, 0.062, 0.39.
+#: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r], for cars without fitted noise and
+#: as the start of identification. From the innovation likelihood over simulated drives, as for ``phy-ukf``, with lag,
+#: load transfer and biases, and frozen. The present simulator gives 0.078, 0.13, 0.01, 0.062, 0.39.
 PHYSICS_Q_STD = (0.085, 0.12, 0.012, 0.086, 0.41, 0.41)
 #: 1-sigma of the axles' forces over the mass at the start, and at a standstill, m/s².
 _FORCE_STD, _STANDSTILL_FORCE_STD = 0.5, 0.05
@@ -90,7 +90,7 @@ LINEAR_SHARE, LIMIT_TIME_S, FILE_LAG = 0.36, 0.5, 1.1
 #: The columns of a block of points: each half is one side of the centre, and ends with the centre.
 _HALF = WIDTH // 2
 _CENTRE = _HALF - 1
-#: Rows of a block of points: those of the entries, and zeros up to a multiple of four.
+#: Rows of a block of points: the entries, and zeros up to a multiple of four.
 _ROWS = 16
 
 # No check of divisors, and sums in any order, so that the compiler can take several terms at a time.
@@ -483,7 +483,7 @@ def _filter(window, tuning, limits, layout, p, f, estimate, out, links):  # type
                 if memory[base.M_STILL] >= rules.still_after_s:
                     factored = False
                 alive = _finite(x, P)
-            # Without steering, a_y and yaw rate nothing determines the motion: the filter ends, and waits for them.
+            # Without steering, a_y and yaw rate the motion is unknown: the filter ends, and waits for them.
             determined = alive and not (unknown and P[STEER_BIAS, STEER_BIAS] > MAX_STEER_STD**2)
             out_valid[k] = determined
             out_diverged[k] = not alive or base.diverges(rules, x, memory)
@@ -569,7 +569,7 @@ class PhysicsFilter(base.LinkedFilter):
 
     @property
     def parameters(self) -> tuple[Layout, ModelParameters, PhysicsParameters]:
-        """What the compiled model takes."""
+        """Arguments of the compiled model."""
         return self.layout, model_parameters(self.vehicle), physics_parameters(self.vehicle)
 
     @property
@@ -645,10 +645,9 @@ def physics_filter(
 def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
     """Return ``physics`` of a car, with its identified parts and noise where the car has them.
 
-    A car without identified parts has none: a static single track with the sensors' noise. If no drive with ground
-    truth has validated it, its body rolls, which a_y feels, and its axle forces may depart from the tyre model, for
-    longer the more grip the car uses: only forces that lag can. What tuned noise leaves out of the process noise is
-    what was found through the filter.
+    A car without identified parts is a static single track with the sensors' noise. If no drive with ground
+    truth has validated it, it gets body roll and lagging axle forces, which may depart from the tyre model for longer
+    the more grip the car uses. Entries that tuned noise does not contain are those of the fitted filter.
     """
     vehicle, noise = car.physics_vehicle, car.noise.get(PHYSICS)
     if noise is not None and car.fitted_physics is not None:

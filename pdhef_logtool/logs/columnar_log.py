@@ -96,7 +96,7 @@ class ColumnarLog(DriveLog):
         self._fields: dict[tuple[int, int], tuple[FieldInfo, ...]] = {}
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
         self._asked: set[tuple[int, int]] = set()  # channels that were requested or listed
-        self._wanted: set[tuple[int, int]] = set()  # channels whose messages were requested
+        self._wanted: set[tuple[int, int]] = set()  # channels with requested messages
         self._schemas_s = 0.0  # processor time that parsing took
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
@@ -110,7 +110,7 @@ class ColumnarLog(DriveLog):
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
-        """All topics by name; ``messages`` leaves out those of spans found damaged so far."""
+        """All topics by name; ``messages`` does not count spans found damaged so far."""
         counts: Counter[str] = Counter()
         for c, container in enumerate(self.containers):
             names = {id_: channel.topic for id_, channel in container.channels.items()}
@@ -198,7 +198,7 @@ class ColumnarLog(DriveLog):
         return self._databases
 
     def definition(self, path: Path) -> Path:
-        """Return a file that defines something of the log; a mere name is that of an attached one."""
+        """Return the file of a definition in the log; a name without a folder is an attached file."""
         attached = {} if path.exists() and len(path.parts) > 1 else {p.name: p for p in self.databases}
         return attached.get(path.name, path)
 
@@ -252,7 +252,7 @@ class ColumnarLog(DriveLog):
         return {topic: np.sort(np.concatenate(part)) for topic, part in parts.items() if part}
 
     def covered_topics(self, topics: Collection[str]) -> frozenset[str]:
-        """Return the topics whose messages are all in spans with one of these topics: they need no further read."""
+        """Return the topics with all messages in spans with one of these topics: they need no further read."""
         held, apart = set(topics), set[str]()
         for container in self.containers:
             names = {id_: channel.topic for id_, channel in container.channels.items()}
@@ -268,7 +268,7 @@ class ColumnarLog(DriveLog):
             container.prefetch({span.index: span for span in expected}.values())
 
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
-        """Return the scalar leaves of a topic's schema; empty if the encoding has none.
+        """Return the scalar leaves of a topic's schema; empty for an encoding without schema.
 
         With ``quiet`` a schema that does not parse is not reported as a loss.
         """
@@ -379,7 +379,7 @@ class ColumnarLog(DriveLog):
 
         Parameters
         ----------
-        want : channels whose messages are needed. payloads : those of them whose payloads are needed. None: all.
+        want : channels of the needed messages. payloads : channels of the needed payloads. None: all.
         """
         payloads = want if payloads is None else payloads
         container = self.containers[c]
@@ -443,7 +443,7 @@ class ColumnarLog(DriveLog):
                 self._partial[c, span.index, (kind, want)] = loss
 
     def schema_of(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
-        """Return the schema of a channel of the c-th container, or why there is none."""
+        """Return the schema of a channel of the c-th container, or the reason why it is unknown."""
         key = (c, channel.id)
         if key not in self._schemas:
             self._schemas[key] = self._parse_schema(c, channel)
@@ -535,7 +535,7 @@ class ColumnarLog(DriveLog):
         window_ns: tuple[int | None, int | None],
         parts: Mapping[str, list[Columns]],
     ) -> None:
-        """Add the columns of the requested topics in a span; if it has to be opened, keep those of expected topics."""
+        """Add the columns of the requested topics in a span; if it is opened, keep those of expected topics."""
         channels = self.containers[c].channels
         requested = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
         stored = self._columns.get((c, span.index), {})

@@ -131,7 +131,7 @@ class Block:
         """Rows by channel, ascending."""
         if not len(self):
             return {}
-        # 16 bits, where they are enough, sort much faster.
+        # 16 bits, if enough, sort much faster.
         fit = self.channel.view(np.uint64).max() < 1 << 16  # an id below 0 is a huge one
         order = np.argsort(self.channel.astype(np.uint16) if fit else self.channel, kind="stable")
         ordered = self.channel[order]
@@ -405,7 +405,7 @@ class FileContainer(Container):
         return cls(file.path, file.place, file.meter)
 
     def _open(self) -> None:
-        """Walk the file. What escapes the walk loses the rest of the file from there on."""
+        """Walk the file. An error of the walk loses the rest of the file."""
         try:
             self._walk()
         except Exception as error:

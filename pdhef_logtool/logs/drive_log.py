@@ -139,7 +139,7 @@ class DriveLog(ABC):
         del requests
 
     def keep_no_more(self) -> None:  # noqa: B027 (most logs keep nothing)
-        """Announce the last long read: what it decodes is not kept for later ones."""
+        """Announce the last long read: its columns are not kept for later reads."""
 
     @abstractmethod
     def close(self) -> None:
@@ -162,7 +162,7 @@ class DriveLog(ABC):
 
     @property
     def index(self) -> ColumnarLog | None:
-        """The log's index; None if there is none, or an inconsistent one."""
+        """The log's index, None without a consistent one."""
         return None
 
     def metadata(self) -> dict[str, str]:

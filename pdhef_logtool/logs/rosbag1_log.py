@@ -64,7 +64,7 @@ class Rosbag1Container(FileContainer):
 
     def __init__(self, path: Path | ByteSource, shown_path: LogPlace | None = None, meter: Meter | None = None) -> None:
         self._found = 0
-        self._pending: _Chunk | None = None  # the chunk whose index records are being read
+        self._pending: _Chunk | None = None  # the chunk of the index records
         self._header: tuple[int, int] | None = None  # where the index begins, and how many chunks there are
         self._infos: dict[
             int, Counter[int]

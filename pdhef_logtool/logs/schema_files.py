@@ -42,7 +42,7 @@ def message_definition(type_name: str) -> str:
 
     Raises
     ------
-    KeyError : the type is in neither, or the name is none of a type.
+    KeyError : the type is in neither, or the name is invalid.
     """
     if not _TYPE_NAME.fullmatch(type_name):
         raise KeyError(type_name)

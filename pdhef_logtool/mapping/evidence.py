@@ -189,7 +189,7 @@ def _usual(values: FloatArray) -> tuple[float, float]:
 
 
 def _filled(rows: FloatArray) -> FloatArray:
-    """Interpolate empty cells whose neighbours are at most ``BRIDGED_CELLS`` away [pieces, cells]."""
+    """Interpolate empty cells with neighbours at most ``BRIDGED_CELLS`` away [pieces, cells]."""
     cell = np.arange(rows.shape[1])
     for row in rows:
         finite_cells = np.flatnonzero(np.isfinite(row))
