@@ -12,12 +12,14 @@ from typing import Any
 from pdhef_logtool.evaluation.requirement_verdicts import joint_notes, next_steps, of_documents
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import shown
-from pdhef_logtool.records.printable import printable
+from pdhef_logtool.records.printable import listed, printable
 
 #: Class of the style by outcome.
 _KINDS = {"PASS": "pass", "FAIL": "fail", "INCONCLUSIVE": "unknown"}
 #: Versions on a first screen; the appendix lists all.
 _VERSIONS = ("pdhef-logtool", "python", "numpy")
+#: Names in a line.
+_MOST_NAMED = 5
 #: The interval in brackets after a value.
 _INTERVAL = re.compile(r"^\((.*?)\)")
 _UNIT = re.compile(r"_(rad_s|rad|m_s2|m_s)$")
@@ -193,8 +195,8 @@ def tested_run(run: Mapping[str, Any], hours: float) -> list[tuple[str, str]]:
     mains = Counter(str(log["main"]) for log in logs if log.get("main"))
 
     def counted(counts: Mapping[str, int]) -> str:
-        named = [f"{printable(k)} ({n})" if len(counts) > 1 else printable(k) for k, n in [*counts.items()][:5]]
-        return ", ".join(named) + (f" and {len(counts) - 5} more" if len(counts) > 5 else "")
+        named = [f"{printable(k)} ({n})" if len(counts) > 1 else printable(k) for k, n in counts.items()]
+        return listed(named, _MOST_NAMED)
 
     failed = sum(str(log.get("outcome", "")).startswith("failed") for log in logs)
     lost = sum(str(log.get("outcome", "")).startswith("lost") for log in logs)
