@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
     from pdhef_logtool.results.events import FoundEvents
 
-#: Largest number of events, and of excluded drives per reason, in the output.
-_MOST_EVENTS, _MOST_NAMED = 50, 5
+#: Largest number of events in the output.
+_MOST_EVENTS = 50
 
 
 def render_events(events: FoundEvents, console: Console) -> None:
@@ -38,6 +38,6 @@ def render_events(events: FoundEvents, console: Console) -> None:
     for drive, reason in events.left_out.items():
         reasons.setdefault(reason, []).append(drive)
     for reason, names in reasons.items():
-        console.print(f"not searched, {reason}: {listed(names, _MOST_NAMED)}")
+        console.print(f"not searched, {reason}: {listed(names)}")
     for clip in events.clips:
         console.print(f"clip: {clip}", soft_wrap=True)

@@ -193,10 +193,10 @@ def render_fleet(summary: Mapping[str, Any], console: Console) -> None:
         console.print()
     for kind in summary["failed"]:
         console.print(Text.assemble((f"{kind['count']} failed: ", "bold"), kind["reason"]))
-        print_indented(listed(kind["labels"], _MOST_FAILED, kind["count"]), console)
+        print_indented(listed(kind["labels"], count=kind["count"]), console)
     if checks := summary["checks_failed"]:
         console.print(Text.assemble((f"{len(checks)} with failed checks", "bold"), ", see report.json:"))
-        print_indented(listed(checks, _MOST_FAILED), console)
+        print_indented(listed(checks), console)
     left = f", {summary['remaining']} not done" if summary["remaining"] else ""
     logs, done, lost = (summary[key] for key in ("logs", "done", "lost"))
     console.print(f"{logs} logs: {done} done, {logs - done} failed, {lost} with input lost{left}")

@@ -29,7 +29,7 @@ def printable(text: object, most: int = MOST_SIGNS) -> str:
     return line
 
 
-def listed(names: Sequence[str], most: int, count: int | None = None) -> str:
+def listed(names: Sequence[str], most: int = 5, count: int | None = None) -> str:
     """Return the first ``most`` names and the number of others, ``a, b and 3 more``, of ``count`` or of those given."""
     more = (len(names) if count is None else count) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")

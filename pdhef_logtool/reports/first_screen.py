@@ -18,8 +18,6 @@ from pdhef_logtool.records.printable import listed, printable
 _KINDS = {"PASS": "pass", "FAIL": "fail", "INCONCLUSIVE": "unknown"}
 #: Versions on a first screen; the appendix lists all.
 _VERSIONS = ("pdhef-logtool", "python", "numpy")
-#: Names in a line.
-_MOST_NAMED = 5
 #: The interval in brackets after a value.
 _INTERVAL = re.compile(r"^\((.*?)\)")
 _UNIT = re.compile(r"_(rad_s|rad|m_s2|m_s)$")
@@ -196,7 +194,7 @@ def tested_run(run: Mapping[str, Any], hours: float) -> list[tuple[str, str]]:
 
     def counted(counts: Mapping[str, int]) -> str:
         named = [f"{printable(k)} ({n})" if len(counts) > 1 else printable(k) for k, n in counts.items()]
-        return listed(named, _MOST_NAMED)
+        return listed(named)
 
     failed = sum(str(log.get("outcome", "")).startswith("failed") for log in logs)
     lost = sum(str(log.get("outcome", "")).startswith("lost") for log in logs)

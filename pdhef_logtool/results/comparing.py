@@ -39,8 +39,6 @@ INDEPENDENT = "none"
 MOST_FOLLOWED = 10
 #: Verdicts from grave to harmless; the gravest one is the overall verdict.
 _GRAVITY: tuple[FigureVerdict, ...] = ("worse", "no figure", "inconclusive", "not worse", "better", "equal")
-#: Names in a line.
-_MOST_NAMED = 5
 #: Rows of metrics.parquet that are in memory at once.
 _ROWS = 1 << 18
 _FIGURE = ["estimator", "signal", "segment", "metric", "value", "n", "unit"]
@@ -161,7 +159,7 @@ class Comparison:
         sides = [("drives", "", self.only_a, self.only_b)]
         sides += [("figures", f": {f.figure.label}", f.only_a, f.only_b) for f in self.figures]
         return tuple(
-            f"{what} in {side} only{label}: {listed(names, _MOST_NAMED)}"
+            f"{what} in {side} only{label}: {listed(names)}"
             for what, label, a, b in sides
             for side, names in (("A", a), ("B", b))
             if names
