@@ -113,6 +113,11 @@ def warn(text: str) -> None:
     say(f"warning: {text}")
 
 
+def has_display() -> bool:
+    """Return whether a window can be opened, which may be impossible on Linux only."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 def print_json(document: Any) -> None:
     """Print one JSON document with control characters escaped."""
     text = json.dumps(jsonable(document), indent=2, sort_keys=False, ensure_ascii=False, allow_nan=False)

@@ -5,14 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.cli.console import table, three_lines
+from pdhef_logtool.records.printable import listed
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from pdhef_logtool.results.events import FoundEvents
 
-#: Largest number of events, and of excluded drives per reason, in the output.
-_MOST_EVENTS, _MOST_NAMED = 50, 5
+#: Largest number of events in the output.
+_MOST_EVENTS = 50
 
 
 def render_events(events: FoundEvents, console: Console) -> None:
@@ -37,7 +38,6 @@ def render_events(events: FoundEvents, console: Console) -> None:
     for drive, reason in events.left_out.items():
         reasons.setdefault(reason, []).append(drive)
     for reason, names in reasons.items():
-        more_names = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-        console.print(f"not searched, {reason}: {', '.join(names[:_MOST_NAMED])}{more_names}")
+        console.print(f"not searched, {reason}: {listed(names)}")
     for clip in events.clips:
         console.print(f"clip: {clip}", soft_wrap=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -14,6 +14,7 @@ from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, UsageError
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.drive_log import DriveLog
+    from pdhef_logtool.logs.remote_place import LogPlace
     from pdhef_logtool.runs.config import RunConfig
     from pdhef_logtool.runs.inspection.report import Inspection
 
@@ -53,18 +54,16 @@ def inspect(
 
     Of an MCAP file above 32 MB with an intact index, only a part of the chunks is read; the output states how many.
     """
-    from pdhef_logtool.logs.discovery import one_place
-    from pdhef_logtool.runs.inspection import fields_of_log, inspect_log, render_fields, render_inspection
+    from pdhef_logtool.runs.inspection import fields_of_log, render_fields, render_inspection
     from pdhef_logtool.runs.inspection import write_mapping as write_mapping_file
 
-    reading = config.read_options
     if topic is not None and not fields:
         raise UsageError(expected="one log", got=f"{log} and {topic}", where="LOG", remedy="a topic needs --fields")
     if fields and (report or write_mapping) is not None:
         raise UsageError(expected="--fields alone", got="--report or --write-mapping as well", where="--fields")
-    place = one_place(log, private_redirects=config.allow_private_redirects)
     if fields:
-        topic_fields = fields_of_log(place, topic, budget=reading.limits, msgs=reading.msgs)
+        reading = config.read_options
+        topic_fields = fields_of_log(_place(log, config), topic, budget=reading.limits, msgs=reading.msgs)
         console.finish(topic_fields, render_fields, as_json, exit_code=EXIT_OK)
 
     def write_files(inspection: Inspection, open_log: DriveLog) -> None:
@@ -77,17 +76,9 @@ def inspect(
             write_page(inspection, open_log, report)
             console.say(f"page written to {report}")
 
-    inspection = inspect_log(
-        place,
-        config.mapping,
-        prefer_truth=reading.prefer_truth,
-        budget=reading.limits,
-        msgs=reading.msgs,
-        whole=whole,
-        then=write_files,
-    )
-    lost = any(loss.severity == "lost" for loss in inspection.lost)
-    console.finish(inspection, render_inspection, as_json, exit_code=EXIT_PARTIAL if lost else EXIT_OK)
+    inspection = _inspect(log, config, whole=whole, then=write_files)
+    exit_code = EXIT_PARTIAL if inspection.is_partial else EXIT_OK
+    console.finish(inspection, render_inspection, as_json, exit_code=exit_code)
 
 
 @options.command(
@@ -110,23 +101,30 @@ def map_(
     """
     import sys
 
-    from pdhef_logtool.logs.discovery import one_place
-    from pdhef_logtool.runs.inspection import ask_mapping, inspect_log, write_mapping
+    from pdhef_logtool.runs.inspection import ask_mapping, write_mapping
 
-    reading = config.read_options
-    place = one_place(log, private_redirects=config.allow_private_redirects)
-    inspection = inspect_log(
-        place,
-        config.mapping,
-        prefer_truth=reading.prefer_truth,
-        budget=reading.limits,
-        msgs=reading.msgs,
-    )
+    inspection = _inspect(log, config)
     if sys.stdin.isatty() and sys.stderr.isatty():
         answers = ask_mapping(inspection, _ask, console.say)
         inspection = replace(inspection, mapping=answers)
     write_mapping(inspection, output)
     console.say(f"mapping written to {output}")
+
+
+def _place(log: str, config: RunConfig) -> LogPlace:
+    """Return the place of the log of an argument."""
+    from pdhef_logtool.logs.discovery import one_place
+
+    return one_place(log, private_redirects=config.allow_private_redirects)
+
+
+def _inspect(log: str, config: RunConfig, **given: Any) -> Inspection:
+    """Inspect the log of an argument as configured."""
+    from pdhef_logtool.runs.inspection import inspect_log
+
+    reading = config.read_options
+    given |= {"prefer_truth": reading.prefer_truth, "budget": reading.limits, "msgs": reading.msgs}
+    return inspect_log(_place(log, config), config.mapping, **given)
 
 
 def _ask(question: str) -> str:

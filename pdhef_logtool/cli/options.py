@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
+from functools import partial, wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -31,15 +31,12 @@ TruthLogs = Annotated[
     list[str],
     Argument(metavar="LOG", help="Logs with ground truth, folders with logs, glob patterns, URLs, or @list.txt."),
 ]
-JsonFlag = Annotated[bool, Option("--json", help="Print one JSON document instead of tables.", rich_help_panel=OUTPUT)]
-JunitFile = Annotated[Path | None, Option(help="JUnit XML file for the verdicts of --plan.", rich_help_panel=OUTPUT)]
-Strict = Annotated[
-    bool, Option("--strict", help="INCONCLUSIVE requirements fail, too (exit code 4).", rich_help_panel=OUTPUT)
-]
-Jobs = Annotated[
-    int,
-    Option("--jobs", "-j", help="Number of worker processes. Results do not depend on it.", rich_help_panel=WORK),
-]
+#: Options in a panel of the help.
+output_option, work_option = partial(Option, rich_help_panel=OUTPUT), partial(Option, rich_help_panel=WORK)
+JsonFlag = Annotated[bool, output_option("--json", help="Print one JSON document instead of tables.")]
+JunitFile = Annotated[Path | None, output_option(help="JUnit XML file for the verdicts of --plan.")]
+Strict = Annotated[bool, output_option("--strict", help="INCONCLUSIVE requirements fail, too (exit code 4).")]
+Jobs = Annotated[int, work_option("--jobs", "-j", help="Number of worker processes. Results do not depend on it.")]
 
 
 def local_folder(argument: str) -> Path:
@@ -57,133 +54,82 @@ def local_folder(argument: str) -> Path:
     return Path(argument)
 
 
-_Text = str | None
-_File = Path | None
+def _option(kind: Any, panel: str, text: str | None = None, *names: str, metavar: str | None = None) -> Any:
+    """Return the annotation of a shared option of the command line."""
+    return Annotated[kind, Option(*names, metavar=metavar, help=text, rich_help_panel=panel)]
+
+
+_Text, _File, _Many = str | None, Path | None, list[str] | None
 #: Shared options by the name of the configuration entry, in the order of the help.
 _OPTIONS: dict[str, Any] = {
-    "car": Annotated[_File, Option(rich_help_panel=INPUT)],
-    "cars": Annotated[
+    "car": _option(_File, INPUT),
+    "cars": _option(_File, INPUT, "cars.toml, which assigns a car to each log by folder, metadata or name."),
+    "mapping": _option(
         _File,
-        Option(help="cars.toml, which assigns a car to each log by folder, metadata or name.", rich_help_panel=INPUT),
-    ],
-    "mapping": Annotated[
-        _File,
-        Option(
-            "--mapping",
-            "-m",
-            help="mapping.toml, which maps fields to signals, or a folder with one per recorder. Default: recognised "
-            "by message type, name and unit.",
-            rich_help_panel=INPUT,
-        ),
-    ],
-    "start": Annotated[
-        _Text, Option(help="Start of the time slice: 12.5, +10s, end-5s, ns or RFC 3339.", rich_help_panel=INPUT)
-    ],
-    "end": Annotated[_Text, Option(help="End of the time slice, same formats as --start.", rich_help_panel=INPUT)],
-    "clock": Annotated[
+        INPUT,
+        "mapping.toml, which maps fields to signals, or a folder with one per recorder. Default: recognised "
+        "by message type, name and unit.",
+        "--mapping",
+        "-m",
+    ),
+    "start": _option(_Text, INPUT, "Start of the time slice: 12.5, +10s, end-5s, ns or RFC 3339."),
+    "end": _option(_Text, INPUT, "End of the time slice, same formats as --start."),
+    "clock": _option(
         _Text,
-        Option(
-            help="arrival: use a sample from its arrival on, as in a car. stamp: from its stamp on (not causal).",
-            rich_help_panel=ESTIMATION,
-        ),
-    ],
-    "setup": Annotated[
-        _File,
-        Option(
-            help="setup.toml of another run of this car and recorder, for mounting, delays and clocks.",
-            rich_help_panel=ESTIMATION,
-        ),
-    ],
-    "setup_from_s": Annotated[
+        ESTIMATION,
+        "arrival: use a sample from its arrival on, as in a car. stamp: from its stamp on (not causal).",
+    ),
+    "setup": _option(
+        _File, ESTIMATION, "setup.toml of another run of this car and recorder, for mounting, delays and clocks."
+    ),
+    "setup_from_s": _option(
         float | None,
-        Option(
-            "--setup-from",
-            metavar="SECONDS",
-            help="Decide mounting, delays and clocks on the first SECONDS only, as in a car.",
-            rich_help_panel=ESTIMATION,
-        ),
-    ],
-    "estimators": Annotated[
+        ESTIMATION,
+        "Decide mounting, delays and clocks on the first SECONDS only, as in a car.",
+        "--setup-from",
+        metavar="SECONDS",
+    ),
+    "estimators": _option(
+        _Text, ESTIMATION, "Comma-separated names, or all. Default: pd-hef, physics, zero.", "--estimators", "-e"
+    ),
+    "friction": _option(
+        _Text, ESTIMATION, "auto (from the log, else the car, else estimated), file, estimate, or a number."
+    ),
+    "network": _option(_File, ESTIMATION, "Network folder, default or none. Default: the car's."),
+    "calibrate": _option(
         _Text,
-        Option(
-            "--estimators",
-            "-e",
-            help="Comma-separated names, or all. Default: pd-hef, physics, zero.",
-            rich_help_panel=ESTIMATION,
-        ),
-    ],
-    "friction": Annotated[
-        _Text,
-        Option(
-            help="auto (from the log, else the car, else estimated), file, estimate, or a number.",
-            rich_help_panel=ESTIMATION,
-        ),
-    ],
-    "network": Annotated[
-        _File,
-        Option(help="Network folder, default or none. Default: the car's.", rich_help_panel=ESTIMATION),
-    ],
-    "calibrate": Annotated[
-        _Text,
-        Option(
-            help="Calibration without ground truth of a car without validation data: log, online, pool or off.",
-            rich_help_panel=ESTIMATION,
-        ),
-    ],
-    "reference": Annotated[
-        _Text,
-        Option(
-            help="Sideslip reference without tyre data: auto (without ground truth), on or off.",
-            rich_help_panel=ESTIMATION,
-        ),
-    ],
-    "gnss": Annotated[
-        _Text, Option(help="GNSS velocity in filters and reference: auto or off.", rich_help_panel=ESTIMATION)
-    ],
-    "no_position": Annotated[
+        ESTIMATION,
+        "Calibration without ground truth of a car without validation data: log, online, pool or off.",
+    ),
+    "reference": _option(
+        _Text, ESTIMATION, "Sideslip reference without tyre data: auto (without ground truth), on or off."
+    ),
+    "gnss": _option(_Text, ESTIMATION, "GNSS velocity in filters and reference: auto or off."),
+    "no_position": _option(
         bool | None,
-        Option(
-            "--no-position",
-            help="Keep positions, metadata and file names out of all outputs; copy only topics without a position.",
-            rich_help_panel=OUTPUT,
-        ),
-    ],
-    "waived": Annotated[
-        list[str] | None,
-        Option("--waive", metavar="CHECK", help="Ignore the failure of this check. Repeatable.", rich_help_panel=INPUT),
-    ],
-    "annotate": Annotated[
-        _Text,
-        Option(help="full: copy of the log with the estimates; sidecar: estimates only; none.", rich_help_panel=OUTPUT),
-    ],
-    "keep": Annotated[
-        _Text,
-        Option(
-            help="Files per log: metrics, estimates or full. Default: full, for more than 50 logs metrics.",
-            rich_help_panel=OUTPUT,
-        ),
-    ],
-    "plan": Annotated[
+        OUTPUT,
+        "Keep positions, metadata and file names out of all outputs; copy only topics without a position.",
+        "--no-position",
+    ),
+    "waived": _option(_Many, INPUT, "Ignore the failure of this check. Repeatable.", "--waive", metavar="CHECK"),
+    "annotate": _option(_Text, OUTPUT, "full: copy of the log with the estimates; sidecar: estimates only; none."),
+    "keep": _option(
+        _Text, OUTPUT, "Files per log: metrics, estimates or full. Default: full, for more than 50 logs metrics."
+    ),
+    "plan": _option(_File, OUTPUT, "Validation plan (pdhef plan init). Exit code 4 if a requirement fails."),
+    "config_file": _option(
         _File,
-        Option(help="Validation plan (pdhef plan init). Exit code 4 if a requirement fails.", rich_help_panel=OUTPUT),
-    ],
-    "config_file": Annotated[
-        _File,
-        Option(
-            "--config",
-            help="Settings file. Default: pdhef.toml in the working directory. Options have priority.",
-            rich_help_panel=SETTINGS,
-        ),
-    ],
-    "assignments": Annotated[
-        list[str] | None,
-        Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="A setting of pdhef.toml, listed in docs/settings.md. Repeatable.",
-            rich_help_panel=SETTINGS,
-        ),
-    ],
+        SETTINGS,
+        "Settings file. Default: pdhef.toml in the working directory. Options have priority.",
+        "--config",
+    ),
+    "assignments": _option(
+        _Many,
+        SETTINGS,
+        "A setting of pdhef.toml, listed in docs/settings.md. Repeatable.",
+        "--set",
+        metavar="KEY=VALUE",
+    ),
 }
 
 
@@ -210,14 +156,14 @@ def command(
     wanted = {"mapping", "config_file", "assignments", *shared.split(), *(("car", "start", "end") if car else ())}
     taken = {key: option for key, option in _OPTIONS.items() if key in wanted}
     if car:
-        taken["car"] = Annotated[_File, Option(help=f"{car}: car folder or vehicle.toml.", rich_help_panel=INPUT)]
+        taken["car"] = _option(_File, INPUT, f"{car}: car folder or vehicle.toml.")
     # \b keeps the lines of a paragraph as they are.
     epilog = "\n  ".join(("\b\nExamples:", *examples)) + f"\n\n{notes}" if examples else None
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         given = signature(function).parameters
 
-        @functools.wraps(function)
+        @wraps(function)
         def run_command(**values: Any) -> None:
             if isinstance(output := values.get("output"), Path):
                 from pdhef_logtool.storage.outputs import local_path

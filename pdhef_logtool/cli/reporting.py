@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -73,8 +71,7 @@ def open_page(result: WrittenPages) -> None:
     page = next((p.file for p in pages if p.file is not None), None)
     if page is None:
         return
-    has_display = sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    if not has_display or not webbrowser.open(page.resolve().as_uri()):
+    if not console.has_display() or not webbrowser.open(page.resolve().as_uri()):
         console.say(f"no browser is available; open {page.resolve()}, a single file, on any machine")
 
 

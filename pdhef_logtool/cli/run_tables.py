@@ -17,7 +17,7 @@ from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
-from pdhef_logtool.records.printable import all_printable
+from pdhef_logtool.records.printable import all_printable, listed
 from pdhef_logtool.results.opened_run import PAGE_FILE
 from pdhef_logtool.results.run_report import diverged_line, reasons_line
 from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, degrees, truth_of
@@ -193,20 +193,14 @@ def render_fleet(summary: Mapping[str, Any], console: Console) -> None:
         console.print()
     for kind in summary["failed"]:
         console.print(Text.assemble((f"{kind['count']} failed: ", "bold"), kind["reason"]))
-        _print_some(kind["labels"], kind["count"], console)
+        print_indented(listed(kind["labels"], count=kind["count"]), console)
     if checks := summary["checks_failed"]:
         console.print(Text.assemble((f"{len(checks)} with failed checks", "bold"), ", see report.json:"))
-        _print_some(checks, len(checks), console)
+        print_indented(listed(checks), console)
     left = f", {summary['remaining']} not done" if summary["remaining"] else ""
     logs, done, lost = (summary[key] for key in ("logs", "done", "lost"))
     console.print(f"{logs} logs: {done} done, {logs - done} failed, {lost} with input lost{left}")
     _print_outputs(summary["output"], console)
-
-
-def _print_some(labels: Sequence[str], count: int, console: Console) -> None:
-    """Print the names of the first logs and the number of others."""
-    more = f" and {count - _MOST_FAILED} more" if count > _MOST_FAILED else ""
-    print_indented(", ".join(labels[:_MOST_FAILED]) + more, console)
 
 
 def _print_outputs(output: Path | str, console: Console) -> None:
@@ -296,8 +290,7 @@ def _failed_checks(report: _Report, *, undecided: bool = True) -> Iterable[str |
             yield Text.assemble(f"{waived}: ", (check["name"], "bold"), f": {evidence}{remedy}")
     names = [check["name"] for check in checks if check["verdict"] == "undecided"]
     if names and undecided:
-        more = f" and {len(names) - _MOST_UNDECIDED} more" if len(names) > _MOST_UNDECIDED else ""
-        yield f"Not observable in this drive: {', '.join(names[:_MOST_UNDECIDED])}{more}"
+        yield f"Not observable in this drive: {listed(names, _MOST_UNDECIDED)}"
 
 
 def _losses(report: _Report, *, notes: bool = True) -> Iterable[str]:
@@ -314,8 +307,7 @@ def _losses(report: _Report, *, notes: bool = True) -> Iterable[str]:
     for (word, what, span), places in where.items():
         if word == "note" and not notes:
             continue
-        more = f" and {len(places) - _MOST_PLACES} more" if len(places) > _MOST_PLACES else ""
-        yield f"{word}: {what} ({', '.join(places[:_MOST_PLACES])}{more}{span})"
+        yield f"{word}: {what} ({listed(places, _MOST_PLACES)}{span})"
 
 
 def _below(report: _Report) -> Iterable[str]:

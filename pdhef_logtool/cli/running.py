@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -61,42 +60,28 @@ def _list_estimators(show: bool) -> None:
 def run(  # positional: one an option of the command line
     logs: options.Logs,
     output: Annotated[
-        str,
-        Option(
-            "--output", "-o", metavar="DIR|URL", help="Output folder, or s3:// URL.", rich_help_panel=options.OUTPUT
-        ),
+        str, options.output_option("--output", "-o", metavar="DIR|URL", help="Output folder, or s3:// URL.")
     ],
     config: RunConfig,
     junit: options.JunitFile = None,
     strict: options.Strict = False,
     report: Annotated[
-        bool, Option(help="Write HTML reports: report.html per log and for the run.", rich_help_panel=options.OUTPUT)
+        bool, options.output_option(help="Write HTML reports: report.html per log and for the run.")
     ] = True,
     jobs: options.Jobs = 1,
     ray: Annotated[
         str | None,
-        Option(
-            metavar="ADDRESS",
-            help="Ray cluster (auto or HOST:PORT). The output must be a shared folder or a URL.",
-            rich_help_panel=options.WORK,
+        options.work_option(
+            metavar="ADDRESS", help="Ray cluster (auto or HOST:PORT). The output must be a shared folder or a URL."
         ),
     ] = None,
     resume: Annotated[
-        bool,
-        Option(
-            "--resume", help="Continue the run in the output: only new or changed logs.", rich_help_panel=options.WORK
-        ),
+        bool, options.work_option("--resume", help="Continue the run in the output: only new or changed logs.")
     ] = False,
-    retry: Annotated[
-        bool, Option("--retry", help="Like --resume, and repeat failed logs.", rich_help_panel=options.WORK)
-    ] = False,
+    retry: Annotated[bool, options.work_option("--retry", help="Like --resume, and repeat failed logs.")] = False,
     only: Annotated[
         list[str] | None,
-        Option(
-            metavar="NAME",
-            help="Repeat this log of the run and keep all its files. Repeatable.",
-            rich_help_panel=options.WORK,
-        ),
+        options.work_option(metavar="NAME", help="Repeat this log of the run and keep all its files. Repeatable."),
     ] = None,
     list_estimators: Annotated[
         bool,
@@ -203,7 +188,7 @@ def view(
         raise damaged[0]
     for error in damaged:
         console.warn(str(error))
-    if not web and not _has_display():
+    if not web and not console.has_display():
         raise UsageError(
             expected="a display to open the viewer on",
             got="neither DISPLAY nor WAYLAND_DISPLAY",
@@ -279,8 +264,3 @@ def open_viewer(recordings: Sequence[Path], *, web: bool) -> int:
     """Open recordings in one viewer, which is not reachable from the network, and return its exit code."""
     command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--new", *(["--web-viewer"] if web else [])]
     return subprocess.call([*command, *map(str, recordings)])  # noqa: S603 (our own interpreter)
-
-
-def _has_display() -> bool:
-    """Return whether a window can be opened, which may be impossible on Linux only."""
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

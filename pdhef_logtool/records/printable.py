@@ -7,7 +7,7 @@ warning, and a line break could fake one. All results and errors for users are e
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import PurePath
 from typing import Any, TypeVar
@@ -27,6 +27,12 @@ def printable(text: object, most: int = MOST_SIGNS) -> str:
         half = (most - 1) // 2
         line = f"{line[:half]}…{line[-half:]}"
     return line
+
+
+def listed(names: Sequence[str], most: int = 5, count: int | None = None) -> str:
+    """Return the first ``most`` names and the number of others, ``a, b and 3 more``, of ``count`` or of those given."""
+    more = (len(names) if count is None else count) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def all_printable(value: _T) -> _T:

@@ -12,7 +12,7 @@ from typing import Any
 from pdhef_logtool.evaluation.requirement_verdicts import joint_notes, next_steps, of_documents
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import shown
-from pdhef_logtool.records.printable import printable
+from pdhef_logtool.records.printable import listed, printable
 
 #: Class of the style by outcome.
 _KINDS = {"PASS": "pass", "FAIL": "fail", "INCONCLUSIVE": "unknown"}
@@ -193,8 +193,8 @@ def tested_run(run: Mapping[str, Any], hours: float) -> list[tuple[str, str]]:
     mains = Counter(str(log["main"]) for log in logs if log.get("main"))
 
     def counted(counts: Mapping[str, int]) -> str:
-        named = [f"{printable(k)} ({n})" if len(counts) > 1 else printable(k) for k, n in [*counts.items()][:5]]
-        return ", ".join(named) + (f" and {len(counts) - 5} more" if len(counts) > 5 else "")
+        named = [f"{printable(k)} ({n})" if len(counts) > 1 else printable(k) for k, n in counts.items()]
+        return listed(named)
 
     failed = sum(str(log.get("outcome", "")).startswith("failed") for log in logs)
     lost = sum(str(log.get("outcome", "")).startswith("lost") for log in logs)

@@ -18,6 +18,7 @@ from pdhef_logtool.evaluation.metrics.sensors import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.units import SIGNALS
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
+from pdhef_logtool.records.printable import listed
 from pdhef_logtool.results.changed_signals import ChangedSignal, changed_signals
 from pdhef_logtool.results.gate import MAIN, Figure, Gate
 from pdhef_logtool.results.opened_run import METRICS_FILE, OpenedLog, OpenedRun
@@ -102,11 +103,7 @@ class ComparedFigure:
             **bounds,
             "detectable": self.detectable,
             "sign_p": change.sign_p,
-            "corrected_p": self.corrected_p,
-            "only_a": self.only_a,
-            "only_b": self.only_b,
-            "neither": self.neither,
-            "notes": self.notes,
+            **{key: getattr(self, key) for key in ("corrected_p", "only_a", "only_b", "neither", "notes")},
             "of_drives": [asdict(d) for d in self.drives],
         }
 
@@ -162,7 +159,7 @@ class Comparison:
         sides = [("drives", "", self.only_a, self.only_b)]
         sides += [("figures", f": {f.figure.label}", f.only_a, f.only_b) for f in self.figures]
         return tuple(
-            f"{what} in {side} only{label}: {_named(names)}"
+            f"{what} in {side} only{label}: {listed(names)}"
             for what, label, a, b in sides
             for side, names in (("A", a), ("B", b))
             if names
@@ -196,18 +193,11 @@ class Comparison:
         return {
             "format": "pdhef.comparison",
             "version": 1,
-            "a": self.a,
-            "b": self.b,
-            "verdict": self.verdict,
-            "exit_code": self.exit_code,
-            "failures": self.failures,
+            **{key: getattr(self, key) for key in ("a", "b", "verdict", "exit_code", "failures")},
             "plan": None if self.requirements is None else self.requirements.to_dict(),
             "differences": self.differences,
             "pairs": dict(self.pairs),
-            "only_a": self.only_a,
-            "only_b": self.only_b,
-            "changed": self.changed,
-            "cluster": self.cluster,
+            **{key: getattr(self, key) for key in ("only_a", "only_b", "changed", "cluster")},
             "figures": [f.to_dict() for f in self.figures],
             "others": [f.to_dict() for f in self.others],
             "signals": [asdict(s) for s in self.signals],
@@ -529,8 +519,3 @@ def _grouping(pairing: Pairing, key: str | None, damaged: _Damaged) -> _Grouping
         names = dict.fromkeys((*FACTORS, INDEPENDENT, *sorted({str(k) for of in stated for k in of})))
         raise UsageError(expected=f"a key of the drives: {', '.join(names)}", got=key, where="--cluster")
     return _Grouping(values)
-
-
-def _named(names: Sequence[str], most: int = 5) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -153,15 +153,8 @@ def write_events(path: Path, events: FoundEvents) -> None:
     """Write the events as Parquet; raises OutputError."""
     import polars as pl
 
-    schema = {
-        "drive": pl.String,
-        "start_ns": pl.Int64,
-        "end_ns": pl.Int64,
-        "start_s": pl.Float64,
-        "end_s": pl.Float64,
-        "peak": pl.Float64,
-        "peak_ns": pl.Int64,
-    }
+    names = (f.name for f in fields(FoundEvent))
+    schema = {n: pl.String if n == "drive" else pl.Int64 if n.endswith("_ns") else pl.Float64 for n in names}
     with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
         pl.DataFrame([asdict(e) for e in events.events], schema=schema).write_parquet(file)
 
@@ -183,21 +176,15 @@ def _check_tracks(logs: Sequence[OpenedLog], condition: Condition, estimator: st
     estimators = {name for log in logs if log.file(ESTIMATES_FILE) is not None for name in _tracks(log)}
     if not estimators:
         return
+    expected = f"an estimator of this run: {', '.join(sorted(estimators))}"
     if estimator is None and not any(log.main() for log in logs):
-        raise UsageError(
-            expected=f"an estimator of this run: {', '.join(sorted(estimators))}",
-            got="none named, and none that is selected",
-            where="--estimator",
-        )
+        raise UsageError(expected=expected, got="none named, and none that is selected", where="--estimator")
     asked = {r.track for r in condition.references.values() if r.track is not None} | (
         {estimator} if estimator else set()
     )
     for name in sorted(asked - estimators - {TRUTH, None}, key=str):
-        raise UsageError(
-            expected=f"an estimator of this run: {', '.join(sorted(estimators))}",
-            got=str(name),
-            where="--where" if name != estimator else "--estimator",
-        )
+        where = "--where" if name != estimator else "--estimator"
+        raise UsageError(expected=expected, got=str(name), where=where)
 
 
 def _tracks(log: OpenedLog) -> frozenset[str]:

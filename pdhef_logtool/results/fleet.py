@@ -249,13 +249,9 @@ class _Gathered:
         kind, _, reason = log.outcome.partition(": ")
         try:
             report = log.report()
-        except PdhefError as error:
-            self.failed.append((log.label, f"its report cannot be read: {error.expected}, got {error.got}"))
-            return
-        if kind == "failed" or report is None:
-            self.failed.append((log.label, reason or "its report is not there any more"))
-            return
-        try:
+            if kind == "failed" or report is None:
+                self.failed.append((log.label, reason or "its report is not there any more"))
+                return
             with log.reading():
                 drive = _drive(log, report, figures)
                 lost = [(log.label, str(x["what"])) for x in report.get("losses", ()) if x.get("severity") == "lost"]

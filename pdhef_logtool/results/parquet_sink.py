@@ -39,17 +39,18 @@ _STD_COLUMNS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
 def parquet_writer(
     path: Path,
     schema: pa.Schema,
-    dictionaries: Sequence[str],
+    dictionaries: Sequence[str] | None = None,
     *,
     encodings: Mapping[str, str] | None = None,
     level: int | None = None,
+    checksums: bool = True,
 ) -> Iterator[pq.ParquetWriter]:
-    """Yield the writer of a Parquet file with zstd and page checksums, which gets its name when it is complete.
+    """Yield the writer of a Parquet file with zstd, which gets its name when it is complete.
 
     Parameters
     ----------
-    path : the finished file. dictionaries : columns of few values.
-    encodings : Parquet's, by column. level : of zstd; None: Parquet's default.
+    path : the finished file. dictionaries : columns of few values; None: Parquet's choice.
+    encodings : Parquet's, by column. level : of zstd; None: Parquet's default. checksums : of pages.
 
     Raises
     ------
@@ -65,9 +66,9 @@ def parquet_writer(
             schema,
             compression="zstd",
             compression_level=level,
-            use_dictionary=list(dictionaries),
+            use_dictionary=True if dictionaries is None else list(dictionaries),
             column_encoding=encodings,
-            write_page_checksum=True,
+            write_page_checksum=checksums,
         ) as writer,
     ):
         yield writer
@@ -251,18 +252,13 @@ def _open(path: Path, kind: str) -> pq.ParquetFile:
         file = pq.ParquetFile(path)
         types = {f.name: _class_of(f.type) for f in file.schema_arrow}
     wanted = {f.name: _class_of(f.type) for f in arrow_schema(f"{kind}.json")}
-    if absent := sorted(wanted.keys() - types.keys()):
+    absent = sorted(wanted.keys() - types.keys())
+    other = sorted(name for name in wanted.keys() & types.keys() if types[name] != wanted[name])
+    if absent or other:
         file.close()
-        got = f"a Parquet file without {', '.join(absent)}"
+        got = ", ".join(f"{name} of {types[name]}" for name in other)
+        got = f"a Parquet file without {', '.join(absent)}" if absent else got
         raise OutputError(expected=f"the columns of {kind}", got=got, where=str(path), remedy=_AGAIN)
-    if other := sorted(name for name in wanted.keys() & types.keys() if types[name] != wanted[name]):
-        file.close()
-        raise OutputError(
-            expected=f"the columns of {kind}",
-            got=", ".join(f"{name} of {types[name]}" for name in other),
-            where=str(path),
-            remedy=_AGAIN,
-        )
     return file
 
 
@@ -301,19 +297,14 @@ def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
     """Write metrics.parquet, rows in the order given; NaN becomes null; raises OutputError."""
     schema = arrow_schema("metrics.parquet.json")
     arrays = [arrow_array([getattr(r, f.name) for r in rows], f.type) for f in schema]
-    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
-        pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
+    with parquet_writer(path, schema, checksums=False) as writer:
+        writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
 
 
 def join_metrics(path: Path, parts: Sequence[Path]) -> None:
     """Concatenate metrics.parquet of drives in their order, a few at a time; raises OutputError."""
     schema = arrow_schema("metrics.parquet.json")
-    with (
-        PendingFile(path) as pending,
-        writing(path),
-        open_new(pending.path) as file,
-        pq.ParquetWriter(file, schema, compression="zstd") as writer,
-    ):
+    with parquet_writer(path, schema, checksums=False) as writer:
         for first in range(0, len(parts), _PARTS_AT_ONCE):
             tables = [_metrics_table(part, schema) for part in parts[first : first + _PARTS_AT_ONCE]]
             writer.write_table(pa.concat_tables(tables).combine_chunks())

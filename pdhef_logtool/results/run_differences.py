@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.printable import listed
 from pdhef_logtool.results.opened_run import OpenedRun
 from pdhef_logtool.results.pairing import Pair
 
@@ -128,5 +129,4 @@ def _of(count: int, pairs: int) -> str:
 
 
 def _names(pairs: Sequence[Pair]) -> str:
-    named = ", ".join(pair.a.label for pair in pairs[:_MOST_NAMED])
-    return named if len(pairs) <= _MOST_NAMED else f"{named} and {len(pairs) - _MOST_NAMED} more"
+    return listed([pair.a.label for pair in pairs], _MOST_NAMED)

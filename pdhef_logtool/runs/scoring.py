@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.drive.reading import Drive
@@ -93,19 +93,7 @@ def drive_events(
     spans = [s for s in find_intervals(stamped, masks) if s.name not in ("all", "linear", *MANOEUVRES)]
     events = [Event(s.name, s.start_ns, s.end_ns, "") for s in spans]
     events += [
-        ManoeuvreEvent(
-            name=m.name,
-            start_ns=m.start_ns,
-            end_ns=m.end_ns,
-            text=m.text,
-            side="left" if m.side > 0 else "right",
-            speed_m_s=m.speed_m_s,
-            peak_ay_m_s2=m.peak_ay_m_s2,
-            peak_yaw_rate_rad_s=m.peak_yaw_rate_rad_s,
-            peak_steer_rad=m.peak_steer_rad,
-            lowest_ax_m_s2=m.lowest_ax_m_s2,
-        )
-        for m in manoeuvres
+        ManoeuvreEvent(**{**asdict(m), "text": m.text, "side": "left" if m.side > 0 else "right"}) for m in manoeuvres
     ]
     for track in tracks:
         events += [

@@ -12,7 +12,7 @@ from rich.text import Text
 from pdhef_logtool.logs.recording_span import shown_time
 from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
-from pdhef_logtool.runs.inspection.report import Inspection, SignalReport, TopicReport
+from pdhef_logtool.runs.inspection.report import Inspection, TopicReport
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -149,24 +149,12 @@ def _statistics_table(inspection: Inspection) -> Table:
     table = empty_table("Values in SI units", *headings, words=1)
     for section in (inspection.signals, inspection.truth):
         for report in section.values():
-            table.add_row(*_statistics_row(report))
+            dropped = sum(report.dropped.values())
+            values = (report.rate_hz, report.latency_s * 1e3, report.minimum, report.mean, report.maximum, report.std)
+            table.add_row(report.name, *map(number_text, values), str(report.gaps or "-"), str(dropped or "-"))
         if section is inspection.signals and inspection.truth:
             table.add_row(Text("truth", "bold"), *[""] * 8)
     return table
-
-
-def _statistics_row(report: SignalReport) -> tuple[str, ...]:
-    return (
-        report.name,
-        number_text(report.rate_hz),
-        number_text(report.latency_s * 1e3),
-        number_text(report.minimum),
-        number_text(report.mean),
-        number_text(report.maximum),
-        number_text(report.std),
-        str(report.gaps) if report.gaps else "-",
-        str(sum(report.dropped.values())) if any(report.dropped.values()) else "-",
-    )
 
 
 def findings_of(inspection: Inspection) -> list[tuple[str, str, str]]:

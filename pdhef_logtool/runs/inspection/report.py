@@ -65,6 +65,11 @@ COVARIANCE = re.compile(r"cov(ariance)?(\[\d*\])?$", re.IGNORECASE)
 INDEX = re.compile(r"\[\d+\]$")
 #: A device clock whose envelope leaves the fitted line by more has stepped or bent.
 CLOCK_RESIDUAL_S = 0.02
+#: Entries of the JSON in order; those without an attribute of the name are of the mapping.
+_IN_DOCUMENT = (
+    "path", "kind", "start_ns", "end_ns", "duration_s", "sample", "topics", "clocks", "mapping_origin", "signals",
+    "truth", "truth_quality", "missing", "ambiguities", "notes", "checks", "proposals", "lost", "candidates",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,25 +212,10 @@ class Inspection:
     def to_dict(self) -> dict[str, Any]:
         """Return what ``pdhef inspect --json`` prints; NaN and infinities become None."""
         document = {
-            "path": self.path,
-            "kind": self.kind,
-            "start_ns": self.start_ns,
-            "end_ns": self.end_ns,
-            "duration_s": self.duration_s,
-            "sample": self.sample,
-            "topics": self.topics,
-            "clocks": self.clocks,
+            **{name: getattr(self, name, None) for name in _IN_DOCUMENT},
             "mapping_origin": self.mapping.origin,
-            "signals": self.signals,
-            "truth": self.truth,
             "truth_quality": None if self.mapping.quality is None else self.mapping.quality.describe(),
-            "missing": self.missing,
-            "ambiguities": self.ambiguities,
-            "notes": self.notes,
-            "checks": self.checks,
             "proposals": [{"subject": p.subject, "evidence": p.evidence} for p in self.proposals],
-            "lost": self.lost,
-            "candidates": self.candidates,
             **self.uses,
         }
         return {key: jsonable(value) for key, value in document.items()}
@@ -389,7 +379,7 @@ def _topic_reports(log: DriveLog, look: _Look, parts: Sequence[MappedChannels]) 
 
 
 def _topic_report(topic: TopicInfo, steps: Steps, stamps: Sequence[Columns], log: DriveLog) -> TopicReport:
-    largest = steps.longest()
+    gap_s, gap_at_s = steps.longest(log.start_ns)
     log_s = (log.end_ns - log.start_ns) * 1e-9
     numbers = tuple(name for name, _, _ in collapsed(log.fields(topic.name)))
     times = np.concatenate([np.empty(0), *((c.log_time_ns - log.start_ns) * 1e-9 for c in stamps)])
@@ -402,8 +392,8 @@ def _topic_report(topic: TopicInfo, steps: Steps, stamps: Sequence[Columns], log
         messages=topic.messages,
         rate_hz=steps.rate_hz if steps.count else topic.messages / log_s if log_s > 0.0 else math.nan,
         jitter_p95_s=steps.jitter_p95_s,
-        largest_gap_s=largest[0] if largest else math.nan,
-        largest_gap_at_s=(largest[1] - log.start_ns) * 1e-9 if largest else math.nan,
+        largest_gap_s=gap_s,
+        largest_gap_at_s=gap_at_s,
         delay_median_s=median,
         delay_p95_s=late,
         delay_drift_ppm=_slope(times, delays) * 1e6,
@@ -441,7 +431,7 @@ def _signal_report(
     quality: QualityGate | None,
 ) -> SignalReport:
     steps, values = Steps.of([c.stamps_ns for c in channels]), _values(channels)
-    largest = steps.longest(steps.gap_limit_s)
+    gap_s, gap_at_s = steps.longest(log.start_ns, steps.gap_limit_s)
     places = {f"{source.name} ({source.label})"}
     if section == "truth" and quality is not None:
         places.add(f"{source.name} ({quality.describe()})")
@@ -449,7 +439,9 @@ def _signal_report(
     # Messages that were sorted back are used.
     dropped |= {x.kind: x.count or 0 for x in losses if x.where == source.read_topic and x.kind in TOPIC_DROPS}
     with np.errstate(over="ignore", invalid="ignore"):  # values that are no measurements
-        mean, std = (float(values.mean()), float(values.std())) if values.size else (math.nan, math.nan)
+        mean, std, minimum, maximum = (
+            float(f(values)) if values.size else math.nan for f in (np.mean, np.std, np.min, np.max)
+        )
     return SignalReport(
         name=source.name,
         unit=(SIGNAL_UNITS if section == "signals" else TRUTH_UNITS)[source.name],
@@ -460,11 +452,11 @@ def _signal_report(
         latency_s=clock.median_delay_s + source.latency_s,
         mean=mean,
         std=std,
-        minimum=float(values.min()) if values.size else math.nan,
-        maximum=float(values.max()) if values.size else math.nan,
+        minimum=minimum,
+        maximum=maximum,
         gaps=steps.gaps,
-        largest_gap_s=largest[0] if largest else math.nan,
-        largest_gap_at_s=(largest[1] - log.start_ns) * 1e-9 if largest else math.nan,
+        largest_gap_s=gap_s,
+        largest_gap_at_s=gap_at_s,
         dropped=dropped,
     )
 

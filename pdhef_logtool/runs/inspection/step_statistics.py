@@ -64,12 +64,12 @@ class Steps:
         steps = self.steps_s
         return float(np.quantile(np.abs(steps - self.median_s), 0.95)) if steps.shape[0] else float("nan")
 
-    def longest(self, above_s: float = MIN_GAP_S) -> tuple[float, int] | None:
-        """Return the longest step above a limit and its start in ns."""
-        if not self.steps_s.shape[0]:
-            return None
-        i = int(np.argmax(self.steps_s))
-        return (float(self.steps_s[i]), int(self.starts_ns[i])) if self.steps_s[i] > above_s else None
+    def longest(self, since_ns: int, above_s: float = MIN_GAP_S) -> tuple[float, float]:
+        """Return the longest step above a limit and its start since a stamp, both in s; NaN without one."""
+        i = int(np.argmax(self.steps_s)) if self.steps_s.shape[0] else 0
+        if not (self.steps_s[i : i + 1] > above_s).any():
+            return float("nan"), float("nan")
+        return float(self.steps_s[i]), (int(self.starts_ns[i]) - since_ns) * 1e-9
 
     @property
     def gap_limit_s(self) -> float:
