@@ -412,7 +412,7 @@ def _tell_doubts(plan: DrivePlan, options: ReadOptions, tell: Tell) -> None:
     for name in sorted(set(options.waived) - {c.name for c in plan.checks}):
         tell(f"--waive {name}: no check of this log is called that")
     if options.clock == "arrival":
-        for channel in plan.alignment.by_stamp:
+        for channel in (c for c in plan.alignment.channels if c.clock == "stamp"):
             source = plan.mapping.signals[channel.name].label
             tell(
                 f"{channel.name} ({source}) arrives {channel.delay_s:.2f} s after its stamps, expected at most "

@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 
@@ -24,7 +25,7 @@ from pdhef_logtool.logs.decoding import (
     missing_column,
 )
 from pdhef_logtool.logs.definitions import SHIPPED
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, nearest
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window, nearest
 from pdhef_logtool.logs.message_schema import (
     FieldInfo,
     MessageSchema,
@@ -77,6 +78,7 @@ class ColumnarLog(DriveLog):
         self.path = path
         self.kind = kind
         self.containers = tuple(containers)
+        self.size = sum(container.size for container in self.containers)
         self._opened_lost = tuple(lost)
         self._custom = custom
         self.distro = distro
@@ -104,7 +106,6 @@ class ColumnarLog(DriveLog):
         self._expected: dict[str, _Plan] = {}  # by topic
         self._columns: dict[tuple[int, int], dict[int, Columns]] = {}  # of expected topics, by span and channel
         self._column_bytes = 0
-        self._recording_span: RecordingSpan | None = None
         self._databases: tuple[Path, ...] | None = None
         self._extracted: tempfile.TemporaryDirectory[str] | None = None
 
@@ -121,12 +122,10 @@ class ColumnarLog(DriveLog):
         firsts = ((name, channels[0][1]) for name, channels in sorted(self._by_topic.items()))
         return tuple(TopicInfo(name, first.type_name, first.encoding, counts[name]) for name, first in firsts)
 
-    @property
+    @cached_property
     def recording_span(self) -> RecordingSpan:
         """When the log was recorded; determined at the first access."""
-        if self._recording_span is None:
-            self._recording_span = survey(self.containers, self._times, str(self.path))
-        return self._recording_span
+        return survey(self.containers, self._times, str(self.path))
 
     def _times(self, c: int, span: Span) -> tuple[IntArray, IntArray] | None:
         """Return channels and log times of a span's messages on known channels [N]; None if they cannot be read."""
@@ -227,11 +226,6 @@ class ColumnarLog(DriveLog):
         return any(container.is_remote for container in self.containers)
 
     @property
-    def size(self) -> int:
-        """Bytes of all files."""
-        return sum(container.size for container in self.containers)
-
-    @property
     def chunks_read(self) -> tuple[int, int]:
         """Number of spans that were read, and of all spans."""
         return len({(c, index) for c, index, _ in self._seen}), sum(len(c.spans) for c in self.containers)
@@ -320,16 +314,9 @@ class ColumnarLog(DriveLog):
                     messages += [decode(block.message(row)) for row in rows[: most - len(messages)]]
         return [message for message in messages if message is not None]
 
-    def read(
-        self,
-        requests: Mapping[str, Sequence[str]],
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-        *,
-        quiet: bool = False,
-        stamps: Collection[str] = (),
+    def _read(
+        self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
     ) -> dict[str, Columns]:
-        """Read fields of messages; see :class:`~pdhef_logtool.logs.drive_log.DriveLog`."""
         plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
         self.expect({topic: paths for topic, paths in requests.items() if topic in self._expected})
         if not quiet:
@@ -341,11 +328,11 @@ class ColumnarLog(DriveLog):
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
         expected = self._expected if self._column_bytes < _COLUMN_BYTES else {}
         for c, container in enumerate(self.containers):
-            spans = tuple(self._to_read(plans, container, start_ns, end_ns))
+            spans = tuple(self._to_read(plans, container, *window_ns))
             container.prefetch(spans)
             with container.meter.running():
                 for span in spans:
-                    self._collect_span(plans, expected, c, span, (start_ns, end_ns), parts)
+                    self._collect_span(plans, expected, c, span, window_ns, parts)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
 
     def expect(self, requests: Mapping[str, Sequence[str]]) -> None:
