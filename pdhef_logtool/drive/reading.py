@@ -181,11 +181,7 @@ class Drive:
         merged = merge_losses(
             [self.log.lost, () if self._recorded is None else self._recorded.losses, damage(self.sample_ledger)]
         )
-        return tuple(replace(x, where=self.without_folder(x.where)) for x in merged)
-
-    def without_folder(self, where: str) -> str:
-        """Return a place in the log without the folder of the log."""
-        return where.removeprefix(f"{self.path.parent}/")
+        return tuple(replace(x, where=x.where.removeprefix(f"{self.path.parent}/")) for x in merged)
 
     @property
     def samples(self) -> dict[str, int]:

@@ -311,11 +311,6 @@ def channel_of(truth: TruthTrack, name: str) -> Channel:
     return Channel(name, TRUTH_UNITS.get(name, ""), source, stamps, stamps, values[finite])
 
 
-def yaw_rate_channel(truth: TruthTrack) -> Channel:
-    """Return the ground-truth yaw rate, mapped or derived, as a channel without NaN."""
-    return channel_of(truth, "yaw_rate_rad_s")
-
-
 def booked_on_the_late(latency: LatencyEstimate, speed: LatencyEstimate | None) -> LatencyEstimate:
     """Return the latency, with a negative one attributed to the gyro.
 

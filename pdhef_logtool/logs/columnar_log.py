@@ -123,7 +123,7 @@ class ColumnarLog(DriveLog):
         return tuple(TopicInfo(name, first.type_name, first.encoding, counts[name]) for name, first in firsts)
 
     @cached_property
-    def recording_span(self) -> RecordingSpan:
+    def recording_span(self) -> RecordingSpan:  # type: ignore[override]
         """When the log was recorded; determined at the first access."""
         return survey(self.containers, self._times, str(self.path))
 
@@ -323,16 +323,15 @@ class ColumnarLog(DriveLog):
             wanted = {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
             self._asked |= wanted
             self._wanted |= wanted
-        times = {topic: _Plan((), {}) for topic in stamps if topic not in plans}
-        plans |= times
+        plans |= {topic: _Plan((), {}) for topic in stamps if topic not in plans}
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
-        expected = self._expected if self._column_bytes < _COLUMN_BYTES else {}
+        request = _Request(plans, self._expected if self._column_bytes < _COLUMN_BYTES else {}, window_ns)
         for c, container in enumerate(self.containers):
             spans = tuple(self._to_read(plans, container, *window_ns))
             container.prefetch(spans)
             with container.meter.running():
                 for span in spans:
-                    self._collect_span(plans, expected, c, span, window_ns, parts)
+                    self._collect_span(request, c, span, parts)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
 
     def expect(self, requests: Mapping[str, Sequence[str]]) -> None:
@@ -513,46 +512,29 @@ class ColumnarLog(DriveLog):
             if span.overlaps(start_ns, end_ns) and any(container.channels[id_].topic in topics for id_ in span.counts):
                 yield span
 
-    def _collect_span(
-        self,
-        plans: Mapping[str, _Plan],
-        expected: Mapping[str, _Plan],
-        c: int,
-        span: Span,
-        window_ns: tuple[int | None, int | None],
-        parts: Mapping[str, list[Columns]],
-    ) -> None:
+    def _collect_span(self, request: _Request, c: int, span: Span, parts: Mapping[str, list[Columns]]) -> None:
         """Add the columns of the requested topics in a span; if it has to be opened, keep those of expected topics."""
-        channels = self.containers[c].channels
+        channels, plans, expected = self.containers[c].channels, request.plans, request.expected
         requested = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
         stored = self._columns.get((c, span.index), {})
         if not all(id_ in stored and plans[channels[id_].topic].is_in(stored[id_]) for id_ in requested):
             later = frozenset(id_ for id_ in span.counts if channels[id_].topic in expected and id_ not in stored)
-            used = {**plans, **expected}
-            payloads = frozenset(id_ for id_ in requested | later if used[channels[id_].topic].selections)
+            payloads = frozenset(id_ for id_ in requested | later if request.used[channels[id_].topic].selections)
             block = self.load(c, span, requested | later, payloads)
             if block is None:
                 return
-            stored = stored | self._decode_span(used, expected, c, span, window_ns, block)
+            stored = stored | self._decode_span(request, c, span, block)
         for id_ in sorted(stored, key=lambda id_: self._rank[c].get(id_, -1)):
             columns = stored[id_]
             if columns.topic in plans:
-                keep = in_window(columns.log_time_ns, *window_ns)
+                keep = in_window(columns.log_time_ns, *request.window_ns)
                 parts[columns.topic].append(columns if keep is None else columns.rows(keep))
 
-    def _decode_span(
-        self,
-        plans: Mapping[str, _Plan],
-        expected: Mapping[str, _Plan],
-        c: int,
-        span: Span,
-        window_ns: tuple[int | None, int | None],
-        block: Block,
-    ) -> dict[int, Columns]:
+    def _decode_span(self, request: _Request, c: int, span: Span, block: Block) -> dict[int, Columns]:
         """Return the columns of a block by channel, within the window or of an expected topic; keep the latter."""
-        channels = self.containers[c].channels
+        channels, plans, expected = self.containers[c].channels, request.used, request.expected
         decoded: dict[int, Columns] = {}
-        keep = in_window(block.log_time_ns, *window_ns)
+        keep = in_window(block.log_time_ns, *request.window_ns)
         # By the channels of the block: the counts of the span can be from a wrong index.
         for id_, rows in block.rows.items():
             topic = channels[id_].topic if id_ in channels else ""
@@ -613,6 +595,14 @@ class _Plan:
     def is_in(self, columns: Columns) -> bool:
         """Return whether columns have all paths of this plan."""
         return columns.fields.keys() >= set(self.paths)
+
+
+class _Request:
+    """One read: how the requested and the expected topics are read, by topic, and the window."""
+
+    def __init__(self, plans: Mapping[str, _Plan], expected: Mapping[str, _Plan], window_ns: Window) -> None:
+        self.plans, self.expected, self.window_ns = plans, expected, window_ns
+        self.used = {**plans, **expected}
 
 
 def _out_of_time(container: Container, spans: Sequence[Span]) -> Loss:
