@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.records.signals import IntArray, Loss
@@ -30,6 +31,7 @@ class FakeLog(DriveLog):
     contents: dict[str, FakeTopic]
     path: Path = Path("memory.mcap")
     kind: str = "mcap"
+    size: int = 0
     lost: tuple[Loss, ...] = ()
     reads: list[dict[str, list[str]]] = field(default_factory=list)
 
@@ -47,11 +49,7 @@ class FakeLog(DriveLog):
     def end_ns(self) -> int:
         return max((int(t.log_time_ns.max()) + 1 for t in self.contents.values() if len(t.log_time_ns)), default=0)
 
-    @property
-    def size(self) -> int:
-        return 0
-
-    @property
+    @cached_property
     def recording_span(self) -> RecordingSpan:
         return RecordingSpan(((self.start_ns, self.end_ns),) if self.end_ns else ())
 
@@ -71,18 +69,12 @@ class FakeLog(DriveLog):
     def first_messages(self, topic: str, most: int) -> list[object]:
         return list(self.contents[topic].examples[:most])
 
-    def read(
-        self,
-        requests: Mapping[str, Sequence[str]],
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-        *,
-        quiet: bool = False,
-        stamps: Collection[str] = (),
+    def _read(
+        self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
     ) -> dict[str, Columns]:
         self.reads.append({t: list(p) for t, p in requests.items()})
         wanted = {**dict.fromkeys(stamps, ()), **requests}
-        return {name: self._columns(name, paths, start_ns, end_ns) for name, paths in wanted.items()}
+        return {name: self._columns(name, paths, *window_ns) for name, paths in wanted.items()}
 
     def close(self) -> None:
         pass

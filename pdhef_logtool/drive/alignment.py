@@ -149,27 +149,11 @@ class AlignmentPlan:
         return replace(self, channels=channels, unused=tuple(sorted(unused.items())), speed_from=speed_from)
 
     @property
-    def by_stamp(self) -> tuple[ChannelPlan, ...]:
-        """Channels that are read by their stamps. Estimates from them are not causal."""
-        return tuple(c for c in self.channels if c.clock == "stamp")
-
-    @property
-    def lookback_ns(self) -> int:
-        """Longest time between a grid stamp and the arrival of a sample used there."""
-        return _ns(self._longest_gap_s + self._longest_delay_s)
-
-    @property
     def margin_ns(self) -> int:
         """Duration before ``start_ns`` and after ``end_ns`` that :func:`align` needs in addition."""
-        return self.lookback_ns + _ns(self._longest_gap_s + LATE_NEIGHBOURHOOD_S + self._longest_delay_s)
-
-    @property
-    def _longest_gap_s(self) -> float:
-        return max((c.max_gap_s for c in self.channels), default=0.0)
-
-    @property
-    def _longest_delay_s(self) -> float:
-        return max((c.max_delay_s for c in self.channels), default=0.0)
+        gap_s = max((c.max_gap_s for c in self.channels), default=0.0)
+        delay_s = max((c.max_delay_s for c in self.channels), default=0.0)
+        return _ns(gap_s + delay_s) + _ns(gap_s + LATE_NEIGHBOURHOOD_S + delay_s)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as JSON-able dictionaries and lists."""

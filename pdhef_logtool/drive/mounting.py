@@ -46,7 +46,6 @@ from pdhef_logtool.drive.truth import (
     derive_truth,
     estimate_truth_latency,
     plan_truth,
-    yaw_rate_channel,
 )
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, auto_map, fit_clocks, read_signals
@@ -599,7 +598,7 @@ def truth_latency(channels: MappedChannels, truth: TruthTrack | None) -> Latency
     gyro = channels.signals.get("yaw_rate_rad_s")
     if truth is None or gyro is None or not len(gyro):
         return None
-    rate = channels.truth.get("yaw_rate_rad_s") or yaw_rate_channel(truth)
+    rate = channels.truth.get("yaw_rate_rad_s") or channel_of(truth, "yaw_rate_rad_s")
     if not len(rate):
         return None
     latency = estimate_truth_latency(gyro, rate)

@@ -181,11 +181,7 @@ class Drive:
         merged = merge_losses(
             [self.log.lost, () if self._recorded is None else self._recorded.losses, damage(self.sample_ledger)]
         )
-        return tuple(replace(x, where=self.without_folder(x.where)) for x in merged)
-
-    def without_folder(self, where: str) -> str:
-        """Return a place in the log without the folder of the log."""
-        return where.removeprefix(f"{self.path.parent}/")
+        return tuple(replace(x, where=x.where.removeprefix(f"{self.path.parent}/")) for x in merged)
 
     @property
     def samples(self) -> dict[str, int]:
@@ -412,7 +408,7 @@ def _tell_doubts(plan: DrivePlan, options: ReadOptions, tell: Tell) -> None:
     for name in sorted(set(options.waived) - {c.name for c in plan.checks}):
         tell(f"--waive {name}: no check of this log is called that")
     if options.clock == "arrival":
-        for channel in plan.alignment.by_stamp:
+        for channel in (c for c in plan.alignment.channels if c.clock == "stamp"):
             source = plan.mapping.signals[channel.name].label
             tell(
                 f"{channel.name} ({source}) arrives {channel.delay_s:.2f} s after its stamps, expected at most "

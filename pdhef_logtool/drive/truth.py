@@ -311,11 +311,6 @@ def channel_of(truth: TruthTrack, name: str) -> Channel:
     return Channel(name, TRUTH_UNITS.get(name, ""), source, stamps, stamps, values[finite])
 
 
-def yaw_rate_channel(truth: TruthTrack) -> Channel:
-    """Return the ground-truth yaw rate, mapped or derived, as a channel without NaN."""
-    return channel_of(truth, "yaw_rate_rad_s")
-
-
 def booked_on_the_late(latency: LatencyEstimate, speed: LatencyEstimate | None) -> LatencyEstimate:
     """Return the latency, with a negative one attributed to the gyro.
 
@@ -437,24 +432,19 @@ def _velocity_source(
     placeless = velocity == "ecef_velocity_m_s" and origin is None
     heading = _first(has - {"yaw_rad"} if placeless else has, "yaw_rad", "quat_wxyz")
     position = _first(has & (frozenset({"ecef_position_m"}) | _pairs(has)), "x_m", "ecef_position_m", "lat_deg")
-    if {"vx_m_s", "vy_m_s"} <= has:
-        return "body velocity", "vx_m_s"
-    if {"vx_m_s", "sideslip_rad"} <= has:
-        return "v_x and sideslip", "vx_m_s"
-    if velocity and heading:
-        return "velocity and heading", velocity
-    if position and heading:
-        return "position and heading", position
-    if {"vx_m_s", "course_rad", "yaw_rad"} <= has:
-        return "v_x, course and yaw", "vx_m_s"
-    if "vx_m_s" in has:
-        return "v_x alone", "vx_m_s"
     ground = velocity or position
-    if ground and "sideslip_rad" in has:
-        return "ground speed and sideslip", ground
-    if ground:
-        return "ground speed alone", ground
-    return "none", max(sorted(survey.keys() - {_FRICTION}), key=lambda n: len(survey[n]))
+    choices: tuple[tuple[object, VelocitySource, str | None], ...] = (
+        ({"vx_m_s", "vy_m_s"} <= has, "body velocity", "vx_m_s"),
+        ({"vx_m_s", "sideslip_rad"} <= has, "v_x and sideslip", "vx_m_s"),
+        (heading, "velocity and heading", velocity),
+        (heading, "position and heading", position),
+        ({"vx_m_s", "course_rad", "yaw_rad"} <= has, "v_x, course and yaw", "vx_m_s"),
+        ("vx_m_s" in has, "v_x alone", "vx_m_s"),
+        ("sideslip_rad" in has, "ground speed and sideslip", ground),
+        (True, "ground speed alone", ground),
+    )
+    longest = max(sorted(survey.keys() - {_FRICTION}), key=lambda n: len(survey[n]))
+    return next(((source, base) for applies, source, base in choices if applies and base), ("none", longest))
 
 
 def _pairs(has: frozenset[str]) -> frozenset[str]:
@@ -592,6 +582,15 @@ def _turn(matrix: FloatArray, vectors: FloatArray) -> FloatArray:
     return np.stack([(matrix[i] * vectors).sum(axis=1) for i in range(3)], axis=1)
 
 
+def cubic_equations(u: FloatArray) -> tuple[list[FloatArray], FloatArray]:
+    """Return the powers 0 to 6 of times [N, k], each [N, k], and the normal matrices [N, 4, 4] of a cubic in them."""
+    powers = [np.ones_like(u)]
+    for _ in range(6):
+        powers.append(powers[-1] * u)
+    moments = [p.sum(axis=1) for p in powers]
+    return powers, np.stack([np.stack([moments[i + j] for j in range(4)], axis=1) for i in range(4)], axis=1)
+
+
 def differentiate(
     stamps_ns: IntArray, values: FloatArray, half_window: int, max_gap_ns: int, *, angle: bool = False
 ) -> FloatArray:
@@ -618,11 +617,7 @@ def differentiate(
         y = values[window] - values[centre][:, None]
         if angle:
             y = wrap_angle(y)
-        powers = [np.ones_like(u)]
-        for _ in range(6):
-            powers.append(powers[-1] * u)
-        moments = [p.sum(axis=1) for p in powers]
-        normal = np.stack([np.stack([moments[i + j] for j in range(4)], axis=1) for i in range(4)], axis=1)
+        powers, normal = cubic_equations(u)
         right = np.stack([(powers[i] * y).sum(axis=1) for i in range(4)], axis=1)
         slope[centre] = np.linalg.solve(normal, right[:, :, None])[:, 1, 0] / span
     return slope

@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 
@@ -24,7 +25,7 @@ from pdhef_logtool.logs.decoding import (
     missing_column,
 )
 from pdhef_logtool.logs.definitions import SHIPPED
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, nearest
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window, nearest
 from pdhef_logtool.logs.message_schema import (
     FieldInfo,
     MessageSchema,
@@ -77,6 +78,7 @@ class ColumnarLog(DriveLog):
         self.path = path
         self.kind = kind
         self.containers = tuple(containers)
+        self.size = sum(container.size for container in self.containers)
         self._opened_lost = tuple(lost)
         self._custom = custom
         self.distro = distro
@@ -104,7 +106,6 @@ class ColumnarLog(DriveLog):
         self._expected: dict[str, _Plan] = {}  # by topic
         self._columns: dict[tuple[int, int], dict[int, Columns]] = {}  # of expected topics, by span and channel
         self._column_bytes = 0
-        self._recording_span: RecordingSpan | None = None
         self._databases: tuple[Path, ...] | None = None
         self._extracted: tempfile.TemporaryDirectory[str] | None = None
 
@@ -121,12 +122,10 @@ class ColumnarLog(DriveLog):
         firsts = ((name, channels[0][1]) for name, channels in sorted(self._by_topic.items()))
         return tuple(TopicInfo(name, first.type_name, first.encoding, counts[name]) for name, first in firsts)
 
-    @property
-    def recording_span(self) -> RecordingSpan:
+    @cached_property
+    def recording_span(self) -> RecordingSpan:  # type: ignore[override]
         """When the log was recorded; determined at the first access."""
-        if self._recording_span is None:
-            self._recording_span = survey(self.containers, self._times, str(self.path))
-        return self._recording_span
+        return survey(self.containers, self._times, str(self.path))
 
     def _times(self, c: int, span: Span) -> tuple[IntArray, IntArray] | None:
         """Return channels and log times of a span's messages on known channels [N]; None if they cannot be read."""
@@ -227,11 +226,6 @@ class ColumnarLog(DriveLog):
         return any(container.is_remote for container in self.containers)
 
     @property
-    def size(self) -> int:
-        """Bytes of all files."""
-        return sum(container.size for container in self.containers)
-
-    @property
     def chunks_read(self) -> tuple[int, int]:
         """Number of spans that were read, and of all spans."""
         return len({(c, index) for c, index, _ in self._seen}), sum(len(c.spans) for c in self.containers)
@@ -320,32 +314,24 @@ class ColumnarLog(DriveLog):
                     messages += [decode(block.message(row)) for row in rows[: most - len(messages)]]
         return [message for message in messages if message is not None]
 
-    def read(
-        self,
-        requests: Mapping[str, Sequence[str]],
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-        *,
-        quiet: bool = False,
-        stamps: Collection[str] = (),
+    def _read(
+        self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
     ) -> dict[str, Columns]:
-        """Read fields of messages; see :class:`~pdhef_logtool.logs.drive_log.DriveLog`."""
         plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
         self.expect({topic: paths for topic, paths in requests.items() if topic in self._expected})
         if not quiet:
             wanted = {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
             self._asked |= wanted
             self._wanted |= wanted
-        times = {topic: _Plan((), {}) for topic in stamps if topic not in plans}
-        plans |= times
+        plans |= {topic: _Plan((), {}) for topic in stamps if topic not in plans}
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
-        expected = self._expected if self._column_bytes < _COLUMN_BYTES else {}
+        request = _Request(plans, self._expected if self._column_bytes < _COLUMN_BYTES else {}, window_ns)
         for c, container in enumerate(self.containers):
-            spans = tuple(self._to_read(plans, container, start_ns, end_ns))
+            spans = tuple(self._to_read(plans, container, *window_ns))
             container.prefetch(spans)
             with container.meter.running():
                 for span in spans:
-                    self._collect_span(plans, expected, c, span, (start_ns, end_ns), parts)
+                    self._collect_span(request, c, span, parts)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
 
     def expect(self, requests: Mapping[str, Sequence[str]]) -> None:
@@ -526,46 +512,29 @@ class ColumnarLog(DriveLog):
             if span.overlaps(start_ns, end_ns) and any(container.channels[id_].topic in topics for id_ in span.counts):
                 yield span
 
-    def _collect_span(
-        self,
-        plans: Mapping[str, _Plan],
-        expected: Mapping[str, _Plan],
-        c: int,
-        span: Span,
-        window_ns: tuple[int | None, int | None],
-        parts: Mapping[str, list[Columns]],
-    ) -> None:
+    def _collect_span(self, request: _Request, c: int, span: Span, parts: Mapping[str, list[Columns]]) -> None:
         """Add the columns of the requested topics in a span; if it is opened, keep those of expected topics."""
-        channels = self.containers[c].channels
+        channels, plans, expected = self.containers[c].channels, request.plans, request.expected
         requested = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
         stored = self._columns.get((c, span.index), {})
         if not all(id_ in stored and plans[channels[id_].topic].is_in(stored[id_]) for id_ in requested):
             later = frozenset(id_ for id_ in span.counts if channels[id_].topic in expected and id_ not in stored)
-            used = {**plans, **expected}
-            payloads = frozenset(id_ for id_ in requested | later if used[channels[id_].topic].selections)
+            payloads = frozenset(id_ for id_ in requested | later if request.used[channels[id_].topic].selections)
             block = self.load(c, span, requested | later, payloads)
             if block is None:
                 return
-            stored = stored | self._decode_span(used, expected, c, span, window_ns, block)
+            stored = stored | self._decode_span(request, c, span, block)
         for id_ in sorted(stored, key=lambda id_: self._rank[c].get(id_, -1)):
             columns = stored[id_]
             if columns.topic in plans:
-                keep = in_window(columns.log_time_ns, *window_ns)
+                keep = in_window(columns.log_time_ns, *request.window_ns)
                 parts[columns.topic].append(columns if keep is None else columns.rows(keep))
 
-    def _decode_span(
-        self,
-        plans: Mapping[str, _Plan],
-        expected: Mapping[str, _Plan],
-        c: int,
-        span: Span,
-        window_ns: tuple[int | None, int | None],
-        block: Block,
-    ) -> dict[int, Columns]:
+    def _decode_span(self, request: _Request, c: int, span: Span, block: Block) -> dict[int, Columns]:
         """Return the columns of a block by channel, within the window or of an expected topic; keep the latter."""
-        channels = self.containers[c].channels
+        channels, plans, expected = self.containers[c].channels, request.used, request.expected
         decoded: dict[int, Columns] = {}
-        keep = in_window(block.log_time_ns, *window_ns)
+        keep = in_window(block.log_time_ns, *request.window_ns)
         # By the channels of the block: the counts of the span can be from a wrong index.
         for id_, rows in block.rows.items():
             topic = channels[id_].topic if id_ in channels else ""
@@ -626,6 +595,14 @@ class _Plan:
     def is_in(self, columns: Columns) -> bool:
         """Return whether columns have all paths of this plan."""
         return columns.fields.keys() >= set(self.paths)
+
+
+class _Request:
+    """One read: how the requested and the expected topics are read, by topic, and the window."""
+
+    def __init__(self, plans: Mapping[str, _Plan], expected: Mapping[str, _Plan], window_ns: Window) -> None:
+        self.plans, self.expected, self.window_ns = plans, expected, window_ns
+        self.used = {**plans, **expected}
 
 
 def _out_of_time(container: Container, spans: Sequence[Span]) -> Loss:

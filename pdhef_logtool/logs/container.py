@@ -276,6 +276,11 @@ class Container(ABC):
         self._losses: dict[str, int] = {}  # how many of a kind
         self._folded: dict[str, int] = {}  # index in ``lost`` of the loss that sums up further ones
 
+    @classmethod
+    def open(cls, file: LogFile) -> Self:
+        """Open a file of this format; for formats with the parameters of :class:`FileContainer`."""
+        return cls(file.path, file.place, file.meter)  # type: ignore[arg-type]
+
     @abstractmethod
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Read a span's messages (at least of the channels in ``want``); any error is a loss of the span."""
@@ -398,11 +403,6 @@ class FileContainer(Container):
         except BaseException:
             self.source.close()
             raise
-
-    @classmethod
-    def open(cls, file: LogFile) -> Self:
-        """Open a file of this format."""
-        return cls(file.path, file.place, file.meter)
 
     def _open(self) -> None:
         """Walk the file. An error of the walk loses the rest of the file."""

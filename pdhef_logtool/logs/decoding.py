@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial as bind
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,8 @@ _LAYOUTS_PER_CHANNEL = 8
 #: An array has as many columns as its longest value: at most this many cells, or columns if there are many values.
 _CELLS = 1 << 26
 _COLUMNS = 64
+#: Rows of messages that are decoded, with their columns by path.
+_Parts: TypeAlias = list[tuple[IntArray, dict[str, NDArray[Any]]]]
 
 
 def channel_schema(
@@ -112,7 +114,7 @@ class ChannelDecoder:
     def columns(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         """Decode the messages ``rows`` of a block: float64 [N] or [N, k], or int64 nanoseconds [N], by path."""
         self.undecodable = []
-        partial: list[tuple[IntArray, dict[str, NDArray[Any]]]] = []
+        partial: _Parts = []
         left = every = np.arange(len(rows))
         if self.schema.wire in ("cdr", "ros1"):
             left = self._read_records(block, rows, left, partial)
@@ -128,11 +130,8 @@ class ChannelDecoder:
         back = np.argsort(np.concatenate([part_rows for part_rows, _ in partial]), kind="stable")
         return {path: column[back] for path, column in joined.items()}
 
-    def _read_records(
-        self, block: Block, rows: IntArray, left: IntArray, partial: list[tuple[IntArray, dict[str, NDArray[Any]]]]
-    ) -> IntArray:
+    def _read_records(self, block: Block, rows: IntArray, left: IntArray, partial: _Parts) -> IntArray:
         """Read messages of a fixed layout; return the other rows."""
-        offset, length = block.offset[rows], block.length[rows]
         no_layout: list[IntArray] = []
         tried = 0
         while left.size and tried <= len(self._layouts):
@@ -153,7 +152,7 @@ class ChannelDecoder:
                 self._layouts.append(LayoutReader(layout, self.schema.wire, wanted))
             reader = self._layouts[tried]
             tried += 1
-            left = self._read_layout(reader, block, offset, length, left, partial)
+            left = self._read_layout(reader, block, rows, left, partial)
         return np.concatenate([*no_layout, left]) if no_layout else left
 
     def _check_widths(self, layout: WireLayout, n: int) -> None:
@@ -164,17 +163,10 @@ class ChannelDecoder:
             raise NoLayoutError("an array is too wide for columns")
 
     def _read_layout(
-        self,
-        layout: LayoutReader,
-        block: Block,
-        offset: IntArray,
-        length: IntArray,
-        left: IntArray,
-        partial: list[tuple[IntArray, dict[str, NDArray[Any]]]],
+        self, layout: LayoutReader, block: Block, rows: IntArray, left: IntArray, partial: _Parts
     ) -> IntArray:
         """Read messages of this layout; return the other rows."""
-        if len(left) < len(offset):
-            offset, length = offset[left], length[left]
+        offset, length = block.offset[rows[left]], block.length[rows[left]]
         candidates = left
         if not (length == layout.size).all():
             # Up to three bytes of padding may follow a CDR message.

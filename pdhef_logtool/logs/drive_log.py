@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from numpy.typing import NDArray
 
@@ -24,6 +24,9 @@ from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.columnar_log import ColumnarLog
+
+#: Log times [start, end); None: from the start, to the end.
+Window: TypeAlias = tuple[int | None, int | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +78,15 @@ class DriveLog(ABC):
     ----------
     path : file, folder or object.
     kind : name of the format, for reports: ``mcap``, ``rosbag1``, ``rosbag2-sqlite3``, ``rosbag2-mcap``, ...
+    size : bytes of all files.
+    recording_span : when the log was recorded; messages of other times are never read.
     given_databases : DBC files given with the log.
     """
 
     path: LogPlace
     kind: str
+    size: int
+    recording_span: RecordingSpan
     given_databases: tuple[Path, ...] = ()
 
     @property
@@ -89,18 +96,8 @@ class DriveLog(ABC):
 
     @property
     @abstractmethod
-    def recording_span(self) -> RecordingSpan:
-        """When the log was recorded; messages of other times are never read."""
-
-    @property
-    @abstractmethod
     def lost(self) -> tuple[Loss, ...]:
         """Losses so far (complete after a full read)."""
-
-    @property
-    @abstractmethod
-    def size(self) -> int:
-        """Bytes of all files."""
 
     @abstractmethod
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
@@ -109,7 +106,6 @@ class DriveLog(ABC):
         With ``quiet`` a schema that does not parse is not reported as a loss.
         """
 
-    @abstractmethod
     def read(
         self,
         requests: Mapping[str, Sequence[str]],
@@ -128,6 +124,13 @@ class DriveLog(ABC):
         ------
         MappingError : the log has no such topic, no such field, or cannot decode the topic.
         """
+        return self._read(requests, (start_ns, end_ns), quiet, stamps)
+
+    @abstractmethod
+    def _read(
+        self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
+    ) -> dict[str, Columns]:
+        """Read as :meth:`read`."""
 
     def expect(self, requests: Mapping[str, Sequence[str]]) -> None:
         """Announce the fields that later reads request, so that one pass over the file can serve them.

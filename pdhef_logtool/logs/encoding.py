@@ -146,16 +146,15 @@ class CdrEncoder:
         if selection.shape == "time":
             if values.dtype.kind not in "iu" or values.ndim != 1:
                 raise self._misfit(path, "int64 nanoseconds [N]", f"{values.dtype} {values.shape}")
-            seconds, nanoseconds = np.divmod(values.astype(np.int64), 1_000_000_000)
-            self._put_leaf(layout, rows, selection.components[0], seconds, path)
-            self._put_leaf(layout, rows, selection.components[1], nanoseconds, path)
+            parts: Sequence[NDArray[Any]] = np.divmod(values.astype(np.int64), 1_000_000_000)
         elif selection.shape == "vector":
             if values.ndim != 2 or values.shape[1] != len(selection.components):
                 raise self._misfit(path, f"[N, {len(selection.components)}]", f"shape {values.shape}")
-            for i, steps in enumerate(selection.components):
-                self._put_leaf(layout, rows, steps, values[:, i], path)
+            parts = tuple(values.T)
         else:
-            self._put_leaf(layout, rows, selection.components[0], values, path)
+            parts = (values,)
+        for steps, part in zip(selection.components, parts, strict=False):
+            self._put_leaf(layout, rows, steps, part, path)
 
     def _put_leaf(
         self, layout: WireLayout, rows: NDArray[np.uint8], steps: Steps, values: NDArray[Any], path: str
@@ -163,16 +162,15 @@ class CdrEncoder:
         leaf = leaf_at(layout, steps)
         if leaf is None:
             raise self._misfit(path, "an element of the message", "an index outside its sequence")
-        if values.ndim != (1 if leaf.count is None else 2) or (
-            leaf.count is not None and values.shape[1] != leaf.count
-        ):
+        inner = () if leaf.count is None else (leaf.count,)
+        if values.shape[1:] != inner:
             expected = "[N]" if leaf.count is None else f"[N, {leaf.count}]"
             raise self._misfit(path, expected, f"shape {values.shape}")
         if leaf.dtype.kind in "iu" and values.dtype.kind == "f":
             if not np.all(np.isfinite(values)):
                 raise self._misfit(path, "finite values for an integer field", "NaN or infinity")
             values = np.rint(values)
-        size, kind = rows.shape[1], leaf.dtype if leaf.count is None else np.dtype((leaf.dtype, (leaf.count,)))
+        size, kind = rows.shape[1], np.dtype((leaf.dtype, inner))
         offset = size - layout.size + leaf.offset
         place = np.dtype({"names": ["leaf"], "formats": [kind], "offsets": [offset], "itemsize": size})
         rows.view(place)["leaf"][:, 0] = values  # many times faster than byte by byte

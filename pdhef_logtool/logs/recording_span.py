@@ -92,12 +92,9 @@ class RecordingSpan:
 
         To be asked where anything is ``left_out`` at all.
         """
-        unused = ~_inside(log_time_ns, self.intervals) | self.recorded_before(topic, c, span, log_time_ns)
+        of_earlier_passes = _cut_out(log_time_ns, topic, (c, span.index), self.cuts)
+        unused = ~_inside(log_time_ns, self.intervals) | of_earlier_passes
         return unused if unused.any() else None
-
-    def recorded_before(self, topic: str, c: int, span: Span, log_time_ns: IntArray) -> BoolArray:
-        """Return which of a topic's messages in a span (all of them, in file order) have times of an earlier pass."""
-        return _cut_out(log_time_ns, topic, (c, span.index), self.cuts)
 
 
 def find_epochs(

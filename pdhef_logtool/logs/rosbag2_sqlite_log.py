@@ -7,7 +7,6 @@ import sqlite3
 from collections import Counter
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
 from urllib.parse import quote
 
 import numpy as np
@@ -29,9 +28,6 @@ from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.storage.files import scratch_folder
 
-if TYPE_CHECKING:
-    from pdhef_logtool.logs.log_file import LogFile
-
 _PAGE_ROWS = 8192
 _PAGE_BYTES = 4 << 20
 _STEPS_A_CHECK = 100_000  # instructions of SQLite between checks of the time
@@ -50,11 +46,6 @@ class SqliteContainer(Container):
     form = "sqlite3"
     selective = True  # rows of other topics are not read
     remedy = "is it a rosbag2 recording?"
-
-    @classmethod
-    def open(cls, file: LogFile) -> Self:
-        """Open a file of this format."""
-        return cls(file.path, file.place, file.meter)
 
     def __init__(self, path: Path, shown_path: LogPlace | None = None, meter: Meter | None = None) -> None:
         require_regular(path, shown_path)

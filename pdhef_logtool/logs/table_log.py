@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import describe_damage
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, nearest
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window, nearest
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.recording_span import RecordingSpan, survey_stamps
+from pdhef_logtool.logs.recording_span import survey_stamps
 from pdhef_logtool.logs.table_clocks import unlike_lengths
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray, Loss
@@ -87,13 +87,13 @@ class TableLog(DriveLog):
             got = f"others: {', '.join(wrong)}"
             raise LogError(expected="tables of different names with ascending times", got=got, where=str(self.path))
         stamps = {name: table.stamps_ns for name, table in self._tables.items()}
-        self._recording_span = survey_stamps(stamps, str(self.path))
+        self.recording_span = survey_stamps(stamps, str(self.path))
         inside = {n: s[slice(*np.searchsorted(s, (self.start_ns, self.end_ns)))] for n, s in stamps.items()}
         cut = [Loss("truncated", file.cut, str(self.path))] if file.cut else []
-        self._lost = [*lost, *cut, *unlike_lengths(inside, str(self.path)), *self._recording_span.losses]
+        self._lost = [*lost, *cut, *unlike_lengths(inside, str(self.path)), *self.recording_span.losses]
         self._unreadable: set[tuple[str, str]] = set()
         self._column_losses: dict[tuple[str, str], list[Loss]] = {}
-        self._size = file.path.stat().st_size
+        self.size = file.path.stat().st_size
 
     def decode_frames(self, databases: Sequence[tuple[str, Database]]) -> None:
         """Add a table for each message of DBC files, given with their names, that raw CAN frames of the log contain."""
@@ -110,37 +110,21 @@ class TableLog(DriveLog):
         return tuple(TopicInfo(t.name, t.type_name, self.kind, len(t.stamps_ns)) for t in self._tables.values())
 
     @property
-    def recording_span(self) -> RecordingSpan:
-        """When the log was recorded."""
-        return self._recording_span
-
-    @property
     def lost(self) -> tuple[Loss, ...]:
         """Losses so far."""
         return tuple(self._lost)
-
-    @property
-    def size(self) -> int:
-        """Bytes of the file."""
-        return self._size
 
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
         """Return the columns of a table."""
         del quiet
         return self._tables[topic].fields if topic in self._tables else ()
 
-    def read(
-        self,
-        requests: Mapping[str, Sequence[str]],
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-        *,
-        quiet: bool = False,
-        stamps: Collection[str] = (),
+    def _read(
+        self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
     ) -> dict[str, Columns]:
-        """Read columns of tables; see :class:`~pdhef_logtool.logs.drive_log.DriveLog`."""
         for topic, paths in requests.items():
             self._check(topic, paths)
+        start_ns, end_ns = window_ns
         window = (self.start_ns if start_ns is None else start_ns, self.end_ns if end_ns is None else end_ns)
         with self._file.meter.running():
             wanted = {**dict.fromkeys(stamps, ()), **requests}
@@ -160,7 +144,7 @@ class TableLog(DriveLog):
 
     def _columns(self, table: Table, paths: Sequence[str], window: tuple[int, int], quiet: bool) -> Columns:
         times = table.stamps_ns
-        spans = [(max(low, window[0]), min(high, window[1])) for low, high in self._recording_span.intervals]
+        spans = [(max(low, window[0]), min(high, window[1])) for low, high in self.recording_span.intervals]
         rows = [slice(*np.searchsorted(times, span).tolist()) for span in spans if span[0] < span[1]]
         stamps = np.concatenate([np.empty(0, np.int64), *(times[r] for r in rows)])
         columns = {p: self._column(table, p, rows, len(stamps), quiet) for p in dict.fromkeys(paths)}

@@ -129,7 +129,7 @@ class _Merged:
         return int(self.log_time_ns[self.position]) if self.position < len(self.log_time_ns) else None
 
 
-class McapLogWriter:
+class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
     """Writes one MCAP file under a temporary name and renames it on :meth:`close`; removes it on an error.
 
     Parameters
@@ -163,10 +163,6 @@ class McapLogWriter:
             self._file: IO[bytes] = open_new(self._pending.path)
         self._emit(MCAP_MAGIC)
         self._emit_record(Header(profile=profile, library=LIBRARY))
-
-    def __enter__(self) -> McapLogWriter:
-        """Return the writer."""
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Close the file, or remove it if an exception passes."""

@@ -30,9 +30,8 @@ from pdhef_logtool.logs.can_decoding import (
     signal_groups,
     signal_values,
 )
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.recording_span import RecordingSpan
 from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.errors import MappingError
@@ -192,7 +191,8 @@ class CanSignalLog(DriveLog):
 
     def __init__(self, log: DriveLog, views: Mapping[str, _CanView], settings: CanSettings) -> None:
         self._log = log
-        self.path, self.kind = log.path, log.kind
+        self.path, self.kind, self.size = log.path, log.kind, log.size
+        self.recording_span = log.recording_span
         self._settings = settings
         self._views = views
         self.short_frames: tuple[Loss, ...] = ()
@@ -217,11 +217,6 @@ class CanSignalLog(DriveLog):
         wanted = {t.name: t for t in self._log.topics}
         views = (TopicInfo(name, v.message.name, "can", wanted[v.topic].messages) for name, v in self._views.items())
         return (*wanted.values(), *views)
-
-    @property
-    def recording_span(self) -> RecordingSpan:
-        """Recording span of the log."""
-        return self._log.recording_span
 
     @property
     def lost(self) -> tuple[Loss, ...]:
@@ -252,14 +247,8 @@ class CanSignalLog(DriveLog):
         view = self._views.get(topic)
         return self._log.first_messages(topic if view is None else view.topic, most)
 
-    def read(
-        self,
-        requests: Mapping[str, Sequence[str]],
-        start_ns: int | None = None,
-        end_ns: int | None = None,
-        *,
-        quiet: bool = False,
-        stamps: Collection[str] = (),
+    def _read(
+        self, requests: Mapping[str, Sequence[str]], window_ns: Window, quiet: bool, stamps: Collection[str]
     ) -> dict[str, Columns]:
         """Read fields; each topic of frames is read once for all of its signals."""
         raw: dict[str, list[str]] = {}
@@ -268,7 +257,7 @@ class CanSignalLog(DriveLog):
             wanted = paths if view is None else (*view.paths.all, *(p for p in paths if p not in view.signals))
             merged = raw.setdefault(topic if view is None else view.topic, [])
             merged += [p for p in wanted if p not in merged]
-        read = self._log.read(raw, start_ns, end_ns, quiet=quiet, stamps=stamps) if raw or stamps else {}
+        read = self._log.read(raw, *window_ns, quiet=quiet, stamps=stamps) if raw or stamps else {}
         short: dict[str, Loss] = {}
         matches = {topic: read[topic] for topic in stamps}
         for topic, paths in requests.items():
@@ -276,11 +265,6 @@ class CanSignalLog(DriveLog):
             matches[topic] = read[topic] if view is None else self._view_columns(view, read, topic, paths, short)
         self.short_frames = tuple(short.values())
         return matches
-
-    @property
-    def size(self) -> int:
-        """Size of the log in bytes."""
-        return self._log.size
 
     def close(self) -> None:
         """Release the files."""

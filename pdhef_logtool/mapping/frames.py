@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.message_schema import value_at
 from pdhef_logtool.records.geometry import rotation_from_quat
 from pdhef_logtool.records.signals import FloatArray
@@ -54,17 +54,12 @@ def placement_of(log: DriveLog, topic: str) -> Placement | None:
     return Placement(frame, current, rotation) if is_placed else None
 
 
-def holds_fixed_frames(topic: TopicInfo) -> bool:
-    """Return whether a topic contains fixed frames."""
-    return topic.type_name.replace("/msg/", "/") in _TYPES and topic.name.endswith("tf_static")
-
-
 def _fixed_frames(log: DriveLog) -> Mapping[str, _Step]:
     """Return the fixed frames by name; a frame that is defined twice with different poses is excluded."""
     by_name: dict[str, _Step] = {}
     moved: set[str] = set()
     for topic in log.topics:
-        if not holds_fixed_frames(topic):
+        if topic.type_name.replace("/msg/", "/") not in _TYPES or not topic.name.endswith("tf_static"):
             continue
         for message in log.first_messages(topic.name, MOST_MESSAGES):
             transforms = value_at(message, ("transforms",))

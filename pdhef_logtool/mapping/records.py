@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.storage.documents import digest, jsonable
@@ -137,15 +137,8 @@ class QualityGate:
 
     def as_source(self) -> SignalSource:
         """Return the gate's field as a source that can be read like a signal."""
-        return SignalSource(
-            name="truth_quality",
-            topic=self.topic,
-            field=self.field,
-            stamp=self.stamp,
-            stamp_unit=self.stamp_unit,
-            clock=self.clock,
-            latency_s=self.latency_s,
-        )
+        timing: dict[str, Any] = {n: getattr(self, n) for n in ("stamp", "stamp_unit", "clock", "latency_s")}
+        return SignalSource("truth_quality", self.topic, self.field, **timing)
 
     def describe(self) -> str:
         """Return the gate's condition in words."""

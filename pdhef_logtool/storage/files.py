@@ -11,7 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Literal, Self
+from typing import IO, Literal
 
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.processes import NAME, is_alive, process_name
@@ -42,7 +42,7 @@ _REMEDIES = {
 }
 
 
-class PendingFile:
+class PendingFile(contextlib.AbstractContextManager["PendingFile"]):
     """A file that is written beside its target and takes the target's name when it is complete.
 
     The temporary name contains the name of the process, so that two processes never write to the same file, and files
@@ -82,10 +82,6 @@ class PendingFile:
         """Remove the temporary file, if there is one."""
         with contextlib.suppress(OSError):
             self.path.unlink(missing_ok=True)
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Commit on success, discard on an exception."""

@@ -32,7 +32,7 @@ _POLL_S = 0.05
 _TRIES = 100
 
 
-class FolderTransaction:
+class FolderTransaction(contextlib.AbstractContextManager["FolderTransaction"]):
     """A folder that is replaced completely, or not at all; files that only the old one has are kept by a hard link.
 
     Files are written to the paths that :meth:`file` returns. Then either :meth:`commit` makes them the outputs, or
@@ -69,10 +69,6 @@ class FolderTransaction:
         except BaseException:
             self.discard()
             raise
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         """Commit on success, discard on an exception; a full disk is an OutputError wherever it was noticed."""

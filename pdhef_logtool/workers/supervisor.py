@@ -15,7 +15,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Generic, TypeVar
 
 import psutil
 
@@ -171,7 +171,7 @@ class _Worker(Generic[T]):
             return 0
 
 
-class Crew(Generic[T, R]):
+class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
     """Workers for several lists of items; arguments and errors as for :func:`supervise`."""
 
     def __init__(
@@ -193,10 +193,6 @@ class Crew(Generic[T, R]):
         #: Items that are tried next because their server died, and those that are tried again alone.
         self._returned: list[_Attempt[T]] = []
         self._lost: list[_Attempt[T]] = []
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
 
     def __exit__(self, *_: object) -> None:
         """End all processes."""

@@ -17,6 +17,7 @@ from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive import checks
 from pdhef_logtool.drive.checks import registry
 from pdhef_logtool.drive.checks.registry import registered
+from pdhef_logtool.records.entries import load_entries
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.inspection import inspect_log
@@ -37,7 +38,7 @@ def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setattr(registry, "MODULES", (*registry.MODULES, "speed_range"))
     yield NAME
     sys.modules.pop(f"{checks.__name__}.speed_range", None)
-    registry.__dict__["_load"].cache_clear()
+    load_entries.cache_clear()
 
 
 @pytest.mark.slow

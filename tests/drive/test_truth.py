@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from pdhef_logtool.drive.correlation import parabolic_peak
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.truth import (
+    channel_of,
     dependent_signals,
     derive_truth,
     differentiate,
@@ -22,7 +23,6 @@ from pdhef_logtool.drive.truth import (
     plan_truth,
     truth_at,
     valid_as_a_whole,
-    yaw_rate_channel,
 )
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel
 
@@ -438,7 +438,7 @@ def test_parabola_vertex():
 def test_latency_of_a_truth_whose_yaw_rate_is_derived():
     stamps, d = drive(60.0, rate=20)
     channels = {n: channel(n, stamps, v) for n, v in sources(stamps, d)["position, yaw"].items()}
-    derived = yaw_rate_channel(derive_truth(channels))
+    derived = channel_of(derive_truth(channels), "yaw_rate_rad_s")
     assert np.isfinite(derived.values).all()
     t = np.arange(0, 60, 0.01)
     gyro = channel("yaw_rate_rad_s", T0 + np.round((t - 0.05) * 1e9), Drive(t).r, SIGNAL_UNITS, "/imu")

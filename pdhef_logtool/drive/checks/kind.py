@@ -10,7 +10,7 @@ from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.delays import LateSensor
 from pdhef_logtool.drive.measured import Measured
 from pdhef_logtool.drive.truth import LatencyEstimate
-from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.checks import Check, Verdict
 from pdhef_logtool.records.signals import FloatArray
 
 #: Placeholder for the signal in the name of a check.
@@ -48,18 +48,15 @@ class CheckKind:
 
     def passed(self, evidence: str, signal: str = "") -> Check:
         """Return a passed check; ``signal``: its signal, for a check of several."""
-        name = self._name(signal)
-        return Check(name, name.rpartition(".")[0], "passed", evidence)
+        return self._check("passed", signal, evidence)
 
     def failed(self, evidence: str, signal: str = "", **fields: object) -> Check:
         """Return a failed check with its remedy."""
-        name = self._name(signal)
-        return Check(name, name.rpartition(".")[0], "failed", evidence, self.remedy.format(**fields))
+        return self._check("failed", signal, evidence, self.remedy.format(**fields))
 
     def undecided(self, evidence: str, signal: str = "", lacks: str = "") -> Check:
         """Return an undecided check; ``lacks`` replaces the text of missing data."""
-        name = self._name(signal)
-        return Check(name, name.rpartition(".")[0], "undecided", evidence, lacks or self.lacks)
+        return self._check("undecided", signal, evidence, lacks or self.lacks)
 
     def judged(self, good: bool, evidence: str, signal: str = "", **fields: object) -> Check:
         """Return a passed or failed check."""
@@ -75,8 +72,9 @@ class CheckKind:
         is_inside = low <= value - 2.0 * error and value + 2.0 * error <= high
         return self.passed(evidence) if is_inside else self.undecided(evidence)
 
-    def _name(self, signal: str) -> str:
-        return self.name.replace(SIGNAL, signal)
+    def _check(self, verdict: Verdict, signal: str, evidence: str, remedy: str = "") -> Check:
+        name = self.name.replace(SIGNAL, signal)
+        return Check(name, name.rpartition(".")[0], verdict, evidence, remedy)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

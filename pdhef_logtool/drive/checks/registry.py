@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
-from importlib import import_module
-from types import MappingProxyType
 
 from pdhef_logtool.drive.checks.kind import CheckKind
+from pdhef_logtool.records.entries import load_entries
 
 #: Modules of this package that export ``CHECKS``. Add the name of a new one here.
 MODULES = (
@@ -25,15 +23,4 @@ MODULES = (
 
 def registered() -> Mapping[str, CheckKind]:
     """Return the checks by name; their files are imported at the first call."""
-    return _load(MODULES)
-
-
-@cache
-def _load(modules: tuple[str, ...]) -> Mapping[str, CheckKind]:
-    kinds: dict[str, CheckKind] = {}
-    for module in modules:
-        for kind in import_module(f"pdhef_logtool.drive.checks.{module}").CHECKS:
-            if kind.name in kinds:
-                raise ValueError(f"check {kind.name!r} of {module}.py is registered twice")
-            kinds[kind.name] = kind
-    return MappingProxyType(kinds)
+    return load_entries("pdhef_logtool.drive.checks", MODULES, "CHECKS")

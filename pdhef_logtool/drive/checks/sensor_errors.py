@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,10 +115,14 @@ def ay_delay(errors: SensorErrors, latency: LatencyEstimate | None) -> tuple[flo
     return errors.ay_delay_s + latency.latency_s, math.hypot(errors.ay_delay_error_s, latency.std_error_s)
 
 
-def _ay_place(drive: CheckedDrive) -> Iterator[Check]:
-    errors = errors_of("ay_m_s2", drive)
-    if errors is None:
-        return
+def _with_errors(
+    name: str, check: Callable[[CheckedDrive, SensorErrors], Iterable[Check]]
+) -> Callable[[CheckedDrive], Iterable[Check]]:
+    """Return a check that is made only if the errors of this sensor are known."""
+    return lambda drive: () if (errors := errors_of(name, drive)) is None else check(drive, errors)
+
+
+def _ay_place(drive: CheckedDrive, errors: SensorErrors) -> Iterator[Check]:
     place = drive.vehicle.imu_position_m[0]
     off, error = errors.lever_m - place, errors.lever_error_m
     evidence = (
@@ -141,14 +145,11 @@ AY_PLACE = CheckKind(
     fails="they are 0.5 m apart",
     remedy="imu_position_m = [{lever:.2f}, 0.0, 0.0] in the vehicle file",
     lacks="needs quick bends to both sides",
-    function=_ay_place,
+    function=_with_errors("ay_m_s2", _ay_place),
 )
 
 
-def _ay_gain(drive: CheckedDrive) -> Iterator[Check]:
-    errors = errors_of("ay_m_s2", drive)
-    if errors is None:
-        return
+def _ay_gain(drive: CheckedDrive, errors: SensorErrors) -> Iterator[Check]:
     gain, error = errors.ay_gain, errors.ay_gain_error
     lateral = drive.measured.columns["truth.vx_m_s"] * drive.measured.columns["truth.yaw_rate_rad_s"]
     if not np.nanstd(lateral) > LEAST_LATERAL_M_S2:
@@ -168,13 +169,12 @@ AY_GAIN = CheckKind(
     fails="it reads less than 0.65 or more than 1.3 of it",
     remedy="divide its scale in the mapping by about {gain:.2f}",
     lacks="needs quick bends to both sides",
-    function=_ay_gain,
+    function=_with_errors("ay_m_s2", _ay_gain),
 )
 
 
-def _ay_delay(drive: CheckedDrive) -> Iterator[Check]:
-    errors = errors_of("ay_m_s2", drive)
-    delay_and_error = None if errors is None else ay_delay(errors, drive.latency)
+def _ay_delay(drive: CheckedDrive, errors: SensorErrors) -> Iterator[Check]:
+    delay_and_error = ay_delay(errors, drive.latency)
     if delay_and_error is None or delay_and_error[1] > SENSOR_DELAY_S:
         return
     delay, error = delay_and_error
@@ -188,14 +188,11 @@ AY_DELAY = CheckKind(
     fails="a_y is 30 ms late",
     remedy="latency_s = {delay:.4f} more in the mapping",
     lacks="needs quick bends to both sides",
-    function=_ay_delay,
+    function=_with_errors("ay_m_s2", _ay_delay),
 )
 
 
-def _gyro_gain(drive: CheckedDrive) -> Iterator[Check]:
-    errors = errors_of("yaw_rate_rad_s", drive)
-    if errors is None:
-        return
+def _gyro_gain(drive: CheckedDrive, errors: SensorErrors) -> Iterator[Check]:
     gain, error = errors.yaw_rate_gain / drive.vehicle.sensors.yaw_rate_gain, errors.gain_error
     evidence = f"the gyro reads {gain:.3f} +- {error:.3f} of the ground-truth yaw rate"
     plausible = (1.0 - GAIN_ERROR, 1.0 + GAIN_ERROR)
@@ -208,7 +205,7 @@ GYRO_GAIN = CheckKind(
     fails="its gain is off by 5 %",
     remedy="sensors.yaw_rate_gain = {gain:.3f} in the vehicle file",
     lacks="needs bends to both sides",
-    function=_gyro_gain,
+    function=_with_errors("yaw_rate_rad_s", _gyro_gain),
 )
 
 

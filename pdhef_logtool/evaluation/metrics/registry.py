@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from functools import cache
-from importlib import import_module
-from types import MappingProxyType
 
 from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive, Metric, MetricRow, figures
+from pdhef_logtool.records.entries import load_entries
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -26,18 +24,7 @@ MODULES = (
 
 def registered() -> Mapping[str, Metric]:
     """Return the metrics by name; their files are imported at the first call."""
-    return _load(MODULES)
-
-
-@cache
-def _load(modules: tuple[str, ...]) -> Mapping[str, Metric]:
-    metrics: dict[str, Metric] = {}
-    for module in modules:
-        for metric in import_module(f"pdhef_logtool.evaluation.metrics.{module}").METRICS:
-            if metric.name in metrics:
-                raise ValueError(f"metric {metric.name!r} of {module}.py is registered twice")
-            metrics[metric.name] = metric
-    return MappingProxyType(metrics)
+    return load_entries("pdhef_logtool.evaluation.metrics", MODULES, "METRICS")
 
 
 def evaluate_drive(drive: EvaluatedDrive, names: Collection[str] | None = None) -> list[MetricRow]:

@@ -27,6 +27,7 @@ import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
 from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.drive.truth import cubic_equations
 from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.filter_base import U_AX, U_FRICTION, U_STEER, HeldInputs
 from pdhef_logtool.estimators.parallel_physics import run_features
@@ -249,11 +250,7 @@ def smooth_increments(stamps_ns: IntArray, increments: FloatArray, half_window: 
         time_s = (stamps_ns[centre[:, None] + points] - stamps_ns[centre][:, None]) * 1e-9
         span = np.abs(time_s).max(axis=1)
         u = time_s / span[:, None]
-        powers = [np.ones_like(u)]
-        for _ in range(6):
-            powers.append(powers[-1] * u)
-        moments = [p.sum(axis=1) for p in powers]
-        normal = np.stack([np.stack([moments[i + j] for j in range(4)], axis=1) for i in range(4)], axis=1)
+        powers, normal = cubic_equations(u)
         right = np.stack([(powers[i][:, :, None] * curve).sum(axis=1) for i in range(4)], axis=1)
         fit = np.linalg.solve(normal, right)
         end, begin = u[:, h + 1], u[:, h]
