@@ -48,7 +48,7 @@ def _drawn(vehicle: VehicleParameters, spread: float, rng: np.random.Generator) 
     def tyre(axle: str) -> AxleTyre:
         old: AxleTyre = getattr(vehicle.tyres, axle)
         assert old.B is not None and old.D_n is not None
-        B = old.B * factor["stiffness"] * of_axle[axle] / factor["peak"]
+        B = old.B * (factor["stiffness"] * of_axle[axle]) / factor["peak"]
         return old.model_copy(update={"B": B, "D_n": old.D_n * factor["peak"]})
 
     update = {
