@@ -88,11 +88,6 @@ def vehicle_of_entries(raw: Mapping[str, Any], *, where: str) -> VehicleFile:
     return VehicleFile(vehicle, trust, assumed)
 
 
-def load_vehicle(path: Path) -> VehicleParameters:
-    """Return physics and sensors of a vehicle.toml; raises VehicleError as :func:`read_vehicle_file`."""
-    return read_vehicle_file(path).vehicle
-
-
 def part_toml(part: Record, head: str, comments: Mapping[str, str] | None = None) -> str:
     """Return a part of a car's folder as TOML with ``head`` above it and ``comments`` on entries by dotted name."""
     plain: dict[str, Any] = part.model_dump(mode="json", exclude_none=True)

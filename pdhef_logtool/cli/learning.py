@@ -83,7 +83,6 @@ def extract(
     ] = "auto",
     split: Annotated[str | None, Option(help="Split of all drives of this command: train, validation or test.")] = None,
     seed: Annotated[int, Option(help="Seed of the split by drive.")] = 0,
-    vary: Annotated[float, Option(help="Spread of wrong friction and vehicle in a part of the drives.")] = 0.0,
     model: Annotated[
         str, Option("--filter", help="Filter of the residuals: physics, or phy-ukf for train --paper and --baselines.")
     ] = "physics",
@@ -107,7 +106,6 @@ def extract(
         truth_smoothing=truth_smoothing,
         split=split,
         seed=seed,
-        vary=vary,
         model=model,
         where=where,
         per_cell_s=per_cell,

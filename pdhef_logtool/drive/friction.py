@@ -55,7 +55,6 @@ class FrictionSource:
     note : warning to the user before the run; empty without one.
     constant : friction for all estimators; None uses the signals' friction, or else the vehicle file's.
     bank : estimates the friction; None if it is not estimated.
-    factor : deliberate error of the friction of topic or option, for training (docs/method.md#limits).
     model_std : 1-sigma of the estimate due to errors of the vehicle file (:data:`MODEL_STD`).
     of_truth : uses the friction of the ground truth, for datasets only; estimators of a run never receive it.
     """
@@ -64,7 +63,6 @@ class FrictionSource:
     note: str = ""
     constant: float | None = None
     bank: FrictionBank | None = None
-    factor: float = 1.0
     model_std: float = 0.0
     of_truth: bool = False
     estimate: FrictionEstimate | None = None
@@ -77,7 +75,7 @@ class FrictionSource:
         if self.constant is not None:
             return replace(signals, friction=np.full(len(signals), self.constant))
         if self.bank is None:
-            return signals if self.factor == 1.0 else replace(signals, friction=signals.friction * self.factor)
+            return signals
         if self._filled is None or self._filled[0] is not signals:
             self.estimate = self.bank.run(signals)
             self._filled = signals, replace(signals, friction=self.estimate.friction)
@@ -126,7 +124,6 @@ def friction_source(
     topic: str = "",
     *,
     use_speed: bool = True,
-    factor: float = 1.0,
     validated: bool = True,
 ) -> FrictionSource:
     """Choose the source of a drive's friction.
@@ -137,7 +134,6 @@ def friction_source(
     Parameters
     ----------
     choice : of :func:`parse_friction`. available : signals that the log provides. topic : of its friction, ``/a.b``.
-    factor : on the friction of topic or option; it does not change the friction of a vehicle file.
     validated : whether a drive has confirmed the tyres of the vehicle.
 
     Raises
@@ -145,9 +141,9 @@ def friction_source(
     UsageError : The chosen source is not available.
     """
     if not isinstance(choice, str):
-        return FrictionSource(f"option, {choice:g}", constant=choice * factor)
+        return FrictionSource(f"option, {choice:g}", constant=choice)
     if choice == "auto" and "friction" in available:
-        return FrictionSource(f"topic {topic}" if topic else "topic", factor=factor)
+        return FrictionSource(f"topic {topic}" if topic else "topic")
     if choice == "file" and vehicle.friction is None:
         raise UsageError(
             expected="a vehicle file with friction",

@@ -425,26 +425,22 @@ def friction_of(
     plan: DrivePlan,
     vehicle: VehicleParameters,
     options: ReadOptions,
-    factor: float = 1.0,
     *,
     validated: bool,
     of_truth: bool = False,
 ) -> FrictionSource:
-    """Return the friction source of a drive by its options; ``factor`` is a deliberate error.
+    """Return the friction source of a drive by its options.
 
     With ``of_truth``, ``auto`` uses the friction of the ground truth if the log contains it.
     """
     if of_truth and options.friction == "auto" and (true := plan.mapping.truth.get("friction")) is not None:
-        return FrictionSource(f"ground truth {true.label}", factor=factor, of_truth=True)
+        return FrictionSource(f"ground truth {true.label}", of_truth=True)
     source = plan.mapping.signals.get("friction")
     topic = "" if source is None else source.label
     if options.friction is None:
         return FrictionSource(f"topic {topic}" if topic else "none")
-    available = plan.alignment.available
-    use_speed = options.use_speed
-    return friction_source(
-        options.friction, vehicle, available, topic, use_speed=use_speed, factor=factor, validated=validated
-    )
+    available, use_speed = plan.alignment.available, options.use_speed
+    return friction_source(options.friction, vehicle, available, topic, use_speed=use_speed, validated=validated)
 
 
 def _nbytes(record: Signals | StateTrack) -> int:

@@ -16,8 +16,8 @@ from pdhef_logtool.estimators.filter_base import U_STEER, VX, VY, YAW_RATE, Post
 from pdhef_logtool.estimators.physics_model import FRONT, REAR
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns, last_stamp_ns, step_durations_s
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import RESTART_GAP_S, ExtendedSteps, Extrapolation, last_stamp_ns, step_durations_s
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.slow_features import SlowFeatures, slow_features
 
@@ -28,18 +28,12 @@ _BAD_AY = BURST_AY | SPIKE_AY | STUCK_AY | DEAD_AY | MISSING_AY
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CorrectedSteps(StepColumns):
+class CorrectedSteps(ExtendedSteps):
     """Steps of ``physics``, and for each step [K] the residual with its 1-sigma, rad, both times the gain; the gain."""
 
-    steps: MixtureSteps
     residual_rad: FloatArray
     std_rad: FloatArray
     gain: FloatArray
-
-    @property
-    def valid(self) -> BoolArray:
-        """Whether there is an estimate, [K]."""
-        return self.steps.valid
 
 
 @dataclass(frozen=True, slots=True, eq=False)

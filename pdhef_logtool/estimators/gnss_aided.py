@@ -34,7 +34,7 @@ from pdhef_logtool.estimators.reference.gnss import JUMP_M_S, LEAST_COURSE_SPEED
 from pdhef_logtool.estimators.reference.inputs import GNSS_LAG_S
 from pdhef_logtool.estimators.reference.smoother import BIAS_M_S2, BIAS_S, LAW_S, LAW_WHITE, TILT_SHARE, correct
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns, last_stamp_ns, step_durations_s
+from pdhef_logtool.records.steps import RESTART_GAP_S, ExtendedSteps, Extrapolation, last_stamp_ns, step_durations_s
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Entries of the state of a hypothesis.
@@ -292,16 +292,10 @@ def _aid(columns, body, antenna, memory, out):  # type: ignore[no-untyped-def]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AidedSteps(StepColumns):
+class AidedSteps(ExtendedSteps):
     """Steps of the filter, and for each step the correction of v_y, the filter's weight and more variance, [K, 3]."""
 
-    steps: Any
     aid: FloatArray
-
-    @property
-    def valid(self) -> Any:
-        """Whether there is an estimate, [K]."""
-        return self.steps.valid
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,7 +23,6 @@ from pdhef_logtool.car.parts import (
     Inflation,
     IntervalEntry,
     Intervals,
-    SideslipCoefficients,
     YawRateCoefficients,
 )
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -197,18 +196,3 @@ def _ratio(new: FloatArray, old: FloatArray) -> FloatArray:
 
 def _ordered(coefficients: YawRateCoefficients, terms: Sequence[str]) -> tuple[float, ...]:
     return tuple(getattr(coefficients, term) for term in terms)
-
-
-def make_inflation(
-    sideslip: Sequence[float],
-    yaw_rate: Sequence[float],
-    vy_factor: float = 1.0,
-    grip_factors: tuple[float, float, float] = (1.0, 1.0, 1.0),
-) -> Inflation:
-    """Return an inflation of coefficients in the order of :data:`SIDESLIP_TERMS` and :data:`YAW_RATE_TERMS`."""
-    return Inflation(
-        sideslip=SideslipCoefficients(**dict(zip(SIDESLIP_TERMS, map(float, sideslip), strict=True))),
-        yaw_rate=YawRateCoefficients(**dict(zip(YAW_RATE_TERMS, map(float, yaw_rate), strict=True))),
-        vy_factor=float(vy_factor),
-        grip_factors=grip_factors,
-    )

@@ -17,21 +17,15 @@ from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import predict_track
 from pdhef_logtool.estimators.self_calibrated import CalibratedBand, SelfCalibrated
 from pdhef_logtool.records.signals import IntArray, Signals
-from pdhef_logtool.records.steps import Extrapolation, StepColumns
+from pdhef_logtool.records.steps import ExtendedSteps, Extrapolation
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StagedSteps(StepColumns):
+class StagedSteps(ExtendedSteps):
     """Steps of the estimator [K], and the stage of each, [K]."""
 
-    steps: Any
     stage: IntArray
-
-    @property
-    def valid(self) -> Any:
-        """Whether there is an estimate, [K]."""
-        return self.steps.valid
 
 
 def _spans(stage: IntArray) -> Iterator[tuple[int, int, int]]:

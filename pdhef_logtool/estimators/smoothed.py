@@ -182,15 +182,6 @@ def spans(stamps_ns: IntArray, count: int, origin_ns: int, block_ns: int) -> Ite
         yield first, min(behind, count) - 1, int(np.searchsorted(block, b + 2)) - 1
 
 
-def smooth_steps(
-    steps: PosteriorSteps, links: StepLinks, count: int, origin_ns: int, block_ns: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return smoothed states [count, n] and covariances [count, n, n] of the first ``count`` steps (see `spans`)."""
-    x, P = smooth_blocks([ForwardSteps(steps, links)], steps.stamps_ns, count, origin_ns, block_ns)
-    return x[:count], P[:count]
-
-
-# positional: arguments of `smooth_steps`, and earlier results.
 def smooth_blocks(
     pieces: Sequence[ForwardSteps],
     stamps_ns: IntArray,
@@ -199,7 +190,7 @@ def smooth_blocks(
     block_ns: int,
     earlier: Smoothed | None = None,
 ) -> Smoothed:
-    """Return `smooth_steps` for all steps of the blocks that contain the first ``count`` steps, [M ≥ count].
+    """Return smoothed states [M, n] and covariances of the blocks (see `spans`) with the first ``count`` ≤ M steps.
 
     ``pieces`` are consecutive and contain the steps at ``stamps_ns``. ``earlier`` [D] is the result for the first
     steps, up to the end of a block, which is not computed again.

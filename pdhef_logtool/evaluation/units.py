@@ -34,18 +34,11 @@ LABELS = {
 }
 #: Unit for display and factor to it, by unit of metrics.parquet.
 _READ = {"rad": ("°", DEGREES), "rad/s": ("°/s", DEGREES), "m/s^2": ("m/s²", 1.0), "s": ("ms", 1e3), "1": ("", 1.0)}
-#: The same for input, in ASCII letters.
-_TYPED = {"rad": ("deg", DEGREES), "rad/s": ("deg/s", DEGREES), "s": ("ms", 1e3), "1": ("%", 100.0)}
 
 
 def read_unit(unit: str) -> tuple[str, float]:
     """Return the unit for display and the factor to it, for a unit of metrics.parquet."""
     return _READ.get(unit, (unit, 1.0))
-
-
-def typed_unit(unit: str) -> tuple[str, float]:
-    """Return the unit for input and the factor to it, for a unit of metrics.parquet."""
-    return _TYPED.get(unit, (unit, 1.0))
 
 
 def share_of(text: str) -> float | None:

@@ -21,7 +21,6 @@ from pdhef_logtool.drive.reading import MAX_BYTES, Drive, Tell, WholeDrive, lost
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
 from pdhef_logtool.records.signals import BoolArray, Loss
 from pdhef_logtool.records.tracks import StateTrack
@@ -71,13 +70,8 @@ class LearnSettings:
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON-able values; files by name only."""
         values = {"stages": [self.stage], "seed": self.seed, "split": self.split}
-        return {**config_document(self.config), **values}
-
-
-def config_document(config: RunConfig) -> dict[str, Any]:
-    """Return the entries of a configuration that affect learning, as JSON-able values; files by name only."""
-    document = config.to_dict()
-    return {k: document[k] for k in _SETTINGS}
+        document = self.config.to_dict()
+        return {**{k: document[k] for k in _SETTINGS}, **values}
 
 
 def open_car(config: RunConfig, warn: Tell) -> Car:
@@ -93,11 +87,6 @@ def open_car(config: RunConfig, warn: Tell) -> Car:
     for note in car.notes:
         warn(note)
     return car
-
-
-def open_mapping(config: RunConfig) -> SignalMapping | None:
-    """Return the configured mapping, or None."""
-    return mapping_of(config.mapping)
 
 
 def record_head(kind: str, version: int, settings: LearnSettings, car: Car) -> dict[str, Any]:

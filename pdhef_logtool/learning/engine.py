@@ -21,13 +21,13 @@ from pdhef_logtool.learning.drives import (
     drives_document,
     exit_code,
     open_car,
-    open_mapping,
 )
 from pdhef_logtool.learning.stages.calibrate import calibrate
 from pdhef_logtool.learning.stages.gain import find_gain
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.learning.stages.teach import teach
 from pdhef_logtool.logs.discovery import Logs
+from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.residual_model.bundle import NO_MODEL
@@ -97,7 +97,7 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
         car=car,
         settings=settings,
         logs=tuple(inputs),
-        mapping=open_mapping(config),
+        mapping=mapping_of(config.mapping),
         set_splits=set_splits,
         reporter=reporter,
     )

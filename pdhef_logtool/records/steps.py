@@ -36,6 +36,19 @@ class StepColumns:
         return type(self)(*(_cut(getattr(self, f.name), part) for f in fields(self)))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ExtendedSteps(StepColumns):
+    """Base of the steps of an estimator with further columns."""
+
+    steps: Any
+
+    @property
+    def valid(self) -> BoolArray:
+        """Whether there is an estimate, [K]."""
+        valid: BoolArray = self.steps.valid
+        return valid
+
+
 def _joined(a: Any, b: Any) -> Any:
     if isinstance(a, tuple):
         return tuple(_joined(x, y) for x, y in zip(a, b, strict=True))

@@ -24,7 +24,7 @@ from pdhef_logtool.storage.documents import digest
 if TYPE_CHECKING:
     from pdhef_logtool.residual_model.ladder_kernels import LadderArrays
 
-NONE, LINEAR, RANDOM = RUNGS = ("none", "linear", "random")
+NONE, LINEAR, RANDOM = ("none", "linear", "random")
 #: Squared distance over its 98 % quantile up to which the gain is 1, and from which it is 0.
 FULL_WITHIN, NONE_BEYOND = 1.0, 3.0
 #: The same for the speed: factors on its range.

@@ -21,9 +21,9 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from pdhef_logtool.car.parts import Inflation
+from pdhef_logtool.car.parts import Inflation, SideslipCoefficients, YawRateCoefficients
 from pdhef_logtool.estimators.error_features import grip_share
-from pdhef_logtool.estimators.intervals import combined, grip_factor, make_inflation
+from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS, YAW_RATE_TERMS, combined, grip_factor
 from pdhef_logtool.evaluation.metrics import NORMAL_95
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
@@ -125,11 +125,11 @@ def fit_inflation(samples: Samples) -> Fitted:
     everywhere = np.ones(len(samples), dtype=np.bool_)
     rate, unseen_rate = _fit(samples, samples.yaw_rate_terms, samples.yaw_rate_error, weight)
     rate_factor = _factor(samples, samples.yaw_rate_error, unseen_rate, weight, everywhere)
-    inflation = make_inflation(
-        coefficients,
-        [rate_factor * k for k in rate],
-        _factor(samples, samples.vy_error, std * samples.vy_per_sideslip, weight, everywhere),
-        factors,
+    inflation = Inflation(
+        sideslip=SideslipCoefficients(**dict(zip(SIDESLIP_TERMS, coefficients, strict=True))),
+        yaw_rate=YawRateCoefficients(**{name: rate_factor * k for name, k in zip(YAW_RATE_TERMS, rate, strict=True)}),
+        vy_factor=_factor(samples, samples.vy_error, std * samples.vy_per_sideslip, weight, everywhere),
+        grip_factors=factors,
     )
     factor = _factor(samples, samples.sideslip_error, unseen, weight, everywhere)
     return Fitted(inflation, factor, tuple(coverage_rows(samples, std)))

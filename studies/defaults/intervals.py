@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -22,7 +21,6 @@ from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ
 from pdhef_logtool.evaluation.smoothing import smooth
 from pdhef_logtool.learning.drives import DriveRecord, load_drive
 from pdhef_logtool.learning.stages.task import Task
-from pdhef_logtool.learning.variation import Variation, vary
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -37,6 +35,7 @@ from studies.defaults.interval_fit import (
     fit_inflation,
     join_samples,
 )
+from studies.defaults.variation import made_wrong
 
 #: Neighbouring errors are correlated: one sample in this time is kept.
 SAMPLE_EVERY_S = 0.05
@@ -96,12 +95,6 @@ def fit_intervals(task: Task, spread: float) -> Change:
     return Change(command, INTERVALS_FILE, files, settings=settings, drives=fitted_intervals.drives)
 
 
-def made_wrong(vehicle: VehicleParameters, spread: float, key: str) -> Iterator[Variation]:
-    """Yield the draws of a key that do not leave everything as it is; ``spread`` > 0."""
-    draws = (vary(vehicle, spread, f"{key}:{number}") for number in itertools.count())
-    return (draw for draw in draws if draw.vehicle is not vehicle)
-
-
 def _run_drive(log: LogInput, number: int, task: Task, spread: float) -> tuple[DriveRecord, _Ran | None]:
     """Run the estimators on a drive, once as given and some times with a wrong vehicle; return errors and terms."""
     car, vehicle, options = task.car, task.car.vehicle, task.options
@@ -112,10 +105,13 @@ def _run_drive(log: LogInput, number: int, task: Task, spread: float) -> tuple[D
     runs = [(vehicle, 1.0, False)]
     if spread > 0.0:
         draws = itertools.islice(made_wrong(vehicle, spread, f"{task.settings.seed}:{record.sha256}"), WRONG_RUNS)
-        runs += [(draw.vehicle, draw.friction_factor, True) for draw in draws]
+        runs += [(*draw, True) for draw in draws]
     ran: _Ran = []
     for assumed, factor, wrong in runs:
-        seen = friction_of(drive.plan, assumed, options, factor, validated=car.has_evidence).fill(drive.signals)
+        source = friction_of(drive.plan, assumed, options, validated=car.has_evidence)
+        seen = source.fill(drive.signals)
+        if source.from_log:
+            seen = replace(seen, friction=factor * seen.friction)
         if not ran and "friction" not in drive.plan.alignment.available:
             signals = replace(signals, friction=seen.friction)  # the best that is known of the drive, for the bins
         presumed = car if assumed is vehicle else car.with_vehicle(assumed)

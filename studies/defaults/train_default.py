@@ -33,11 +33,12 @@ from pdhef_logtool.car.car import (
     VEHICLE_FILE,
 )
 from pdhef_logtool.car.store import update_car
-from pdhef_logtool.car.toml_files import load_vehicle, vehicle_toml
-from pdhef_logtool.learning.drives import LearnSettings, choose_drives, open_car, open_mapping
+from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_toml
+from pdhef_logtool.learning.drives import LearnSettings, choose_drives, open_car
 from pdhef_logtool.learning.network.fit import Recipe
 from pdhef_logtool.learning.network.train_command import dataset_for, train_on
 from pdhef_logtool.learning.stages.task import Task
+from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import MODELS, NOMINAL_MODEL, PAPER_FOLDER, PHYSICS_MODEL, SHIPPED
@@ -108,7 +109,7 @@ class Training:
         settings = LearnSettings(config=config, split="validation")
         inputs, splits = choose_drives([str(self.work / "one_car")], settings)
         reporter = Reporter(warn=print)
-        car, mapping = open_car(config, print), open_mapping(config)
+        car, mapping = open_car(config, print), mapping_of(config.mapping)
         return Task(
             car=car, settings=settings, logs=tuple(inputs), mapping=mapping, set_splits=splits, reporter=reporter
         )
@@ -118,7 +119,9 @@ def simulate(t: Training) -> None:
     """Write the vehicle file, the mapping and the three sets of drives."""
     t.work.mkdir(parents=True, exist_ok=True)
     t.car.mkdir(parents=True, exist_ok=True)
-    text = vehicle_toml(load_vehicle(SAMPLE_VEHICLE), "Written by python -m studies.defaults.train_default.")
+    text = vehicle_toml(
+        read_vehicle_file(SAMPLE_VEHICLE).vehicle, "Written by python -m studies.defaults.train_default."
+    )
     (t.car / VEHICLE_FILE).write_text(text, encoding="utf-8")
     if t.seed:
         for part in (FIT_FILE, NOISE_FILE):

@@ -11,7 +11,7 @@ from made_models import random_network
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FilterNoise, Fit, FittedValues, Trust
-from pdhef_logtool.car.toml_files import load_vehicle, part_toml, vehicle_toml
+from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file, vehicle_toml
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.residual_model.bundle import ModelBundle
@@ -98,7 +98,7 @@ def test_the_report_says_the_cap_and_why(
 
     model = random_network()
     model.save(tmp_path / "model")
-    text = vehicle_toml(load_vehicle(sample_logs_dir / "vehicle.toml"))
+    text = vehicle_toml(read_vehicle_file(sample_logs_dir / "vehicle.toml").vehicle)
     tried = Trust(trust_cap=0.25, evidence=EVIDENCE, network_sha256=model.sha256)
     for trust, cap, why in ((tried, 0.25, EVIDENCE), (Trust(), 0.0, "no evidence")):
         file = tmp_path / f"car{cap}"

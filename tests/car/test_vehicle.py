@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import Noise, Trust
-from pdhef_logtool.car.toml_files import load_vehicle, read_vehicle_file, vehicle_of_entries
+from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_of_entries
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.records.errors import VehicleError
 
@@ -63,7 +63,7 @@ def write(tmp_path: Path, text: str | bytes) -> Path:
 
 def problem(path: Path) -> str:
     with pytest.raises(VehicleError) as caught:
-        load_vehicle(path)
+        read_vehicle_file(path)
     text = str(caught.value)
     assert "\n" not in text
     assert str(path) in text
@@ -86,7 +86,7 @@ def test_every_entry_of_the_example_is_read(tmp_path):
 def test_defaults_of_what_the_file_leaves_out(tmp_path):
     lines = "mass_kg = 1000\nyaw_inertia_kg_m2 = 1200\ncg_to_front_axle_m = 1.2\ncg_to_rear_axle_m = 1.3\n"
     tyres = "".join(f"[tyres.{a}]\ncornering_stiffness_n_per_rad = 8e4\n" for a in ("front", "rear"))
-    vehicle = load_vehicle(write(tmp_path, lines + tyres))
+    vehicle = read_vehicle_file(write(tmp_path, lines + tyres)).vehicle
     assert vehicle.friction is None
     assert vehicle.assumed_friction == 1.0
     assert vehicle.imu_position_m == (0.0, 0.0, 0.0)
@@ -96,7 +96,7 @@ def test_defaults_of_what_the_file_leaves_out(tmp_path):
 
 def test_the_default_vehicle_is_the_published_one(tmp_path):
     published = EXAMPLE.replace("cornering_stiffness_n_per_rad = 108000.0", "B = 15.4\nC = 1.17\nD_n = 6110.0\nE = 0.2")
-    vehicle = load_vehicle(write(tmp_path, published))
+    vehicle = read_vehicle_file(write(tmp_path, published)).vehicle
     same = {"imu_position_m", "truth_position_m", "sensors"}
     assert default_vehicle().model_dump(exclude=same) == vehicle.model_dump(exclude=same)
 
@@ -198,7 +198,7 @@ def test_relations_find_a_slip_that_the_ranges_let_pass(tmp_path, entry, factor,
 def test_a_small_car_needs_no_height_track_or_speed_limit(tmp_path):
     """What a 1:10 car leaves out follows from its wheelbase."""
     text = (FILES / "f1tenth.toml").read_text().replace("track_m", "# track_m").replace("cg_height_m", "# cg_height_m")
-    vehicle = load_vehicle(write(tmp_path, text))
+    vehicle = read_vehicle_file(write(tmp_path, text)).vehicle
     assert 0.1 < vehicle.track_m < 0.3
     assert 0.03 < vehicle.cg_height_m < 0.1
 
@@ -233,7 +233,7 @@ def test_real_vehicles_are_taken(name):
 
 @pytest.mark.parametrize("path", [*sorted(FILES.glob("*.toml")), *sorted(SAMPLES.glob("vehicle*.toml"))], ids=str)
 def test_the_files_of_the_project_are_taken(path):
-    load_vehicle(path)
+    read_vehicle_file(path)
 
 
 @pytest.mark.slow

@@ -22,11 +22,11 @@ def test_a_dataset_takes_the_friction_of_the_ground_truth(sample_logs_dir: Path)
         frictions = []
         for of_truth in (True, False):
             drive.friction = friction_of(
-                drive.plan, drive.car.vehicle, drive.options, 2.0, validated=True, of_truth=of_truth
+                drive.plan, drive.car.vehicle, drive.options, validated=True, of_truth=of_truth
             )
             frictions.append(drive.whole().signals.friction)
         known = np.isfinite(frictions[0])
-        np.testing.assert_allclose(frictions[0][known], 0.6, atol=1e-6)
+        np.testing.assert_allclose(frictions[0][known], 0.3, atol=1e-6)
         assert known.mean() > 0.9
         assert not np.isfinite(frictions[1]).any()  # that of the vehicle file
         assert drive.friction.label == "vehicle file, 0.85"

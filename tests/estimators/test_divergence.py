@@ -18,7 +18,7 @@ from reference_car import cut, make_signals
 from rich.console import Console
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.toml_files import load_vehicle
+from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive.plan import plan_drive
@@ -254,7 +254,7 @@ def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(
 
 def test_the_filter_itself_sees_it_later(sweep: Path, sample_logs_dir: Path) -> None:
     """What the watch adds: its flag stands before that of the filter's own innovations."""
-    vehicle = load_vehicle(sample_logs_dir / "vehicle_mu03.toml")
+    vehicle = read_vehicle_file(sample_logs_dir / "vehicle_mu03.toml").vehicle
     signals = read_signals(sweep, vehicle)
     track, _ = run_window(make_estimator("phy-ukf", Car.of(vehicle)), signals)
     own, seen = (int(np.flatnonzero(f)[0]) for f in (track.diverged, flags(track, signals, vehicle)))

@@ -22,12 +22,12 @@ from pdhef_logtool.estimators.intervals import (
     TrackCalibrator,
     calibrated,
     inflated,
-    make_inflation,
 )
 from pdhef_logtool.records.errors import PdhefError, VehicleError
 from pdhef_logtool.records.reasons import STUCK_AY, STUCK_YAW_RATE
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
+from tests.estimators.made_inflation import make_inflation
 
 STEP_NS = 10_000_000
 SIDESLIP_FACTORS = (1.0, 1.5, 0.3, 0.8, 0.5, 0.9, 0.2, 0.6, 0.4)

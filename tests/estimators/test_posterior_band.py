@@ -25,7 +25,7 @@ from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.calibration.joint import prior_variations
 from pdhef_logtool.estimators.error_features import TERMS, error_terms
-from pdhef_logtool.estimators.intervals import POSTERIOR_NOTE, make_inflation
+from pdhef_logtool.estimators.intervals import POSTERIOR_NOTE
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import physics_filter
 from pdhef_logtool.estimators.posterior_band import OWN_SHARE, posterior_band
@@ -33,6 +33,7 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.estimating import calibrator
+from tests.estimators.made_inflation import make_inflation
 
 OWN = default_vehicle()
 PARTS = PhysicsParts(lag=True, force_scale=True)

@@ -15,7 +15,6 @@ from pdhef_logtool.car.parts import FilterNoise, IntervalEntry, Intervals
 from pdhef_logtool.car.toml_files import vehicle_of_entries
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.intervals import make_inflation
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter, physics_filter
 from pdhef_logtool.estimators.self_calibrated import (
@@ -28,6 +27,7 @@ from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.estimating import calibrator
+from tests.estimators.made_inflation import make_inflation
 
 OWN = default_vehicle()
 FOUND = OWN.model_copy(

@@ -27,7 +27,7 @@ from pdhef_logtool.estimators.filter_base import AX_BIAS, LINK_BIASES, LINK_NONE
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter
-from pdhef_logtool.estimators.smoothed import SmoothedPhysics, smooth_steps
+from pdhef_logtool.estimators.smoothed import ForwardSteps, SmoothedPhysics, smooth_blocks
 from pdhef_logtool.estimators.table import SPECS, make_estimator
 from pdhef_logtool.records.reasons import (
     BURST_YAW_RATE,
@@ -70,6 +70,12 @@ def linear_steps(x, P, prior, predicted, cross, kind=None) -> tuple[PosteriorSte
     if kind is None:
         kind = np.array([LINK_NONE] + [LINK_WHOLE] * (count - 1))
     return steps, StepLinks(kind, predicted, cross)
+
+
+def smooth_steps(steps, links, count, origin_ns, block_ns):
+    """Smooth the first ``count`` steps of one piece."""
+    x, P = smooth_blocks([ForwardSteps(steps, links)], steps.stamps_ns, count, origin_ns, block_ns)
+    return x[:count], P[:count]
 
 
 def kalman(z, F, H, Q, R, P0, x0=None):

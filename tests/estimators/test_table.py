@@ -25,7 +25,7 @@ from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import LookingAhead
-from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS, make_inflation
+from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import FILE_LAG, PHYSICS_Q_STD
 from pdhef_logtool.estimators.presets import OPEN_LOOP, OPTIONS, options_of, preset_of, split_names
@@ -43,6 +43,7 @@ from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.estimating import calibrator
+from tests.estimators.made_inflation import make_inflation
 
 pytestmark = pytest.mark.slow
 

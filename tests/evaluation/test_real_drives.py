@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.car.toml_files import load_vehicle
+from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.drive.alignment import align, plan_alignment
 from pdhef_logtool.drive.truth import (
     Attitude,
@@ -44,7 +44,7 @@ def drive(shared_dir):
             clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
             channels = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
             log.close()
-            done[name] = channels, load_vehicle(REFERENCE / "vehicles" / f"{vehicle_name}.toml")
+            done[name] = channels, read_vehicle_file(REFERENCE / "vehicles" / f"{vehicle_name}.toml").vehicle
         return done[name]
 
     return read

@@ -9,7 +9,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from pdhef_logtool.car.toml_files import load_vehicle
+from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.network.train_command import run_training
 from pdhef_logtool.records.errors import OutputError, UsageError
@@ -65,7 +65,7 @@ def test_train_writes_a_model_that_runs(
         run_training(joined, tmp_path / "model", init=tmp_path / "model", epochs=1)
     tuned = run_training(joined, tmp_path / "tuned", init=tmp_path / "model", epochs=1)
     assert tuned.bundle.provenance["fine_tuned_from"] == bundle.sha256
-    assert tuned.bundle.provenance["fine_tuned_on"] == load_vehicle(sample_logs_dir / "vehicle.toml").name
+    assert tuned.bundle.provenance["fine_tuned_on"] == read_vehicle_file(sample_logs_dir / "vehicle.toml").vehicle.name
     with pytest.raises(OutputError, match="--filter phy-ukf"):
         run_training(joined, tmp_path / "paper", paper=True, epochs=1)
     nominal = extracted(sample_logs_dir, tmp_path / "nominal", "--filter", "phy-ukf")

@@ -16,7 +16,7 @@ from made_models import random_network
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import LearntOn
-from pdhef_logtool.car.toml_files import load_vehicle
+from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.latency_compensation import run_window
@@ -176,7 +176,7 @@ def _settings(sample_logs_dir: Path, folder: Path, **changes: object) -> LearnSe
 
 
 def test_the_errors_are_those_of_pd_hef_at_each_trust(sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    vehicle, bundle = load_vehicle(sample_logs_dir / "vehicle.toml"), random_network()
+    vehicle, bundle = read_vehicle_file(sample_logs_dir / "vehicle.toml").vehicle, random_network()
     car = Car.of(vehicle, network=bundle)
     drive = load_drive(find_logs([str(sample_logs_dir / "dlc.mcap")])[0], car, None, ReadOptions())[1]
     assert drive is not None and drive.truth is not None

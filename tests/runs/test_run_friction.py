@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 from rich.console import Console
 
-from pdhef_logtool.car.toml_files import load_vehicle, vehicle_toml
+from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_toml
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.estimators.friction_bank import USUAL_FRICTION
 from pdhef_logtool.learning.network.dataset import read_dataset
@@ -38,7 +38,7 @@ field = "friction"
 @pytest.fixture(scope="module")
 def files(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("files")
-    vehicle = load_vehicle(sample_logs_dir / "vehicle.toml").model_copy(update={"friction": None})
+    vehicle = read_vehicle_file(sample_logs_dir / "vehicle.toml").vehicle.model_copy(update={"friction": None})
     (folder / "car.toml").write_text(vehicle_toml(vehicle))
     (folder / "told.toml").write_text(TOLD)
     return folder

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import SHIPPED_CARS, Car, load_intervals
-from pdhef_logtool.car.toml_files import load_vehicle
+from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.evaluation.validation_plan import load_plan
 from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
 from pdhef_logtool.records.errors import PdhefError, UsageError, VehicleError
@@ -76,7 +76,7 @@ LOADERS = [
     Loader("pdhef.toml", lambda path: load_config(path, {}), VALID_CONFIG),
     Loader("mapping.toml", load_mapping, VALID_MAPPING),
     Loader("plan.toml", load_plan, VALID_PLAN),
-    Loader("vehicle.toml", load_vehicle, tomllib.loads((CAR / "vehicle.toml").read_text())),
+    Loader("vehicle.toml", read_vehicle_file, tomllib.loads((CAR / "vehicle.toml").read_text())),
     Loader("fit.toml", _part, VALID_FIT),
     Loader("noise.toml", _part, tomllib.loads((CAR / "noise.toml").read_text())),
     Loader("network.toml", _part, tomllib.loads((CAR / "network.toml").read_text())),

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pdhef_logtool.car.toml_files import load_vehicle
+from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.records.errors import OutputError
 from studies.defaults import fit_nominal_tyres
 from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
@@ -263,7 +263,7 @@ def test_write_samples_repeats_itself_bit_for_bit(tmp_path: Path, monkeypatch: p
 def test_vehicle_files_are_the_fit_to_the_truth_vehicle(tmp_path: Path) -> None:
     fit_nominal_tyres.main(tmp_path)
     for name, friction in (("vehicle.toml", 0.85), ("vehicle_mu03.toml", 0.3)):
-        old, new = load_vehicle(ROOT / "sample_logs" / name), load_vehicle(tmp_path / name)
+        old, new = read_vehicle_file(ROOT / "sample_logs" / name).vehicle, read_vehicle_file(tmp_path / name).vehicle
         assert old.friction == new.friction == friction
         for front in (True, False):
             assert new.magic_formula(front, friction) == pytest.approx(old.magic_formula(front, friction), rel=0.01)
@@ -272,7 +272,7 @@ def test_vehicle_files_are_the_fit_to_the_truth_vehicle(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("name", "friction"), [("vehicle.toml", 0.85), ("vehicle_mu03.toml", 0.3)])
 def test_vehicle_file_gives_the_truth_s_axle_forces_and_understeer(name: str, friction: float) -> None:
-    vehicle = load_vehicle(ROOT / "sample_logs" / name)
+    vehicle = read_vehicle_file(ROOT / "sample_logs" / name).vehicle
     for axle, (alpha, force) in fit_nominal_tyres.axle_curves(fit_nominal_tyres.ramp(friction)).items():
         b, c, d, e = vehicle.magic_formula(axle == "front", friction)
         x = b * alpha

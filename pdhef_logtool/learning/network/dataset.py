@@ -67,7 +67,6 @@ def write_drive(
     entry: Mapping[str, Any],
     *,
     truth_source: str = "",
-    rows_a_group: int = ROWS_A_GROUP,
 ) -> None:
     """Write the Parquet file of one drive, with the drive's entry.
 
@@ -81,7 +80,7 @@ def write_drive(
     """
     schema = arrow_schema(_SCHEMA)
     with parquet_writer(path, schema, ["segment", "cell", "draw"]) as writer:
-        writer.write_table(_table(rows, picked, truth_source, schema), row_group_size=rows_a_group)
+        writer.write_table(_table(rows, picked, truth_source, schema), row_group_size=ROWS_A_GROUP)
         writer.add_key_value_metadata({_ENTRY.decode(): json.dumps(seal(entry), sort_keys=True)})
 
 
@@ -159,8 +158,7 @@ def write_manifest(
     drives = []
     for entry in sorted(entries, key=lambda e: str(e["name"])):
         path = drive_file(folder, entry)
-        sha256 = _sha256(path)
-        _check_content(path, entry.get("file_sha256", sha256), sha256)
+        sha256 = _checked_sha256(path, entry.get("file_sha256"))
         drives.append({**entry, "file": path.relative_to(folder).as_posix(), "file_sha256": sha256})
     splits: dict[str, dict[str, int]] = {name: {"drives": 0, "rows": 0, "usable_rows": 0} for name in SPLITS}
     for d in drives:
@@ -230,10 +228,11 @@ def vehicle_entry(sha256: str, vehicle: VehicleParameters) -> dict[str, Any]:
     return {"name": vehicle.name, "sha256": sha256, "parameters": vehicle.model_dump(mode="json")}
 
 
-def _sha256(path: Path) -> str:
+def _checked_sha256(path: Path, named: str | None) -> str:
+    """Return the digest of a drive's file; raises OutputError if it differs from the one that the manifest names."""
     try:
         with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise OutputError(
             expected="a drive's file of the dataset",
@@ -241,16 +240,14 @@ def _sha256(path: Path) -> str:
             where=str(path),
             remedy="extract it again",
         ) from None
-
-
-def _check_content(path: Path, named: str, actual: str) -> None:
-    if actual != named:
+    if named not in (None, sha256):
         raise OutputError(
             expected="the file that the manifest names",
             got="another content",
             where=str(path),
             remedy="extract it again",
         )
+    return sha256
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -300,7 +297,7 @@ class DatasetDrive:
         OutputError
             The file is missing or differs from the manifest.
         """
-        _check_content(self.path, self.entry["file_sha256"], _sha256(self.path))
+        _checked_sha256(self.path, self.entry["file_sha256"])
         table = pq.read_table(self.path, partitioning=None)
         column = {name: table[name].to_numpy() for name in table.column_names if name != "split"}
         stamps = column["stamp_ns"].astype(np.int64)

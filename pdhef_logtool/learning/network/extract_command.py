@@ -35,7 +35,6 @@ from pdhef_logtool.learning.drives import (
     DriveRecord,
     drives_document,
     exit_code,
-    open_mapping,
     record_of,
     set_manifest,
     tell_drive,
@@ -64,9 +63,9 @@ from pdhef_logtool.learning.network.residuals import (
     residual_rows,
 )
 from pdhef_logtool.learning.truth import TruthAt, teaching_reference
-from pdhef_logtool.learning.variation import MAX_VARIATION, vary
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
@@ -97,8 +96,7 @@ class ExtractSettings:
     config : vehicle, mapping, slice, sensors, friction, truth channel; the other entries are not used.
     truth_smoothing : ``auto`` (per drive, by the noise of ground truth), ``none``, or a half window in seconds.
     split : split of all drives; None = the split in a set's manifest, else 70/15/15 by a hash of the content.
-    seed : seed of that hash, and of the variation.
-    vary : spread of the errors of friction and vehicle in a part of the drives (``variation.vary``).
+    seed : seed of that hash.
     model : filter of the residuals, one of :data:`~.bundle.MODELS`.
     where : condition on the columns of a row (``cells.COLUMNS``) for its use in training.
     per_cell_s : maximum number of seconds per cell of driving in split train; None = all.
@@ -108,7 +106,6 @@ class ExtractSettings:
     truth_smoothing: str = "auto"
     split: str | None = None
     seed: int = 0
-    vary: float = 0.0
     model: str = PHYSICS_MODEL
     where: str | None = None
     per_cell_s: float | None = None
@@ -151,7 +148,6 @@ class ExtractSettings:
             "model": self.model,
             "where": self.where,
             "per_cell_s": self.per_cell_s,
-            **({"vary": self.vary, "vary_seed": self.seed} if self.vary else {}),
         }
 
 
@@ -256,7 +252,7 @@ def extract(
     settings.smoothing_half_s()
     _check_counts(jobs, settings)
     inputs = find_logs(arguments, private_redirects=settings.config.allow_private_redirects)
-    mapping = open_mapping(settings.config)
+    mapping = mapping_of(settings.config.mapping)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, reporter.warn))
     before = _earlier(output, settings)
     names = {settings.name_of(i.stem) for i in inputs}
@@ -394,8 +390,6 @@ def _check_counts(jobs: int, settings: ExtractSettings) -> None:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
     if settings.seed < 0:
         raise UsageError(expected="a seed of at least 0", got=str(settings.seed), where="--seed")
-    if not 0.0 <= settings.vary <= MAX_VARIATION:
-        raise UsageError(expected=f"a spread of 0 to {MAX_VARIATION:g}", got=str(settings.vary), where="--vary")
     if settings.split is not None and settings.split not in SPLITS:
         raise UsageError(expected=f"one of {', '.join(SPLITS)}", got=repr(settings.split), where="--split")
     if settings.where is not None:
@@ -416,10 +410,10 @@ def _plan_jobs(
 ) -> Iterator[_Job]:
     cars, manifests = cache(_car), cache(set_manifest)
     listed = [_listed(i, manifests(i.folder)) for i in inputs]
-    for log_input, entry in zip(inputs, listed, strict=True):
-        car = cars(settings.config.car or entry.vehicle)
-        yield _Job(log_input, output, settings, car, mapping, entry.split, resume)
-    if settings.config.car is None and any(entry.vehicle is None for entry in listed):
+    for log_input, (split, vehicle) in zip(inputs, listed, strict=True):
+        car = cars(settings.config.car or vehicle)
+        yield _Job(log_input, output, settings, car, mapping, split, resume)
+    if settings.config.car is None and any(vehicle is None for _, vehicle in listed):
         warn(f"no --car: residuals refer to the default {cars(None).vehicle.name}")
 
 
@@ -477,12 +471,8 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         truth = _truth_facts(plan, smoothing, estimated=reference is not None)
         service = _in_service(drive, job)
         physics = filter_of(service.car, settings.model, use_speed=drive.options.use_speed)
-        varied = vary(physics.vehicle, settings.vary, f"{settings.seed}:{source}")
-        physics = replace(physics, vehicle=varied.vehicle)
         validated = drive.car.has_evidence
-        drive.friction = friction_of(
-            plan, varied.vehicle, drive.options, varied.friction_factor, validated=validated, of_truth=True
-        )
+        drive.friction = friction_of(plan, physics.vehicle, drive.options, validated=validated, of_truth=True)
         condition = None if settings.where is None else condition_of(settings.where)
         rows = _residuals(drive, physics, smoothing, service, reference)
         if not len(rows):
@@ -507,7 +497,6 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             **_counts(rows, picked, drive.log.start_ns),
             "truth": truth,
             "friction_from": friction.label + (f", {friction.summary}" if friction.summary else ""),
-            **({"friction_factor": varied.friction_factor} if settings.vary else {}),
             "losses": [asdict(x) for x in drive.losses],
         }
         write_drive(target, rows, picked, entry, truth_source=truth["kind"])
@@ -599,21 +588,13 @@ def choose_split(
     return SPLITS[sum(place >= end for end in SPLIT_ENDS)], "hash"
 
 
-@dataclass(frozen=True, slots=True)
-class _Listed:
-    split: str | None = None
-    vehicle: Path | None = None
-
-
-def _listed(log: LogInput, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed:
+def _listed(log: LogInput, manifest: Mapping[str, Mapping[str, Any]]) -> tuple[str | None, Path | None]:
     """Return split and vehicle file of a log from the manifest of its simulated set."""
     entry = manifest.get(log.path.name, {})
     split, vehicle = entry.get("split"), entry.get("vehicle_file", entry.get("vehicle"))
     car = log.folder / vehicle if log.folder is not None and isinstance(vehicle, str) else None
-    return _Listed(
-        split=split if isinstance(split, str) and split else None,
-        vehicle=car if car is not None and (car.is_file() or (car / VEHICLE_FILE).is_file()) else None,
-    )
+    exists = car is not None and (car.is_file() or (car / VEHICLE_FILE).is_file())
+    return split if isinstance(split, str) and split else None, car if exists else None
 
 
 def _strict_truth(plan: DrivePlan) -> DrivePlan:

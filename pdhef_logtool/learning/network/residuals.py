@@ -99,17 +99,6 @@ class ResidualRows:
         return int(self.stamps_ns.shape[0])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ModelSteps:
-    """Model inputs: states of the parallel filter [N, n] and inputs [N, 5] of its steps.
-
-    The steering of ``inputs`` is NaN where it was not measured: a predicted steering angle must not affect a residual.
-    """
-
-    x: FloatArray
-    inputs: FloatArray
-
-
 @njit(cache=True)
 def _nominal_rates(state, steer, friction, p, out):  # type: ignore[no-untyped-def]
     for k in range(state.shape[0]):
@@ -194,7 +183,8 @@ def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  #
 def physics_increments(
     stamps_ns: IntArray,
     state: FloatArray,
-    model: ModelSteps,
+    x: FloatArray,
+    inputs: FloatArray,
     physics: PhysicsFilter,
     *,
     max_step_s: float,
@@ -204,28 +194,27 @@ def physics_increments(
     Parameters
     ----------
     stamps_ns : int64 [N]. state : true [v_x, v_y, r], [N, 3]; NaN where it must not be used.
-    model : of the parallel filter. max_step_s : longer steps are gaps.
+    x, inputs : of the steps of the parallel filter, [N, n] and [N, 5]. max_step_s : longer steps are gaps.
 
     Returns
     -------
     Increments of v_y in m/s and r in rad/s; NaN as in :func:`residual_increments`.
     """
     layout, p, f = physics.parameters
-    good = _dynamic(state, p) & np.isfinite(model.x).all(axis=1) & np.isfinite(model.inputs).all(axis=1)
-    states = np.zeros_like(model.x)
+    good = _dynamic(state, p) & _complete(x) & _complete(inputs)
+    states = np.zeros_like(x)
     states[:, :3] = np.where(good[:, None], state, 1.0)
-    states[:, AX_BIAS] = np.where(good, model.x[:, AX_BIAS], 0.0)
+    states[:, AX_BIAS] = np.where(good, x[:, AX_BIAS], 0.0)
     moved = np.empty((max(len(stamps_ns) - 1, 0), 2))
-    _run_model(stamps_ns, states, model.inputs, good, max_step_s, (layout, p, f), np.zeros(_RUN), moved)
+    _run_model(stamps_ns, states, inputs, good, max_step_s, (layout, p, f), np.zeros(_RUN), moved)
     increments: FloatArray = np.diff(state[:, 1:3], axis=0) - moved
     return increments
 
 
 def _dynamic(state: FloatArray, parameters: ModelParameters) -> BoolArray:
     """Return a mask: true state [N, 3] finite, model in its dynamic range, and the car moves forward."""
-    is_complete = np.isfinite(state).all(axis=1)
     forward = np.abs(np.arctan2(state[:, 1], state[:, 0])) <= MAX_SIDESLIP_RAD
-    return np.asarray(is_complete & forward & (state[:, 0] >= parameters.blend_high_m_s), dtype=np.bool_)
+    return np.asarray(_complete(state) & forward & (state[:, 0] >= parameters.blend_high_m_s), dtype=np.bool_)
 
 
 def smooth_increments(stamps_ns: IntArray, increments: FloatArray, half_window: int) -> FloatArray:
@@ -306,9 +295,15 @@ def residual_rows(
         corrected, _ = taught.run(signals, None)
         region = np.where(corrected.valid, corrected.gain, np.nan)
     inputs, state = filtered.inputs.copy(), _true_state(truth, count)
+    # A predicted steering angle must not affect a residual.
     inputs[~np.isfinite(without_impossible(signals).steer_rad), U_STEER] = np.nan
-    model = ModelSteps(filtered.x, inputs)
-    increments = _increments(signals.stamps_ns, state, model, physics, GAP_PERIODS * period_s)
+    stamps_ns, gap_s = signals.stamps_ns, GAP_PERIODS * period_s
+    if isinstance(physics, PhysicsFilter):
+        increments = physics_increments(stamps_ns, state, filtered.x, inputs, physics, max_step_s=gap_s)
+    else:
+        steer, friction = inputs[:, U_STEER], inputs[:, U_FRICTION]
+        nominal = model_parameters(physics.vehicle)
+        increments = residual_increments(stamps_ns, state, steer, friction, nominal, max_step_s=gap_s)
     targets, step_s = np.full((count, 2), np.nan), np.full(count, np.nan)
     targets[:-1] = smooth_increments(signals.stamps_ns, increments, half_window)
     step_s[:-1] = np.diff(signals.stamps_ns) * 1e-9
@@ -326,18 +321,6 @@ def residual_rows(
         truth_velocity=state[:, :2],
         truth_std_rad=truth_std,
         region=region,
-    )
-
-
-def _increments(
-    stamps_ns: IntArray, state: FloatArray, model: ModelSteps, physics: PhysicsFilter | PhysicsUkf, max_step_s: float
-) -> FloatArray:
-    """Return the residual of the parallel filter's model between stamps, [N − 1, 2]."""
-    if isinstance(physics, PhysicsFilter):
-        return physics_increments(stamps_ns, state, model, physics, max_step_s=max_step_s)
-    parameters, inputs = model_parameters(physics.vehicle), model.inputs
-    return residual_increments(
-        stamps_ns, state, inputs[:, U_STEER], inputs[:, U_FRICTION], parameters, max_step_s=max_step_s
     )
 
 

@@ -242,7 +242,10 @@ def steering_offset(rows: DriveArrays, vehicle: VehicleParameters) -> FloatArray
 
 @dataclass(frozen=True, slots=True)
 class SplitSequences:
-    """The sequences of the drives of a split, read again on each iteration."""
+    """The sequences of the drives of a split, read again on each iteration.
+
+    A sequence is a gap-free run with residual increments divided by the true step, or with the true v_y.
+    """
 
     drives: tuple[DatasetDrive, ...]
     target: str
@@ -251,30 +254,20 @@ class SplitSequences:
 
     def __iter__(self) -> Iterator[FeatureSequence]:
         """Yield the sequences in the order of the drives; one drive is in memory at a time."""
-        yield from _sequences(self.drives, self.target, vehicle_of=self.vehicle_of if self.odd else None)
-
-
-def _sequences(
-    drives: Iterable[DatasetDrive],
-    target: str = RESIDUAL,
-    *,
-    vehicle_of: Callable[[DatasetDrive], VehicleParameters] | None = None,
-) -> Iterable[FeatureSequence]:
-    """Yield the gap-free runs of the drives: residual increments divided by the true step, or the true v_y."""
-    for drive in drives:
-        rows = drive.load()
-        offset = np.zeros(2) if vehicle_of is None else steering_offset(rows, vehicle_of(drive))
-        for part in gap_free_runs(rows):
-            weight = weights_of(rows, part)
-            features = np.asarray(rows.features[part], dtype=np.float64)
-            if target == RESIDUAL:
-                values = np.asarray(rows.targets[part], dtype=np.float64) / rows.step_s[part, None] - offset
-            else:
-                values = np.asarray(rows.truth_velocity[part, 1:2], dtype=np.float64)
-                weight = weight * np.isfinite(values[:, 0])
-            values[weight == 0.0] = 0.0
-            if weight.sum() > 0.0:
-                yield FeatureSequence(drive.name, features, values, weight)
+        for drive in self.drives:
+            rows = drive.load()
+            offset = steering_offset(rows, self.vehicle_of(drive)) if self.odd else np.zeros(2)
+            for part in gap_free_runs(rows):
+                weight = weights_of(rows, part)
+                features = np.asarray(rows.features[part], dtype=np.float64)
+                if self.target == RESIDUAL:
+                    values = np.asarray(rows.targets[part], dtype=np.float64) / rows.step_s[part, None] - offset
+                else:
+                    values = np.asarray(rows.truth_velocity[part, 1:2], dtype=np.float64)
+                    weight = weight * np.isfinite(values[:, 0])
+                values[weight == 0.0] = 0.0
+                if weight.sum() > 0.0:
+                    yield FeatureSequence(drive.name, features, values, weight)
 
 
 def _history_table(history: Iterable[Epoch]) -> bytes:
