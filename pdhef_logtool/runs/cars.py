@@ -26,7 +26,7 @@ _Name = Annotated[str, Field(min_length=1)]
 
 
 class CarTable(Record):
-    """``cars.toml``: cars by log, by folder of logs, or by what the logs' metadata state.
+    """``cars.toml``: cars by log, by folder of logs, or by metadata of the logs.
 
     Cars and folders are relative to the file; a car may be a shipped one's name.
 
@@ -35,7 +35,7 @@ class CarTable(Record):
     logs : car by file name of a log, or pattern of names (``run_*.mcap``); they win, the first that matches.
     folders : car by folder, the deepest that a log lies in.
     metadata : by key of the log's metadata, or ``record.key``, the car of each value.
-    default : car of what nothing else names; None: such a log has no car, which is an error.
+    default : car of the other logs; None: a log without an entry is an error.
     """
 
     logs: dict[_Name, _Name] = Field(default_factory=dict)
@@ -50,7 +50,7 @@ class RunCars:
 
     Attributes
     ----------
-    paths : the files and folders of the cars, None for the default one. warn : called with what is stale in one.
+    paths : the files and folders of the cars, None for the default one. warn : called with stale parts.
     """
 
     config: RunConfig
@@ -168,9 +168,9 @@ class RunCars:
 
 
 def car_record(car: Car) -> dict[str, Any]:
-    """Return what a car is to a run that goes on: its name, its network's name and digest, and a digest of each part.
+    """Return the identity of a car for ``--resume``: its name, name and digest of its network, a digest of each part.
 
-    The parts are named as a person is given which of them has changed.
+    Messages name the part that has changed.
     """
     network = None if car.network is None else [Path(car.network_name).name, car.network.sha256]
     parts = {

@@ -1,4 +1,4 @@
-"""What a run does: defaults, ``pdhef.toml`` and flags, where flags win."""
+"""Configuration of a run: flags override ``pdhef.toml``, which overrides defaults."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from pdhef_logtool.storage.documents import read_toml, validated
 _FILES = ("car", "cars", "mapping", "msgs", "plan", "network", "intervals", "setup", "sensor_profile")
 #: Settings that change no result.
 _NO_RESULT = ("allow_private_redirects", "log_timeout_s", "max_memory_mb", "full_worst")
-#: What may be in place of a file.
+#: Values that replace a file.
 _KEYWORDS = {
     "car": tuple(SHIPPED_CARS),
     "network": (*SHIPPED_FOLDERS, NO_MODEL),
@@ -135,22 +135,22 @@ class RunConfig:
 
     @property
     def read_options(self) -> ReadOptions:
-        """What of it decides how a log is read."""
+        """The part that decides how a log is read."""
         return ReadOptions(**{f.name: getattr(self, f.name) for f in fields(ReadOptions)})
 
     @property
     def kept(self) -> Keep:
-        """What is written of a drive."""
+        """Outputs of a drive."""
         return self.keep or "full"
 
     @property
     def annotation(self) -> Literal["full", "sidecar", "none"]:
-        """What annotated.mcap contains; what was asked for is never left out."""
+        """Content of annotated.mcap."""
         return self.annotate or ("full" if self.kept == "full" else "none")
 
     @property
     def files(self) -> list[Path]:
-        """The files and folders that it names, with what may be in place of one."""
+        """The files and folders that it names."""
         return [path for key in _FILES if (path := getattr(self, key)) is not None]
 
     def to_dict(self) -> dict[str, Any]:
@@ -175,7 +175,7 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
     Raises
     ------
     UsageError
-        The file is missing or wrong, or a value is none of those allowed.
+        The file is missing or wrong, or a value is not allowed.
     """
     if path is None and Path("pdhef.toml").is_file():
         path = Path("pdhef.toml")
@@ -193,7 +193,7 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         check_names(config.estimators)
     if config.setup is not None and config.setup_from_s is not None:
         raise UsageError(expected="--setup or --setup-from", got="both", where="--setup")
-    # Times are understood without a log, so that a typing error is given before the first log is opened.
+    # Times are parsed without a log, so that a typing error is reported before the first log is opened.
     for name, text in (("--start", config.start), ("--end", config.end)):
         if text is not None:
             parse_time(text, 0, 0, option=name)
@@ -201,7 +201,7 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
 
 
 def parse_assignments(texts: Sequence[str]) -> dict[str, Any]:
-    """Return the settings of ``KEY=VALUE`` texts; a value is read as TOML where it is valid TOML, else as text.
+    """Return the settings of ``KEY=VALUE`` texts; a value is TOML if it is valid TOML, else text.
 
     Raises
     ------

@@ -21,7 +21,7 @@ from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import ESTIMATE_UNITS, BoolArray, Channel, FloatArray, IntArray, Loss
 from pdhef_logtool.records.tracks import StateTrack, diagonal_covariance, make_track
 
-#: Nothing is interpolated across a step of more than this many of its median periods.
+#: Steps of more than this number of median periods are not interpolated.
 GAP_PERIODS = 3.0
 
 
@@ -45,7 +45,7 @@ def read_estimate(
 ) -> tuple[RecordedEstimate, list[Loss]]:
     """Read one recorded estimate with log time in [start, end) onto the stamps of its first quantity of BASE_ORDER.
 
-    NaN stays: where an estimator states nothing it is not available, which is a figure and no loss.
+    NaN stays: it counts against the availability of the estimator and is not a loss.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def _in_order(stamps_ns: IntArray, arrival_ns: IntArray, usable: BoolArray) -> I
 
 
 def _planar_covariance(topic: Columns, source: CovarianceSource) -> FloatArray:
-    """Return [N, 3, 3] over v_x, v_y, yaw rate; NaN where it is unknown (all zero, or −1 first, as ROS states)."""
+    """Return [N, 3, 3] over v_x, v_y, yaw rate; NaN if unknown (all zero, or −1 first, as in ROS)."""
     raw = np.asarray(topic.fields[source.field], dtype=np.float64)
     n = raw.shape[0]
     if raw.ndim != 2 or raw.shape[1] != source.size**2:

@@ -31,8 +31,8 @@ from pdhef_logtool.results.sink import TRUTH
 class Estimated:
     """A drive with the tracks of all estimators by name, in their order.
 
-    ``truth`` is what they are scored against, ``drawn_truth`` is what is written: the same with a pose, and valid where
-    all of it is known; None if the log has none.
+    ``truth`` is for scores, ``drawn_truth`` for outputs: with a pose, and valid if it is complete; None without ground
+    truth.
     """
 
     signals: Signals
@@ -41,7 +41,7 @@ class Estimated:
     tracks: dict[str, StateTrack]
 
     def read(self, name: str) -> StateTrack | None:
-        """Return the track of a name, :data:`TRUTH` is the ground truth; None if there is none."""
+        """Return the track of a name (:data:`TRUTH`: ground truth), or None."""
         return self.truth if name == TRUTH else self.tracks.get(name)
 
 
@@ -95,9 +95,9 @@ def estimate_drive(
 
 
 def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
-    """Return what puts the car's intervals on the tracks of estimators, by what they really are.
+    """Return a calibrator with the car's intervals for the resolved algorithms of estimators.
 
-    What it has none for gets the confidence interval of what its identification left open of its parameters.
+    Other algorithms get an interval from the uncertainty of the car's identified parameters.
     """
     from pdhef_logtool.estimators.posterior_band import posterior_band
 

@@ -28,7 +28,7 @@ class Estimates:
     Attributes
     ----------
     tracks : by estimator, and ``truth`` where the log has one, with dead-reckoned poses, divergence and intervals.
-    signals : what the estimators saw. algorithms : what ran under each name. skipped : what could not run, and why.
+    signals : input of the estimators. algorithms : by name. skipped : estimators that could not run, with reasons.
     """
 
     drive: Drive

@@ -377,7 +377,7 @@ def _truth_of(channels: Mapping[str, Channel], drive: Drive) -> TruthTrack:
             expected="ground truth in the chosen slice",
             got="no samples that can be used",
             where=f"{drive.log.path} {', '.join(s.label for s in drive.plan.mapping.truth.values())}",
-            remedy="pdhef inspect LOG shows what the log contains and what was dropped",
+            remedy="pdhef inspect LOG shows the contents of the log and the dropped samples",
         )
     return TruthTrack(track, plan.max_gap_s[plan.base], drive.plan.derivation)
 

@@ -8,14 +8,15 @@ from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 
-#: Blocks over which differences are averaged, s; so many in a row, beyond so many 1-sigmas, are a contradiction.
+#: Duration of blocks over which differences are averaged, s; number of successive blocks, and of 1-sigmas, that make a
+#: contradiction.
 BLOCK_S, LEAST_BLOCKS, BEYOND_STD = 1.0, 3, 3.0
 #: Share of equal neighbours that makes ground truth held; correlation with time that makes it drift.
 HELD_SHARE, DRIFT_CORRELATION = 0.8, 0.8
 
 
 def audit_truth(truth: StateTrack, reference: StateTrack, low_speed_m_s: float) -> tuple[str, ...]:
-    """Return what contradicts ground truth [N] in sentences; empty where the reference contains it."""
+    """Return contradictions between ground truth [N] and the reference, as sentences."""
     seconds, difference, std, held = _blocks(truth, reference, low_speed_m_s)
     if len(seconds) < LEAST_BLOCKS:
         return ()

@@ -1,4 +1,4 @@
-"""The sideslip reference of a drive: when it is made, on what, and what the report states of it."""
+"""The sideslip reference of a drive: conditions, inputs, and its entry in the report."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 #: A drive is smoothed in spans of this length, which overlap by twice the margin: memory does not grow with the drive.
 SPAN_S, MARGIN_S = 1200.0, 30.0
-#: A fitted position of the accelerometer replaces that of the file where it differs by so many of its 1-sigmas.
+#: A fitted position of the accelerometer replaces the file's if it differs by this number of 1-sigmas.
 SIGNIFICANT = 2.0
 _FILE_STD_M, _FITTED_STD_M, _LEAST_GAIN_STD = 0.05, 0.1, 0.02
 _NEEDS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
@@ -28,14 +28,14 @@ _NEEDS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveReference:
-    """What came of the reference: ``estimator``, None where refused, and what the report states (``document``)."""
+    """Result of the reference: ``estimator``, None if refused, and the entry of the report (``document``)."""
 
     estimator: ReferenceEstimator | None
     document: dict[str, Any]
 
 
 def reference_of(drive: Drive, calibration: SelfCalibration | None, config: RunConfig) -> DriveReference | None:
-    """Return the sideslip reference of a drive; None where it is not asked for.
+    """Return the sideslip reference of a drive; None if not requested.
 
     With ``reference = auto`` it is made where the log has no ground truth of sideslip.
     """
@@ -60,9 +60,9 @@ def reference_of(drive: Drive, calibration: SelfCalibration | None, config: RunC
 
 
 def prior_of(car: Car, calibration: SelfCalibration | None) -> ReferencePrior:
-    """Return what is known of a car before its drive: the geometry of its file, sensors as the log calibrated them.
+    """Return the prior of a car before its drive: the geometry of its file, sensors as the log calibrated them.
 
-    Without calibration or ground truth nothing has shown that the accelerometer is where no file states another place.
+    Without calibration or ground truth, the position of the accelerometer is not verified if no file gives one.
     """
     from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, IMU_X_REACH, RATE_BIAS
     from pdhef_logtool.estimators.reference.drive import ReferencePrior
@@ -115,7 +115,7 @@ def _spans(drive: Drive, prior: ReferencePrior, *, use_gnss: bool) -> Iterator[S
 
 
 def _document(spans: Sequence[SideslipReference], refused: str) -> dict[str, Any]:
-    """Return what report.json states; parameters are those of the longest span."""
+    """Return the entry of report.json, with the parameters of the longest span."""
     longest = max(spans, key=lambda span: len(span.stamps_ns), default=None)
     knots = sum(len(span.stamps_ns) for span in spans)
     valid = sum(int(span.valid.sum()) for span in spans)

@@ -49,8 +49,8 @@ def evaluate(
 
     Parameters
     ----------
-    names : of the estimators. read : returns the track of a name, ``truth`` too; None if there is none.
-    signals : what the estimators saw. sensors : as the log calibrated them; None: as the car's file states.
+    names : of the estimators. read : returns the track of a name (also ``truth``), or None.
+    signals : input of the estimators. sensors : as the log calibrated them; None: as in the car's file.
     """
     from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
     from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
@@ -73,7 +73,7 @@ def evaluate(
 
 
 def in_time(event: Event) -> tuple[int, int, str]:
-    """Return what events are sorted by."""
+    """Return the sort key of events."""
     return event.start_ns, event.end_ns, event.name
 
 

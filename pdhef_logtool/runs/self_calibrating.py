@@ -1,4 +1,4 @@
-"""The first pass over a log, in which it calibrates its car without ground truth, and what comes of it.
+"""The first pass over a log: calibration of its car without ground truth, and its results.
 
 See docs/method.md#self-calibration.
 """
@@ -31,7 +31,7 @@ _NEEDS = ("steer_rad", "yaw_rate_rad_s", "speed_m_s")
 
 
 def calibrate_drive(drive: Drive, config: RunConfig) -> SelfCalibration | None:
-    """Return what a drive states of its car, its prior where the log lacks a sensor for more; None if nobody asks."""
+    """Return the calibration of a car by a drive, its prior if a sensor is missing; None if not requested."""
     if config.calibrate == "off" or not _asked(config, drive.car):
         return None
     from pdhef_logtool.estimators.calibration.calibration import calibrate_online, prior_calibration, self_calibrate
@@ -46,7 +46,7 @@ def calibrate_drive(drive: Drive, config: RunConfig) -> SelfCalibration | None:
 def calibrate_pool(
     inputs: Sequence[LogInput], car: Car, mapping: Mapping | None, config: RunConfig
 ) -> SelfCalibration | None:
-    """Return what all logs of a run together state of its car; None where nobody asks. A log that fails is left out."""
+    """Return the calibration of a car by all logs of a run; None if not requested. A log that fails is left out."""
     if not _asked(config, car):
         return None
     from pdhef_logtool.estimators.calibration.calibration import self_calibrate
@@ -58,12 +58,12 @@ def calibrate_pool(
                 if not lacking(drive):
                     drivings.append(read_driving(drive))
         except PdhefError:
-            continue  # the run itself states what is wrong with it
+            continue  # the run itself reports the error
     return self_calibrate(drivings, car.vehicle, taught=car.taught_prior)
 
 
 def lacking(drive: Drive) -> list[str]:
-    """Return the signals without which a drive calibrates nothing, those that it lacks."""
+    """Return the missing signals that a calibration needs."""
     return [name for name in _NEEDS if name not in drive.available]
 
 
@@ -100,12 +100,12 @@ def driven_d2(signals: Signals, car: Car, calibration: SelfCalibration) -> float
 
 
 def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
-    """Return the car of a drive with what was found, unless it was refused."""
+    """Return the car of a drive with the calibration, unless it was refused."""
     if calibration is None or calibration.refused:
         return drive.car
     causal, note = bool(calibration.earlier), "not causal: car calibrated on the whole log, without ground truth"
     if causal:
-        note = "its car is calibrated on what the log has shown so far, without ground truth"
+        note = "its car is calibrated on the log up to each time, without ground truth"
     elif not calibration.parameters:
         causal, note = True, calibration.text
 
@@ -130,9 +130,9 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
 def log_sensors(
     vehicle: VehicleParameters, calibration: SelfCalibration | None, *, told_friction: bool = True
 ) -> SensorErrors:
-    """Return what the sensors of a log have that was read with a vehicle: as calibrated on it, else as its file states.
+    """Return the sensor errors of a log that was read with a vehicle: as calibrated, else as in its file.
 
-    What is refused for its tyres is no worse for its sensors. ``told_friction`` : whether that of the signals is given.
+    A calibration with refused tyres is still valid for sensors. ``told_friction`` : whether the friction is known.
     """
     from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, RATE_BIAS, STEER_DELAY
     from pdhef_logtool.evaluation.metrics.metric import SensorErrors
@@ -164,5 +164,5 @@ def _without_log_friction(drive: Drive, signals: Signals) -> Signals:
 
 
 def _told(drive: Drive) -> bool:
-    """Whether the friction of a drive is given, and no estimate with the file as it is."""
+    """Whether the friction of a drive is known, not estimated with the unchanged file."""
     return drive.friction.bank is None

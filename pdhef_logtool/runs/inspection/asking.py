@@ -1,4 +1,4 @@
-"""A mapping by questions: for each signal the field that is taken, its alternatives, and the user's answer."""
+"""A mapping by questions: for each signal the selected field, its alternatives, and the user's answer."""
 
 from __future__ import annotations
 

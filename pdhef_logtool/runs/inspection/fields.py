@@ -35,7 +35,7 @@ MOST_FIELDS = 2000
 
 @dataclass(frozen=True, slots=True)
 class FieldReport:
-    """One field: float64 statistics in raw units over what was read, NaN without a finite value."""
+    """One field: float64 statistics in raw units over the read part, NaN without a finite value."""
 
     path: str
     type: str
@@ -46,7 +46,7 @@ class FieldReport:
 
 @dataclass(frozen=True, slots=True)
 class TopicFields:
-    """The fields of a topic; ``reason`` is given where there are none."""
+    """The fields of a topic; ``reason``: why it has no fields."""
 
     name: str
     type: str
@@ -66,7 +66,7 @@ class FieldsOfLog:
     whole: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what ``pdhef inspect --fields --json`` prints."""
+        """Return the document of ``pdhef inspect --fields --json``."""
         return {"path": self.path, "seconds": self.seconds, "whole": self.whole, "topics": jsonable(self.topics)}
 
 
@@ -117,7 +117,7 @@ def _topic_fields(log: DriveLog, pieces: Pieces, topic: TopicInfo) -> TopicField
 
 
 def _values_by_path(samples: Mapping[tuple[str, str], Seen], paths: set[str]) -> dict[str, list[FloatArray]]:
-    """Return values by path; those of an array's elements by the array's path as well."""
+    """Return values by path; elements of an array also by the array's path."""
     values: dict[str, list[FloatArray]] = {}
     for (_, path), sample in samples.items():
         for name in {path} if path in paths else {path, INDEX.sub("", path)}:

@@ -35,7 +35,7 @@ _LABEL_SIGNS = 160
 
 @dataclass(frozen=True, slots=True)
 class _Card:
-    """A field: its place, what is drawn of it, figures with units, and why it is, or is not, taken."""
+    """A field: its place, its sketch, figures with units, and the reason for or against it."""
 
     label: str
     chip: str
@@ -48,7 +48,7 @@ class _Card:
 
 @dataclass(frozen=True, slots=True)
 class _Subject:
-    """A signal or ground truth quantity with its cards, the one that is taken first."""
+    """A signal or ground truth quantity with its cards, the selected one first."""
 
     name: str
     unit: str
@@ -87,7 +87,7 @@ def inspection_page(inspection: Inspection, log: DriveLog) -> bytes:
 
 
 def _subjects(inspection: Inspection, section: str, samples: dict[tuple[str, str], Seen]) -> list[_Subject]:
-    """Return what the mapping takes, and each signal that is not mapped but has candidates."""
+    """Return the mapped signals, and unmapped signals with candidates."""
     reports = inspection.signals if section == "signals" else inspection.truth
     units = SIGNAL_UNITS if section == "signals" else TRUTH_UNITS
     subjects = []
@@ -170,7 +170,7 @@ def _label(source: SignalSource) -> str:
 def _figures(
     low: float, high: float, unit: str, rate_hz: float, source: SignalSource | None
 ) -> tuple[tuple[str, str], ...]:
-    """Return range with unit, rate, and what makes SI of raw values."""
+    """Return range with unit, rate, and the conversion of raw values to SI."""
     shown = "" if unit == "1" else unit.replace("^2", "²")
     text = f"{number_text(low)} to {number_text(high)} {shown}".strip() if math.isfinite(low) else "no value"
     figures = [("range", text), ("rate", f"{number_text(rate_hz)} Hz")]

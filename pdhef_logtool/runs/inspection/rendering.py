@@ -25,7 +25,7 @@ OTHER_CLOCK_S, SIMULATION_CLOCK_S = 60.0, 1e8
 
 
 def render_inspection(inspection: Inspection, console: Console) -> None:
-    """Print an inspection: topics, signals and ground truth, what is missing, and everything to look at."""
+    """Print an inspection: topics, signals and ground truth, missing signals, and findings."""
     messages = sum(t.messages for t in inspection.topics)
     console.print(Text(inspection.path, "bold"), soft_wrap=True)
     console.print(
@@ -50,7 +50,7 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
 
 
 def empty_table(title: str, *headings: str | Text, words: int) -> Table:
-    """Return an empty table whose first ``words`` columns contain text and the others numbers."""
+    """Return an empty table with ``words`` columns of text, then numbers."""
     table = Table(
         title=Text(title),
         title_justify="left",
@@ -97,7 +97,7 @@ def _topics_table(topics: tuple[TopicReport, ...]) -> Table:
 
 
 def _delay_text(delay_s: float) -> str:
-    """Return what a delay is that no transport has; empty if one may have it."""
+    """Return a remark on a delay that no transport has, or an empty string."""
     if abs(delay_s) > SIMULATION_CLOCK_S:
         return "simulation clock"
     return "other clock" if abs(delay_s) > OTHER_CLOCK_S else ""
@@ -132,7 +132,7 @@ def _candidates_table(candidates: tuple[Candidate, ...]) -> Table:
 
 
 def _uses(inspection: Inspection) -> list[tuple[str, str, str]]:
-    """Return the last lines: what the log is good for, and what it lacks."""
+    """Return the last lines: uses of the log, and missing signals."""
     uses = inspection.uses
     lines = [("can", "green", f"Possible uses of this log: {uses['can']}")]
     if uses["sideslip_needs"]:

@@ -1,4 +1,4 @@
-"""Look a log through: topics, rates, gaps, clocks, what maps to which signal, what is missing, what is implausible."""
+"""Inspection of a log: topics, rates, gaps, clocks, mapped and missing signals, implausible values."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ MAX_LISTED_FIELDS = 40
 #: Arrays that no signal comes from are in one line.
 COVARIANCE = re.compile(r"cov(ariance)?(\[\d*\])?$", re.IGNORECASE)
 INDEX = re.compile(r"\[\d+\]$")
-#: A device clock whose envelope leaves the fitted line by more has stepped or bent.
+#: If the envelope of a device clock leaves the fitted line by more, the clock has stepped or bent.
 CLOCK_RESIDUAL_S = 0.02
 #: Entries of the JSON in order; those without an attribute of the name are of the mapping.
 _IN_DOCUMENT = (
@@ -74,9 +74,9 @@ _IN_DOCUMENT = (
 
 @dataclass(frozen=True, slots=True)
 class TopicReport:
-    """One topic. Times in s; ``largest_gap_at_s`` is since the log's start; NaN where nothing can be stated.
+    """One topic. Times in s; ``largest_gap_at_s`` is since the log's start; NaN if unknown.
 
-    ``rate_hz`` is by the median step, of bursts by the mean; of a topic whose times were not read, by its messages
+    ``rate_hz`` is by the median step, for bursts by the mean; for a topic without read times, by its messages
     and the log's length.
     ``delay_*`` are of log time − publish time, which equals zero where a recorder has one time only.
     """
@@ -114,7 +114,7 @@ class ClockReport:
 
 @dataclass(frozen=True, slots=True)
 class SignalReport:
-    """One mapped signal in SI units, cleaned. Statistics of vectors are those of their length.
+    """One mapped signal in SI units, cleaned. Statistics of vectors refer to their length.
 
     ``gaps`` counts steps of more than 5 median steps and 0.1 s; ``dropped`` samples by kind.
     """
@@ -138,9 +138,9 @@ class SignalReport:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What was looked at of a log that was not read whole.
+    """The part of a log that was read.
 
-    ``times`` states what rates, jitter and gaps of topics come from: the ``index``, or the chunks that were read
+    ``times`` is the source of rates, jitter and gaps of topics: the ``index``, or the chunks that were read
     (``sample``), as do delays, signals and ground truth in any case. Counts are the index's.
     """
 
@@ -166,10 +166,10 @@ class Inspection:
     kind : of log. start_ns, end_ns : log time, [start, end).
     signals, truth : reports by name. missing : signals that an estimator uses and no topic provides.
     ambiguities, notes : of the mapping. candidates : fields that were weighed for it.
-    checks : what physics states of signals and ground truth. proposals : corrections of the mapping that are certain.
-    lost : every loss and note of reading. sample : what was looked at; None: everything.
+    checks : of signals and ground truth by physics. proposals : certain corrections of the mapping.
+    lost : every loss and note of reading. sample : the part that was read; None: all.
     lines : extremes in equal parts of the log [C] by section and signal, no part of the JSON.
-    refused : by channel why a run computes nothing from it.
+    refused : by channel the reason why a run does not use it.
     """
 
     path: str
@@ -194,7 +194,7 @@ class Inspection:
 
     @property
     def uses(self) -> MappingABC[str, str]:
-        """What the log is good for (``can``), and what it lacks for sideslip (``sideslip_needs``, may be empty)."""
+        """Possible uses of the log (``can``), and missing signals for sideslip (``sideslip_needs``, may be empty)."""
         signals = {n: s for n, s in self.mapping.signals.items() if n not in self.refused}
         truth = {n: s for n, s in self.mapping.truth.items() if f"truth.{n}" not in self.refused}
         return uses_of(replace(self.mapping, signals=signals, truth=truth))
@@ -210,7 +210,7 @@ class Inspection:
         return any(loss.severity == "lost" for loss in self.lost)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what ``pdhef inspect --json`` prints; NaN and infinities become None."""
+        """Return the document of ``pdhef inspect --json``; NaN and infinities become None."""
         document = {
             **{name: getattr(self, name, None) for name in _IN_DOCUMENT},
             "mapping_origin": self.mapping.origin,
@@ -245,7 +245,7 @@ def inspect_log(
     Raises
     ------
     LogError : The file is no log.
-    MappingError : The mapping names what the log does not contain.
+    MappingError : The mapping names a topic or field that the log does not contain.
     """
     mapping = mapping_of(mapping)
     if not whole:
@@ -274,7 +274,7 @@ def inspect_drive_log(
     prefer_truth: Literal["perfect", "rtk"] = "perfect",
     index: ColumnarLog | None = None,
 ) -> Inspection:
-    """Do what :func:`inspect_log` does with a log that is open already; with its ``index`` a sample of it is read."""
+    """Inspect an open log as :func:`inspect_log` does; with its ``index`` a sample of it is read."""
     ambiguities: tuple[Ambiguity, ...] = ()
     candidates: tuple[Candidate, ...] = ()
     if given is None:
@@ -328,13 +328,13 @@ def inspect_drive_log(
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """What of a log is read.
+    """The part of a log that is read.
 
     Attributes
     ----------
-    windows : [start, end) that are read. stamps : topics whose times are read there.
-    by_index : the index that shows the times of all topics; None: what is read shows them.
-    sample : states what was looked at in the end; None: all of the log is.
+    windows : [start, end) that are read. stamps : topics with times to read there.
+    by_index : the index with the times of all topics; None: times are read.
+    sample : description of the part that was read; None: all.
     """
 
     windows: Sequence[tuple[int, int]]
@@ -344,7 +344,7 @@ class _Look:
 
 
 def _sample_look(log: DriveLog, index: ColumnarLog, mapping: Mapping, head: tuple[int, int]) -> _Look:
-    """Look at what the clocks are fitted to, evenly over the log. With the head, which is checked, it is expected."""
+    """Read the windows for the clock fits, evenly over the log. They are expected together with the checked head."""
     mapped = {source.topic for source in mapping.sources()}
     spread = survey_windows(log.start_ns, log.end_ns) if log.end_ns > head[1] else [head]
     index.prefetch(mapped, [head, *spread])
@@ -358,7 +358,7 @@ def _sample_look(log: DriveLog, index: ColumnarLog, mapping: Mapping, head: tupl
 
 
 def collapsed(fields: Sequence[FieldInfo]) -> list[tuple[str, str, list[str]]]:
-    """Return name, type and paths of what is in a line each: covariances are one, with all their elements."""
+    """Return name, type and paths of each line; a covariance is one line with all its elements."""
     lines: dict[str, tuple[str, list[str]]] = {}
     for info in fields:
         if info.kind not in ("number", "bool"):
@@ -484,7 +484,7 @@ def _why_stamp(source: SignalSource, clock: ClockModel) -> str:
         return "" if clock.samples else "no message in the parts that were examined"
     steps = f"steps of {_number(clock.median_period_s * 1e3)} ms"
     if source.clock == "device":
-        return f"{steps} on a clock of its own, fitted to log time"
+        return f"{steps} on a separate clock, fitted to log time"
     delays = f"{_number(clock.median_delay_s * 1e3)} to {_number(clock.p95_delay_s * 1e3)} ms before log time"
     return f"{steps}, {delays}" if clock.delay_known else f"{steps}; all topics are off from log time as one"
 

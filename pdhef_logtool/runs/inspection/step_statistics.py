@@ -13,9 +13,9 @@ from pdhef_logtool.records.signals import FloatArray, IntArray
 #: A gap is more than this many median steps, and more than ``MIN_GAP_S``.
 GAP_PERIODS = 5.0
 MIN_GAP_S = 0.1
-#: Messages whose median step differs from the mean step by more come in bursts.
+#: If the median step differs from the mean step by more, messages come in bursts.
 BURST = 0.75
-#: Parts of a log whose extremes are kept.
+#: Number of parts of a log with stored extremes.
 COLUMNS = 100
 
 
@@ -46,7 +46,7 @@ class Steps:
 
     @property
     def rate_hz(self) -> float:
-        """Rate by the median step; of bursts, whose mean step differs, by the mean of the steps that are no gaps."""
+        """Rate by the median step; for bursts, by the mean of the steps that are no gaps."""
         steps = self.steps_s
         if not steps.shape[0]:
             return float("nan")

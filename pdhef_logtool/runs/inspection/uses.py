@@ -9,7 +9,7 @@ from pdhef_logtool.estimators.table import SPECS, all_specs
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.signals import WHEELS
 
-#: What a person calls the signals that the estimator of sideslip needs.
+#: Plain names of the signals that the estimator of sideslip needs.
 _WORDS = {
     "steer_rad": "a steering angle",
     "ax_m_s2": "a longitudinal acceleration",
@@ -32,7 +32,7 @@ def usable_signals(mapping: Mapping) -> frozenset[str]:
 
 
 def possible_uses(mapping: Mapping) -> str:
-    """Return what can be done with a log that is mapped so."""
+    """Return the possible uses of a log with this mapping."""
     have = usable_signals(mapping)
     uses = []
     if not _MAIN.lacking(have):
@@ -53,7 +53,7 @@ def _estimators_with(have: frozenset[str]) -> list[str]:
 
 
 def missing_for_sideslip(mapping: Mapping) -> str:
-    """Return what sideslip still needs, or would gain most from; empty where nothing is missing."""
+    """Return the signals that sideslip still needs or would gain most from; empty if none is missing."""
     wanted = _MAIN.needs | {"steer_rad"}
     lacking = sorted(wanted - usable_signals(mapping), key=list(_WORDS).index)
     return ", ".join(_WORDS.get(n, n) for n in lacking)
