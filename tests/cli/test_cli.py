@@ -39,7 +39,7 @@ def test_help_names_every_command_with_a_whole_sentence() -> None:
     assert all(re.search(r"\.(\n[A-Z].*:)?\s*$", entry) for entry in listed)
 
 
-#: Asks for help of all commands in one process, at two widths, and says after each what it has loaded.
+#: Print the help of every command in one process, at two widths, and list the loaded modules after each command.
 _HELPS = """
 import contextlib, io, json, os, sys
 from pdhef_logtool.cli.app import main
@@ -98,7 +98,7 @@ def test_run_prints_a_table_on_stdout_and_warnings_on_stderr(sample_logs_dir: Pa
     assert result.returncode == 0
     assert "phy-ukf" in result.stdout
     assert "default sedan (no car given)" in " ".join(result.stdout.split())
-    assert "warning" not in result.stdout + result.stderr  # nothing here may be wrong
+    assert "warning" not in result.stdout + result.stderr  # the sample log must not cause warnings
     assert "truth" in result.stdout
     assert all(len(line) <= 160 for line in result.stdout.splitlines() if "outputs in" not in line)
 
@@ -281,7 +281,7 @@ def test_inspect_never_overwrites_a_mapping(sample_logs_dir: Path, tmp_path: Pat
 
 
 def _run_of(folder: Path, *names: str) -> Path:
-    """Make a run whose logs have recordings of an end alone; the last one failed and has none."""
+    """Write a run; every log except the last, which failed, has a recording with only a footer."""
     for name in names[:-1]:
         (folder / "logs" / name).mkdir(parents=True)
         (folder / "logs" / name / "recording.rrd").write_bytes(b"RRF2FOOT")

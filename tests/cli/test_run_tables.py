@@ -1,4 +1,4 @@
-"""What a run prints: the answer first, within the terminal's width, names whole, nothing twice."""
+"""Printed output of a run: result first, within the terminal width, complete names, no repeated line."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def named(name: str, **changes: Any) -> dict[str, Any]:
 
 
 def rows(text: str, *names: str) -> list[str]:
-    """Return the lines that begin with one of the names, as those of a table do."""
+    """Return the table rows: lines that begin with one of the names."""
     return [line for line in text.splitlines() if line.strip().startswith(names)]
 
 
@@ -67,7 +67,7 @@ def test_every_estimator_fits_and_keeps_its_whole_name(width: int) -> None:
     assert set(NAMES) <= table
     assert "pd-hef-smoothed *" in text
     assert "* not causal" in text
-    assert ("max °" in text) == (width == 120)  # what matters least has given way
+    assert ("max °" in text) == (width == 120)  # the least important column is dropped first
 
 
 def test_the_answer_stands_first_then_three_rows() -> None:
@@ -124,7 +124,7 @@ def test_several_logs_have_one_table_and_say_once_what_holds_for_all() -> None:
     assert rows(text, "wednesday")[0].split()[-2:] == ["input", "lost"]
     assert text.count("car golf") == 1 and "a remark" not in text
     assert "lost: 0.4 s without samples (/imu)" in text
-    assert text.count("monday") == 1  # there is nothing more to say of it
+    assert text.count("monday") == 1  # no further line about this log
     assert "bad  failed: no log" in text
     assert "4 logs: 3 done, 1 failed, 1 with input lost" in text
 

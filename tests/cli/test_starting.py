@@ -1,4 +1,4 @@
-"""What a run loads: nothing that its outputs do not need, for the start of a process is most of a short log's time."""
+"""A run imports only the modules that its outputs need. Process start dominates the run time of a short log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PyTorch is an extra: only what trains a network needs it."""
+"""PyTorch is an optional dependency: only the commands that train a network need it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ RUN = ("run", "sample_logs/dlc.mcap", "--car", "saloon", "--end", "2", "-e", "pd
 
 
 def ended_without_torch(folder: Path, *commands: tuple[object, ...]) -> list[str]:
-    """Run commands in a process of their own; return their names, exit codes and lines on stderr."""
+    """Run commands in a separate process; return their names, exit codes and lines on stderr."""
     (folder / "sitecustomize.py").write_text(_BLOCKED)
     done = subprocess.run(
         [sys.executable, "-c", _CODE],
