@@ -1,4 +1,4 @@
-"""A reader of tables that does what its file says: ``PLANTED deed argument``."""
+"""Table reader with faults. Its input file selects the fault: ``PLANTED deed argument``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FORMAT = LogFormat("a planted file", f"{__name__}:open_planted", (".planted",), 
 
 
 def open_planted(file: TableFile) -> Tables:
-    """Return one table of 5 rows; its columns do what they are named."""
+    """Return one table of 5 rows; the name of a column selects its fault."""
     _, deed, argument = file.stream.read().decode().split()
     before = _do(deed, file, argument)
     fields = tuple(FieldInfo(name, "number", unit="m/s") for name in ("good", "segv", "bad", "better"))

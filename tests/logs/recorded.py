@@ -1,4 +1,4 @@
-"""What tests of the readers share: fields that any log offers, and decoded values by an independent reader."""
+"""Helpers for the reader tests: fields that every log contains, and values decoded by an independent reader."""
 
 from __future__ import annotations
 

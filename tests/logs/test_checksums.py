@@ -1,4 +1,4 @@
-"""Checksums of a file: what they cover is told, and damage that only they show is a loss."""
+"""Checksums of a file: their coverage is reported, and damage that only a checksum detects is a loss."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ N = 400
 
 
 def _log(path: Path, *, chunk_crcs: bool, data_crc: bool, chunked: bool = True) -> Path:
-    """Write an MCAP whose messages hold numbers of which any is possible."""
+    """Write an MCAP file with plain numbers, so that a damaged value is still a valid number."""
     text = b"float64 a\nfloat64 b\nfloat64 c\n"
     with path.open("wb") as file:
         writer = Writer(
@@ -62,7 +62,7 @@ def test_a_flipped_bit_that_only_the_crc_of_the_data_shows_is_a_loss(tmp_path: P
     values = log.read({"/t": ["a", "b", "c"]})["/t"].fields
     assert [(loss.kind, loss.severity) for loss in log.lost] == [("bad-data-crc", "lost")]
     assert "it is unknown which" in log.lost[0].what
-    np.testing.assert_array_equal(values["b"], 0.5 * np.arange(N))  # what can be read is read
+    np.testing.assert_array_equal(values["b"], 0.5 * np.arange(N))  # readable values are returned
     log.close()
     assert _exit_code(path) == EXIT_PARTIAL
 

@@ -1,4 +1,4 @@
-"""Damaged files: whatever bytes change, a log opens with a loss or ends in one clear error; nothing else escapes."""
+"""Damaged files: with any bytes changed, a log opens with a loss or raises one clear error of this package."""
 
 from __future__ import annotations
 

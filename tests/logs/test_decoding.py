@@ -1,4 +1,4 @@
-"""Paths, shapes and missing values, on messages whose content is known."""
+"""Paths, shapes and missing values, on messages with known content."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs that define no types: what is shipped, what a folder of the user's adds, and what is said of the rest."""
+"""Logs without type definitions: shipped definitions, definitions in a user's folder, and errors for unknown types."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A format of logs without messages, in a package of its own: one module and one entry make every command read it."""
+"""A table format from a separate package: with one module and one entry point, every command reads it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hostile and unlucky files: claims that memory cannot hold, files that are none, files that shrink while open."""
+"""Hostile and corrupt files: declared sizes beyond memory, files of another format, files that shrink while open."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _records(data: bytes) -> list[tuple[int, int, int]]:
 
 
 def _outcome(path: Path, budget: ResourceLimits = DEFAULT_LIMITS) -> tuple[int, tuple[Loss, ...], int]:
-    """Return how many messages are read, what is lost, and how many messages the topics then claim."""
+    """Return the number of messages read, the losses, and the number of messages that the topics then declare."""
     log = open_log(path, budget)
     try:
         read = sum(len(c) for c in log.read({}, stamps=[t.name for t in log.topics]).values())
@@ -182,7 +182,7 @@ def test_decompression_stops_where_the_claim_ends(compression: str, monkeypatch:
         decompress(compression, stored[:-10], 5000, DEFAULT_LIMITS)
     with pytest.raises(LimitError, match="--set budget"):
         decompress(compression, stored, 5000, ResourceLimits(chunk_bytes=4999))
-    # By ratio: a hundred kilobytes of nothing may not become gigabytes, whatever is claimed.
+    # Limit on the ratio: 100 kB of zeros must not expand to gigabytes, for any declared size.
     with pytest.raises(LimitError, match="chunk ratio"):
         decompress(compression, stored, 200 << 20, DEFAULT_LIMITS)
     with pytest.raises(LimitError):
@@ -314,7 +314,7 @@ def test_whatever_escapes_a_container_is_the_loss_of_its_span(tmp_path: Path, mo
 
 
 def _within(action: Callable[[], object]) -> BaseException | None:
-    """Return what an action raises; fails if it does not end."""
+    """Return the exception that an action raises; fail if the action does not end."""
     caught: list[BaseException | None] = []
 
     def run() -> None:

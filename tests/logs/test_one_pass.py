@@ -15,7 +15,7 @@ from pdhef_logtool import inspect_log
 from pdhef_logtool.logs import mcap_log
 from pdhef_logtool.logs.open_log import open_log
 
-#: A JSON payload that is larger than what is kept of a chunk.
+#: A JSON payload that is larger than the cached part of a chunk.
 LARGE = b'{"size": %d, "pixels": "' + b"x" * 20_000 + b'"}'
 
 

@@ -1,4 +1,4 @@
-"""What is opened as what, what is refused, and that nothing is written beside a source."""
+"""Format detection and rejected inputs. Opening a log writes no file next to it."""
 
 from __future__ import annotations
 

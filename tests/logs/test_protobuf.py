@@ -67,7 +67,7 @@ def _files(with_timestamp: bool = True) -> descriptor_pb2.FileDescriptorSet:
     _add(state, "brake", 32, Field.TYPE_DOUBLE, oneof_index=0)
     state.oneof_decl.add(name="_maybe")
     _add(state, "maybe", 33, Field.TYPE_DOUBLE, oneof_index=1, proto3_optional=True)
-    # Importers may stand before what they import, and well-known files may be missing.
+    # A file may precede its imports, and well-known files may be missing.
     files = descriptor_pb2.FileDescriptorSet(file=[file])
     if with_timestamp:
         timestamp_pb2.DESCRIPTOR.CopyToProto(files.file.add())
@@ -194,7 +194,7 @@ def test_a_payload_that_is_no_message_is_counted_and_nan(tmp_path: Path) -> None
     good = STATE(a_double=2.0).SerializeToString()
     _write(tmp_path / "a.mcap", [good, b"\xff\xff\xff", good, good[:-1]])
     log = open_log(tmp_path / "a.mcap")
-    for _ in range(2):  # a second read counts nothing twice
+    for _ in range(2):  # a second read does not count losses again
         column = log.read({"/state": ["a_double"]})["/state"].fields["a_double"]
         np.testing.assert_array_equal(column, [2.0, np.nan, 2.0, np.nan])
     assert [(x.kind, x.count) for x in log.lost] == [("undecodable", 2)]

@@ -1,4 +1,4 @@
-"""The process in which a file of tables is read: what it cannot do, and what its end costs."""
+"""The process that reads a table file: its restrictions, and the losses after a crash."""
 
 from __future__ import annotations
 

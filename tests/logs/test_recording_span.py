@@ -1,4 +1,4 @@
-"""Strays, epochs and steps back of the recorder's clock: found before windows, and nothing else moves."""
+"""Outlier stamps, clock resets and backward clock steps: detected before windows are cut; other times do not move."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_any_time_can_be_shown() -> None:
 
 @pytest.mark.parametrize("back_s", [0, 3])
 def test_indexes_say_whether_a_chunk_must_be_looked_at(back_s: int, tmp_path: Path) -> None:
-    """A chunk of 20 s whose first and last time tell nothing of a clock that steps back in its middle."""
+    """In a chunk of 20 s the clock steps back midway; the first and last time do not show it."""
     path = tmp_path / "log.mcap"
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=1 << 30)

@@ -1,4 +1,4 @@
-"""Clocks of tables: planted times in every unit come back; what is assumed is noted; no row is moved."""
+"""Clocks of tables: times in every unit are recovered, assumptions are noted, and no row is moved."""
 
 from __future__ import annotations
 

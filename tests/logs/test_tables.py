@@ -95,7 +95,7 @@ DIALECTS = {
 }
 
 
-#: Dialects whose times need an assumption.
+#: Dialects that need an assumption about their times.
 ASSUMED = {dialect: [("clock", "note")] for dialect in ("milliseconds-by-step", "month-first")}
 
 
