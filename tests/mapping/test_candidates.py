@@ -1,4 +1,4 @@
-"""Candidates: a drive under names, units, nestings and signs of strangers, and what is taken of it."""
+"""Candidates: signals selected from a drive with third-party names, units, nesting and signs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def found(**contents: FakeTopic) -> AutoMapping:
 
 
 def surveyed(**contents: FakeTopic) -> AutoMapping:
-    """Return what is found with the signs that the drive shows, and the checks of the drive that did not pass."""
+    """Return the automatic mapping with the signs of the drive and the checks that the drive did not pass."""
     log = FakeLog({"/" + k.replace("__", "/"): v for k, v in contents.items()})
     auto = auto_map(log)
     span = (log.start_ns, log.end_ns)
@@ -54,7 +54,7 @@ def surveyed(**contents: FakeTopic) -> AutoMapping:
 
 
 def unsettled(auto: AutoMapping) -> set[str]:
-    """Return the signals whose sign the drive questions or leaves open."""
+    """Return the signals with a questionable or undecided sign."""
     return {c.subject for c in auto.mapping.checks if c.name.endswith((".sign", ".candidate", ".corrected"))}
 
 
@@ -658,7 +658,7 @@ def test_values_that_are_no_drive_break_nothing(values: str) -> None:
         message.log_time_ns = T[:2]
         message.fields = {k: v[:2] for k, v in message.fields.items()}
     auto = found(ins__car=message, gps__fix=topic("sensor_msgs/msg/NavSatFix", latitude=made, longitude=made))
-    # What is no measurement is not taken; noise is told to follow nothing, or what it is not.
+    # Values that are no measurement are not selected. Noise is reported as undecided.
     if values in ("nan", "inf", "huge", "zero"):
         assert taken(auto) == {}
     else:

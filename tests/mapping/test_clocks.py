@@ -35,7 +35,7 @@ def test_the_line_finds_offset_and_drift(
     reference, reference_log, drift, _ = fit_clock_line(device, log_time)
     clock = ClockModel(reference_stamp_ns=reference, reference_log_ns=reference_log, drift=drift)
     error_s = (apply_clock(device, clock) - (T0 + np.rint(true_s * 1e9).astype(np.int64))) * 1e-9
-    # Known only up to the smallest delay (3 ms here), and to what a low quantile of the jitter leaves.
+    # The time is known up to the smallest delay (3 ms here) and a low quantile of the jitter.
     assert np.abs(error_s - 0.003).max() < 0.3 * jitter_ms * 1e-3 + 1e-5
 
 

@@ -1,4 +1,4 @@
-"""GNSS as a sensor: which messages are recognised, with which units, and what is ground truth instead."""
+"""GNSS as a sensor: recognised messages, their units, and the messages that are ground truth instead."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How losses of windows become one, and what a text of ``--estimate`` or ``--truth`` is refused for."""
+"""Merging of losses across windows, and rejected texts of ``--estimate`` and ``--truth``."""
 
 from __future__ import annotations
 

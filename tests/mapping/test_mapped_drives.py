@@ -1,4 +1,4 @@
-"""The recorded drives through their mappings, against what their description states."""
+"""The recorded drives, read through their mappings and compared with their descriptions."""
 
 from __future__ import annotations
 

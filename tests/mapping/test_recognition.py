@@ -1,4 +1,4 @@
-"""Recognising well-known types: what is mapped, what is told as ambiguous, and what is never taken."""
+"""Recognition of well-known types: mapped, ambiguous and excluded topics."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_wheel_speeds_and_perfect_truth_of_the_simulator() -> None:
     assert any("perfect ground truth used; /rtk/fix, /rtk/odometry not used" in n for n in auto.mapping.notes)
     other = auto_map(FakeLog(contents), prefer_truth="rtk").mapping.truth
     assert {s.topic for s in other.values()} == {"/rtk/odometry"}
-    # With only one of them that one is taken, whatever is preferred.
+    # A single ground truth is used regardless of the preference.
     del contents["/truth/perfect/odometry"]
     assert {s.topic for s in auto_map(FakeLog(contents)).mapping.truth.values()} == {"/rtk/odometry"}
 
@@ -160,7 +160,7 @@ def test_names_tell_sensors_from_truth(name: str, role: str) -> None:
     auto = found({name: odometry()})
     assert ("speed_m_s" in auto.mapping.signals) == (role == "speed")
     assert ("vy_m_s" in auto.mapping.truth) == (role == "truth")
-    # What is not taken is told.
+    # An unused topic is reported.
     assert [a.chosen for a in auto.ambiguities] == ([None] if role == "neither" else [])
     assert any("lateral velocity, which" in n for n in auto.mapping.notes) == (role == "speed")
 
@@ -335,7 +335,7 @@ def test_a_reference_instrument_beside_a_receiver_is_ground_truth_and_no_input(s
     ("drive", "reference", "unmapped"),
     [
         ("revs_250lm_a.mcap", "revs_250lm", set()),
-        ("f1tenth_hoons_run2.bag", "f1tenth", set()),  # The speed is one of a bare array, told by a_y ≈ v r.
+        ("f1tenth_hoons_run2.bag", "f1tenth", set()),  # The speed is an array element, identified by a_y ≈ v r.
     ],
 )
 def test_real_drives_map_as_by_hand(shared_dir: Path, drive: str, reference: str, unmapped: set[str]) -> None:

@@ -1,4 +1,4 @@
-"""A folder of mappings: each log takes the one whose topics, fields and types it contains."""
+"""A folder of mappings: each log uses the mapping that matches its topics, fields and types."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Header stamps that are no measure of time: log time serves, the log says so, and nothing is dropped in silence."""
+"""Unusable header stamps: log time replaces them, a note reports it, and no message is dropped silently."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_single_wild_stamps_are_bad_stamps() -> None:
 
 @pytest.mark.parametrize(("behind_ns", "serves"), [(3600 * S, True), (-3 * S, True), (20 * MS, False)])
 def test_one_topic_of_another_clock(behind_ns: int, serves: bool) -> None:
-    """Stamps that are off as one stay, but one topic's cannot be set against those of the others."""
+    """A clock offset shared by all topics is accepted; a topic with a different offset has unusable stamps."""
     topics = {
         "/imu": FakeTopic("a/b", LOG, {"header.stamp": TRUE - behind_ns, "v": np.arange(float(N))}),
         "/steer": FakeTopic("a/b", LOG, {"header.stamp": TRUE, "v": np.arange(float(N))}),
@@ -166,7 +166,7 @@ BURSTS = np.repeat(TRUE[99::100], 100) + 20 * MS + np.tile(np.arange(100) * 1000
         (None, TRUE + MS, LOG, "log_time"),
         (TRUE, TRUE + MS, BURSTS, "header.stamp"),
         (TRUE * 0, TRUE + MS, BURSTS, "publish_time"),
-        (TRUE * 0, BURSTS, BURSTS, "header.stamp"),  # log time serves, and the reason is given there
+        (TRUE * 0, BURSTS, BURSTS, "header.stamp"),  # log time is used, with the reason in the notes
     ],
 )
 def test_the_time_of_publication_is_read_where_it_is_the_only_regular_one(
