@@ -1,4 +1,4 @@
-"""Alignment: nothing crosses a gap, measurements count once, the late are not awaited."""
+"""Alignment: no value crosses a gap, each measurement counts once, late measurements do not delay a step."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_an_imu_channel_of_another_device_is_brought_to_the_grid():
     assert "ay_m_s2" not in plan.grid_channels
     signals = whole(channels, plan)
     np.testing.assert_allclose(signals.ay_m_s2[1:], 2.0 * seconds(signals.stamps_ns[1:]), atol=1e-6)
-    assert np.isnan(signals.ay_m_s2[0])  # nothing is extrapolated
+    assert np.isnan(signals.ay_m_s2[0])  # no extrapolation
 
 
 @pytest.mark.parametrize("channels", [{}, {"speed_m_s": channel("speed_m_s", regular(0, 1, 10), np.zeros(10))}])

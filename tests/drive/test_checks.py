@@ -35,7 +35,7 @@ def channel(name: str, time_s: np.ndarray, values: np.ndarray) -> Channel:
 def drive(
     seed: int = 0, duration_s: float = 60.0, calm: bool = False, wheel_radius_m: float = 0.3
 ) -> dict[str, Channel]:
-    """A car on a winding road at changing speed, by kinematics alone; every sensor with noise of its own."""
+    """Return a kinematic drive on a winding road at changing speed, with independent noise on every sensor."""
     rng = np.random.default_rng(seed)
 
     def slow(t: np.ndarray, phases: np.ndarray) -> np.ndarray:
@@ -218,7 +218,7 @@ def saloon(sample_logs_dir: Path) -> VehicleParameters:
 @pytest.mark.slow
 def test_a_sound_road_passes_everything(road: MappedChannels, saloon: VehicleParameters) -> None:
     checks = checked(road, saloon)
-    alone = {"roll_rate_rad_s", "pitch_rate_rad_s"}  # nothing else in the log measures them
+    alone = {"roll_rate_rad_s", "pitch_rate_rad_s"}  # the log has no second measurement of them
     place = {"ay_m_s2.place"}  # too few quick bends
     assert {c.verdict for c in checks if c.subject not in alone and c.name not in place} == {"passed"}
     assert {c.verdict for c in checks if c.subject in alone} == {"undecided"}
@@ -361,7 +361,7 @@ def test_a_place_that_no_car_has_is_undecided(sample_logs_dir: Path) -> None:
 
 
 def test_sideslip_that_hardly_moves_beside_a_y_tells_no_sign(tmp_path: Path) -> None:
-    """A ramp steer at constant speed: what is left of curvature beside a_y is noise, and goes with what is left."""
+    """In a ramp steer at constant speed, the curvature that a_y does not explain is noise and decides no sign."""
     ramp = simulate_drive(
         "ramp-steer", speed_km_h=81.81, friction=0.426, seed=1068668474, duration_s=12.5, amplitude=0.2748
     )
@@ -398,7 +398,7 @@ def test_sensors_that_are_all_late_by_the_same_leave_it_with_the_truth() -> None
 
 
 def test_what_one_wrong_signal_contradicts_is_not_blamed_with_it() -> None:
-    """Speed goes with a_x, a_y and steering: wheel speeds that are something else are the wrong ones."""
+    """The speed agrees with a_x, a_y and steering, so the wheel speeds that disagree are wrong."""
     channels = drive(3)
     angles = {
         f"wheel_speed_{w}_m_s": replace(
@@ -478,7 +478,7 @@ def test_marks_of_invalid_values_are_no_motion() -> None:
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", ["speed_m_s", "yaw_rate_rad_s", "wheel_speed_rl_m_s"])
 def test_no_number_warns(name: str) -> None:
-    """Garbage of any size, runs of NaN, and nothing at all; readers drop what is infinite."""
+    """Values of any magnitude and runs of NaN cause no warning; readers drop infinite values."""
     channels = drive(5)
     values, i = channels[name].values, np.arange(len(channels[name]))
     for wrong in (

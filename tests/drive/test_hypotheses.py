@@ -64,7 +64,7 @@ def test_two_mistakes_are_found_that_are_worse_than_none_alone() -> None:
 
 
 def test_scales_of_right_mappings_are_those_of_units() -> None:
-    """What a gain leaves open between km/h and mph, a scale that would be no unit's decides; sums of both do not."""
+    """A gain between km/h and mph fits both; only one of them corrects the mapping to the scale of a unit."""
     between = relation(2.8, 2.9, 2.85, powers={"speed_m_s": 1}, text="another speed")
     likeliest = {
         scale: posterior([between], known_hypotheses(("speed_m_s",)), {"speed_m_s": scale}).of("speed_m_s")[0]

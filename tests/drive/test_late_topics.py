@@ -1,4 +1,4 @@
-"""Topics that arrive too late to wait for are read by their stamps and named; nothing is called causal then."""
+"""Topics that arrive too late are read by their stamps and named; no estimate is then reported as causal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A wrong unit of v_y shows whatever its lever is, and a wrong speed blames nothing else."""
+"""A wrong unit of v_y is detected for any lever arm, and a wrong speed does not fail other signals."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m: float, factor: float) -
 def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
     factor: float, mirrored: bool, antenna_m: float
 ) -> None:
-    """An identity of rigid bodies; a pose counted to the right, or of an antenna further ahead, contradicts nothing."""
+    """A rigid-body identity: a pose with y to the right, or from an antenna further ahead, fails no check."""
     vehicle = default_vehicle().model_copy(update={"truth_position_m": (1.3, 0.0, 0.0)})
     signals, truth = with_truth(vehicle, 1.0)
     vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
@@ -169,7 +169,7 @@ def test_a_unit_that_the_drive_leaves_open_is_not_checkable() -> None:
 
 
 def test_a_car_that_reverses_fast_has_a_wrong_sign_of_its_speed() -> None:
-    """All four wheels turned, and no ground truth: nothing else contradicts them."""
+    """Without ground truth, four wheel speeds with reversed sign contradict no other signal."""
     signals = {n: c for n, c in drive(3, calm=True).items() if n in ("wheel_speed_rl_m_s", "yaw_rate_rad_s", "ay_m_s2")}
     wheel = signals["wheel_speed_rl_m_s"]
     wheels = {f"wheel_speed_{w}_m_s": replace(wheel, name=f"wheel_speed_{w}_m_s") for w in ("fl", "fr", "rl", "rr")}

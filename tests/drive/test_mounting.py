@@ -1,4 +1,4 @@
-"""An IMU in every mounting is read as if it were x forward, z up; what is doubtful is said and not applied."""
+"""Signals of an IMU in any mounting are rotated to x forward, z up; a doubtful rotation is reported, not applied."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def difference(a: Signals, b: Signals) -> float:
 
 @pytest.fixture(scope="module")
 def components(log):
-    """Channels of a log with the six components of its IMU, and what else finding a mounting takes."""
+    """Return the channels of a log with the six IMU components, the triads and the mapping."""
     mapping = resolve_mapping(log, auto_map(log).mapping)
     triads = find_triads(log, mapping)
     extra = {**triads[0].components(ACCELERATIONS), **triads[1].components(RATES)}

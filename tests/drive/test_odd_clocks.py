@@ -1,4 +1,4 @@
-"""Logs of odd clocks end, say what they left out, and what is left is what the sound log gives."""
+"""Logs with odd clocks are processed and report dropped messages; the rest equals the result of the sound log."""
 
 from __future__ import annotations
 

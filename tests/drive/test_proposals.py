@@ -115,7 +115,7 @@ def test_proposals_say_where_they_belong_and_why(log) -> None:
 
 
 class TurnedTruth(TurnedLog):
-    """A truth whose body velocity is turned by 0.4 degrees."""
+    """A log with the body velocity of its ground truth rotated by 0.4 degrees."""
 
     def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int, **options: bool) -> dict[str, Any]:
         found = dict(self._log.read(requests, start_ns, end_ns, **options))

@@ -78,7 +78,7 @@ def test_what_is_told_is_noted_and_named(sample_logs_dir: Path, car: Car) -> Non
         drive.tell("one more")
         notes, remarks = list(drive.notes), list(drive.remarks)
     assert told == [f"dlc: {note}" for note in notes]
-    # No alarms: they are kept, not told.
+    # Remarks are no warnings: they are stored, not printed.
     assert any("/rtk/odometry not used" in remark for remark in remarks)
     assert any("friction" in remark for remark in remarks)
     assert notes[-1] == "one more"

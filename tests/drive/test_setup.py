@@ -1,4 +1,4 @@
-"""A frozen set-up: decided once, from another log or from the first seconds; nothing later changes what came before."""
+"""A frozen set-up is determined once, from another log or the first seconds; later data do not change it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TURNED = tuple(f"{vector}.{axis}" for vector in ("linear_acceleration", "angular
 
 
 class ChangedLater:
-    """A log whose IMU is turned by half a turn, and whose messages arrive 70 ms later, from some time on."""
+    """A log with a change: from a given time on, its IMU is rotated by 180° and its messages arrive 70 ms later."""
 
     def __init__(self, log: Any, change_ns: int) -> None:
         self._log, self._change_ns = log, change_ns

@@ -1,4 +1,4 @@
-"""Friction of the ground truth: datasets and segments take it, and no estimator of a run is given it."""
+"""Friction of the ground truth: datasets and segments use it; the estimators of a run do not receive it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pdhef_logtool.runs.config import RunConfig
 
 
 def _read(logs: Path, **options: object) -> Drive:
-    """Open a drive on a road of friction 0.3 with a car whose file states 0.85."""
+    """Open a drive on a road with friction 0.3; the vehicle file states 0.85."""
     return read_drive(logs / "sweep.mcap", logs / "vehicle.toml", options=RunConfig(end="4", **options).read_options)  # type: ignore[arg-type]
 
 
@@ -28,7 +28,7 @@ def test_a_dataset_takes_the_friction_of_the_ground_truth(sample_logs_dir: Path)
         known = np.isfinite(frictions[0])
         np.testing.assert_allclose(frictions[0][known], 0.3, atol=1e-6)
         assert known.mean() > 0.9
-        assert not np.isfinite(frictions[1]).any()  # that of the vehicle file
+        assert not np.isfinite(frictions[1]).any()  # friction of the vehicle file
         assert drive.friction.label == "vehicle file, 0.85"
 
 

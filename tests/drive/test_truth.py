@@ -45,7 +45,7 @@ def channel(name, stamps_ns, values, units=TRUTH_UNITS, source="/ins", delay_ns=
 
 
 class Drive:
-    """A smooth drive whose every quantity is known in closed form at any time (CG)."""
+    """A smooth drive with all quantities in closed form at any time, at the center of gravity (CG)."""
 
     def __init__(self, t):
         self.t = t

@@ -1,4 +1,4 @@
-"""The truth's latency is applied only where it stands out of its own uncertainty: more than two standard errors."""
+"""The latency of the ground truth is applied only if it exceeds two standard errors."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_the_rule_decides_what_the_estimates_are_compared_with(planned):
     dropped = truth_of(log, with_latency(plan, 0.05, 0.05))
     np.testing.assert_array_equal(dropped.yaw_rate_rad_s, at_zero.yaw_rate_rad_s)
     np.testing.assert_array_equal(applied.stamps_ns, at_zero.stamps_ns)
-    # The truth shows at t + latency what the sensors show at t.
+    # A motion that the sensors show at t appears in the ground truth at t + latency.
     t = (at_zero.stamps_ns - at_zero.stamps_ns[0]) * 1e-9
     later = np.interp(t + 0.05, t, at_zero.yaw_rate_rad_s)
     inside = np.isfinite(applied.yaw_rate_rad_s) & (t < t[-1] - 0.1)
