@@ -1,4 +1,4 @@
-"""The estimator of ARCHITECTURE.md as an installed package of its own, with an entry point."""
+"""The estimator of ARCHITECTURE.md as a separate installed package with an entry point."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def example_code() -> str:
 
 
 def install(folder: Path, code: str, name: str = "half_slip") -> Path:
-    """Write a distribution with one module, whose ``SPEC`` is the entry point; return the folder for ``sys.path``."""
+    """Write a distribution with one module and an entry point to its ``SPEC``; return the folder for ``sys.path``."""
     (folder / f"{name}.py").write_text(code, encoding="utf-8")
     info = folder / f"{name}-1.0.dist-info"
     info.mkdir()

@@ -1,4 +1,4 @@
-"""The adaptive filter: nothing happens where nothing is wrong, and what is wrong is seen for what it is."""
+"""The adaptive filter: no adaptation without a fault, and a correct diagnosis of each fault."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ PHYSICS = PhysicsFilter(
     q_std=(0.089, 0.06, 0.03, 0.021, 0.4, 0.4),
     r_std=(0.3, 0.003, 0.08),
 )
-#: As if nothing was found in its driving that cures anything.
+#: The same filter without the additional physics of ``PARTS``.
 PLAIN = replace(PHYSICS, vehicle=VEHICLE)
 
 
@@ -76,7 +76,7 @@ def made():
 
 @pytest.fixture(scope="module")
 def weak():
-    """The car has a quarter less grip and stiffness than the model is told: all forces are 0.75 times the model's."""
+    """Return a drive of a car with 25 % less grip and stiffness than the model, hence 0.75 times its forces."""
     return drive(slalom(0.035, 0.5), 12.0, speed=22.0, mu=0.75 * 0.85)
 
 
@@ -92,7 +92,7 @@ def rough() -> Signals:
     return replace(s, ready_ns=np.maximum.accumulate(s.stamps_ns + rng.integers(0, 45_000_000, len(s))))
 
 
-# --- nothing wrong ---------------------------------------------------------------------------------------------------
+# --- without faults --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("trust", [0.0, 0.4, 1.0])
@@ -105,7 +105,7 @@ def test_without_noise_and_error_it_is_the_fixed_filter_to_the_bit(made, trust):
 
 
 def test_with_noise_it_is_the_fixed_filter_but_for_a_few_samples(made):
-    """Clean drives: the mechanism costs next to nothing."""
+    """On clean drives, the adaptation hardly changes the estimate."""
     for seed in range(5):
         signals = noisy(made, seed)
         a, _ = run_window(adaptive(), signals)
@@ -177,7 +177,7 @@ def rmse(estimator: AdaptivePhysics, signals: Signals, made) -> float:
 
 
 def test_cures_of_nothing_cost_little(made):
-    """Right model, white noise: all filters are right, and their mixture is worth nearly what the simplest is."""
+    """With a correct model and white noise, the mixture is nearly as accurate as the simplest filter."""
     for seed in range(3):
         signals = noisy(made, seed)
         loud = 0.3 * np.random.default_rng(0).standard_normal(len(signals))
@@ -196,7 +196,7 @@ def test_each_filter_has_one_cure_and_only_those_that_the_car_has():
 
 
 def test_a_banked_road_is_taken_for_one(made):
-    """The bend leans: a part of what holds the car in it is its weight, which no accelerometer feels."""
+    """On a banked bend, gravity supplies a part of the lateral force. No accelerometer measures this part."""
     leaning = drive(slalom(0.035, 0.5), 12.0, speed=22.0, side_pull_m_s2=-9.80665 * 0.08)
     signals = noisy(leaning, 7)
     lone, _ = run_window(fixed(), signals)

@@ -28,7 +28,7 @@ GAP_S = (60.0, 80.0)
 
 
 def without(*missing: str) -> object:
-    """Return what takes signals out of a mapping."""
+    """Return a function that removes signals from a mapping."""
     return lambda _log, mapping, _tell: replace(
         mapping, signals={k: v for k, v in mapping.signals.items() if k not in missing}
     )
@@ -117,7 +117,7 @@ def test_a_log_without_steering_keeps_the_prior_of_its_car(sample_logs_dir: Path
         assert (calibration.parameters, calibration.refused) == ((), "")
         assert len(calibration.varied) == 6
         estimator = make_estimator("physics", self_calibrated(drive, calibration))
-        assert estimator.causal  # nothing of the log is in it
+        assert estimator.causal  # it contains no data of the log
 
 
 def test_without_a_y_the_yaw_rate_calibrates(sample_logs_dir: Path) -> None:

@@ -1,4 +1,4 @@
-"""What others are measured against is as strong as it was: a weakened baseline fails here, and no flag updates it."""
+"""Frozen accuracy of the baselines: a weakened baseline fails this test, and no flag updates the values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.runs.config import RunConfig
 
 SAMPLES = Path(__file__).parents[2] / "sample_logs"
-#: Sideslip RMSE in degrees on sample logs with the shipped car: friction of the file, and told for the sweep.
+#: Sideslip RMSE in degrees on sample logs with the shipped car: friction from the file, or from the user (sweep).
 STRENGTH = {
     ("dlc", None): {"kinematic": 0.7728, "open-loop": 0.2991, "phy-ukf": 0.3721, "physics": 0.0609},
     ("road", None): {"kinematic": 1.8236, "open-loop": 0.1216, "phy-ukf": 0.1218, "physics": 0.0690},

@@ -47,7 +47,7 @@ FRICTION = 0.85
 def motion(
     share: float = 0.9, duration_s: float = 12.0, hz: float = 0.4, seed: int = 0, delay_ns: int = 10_000_000
 ) -> tuple[Signals, StateTrack]:
-    """Return what the sensors read of a slalom up to a share of the grip, and its true state; irregular 100 Hz."""
+    """Return sensor signals and true state of a slalom up to a share of the grip, at irregular 100 Hz."""
     rng = np.random.default_rng(seed)
     dt = rng.uniform(0.008, 0.012, round(duration_s * 100))
     t = np.concatenate([[0.0], np.cumsum(np.round(dt * 1e9) * 1e-9)])
@@ -107,7 +107,7 @@ def test_an_error_is_flagged_while_it_grows_and_taken_back_with_it(degrees: floa
     assert not found[t < 5.0].any()
     grown = 5.0 + rise_s
     assert found[(t > grown + 0.1) & (t < grown + 0.5)].all()
-    # What the leak forgot of the error stands on the other side when it goes: at most 1 − e^(−2/3) of it.
+    # The leaky integrator forgets up to 1 − e^(−2/3) of the error. This part changes sign when the error ends.
     left = degrees * (1.0 - math.exp(-(2.0 + rise_s) / 3.0))
     assert left > 2.9 or not found[t > 7.0 + rise_s + 0.1].any()
 
@@ -253,7 +253,7 @@ def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(
 
 
 def test_the_filter_itself_sees_it_later(sweep: Path, sample_logs_dir: Path) -> None:
-    """What the watch adds: its flag stands before that of the filter's own innovations."""
+    """The monitor raises its flag earlier than the filter, which uses its innovations."""
     vehicle = read_vehicle_file(sample_logs_dir / "vehicle_mu03.toml").vehicle
     signals = read_signals(sweep, vehicle)
     track, _ = run_window(make_estimator("phy-ukf", Car.of(vehicle)), signals)

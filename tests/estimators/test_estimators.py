@@ -1,4 +1,4 @@
-"""What every estimator must do: join windows, see no future, mirror, predict by the delay, survive bad signals."""
+"""Requirements for all estimators: continuity across windows, causality, symmetry, latency compensation, robustness."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ pytestmark = pytest.mark.slow
 #: With the noise that ``phy-ukf:tuned`` and ``physics`` look for in the car.
 NOISE = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
 VEHICLE = default_vehicle()
-#: What a log calibrated is another estimator in a wrapper (test_self_calibrated.py).
+#: Without the self-calibrated estimator, which wraps another one (test_self_calibrated.py).
 NAMES = tuple(s.name for s in all_specs() if not s.network and s.name != "open-loop:calibrated")
-#: Those that claim a lateral velocity by a model or by integration.
+#: Estimators that compute the lateral velocity from a model or by integration.
 FILTERS = ("phy-ukf", "physics", "phy-ukf:tuned")
 CLAIMING = ("kinematic", "open-loop", *FILTERS)
 STIFFNESS_VEHICLE = VEHICLE.model_copy(
@@ -381,7 +381,7 @@ PASSING = [f for f in FAULTS if f not in ("one stamp", "nothing", "noise x20") a
 
 @pytest.mark.parametrize("fault", PASSING)
 def test_the_filter_recovers_from_every_fault(fault, plain):
-    """Two seconds after the last bad sample it is back at what it says without the fault."""
+    """Two seconds after the last bad sample, the estimate equals the estimate without the fault."""
     faulty = FAULTS[fault](plain)
     reference, track = run("phy-ukf", plain), run("phy-ukf", faulty)
     at = np.searchsorted(plain.stamps_ns, faulty.stamps_ns)
@@ -484,7 +484,7 @@ def test_what_cannot_run_is_skipped_with_the_reason():
 
 def test_the_tuned_filter_takes_its_noise_from_the_car():
     tuned, plain_filter = make_estimator("phy-ukf:tuned", car_of()), make_estimator("phy-ukf", car_of())
-    assert tuned.q_std == (0.05, 0.02, 0.02, plain_filter.q_std[3])  # what the car leaves out stays
+    assert tuned.q_std == (0.05, 0.02, 0.02, plain_filter.q_std[3])  # the default applies if the car has no value
     assert tuned.measurement_std.tolist() == [0.8, *plain_filter.measurement_std[1:]]
     assert tuned.roll_correction
     assert not plain_filter.roll_correction

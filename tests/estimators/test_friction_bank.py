@@ -1,4 +1,4 @@
-"""The bank against drives on roads of known friction, its silence where nothing shows, and where a run gets it from."""
+"""The filter bank on roads of known friction: estimates, no estimate without excitation, and the source in a run."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_friction_is_never_below_what_the_acceleration_needs():
     found = estimate(signals)
     capacity = (FRONT_TYRE[2] + REAR_TYRE[2]) / MASS_KG
     smooth = np.convolve(np.abs(signals.ay_m_s2), np.ones(5) / 5, mode="same")
-    # The bound looks back over a tenth of a second; this is looser by what a_y can fall in that time.
+    # The bound covers the last 0.1 s. The tolerance allows for the decrease of a_y in this time.
     behind = np.minimum.reduce([np.roll(smooth, k) for k in range(30)])[40:]
     assert np.all(found.friction[40:] >= BOUND_SHARE * (behind - 0.3) / capacity)
 

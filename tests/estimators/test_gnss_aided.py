@@ -1,4 +1,4 @@
-"""GNSS velocity in ``physics``: what it gains on a simulated car, that nothing comes early, and what it must ignore."""
+"""GNSS velocity in ``physics``: benefit on a simulated car, causality, and samples that the filter must ignore."""
 
 from __future__ import annotations
 

@@ -126,7 +126,7 @@ def test_the_undisturbed_norm_is_the_papers():
 
 
 def numpy_reference(signals: Signals, bundle: ModelBundle) -> dict[str, np.ndarray]:
-    """Every step of Eq 19-26 in plain numpy, predicted to the stamps; the parallel filter and the network are given."""
+    """Compute Eq 19-26 in plain numpy, predicted to the stamps, from the package's parallel filter and network."""
     features, physics, _ = run_features(parallel_filter(VEHICLE), signals, None)
     rate, _ = NetworkService(bundle).run(features, ~np.isfinite(physics.prior[:, 0]), None)
     signals = without_impossible(signals)
@@ -222,7 +222,7 @@ def test_it_is_the_papers_equations_in_plain_numpy(weaving):
     }  # fmt: skip
     for name, values in want.items():
         np.testing.assert_allclose(got[name], values, rtol=1e-9, atol=1e-9, err_msg=name)
-    assert np.ptp(want["beta"][5:]) > 0.5  # the drive goes through the table
+    assert np.ptp(want["beta"][5:]) > 0.5  # the drive covers the whole table
     assert np.nanmax(want["r_scale"]) > 5.0
 
 

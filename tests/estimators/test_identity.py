@@ -1,4 +1,4 @@
-"""What identifies an algorithm, frozen for the shipped presets: a change here is a new version of the algorithm."""
+"""Frozen identities of the shipped presets: a changed identity requires a new version of the algorithm."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SHIPPED = {
     ),
     "pd-hef-paper": ("paper-hybrid-ukf 1", "c13712e0df29"),
 }
-#: Fields that are no option: names and texts, and what counts as noise, physics or network.
+#: Fields that are no option: names, texts, noise, physics and network.
 ROLES = {"name", "causal", "notes", "vehicle", "read_with", "network", "model", "q_std", "r_std", "use_speed"}
 
 

@@ -1,4 +1,4 @@
-"""Calibrated intervals: exact over windows, causal, monotone, and only from a file that says what it is."""
+"""Calibrated intervals: independent of windows, causal, monotone, and read only from valid files."""
 
 from __future__ import annotations
 
@@ -265,7 +265,7 @@ def test_the_notes_say_for_what_intervals_were_made() -> None:
         ({"use_speed": False}, "sensors (with or without the speed)"),
     ):
         assert notes(_intervals(), ALGORITHM.model_copy(update=changes)).endswith(f"as given, but with other {said}")
-    # The physics that the whole car has now are no matter: those of what ran are.
+    # The current physics of the car do not matter, only the physics of the estimator that ran.
     assert notes(_intervals(physics_sha256="cd" * 32)) == f"{made} as given"
 
 

@@ -94,7 +94,7 @@ def test_it_runs_on_what_it_needs_alone_and_not_on_what_is_too_late(name):
 
 
 def test_pure_lstm_says_what_its_network_says_and_predicts_it_over_the_delay():
-    """A network that always says 0.25 m/s; what is added to it is the latency times what the sensors say of v̇_y."""
+    """The network output is constant, 0.25 m/s. Latency compensation adds the latency times the measured v̇_y."""
     lstm = MODEL.pure_lstm
     assert lstm is not None
     weights = {k: np.zeros_like(v) for k, v in lstm.weights.items()}

@@ -66,7 +66,7 @@ def test_left_and_right_are_mirrored(vx, vy, r, steer, mu):
 @exact
 @given(lateral, yaw_rates, steering, friction)
 def test_blend_has_no_step_in_speed(vy, r, steer, mu):
-    # Across both ends of the blend, and in it, a speed change of 1e-9 m/s moves nothing by more than its slope can.
+    # At both ends of the blend, and inside it, a speed change of 1e-9 m/s causes no jump in any output.
     for vx in (BLEND_LOW, 2.0, BLEND_HIGH):
         below = nominal_model.state_derivative(vx - 1e-9, vy, r, steer, 0.0, mu, P)
         above = nominal_model.state_derivative(vx + 1e-9, vy, r, steer, 0.0, mu, P)

@@ -1,4 +1,4 @@
-"""A car that is calibrated while its log goes on: causal, independent of windows, and better than the file."""
+"""Online calibration of a car during its log: causal, independent of windows, and better than the vehicle file."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ def test_run_with_a_model_writes_its_hash_and_its_estimates(sample_logs_dir: Pat
 
 
 def test_a_residual_in_the_model_is_what_the_car_does_with_it() -> None:
-    """The oracle's car with a force and a moment that its model lacks; told them as a residual, the filter is right."""
+    """The car has a force and a moment that its model lacks. With both as a residual, the filter is correct."""
     oracle = Oracle(parts("lag", "roll"))
 
     @dataclass(frozen=True)

@@ -255,7 +255,7 @@ def test_a_short_gap_is_filtered_through():
     steps = posteriors(keep(made.signals, mask))
     after = made.time_s[mask] > 4.45
     beta = np.arctan2(steps.x[:, 1], steps.x[:, 0])
-    # one step of 0.46 s: the process noise that it adds makes the update coarse, yet nothing starts anew
+    # one step of 0.46 s: the process noise that it adds makes the update coarse, yet the filter does not restart
     assert np.abs(beta - made.sideslip[mask])[after].max() < 0.1 * DEGREE
     assert np.abs(beta - made.sideslip[mask])[made.time_s[mask] > 5].max() < 0.01 * DEGREE
 
@@ -397,7 +397,7 @@ def simulate_from_the_filters_own_model(q_std, r_std, seconds, seed):
 def innovation_log_likelihood(estimator: PhysicsUkf, signals: Signals) -> tuple[float, int]:
     """Return the Gaussian log-likelihood of all innovations of a drive and how many scalar innovations it sums.
 
-    A sample beyond the gate counts with the likelihood at the gate: a filter gains nothing by rejecting samples, and
+    A sample beyond the gate counts with the likelihood at the gate: a filter has no benefit from rejecting samples, and
     no single outlier decides.
     """
     steps, _ = estimator.run(signals, None)
@@ -456,7 +456,7 @@ def test_innovations_are_consistent_when_the_model_is_right():
 
 
 def test_sideslip_std_is_the_first_order_band():
-    """Against the gradient of atan2 by differences, with a covariance whose correlation matters."""
+    """Compare with finite differences of atan2, for a covariance with a significant correlation."""
     vx, vy = np.array([12.0, 9.0]), np.array([4.0, -6.0])
     covariance = np.array([[[0.5, 0.4, 0], [0.4, 0.6, 0], [0, 0, 1]], [[0.5, -0.3, 0], [-0.3, 0.2, 0], [0, 0, 1]]])
     h = 1e-6

@@ -107,7 +107,7 @@ def test_the_layout_of_every_combination_of_parts():
 @pytest.mark.parametrize("ax", [0.1, -4.0])
 @every_set
 def test_a_step_is_that_of_the_equations_to_the_second_order(names, ax):
-    """From 20 ms to 5 ms; what is left of first order (bank, force scale, load transfer) shows far below that."""
+    """For steps of 20 ms to 5 ms. First-order terms (bank, force scale, load transfer) only matter below 5 ms."""
     oracle, steer, mu, whole_s = Oracle(parts(*names), imu=IMU), 0.03, 0.8, 0.2
     x, v = state_of(oracle, steer, ax, mu), oracle.as_vehicle()
     want = oracle.after(x, steer, ax, mu, whole_s)
@@ -138,7 +138,7 @@ def test_at_low_speed_it_rolls_without_slip(names, speed):
 
 @pytest.mark.parametrize(("vx", "vy", "r", "steer"), [(25.0, 0.4, -0.2, 0.03), (12.0, -0.3, 0.4, -0.05)])
 def test_without_parts_it_is_the_nominal_model(vx, vy, r, steer):
-    """No lag: the force is the tyres' force, the sensor's a_y that of the nominal model with roll."""
+    """Without lag, the filter uses the tyre forces directly, and its a_y equals the nominal model with roll."""
     v = vehicle(imu_position_m=(*IMU, 0.0))
     p, f, layout = model_parameters(v, roll_correction=True), physics_parameters(v), layout_of(v)
     x = settled(v, [vx, vy, r, 0.0, 7.0, -7.0], steer)
@@ -185,7 +185,7 @@ def test_a_force_builds_up_over_the_relaxation_length(speed, length):
 @pytest.mark.parametrize("ay", [0.0, 3.0, -6.0, 30.0])
 @pytest.mark.parametrize("sensitivity", [0.0, 0.2])
 def test_load_transfer_takes_a_share_of_its_square(ay, sensitivity):
-    """Two wheels in closed form: the whole of it for a stiffness, what steady cornering has not for a formula."""
+    """Two wheels in closed form. A stiffness takes the full loss; a tyre formula already includes steady cornering."""
     x = min(1.0, 2.0 * CG_HEIGHT_M * abs(ay) / (G * TRACK_M))
     two_wheels = 0.5 * ((1 + x) * (1 - sensitivity * x) + (1 - x) * (1 + sensitivity * x))
     stiff = AxleTyre(cornering_stiffness_n_per_rad=105_000.0)
@@ -193,7 +193,7 @@ def test_load_transfer_takes_a_share_of_its_square(ay, sensitivity):
     plain = np.array([25.0, 0.3, -0.1, 0.0, 0.0, 0.0, 0.0105 * ay, 0.0])
 
     def asked(v: VehicleParameters) -> np.ndarray:
-        """Forces of a car that leans as at ``ay``, in a step in which nothing else moves."""
+        """Return the axle forces at the roll angle for ``ay``, after a step too short to change other states."""
         return moved(v, plain, HeldInputs(0.02, 0.0, True, FRICTION), 1e-9)[4:6]
 
     tyres = Tyres(front=stiff, rear=stiff)
@@ -223,7 +223,7 @@ def test_braking_moves_load_and_takes_grip(ax, mu):
 
 @pytest.mark.parametrize("names", [("roll",), ("lag", "roll", "load_transfer")], ids="+".join)
 def test_roll_settles_where_the_springs_hold_it(names):
-    """φ = G a_y; the sensor then reads what it reads of a car without a roll mode."""
+    """In steady state φ = G a_y, and the sensor reads the same as on a car without a roll mode."""
     v = vehicle(*names)
     x = np.zeros(layout_of(v).size)
     x[0] = 20.0
@@ -243,7 +243,7 @@ def test_roll_settles_where_the_springs_hold_it(names):
 
 
 def test_a_car_that_does_not_lean_has_the_load_transfer_of_its_acceleration():
-    """A roll gradient of 0 tells nothing of the load transfer and divides by nothing."""
+    """With a roll gradient of 0, the load transfer follows from a_y, without a division by zero."""
     v = vehicle("roll", "load_transfer", roll_gradient_rad_per_m_s2=0.0)
     flat = vehicle("load_transfer", roll_gradient_rad_per_m_s2=0.0)
     x = np.array([25.0, 0.3, -0.1, 0.0, 3.0, 2.0])
@@ -299,7 +299,7 @@ def spread(layout, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def drawn(layout, x: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What _draw writes, [16, WIDTH], and the places of the state's entries."""
+    """Return the sigma points of _draw, [16, WIDTH], and the positions of the state's entries."""
     places, wide = places_of(layout), np.zeros(PLACES)
     P_wide, L, points = np.zeros((PLACES, PLACES)), np.zeros((PLACES, PLACES)), np.zeros((16, WIDTH))
     wide[places], P_wide[np.ix_(places, places)] = x, P
@@ -422,7 +422,7 @@ def test_posteriors_agree_with_filterpy(names):
     s.yaw_rate_rad_s[1:][rng.random(len(s) - 1) < 0.1] = np.nan
     s.friction[:] = np.where(np.arange(len(s)) < 200, 0.85, 0.8)
     s = replace(s, speed_m_s=np.where(np.arange(len(s)) % 3 == 0, s.speed_m_s, np.nan))
-    oracle = Oracle(parts(*names), imu=(0.4, 0.0))  # no r²: what is read is then linear, and both updates are one
+    oracle = Oracle(parts(*names), imu=(0.4, 0.0))  # without r² the measurement is linear and both updates agree
     estimator = PhysicsFilter(oracle.as_vehicle(), r_std=R_STD)
     steps, _ = estimator.run(s, None)
     x, P, nis = filterpy_run(s, estimator, oracle)
@@ -547,7 +547,7 @@ def test_the_parts_that_a_car_has_are_worth_having(names, without, share):
 
 
 def test_beyond_the_linear_range_kinematics_count_more():
-    """With tyres half as stiff in the file the error at the limit is lower; in the linear range nothing changes."""
+    """With half the tyre stiffness in the file, the error at the limit is lower; the linear range does not change."""
     oracle = Oracle(parts("lag"))
     v = oracle.as_vehicle()
     tyres = Tyres(**{name: tyre.model_copy(update={"B": 0.5 * tyre.B}) for name, tyre in v.tyres})
@@ -591,7 +591,7 @@ def test_forces_of_the_axles_are_found():
 
 @pytest.mark.parametrize("bias", [{"ay_m_s2": 0.15}, {"steer_rad": 0.0016}])
 def test_a_bias_is_found_and_its_removal_helps(bias):
-    """Each alone: together, or from the gyro's, they cannot be told apart while nothing stands."""
+    """Each bias alone. Two biases, or a bias and the gyro's, are not distinguishable while the car moves."""
     oracle = Oracle(parts("lag"))
     made = oracle.drive(slalom(0.03, 0.5), 25.0, n=2)
     noisy = with_noise(made.signals, 4)

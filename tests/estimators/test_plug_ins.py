@@ -1,4 +1,4 @@
-"""An estimator of another package that misbehaves is named, and costs nothing but its own estimates."""
+"""A faulty estimator of another package is named in the error; only its estimates are lost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The band of an identified car: what its drives left open of its parameters, and what the sensors contradict."""
+"""The interval of an identified car: parameter uncertainty after identification, and sensor residuals."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ NOISE = FilterNoise(r_std={"ay_m_s2": 1.0})
 
 
 def identified(share: float = 0.1) -> Car:
-    """Return a car whose rear stiffness and steering offset are known to a share of it and of a radian."""
+    """Return a car with uncertain parameters: rear stiffness by ``share``, steering offset by 0.05 ``share`` rad."""
     rear = OWN.tyres.rear
     assert rear.B is not None
     softer = OWN.tyres.model_copy(update={"rear": rear.model_copy(update={"B": rear.B * (1.0 - share)})})
@@ -77,7 +77,7 @@ def test_no_estimate_changes(signals: Signals) -> None:
 
 
 def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
-    """What the filter does on the other vehicles counts without the states that would cure them."""
+    """The filter runs on the varied vehicles without the states that would compensate the variation."""
     car = identified()
     (plain,), (wide,) = banded(car, signals)
     bare = {"physics": PARTS.model_copy(update={"force_scale": False})}

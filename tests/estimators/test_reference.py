@@ -1,4 +1,4 @@
-"""The sideslip reference: against an independent car, its own intervals, dense matrices, and what it must refuse."""
+"""The sideslip reference: comparison with an independent car and dense matrices, interval coverage, rejected inputs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ START_NS = 1_700_000_000_000_000_000
 
 @dataclass(frozen=True)
 class Driven:
-    """A linear car (mass 1500 kg, I_z 2400 kg m²) whose tyres lose two thirds of their grip beyond a slip angle."""
+    """A linear car (mass 1500 kg, I_z 2400 kg m²) with two thirds less tyre grip beyond a slip angle."""
 
     signals: Signals
     vx: FloatArray
@@ -174,7 +174,7 @@ def test_a_drive_with_an_implausible_sensor_is_refused_with_the_parameter(change
 
 @pytest.mark.parametrize("moved_m", [-1.7, -0.5, 1.0])
 def test_where_nothing_states_the_accelerometer_the_interval_contains_its_lever(moved_m):
-    """The estimate itself is that of the file: a free position explains what the axle law lacks."""
+    """The estimate uses the position from the file, because a free position would absorb errors of the axle law."""
     driven = SLALOM
     t = driven.signals.stamps_ns * 1e-9
     turning = np.gradient(np.gradient(driven.heading, t - t[0]), t - t[0])
@@ -315,8 +315,8 @@ _OVER_THE_OFFSET = {
     smoother.YAW_RATE_BIAS,
     smoother.YAW_RATE_GAIN,
 }
-#: What is left out of the transition: errors of the gyro in the centripetal term and in the tilt, and of accelerations
-#: in the position.
+#: Error terms that the transition neglects: gyro errors in the centripetal term and in the tilt, and acceleration
+#: errors in the position.
 _SECOND_ORDER = {smoother.YAW_RATE_BIAS, smoother.YAW_RATE_GAIN} | (_OVER_THE_OFFSET - {smoother.HEADING})
 
 

@@ -46,7 +46,7 @@ def calibrated(vehicle: VehicleParameters = FOUND, *, told_friction: bool = True
 
 
 def with_band(share: float = 0.1, d2_m_s: float = 0.1) -> Car:
-    """Return a calibrated car whose steering offset and rear stiffness are known to a share of a radian and of it."""
+    """Return a calibrated car with uncertain rear stiffness (``share``) and steering offset (0.05 ``share`` rad)."""
     rear = FOUND.tyres.rear
     assert rear.B is not None
     softer = FOUND.tyres.model_copy(update={"rear": rear.model_copy(update={"B": rear.B * (1.0 - share)})})
@@ -149,7 +149,7 @@ def test_what_is_known_less_has_the_wider_band(wider: dict[str, float], signals:
 
 
 def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
-    """The parameters' part is what the filter does on the other vehicles; d2's is a velocity."""
+    """The parameter part is the spread of the filter over the varied vehicles; the d2 part is a velocity."""
     (plain,), (alone,), (both,) = (
         tracks("physics", car, signals) for car in (calibrated(), with_band(d2_m_s=0.0), with_band(d2_m_s=0.1))
     )

@@ -1,4 +1,4 @@
-"""A car that calibrates itself: what it recovers of a car that is known, and when it refuses."""
+"""Self-calibration: recovered parameters of a known car, and rejected drives."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RIGHT = default_vehicle()
 
 
 def wrong(front: float, rear: float, vehicle: VehicleParameters = RIGHT) -> VehicleParameters:
-    """Return a vehicle whose axles are stiffer by factors; peaks stay."""
+    """Return a vehicle with the axle stiffness multiplied by factors and unchanged peak forces."""
 
     def of(tyre: AxleTyre, factor: float) -> AxleTyre:
         assert tyre.B is not None
@@ -229,7 +229,7 @@ def test_a_pool_knows_more_than_each_of_its_logs() -> None:
 
 
 def test_a_pool_states_what_its_drives_differ_in() -> None:
-    """A steering offset in one of three drives widens that of the pool, beyond the offset of each drive."""
+    """A steering offset in one of three drives widens the pooled posterior to include the offset of every drive."""
     parts = [with_noise(cut(wide().signals, a, a + 2000), a) for a in (0, 2000, 4000)]
 
     def offset(*added_rad: float) -> tuple[float, float]:
@@ -257,7 +257,7 @@ def test_any_losses_give_a_grid_whose_stretches_are_whole(seed: int, share: floa
 
 
 def test_the_vehicles_of_the_band_spread_as_the_posterior_does() -> None:
-    """Together no more than the posterior of each parameter, and most of that of a stiffness, which moves the car."""
+    """Their joint spread is 70 % to 105 % of the posterior standard deviation of the cornering stiffness."""
     calibration = found(with_noise(wide().signals, 3), wrong(2.0, 0.5))
     assert len(calibration.varied) == 5
     by = {p.name: p for p in calibration.parameters}

@@ -1,4 +1,4 @@
-"""The fault detector: what it must see, how fast, and above all what it must not take for a fault."""
+"""The fault detector: detected faults, detection times, and above all no false alarms."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_a_car_rougher_than_its_file_is_healthy_from_the_start(factor):
 
 @pytest.mark.parametrize("channel", CHANNELS)
 def test_a_short_burst_is_weighted_down_and_not_reported(channel, clean):
-    """A kerb; what is reported has to last."""
+    """For example a kerb: the detector only reports lasting faults."""
     t = times(clean)
     noise = 8.0 * S0[channel] * np.random.default_rng(0).standard_normal(len(t))
     result = found(with_column(clean, channel, (t > 5.0) & (t < 5.15), getattr(clean, COLUMNS[channel]) + noise))
@@ -156,7 +156,7 @@ def test_a_short_burst_is_weighted_down_and_not_reported(channel, clean):
 @pytest.mark.parametrize("amplitude", [0.02, 0.06])
 @pytest.mark.parametrize("frequency", [0.2, 0.7, 2.0])
 def test_a_slow_model_error_does_not_raise_r(amplitude, frequency):
-    """Another car than the file's, to its grip limit: the innovations are large, and nothing is wrong with a sensor."""
+    """Drive another car than the file's to its grip limit: innovations are large, but no sensor has a fault."""
     s = with_noise(drive(slalom(amplitude, frequency), 12.0, speed=24.0, tyre=tanh_tyre, mu=0.7).signals, seed=3)
     s.friction[:] = 1.0
     result = found(s)
@@ -171,7 +171,7 @@ def test_a_biased_channel_is_not_noisy(clean):
 
 @pytest.mark.slow
 def test_a_rough_car_becomes_usual():
-    """Five times the file's noise from 10 s on: a burst at first, what this car is like in the end."""
+    """The noise is five times the file's from 10 s on: first a burst, later the normal state of this car."""
     s = with_noise(drive(slalom(0.02, 0.3), 100.0, speed=20.0).signals, seed=1)
     t = times(s)
     more = np.where(t > 10, 5 * S0[0], 0.0) * np.random.default_rng(0).standard_normal(len(s))

@@ -121,7 +121,7 @@ def test_agrees_with_filterpys_smoother_on_a_linear_system(seed):
 
 
 def test_time_reversed_it_smooths_to_the_same():
-    """A random walk is the same model in both directions, and nothing is known beforehand."""
+    """A random walk has the same model in both directions, and the prior is uninformative."""
     rng = np.random.default_rng(4)
     n, count = 4, 80
     z = np.cumsum(rng.normal(size=(count, n)), axis=0)
@@ -146,7 +146,7 @@ def test_what_a_standstill_overwrites_tells_nothing_of_before_but_the_biases_do(
     want = fP[29] + G @ (P[30] - predicted[30])[keep_, keep_] @ G.T
     np.testing.assert_allclose(P[29], want, atol=1e-10)
     changed = [r.copy() for r in rows]
-    changed[0][30:, :AX_BIAS] += 5.0  # the overwritten states, and nothing else, at and behind the standstill
+    changed[0][30:, :AX_BIAS] += 5.0  # only the overwritten states, at and after the standstill
     kind[31] = LINK_NONE
     a, _ = smooth_steps(*linear_steps(*rows, kind), 60, 0, ALL * NS)
     b, _ = smooth_steps(*linear_steps(*changed, kind), 60, 0, ALL * NS)
@@ -385,7 +385,7 @@ def test_without_a_fault_it_is_what_it_is_without_the_detector(slalom_drive):
     assert not track.reason.any()
     assert (track.r_scale == 1.0).all()
     properties.same_bits(track, unchecked(estimator, slalom_drive.signals))
-    for seed in range(4):  # false alarms cost next to nothing
+    for seed in range(4):  # false alarms hardly change the estimate
         signals = with_noise(slalom_drive.signals, seed)
         a, _ = run_window(estimator, signals)
         away = np.abs(a.sideslip_rad - unchecked(estimator, signals).sideslip_rad)
@@ -416,7 +416,7 @@ def test_a_faulty_gyro_costs_little_and_is_told(slalom_drive, kind):
 
 
 def test_it_starts_from_what_the_adaptive_filter_starts_from(faulty):
-    """The reasons are those of pd-hef, at the step itself; a factor on R is over this filter's own."""
+    """The smoother uses the reasons of pd-hef without delay. Factors on R multiply the R of this filter."""
     estimator = smoother(r_std=(0.5, 0.006, 0.08))
     track, _ = run_window(estimator, faulty)
     adaptive, _ = run_window(estimator.filtered, replace(faulty, ready_ns=faulty.stamps_ns), None)
@@ -426,7 +426,7 @@ def test_it_starts_from_what_the_adaptive_filter_starts_from(faulty):
 
 
 def test_its_weights_know_what_comes_later():
-    """The grip is a quarter less than told: the filter has to find out, and the smoother knows from the start."""
+    """The true grip is 25 % lower than the input. The filter adapts over time, the smoother from the start."""
     made = drive(slalom(0.035, 0.5), 12.0, speed=22.0, mu=0.75 * 0.85)
     signals = with_noise(made.signals, 0)
     signals.friction[:] = 0.85

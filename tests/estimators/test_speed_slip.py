@@ -1,4 +1,4 @@
-"""The speed of wheels that spin or lock is kept from the filters; nothing else is."""
+"""Speed gating: the filters receive no speed from spinning or locked wheels, but every other speed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def start_and_stop(t: np.ndarray) -> np.ndarray:
 
 
 def spin(t: np.ndarray, at: float = 2.0, length: float = 2.5, size: float = 10.0) -> np.ndarray:
-    """What spinning wheels turn too fast, m/s: up, and down again."""
+    """Return the excess speed of spinning wheels, m/s: one half sine."""
     return size * np.sin(np.pi * np.clip((t - at) / length, 0.0, 1.0)) ** 2
 
 
@@ -68,7 +68,7 @@ def test_spinning_wheels_are_not_believed(good, size):
     slipping = replace(good.signals, speed_m_s=good.signals.speed_m_s + spin(good.time_s, size=size))
     out = believed(slipping)
     error = np.abs(out - good.vx)
-    assert np.nanmax(error) < 2.0  # the bound, and what the tolerance has grown
+    assert np.nanmax(error) < 2.0  # the bound plus the growth of the tolerance
     lasts = (good.time_s > 2.8) & (good.time_s < 3.8)
     assert np.isnan(out[lasts & np.isfinite(slipping.speed_m_s)]).all()
     away = (good.time_s < 2.0) | (good.time_s > 5.5)
@@ -213,7 +213,7 @@ def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(maker, g
 
 
 def test_slip_that_is_seen_only_as_it_ends_is_no_lock(good):
-    """Wheels come to spin slowly and grip at once: the fall of their speed is no reason to believe what was before."""
+    """Wheels start to spin slowly and then regain grip at once. Their sudden deceleration is not a wheel lock."""
     t = good.time_s
     slow = np.clip(2.0 * (t - 2.0), 0.0, 4.0) * (t < 4.2)
     recovering = replace(good.signals, speed_m_s=good.signals.speed_m_s + slow)

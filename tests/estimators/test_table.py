@@ -1,4 +1,4 @@
-"""The table of estimators: every line builds what it says, and what runs under a name is told from the object."""
+"""The table of estimators: every row builds its estimator, and the identity follows from the estimator object."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ pytestmark = pytest.mark.slow
 VEHICLE = default_vehicle()
 NOISE = FilterNoise(q_std=(0.1, 0.2, 0.1), r_std={"ay_m_s2": 0.9})
 EVIDENCE = Trust(trust_cap=1.0, evidence="a drive of 300 s")
-#: But for what runs on a car that its log has calibrated (``test_self_calibrated``).
+#: All rows except the estimator on a self-calibrated car (``test_self_calibrated``).
 LINES = tuple(s for s in all_specs() if s.name != OPEN_LOOP)
 every_spec = pytest.mark.parametrize("spec", LINES, ids=lambda spec: spec.name)
 
@@ -95,7 +95,7 @@ def test_a_line_builds_what_it_says(spec: Any) -> None:
 
 @every_spec
 def test_what_it_needs_is_what_it_needs(spec: Any, signals: Signals) -> None:
-    """It runs on that alone; without any of it, it is skipped and says why; and none of it is asked for in vain."""
+    """An estimator runs with only its required signals, is skipped if one is missing, and uses every one of them."""
     dt = np.diff(signals.stamps_ns) * 1e-9
     given = spec.needs | frozenset(sorted(spec.one_of)[-1:])  # with the yaw rate, where any lateral signal will do
     bare = make_signals(dt, **{c: getattr(signals, c) for c in given})
@@ -198,9 +198,9 @@ def test_options_of_a_name_are_combined() -> None:
     assert [s.name for s in skipped] == ["pd-hef:gain=0.5"]
 
 
-# --- what runs under a name ------------------------------------------------------------------------------------------
+# --- algorithm of each name ------------------------------------------------------------------------------------------
 
-#: Nothing of the car but its signals.
+#: Estimators that use signals only, without vehicle parameters.
 SENSORS_ALONE = ("zero", "zero:no-lateral", "kinematic")
 
 
@@ -226,7 +226,7 @@ def test_the_name_of_a_car_changes_no_algorithm_and_its_physics_do(spec: Any) ->
     for changes in ({"name": "ours"}, {"truth_position_m": (1.0, 0.0, 0.0)}):
         assert ran(spec.name, replace(CAR, vehicle=other(**changes))) == was
     heavier = ran(spec.name, replace(CAR, vehicle=other(mass_kg=1500.0)))
-    assert heavier.identity == was.identity  # intervals are found, and their note says what is other
+    assert heavier.identity == was.identity  # intervals apply, and their note names the difference
     assert (heavier.physics_sha256 != was.physics_sha256) == (spec.name not in SENSORS_ALONE)
     assert (heavier.sha256 != was.sha256) == (spec.name not in SENSORS_ALONE)
     assert (was.physics_sha256 is None) == (spec.name in SENSORS_ALONE)
@@ -278,7 +278,7 @@ def intervals_for(*algorithms: Algorithm, factor: float = 2.0) -> Intervals:
 
 
 def with_intervals(car: Car, intervals: Intervals, signals: Signals) -> tuple[float, Sequence[str]]:
-    """Return by how much the intervals widen the sideslip's 1-sigma of pd-hef, and what is said of it."""
+    """Return the factor by which intervals widen the 1-sigma sideslip of pd-hef, and the notes."""
     estimator = make_estimator("pd-hef", car)
     track, _ = run_window(estimator, signals)
     applied = calibrator(replace(car, intervals=intervals), [estimator])
