@@ -50,7 +50,7 @@ from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
 from pdhef_logtool.storage import outputs
 from pdhef_logtool.storage.documents import digest
 
-#: A person's file: with comments, an order of its own, and a line that is set apart.
+#: A vehicle file written by hand: with comments, entries in any order, and a blank line.
 PERSONS = """# My car, weighed on 3 May.
 mass_kg = 1440.0            # with driver
 name = "mine"
@@ -206,7 +206,7 @@ def test_a_cars_network_may_be_its_own_or_named_by_the_cars_folder(folder: Path,
     assert other.network.sha256 == car.network.sha256
 
 
-# --- what was found through physics --------------------------------------------------------------------------------
+# --- parameters identified with physics -----------------------------------------------------------------------------
 
 FOUND = FittedPhysics(
     values=FittedValues(
@@ -318,7 +318,7 @@ def test_what_is_no_physics_makes_nothing_stale(folder: Path, old: str, new: str
 
 
 def test_an_entry_that_a_later_version_adds_makes_no_car_stale(tmp_path: Path) -> None:
-    """What stands at its default is as if it were absent; what follows from mass and wheelbase counts as given."""
+    """The hash omits entries with default values, and includes entries computed from mass and wheelbase."""
     (tmp_path / "mine.toml").write_text(PERSONS)
     entries, _ = completed(tomllib.loads(PERSONS))
     defaults = {k: f.default for k, f in VehicleParameters.model_fields.items()}
@@ -377,7 +377,7 @@ def test_trust_changes_no_physics_so_that_intervals_stay_those_of_the_car(folder
     assert not any("intervals" in note for note in load(folder).notes)  # they are not in force
 
 
-# --- what is refused -------------------------------------------------------------------------------------------------
+# --- rejected inputs -------------------------------------------------------------------------------------------------
 
 
 def test_a_network_is_no_car(tmp_path: Path) -> None:
@@ -473,7 +473,7 @@ def test_a_bare_file_and_the_default_car_become_folders(tmp_path: Path) -> None:
 
 
 def test_what_the_output_knows_of_the_car_stays(folder: Path, tmp_path: Path) -> None:
-    """The bare file of the same car is named: its folder keeps what other commands found."""
+    """For a bare file of the same car, the output folder keeps the results of other commands."""
     fit = add_fit(folder)
     shutil.copy(folder / VEHICLE_FILE, tmp_path / "mine.toml")
     update_car(load(tmp_path / "mine.toml"), folder, noise_change(NEW))

@@ -1,4 +1,4 @@
-"""Offsets and biases of the vehicle file come off the signals: what a sensor reads too much is taken away."""
+"""Offsets and biases of the vehicle file are subtracted from the signals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from reference_car import drive, slalom
 from pdhef_logtool.car.vehicle import Sensors, VehicleParameters, correct_signals, corrected_anew, default_vehicle
 from pdhef_logtool.records.signals import Signals
 
-#: By signal, what its sensor reads too much; all different, so that none can stand in for another.
+#: Sensor bias per signal; all values differ, so that a swapped bias is detected.
 TOO_MUCH = {"steer_rad": 0.011, "ax_m_s2": 0.21, "ay_m_s2": -0.37, "yaw_rate_rad_s": 0.0053}
 CAR = default_vehicle().model_copy(
     update={

@@ -1,4 +1,4 @@
-"""The JSON Schemas of a car's parts are what their models say; ``PDHEF_UPDATE_SCHEMAS=1`` writes them anew."""
+"""The JSON Schemas of a car's parts match their models; ``PDHEF_UPDATE_SCHEMAS=1`` regenerates them."""
 
 from __future__ import annotations
 

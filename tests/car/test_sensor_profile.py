@@ -1,4 +1,4 @@
-"""A sensor profile replaces the sensors of a car, changes what each of its entries is about, and is in the records."""
+"""A sensor profile replaces the sensors of a car. Each entry affects its signals, and a run records the profile."""
 
 from __future__ import annotations
 

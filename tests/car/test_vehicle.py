@@ -1,4 +1,4 @@
-"""The vehicle file: what it accepts, and how it says what is wrong."""
+"""The vehicle file: accepted entries and error messages."""
 
 from __future__ import annotations
 
@@ -196,14 +196,14 @@ def test_relations_find_a_slip_that_the_ranges_let_pass(tmp_path, entry, factor,
 
 
 def test_a_small_car_needs_no_height_track_or_speed_limit(tmp_path):
-    """What a 1:10 car leaves out follows from its wheelbase."""
+    """Missing dimensions of a 1:10 car are derived from its wheelbase."""
     text = (FILES / "f1tenth.toml").read_text().replace("track_m", "# track_m").replace("cg_height_m", "# cg_height_m")
     vehicle = read_vehicle_file(write(tmp_path, text)).vehicle
     assert 0.1 < vehicle.track_m < 0.3
     assert 0.03 < vehicle.cg_height_m < 0.1
 
 
-#: Published values: mass, yaw inertia, l_f, l_r, stiffness of the axles, what else is known.
+#: Published values: mass, yaw inertia, l_f, l_r, stiffness of the axles, other parameters.
 CARS = {
     "GTI": (1926.2, 2763.49, 1.264, 1.367, 80e3, 120e3, {"steering_ratio": 1, "wheel_radius_m": 0.318}),
     "TT-S": (1466.9, 2235, 1.018, 1.450, 200e3, 160e3, {"steering_ratio": 1, "friction": 1.2, "track_m": 1.554}),
