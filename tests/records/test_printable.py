@@ -1,4 +1,4 @@
-"""What comes from outside on its way to a person."""
+"""Printing of text from input files: control characters and markup are escaped."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_an_inspection_of_hostile_names_is_plain(
     schema = writer.register_schema(topic, "jsonschema", b'{"properties": {"x": {"type": "number"}}}')
     writer.add_message(writer.register_channel(topic, "json", schema), 5, b'{"x": 1}', 5)
     writer.finish()
-    # A file name that is no UTF-8, with what would be a colour in a table.
+    # A file name that is not valid UTF-8 and contains color markup.
     path = tmp_path / "a\n\x1b[31m[/red]\udcff.mcap"
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(stream.getvalue())
