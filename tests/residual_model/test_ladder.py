@@ -41,7 +41,7 @@ def features(signals: np.ndarray) -> SlowFeatures:
 
 
 def taught(seconds: float, seed: int, lacking: object = None, noise_rad: float = 0.002) -> TaughtDrive:
-    """Return a drive whose error is a function of its features, with slow noise and a constant."""
+    """Return a drive with an error that depends on its features, plus slow noise and a constant."""
     found = features(driving(seconds, seed))
     rng = np.random.default_rng(seed + 100)
     noise = np.convolve(rng.normal(size=len(found.odd) + 24), np.ones(25) / 5.0, "valid") * noise_rad
