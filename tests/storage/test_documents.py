@@ -110,7 +110,7 @@ def write(path: Path, document: Any) -> Path:
 
 
 def outcome(loader: Loader, path: Path) -> str:
-    """Return the line of a refused document, empty for one that is taken; anything else fails the test."""
+    """Return the error line of a rejected document, or an empty string for an accepted one; fail on other outcomes."""
     try:
         loader.load(path)
     except PdhefError as error:
@@ -299,7 +299,7 @@ def test_misspelt_entries_are_told_with_the_nearest_name(loader: Loader, line: s
 
 
 def test_hashes_that_stand_in_files_stay_what_they_were() -> None:
-    """Of version 0.2.0: journals, caches, datasets and cars name by them what they rest on."""
+    """Hashes of version 0.2.0. Journals, caches, datasets and cars identify their sources by these hashes."""
     document = {"b": [1, 2.5, None, True], "a": {"ü\udc80": "/", "": (1e-9, 1e22)}}
     assert digest(document) == "67b92e78790c0c9feafdf6c5b26ff7e18525bc442921e21ed792a5d1dbcc28d6"
     assert digest_of(document) == "67b92e78790c0c9f"

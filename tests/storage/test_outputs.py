@@ -162,7 +162,7 @@ def test_whichever_call_fails_one_of_the_two_is_whole(
         new = {**OLD, "a.txt": "new a", "notes.txt": "mine"}
         assert found in ({**OLD, "notes.txt": "mine"}, new), number
         assert found == new or not done
-        FolderTransaction(folder).discard()  # the next command sweeps what a failing clean-up has left
+        FolderTransaction(folder).discard()  # the next command removes the remains of a failed clean-up
         assert [p.name for p in folder.parent.iterdir()] == ["x"], number
     assert number > 8
 
@@ -170,7 +170,7 @@ def test_whichever_call_fails_one_of_the_two_is_whole(
 def test_a_kill_between_the_two_renames_is_repaired(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make(tmp_path / "logs" / "x", OLD)
     child = os.fork()
-    if child == 0:  # dies as a killed process does: nothing is cleaned up
+    if child == 0:  # ends like a killed process, without clean-up
         outputs._exchanged = lambda *_: False
         rename = Path.rename
 

@@ -1,4 +1,4 @@
-"""TOML that we write is what tomllib reads."""
+"""tomllib reads written TOML back unchanged."""
 
 from __future__ import annotations
 
