@@ -1,4 +1,4 @@
-"""What goes wrong in a worker, on purpose: a work for the supervisor, whose items say what is to happen."""
+"""Fault injection for workers: each work item selects the fault."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ called: list[int] = []
 
 
 def note_call() -> None:
-    """Be called by the fork server."""
+    """Record a call by the fork server."""
     called.append(os.getpid())
 
 
@@ -27,7 +27,7 @@ DEATHS, MOST_DEATHS = "PDHEF_TEST_DEATHS", "PDHEF_TEST_MOST_DEATHS"
 
 
 def die_at_start() -> None:
-    """Kill the fork server while it loads, so often."""
+    """Kill the fork server while it loads, as many times as the environment requests."""
     file = Path(os.environ[DEATHS])
     if len(file.read_bytes()) < int(os.environ[MOST_DEATHS]):
         with file.open("ab") as opened:
@@ -36,14 +36,14 @@ def die_at_start() -> None:
 
 
 class Odd:
-    """A result that does not travel."""
+    """A result that cannot be pickled."""
 
     def __reduce__(self) -> tuple[object, ...]:
         raise TypeError("not me")
 
 
 class Unreadable:
-    """A result, or an item, that travels and cannot be opened."""
+    """A result or item that can be pickled but not unpickled."""
 
     def __reduce__(self) -> tuple[object, ...]:
         return (_burst, ())
@@ -54,7 +54,7 @@ def _burst() -> None:
 
 
 def planted(item: Item, tell: Tell) -> object:
-    """Do what the item says."""
+    """Run the fault or action that the item selects."""
     what, value = item
     tell(f"at {what}", 0.5)
     if what in _FAULTS:
@@ -119,7 +119,7 @@ def _raise(_value: str, _tell: Tell) -> None:
 
 
 def _cut(_value: str, _tell: Tell) -> None:
-    """Write half a message and then nothing, as when it is stopped while it writes."""
+    """Write half a message and then wait, like a worker stopped during a write."""
     files = [f for f in Path("/proc/self/fd").iterdir() if int(f.name) > 2 and f.is_socket()]
     for file in files:
         os.write(int(file.name), (1000).to_bytes(4, "big") + b"half")

@@ -1,4 +1,4 @@
-"""A Ray cluster on this machine, whose nodes can be lost."""
+"""A Ray cluster on this machine with nodes that tests can kill."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 _NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
-#: What a node may take to start, on a machine that does other things too.
+#: Time limit for the start of a node, with margin for a busy machine.
 START_S = 120.0
 
 

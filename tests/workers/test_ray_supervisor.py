@@ -47,7 +47,7 @@ def test_faults_end_on_a_node_as_they_do_here(cluster: Any) -> None:
 
 
 def test_a_node_that_is_lost_while_its_task_runs_costs_no_item(cluster: Any, tmp_path: Path) -> None:
-    """Every item notes where it begins, and waits; the node of one is killed, then the word is given to go on."""
+    """Every item records its process and waits. The test kills the node of one item, then releases all items."""
     nodes = grow(cluster)
     lost: list[Path] = []
 

@@ -1,4 +1,4 @@
-"""Workers under watch: what dies, hangs or grows costs its own item only, and is told."""
+"""Supervised workers: a worker that dies, hangs or exceeds its memory loses only its item; the run reports it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ REASONS = {
     "odd": "its result cannot be sent: TypeError: not me",
     "unreadable": "its result cannot be read: ValueError: burst",
 }
-#: What another try would not change.
+#: Faults that are not retried.
 FINAL = {"raise", "quit", "odd", "unreadable"}
 
 
