@@ -170,7 +170,7 @@ def test_seconds_in_the_bins_are_those_of_the_drive() -> None:
     drive = DriveSpec("step-steer", 100.0, 0.85, 1, 11.0).simulate()
     bins = time_in_bins_s(drive)
     assert list(bins) == list(BINS) == ["low", "middle", "high"]
-    # A second straight, then 4 m/s² of 8.3: half of what the friction allows.
+    # One second straight, then 4 m/s², half of the friction limit of 8.3 m/s².
     assert bins["low"] == pytest.approx(1.1, abs=0.15) and bins["middle"] == pytest.approx(9.9, abs=0.2)
     assert sum(bins.values()) == pytest.approx(11.01)
 

@@ -1,4 +1,4 @@
-"""Manoeuvres reach what they are for, spins and misses are reported, and bad requests are one clear line."""
+"""Manoeuvres reach their targets, spins and missed targets are reported, and invalid requests give a one-line error."""
 
 from __future__ import annotations
 
@@ -231,7 +231,7 @@ def test_a_road_is_ordinary_and_has_a_standstill(road: Drive) -> None:
     assert np.abs(truth["ay_m_s2"]).max() < 4.5 and np.abs(truth["ax_m_s2"]).max() < 3.5
     assert truth["vx_m_s"].max() * 3.6 < 113.0 and truth["vx_m_s"].min() > -0.15
     assert np.abs(truth["ay_m_s2"]).std() > 0.3  # it does have bends
-    # On a slope and a bank too: once the body has stopped rocking, nothing moves.
+    # The car is at rest once its body has stopped rocking, also on a slope and a banked road.
     for start, end in stops:
         still = slice(start + 200, end - 20)
         assert np.abs(truth["grade_rad"][still]).max() > 1e-3
@@ -248,7 +248,7 @@ def test_roads_are_those_of_town_country_and_motorway() -> None:
     assert limit[kinds["town"]].max() <= 55.0 and limit[kinds["motorway"]].min() > 80.0
     sharpest = {name: 1.0 / np.abs(course.curvature_1_m[rows]).max() for name, rows in kinds.items()}
     assert 7.0 < sharpest["town"] < 17.0 and 55.0 < sharpest["rural"] < 120.0 and sharpest["motorway"] > 300.0
-    # What a car would feel at the speed allowed is comfortable everywhere.
+    # The lateral acceleration at the speed limit is comfortable everywhere.
     assert (np.abs(course.curvature_1_m) * course.limit_m_s**2).max() < 3.7
     assert np.abs(course.grade_rad).max() <= 0.06 and np.abs(course.bank_rad).max() <= 0.0701
     assert np.std(course.grade_rad) > 0.01
@@ -281,7 +281,7 @@ def test_seeds_make_other_roads_and_other_noise_and_repeat(road: Drive) -> None:
 
 
 def test_a_spin_is_dropped_unless_asked_for() -> None:
-    # A car whose rear axle steers out of the bend oversteers.
+    # A car oversteers if its rear axle steers out of the bend.
     loose = Vehicle()._replace(rear_compliance_rad_per_n=-4e-5)
     with pytest.raises(SimulationError, match="--keep-spins") as caught:
         simulate_drive("dlc-3888-2", speed_km_h=70.0, vehicle=loose)

@@ -1,4 +1,4 @@
-"""Faults are what they are called, where and when they are said to be, and nowhere else."""
+"""Injected faults match their kind, signal and time interval; all other samples are unchanged."""
 
 from __future__ import annotations
 

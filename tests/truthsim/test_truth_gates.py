@@ -1,8 +1,8 @@
 """Credibility gates of the truth vehicle (docs/method.md#simulator), each with proof that it can fail.
 
-A gate is a function of a simulator and a car that asserts what physics or linear theory demands of Table 3's car.
-Each is run on the simulator as it is; then on simulators with an error put in, a wrong sign or a gain 10 % off, in a
-value of the car or in a line of the equations, and must fail on every one of them.
+A gate is a function of a simulator and a car. It asserts a result of physics or linear theory for the car of Table 3.
+Each gate must pass on the unmodified simulator. It must fail on every simulator with an injected error: a wrong sign or
+a gain error of 10 % in a value of the car or in a line of the equations.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ PACKAGE = Path(__file__).resolve().parents[2] / "truthsim"
 
 
 def near(value: object, wanted: float, *, rel: float = 0.0, within: float = 0.0) -> None:
-    """All of a value are near a number; NaN is near nothing."""
+    """Assert that all elements of a value are close to a number; NaN fails."""
     got = np.asarray(value, dtype=float)
     assert np.all(np.abs(got - wanted) <= rel * abs(wanted) + within), (got, wanted)
 
@@ -103,7 +103,7 @@ def left_is_right(simulate: Simulate, car: Vehicle) -> None:
 
 
 def steps_are_fine_enough(simulate: Simulate, car: Vehicle) -> None:
-    """A quarter of the step changes nothing beyond 1e-4, and the path is the integral of the velocity."""
+    """A quarter of the step changes results by less than 1e-4, and the path is the integral of the velocity."""
     steer = 0.02 * np.sin(2.0 * np.pi * np.arange(0.0, 4.0, 1e-3))
     coarse = simulate(open_loop(25.0, steer), DRY, vehicle=car, period_s=0.001)
     fine = simulate(open_loop(25.0, steer), DRY, vehicle=car, period_s=0.001, substeps=4)
@@ -153,7 +153,7 @@ def slope(motion: Motion, rows: np.ndarray, column: np.ndarray) -> float:
 
 
 def load_moves_as_statics_say(simulate: Simulate, car: Vehicle) -> None:
-    """Per axle that of springs, bars and tyres in series; in total the moment of the CG over the track."""
+    """Per axle, springs, bars and tyres act in series; the total equals the moment of the CG divided by the track."""
     motion, linear = slow_ramp(simulate, car)
     front = slope(motion, linear, 0.5 * (motion.column("fz_fr_n") - motion.column("fz_fl_n")))
     rear = slope(motion, linear, 0.5 * (motion.column("fz_rr_n") - motion.column("fz_rl_n")))
@@ -235,7 +235,7 @@ def a_banked_bend_presses(simulate: Simulate, car: Vehicle) -> None:
 
 
 def rolling_mass() -> float:
-    """Mass and what the turning wheels add to it."""
+    """Return the mass plus the equivalent mass of the rotating wheels."""
     return M + 2.0 * (1.6 + 1.2) / RADIUS**2
 
 
@@ -284,7 +284,7 @@ def torque_becomes_speed(simulate: Simulate, car: Vehicle) -> None:
 
 
 def standing_still_is_still(simulate: Simulate, car: Vehicle) -> None:
-    """A stop after a bend, and half a minute of it: nothing moves."""
+    """After a bend, the car stops and stays at rest for half a minute."""
     s = np.arange(0.0, 60.0, 0.5)
     speed = np.minimum(np.sqrt(2.0 * 2.0 * np.maximum(20.0 - s, 0.0)), 8.0)
     y = 0.02 * s**2 / 2.0

@@ -189,7 +189,7 @@ def test_manifest_lists_the_sample_logs_with_their_hashes(manifest: list[dict]) 
     assert sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) < 15_000_000
 
 
-#: Five minutes take too long to be read by these libraries, and the rosbag2 has a test of its own.
+#: These libraries need too long for a log of five minutes. The rosbag2 has a separate test.
 READABLE = [s for s in SAMPLES if s.file.endswith(".mcap") and s.file != "road.mcap"]
 
 
@@ -256,7 +256,7 @@ def test_write_samples_repeats_itself_bit_for_bit(tmp_path: Path, monkeypatch: p
         manifests.append((tmp_path / name / "manifest.toml").read_bytes())
     assert manifests[0] == manifests[1]
     assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["dlc.mcap", "manifest.toml", "step_rosbag2"]
-    write_samples(tmp_path / "a")  # over what is there
+    write_samples(tmp_path / "a")  # over existing files
     assert (tmp_path / "a" / "manifest.toml").read_bytes() == manifests[0]
 
 

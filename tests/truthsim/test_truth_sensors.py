@@ -24,7 +24,7 @@ from truthsim.vehicle import Vehicle
 
 G = 9.80665
 PHASES = (0.0, STEER_PHASE_S, WHEEL_PHASE_S)
-#: Sensors that err in nothing but delay, tilt, wheel slip and quantisation.
+#: Sensors with no errors except delay, tilt, wheel slip and quantisation.
 NO_NOISE = SensorNoise(
     acceleration_m_s2=0.0, yaw_rate_rad_s=0.0, steer_rad=0.0, wheel_speed_m_s=0.0, wheel_scale=0.0,
     acceleration_bias_m_s2=0.0, yaw_rate_bias_rad_s=0.0, steer_bias_rad=0.0,
@@ -283,7 +283,7 @@ def test_play_lets_the_steering_wheel_turn_alone_behind_a_reversal(lane_change: 
     turning = np.gradient(angle)
     through = np.abs(ahead) > play / 2.0 - 1e-12
     assert (np.sign(ahead[through][1:]) == np.sign(turning[through][1:])).mean() > 0.99
-    assert 0.05 < 1.0 - through.mean() < 0.2  # it goes through it four times, and slowly where the angle is largest
+    assert 0.05 < 1.0 - through.mean() < 0.2  # the angle crosses the play four times, slowly near its peaks
     assert ahead_by_play(angle, 0.0).max() == 0.0
     usual, loose = (
         sense(lane_change, Vehicle(), NO_NOISE._replace(steer_play_rad=p), 1, 100)["steering"].fields["steer_rad"]

@@ -1,4 +1,4 @@
-"""What the truth vehicle does beyond the gates: forces and accelerations, braking, wheel lift, other simulators."""
+"""The truth vehicle beyond the gates: forces and accelerations, braking, wheel lift, other simulators."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_geometry_is_table_3() -> None:
 
 
 def test_load_transfer_on_the_move_is_what_rolls_the_body(lane_change: Motion) -> None:
-    # Springs and dampers carry the sprung mass's moment less what turns it: m_s arm (a_y + g roll) - I d2roll/dt2.
+    # Springs and dampers carry the sprung mass's moment minus its inertia: m_s arm (a_y + g roll) - I d2roll/dt2.
     arm = (M * H_CG - 140.0 * 0.30) / 1300.0 - 0.10
     inertia = 480.0 + 1300.0 * arm**2 * 140.0 / M
     a_y, roll = lane_change.column("ay_m_s2"), lane_change.column("roll_rad")
@@ -65,8 +65,8 @@ def test_braking_loads_the_front_axle() -> None:
     rows = slice(200, 400)
     a_x, speed = motion.column("ax_m_s2")[rows], motion.column("vx_m_s")[rows]
     assert a_x.mean() < -1.5 and motion.column("pitch_rad")[rows].mean() > 0.0
-    # What stops the car acts at the road, what is stopped at the CG; the air pushes at the sprung mass's CG. The
-    # pitching body carries its own weight forward, and stopping wheels throw their turning on the front axle.
+    # Brake forces act at the road, inertia at the CG, and drag at the CG of the sprung mass. The pitching body moves
+    # its weight forward, and the deceleration of the wheels loads the front axle.
     height = (M * H_CG - 140.0 * 0.30) / 1300.0
     drag = 0.5 * 1.204 * 0.66 * speed**2
     wheels = sum(i * np.gradient(motion.column(f"spin_{w}_rad_s"), 0.01)[rows] for w, i in INERTIAS.items())
@@ -137,7 +137,7 @@ def test_a_wheel_leaves_the_road_and_comes_back() -> None:
     assert lifted.sum() > 50
     for name in ("fx_rl_n", "fy_rl_n"):
         assert np.all(motion.column(name)[lifted] == 0.0)
-    # In the air nothing but its own weight and its links pull a wheel, so it droops out of the suspension.
+    # In the air, only its weight and its links act on a wheel, so the suspension extends.
     assert motion.column("suspension_rl_m")[lifted].min() < -0.04
 
 
@@ -196,8 +196,9 @@ def check_bands(found: dict, bands: dict[str, tuple[float, float, float]]) -> No
 def test_an_independent_simulator_agrees(shared_dir, run: str, friction: float) -> None:
     """Same steering into another simulator's car of the same mass and geometry.
 
-    What is left has known causes (docs/truthsim.md): its tyres relax over 0.2 m (here 0.65 m), its rear axle is stiffer
-    for its load (hence less sideslip), its CG does not swing as the body rolls, and it has no anti-roll bars.
+    The differences have known causes (docs/truthsim.md). In the other simulator, the tyres relax over 0.2 m (here
+    0.65 m), the rear axle is stiffer for its load (hence less sideslip), the CG does not move with body roll, and
+    there are no anti-roll bars.
     """
     check_bands(
         against_another_simulator(shared_dir, run, friction, CAR),
@@ -210,7 +211,7 @@ def test_an_independent_simulator_agrees(shared_dir, run: str, friction: float) 
     )
 
 
-#: The sedan with what is known of the other's car: no bars, short relaxation, no compliance, its axle stiffness.
+#: The sedan with the known values of the other car: no bars, short relaxation, no compliance, its axle stiffness.
 LIKE_THE_OTHER = CAR._replace(
     front_anti_roll_n_m_per_rad=0.0,
     rear_anti_roll_n_m_per_rad=0.0,

@@ -1,4 +1,4 @@
-"""Vehicle files: what ships is sane, what is wrong is said in one line, and a randomised car is a car."""
+"""Vehicle files: shipped cars are plausible, an invalid file gives a one-line error, and randomised cars drive."""
 
 from __future__ import annotations
 
