@@ -1,4 +1,4 @@
-# Two commands do all the set-up: `make demo` and `make test`. They need Python 3.11+ and make, nothing else.
+# `make demo` and `make test` install everything that they need. They require only Python 3.11+ and make.
 
 PYTHON ?= python3
 VENV := .venv
@@ -6,13 +6,13 @@ BIN := $(VENV)/bin
 OUT ?= out/demo
 # The simulated car of the sample logs, with the filter noise that belongs to the shipped network.
 CAR := saloon
-# Test processes; the suite is bound by the processor.
+# Number of test processes; the suite is CPU-bound.
 JOBS ?= 2
-# What Python has compiled stays: each process would compile all tests and sources again.
+# Keep Python's bytecode; otherwise each process compiles all tests and sources again.
 unexport PYTHONDONTWRITEBYTECODE
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
-# A thread a process: threads that wait for each other are no faster than the processors, and they wait by counting.
-# Tests run in random order. The head of their output has the seed: make test ORDER_SEED=17 repeats an order.
+# One thread per process: OpenMP threads in parallel test processes compete for the cores and busy-wait.
+# Tests run in random order. The first lines of the output show the seed: make test ORDER_SEED=17 repeats an order.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(if $(ORDER_SEED),--randomly-seed=$(ORDER_SEED))
 
 .PHONY: help demo test quick fleet pages mutants mutants-fixed check lint format bench train-default samples conditions peers torture \
@@ -54,13 +54,13 @@ $(VENV)/installed: $(BIN)/python pyproject.toml constraints.txt
 	$(INSTALL) --editable .
 	@touch $@
 
-# dev, docs, release: what the extra of that name needs.
+# Dependencies of an extra: dev, docs or release.
 $(VENV)/installed-%: $(VENV)/installed
 	$(INSTALL) --editable '.[$*]'
 	@touch $@
 
-# The versions that CI and the container install; pyproject.toml has the ranges. CUDA packages belong to one build of
-# torch that nothing here needs.
+# The versions that CI and the container install; pyproject.toml has the ranges. CUDA packages are excluded: only
+# the CUDA build of torch needs them.
 lock: $(VENV)/installed-release
 	echo '# Written by `make lock` from pyproject.toml: pip install -c constraints.txt' >constraints.new
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --all-extras --no-header --no-annotate pyproject.toml \
@@ -77,7 +77,7 @@ demo: $(VENV)/installed $(VENV)/compiled
 	@echo "  logs/<log>/recording.rrd    open it with: $(BIN)/pdhef view $(OUT)"
 	@echo "  logs/<log>/report.json, estimates.parquet; metrics.parquet and run.json for the whole run"
 
-# Compiled code is kept under a digest of its sources: after an edit the next run compiles anew, or this does beforehand.
+# The key of the cache of compiled code is a digest of the sources. After an edit, this target or the next run compiles.
 $(VENV)/compiled: $(VENV)/installed $(wildcard pdhef_logtool/*.py pdhef_logtool/*/*.py pdhef_logtool/*/*/*.py truthsim/*.py)
 	$(BIN)/pdhef compile
 	@touch $@
@@ -93,17 +93,17 @@ pages: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.comparing
 	OMP_NUM_THREADS=1 $(BIN)/python tests/reports/screenshots.py
 
-# What takes too long for `make test`, or needs extras: Ray, S3.
+# Tests that take too long for `make test` or need extras: Ray, S3.
 fleet: $(VENV)/installed-dev $(VENV)/compiled
 	PDHEF_FLEET=1 $(PYTEST) -m fleet
 
-# Faults in the code that the tests should notice; each runs the tests until one fails. Hours for many that survive.
+# Mutation tests: each mutant runs the tests until one fails. Many surviving mutants take hours.
 SEED ?= 1
 COUNT ?= 30
 mutants: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python tests/mutants.py --seed $(SEED) --count $(COUNT) --jobs $(JOBS)
 
-# Faults that the tests are known to notice (tests/fixed_mutants.json): each runs its own test alone.
+# Mutants that the tests detect (tests/fixed_mutants.json); each mutant runs only its test.
 mutants-fixed: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python tests/fixed_mutants.py --jobs $(JOBS)
 
@@ -124,8 +124,8 @@ check: lint test
 bench: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.performance
 
-# studies/results/gates.csv has the figures. ONLY="conditions contract/options": parts of gate/row. TREE: another
-# source tree under test.
+# The figures are in studies/results/gates.csv. ONLY="conditions contract/options" selects gates or rows; TREE selects
+# another source tree.
 GATES = $(BIN)/python -m studies.gates --jobs $(JOBS) $(if $(ONLY),--only $(ONLY)) $(if $(TREE),--tree $(TREE))
 gates: $(VENV)/installed-dev $(VENV)/compiled
 	$(GATES)
@@ -133,18 +133,18 @@ gates: $(VENV)/installed-dev $(VENV)/compiled
 gates-quick: $(VENV)/installed-dev $(VENV)/compiled
 	$(GATES) --quick
 
-# The figures of the commit that is checked out become those of the file; resumable.
+# Write the figures of the current commit to the file; resumable.
 gates-freeze: $(VENV)/installed-dev $(VENV)/compiled
 	$(GATES) --freeze $$(git rev-parse --short=8 HEAD)
 
-# Stages with their durations: python -m studies.recalibrate --list; a part of them: make recalibrate ONLY="noise gain".
+# List the stages and durations: python -m studies.recalibrate --list. Run some: make recalibrate ONLY="noise gain".
 recalibrate: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.recalibrate $(if $(ONLY),--only $(ONLY))
 
 train-default: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.defaults.train_default
 
-# Without --quiet, which would hide the warnings that make it fail.
+# No --quiet: it hides the warnings that cause a failure.
 docs: $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 	@echo "Site: out/site/index.html"
@@ -168,19 +168,19 @@ peers: $(VENV)/installed-dev $(VENV)/compiled
 torture: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.torture --jobs $(JOBS)
 
-# With the layouts that were built last.
+# Use the layouts of the last build.
 strangers: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.strangers --held-out
 
-# Of what is committed, in a clone: nothing else that lies about here gets in.
+# Build from a clone, so that only committed files are packaged.
 wheel: $(VENV)/installed-release
 	rm -rf build/clone dist
 	git clone --quiet . build/clone
 	$(BIN)/python -m build --outdir dist build/clone >build/build.log 2>&1 || { tail -n 20 build/build.log >&2; exit 1; }
 	$(BIN)/python tests/release/check_dist.py dist
 
-# As a stranger installs and runs it, away from the source tree; the same steps as in the Dockerfile. The bill of
-# materials (CycloneDX) is of that environment.
+# Install and run the wheel outside the source tree, with the same steps as in the Dockerfile. The bill of materials
+# (CycloneDX) describes that environment.
 release: wheel
 	rm -rf build/fresh
 	$(PYTHON) -m venv build/fresh
