@@ -207,7 +207,7 @@ def test_memory_does_not_grow_with_payloads_that_nobody_reads(tmp_path: Path) ->
     _with_payloads(tmp_path / "none.mcap", 0, own_chunks=False)
     _with_payloads(tmp_path / "mixed.mcap", 300_000, own_chunks=False)
     _peak_bytes(tmp_path / "none.mcap")  # imports
-    # 60 MB of payload. Reading keeps a few chunks of 1 MB, and a cache of 8 MB for a second read of a short log.
+    # 60 MB of payload. Reading keeps a few chunks of 1 MB, and caches small messages for a second read of a short log.
     assert _peak_bytes(tmp_path / "mixed.mcap") < _peak_bytes(tmp_path / "none.mcap") + 12_000_000
 
 
