@@ -1,4 +1,4 @@
-"""The verdict of a drive, a sentence a signal: it claims what the interval holds and names why there is none."""
+"""The verdict of a drive, a sentence a signal: it follows from the interval and gives a reason without one."""
 
 from __future__ import annotations
 
