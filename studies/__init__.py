@@ -1,1 +1,1 @@
-"""What writes the pages of results in docs/."""
+"""Studies that write the results pages in docs/."""

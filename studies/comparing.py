@@ -1,10 +1,10 @@
-"""How ``pdhef compare`` decides: false alarms, what it finds, and what a comparison of many drives costs.
+"""Evaluate the decisions of ``pdhef compare``: false alarms, detected changes, and cost with many drives.
 
     python -m studies.comparing [--times 5000] [--planted 2000] [--drives 10000] [--out docs]
 
 The paired log ratios of drives are drawn from a normal and a heavy-tailed distribution (Student's t with 3 degrees of
-freedom, scaled to the same standard deviation), 0.2 wide. A relabelling changes the sign of each at random: nothing
-changed. For the cost a run of many drives is made up, with as many figures a drive as a real one has.
+freedom, scaled to the same standard deviation), 0.2 wide. Without a change, relabelling flips the sign of each ratio at
+random. The cost is measured on a synthetic run of many drives, with as many figures per drive as in a real run.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def cost(drives: int) -> list[str]:
 
 
 def _processor_s() -> float:
-    """Return the processor time of all commands so far: that of a core that has nothing else to do."""
+    """Return the processor time of all commands so far: the time on a core without other load."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 

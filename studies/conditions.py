@@ -3,7 +3,7 @@
     python -m studies.conditions [--car CAR] [--network FOLDER] [--drives 30] [--jobs 2] [--rows NAME,...] [--render]
 
 Simulates the drives, runs all estimators by ``pdhef run``, and writes the page ``conditions.md`` with two figures to
-``--out``, and all tables to ``--results``. ``--work`` keeps logs and runs: a repeated call goes on where it ended.
+``--out``, and all tables to ``--results``. ``--work`` keeps logs and runs: a repeated call resumes where it stopped.
 ``--render`` renders the page from ``--results``. Friction is the only input of an estimator from the ground truth, and
 only with the factor of the row. The runs of the independent simulator are a row if ``../shared`` is beside the
 repository.

@@ -74,7 +74,7 @@ class Figures:
     def get(
         self, row: str, estimator: str, metric: str = "rmse", segment: str = "all"
     ) -> tuple[FloatArray, FloatArray]:
-        """Return values [N] and samples [N] over the drives; empty where there are none."""
+        """Return values [N] and samples [N] over the drives, or empty arrays without drives."""
         pairs = np.array([*self._by.get((row, estimator, metric, segment), {}).values()]).reshape(-1, 2)
         return pairs[:, 0], pairs[:, 1]
 

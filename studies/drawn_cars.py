@@ -1,4 +1,4 @@
-"""Random simulated cars, each with sensors and a vehicle file of its own.
+"""Random simulated cars, each with individual sensors and an individual vehicle file.
 
 Saloons, SUVs and hatchbacks of all loads, heights, tyres and wear, with sensors of all qualities. The file of a car is
 fitted to a ramp steer (``fit_vehicle``), as after a measurement.
@@ -28,7 +28,7 @@ from truthsim.vehicle_choice import choose_vehicle
 KINDS = ("sedan", "suv")
 #: Share of the cars that get the tyres of the other kind.
 OTHER_TYRES_SHARE = 0.3
-#: Ranges of the uniform draws, on top of what ``truthsim.randomisation`` draws.
+#: Ranges of the uniform draws, in addition to the draws of ``truthsim.randomisation``.
 RANGES = {"mass": (0.85, 1.15), "cg": (-0.10, 0.12), "height": (0.9, 1.1), "stiffness": (0.8, 1.25)}
 #: Factors on the usual 1-sigma of sensors, uniform in the logarithm.
 SENSOR_FACTORS = {

@@ -1,7 +1,7 @@
 """Turn the independent simulator's runs (Parquet) into logs as a recorder would leave them.
 
-Topics and types are those of the simulated sample logs, so that the same mapping reads both: IMU, steering and wheel
-speeds from the runs' sensor columns, ``/truth/perfect/odometry`` from their states. The runs' licence keeps them out of
+Topics and types match the simulated sample logs, so that the same mapping reads both: IMU, steering and wheel speeds
+from the runs' sensor columns, ``/truth/perfect/odometry`` from their states. The runs' licence keeps them out of
 the repository.
 """
 

@@ -48,7 +48,7 @@ _UNDOES = re.compile(r"scale(?: in the mapping)?(?: by| =) ([-+.\de]+)")
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What the checks state of one mistake, and those that did not pass."""
+    """Verdict of the checks on one mistake, and the checks that did not pass."""
 
     log: str
     signal: str

@@ -1,6 +1,6 @@
 """Equations of the documentation as MathML, which browsers render without a script or a font: a hook of MkDocs.
 
-In a page, ``$…$`` is LaTeX within a line and ``$$…$$`` an equation in a paragraph of its own. Code stays as it is.
+In a page, ``$…$`` is LaTeX within a line and ``$$…$$`` an equation in a separate paragraph. Code stays as it is.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _PATTERN = re.compile(
 #: Placeholder of an equation in a page until the page is HTML: Markdown must not read the equation.
 _PLACEHOLDER = "\ue000{}\ue001"
 _equations: list[str] = []
-#: A function's name whose argument has no bracket: it needs a space.
+#: Name of a function before an argument without brackets: MathML needs a space here.
 _FUNCTION = re.compile(r"(<mi>(?:sin|cos|tan|arctan|ln)</mi>)(?=<m(?!o|row><mo))")
 
 
@@ -52,7 +52,7 @@ def mathml(latex: str, *, block: bool = False) -> str:
     bare = re.sub(r"\\[{}]", "", latex)
     sides = [len(re.findall(rf"\\{side}(?![a-z])", latex)) for side in ("left", "right")]
     is_balanced = bare.count("{") == bare.count("}") and sides[0] == sides[1]
-    # What the converter leaves: an unknown command, or an alignment, which it has no markup for.
+    # Leftovers of the converter: unknown commands, and alignments, for which it has no markup.
     if "\\" in markup or "&<" in markup or not is_balanced:
         raise PluginError(f"equation not understood: {latex}")
     markup = _FUNCTION.sub(r"\1<mspace width='0.167em'/>", markup)

@@ -1,4 +1,4 @@
-"""What the pages share: the repository's places, Markdown tables and numbers, filled blocks, the commands' options."""
+"""Shared by the pages: paths of the repository, Markdown tables and numbers, filled blocks, options of the commands."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def table(head: Iterable[str], body: Iterable[Iterable[str]], *, right_from: int
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Return a figure, a dash for what is not finite."""
+    """Format a figure; a non-finite value is a dash."""
     return "–" if not math.isfinite(value) else f"{value:.{digits}f}"
 
 
@@ -45,7 +45,7 @@ def fill(page: str, blocks: Mapping[str, str], where: str) -> str:
 
 
 def write(path: Path, text: str) -> None:
-    """Write a page, whole or not at all, and print where it is."""
+    """Write a page atomically and print its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(path, text.encode())
     print(path)

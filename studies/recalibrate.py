@@ -2,11 +2,11 @@
 
     python -m studies.recalibrate [--list] [--only STAGE ...]
 
-The stages run in the order of ``recalibrate.toml``. A stage is skipped if the command and the digest of its inputs are
-those of its last completion and its outputs exist. After a failure or an interruption, the same command continues with
-the stage that was not completed; if its inputs have changed since, its work folders are deleted first. Comments,
-docstrings and the layout of pages (``studies.pages``, ``studies.pictures``) do not count as inputs. The stamp files are
-in ``out/recalibrate``.
+The stages run in the order of ``recalibrate.toml``. A stage is skipped if its outputs exist and its command and
+the digest of its inputs have not changed since its last completion. After a failure or an interruption, the same
+command continues with the stage that was not completed; if its inputs have changed since, its work folders are deleted
+first. Comments, docstrings and the layout of pages (``studies.pages``, ``studies.pictures``) do not count as inputs.
+The stamp files are in ``out/recalibrate``.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class Recalibration:
         return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
 
     def is_complete(self, stage: Stage) -> bool:
-        """Return whether nothing changed since the last completion."""
+        """Return whether the stage is unchanged since its last completion."""
         stamp = self.stamp(stage)
         now = {"command": stage.command, "inputs": input_digest(self.root, stage.inputs)}
         same = all(stamp.get(key) == value for key, value in now.items())

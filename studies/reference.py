@@ -170,8 +170,8 @@ FAULTS = (OUTAGE, MULTIPATH, BIASED)
 WRONG_AXLE = "l_r wrong by 0.15 m"
 #: Of simulated drives: the position of the accelerometer is not stated.
 MOVED_IMU, REAR_IMU = "accelerometer at the rear axle", (("imu_x_m", -1.71),)
-#: Of recorded drives with a receiver: ground truth is taken to be the velocity of the antenna, whose position the
-#: smoother estimates, in place of that of the point that the vehicle file states.
+#: Of recorded drives with a receiver: the ground truth is the velocity of the antenna, at the position estimated by the
+#: smoother, instead of the velocity of the reference point in the vehicle file.
 AT_ANTENNA = "ground truth at the antenna"
 
 

@@ -1,6 +1,6 @@
 """The maths of the condition table: pooling, percentiles, paired bootstrap over drives.
 
-All functions take one figure a drive. A drive whose figure is NaN (nothing to score) does not count.
+All functions take one figure a drive. Drives with NaN (without a scored sample) do not count.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def median_ratio(rmse: FloatArray, other: FloatArray) -> Bound:
 
 
 def verdict(bound: Bound, *, margin: float = 1.05) -> str:
-    """Return what the interval of a ratio decides: better, worse (by more than the margin), not worse, or open."""
+    """Return the verdict from the interval of a ratio: better, worse (by more than the margin), not worse, or open."""
     if not np.isfinite(bound.low):
         return "–"
     if bound.high < 1.0:

@@ -3,8 +3,8 @@
     python -m studies.teaching [--cars GTI,...] [--out docs] [--stored]
 
 ``pdhef learn`` teaches; ``pdhef run`` calibrates the car on the sensors of the scored drive, without ground truth.
-Columns: ``physics`` of the untaught car, of the taught car, and ``pd-hef`` of the taught car with its residual, also of
-a car that the sideslip reference taught, where it is independent, in place of ground truth. The drives are in
+Columns: ``physics`` of the untaught car, of the taught car, and ``pd-hef`` of the taught car with its residual; also
+for a car taught by the sideslip reference in place of ground truth, if the reference is independent. The drives are in
 ``../shared`` and may not be redistributed. Without them, the command ends with 0 and writes no file.
 """
 

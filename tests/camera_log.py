@@ -1,4 +1,4 @@
-"""MCAP logs whose chunks contain either sensors or camera images."""
+"""MCAP logs with either sensors or camera images in each chunk."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def pdhef(*arguments: object) -> None:
 
 
 def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
-    """Run a command and return what it says with ``--json``."""
+    """Run a command with ``--json`` and return its document."""
     capsys.readouterr()
     pdhef(*arguments, "--json")
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
@@ -34,7 +34,7 @@ def called(
 ) -> subprocess.CompletedProcess[str]:
     """Run a command as its own process would, and return its exit code and streams.
 
-    A process takes two seconds to start. Start one where signals, the streams themselves or what is loaded matter.
+    A process takes two seconds to start. Start one to test signals, the streams themselves or loaded modules.
     """
     words = [str(a) for a in arguments]
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}

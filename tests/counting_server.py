@@ -15,7 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 @dataclass(frozen=True)
 class Request:
-    """What was asked for, and the bytes [start, end) that went out."""
+    """A requested path, and the bytes [start, end) that were sent."""
 
     path: str
     start: int
@@ -23,7 +23,7 @@ class Request:
     headers: dict[str, str]
 
 
-#: What a fault does with the n-th request of a path (from 0): True if it has dealt with it, and noted it.
+#: Action of a fault on the n-th request of a path (from 0). It returns True if it answered and recorded the request.
 Fault = Callable[["_Handler", int], bool]
 
 
@@ -179,7 +179,7 @@ def cutting(after_bytes: int, times: int = 10**9) -> Fault:
 
 
 def stalling(seconds: float) -> Fault:
-    """Say nothing."""
+    """Suppress log lines."""
 
     def fault(handler: _Handler, _: int) -> bool:
         handler.note(handler.path.split("?")[0].lstrip("/"), 0, 0)

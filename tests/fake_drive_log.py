@@ -1,4 +1,4 @@
-"""A log in memory that keeps the reader's protocol, so that what reads logs can be tested without files."""
+"""A log in memory with the reader's protocol, to test code that reads logs without files."""
 
 from __future__ import annotations
 

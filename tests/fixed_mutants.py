@@ -4,7 +4,8 @@
 
 An entry of ``fixed_mutants.json`` has the file, its lines that contain the fault (``old``, once in the file), the same
 lines with the fault (``new``) and the tests that fail. If these tests are gone, the quick tests of the package replace
-them. An entry whose lines are gone is reported; ``--add`` removes it and draws new mutants like ``tests/mutants.py``.
+them. An entry is reported if its lines no longer exist; ``--add`` removes it and draws new mutants like
+``tests/mutants.py``.
 
 Each mutant runs in a fork of this process, which has imported libraries only. The fault is inserted at import: no file
 changes, and numba's cache remains valid. A fault in a compiled function (``compiled``) runs without the compiler, as
@@ -37,7 +38,7 @@ import pytest
 
 ROOT = mutants.ROOT
 LIST = Path(__file__).with_suffix(".json")
-#: What tests and sources import: loaded once, where that is quicker.
+#: Imports of tests and sources that are faster to load once.
 LIBRARIES = (
     "numpy", "numba", "numba.typed", "polars", "pyarrow.parquet", "scipy.optimize", "scipy.ndimage", "scipy.stats",
     "pydantic", "rich.console", "typer", "jinja2", "mcap.reader", "mcap.writer", "rosbags.rosbag1",
@@ -73,7 +74,7 @@ class FixedMutant:
 
 @dataclass(eq=False)
 class _Loader(SourceFileLoader):
-    """Loads one module from other text than that of its file."""
+    """Loads one module from a text that differs from its file."""
 
     name: str
     path: str
@@ -136,7 +137,7 @@ def _in_child(mutant: FixedMutant | None, tests: Sequence[str], to: Path) -> int
 def run_forked(
     work: Iterable[tuple[Any, FixedMutant | None, Sequence[str]]], jobs: int
 ) -> Iterator[tuple[Any, int, str]]:
-    """Run the tests of each item in a fork; yield its key, pytest's exit code (< 0: a signal) and what failed first."""
+    """Run the tests of each item in a fork; yield its key, pytest's exit code (< 0: a signal) and the first failure."""
     running: dict[int, tuple[Any, Path]] = {}
     with tempfile.TemporaryDirectory(prefix="fixed-mutants-") as folder:
         os.environ["HYPOTHESIS_STORAGE_DIRECTORY"] = f"{folder}/hypothesis"
@@ -182,7 +183,7 @@ def is_there(test: str) -> bool:
 
 
 def judge(mutants_: Sequence[FixedMutant], jobs: int) -> Iterator[tuple[FixedMutant, str]]:
-    """Yield what becomes of each: DIED, SURVIVED or GONE."""
+    """Yield the outcome of each mutant: DIED, SURVIVED or GONE."""
     work = []
     for mutant in mutants_:
         if mutant.source() is None:

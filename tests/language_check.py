@@ -1,10 +1,10 @@
-"""Check what users and developers read for retired terms: ``make lint`` runs it.
+"""Check the texts for users and developers for retired terms: ``make lint`` runs it.
 
     python tests/language_check.py [--list AREA] [--lower]
 
 Areas: documentation (pages written by hand), help (texts of the command line), messages (other literals with a space,
 HTML templates), comments (with docstrings), names (of variables and parameters). An area fails with more hits than
-``language_limits.json`` allows; ``--lower`` writes the present counts where they are smaller. Code spans, code blocks,
+``language_limits.json`` allows; ``--lower`` lowers the limits to the present counts. Code spans, code blocks,
 names with an underscore, which are contracts of files and commands, and names of parameters in docstrings do not count.
 """
 
@@ -64,7 +64,7 @@ GENERATED = re.compile(r"^Written by|<!-- generated|^Command: `", re.MULTILINE)
 
 
 class Hit(NamedTuple):
-    """A retired term, where it is, and what to write instead."""
+    """A retired term, its place, and its replacement."""
 
     area: str
     place: str
@@ -84,7 +84,7 @@ def in_text(area: str, place: str, text: str) -> Iterator[Hit]:
 
 
 def pages(root: Path) -> Iterator[Hit]:
-    """Yield what the pages that are written by hand contain."""
+    """Yield the retired terms of hand-written pages."""
     for path in (root / "README.md", root / "ARCHITECTURE.md", *sorted((root / "docs").glob("*.md"))):
         text = path.read_text(encoding="utf-8")
         if GENERATED.search(text[:600]):
@@ -94,14 +94,14 @@ def pages(root: Path) -> Iterator[Hit]:
 
 
 def templates(root: Path) -> Iterator[Hit]:
-    """Yield what the templates of the pages contain outside tags."""
+    """Yield the retired terms of page templates outside tags."""
     for path in sorted((root / "pdhef_logtool/reports/templates").glob("*.html")):
         text = re.sub(r"{[%{#].*?[%}#]}|<[^>]*>", " ", path.read_text(encoding="utf-8"), flags=re.DOTALL)
         yield from in_text("messages", path.relative_to(root).as_posix(), text)
 
 
 def code(path: Path, place: str) -> Iterator[Hit]:
-    """Yield what the literals, comments and names of a module contain."""
+    """Yield the retired terms in literals, comments and names of a module."""
     text = path.read_text(encoding="utf-8")
     tree = ast.parse(text)
     area = "help" if "/cli/" in place else "messages"

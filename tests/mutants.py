@@ -3,10 +3,9 @@
     python tests/mutants.py [--seed 1] [--count 30] [--only sinks] [--jobs 2] [--list] [--focused] [--json FILE]
 
 A seeded draw spreads the faults over five packages, over kinds of faults and over functions: no function gets two.
-What only words a message is left alone, and so is what no test can tell apart by construction. Each mutant lives in a
-copy of the tree. The tests of its package run first, those that are not slow before the others, then all the rest; the
-first failure kills it. Before, the same tests must pass in a copy without a fault. Exit code 1: fewer than nine in ten
-died.
+Message texts are not changed, nor is code with effects that no test can observe. Each mutant is tested in a copy of
+the tree. The tests of its package run first, the quick ones before the slow ones, then all others; the first failure
+kills it. Before, the same tests must pass in a copy without a fault. Exit code 1: fewer than nine in ten died.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ _OPPOSITE: dict[type[ast.AST], type[ast.AST]] = {
     **{a: b for x, y in ((ast.Add, ast.Sub), (ast.Mult, ast.Div)) for a, b in ((x, y), (y, x))},
 }
 _COMMUTATIVE = {"min", "max", "minimum", "maximum", "hypot", "isclose", "allclose", "array_equal", "gcd", "dot"}
-#: Calls that word something for a person, and keywords that change nothing or only layout.
+#: Calls with message texts, and keywords without effect or with an effect on layout only.
 _WORDS = re.compile(r"(^|\.)(Loss|print|echo|warn|warning|info|debug|log|\w*Error)$")
 _IDLE_KEYWORDS = {"strict", "stacklevel", "copy", "indent", "cache", "key"}
 _TEXT = (ast.JoinedStr, ast.List, ast.Tuple, ast.Dict)
@@ -76,7 +75,7 @@ class Mutant:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a mutant; ``by`` is the first test that failed, empty for a survivor."""
+    """Outcome of a mutant; ``by`` is the first test that failed, empty for a survivor."""
 
     mutant: Mutant
     killed: bool
@@ -202,7 +201,7 @@ class _Finder(ast.NodeVisitor):
         """Leave messages alone."""
 
     def visit_Assert(self, node: ast.Assert) -> None:
-        """Leave what only narrows types alone."""
+        """Leave assertions alone: they only narrow types."""
 
 
 def _flip(operator: ast.AST) -> Any:
@@ -224,7 +223,7 @@ def possible(package: str, root: Path = ROOT) -> tuple[Mutant, ...]:
 
 @functools.cache
 def _parsed(sources: Path) -> tuple[dict[Path, ast.Module], frozenset[str]]:
-    """Return all modules, and what they call when they are imported."""
+    """Return all modules, and the names that they call at import."""
     trees = {p: ast.parse(p.read_bytes()) for p in sorted(sources.rglob("*.py"))}
     return trees, frozenset(name for tree in trees.values() for name in _called_at_import(tree))
 
@@ -264,11 +263,11 @@ def mutated(source: bytes, mutant: Mutant) -> bytes:
 
 
 def apply(mutant: Mutant, tree: Path) -> None:
-    """Put the fault into a copy of the tree, and forget what was compiled from what it changes.
+    """Put the fault into a copy of the tree, and delete the compiled code that it affects.
 
     All compiled code belongs to one digest of all sources, and a fault would have all of it compiled again. For a fault
-    in a compiled function the code of its module and of all that import it, directly or not, goes; the rest is kept
-    under the new digest.
+    in a compiled function, only the code of its module and of its direct and indirect importers is deleted. The rest is
+    kept under the new digest.
     """
     path, digest = tree / mutant.file, sources_digest(tree)
     before = path.stat()
@@ -305,7 +304,7 @@ def _imported(path: Path) -> Iterator[str]:
 
 
 def copy_tree(source: Path, folder: Path) -> Path:
-    """Copy a working tree with what numba compiled of it; ``shared`` beside it stays in reach of the tests."""
+    """Copy a working tree with its compiled code; the tests can still reach ``shared`` beside it."""
     tree = folder / "tree"
     shutil.copytree(source, tree, symlinks=True, ignore=shutil.ignore_patterns(*NOT_COPIED))
     if (ROOT.parent / "shared").is_dir():
@@ -314,7 +313,7 @@ def copy_tree(source: Path, folder: Path) -> Path:
 
 
 def run_tests(tree: Path, arguments: Sequence[str]) -> str | None:
-    """Run pytest in a copy; return what failed, or None where all passed or nothing was chosen."""
+    """Run pytest in a copy; return the failure, or None if all tests passed or none was chosen."""
     environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     environment |= {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     command = [

@@ -1,6 +1,6 @@
 """The model of ``physics`` in plain Python, from the equations at the head of ``physics_model``, and drives of it.
 
-It shares nothing with the compiled model: no step of its own, no points, no order of evaluation.
+It shares no code with the compiled model, nor its integration steps, sigma points or order of evaluation.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Oracle:
         return found | dict(zip(names_of(self.has), map(float, x), strict=True))
 
     def tyres(self, x: np.ndarray, steer: float, ax: float, mu: float) -> tuple[float, float]:
-        """Steady forces over the mass; ``x`` says what the lateral acceleration is."""
+        """Return the steady forces over the mass; ``x`` contains the lateral acceleration."""
         s = self._named(x)
         v = max(s["vx"], BLEND_LOW_M_S)
         vy = s["vy"] + (self.swing_m * s["phi_dot"] if self.has.roll else 0.0)
@@ -160,7 +160,7 @@ class Oracle:
         return end if self.has.lag else self.settled(end, steer, ax, mu)
 
     def sensed_ay(self, x: np.ndarray, steer: float) -> float:
-        """What an accelerometer that leans with the body reads, at its place."""
+        """Return the reading of an accelerometer that leans with the body, at its place."""
         s = self._named(x)
         w = self.share(s["vx"])
         front = s["ff"] * math.cos(steer)

@@ -1,6 +1,6 @@
 """A single-track car in plain Python, written from docs/method.md, and drives of it for the estimator tests.
 
-It shares nothing with ``pdhef_logtool.car.nominal_model``: it is what the compiled model is compared with.
+It shares no code with ``pdhef_logtool.car.nominal_model``: it is the reference for the compiled model.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Drive:
 
 
 def make_signals(dt: np.ndarray, delay_ns: int | np.ndarray = 0, **columns: np.ndarray) -> Signals:
-    """Columns on stamps that start at START_NS and are ``dt`` apart; what is not given is missing."""
+    """Columns on stamps that start at START_NS and are ``dt`` apart; omitted columns are missing."""
     stamps = START_NS + np.concatenate([[0], np.cumsum(np.round(dt * 1e9).astype(np.int64))])
     n = len(stamps)
     names = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")

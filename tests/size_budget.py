@@ -29,7 +29,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 FILE = Path(__file__).with_suffix(".toml")
 PACKAGE = ROOT / "pdhef_logtool"
-#: Sources whose size is limited as a whole.
+#: Sources with one limit for their total size.
 WHOLE = ("truthsim", "studies", "benchmarks")
 LONG_LINES, COMPLEX = 60, 20
 #: Limits of large figures are multiples of this, so that an edit of a few lines needs no new limit.
@@ -117,7 +117,7 @@ def import_edges() -> int:
 
 
 def command_line_sizes() -> dict[str, int]:
-    """Return the number of commands, of all their options, of those of ``run``, and of estimator presets."""
+    """Count commands, all their options, the options of ``run``, and estimator presets."""
     import typer
 
     from pdhef_logtool.cli.app import app
@@ -165,7 +165,7 @@ def _flat(document: Mapping[str, object]) -> dict[str, int]:
 
 
 def problems(sizes: Mapping[str, int], limits: Mapping[str, int]) -> Iterator[str]:
-    """Yield a line for each size above its limit, without a limit, or whose limit has nothing to measure."""
+    """Yield a line for each size above its limit, size without a limit, and limit without a size."""
     for name in sorted(sizes.keys() | limits.keys()):
         if name not in sizes or name not in limits:
             yield f"{name}: expected in both, the project and {FILE.name}; update the file"
@@ -191,7 +191,7 @@ def _of_commit(commit: str) -> dict[str, object]:
 
 
 def lowered(text: str, sizes: Mapping[str, int]) -> str:
-    """Return the file's text with each figure lowered to the size, where it is larger."""
+    """Return the file's text with each limit lowered to the size, if the limit is larger."""
     table, lines = "", []
     for line in text.splitlines():
         if header := re.fullmatch(r"\[(\w+)\]", line):

@@ -84,7 +84,7 @@ def _settings(name: str, config: pdhef.RunConfig) -> Any:
 
 
 def _ends(call: Callable[[], Any]) -> str:
-    """Return how a command ends whose log is not there."""
+    """Return the error message of a command on a missing log."""
     with pytest.raises(pdhef.PdhefError) as ended:
         call()
     return str(ended.value)

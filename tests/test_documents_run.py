@@ -1,4 +1,4 @@
-"""What ARCHITECTURE.md and docs/api.md tell a reader to do works as it stands there."""
+"""The steps in ARCHITECTURE.md and docs/api.md work as written."""
 
 from __future__ import annotations
 

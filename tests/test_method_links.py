@@ -34,7 +34,7 @@ def anchors(page: str) -> frozenset[str]:
 
 
 def broken(references: Iterator[tuple[str, str, str]]) -> list[str]:
-    """Return those of (where, page, anchor) that lead nowhere."""
+    """Return the broken links as (where, page, anchor)."""
     return [
         f"{where}: {page}#{anchor}"
         for where, page, anchor in references

@@ -95,7 +95,7 @@ def test_a_fault_in_a_compiled_function_forgets_all_that_may_hold_it(tmp_path: P
         (cache / f"{name[:-3]}.cpython-311.pyc").touch()
 
     def kept() -> list[str]:
-        """Return the files of the one folder, which is named after what the sources are now."""
+        """Return the files of the only folder, which is named after the digest of the present sources."""
         (folder,) = compiled.iterdir()
         assert folder.name == f"{sources_digest(tmp_path)}-0"
         return sorted(p.name.partition(".")[0] for p in folder.iterdir())
@@ -110,7 +110,7 @@ def test_a_fault_in_a_compiled_function_forgets_all_that_may_hold_it(tmp_path: P
     by_name = {m.function: m for m in mutants.possible("made", tmp_path) if m.kind == "sign"}
     times = (package / "low.py").stat().st_mtime_ns
 
-    mutants.apply(by_name["plain"], tmp_path)  # nothing compiled changes
+    mutants.apply(by_name["plain"], tmp_path)  # no compiled code changes
     assert kept() == ["apart", "high", "low", "top"]
     assert not list(cache.glob("low.*.pyc"))
     assert (package / "low.py").stat().st_mtime_ns == times

@@ -1,4 +1,4 @@
-"""Windows and macOS: what they do not have, no command with one process needs."""
+"""Windows and macOS: commands with one process need no POSIX-only function."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def without_posix(*arguments: object, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a command in a process without what Windows does not have, and with streams in ASCII."""
+    """Run a command in a process without POSIX-only functions, and with streams in ASCII."""
     words = [sys.executable, ROOT / "tests/without_posix.py", *arguments]
     env = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii", "PDHEF_TRACEBACK": "1"}
     return subprocess.run(words, cwd=folder, env=env, capture_output=True, encoding="ascii", check=False)

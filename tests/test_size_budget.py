@@ -1,4 +1,4 @@
-"""The size budget: what it counts, and that no figure rises without a reason."""
+"""Size limits: the counted figures, and that no limit rises without a reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What docs/troubleshooting.md quotes is said by the tool, word for word."""
+"""Messages quoted in docs/troubleshooting.md match the tool's messages word for word."""
 
 from __future__ import annotations
 

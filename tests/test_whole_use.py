@@ -63,7 +63,7 @@ def test_from_a_recording_to_a_network_and_back(kind: str, tmp_path: Path, capsy
 
 
 def _look_at_recordings(drive: Path, stamps: Counter[str]) -> None:
-    """Read back what other tools open: every stamp of every estimator is there."""
+    """Read the recordings as other tools do: every stamp of every estimator is there."""
     with (drive / "annotated.mcap").open("rb") as file:
         counts = Counter(channel.topic for _, channel, _ in make_reader(file).iter_messages())
     assert counts["/imu/data"] == counts["/truth/perfect/odometry"] == stamps["pd-hef"]

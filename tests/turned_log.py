@@ -1,4 +1,4 @@
-"""A log whose IMU is mounted another way: every reading of it is turned before anybody sees it."""
+"""A log with a rotated IMU: every reading of the IMU is rotated before use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TRIADS = tuple(tuple(f"{part}.{axis}" for axis in "xyz") for part in ("linear_ac
 
 
 class TurnedLog:
-    """Stands for ``log``; ``car_from_sensor`` [3, 3] turns what its topic then holds into what it held."""
+    """Wraps ``log``; ``car_from_sensor`` [3, 3] rotates the new readings of its topic into the original ones."""
 
     def __init__(self, log: Any, car_from_sensor: NDArray[np.float64], topic: str = "/imu/data") -> None:
         self._log, self._topic, self._turn = log, topic, car_from_sensor

@@ -33,7 +33,7 @@ MODULES = ("fcntl", "grp", "posix", "pwd", "resource", "termios", "tty")
 
 
 def imitate() -> None:
-    """Hide what Windows does not have, and refuse what it refuses."""
+    """Hide the functions that Windows lacks, and reject calls that it rejects."""
     for name in LIBRARIES:
         importlib.import_module(name)
     kill, sync, fcntl_ = os.kill, os.fsync, fcntl.fcntl

@@ -30,7 +30,7 @@ SHAPE_STD = 0.10
 SHAPE = 1.35
 #: A peak below this multiple of the largest force that was seen is no peak.
 PEAK_OVER_SEEN = 1.1
-#: Friction demand scatters about the curve by this share of its own size and floor.
+#: Standard deviation of an axle force about the curve, per kg of the car's mass.
 FORCE_STD_N_PER_KG = 0.35
 
 #: Usable where the true speed is above this multiple of the low-speed limit, and where the car does not spin or drift.
@@ -108,9 +108,9 @@ def usable_seconds(drive: FitDrive, vehicle: VehicleParameters) -> float:
 def sampled_errors(
     drive: FitDrive, vehicle: VehicleParameters, steps: PosteriorSteps, settle_s: float
 ) -> tuple[FloatArray, BoolArray, float]:
-    """Return a filter's sideslip errors in rad at :data:`FIT_RATE_HZ`, 0 where it does not count, where it does, and s.
+    """Return sideslip errors of a filter in rad at :data:`FIT_RATE_HZ`, their mask, and the seconds per sample.
 
-    ``settle_s`` : what the filter needs before its error counts. The last value is the time that each error represents.
+    Masked errors are 0. ``settle_s`` : settling time of the filter, excluded from the error.
     """
     every = max(1, round(1.0 / (FIT_RATE_HZ * period_s(drive))))
     pick = slice(None, None, every)

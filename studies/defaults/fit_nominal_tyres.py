@@ -35,7 +35,7 @@ ROADS = {
     "vehicle_mu03.toml": ("truthsim saloon on a road of friction 0.3", 0.3),
 }
 SPEED_KM_H = 80.0
-#: Steering goes to this multiple of what the plain ramp manoeuvre guesses, well into the plateau of the front axle.
+#: Steering amplitude as a multiple of the default ramp manoeuvre, well into the plateau of the front axle.
 SCALE = 2.5
 #: Below this the ramp is the linear range, in which roll is proportional to lateral acceleration.
 LINEAR_A_Y_M_S2 = 4.0

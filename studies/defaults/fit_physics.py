@@ -2,8 +2,8 @@
 
     python -m studies.defaults.fit_physics [-o FOLDER] [--work out/fit-physics] [--jobs 2]
 
-Drives of 12.5 s as networks are trained on, with the true friction, on exact ground truth. None is one of the paper's
-scenarios: those have a speed and a friction of their own. Everything else of the car stays: its vehicle file is right.
+The drives last 12.5 s, like the training drives of networks, with true friction and exact ground truth. The paper's
+scenarios, with their different speeds and friction, are excluded. All other values come from the vehicle file.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"{100 * share:3.0f} % {text}", flush=True)
 
     result, physics = find_physics(drives, car.datasheet, progress=say)
-    # Smoothed it has the filter's noise: its network predicts most of what the model lacks.
+    # The smoother uses the filter's noise: the network predicts most of the model residual.
     physics = physics.model_copy(update={"smoothing": (1.0, 1.0)})
     print(f"sideslip RMSE on what it was fitted to: {result.rms_deg:.4f} deg")
     for tried in physics.tried:

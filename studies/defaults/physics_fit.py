@@ -4,14 +4,14 @@ In normalised parameters θ (distance from the prior in its standard deviations)
 
     Σ_i N_i log(s_i² + s_0²) + |θ|² + (log(n) / w)²
 
-where s_i is the RMS of the filter's sideslip error on drive i, N_i its length over the time in which errors stay alike,
-and s_0 what is not accepted to be beaten. With a fixed σ in place of the log, "σ is what remains" has two fixed points,
+where s_i is the RMS of the filter's sideslip error on drive i, N_i its length over the correlation time of the errors,
+and s_0 the error floor. With a fixed σ in place of the log, the condition σ = RMS of the residual has two fixed points,
 and a poor start ends at the worse one (docs/method.md#identification). The last term, of the mean normalized innovation
 squared n, fixes the scale of Q and R; the gain depends on their ratio only. It is minimised by Gauss-Newton steps on
 errors over their present s_i, derivatives by differences.
 
-Force scale and bank are states of the one filter here, and filters of their own in service
-(:mod:`~pdhef_logtool.estimators.adaptive_physics`): through the bank of them the noise follows few drives too closely.
+The single filter here has force scale and bank as states; in operation they are separate filters
+(:mod:`~pdhef_logtool.estimators.adaptive_physics`). With a filter bank, the noise would overfit to few drives.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from studies.defaults.axle_forces import (
 )
 from studies.defaults.prior import Prior
 
-#: Errors stay alike for this long, s; what the filter needs before its error counts, s.
+#: Correlation time of the errors, s; settling time of the filter, excluded from the error, s.
 CORRELATION_S, SETTLE_S = 1.0, 2.0
 #: An RMS below this is not accepted to be better still.
 FLOOR_RAD = math.radians(0.05)
@@ -63,7 +63,7 @@ MAX_ITERATIONS, MAX_STEP, MIN_GAIN = 40, 1.5, 2e-4
 AXLE_FIT_SHARE = 0.5
 NOISE_LOG_STD = 1.2
 Theta = dict[str, float]
-#: Where θ starts: the noise has two valleys, that of clean sensors and that of a filter that hardly hears a_y.
+#: Start values of θ. The noise cost has two valleys: clean sensors, and a filter with a low gain on a_y.
 STARTS: tuple[Theta, ...] = ({}, {"r a_y": 1.5, "q v_y": 1.4, "q yaw rate": 2.3})
 
 
@@ -189,7 +189,7 @@ class DriveError:
 
     @property
     def rms(self) -> float:
-        """RMS of what counts."""
+        """RMS of the counted errors."""
         return float(np.sqrt(np.sum(self.error**2) / max(self.counted, 1)))
 
 
@@ -273,7 +273,7 @@ def varied_vehicles(
 ) -> tuple[VehicleParameters, ...]:
     """Return a fitted vehicle 1-sigma away along the directions of its posterior that move the sideslip most.
 
-    They are uncorrelated in the posterior and in what they do to the sideslip of the drives. Its noise stays.
+    The variations are uncorrelated in the posterior and in their effect on sideslip. The noise is unchanged.
     """
     held = np.array([p.tuning for p in fit.priors])
     free = np.flatnonzero(~held)
@@ -311,7 +311,7 @@ def _nis_residual(errors: Sequence[DriveError]) -> float:
 
 
 def least_gain(errors: Sequence[DriveError]) -> float:
-    """Return what a step of a fit must gain of :func:`fit_cost`."""
+    """Return the smallest decrease of :func:`fit_cost` that continues a fit."""
     return MIN_GAIN * max(1.0, sum(d.seconds for d in errors) / CORRELATION_S)
 
 
@@ -325,14 +325,14 @@ def scaled_errors(there: Sequence[DriveError], here: Sequence[DriveError]) -> Fl
     return np.concatenate([*parts, [_nis_residual(there)]])
 
 
-#: Parts in the order in which it is tried to do without them, what is least known of first.
+#: Parts in the order of the removal trials, starting with the least certain.
 ORDER = ("braking", "force_scale", "bank", "biases", "load_transfer", "roll", "lag")
 #: A part stays if driving that its fits have not seen is worse by this share without it, on average over the folds.
 LEAST_GAIN = 0.01
 #: Steps of a fit that only states whether a part is worth having; it starts where the one with the part ended.
 TRIAL_ITERATIONS = 8
-#: Drives from which on folds are whole drives; usable driving that a fold needs, for 75 s chose worse than none would
-#: have (150 s cannot choose a structure); nothing within this of a cut.
+#: Smallest number of drives for folds of whole drives; usable driving per fold (75 s selected worse parts than no
+#: selection, 150 s cannot select a structure); excluded time on each side of a cut.
 WHOLE_DRIVES, LEAST_FOLD_S, GUARD_S = 4, 100.0, 2.5
 
 
@@ -340,7 +340,7 @@ Fold = tuple[Sequence[FitDrive], Sequence[FitDrive]]
 
 
 def make_folds(drives: Sequence[FitDrive], start: VehicleParameters) -> list[Fold]:
-    """Return two folds, what one fits on the other scores; none where there is too little driving for two."""
+    """Return two folds of training and scoring drives, or an empty list if there is too little driving."""
     usable = [d for d in drives if usable_seconds(d, start) > 0.0]
     halves: tuple[list[FitDrive], list[FitDrive]] = ([], [])
     if len(usable) >= WHOLE_DRIVES:
@@ -364,8 +364,8 @@ def choose_parts(
 ) -> tuple[PhysicsParts, tuple[TriedParts, ...]]:
     """Choose the parts by driving that their fits have not seen: each stays only with evidence.
 
-    They are left out one after the other from all of them, for some show their worth only beside others: the roll
-    beside the load transfer that it delays. What remains must be better than none.
+    Parts are removed one after the other, starting from all parts: some are useful only together, such as the roll
+    and the load transfer that it delays. The remaining parts must score better than the model without parts.
     """
     theta: list[Sequence[Theta]] = [STARTS for _ in folds]
     tried: list[TriedParts] = []
@@ -412,11 +412,11 @@ def find_physics(
     parts: PhysicsParts | None = None,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> tuple[PhysicsFit, FittedPhysics]:
-    """Find what ``physics`` needs of a car on drives with ground truth, and return it as a car contains it, too.
+    """Identify ``physics`` of a car on drives with ground truth; also return it in the format of a car.
 
     Parameters
     ----------
-    parts : of the model; None: chosen by what part of the drives states of the other.
+    parts : of the model. None: selected by cross-validation between two parts of the drives.
     """
     tried: tuple[TriedParts, ...] = ()
     if parts is None:

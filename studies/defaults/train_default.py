@@ -2,9 +2,9 @@
 
     python -m studies.defaults.train_default [--seed 0] [-o FOLDER] [--work out/train-default] [--steps STEP ...]
 
-Short drives of one simulated car with its correct vehicle file and the true friction. ``physics`` is fitted on five
-minutes of other drives (:mod:`studies.defaults.fit_physics`), its noise with it; the residual network learns what it
-lacks. The direct network, the regression and the paper's network see the same drives, with the nominal model. Filter
+Short drives of one simulated car with its correct vehicle file and the true friction. ``physics`` and its noise are
+fitted on five minutes of other drives (:mod:`studies.defaults.fit_physics`); the residual network learns the model
+residual. The direct network, the regression and the paper's network see the same drives, with the nominal model. Filter
 noise of all tuned estimators is chosen on validation drives in one search. Seeds other than 0 train
 networks for spreads and take fit and noise of the shipped car. A second set has other cars of the same kind. Existing
 logs with unchanged settings are kept.

@@ -5,9 +5,8 @@
 
 ``studies/results/gates.csv`` has one figure in a line: gate, row, figure, value, unit, relative and absolute tolerance
 (the larger one counts), commit. A figure of a deleted feature is removed by hand. ``--freeze`` writes the values of the
-tree under test: of the figures that are in the file, and of rows that are not. It is saved row by row and goes on
-where it ended; ``--again`` also freezes rows that are of this commit already. The tool is used by its command line and
-its files only.
+tree under test, for figures in the file and for rows missing from it. It saves row by row and resumes where it stopped;
+``--again`` also freezes rows that are of this commit already. The tool is used by its command line and its files only.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The paper's experiment, run again: scenarios A and B, all schemes, and what Figures 9 to 23 show."""
+"""The paper's experiment, repeated: scenarios A and B, all schemes, and the data of Figures 9 to 23."""

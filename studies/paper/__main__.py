@@ -2,8 +2,8 @@
 
     python -m studies.paper [-o DOCS] [--noise-seeds N] [--render]
 
-The cars are the shipped one (training seed 0), two more whose networks are of the same training with
-other seeds, and one that never saw a lane change or a sine sweep; what is not there yet is trained first
+The cars are the shipped one (training seed 0), two more with networks from the same training with other seeds, and one
+trained without lane changes and sine sweeps. Missing cars are trained first
 (``python -m studies.defaults.train_default``).
 """
 
@@ -32,7 +32,7 @@ TRAINING_SEEDS = (0, 1, 2)
 
 
 def default_cars() -> dict[int, Car]:
-    """Return the shipped car and those of further training seeds; what is missing is trained."""
+    """Return the shipped car and the cars of further training seeds; missing ones are trained."""
     cars = {TRAINING_SEEDS[0]: Car.load("saloon")}
     for seed in TRAINING_SEEDS[1:]:
         folder = TRAINED / f"car-seed-{seed}"
@@ -56,7 +56,7 @@ def render(results: Path, docs: Path) -> None:
 
 
 def main() -> int:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = options("paper", __doc__)
     parser.add_argument("-o", "--output", type=Path, default=DOCS, metavar="DOCS", help="folder of paper.md")
     parser.add_argument("--results", type=Path, default=RESULTS / "paper", help="folder of the details")

@@ -26,7 +26,7 @@ class Spread:
 
 @dataclass(frozen=True, slots=True)
 class Improvement:
-    """By what share the pooled RMSE of one scheme lies below another's.
+    """Relative reduction of the pooled RMSE of one scheme against another.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ def spread(experiment: Experiment, scenario: str, scheme: str, figure: str) -> S
 
 
 def _mean_squares(runs: list[Run], figure: str, training_seed: int | None = None) -> dict[int, float]:
-    """Mean square error by noise seed, over the networks (or that of one network; schemes without take part as is)."""
+    """Return the mean square error by noise seed, over all networks or one; schemes without a network always count."""
     squares_by_seed: dict[int, list[float]] = {}
     for run in runs:
         if training_seed is None or run.training_seed in (None, training_seed):

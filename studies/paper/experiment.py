@@ -1,8 +1,8 @@
 """Simulate the paper's two manoeuvres, run every scheme on them and score it, as ``pdhef run`` would.
 
 A drive is written as an MCAP file and read back by the tool's own path: recognised mapping, alignment, the estimators
-of the table on aligned signals, the metrics of :mod:`pdhef_logtool.evaluation.metrics`. Friction is known: the
-car gets that of the drive. Noise seeds change the sensors alone; training seeds change the network alone.
+of the table on aligned signals, the metrics of :mod:`pdhef_logtool.evaluation.metrics`. The car gets the friction of
+the drive. Noise seeds change the sensors alone; training seeds change the network alone.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class ReadDrive:
     Attributes
     ----------
     whole : of the reading path; signals and truth at the same stamps.
-    facts : of the simulated drive, JSON-able; ``truth_latency_s`` is what the comparison took off.
+    facts : of the simulated drive, JSON-able; ``truth_latency_s`` is the latency that the comparison subtracted.
     """
 
     scenario: Scenario
@@ -80,12 +80,12 @@ class ReadDrive:
 
     @property
     def signals(self) -> Signals:
-        """What the estimators see."""
+        """Inputs of the estimators."""
         return self.whole.signals
 
     @property
     def truth(self) -> StateTrack:
-        """What they are scored against."""
+        """Ground truth of the scores."""
         assert self.whole.truth is not None
         return self.whole.truth
 
@@ -136,7 +136,7 @@ FIGURES: dict[str, tuple[str, str, str, float]] = {
     "yaw_rate_lag_ms": ("yaw_rate_rad_s", "all", "lag_s", 1e3),
     "diverged": ("state", "all", "diverged", 1.0),
 }
-#: Largest |value| of the estimate over that of the ground truth, minus 1: what the paper calls overshoot.
+#: Overshoot as the paper defines it: the ratio of the largest |value| of estimate and ground truth, minus 1.
 OVERSHOOTS = {"sideslip_overshoot": "sideslip_rad", "ay_overshoot": "ay_m_s2"}
 
 
@@ -205,7 +205,7 @@ def run_experiment(
 
     Parameters
     ----------
-    cars : with their networks by training seed; the friction is replaced by that of each drive.
+    cars : with their networks by training seed; the friction is replaced by the friction of each drive.
     """
     runs: list[Run] = []
     drives: dict[str, ReadDrive] = {}

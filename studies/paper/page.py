@@ -200,7 +200,7 @@ def _notes(d: Document) -> str:
 
 
 def write_details(d: Document, folder: Path) -> str:
-    """Return what was run, all tables, and the published values beside ours, with the pictures of a folder."""
+    """Return the setup, all tables, and the published values beside ours, with the pictures of a folder."""
     seeds = sorted({run["noise_seed"] for run in d["runs"]})
     latency = max(abs(f["truth_latency_ms"]) for f in d["drives"])
     networks = "; ".join(f"seed {m['training_seed']} `{m['sha256'][:12]}`" for m in d["models"])

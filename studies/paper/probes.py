@@ -24,7 +24,7 @@ class ResidualFit:
 
     Attributes
     ----------
-    time_s : [N]. target : [N, 2], what the nominal model misses at the true state with the measured steering.
+    time_s : [N]. target : [N, 2], residual of the nominal model at the true state with the measured steering.
     output : [N, 2], output of the network. step_s : median step.
     """
 

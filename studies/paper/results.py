@@ -40,21 +40,21 @@ from truthsim.suite import is_held_out
 SCENARIOS: tuple[Scenario, ...] = (A, B, BURST)
 #: Schemes with a variable gain or factor on R.
 ADAPTIVE = ("pd-hef-paper", "pd-hef")
-#: What improvements are about by default.
+#: Default figure of the improvements.
 FIGURE = "sideslip_deg"
 BASELINES = ("phy-ukf", "phy-ukf:tuned", "physics", "linear-regression", "pure-lstm", "pd-hef-paper")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Results:
-    """What came out.
+    """Results of the experiment.
 
     Attributes
     ----------
     ran : schemes in the order of the tables.
     cars : by training seed. fits : residual fits by scenario, one a car.
     curves : β over |a_y| by scenario and scheme. inflations : of R by scheme.
-    without : A and B with the network that had no lane change and no sweep, None where there is none.
+    without : A and B with the network trained without lane changes and sweeps, or None.
     """
 
     experiment: Experiment
@@ -137,7 +137,7 @@ def _withheld(r: Results) -> dict[str, Any] | None:
 
 
 def _plain(value: Any) -> Any:
-    """Return JSON-able values, floats to six digits; what is not finite is null."""
+    """Return JSON-able values: floats to six digits, null for non-finite ones."""
     if isinstance(value, float):
         return float(f"{value:.6g}") if math.isfinite(value) else None
     if isinstance(value, Mapping):

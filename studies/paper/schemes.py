@@ -1,4 +1,4 @@
-"""The schemes of the comparison: which there are, what each is called in the page, and which are drawn."""
+"""The schemes of the comparison: descriptions for the page, and the selection for the figures."""
 
 from __future__ import annotations
 

@@ -20,14 +20,14 @@ WITHHELD = ("dlc", "dlc-3888-2", "sine-sweep", "sine-sweep-wide")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Withheld:
-    """Training drives of the shipped network by manoeuvre, and the car whose network had none of :data:`WITHHELD`."""
+    """Training drives of the shipped network by manoeuvre, and a car trained without :data:`WITHHELD` manoeuvres."""
 
     drives: Counter[str]
     car: Car
 
 
 def manoeuvres(work: Path) -> dict[str, str]:
-    """Return the manoeuvre of each drive that the shipped network had, by name; ``work`` is that of its training."""
+    """Return the manoeuvre of each training drive of the shipped network by name; ``work`` is its training folder."""
     manifest = json.loads((work / "one_car" / "manifest.json").read_text(encoding="utf-8"))
     return {Path(e["file"]).stem: e["manoeuvre"] for e in manifest["drives"]}
 
@@ -55,7 +55,7 @@ def train_withheld(work: Path, output: Path) -> None:
 
 
 def withheld_car(work: Path, output: Path) -> Car:
-    """Return the car with that network, trained first where it is not there yet."""
+    """Return the car with that network; train it first if it is missing."""
     if not (output / NETWORK_FILE).is_file():
         train_withheld(work, output)
     return Car.load(output)

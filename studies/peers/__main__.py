@@ -3,8 +3,8 @@
     python -m studies.peers [--out docs] [--results studies/results/peers]
 
 All estimators get the same published vehicle file and the same mapped and aligned signals. Ground truth is used for
-scores only. The drives are in ``../shared`` and may not be redistributed: without them the command ends with 0 and
-writes nothing.
+scores only. The drives are in ``../shared`` and may not be redistributed. Without them, the command ends with 0 and
+writes no file.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from pdhef_logtool.mapping import Mapping, load_mapping
 from studies.pages import DRIVES, ROOT, write_toml
 
 REFERENCE = ROOT / "tests" / "reference"
-#: Groups of the page: full-size cars on roads, small or off-road cars, and drives whose ground truth has an offset.
+#: Groups of the page: full-size cars on roads, small or off-road cars, and drives with an offset in the ground truth.
 FULL_SIZE, SMALL, OFFSET = "full-size", "small", "offset"
 _WHEELS = (("front", "rear"), ("left", "right"))
 #: Quantities of the ``.signals.toml`` files beside the drives, by role; road wheel and steering wheel are sensors only.

@@ -1,7 +1,7 @@
 """The peers, from their published descriptions. They get signals and a vehicle file, and no ground truth.
 
 Constants are published ones; a rule that counts per sample is converted from the published rate to the rate of the log.
-``kinematic`` and ``zero`` are the baselines of the tool: a leaky integral of a_y − v_x r, whose time constant was
+``kinematic`` and ``zero`` are the baselines of the tool: a leaky integral of a_y − v_x r with a time constant that was
 chosen on simulated drives (``studies.defaults.tune_kinematic_leak``), and sideslip 0.
 """
 
@@ -94,7 +94,7 @@ def stiffness(vehicle: VehicleParameters) -> tuple[float, float]:
 
 
 def parameters_of(vehicle: VehicleParameters) -> Parameters:
-    """Return what the kernels use of a vehicle."""
+    """Return the kernel parameters of a vehicle."""
     lengths = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
     noise = vehicle.sensors.ay_std_m_s2, vehicle.sensors.yaw_rate_std_rad_s, vehicle.sensors.steer_std_rad
     tyres = np.array([vehicle.magic_formula(front, vehicle.assumed_friction) for front in (True, False)])
@@ -121,7 +121,7 @@ def _held(stamps_ns: IntArray, values: FloatArray) -> FloatArray:
 
 
 def _low_pass(times_s: FloatArray, values: FloatArray) -> FloatArray:
-    """Return a signal [N] through the published filter, 0 where the log has none of it."""
+    """Return a signal [N] through the published filter, or zeros if the log lacks it."""
     finite = np.isfinite(values)
     if not finite.any():
         return np.zeros_like(values)
@@ -177,9 +177,9 @@ def open_loop(inputs, p):  # type: ignore[no-untyped-def]
 def linear_kf(inputs, p):  # type: ignore[no-untyped-def]
     """Return v_y of a Kalman filter on the linear single track that measures a_y and yaw rate.
 
-    The noise rule is that of Leanza, Reina and Blanco-Claraco, Sensors 21 (2021) 5409, and of its program: R consists
+    The noise rule follows Leanza, Reina and Blanco-Claraco, Sensors 21 (2021) 5409, and their program: R consists
     of the white noise of the sensors, Q of the input with 1000 times the white noise of the steering sensor, at 100 Hz.
-    The noise of the sensors is that of the vehicle file.
+    The vehicle file gives the noise of the sensors.
     """
     steps_s, vx, steer, _, ay, yaw_rate = inputs[:6]
     stds = p.ay_std, p.yaw_rate_std
@@ -233,7 +233,7 @@ def _observe(x, cov, i, z, variance):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def learned_single_track(inputs, p):  # type: ignore[no-untyped-def]
-    """Return the stationary v_y of a single track whose parameters a Kalman filter learns from the yaw rate.
+    """Return the stationary v_y of a single track with parameters from a Kalman filter on the yaw rate.
 
     After openpilot's parameter learner (``paramsd`` and ``car_kf``, 2022 to 2025): states are stiffness factor,
     steering ratio, slow and fast steering offset, v_x, v_y, yaw rate, steering-wheel angle and road roll, with the

@@ -61,7 +61,7 @@ class DriveErrors:
 
 
 def usable_sideslip(track: StateTrack) -> FloatArray:
-    """Return the sideslip [N] of a track in rad, NaN where it is not valid."""
+    """Return the sideslip [N] of a track in rad, NaN at invalid samples."""
     return np.where(track.valid, track.sideslip_rad, np.nan)
 
 

@@ -25,7 +25,7 @@ from studies.strangers.page import OUTCOMES, Result, merged, page
 from studies.strangers.recordings import ITEMS, Recording
 from studies.strangers.scoring import Score, look, score_log
 
-#: What layouts held out gave when they were run for the first time: those now held out, and those that were before.
+#: First results of held-out layouts, present and former.
 FIRST_RUNS = {
     "held_out": "held-out layouts were built last",
     "repositories": "layouts of files and messages in public repositories were held out before",
@@ -40,7 +40,7 @@ FIRST_RUNS = {
 
 
 def result_of(score: Score, name: str, group: str, what: str, page_url: str = "") -> Result:
-    """Return what is kept of a score."""
+    """Return the stored part of a score."""
     wrong = [f for f in score.findings if f.verdict == "wrong"]
     right = [f for f in score.findings if f.verdict == "right"]
     ends = {True: "wrong, reported", False: "wrong, not reported"}
@@ -86,7 +86,7 @@ def score_own(recordings: Sequence[Recording], folder: Path) -> Iterator[tuple[s
 
 
 def score_others(only: Sequence[str]) -> Iterator[tuple[str, Result]]:
-    """Yield the results of the recordings of others, where they are there."""
+    """Yield the results of third-party recordings, if available."""
     if not SHARED.is_dir():
         print(f"{SHARED} is not there: recordings of others are left out", file=sys.stderr)
         return
@@ -99,7 +99,7 @@ def score_others(only: Sequence[str]) -> Iterator[tuple[str, Result]]:
 
 
 def first_run() -> str:
-    """Return the figures of the first runs of layouts held out, where they are over."""
+    """Return the figures of the completed first runs of held-out layouts."""
     said = ""
     for name, what in FIRST_RUNS.items():
         file = RESULTS / "third_party_logs" / f"{name}_first_run.json"
@@ -115,7 +115,7 @@ def first_run() -> str:
 
 
 def others_without_answers() -> str:
-    """Return what is mapped in the recordings of ``reader_corpus`` without vehicle signals."""
+    """Return the mapped channels of the recordings in ``reader_corpus`` without vehicle signals."""
     catalogue = SHARED / "reader_corpus" / "CATALOG.json"
     if not catalogue.is_file():
         return ""

@@ -20,7 +20,7 @@ ANSWERS = Path(__file__).with_name("answers.toml")
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The right sources of one recording by channel, any of several, those allowed too, and what is at fault."""
+    """Right sources of one recording by channel (alternatives), sources that are also allowed, and faulty channels."""
 
     file: str
     right: dict[str, tuple[SignalSource, ...]]

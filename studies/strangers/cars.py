@@ -1,4 +1,4 @@
-"""What the sensors of a simulated car read, in SI units and ISO 8855 axes: the right answers of every log made here."""
+"""Sensor readings of a simulated car, in SI units and ISO 8855 axes: the right answers of every log made here."""
 
 from __future__ import annotations
 

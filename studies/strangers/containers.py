@@ -33,7 +33,7 @@ class Topic:
 
 @lru_cache(maxsize=2)
 def _store(ros1: bool) -> Any:
-    """Return the types of a distribution with those of ``shapes.txt``."""
+    """Return the types of a distribution, extended by ``shapes.txt``."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
@@ -86,7 +86,7 @@ def _mcap(topics: Sequence[Topic], path: Path) -> Path:
 
 
 def _joints(writer: McapLogWriter, topic: Topic) -> Iterator[RawMessage]:
-    """Yield the messages of joints, whose names are an array of texts."""
+    """Yield the messages of joints, with an array of texts as names."""
     types, kind = _store(False).types, topic.type_name
     text = definition(kind).encode()
     about: dict[str, Any] = {"schema_encoding": "ros2msg", "schema_data": text, "message_encoding": "cdr"}

@@ -18,7 +18,7 @@ from truthsim.recording import quaternion
 
 #: Patterns of messages that name a cause.
 CAUSES = {
-    # An IMU whose axes are not those of the car.
+    # An IMU with axes that differ from the axes of the car.
     "MOUNTING": r"mount|rotat|upside|z-down|z down|lies|imu[^.;]{0,60}(turned|tilt)|(turned|tilt)[^.;]{0,60}imu",
     "UNITS": r"unit|degree|deg/s|\bdeg\b|km/h|\bg\b|factor|scale|57\.|9\.8|3\.6",
     "SIGNS": r"sign|negat|opposite|mirror",
@@ -57,7 +57,7 @@ class Columns(dict[str, Any]):
         self.car, self.clock = car, clock
 
     def __missing__(self, name: str) -> FloatArray:
-        """Return a column; raises KeyError for a name that is none, which Python then searches elsewhere."""
+        """Return a column; raise KeyError for an unknown name, which Python then searches elsewhere."""
         return series(self.car, name).along(self.clock).values
 
 

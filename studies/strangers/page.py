@@ -1,4 +1,4 @@
-"""``docs/third_party_logs.md``: the score, every log, and what is wrong by name."""
+"""Write ``docs/third_party_logs.md``: the score, every log, and the wrong items by name."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from studies.pages import table
 
-#: What can become of an item, the worst first.
+#: Outcomes of an item, the worst first.
 OUTCOMES = ("wrong, not reported", "wrong, reported", "missing", "right")
 GROUPS = {
     "fault": "logs with a fault",
@@ -16,7 +16,7 @@ GROUPS = {
     "held-out": "held-out layouts",
     "recording": "third-party recordings",
 }
-#: Groups whose logs are sound and excited, so that checks may neither fail nor stay undecided.
+#: Groups with sound and excited logs: checks may neither fail nor stay undecided.
 SOUND = ("layout", "held-out")
 
 _INTRO = """# Third-party logs
@@ -36,11 +36,11 @@ device status. The motion comes from truthsim: drives of three cars with noise, 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What became of one log, or of all logs of one kind.
+    """Outcome of one log, or of all logs of one kind.
 
     Attributes
     ----------
-    items : outcome by item, one of :data:`OUTCOMES`. wrong : what was taken in a wrong item's place.
+    items : outcome by item, one of :data:`OUTCOMES`. wrong : source mapped by mistake, by item.
     silent : the wrong ones that are not reported, with their sources. doubted : right ones that a sentence doubts.
     verdicts : by right item the worst verdict of its checks: ``failed``, ``undecided``, ``passed``, or ``none``.
     alarms : failed checks on right channels that are not at fault. named : whether the cause is named.
@@ -69,7 +69,7 @@ class Result:
         return sum(1 for o in self.items.values() if o == outcome)
 
     def as_json(self) -> dict[str, Any]:
-        """What is kept of it to compare with later."""
+        """Values that are stored for later comparison."""
         return {"group": self.group, "items": dict(self.items), "named": self.named, "verdicts": dict(self.verdicts)}
 
 

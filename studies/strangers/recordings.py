@@ -20,7 +20,7 @@ KMH = 1.0 / 3.6
 #: Turns forward, left, up into forward, right, down and back.
 DOWN: FloatArray = np.diag([1.0, -1.0, -1.0])
 
-#: What is scored: a part of a log that a person can find in it, and the channels that it may be mapped to.
+#: Scored items: a part of a log that a person can find in it, and the channels that it may be mapped to.
 ITEMS: dict[str, tuple[str, ...]] = {
     "steering": ("steer_rad", "steering_wheel_rad"),
     "ax": ("ax_m_s2",),
@@ -47,10 +47,10 @@ class Recording:
     ----------
     name : of the log; logs of one ``kind`` count as one.
     group : ``fault``, ``layout`` or ``held-out`` (built last, run once).
-    what : one line for a person.
-    right : by channel (``truth.`` before ground truth) what it must be, any of the series.
+    what : description in one line.
+    right : by channel (``truth.`` before ground truth) the expected series, any one of them.
     allowed : channels that may be mapped, and are not missed: an INS that is no ground truth, a second source.
-    cause : pattern of a message that names the cause; empty where nothing is wrong.
+    cause : pattern of a message that names the cause; empty for a log without a fault.
     at_fault : channels with the fault; of all others no check may fail.
     page : where the layout is documented.
     """
@@ -86,7 +86,7 @@ def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
     )
     rates = car.wheels.times(1.0 / car.wheel_radius_m)
     yaw_rates = (car.rate[2], car.yaw_rate)
-    # All that goes for the speed: rims, the body's forward velocity, the speed over ground.
+    # All quantities accepted as speed: rims, the body's forward velocity, the speed over ground.
     speeds = (car.speed, car.body_velocity[0], car.ground_speed)
     by_part: dict[str, dict[str, tuple[Series, ...]]] = {
         "imu": {"ax_m_s2": (car.force[0],), "ay_m_s2": (car.force[1],), "yaw_rate_rad_s": yaw_rates},

@@ -1,4 +1,4 @@
-"""What the tool makes of a log, held against the right answers by value: field names play no part."""
+"""Compare the mapping and messages of the tool with the right answers by value, independent of field names."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Told:
     """Messages of the tool for a log.
 
     ``checks`` as in report.json (name, subject, verdict, evidence, remedy); ``doubts`` are its other sentences:
-    ambiguities, notes, what is missing; ``suspects`` are the channels of warnings, where there are such.
+    ambiguities, notes, missing signals; ``suspects`` are the channels of warnings, if any.
     """
 
     checks: tuple[Mapping[str, Any], ...]
@@ -68,7 +68,7 @@ class Told:
 
     @property
     def text(self) -> str:
-        """Everything that a person reads of what is not in order."""
+        """All messages about problems."""
         bad = [c for c in self.checks if c["verdict"] != "passed"]
         said = [f"{c['name']} {c['subject']}: {c.get('evidence', '')} {c.get('remedy', '')}" for c in bad]
         return "\n".join([*said, *self.doubts, self.error])
@@ -79,7 +79,7 @@ class Finding:
     """One item of one log.
 
     ``verdict`` is ``right``, ``wrong`` or ``missing``; ``told`` whether a failed or undecided check or a doubt names
-    a wrong one; ``checked`` the verdicts of the checks on its channels; ``what`` the sources that were taken;
+    a wrong one; ``checked`` the verdicts of the checks on its channels; ``what`` the mapped sources;
     ``doubted`` whether a sentence doubts it.
     """
 
@@ -93,7 +93,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """What became of one log: its findings, the failed checks on right channels, whether the cause was named."""
+    """Outcome of one log: its findings, the failed checks on right channels, whether the cause was named."""
 
     findings: tuple[Finding, ...]
     false_alarms: tuple[str, ...]
@@ -235,11 +235,11 @@ def score_log(
 
     Parameters
     ----------
-    right : by channel, what it must be. A channel of :data:`ITEMS` that is neither here nor allowed is wrong.
-    allowed : what may be mapped too, and is not missed where it is not.
+    right : expected series by channel. A channel of :data:`ITEMS` that is neither here nor allowed is wrong.
+    allowed : channels that may also be mapped, and do not count as missing.
     cause : pattern that a message must match; empty without a cause.
-    at_fault : channels whose checks may fail even where they were mapped rightly.
-    start_ns : what a log whose times count from its start has counted from.
+    at_fault : channels for which checks may fail despite a right mapping.
+    start_ns : zero of the clock of a log with times relative to its start.
     """
     mapping, messages, channels = look(path)
     sources = {} if mapping is None else _sources(mapping)
@@ -293,7 +293,7 @@ def _is_told(name: str, sources: Mapping[str, str], messages: Told) -> bool:
     return bool({name, subject} & bad) or _is_doubted(name, sources.get(name, ""), messages)
 
 
-#: Words of a sentence that doubts what it names.
+#: Words of a sentence that expresses doubt.
 _DOUBT = re.compile(r"doubt|took|is taken, but|waive|suspect|contradict|not sure|ambig|disagree|may be|might|perhaps")
 
 

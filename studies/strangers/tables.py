@@ -24,7 +24,7 @@ _GPS_NS, _WEEK_NS = (18 - 315_964_800) * 10**9, 604_800 * 10**9
 
 
 def _columns(topics: Sequence[Topic]) -> tuple[IntArray, dict[str, NDArray[np.float64]]]:
-    """Return the union of all times in ns, and every column on it, NaN where it has no value."""
+    """Return the union of all times in ns, and every column at these times, NaN at times without a value."""
     stamps = np.unique(np.concatenate([t.arrival_ns for t in topics]))
     columns: dict[str, NDArray[np.float64]] = {}
     for topic in topics:
@@ -65,7 +65,7 @@ def _text(clock: Sequence[str], columns: dict[str, Any], titles: Sequence[str], 
 
 
 def _lab(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write a laboratory system's export: what was measured above the names, units in brackets below them."""
+    """Write a laboratory system's export: test metadata above the names, units in brackets below them."""
     names = [_split(title) for title in columns]
     head = ["Measurement:;Test 12;;", "Recorder:;17,5 V;car 3;", "Start:;24.11.2025;14:05:12,125;", ""]
     head += [";".join(["Time", *(n for n, _ in names)]), ";".join(["[s]", *(f"[{u}]" for _, u in names)])]
@@ -172,7 +172,7 @@ def _nested_parquet(path: Path, stamps: IntArray, columns: dict[str, Any]) -> No
 
 
 def _vbo(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write the columns of one topic: titles with units are those of input modules, and come last."""
+    """Write the columns of one topic: titles with units belong to input modules, and come last."""
     titles = list(columns)
     modules = [_split(t) for t in titles if "[" in t]
     named = [t for t in titles if "[" not in t]

@@ -40,7 +40,7 @@ def mutations(work: Path, seed: int, jobs: int, logs: int) -> dict[str, Any]:
 
 
 def formats(work: Path, seed: int, jobs: int, count: int, names: Iterable[str]) -> dict[str, Any]:
-    """Judge mutated files of table and CAN formats, each by a command of its own."""
+    """Judge mutated files of table and CAN formats, each by a separate command."""
     limits = Limits(silence_s=3 * HANG_S)
     return {name: _judged(work, name, format_judge(work, name, seed), seed, count, jobs, limits) for name in names}
 
@@ -68,7 +68,7 @@ def _judged(
 
 
 def one_by_one(part: str, work: Path, cases: Mapping[str, Callable[[Path], Verdict]]) -> list[dict[str, Any]]:
-    """Judge the cases of a part, each in a folder of its own that goes with it."""
+    """Judge the cases of a part, each in a temporary folder."""
     collected = []
     for i, (name, judge_case) in enumerate(cases.items()):
         folder = work / f"{part}-{i}"
@@ -83,7 +83,7 @@ def one_by_one(part: str, work: Path, cases: Mapping[str, Callable[[Path], Verdi
 
 
 def kills(work: Path, seed: int, count: int) -> dict[str, Any]:
-    """Kill runs into one folder; then the next run must give what an undisturbed one gives, and leave nothing else."""
+    """Kill runs into one folder; the next run must give the output of an undisturbed run, without leftovers."""
     logs = [str(ROOT / "sample_logs" / name) for name in ("step.mcap", "dlc.mcap")]
     call = [*logs, "--car", "saloon"]
     calm, output = work / "calm", work / "killed"
@@ -191,7 +191,7 @@ def _mutations(collected: dict[str, Any]) -> str:
 
 
 def main() -> int:
-    """Do what is not done, and write the page."""
+    """Run the parts that are not done, and write the page."""
     parser = options("torture", __doc__)
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "torture")
     parser.add_argument("--seed", type=int, default=1)

@@ -261,7 +261,7 @@ def _chunks() -> tuple[Bomb, ...]:
 
 
 def _declarations() -> tuple[Bomb, ...]:
-    """Return channels, types and messages whose declarations are large, endless or strange."""
+    """Return channels, types and messages with large, endless or unusual declarations."""
 
     def ros(name: str, codes: tuple[int, ...], type_name: bytes, text: bytes, data: bytes = bytes(64)) -> Bomb:
         return _made(name, codes, lambda: _typed(type_name, b"ros2msg", text, b"cdr", data))
@@ -328,13 +328,13 @@ BOMBS = (
 
 
 def former_cases() -> list[Bomb]:
-    """Return the files beside the repository that caused failures of earlier versions, where they are present."""
+    """Return the files beside the repository that caused failures of earlier versions, if present."""
     folder = ROOT.parent / "shared" / "torture"
     return [Bomb(p.name, lambda _, p=p: p, _ANY) for p in sorted([*folder.glob("*.mcap"), *folder.glob("*.bag")])]  # type: ignore[misc]
 
 
 def judge_bomb(bomb: Bomb, folder: Path) -> Verdict:
-    """Make a bomb in a folder and inspect it in a process of its own."""
+    """Make a bomb in a folder and inspect it in a separate process."""
     process = measured("inspect", str(bomb.make(folder)), limit_s=3 * LIMIT_S)
     verdict = judge(process, bomb.codes)
     problems = [verdict.problem] if verdict.problem else []

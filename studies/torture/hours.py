@@ -78,7 +78,7 @@ def _shifted(drive: Drive, shift_s: float) -> Drive:
 
 
 def write_hours(path: Path, hours: float) -> None:
-    """Write a log of so many hours: the sample road drive again and again, every time where the last one ended."""
+    """Write a log of the given hours: the sample road drive repeated, each time from the end of the last one."""
     once = read_samples(ROOT / "sample_logs" / "road.mcap")
     imu = once["/imu/data"].log_ns
     lasts_ns = int(imu[-1] - imu[0]) + 10_000_000

@@ -1,4 +1,4 @@
-"""Ends ``pdhef run`` at any moment and reports what it left."""
+"""Kill ``pdhef run`` at random moments and report the remaining files."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ import pyarrow.parquet as pq
 
 #: Content with the time of recording, so that two runs never give the same bytes.
 TIMED = (".rrd",)
-#: What a whole file has near its end.
+#: Bytes near the end of a complete file.
 ENDS = {".mcap": b"\x89MCAP0\r\n", ".rrd": b"RRF2FOOT"}
-#: A command that was asked to end must have done so after this; nothing waits for longer.
+#: Longest wait for the end of a command after a signal.
 LONGEST_END_S = 120.0
 
 
@@ -71,12 +71,12 @@ def kill_run(
 
 
 def _notice_interrupts() -> None:
-    """Undo what a shell does to commands in the background: they ignore SIGINT."""
+    """Undo the shell's setting for commands in the background: they ignore SIGINT."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _prepared(output: Path) -> set[int]:
-    """Return what identifies the folders in which logs' outputs are prepared."""
+    """Return the inodes of the folders in which logs' outputs are prepared."""
     prepared = set()
     with contextlib.suppress(FileNotFoundError):  # also of the search, while a run removes its folder
         for folder in (output / "logs" / ".pdhef").glob("*/new"):
@@ -107,7 +107,7 @@ def kill_many(
 
 
 def faults(output: Path) -> list[str]:
-    """Return what under final names is not whole, in words; empty after any kill."""
+    """Return the problems of incomplete files under final names; empty after any kill."""
     problems = []
     for path in sorted(p for p in output.rglob("*") if p.is_file() and not hidden(p, output)):
         try:
@@ -131,16 +131,16 @@ def faults(output: Path) -> list[str]:
 
 
 def hidden(path: Path, output: Path) -> bool:
-    """Return whether a path lies under a hidden name, where commands prepare what they write."""
+    """Return whether a path lies under a hidden name, where commands prepare their output."""
     return any(part.startswith(".") for part in path.relative_to(output).parts)
 
 
 def leftovers(output: Path) -> list[str]:
-    """Return what no run leaves when it ends by itself."""
+    """Return the files that a run removes at its regular end."""
     return sorted(p.relative_to(output).as_posix() for p in output.rglob("*") if hidden(p, output))
 
 
 def contents(output: Path) -> dict[str, bytes]:
-    """Return the files whose bytes two runs share, by path, and of the others the path alone."""
+    """Return the bytes of all files by path, empty for files with the time of recording."""
     files = sorted(p for p in output.rglob("*") if p.is_file())
     return {os.fspath(p.relative_to(output)): b"" if p.suffix in TIMED else p.read_bytes() for p in files}

@@ -18,7 +18,7 @@ _CHECKED = ("zstd.mcap", "lz4.mcap", "plain.mcap", "unchunked.mcap", "noindex.mc
 
 
 def log_judge(work: Path, seed: int):  # type: ignore[no-untyped-def]
-    """Return what judges one mutated log by its number; the seeds are made first, and what runs need is compiled."""
+    """Make the seeds, compile the code for runs, and return a function that judges one mutated log by its number."""
     seeds = write_seeds(work / "seeds")
     counts = {}
     for name in seeds:

@@ -1,8 +1,8 @@
-"""Damage for recordings: bytes, and records that are taken apart, changed, and put together with valid sums again.
+"""Damage recordings: change bytes, or parse records, change them, and write them with valid checksums.
 
-A flipped byte inside a compressed chunk ends at its CRC; what harms lies behind it. So chunks are opened, their records
-changed, and closed again, so that the faults reach what reads declarations, schemas and payloads. The same seed and
-number give the same file.
+The CRC of a compressed chunk detects a flipped byte, so that later code never reads it. Therefore chunks are opened,
+their records are changed, and the chunks are closed again: the faults reach the readers of declarations, schemas and
+payloads. The same seed and number give the same file.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ _CHUNK, _INDEX = 6, 7
 
 
 def damage_mcap(content: bytes, rng: random.Random) -> bytes:
-    """Change top-level records, or those inside a chunk, whose size, compression and CRC are then made valid again."""
+    """Change top-level records, or records inside a chunk; then correct the chunk's size, compression and CRC."""
     records = _mcap_records(content[8:-8])
     for _ in range(rng.choice((1, 1, 2, 3))):
         if not records:
@@ -145,7 +145,7 @@ def damage_mcap(content: bytes, rng: random.Random) -> bytes:
             records[i] = (_CHUNK, _damage_chunk(records[i][1], rng))
         else:
             _damage_list(records, rng)
-    if rng.random() < 0.2:  # what a killed recorder leaves
+    if rng.random() < 0.2:  # as after a killed recorder
         records = [r for r in records if r[0] not in (_INDEX, 8, 11, 13, 14)]
     body = b"".join(struct.pack("<BQ", op, len(payload)) + payload for op, payload in records)
     return _MAGIC + body + (_MAGIC if rng.random() < 0.9 else b"")
@@ -184,7 +184,7 @@ def _damage_chunk(payload: bytes, rng: random.Random) -> bytes:
         (n,) = struct.unpack_from("<I", payload, 28)
         compression = payload[32 : 32 + n]
         inner = _mcap_records(_unpacked(compression, payload[40 + n :], size))
-    except Exception:  # noqa: BLE001 (what an earlier fault left, with any exception of the decompressor)
+    except Exception:  # noqa: BLE001 (the decompressor raises any exception on an earlier fault)
         return damage_bytes(payload, rng)
     if inner:
         _damage_list(inner, rng)
@@ -232,7 +232,7 @@ def _packed(compression: bytes, body: bytes) -> bytes:
 
 @dataclass(slots=True)
 class BagRecord:
-    """A record of a ROS 1 bag: header fields and data; those of a chunk lie in ``inner``."""
+    """A record of a ROS 1 bag: header fields and data; ``inner`` contains the records of a chunk."""
 
     fields: list[tuple[bytes, bytes]]
     data: bytes

@@ -80,7 +80,7 @@ def _family(pid: int) -> Iterator[int]:
 
 
 def _peak_bytes(pid: int) -> int:
-    """Return the peak memory of a process since its program was loaded, without that of its parent."""
+    """Return the peak memory of a process since its program was loaded, excluding the peak of its parent."""
     with contextlib.suppress(OSError, IndexError, ValueError):
         return int(Path(f"/proc/{pid}/status").read_text().split("VmHWM:")[1].split()[0]) << 10
     return 0

@@ -199,7 +199,7 @@ def _database(path: Path) -> None:
         shutil.copyfile(Path(folder) / "bag" / "bag.db3", path)
 
 
-#: What writes each seed, by its file's name.
+#: Writer of each seed, by file name.
 SEEDS: dict[str, Callable[[Path], None]] = {
     "zstd.mcap": partial(_mcap, "zstd"),
     "lz4.mcap": partial(_mcap, "lz4"),

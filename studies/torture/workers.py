@@ -51,7 +51,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """How a case ended by its number, as one line of the journal; the peak is that of its process so far."""
+    """Outcome of a case by its number, as one line of the journal; the peak is the peak of its process so far."""
 
     number: int
     end: str
@@ -137,7 +137,7 @@ def _case(judge_case: Callable[[int], Verdict], number: int, tell: Tell) -> Case
 
 
 def read_journal(journal: Path) -> Iterator[Case]:
-    """Return the cases that are done; a line that a kill cut is none."""
+    """Return the completed cases; lines cut by a kill are skipped."""
     if not journal.is_file():
         return
     for line in journal.read_text().splitlines():

@@ -1,4 +1,4 @@
-"""Where machine code is kept, and what no cache may do."""
+"""Location of the compiled code, and limits of the cache."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CODE = "from pdhef_logtool.compiled.cache import njit\n\n\n@njit(cache=True)\nd
 
 @pytest.fixture
 def module_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A module with one compiled function, and an installation, a user and temporary folders of its own."""
+    """A module with one compiled function, and a separate installation, user folder and temporary folder."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
     monkeypatch.setattr(cache, "announced", False)
@@ -32,7 +32,7 @@ def module_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
     file = tmp_path / "installed" / "pdhef_logtool" / "module.py"
     file.parent.mkdir(parents=True)
     file.write_text(_CODE)
-    sources.compiled_digest()  # that of the real sources
+    sources.compiled_digest()  # of the real sources
     monkeypatch.setattr(sources, "ROOT", tmp_path / "installed")
     cache.kept_in.cache_clear()
     yield file
@@ -49,7 +49,7 @@ def _load(file: Path) -> ModuleType:
 
 
 def _close(monkeypatch: pytest.MonkeyPatch, *folders: Path) -> None:
-    """Let nothing be written below these folders: permissions do not hold back root."""
+    """Make these folders read-only: permissions do not restrict root."""
     monkeypatch.setattr(
         cache, "_writable", lambda f, was=cache._writable: not any(map(f.is_relative_to, folders)) and was(f)
     )
@@ -71,7 +71,7 @@ def test_the_first_folder_that_can_be_written_keeps_the_code(
         assert _code_files(keeps), keeps
         assert "compiling, once, about" in capsys.readouterr().err
         assert _load(module_file).more(1) == 2
-        assert capsys.readouterr().err == ""  # warm: nothing is compiled
+        assert capsys.readouterr().err == ""  # warm: no compilation
         monkeypatch.setattr(cache, "_writable", writable)
         monkeypatch.setattr(cache, "announced", False)
         shutil.rmtree(module_file.parent / "__pycache__", ignore_errors=True)
@@ -280,7 +280,7 @@ def test_another_compiler_or_processor_is_another_digest(monkeypatch: pytest.Mon
     assert digest() == usual
 
 
-#: Calls a compiled function whose compiled callee lies in another file; prints where it is from and what it returns.
+#: Calls a compiled function with a compiled callee in another file; prints the module's file and the result.
 _USE = """
 import numpy as np
 from pdhef_logtool.car.nominal_model import model_parameters
@@ -294,7 +294,7 @@ _CALLEE, _LINE = "pdhef_logtool/car/nominal_model.py", "    return (1.0 + p.ay_r
 
 
 def _used(python: str | Path, **environment: str) -> tuple[Path, float]:
-    """Return the file of the module in use and what its function returns."""
+    """Return the file of the imported module and the result of its function."""
     done = subprocess.run(
         [python, "-c", _USE], capture_output=True, text=True, cwd="/", env={"PATH": os.environ["PATH"], **environment}
     )

@@ -1,4 +1,4 @@
-"""d2: what an estimate of v_y lets open against the sensors, without truth."""
+"""Lateral kinematic consistency: the residual of v̇_y against the sensors, without ground truth."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SENSORS = SensorErrors(ay_bias_m_s2=0.2, yaw_rate_bias_rad_s=0.003, ay_gain=1.08
 
 
 def signals(sensors: SensorErrors) -> Signals:
-    """Return what such sensors read of the motion above."""
+    """Return the readings of such sensors for the motion above."""
     felt = VY_RATE + SPEED * RATE
     ay = sensors.ay_gain * felt + sensors.lever_m * YAW_ACCELERATION + sensors.ay_bias_m_s2
     return Signals(
@@ -52,7 +52,7 @@ def d2(of: Signals, vy: np.ndarray, sensors: SensorErrors) -> MetricRow:
 
 
 def driven(of: Signals, vy: np.ndarray, *ends: int) -> float:
-    """Return the part of d2 that goes with the driving, of windows that end there."""
+    """Return the part of the consistency residual that correlates with the driving, of windows that end there."""
     total, seconds = np.zeros((4, 4)), 0.0
     for a, b in zip((0, *ends), (*ends, T.size), strict=True):
         part, estimate = of.rows(a, b), track(vy).rows(a, b)
@@ -139,6 +139,6 @@ def test_an_estimate_that_does_not_explain_the_yaw_rate_is_contradicted() -> Non
 def test_without_something_to_compare_with_nothing_is_contradicted() -> None:
     assert contradiction(rows({"pd_hef": 1.0}, pd_hef=3.0)) is None
     assert contradiction(rows({}, phy_ukf=1.0, pd_hef=3.0)) is None  # no steering, no yaw-rate test
-    # it integrates what d2 compares with
+    # kinematic integrates the reference of the test
     assert contradiction(rows({"kinematic": 0.01, "pd_hef": 0.01}, kinematic=0.01, pd_hef=3.0)) is None
     assert contradiction(rows({"zero": 0.01}, zero=1.0)) is None

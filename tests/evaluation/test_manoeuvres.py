@@ -20,7 +20,7 @@ from truthsim.vehicle_choice import choose_vehicle
 
 T0 = 1_700_000_000_000_000_000
 VEHICLE = default_vehicle()
-#: What each manoeuvre of the simulator is recognised as.
+#: Recognised manoeuvre of each manoeuvre of the simulator.
 EXPECTED = {
     **{name: name for name in ("dlc", "dlc-3888-2", "sine-sweep", "sine-with-dwell", "fishhook", "step-steer")},
     **{name: name for name in ("ramp-steer", "brake-in-turn", "power-off-in-turn", "steady-circle", "slalom")},
@@ -53,7 +53,7 @@ def signals(t, steer, speed, yaw_rate, ax, ay, start_ns=T0):
 
 
 def as_signals(drive):
-    """What the sensors of a simulated drive state, on the stamps of its IMU."""
+    """Sensor values of a simulated drive, on the stamps of its IMU."""
     imu, steering, wheels = (drive.channels[c] for c in ("imu", "steering", "wheels"))
     t = imu.times_s
     speed = 0.5 * (wheels.fields["rl_m_s"] + wheels.fields["rr_m_s"])
@@ -83,7 +83,7 @@ def names(s):
 
 
 def linear_car(t, steer, speed=22.0):
-    """A car whose yaw rate follows its steering with 0.1 s of delay."""
+    """A car with a yaw rate that follows the steering with 0.1 s of delay."""
     lag = np.exp(-np.median(np.diff(t)) / 0.1)
     rate, rates = 0.0, []
     for wanted in steer * speed / (2.87 * (1.0 + speed**2 / 28.0**2)):

@@ -1,7 +1,7 @@
-"""Train on a set four times what memory is left for it, and say what a row costs beside a small set without a limit.
+"""Train on a set four times as large as the free memory, and measure the cost per row against a small set.
 
 Run by tests: ``python larger_than_memory.py FOLDER MEGABYTES UNITS EPOCHS``. The set is files on the disk, as extract
-writes them; the limit is that of the kernel on this process's own memory.
+writes them; the limit is the kernel's limit for the memory of this process.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from pdhef_logtool.residual_model.features import FEATURES
 
 #: Of one drive: a minute.
 STEPS = 6000
-#: What a row takes as arrays: features, targets and weight as float32. They came as float64 before.
+#: Bytes of a row as arrays: features, targets and weight as float32. They came as float64 before.
 ROW_BYTES = 4 * (len(FEATURES) + 3)
 
 
@@ -67,7 +67,7 @@ def write_set(folder: Path, drives: int, steps: int = STEPS) -> Path:
 
 
 def held_bytes() -> int:
-    """Return what of this process counts against the limit."""
+    """Return the memory of this process that counts against the limit."""
     status = Path("/proc/self/status").read_text()
     return 1024 * next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmData"))
 
@@ -88,7 +88,7 @@ def main() -> None:
     recipe = replace(Recipe(), hidden=units, head=(units,), epochs=epochs)
     drives = -(-4 * limit // (STEPS * ROW_BYTES))
     small, large = (write_set(folder / name, n) for name, n in (("small", max(10, drives // 8)), ("large", drives)))
-    cost(small, folder / "warm", recipe)  # what a first training loads is no part of a row
+    cost(small, folder / "warm", recipe)  # the first training loads modules: not counted per row
     alone, _ = cost(small, folder / "a", recipe)
     resource.setrlimit(resource.RLIMIT_DATA, (held_bytes() + limit,) * 2)
     among, sha256 = cost(large, folder / "b", recipe)

@@ -1,6 +1,6 @@
-"""A single-track car in plain Python whose motion is the nominal model's plus a residual in closed form.
+"""A single-track car in plain Python with a residual in closed form on top of the nominal model.
 
-It shares nothing with ``pdhef_logtool.car.nominal_model``. The residual is ``A sin(2π f t)`` on v̇_y and another on ṙ,
+It shares no code with ``pdhef_logtool.car.nominal_model``. The residual is ``A sin(2π f t)`` on v̇_y and another on ṙ,
 so that its increments are known exactly.
 """
 
@@ -151,7 +151,7 @@ def truth_of(stamps: np.ndarray, state: np.ndarray) -> StateTrack:
 
 
 def pick(whole: Measured, index: np.ndarray | slice) -> Measured:
-    """Only some rows of a drive: a part, or what a recorder that lost the others would have."""
+    """Return only some rows of a drive: a part, or the rows of a recorder that lost the others."""
     signals = replace(
         whole.signals,
         **{f.name: getattr(whole.signals, f.name)[index] for f in fields(Signals) if f.name != "available"},

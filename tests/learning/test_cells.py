@@ -1,4 +1,4 @@
-"""What a dataset holds by speed, lateral acceleration and friction, and what of it is chosen to learn from."""
+"""Cells of a dataset by speed, lateral acceleration and friction, and the selection of training data from them."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_extract_chooses_leaves_copies_out_and_older_sets_still_open(sample_logs
     held = np.array(result.manifest["cells"]["usable_s"]["train"])
     assert held.max() > 4.0 and seconds.max() < 2.05, "a row or two may lie on an edge in float32"
     assert (seconds[held > 0] > 0).all()
-    # The same signals under another name, in another call, take the place of what was there.
+    # The same signals under another name, in another call, replace the existing ones.
     extract([str(tmp_path / "b.mcap")], out, replace(asked, split="validation", per_cell_s=None))
     (other,) = read_dataset(out).drives
     assert (other.name, other.split, other.limits) == ("b", "validation", None)

@@ -280,7 +280,7 @@ def _slow(values: np.ndarray, dt_s: np.ndarray, tau_s: float) -> np.ndarray:
 
 
 def test_a_plain_ridge_is_trained_from_the_file_alone(sample_logs_dir: Path, tmp_path: Path) -> None:
-    """A file with a front axle that is too soft: what a ridge learns of every second block lowers the others' error."""
+    """The front axle of the file is too soft: a ridge trained on every second block lowers the error on the others."""
     text = (sample_logs_dir / "vehicle.toml").read_text()
     (tmp_path / "soft.toml").write_text(text[: text.index("[network]")] + "\n" + text[text.index("[sensors]") :])
     soft = (tmp_path / "soft.toml").read_text().replace("B = 11.146", "B = 7.0")
@@ -424,7 +424,7 @@ def test_manifest_beside_the_logs_decides_and_the_option_wins(sample_logs_dir: P
     jsonschema.validate(result.manifest, SCHEMA)
     chosen = extract(logs, tmp_path / "out", ExtractSettings(RunConfig(), split="validation"))
     assert {(d["split"], d["split_from"]) for d in chosen.manifest["drives"]} == {("validation", "option")}
-    # What stood in another split's folder is gone: it would be read with the rest.
+    # Files in another split's folder are deleted, as they would be read with the rest.
     assert {p.parent.parent.name for p in (tmp_path / "out").rglob("*.parquet")} == {"split=validation"}
 
 

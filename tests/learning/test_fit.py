@@ -1,4 +1,4 @@
-"""Training: it learns what can be learnt, resumes bit for bit, and refuses what it cannot use."""
+"""Training: it learns learnable targets, resumes bit for bit, and rejects unusable data."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ SCRIPT = Path(__file__).with_name("larger_than_memory.py")
 
 
 def measured(folder: Path, megabytes: float, units: int, epochs: int) -> dict[str, float]:
-    """Return what the script says: a process has one limit for all its life."""
+    """Run the script in a process, for the memory limit applies to a process for its whole life; return its output."""
     command = [sys.executable, str(SCRIPT), str(folder), f"{megabytes:g}", str(units), str(epochs)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)

@@ -1,4 +1,4 @@
-"""The sideslip reference in place of ground truth: only on request, where it is independent, and stated everywhere."""
+"""The sideslip reference in place of ground truth: on request only, if it is independent, and stated everywhere."""
 
 from __future__ import annotations
 

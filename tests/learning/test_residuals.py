@@ -1,4 +1,4 @@
-"""Residuals of drives whose residual is known in closed form."""
+"""Residuals of drives with a residual in closed form."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def test_segments_begin_where_the_filter_does(noisy: Measured) -> None:
     changes = np.flatnonzero(np.diff(rows.segment)) + 1
     assert index[changes].tolist() == [380]
     assert (np.diff(rows.segment) >= 0).all()
-    # What leads into a new start is not carried over in service either.
+    # In operation, the state before a restart is not carried over either.
     assert rows.weight[changes - 1].tolist() == [0.0]
 
 
@@ -216,7 +216,7 @@ def test_staircase_truth_is_noise() -> None:
     assert difference_noise(START_NS + np.arange(2000) * 10_000_000, held) > 1.0
 
 
-# --- what physics lacks ----------------------------------------------------------------------------------------------
+# --- missing residual of physics -------------------------------------------------------------------------------------
 
 
 def oracle_window(oracle: Oracle, made: Drive, **signals: np.ndarray) -> Measured:
@@ -228,7 +228,7 @@ def oracle_window(oracle: Oracle, made: Drive, **signals: np.ndarray) -> Measure
 @pytest.mark.slow
 @pytest.mark.parametrize("names", [("lag",), ("lag", "roll", "load_transfer")], ids="+".join)
 def test_physics_of_the_car_lacks_nothing_and_a_force_that_it_does_not_know_comes_out(names: tuple[str, ...]) -> None:
-    """The oracle's car, driven by its own equations; told 10 % less grip the model lacks force in proportion to a_y."""
+    """Drive the oracle's car by its equations; with 10 % less grip, the model lacks a force in proportion to a_y."""
     oracle = Oracle(parts(*names))
     made = oracle.drive(lambda t: 0.03 * np.sin(3.0 * t), 6.0)
     physics = PhysicsFilter(oracle.as_vehicle())
@@ -245,7 +245,7 @@ def test_physics_of_the_car_lacks_nothing_and_a_force_that_it_does_not_know_come
 
 @pytest.mark.slow
 def test_an_offset_of_the_steering_angle_is_no_residual() -> None:
-    """What is taken off before training is what the offset makes, and nothing of a residual that comes and goes."""
+    """The effect of the offset is removed before training; an alternating residual is not."""
     oracle = Oracle(parts("lag"))
     made = oracle.drive(lambda t: 0.02 * np.sin(3.0 * t), 12.0)
     off = made.signals.steer_rad + 0.002

@@ -44,7 +44,7 @@ def make_features(seed: int, steps: int = 600) -> np.ndarray:
     rng = np.random.default_rng(seed)
     walks = rng.normal(size=(steps, 28))  # more than features: another number of them draws the same
     features = np.cumsum(walks[:, : len(FEATURES)], axis=0) * 0.1
-    features[:, FEATURES.index("friction")] = 0.85  # one road: says nothing
+    features[:, FEATURES.index("friction")] = 0.85  # one road: no information
     return features
 
 
@@ -63,7 +63,7 @@ def test_regression_recovers_known_coefficients():
     assert model.intercept_rad == pytest.approx(0.01, abs=1e-10)
     noisy = fit_linear([make_sequence(s, 0.01) for s in range(8)], NAMES)
     assert noisy.coefficients[:3] == pytest.approx((0.002, -0.03, 0.5), abs=0.004)
-    assert noisy.coefficients[3] == 0.0  # a constant feature takes nothing
+    assert noisy.coefficients[3] == 0.0  # a constant feature gets no weight
 
 
 def test_low_pass_is_the_textbooks_and_carries_its_memory():

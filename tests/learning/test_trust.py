@@ -1,4 +1,4 @@
-"""Stage gain: the rule on errors whose answer is known, and what it writes."""
+"""Stage gain: the rule on errors with a known answer, and its output."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ PERIOD_NS = 10_000_000
 
 
 def _errors(rmse_deg: list[float], *, spread: float = 0.3, blocks: int = 30, seed: int = 0) -> BlockErrors:
-    """Blocks of 1000 stamps whose mean square at each trust scatters about the given RMSE, each for itself."""
+    """Blocks of 1000 stamps; the mean square at each gain scatters independently about the given RMSE."""
     rng = np.random.default_rng(seed)
     scatter = np.exp(rng.normal(0.0, spread, (len(TRUSTS), blocks)))
     squares = 1000.0 * np.radians(rmse_deg)[:, None] ** 2 * scatter
@@ -65,7 +65,7 @@ def test_a_network_that_does_nothing_is_rarely_confirmed() -> None:
 
 
 def test_one_block_cannot_confirm_a_gain() -> None:
-    # All of the gain is in a single block of thirty, of which a third of the resamples know nothing.
+    # All of the gain is in a single block of thirty, which a third of the resamples lack.
     errors = _errors([0.3] * 5, spread=0.0)
     squares = errors.squares.copy()
     squares[0, 7] *= 100.0
@@ -161,7 +161,7 @@ def test_leaving_hard_stamps_out_gains_nothing() -> None:
     blocks = block_errors(errors, truth, stamps, np.ones(count, dtype=np.bool_))
     assert blocks.lost == 200
     assert blocks.squares[-1].sum() == pytest.approx(100 * 0.05**2 + 100 * 0.03**2 + 1800 * 0.01**2)
-    # Where physics alone has no estimate nothing is compared.
+    # Samples without an estimate of physics alone are not compared.
     errors[0, -500:] = np.nan
     assert block_errors(errors, truth, stamps, np.ones(count, dtype=np.bool_)).counts.sum() == 1500
 
@@ -265,7 +265,7 @@ def test_a_drive_of_the_identification_is_told(sample_logs_dir: Path) -> None:
     log = find_logs([str(sample_logs_dir / "dlc.mcap")])[0]
     facts, _ = load_drive(log, car, None, ReadOptions())
     assert seen_by_identification(car, [facts]) == []
-    # By its content where it is known, by its name in older files.
+    # The content identifies a drive if it is known, the name in older files.
     same = LearntOn(name="dlc", end_s=7.0)
     renamed = LearntOn(name="renamed", sha256=facts.sha256, end_s=7.0)
     others = (LearntOn(name="dlc_2", end_s=7.0), LearntOn(name="dlc", sha256="0" * 64, end_s=7.0))

@@ -1,4 +1,4 @@
-"""``pdhef learn --stages calibrate``: a pool of logs makes a car, and what cannot carry one is refused."""
+"""``pdhef learn --stages calibrate``: a car is made from a pool of logs, and insufficient pools are rejected."""
 
 from __future__ import annotations
 

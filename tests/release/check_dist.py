@@ -1,4 +1,4 @@
-"""Looks at what was built: one wheel and one source archive of this version, with all that a run needs and no more.
+"""Check the built archives: one wheel and one source archive of this version, with exactly the files that a run needs.
 
 python tests/release/check_dist.py dist
 """
@@ -14,7 +14,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 #: Of the wheel; it had 2.9 MB when this was written.
 MOST_BYTES = 4_000_000
-#: What is read at run time beside the code, by the folder of the tree that it comes from.
+#: Data files that are read at run time, by their folder in the tree.
 DATA = ("pdhef_logtool/models", "pdhef_logtool/reports/assets", "pdhef_logtool/reports/templates", "truthsim/vehicles")
 NEEDED = {"pdhef_logtool/py.typed", "truthsim/py.typed", "pdhef_logtool/mapping/vendors.toml"}
 NOT_SHIPPED = ("tests", "studies", "benchmarks", "docs", "sample_logs")
@@ -27,7 +27,7 @@ def _files(folder: str, pattern: str = "*") -> set[str]:
 
 
 def problems(folder: Path) -> list[str]:
-    """Return what is wrong with the archives of a folder, in lines."""
+    """Return the problems of the archives of a folder, in lines."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     version = project["version"]
     names = sorted(p.name for p in folder.iterdir())

@@ -14,7 +14,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 #: Distributions of extras, which a release does not bring along.
 NOT_SHIPPED = re.compile(r"torch|triton|nvidia-.*|cuda-.*|pytest.*")
-#: What each virtual environment has.
+#: Packages present in every virtual environment.
 INSTALLERS = {"pip", "setuptools"}
 
 

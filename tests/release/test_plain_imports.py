@@ -8,7 +8,7 @@ import sys
 import plain_install
 import pytest
 
-#: What the extras bring and no hard dependency does.
+#: Packages of the extras that no hard dependency installs.
 OPTIONAL = ("aiobotocore", "aiohttp", "asammdf", "botocore", "h5py", "ray", "s3fs", "torch", "yarl")
 
 

@@ -1,4 +1,4 @@
-"""A release: one version everywhere, and a container file that names what there is."""
+"""A release: one version everywhere, and a container file that names existing files."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_every_dependency_is_locked_and_a_run_needs_no_torch() -> None:
 
 
 def _bill(file: Path, **versions: str | None) -> list[str]:
-    """Return the problems of a bill of materials of what a release installs, but for some versions."""
+    """Return the problems of a bill of materials of the installed packages, with changed versions."""
     needed = {re.split(r"[<>=~\[]", r)[0]: "" for r in PROJECT["dependencies"]} | versions
     pinned = check_sbom.locked()
     parts = [
@@ -76,7 +76,7 @@ def test_a_bill_of_materials_is_checked(tmp_path: Path) -> None:
 
 
 def _archives(folder: Path, without: str = "", besides: str = "") -> Path:
-    """Write what stands for a wheel and a source archive, as they should be but for one file."""
+    """Write stubs of a wheel and a source archive, correct except for one file."""
     name = f"pdhef_logtool-{__version__}"
     files = [*(ROOT / "pdhef_logtool").rglob("*"), *(ROOT / "truthsim").rglob("*")]
     inside = {f.relative_to(ROOT).as_posix(): f for f in files if f.is_file() and "__pycache__" not in f.parts}

@@ -1,4 +1,4 @@
-"""A headless Chromium, spoken to over its debugging pipe: no port is opened and nothing but the file is loaded."""
+"""A headless Chromium, controlled over its debugging pipe: no port is opened and only the file is loaded."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gp
 
 
 class Browser:
-    """One page of a browser; ``messages`` are those of its console, ``requests`` every address that it asked for."""
+    """One page of a browser; ``messages`` come from its console, ``requests`` are all requested addresses."""
 
     def __init__(self, width: int = 1280, height: int = 900, *, webgl: bool = False) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="pdhef-chromium-")
@@ -62,7 +62,7 @@ class Browser:
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
-        self.call("Performance.enable", timeDomain="threadTicks")  # what else the machine does is not counted
+        self.call("Performance.enable", timeDomain="threadTicks")  # other load of the machine is not counted
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
 
     def __enter__(self) -> Browser:
@@ -191,7 +191,7 @@ class Browser:
 
 
 def serious(browser: Browser) -> list[str]:
-    """Return what axe-core finds that is serious or critical (WCAG 2.1 AA), a line an element."""
+    """Return the serious and critical findings of axe-core (WCAG 2.1 AA), a line an element."""
     browser.value(AXE.read_text(encoding="utf-8") + ";0")
     found = json.loads(browser.value("axe.run(document).then((r) => JSON.stringify(r.violations))"))
     grave = [v for v in found if v["impact"] in ("serious", "critical")]

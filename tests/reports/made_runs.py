@@ -1,4 +1,4 @@
-"""Finished runs as files, made without estimating: what a page is drawn from."""
+"""Finished runs as files, made without estimating: the input of a page."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def drive_tracks(
 
 
 def report_of(tracks: list[StateTrack], label: str = "drive", **changes: Any) -> dict[str, Any]:
-    """Return a report.json with what a page reads of it."""
+    """Return a report.json with the entries that a page reads."""
     names = [t.name for t in tracks if t.name != "truth"]
     stamps = tracks[0].stamps_ns
     truth = any(t.name == "truth" for t in tracks)

@@ -1,4 +1,4 @@
-"""The pages in a browser: what it says, asks for, draws, and how long that takes."""
+"""The pages in a browser: messages, requests, figures, and drawing time."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def page_of(folder: Path) -> Path:
 
 
 def opened(browser: Browser, file: Path) -> None:
-    """Open a page and see that nothing but it was asked for, and nothing said."""
+    """Open a page and assert that it requests only its file and prints no message."""
     browser.messages.clear()
     browser.requests.clear()
     browser.open(file)
@@ -144,7 +144,7 @@ def test_an_hour_of_fourteen_tracks_is_small_and_quick(browser, tmp_path):
     before = browser.busy_s()
     opened(browser, file)
     after = browser.busy_s()
-    # The clock of a page begins anew where the browser gives it another process.
+    # The clock of a page restarts if the browser moves the page to another process.
     assert (after - before if after > before else after) < FIRST_PICTURE_S
     browser.value(_DRAWN)
     times = []

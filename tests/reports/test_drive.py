@@ -1,4 +1,4 @@
-"""The page of a drive, without a browser: what it says of drives of every kind."""
+"""The page of a drive, without a browser: its content for drives of every kind."""
 
 from __future__ import annotations
 

@@ -20,10 +20,10 @@ from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 
-#: Units that people read over those of report.json: degrees, percent, minutes, hours, kilometres, milliseconds.
+#: Units of the page over units of report.json: degrees, percent, minutes, hours, kilometres, milliseconds.
 FACTORS = (1.0, math.degrees(1.0), 100.0, 1 / 60, 1 / 3600, 1e-3, 1e3)
 _NUMBER = re.compile(r"(?<![\w.,:#])[-−+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w:]|\.\d)")
-#: Dates are those of start_ns; digits within names, versions and hashes are no figures.
+#: Dates come from start_ns; digits within names, versions and hashes are no figures.
 _NO_FIGURE = re.compile(r"\d{4}-\d\d-\d\d[T ]?[\d:.]*Z?|\d{19}|[\w-]*[A-Za-z_]\w*[-.]\d[\w.-]*")
 
 
@@ -89,7 +89,7 @@ def ratios(document: dict[str, Any]) -> Iterator[float]:
 
 
 def missing(page: str, document: dict[str, Any], template: str = "") -> list[str]:
-    """Return the numbers of a page, with what is around them, that the document has not."""
+    """Return the numbers of a page, with their context, that the document lacks."""
     numbers, texts = known(document, (document.get("log") or {}).get("start_ns", 0))
     text, fixed = shown(page), shown(template) + texts
     absent = []

@@ -1,4 +1,4 @@
-"""The page of a run: it says what is there, links to what it names, and runs nothing that a log says."""
+"""The page of a run: its content and links, and that text from a log is never executed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The document to sign: what it contains, and what it leaves out."""
+"""The document to sign: its content and its omissions."""
 
 from __future__ import annotations
 

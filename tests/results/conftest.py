@@ -19,7 +19,7 @@ TrackMaker = Callable[..., StateTrack]
 
 
 def adaptive_columns(at: np.ndarray) -> dict[str, np.ndarray]:
-    """Return what an adaptive estimator says besides: its gyro stuck at 100 to 149, spikes of a_y at 30 and 400."""
+    """Return further columns of an adaptive estimator: gyro stuck at 100 to 149, spikes of a_y at 30 and 400."""
     reason = np.where((at >= 100) & (at < 150), STUCK_YAW_RATE, 0) | np.where(np.isin(at, [30, 400]), SPIKE_AY, 0)
     return {"mixture_weight": np.where(at % 50 == 49, np.nan, 0.5 + 0.4 * np.sin(at / 50)), "reason": reason}
 

@@ -1,4 +1,4 @@
-"""Folders of finished runs whose figures a test makes up."""
+"""Folders of finished runs with figures set by a test."""
 
 from __future__ import annotations
 

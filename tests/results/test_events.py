@@ -96,7 +96,7 @@ def test_an_error_is_known_only_where_it_is_scored(run: Path) -> None:
     assert [e.drive for e in _find(run, "abs(sideslip_error_deg) > 170").events] == ["b"]
     _report(run, "b", low_speed_blend_m_s=3.0)
     assert not _find(run, "abs(sideslip_error_deg) > 170").events
-    unknown = _find(run, "not abs(vx_error_m_s) > 1").events  # an error of what is not valid is not below 1 either
+    unknown = _find(run, "not abs(vx_error_m_s) > 1").events  # the error of an invalid value is not below 1 either
     assert {e.drive: round(e.end_s, 2) for e in unknown} == {"a": 6.99, "b": 2.04}
 
 
@@ -165,7 +165,7 @@ def test_a_clip_has_the_topics_of_the_source_and_ours_around_the_event(clipped: 
         messages = {t.name: t.messages for t in clip.topics}
         assert (messages["/imu"], messages["/pdhef/pd_hef/state"]) == (209, 210)
     write_clips(open_run(folder), _find(folder, "sideslip_rad > 2"), pad_s=1.0, source=logs)
-    assert list((folder / "clips").iterdir()) == []  # those of the last search alone
+    assert list((folder / "clips").iterdir()) == []  # only clips of the last search
 
 
 def test_a_source_that_is_not_found_or_is_another_file_is_told(clipped: tuple[Path, Path], tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The figures of a fleet: exact intervals, rankings that need evidence, and nothing scored without truth."""
+"""The figures of a fleet: exact intervals, rankings that need evidence, and no score without ground truth."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def test_equal_runs_with_drives_of_six_days_are_seldom_called_worse(shared: floa
         alone += paired_change(ratios).verdict() == "worse"
         together += paired_change(ratios, None, factors).verdict() == "worse"
     assert together <= 140  # of 2000, nominal 100
-    assert alone >= 200  # what treating the drives as independent does
+    assert alone >= 200  # the result of treating the drives as independent
 
 
 def test_the_design_effect_is_that_of_the_simulated_correlation() -> None:

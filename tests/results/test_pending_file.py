@@ -1,4 +1,4 @@
-"""The file that appears only when it is complete: what stays in the folder after every way that writing can end."""
+"""The file that appears only when it is complete: the content of the folder after every way that writing can end."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from pdhef_logtool.results.rerun_sink import LONGEST_BRIDGE_NS, MOST_OTHERS, wri
 from pdhef_logtool.results.sink import Event
 
 HASH = "0123456789abcdef" * 4
-#: Of one track only: the others have those of the palette.
+#: Of one track only: the others use the colours of the palette.
 COLOURS = {"phy-ukf": 0x123456}
 #: The third track that is written, zero, is neither.
 SHOWN = ["phy-ukf"]
@@ -84,7 +84,7 @@ def recording(tmp_path, circle, circle_signals) -> Path:
 
 
 def tables(path: Path) -> tuple[dict[str, pa.Table], dict[str, list[pa.RecordBatch]]]:
-    """Return by entity what stands on the timelines and what is static."""
+    """Return the timed and the static columns by entity."""
     reader = RrdReader(path)
     store = reader.recordings()[0]
     timed: dict[str, list[pa.RecordBatch]] = defaultdict(list)

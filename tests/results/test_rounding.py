@@ -15,7 +15,7 @@ _COLUMNS = ("x_m", "yaw_rad", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_
 @settings(derandomize=True, deadline=None)
 @given(st.sampled_from(_COLUMNS), hnp.arrays(np.float64, 8, elements=st.floats(-1e6, 1e6)))
 def test_no_number_moves_further_than_is_said_and_none_moves_twice(column: str, values: np.ndarray) -> None:
-    # Numbers below the smallest normal one of single precision have fewer bits: they are not what is rounded here.
+    # Numbers below the smallest normal number of single precision have fewer bits; they are not tested here.
     values = np.where(np.abs(values) < np.finfo(np.float32).tiny, 0.0, values)
     once = rounded(column, values)
     step, share = resolution(column)

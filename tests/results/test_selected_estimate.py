@@ -1,4 +1,4 @@
-"""The answer of a run in words: what it claims, and that it claims nothing that the figures do not."""
+"""The selected estimate of a run in words: every claim has a figure that supports it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verdict of a drive, a sentence a signal: it claims what the interval holds and names why there is none."""
+"""The verdict of a drive, one sentence per signal, from the interval or with the reason why it is missing."""
 
 from __future__ import annotations
 

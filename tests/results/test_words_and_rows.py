@@ -1,4 +1,4 @@
-"""What the outputs say and hold to the letter, on documents and rows that are written out here."""
+"""Exact texts and values of the outputs, for literal documents and rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How files hold numbers, said once more: steps of what moves, single precision of what was told, else 12 bits."""
+"""Number formats of files, defined a second time: steps for state values, single precision for inputs, else 12 bits."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def _standing(drive: Drive) -> Drive:
 
 
 def _stepped(drive: Drive, *, stamps_s: float, recorder_s: float) -> list[Drive]:
-    """Set the clocks of stamps and of the recorder by so much from the middle on, in the order of recording."""
+    """Shift the clocks of stamps and of the recorder from the middle on, in the order of recording."""
     imu = drive["/imu/data"].log_ns
     middle = (imu[0] + imu[-1]) // 2
     before = {t: s.take(np.flatnonzero(s.log_ns < middle)) for t, s in drive.items()}
@@ -107,7 +107,7 @@ def _scaled(factor: float) -> Callable[[Drive], Drive]:
     return _sensors(lambda s, _: replace(s, values={k: v * factor for k, v in s.values.items()}))
 
 
-#: What is changed, and the exit codes that are right.
+#: Change of a drive, and the expected exit codes.
 NUMERICS: dict[str, tuple[Callable[[Drive], Drive | list[Drive]], tuple[int, ...]]] = {
     "20 Hz": (_at_rate(20.0), (0,)),
     "200 Hz": (_at_rate(200.0), (0,)),

@@ -21,7 +21,7 @@ from pdhef_logtool.workers.supervisor import Tell
 
 
 def stub_drive(task: DriveTask, tell: Tell) -> DriveEnd:
-    """Write what run_drive writes, without reading the log."""
+    """Write the files of run_drive without reading the log."""
     log = task.log
     tell(log.stem, 0.0)
     car = RunCars.of(task.config, lambda _: None).of_log(log)

@@ -22,7 +22,7 @@ from pdhef_logtool.runs.fleet import run_logs
 
 @pytest.fixture
 def fleet(sample_logs_dir: Path, tmp_path: Path) -> Path:
-    """Return a folder with two cars, and a log of each in a folder of its own."""
+    """Return a folder with two cars, and a log of each in a separate folder."""
     for name in ("golf", "mini"):
         folder = tmp_path / "fleet" / name / "day"
         folder.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Rows of estimates.parquet that depend on nothing later in the log."""
+"""Rows of estimates.parquet that are independent of later parts of the log."""
 
 from __future__ import annotations
 

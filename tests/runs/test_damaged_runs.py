@@ -1,4 +1,4 @@
-"""A run whose files were damaged: what ``--resume`` runs again, and what commands that read it say."""
+"""A run with damaged files: the drives that ``--resume`` repeats, and the messages of commands that read it."""
 
 from __future__ import annotations
 

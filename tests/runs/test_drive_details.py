@@ -1,4 +1,4 @@
-"""What a run writes for the pages: planted faults, the verdict of a plan, and reasons without truth."""
+"""Files that a run writes for the pages: planted faults, the verdict of a plan, and reasons without ground truth."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from pdhef_logtool.runs.inspection import inspect_log
 
 @pytest.fixture
 def wrong_sign(sample_logs_dir: Path, tmp_path: Path) -> Path:
-    """A mapping of the sweep whose steering has the wrong sign."""
+    """Return a mapping of the sweep with the wrong sign of the steering."""
     log = open_log(sample_logs_dir / "sweep.mcap")
     text = mapping_to_toml(auto_map(log).mapping)
     log.close()

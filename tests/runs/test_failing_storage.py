@@ -1,4 +1,4 @@
-"""Logs and outputs whose storage fails during a run."""
+"""Logs and outputs on storage that fails during a run."""
 
 from __future__ import annotations
 

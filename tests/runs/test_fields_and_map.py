@@ -1,4 +1,4 @@
-"""Every number of a log, the way to a mapping by question and answer, and what a log is good for."""
+"""Every number of a log, the way to a mapping by question and answer, and the possible uses of a log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``pdhef run --ray``: three nodes here, one of which goes while it works on a drive. Part of ``make fleet``."""
+"""``pdhef run --ray``: three nodes here; one is lost while it works on a drive. Part of ``make fleet``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.workers.ray_nodes import START_S, cluster_of_one, grow, processes_of
 
 
 def files_of(output: Path) -> dict[str, bytes]:
-    """Return what a run has left, but for its times."""
+    """Return the files of a run that contain no time."""
     return {
         p.relative_to(output).as_posix(): p.read_bytes()
         for p in sorted(output.rglob("*"))

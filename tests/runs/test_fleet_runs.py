@@ -1,4 +1,4 @@
-"""A run of several logs: what its journal keeps, what goes on, what is run anew, what is given up."""
+"""A run of several logs: its journal, resumed drives, repeated drives, and aborted drives."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.runs.stub_drives import stub_drive
 
 
 def named_logs(folder: Path, *names: str) -> Path:
-    """Write logs that a stub's work reads nothing of: each holds its name."""
+    """Write logs that contain only their names; the stub does not read them."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
         (folder / f"{name}.mcap").write_text(f"this is {folder.name}/{name}")
@@ -41,7 +41,7 @@ def labels(output: Path) -> list[str]:
 
 
 class Counted:
-    """A stub's work that counts what it is asked for."""
+    """A stub that records the requested drives."""
 
     def __init__(self, ends: Callable[[DriveTask, Tell], DriveEnd] = stub_drive) -> None:
         self.asked: list[str] = []
@@ -133,7 +133,7 @@ def test_what_is_run_anew_is_said_and_why(tmp_path: Path, sample_logs_dir: Path)
         "2 of 2 drives are run again: --friction auto → 0.4",
     ]
     assert work.asked == ["a", "b"] * 3
-    assert len(list((out / "metrics").rglob("*.parquet"))) == 2  # those of before are gone
+    assert len(list((out / "metrics").rglob("*.parquet"))) == 2  # the former ones are deleted
 
 
 def test_more_is_kept_when_it_is_asked_for_and_never_less(tmp_path: Path) -> None:
@@ -276,7 +276,7 @@ def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir: Path,
     assert (tmp_path / "logs" / worst / "report.html").is_file()
     assert (tmp_path / "report.html").is_file()
     assert {r.metric for r in result.results[0].rows} >= {"rmse", "nees", "lag_s"}
-    assert [(r.document, r.figures) for r in result.results] == [(None, None)] * 2  # nothing is held of a drive
+    assert [(r.document, r.figures) for r in result.results] == [(None, None)] * 2  # no drive stays in memory
 
 
 def test_a_fleets_summary_counts_what_the_figures_say(tmp_path: Path) -> None:

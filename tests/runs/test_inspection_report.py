@@ -1,4 +1,4 @@
-"""The whole inspection: what it reports of a log, as record, as JSON, as tables and as a mapping to edit."""
+"""The whole inspection of a log, as record, as JSON, as tables and as a mapping to edit."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_recorded_drives(shared_dir: Path, file: str, mapping_name: str | None) 
     assert found.truth
     json.dumps(found.to_dict(), allow_nan=False)
     text = text_of(found, 80)
-    assert max(len(line) for line in text.splitlines()[1:]) <= 80  # The path stands on a line of its own.
+    assert max(len(line) for line in text.splitlines()[1:]) <= 80  # The path is on a separate line.
 
 
 @pytest.mark.slow
@@ -183,7 +183,7 @@ def test_a_log_with_a_dropout_and_losses(shared_dir: Path) -> None:
     assert imu.largest_gap_s == pytest.approx(30.01, abs=0.02)
     assert imu.largest_gap_at_s == pytest.approx(135.0, abs=0.1)
     assert found.signals["ay_m_s2"].dropped == {"nan": 2, "duplicate-stamp": 20}
-    # The truth of the same name has lost nothing.
+    # The ground truth of the same name has lost no sample.
     assert found.truth["yaw_rate_rad_s"].dropped == {}
     assert found.is_partial
 

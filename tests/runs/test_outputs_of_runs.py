@@ -1,4 +1,4 @@
-"""Runs that are killed, meet full disks or each other, or would write over what they read."""
+"""Runs that are killed, meet full disks or each other, or would overwrite their input."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SLICE = ("--start", "2", "--end", "4")
 
 
 def config(sample_logs_dir: Path, **changes: Any) -> RunConfig:
-    """Return what runs in a moment: one second of driving, without the compiler."""
+    """Return settings of a short run: one second of driving, without the compiler."""
     car = sample_logs_dir / "vehicle.toml"
     return RunConfig(
         **{"car": car, "estimators": ("zero",), "annotate": "sidecar", "start": "2", "end": "3", **changes}
@@ -74,7 +74,7 @@ def test_a_mapping_in_a_folder_that_is_replaced_is_refused(sample_logs_dir: Path
         run_logs([log], tmp_path, config(sample_logs_dir, mapping=mapping))
 
 
-# ------------------------------------------------------------------------------------------------- what stays
+# ----------------------------------------------------------------------------------------------- files that stay
 
 
 def test_a_persons_files_and_what_the_run_does_not_write_stay(sample_logs_dir: Path, tmp_path: Path, log: str) -> None:
@@ -128,7 +128,7 @@ def test_whichever_write_fails_a_log_is_whole_and_the_error_one_line(
             assert str(error).startswith(str(out)), number
             assert "No space left on device; free some space" in str(error), number
         found = contents(out)
-        # The page is made of the finished run: where that failed there is none, and never that of the run before.
+        # The page is made of the finished run: after a failure there is no page, and never the page of the former run.
         here = {p: c for p, c in found.items() if p.startswith("logs")}
         unpaged = {p: c for p, c in in_log["new"].items() if not p.endswith(".html")}
         assert here in (*in_log.values(), unpaged), number
@@ -143,7 +143,7 @@ def test_whichever_write_fails_a_log_is_whole_and_the_error_one_line(
 
 @pytest.fixture
 def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
-    """A file system of its own with as many bytes as the test says."""
+    """A separate file system of the size that the test requests."""
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = shutil.which("mount") and subprocess.run(

@@ -1,4 +1,4 @@
-"""What the sideslip reference finds in ground truth: turned, drifting, held, and nothing in a sound one."""
+"""Faults that the sideslip reference finds in ground truth (turned, drifting, frozen), and none in a sound one."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def test_the_report_says_when_the_gyro_stuck(stuck_run: tuple[RunResult, Path]) 
     assert filters["phy-ukf"] is None
     (stuck,) = [r for r in filters["pd-hef"] if r["name"] == "stuck_yaw_rate"]
     assert stuck["intervals"] == 1 and stuck["longest"] == [{"start_ns": stuck["first_ns"], "end_ns": stuck["end_ns"]}]
-    # It is told when it has lasted for 0.05 s.
+    # It is reported after it has lasted for 0.05 s.
     assert told(report_markdown(report)) == (pytest.approx(START_S, abs=0.11), pytest.approx(END_S, abs=0.11))
 
 

@@ -1,4 +1,4 @@
-"""A run whose car calibrates itself: who takes it, what is said of it, and that no truth is read."""
+"""A run with self-calibration: its users, its messages, and that no ground truth is read."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool,
 
 pytestmark = pytest.mark.slow
 
-#: Of the road: so much carries a calibration.
+#: End of the part of the road drive that suffices for a calibration.
 END = "110"
 NAMES = ("zero", "open-loop", "open-loop:calibrated", "phy-ukf", "physics")
 
 
 @pytest.fixture(scope="module")
 def wrong_car(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a bare vehicle file of the sample logs' car whose front axle is half as stiff."""
+    """Return a bare vehicle file of the sample logs' car with half the front axle stiffness."""
     text = (sample_logs_dir / "vehicle.toml").read_text()
     head, _, rest = text.partition("[network]")
     path = tmp_path_factory.mktemp("car") / "vehicle.toml"
@@ -166,7 +166,7 @@ def test_a_calibration_on_line_stays_causal_and_says_so(sample_logs_dir: Path, w
     jsonschema.validate(report, load_schema("report.schema.json"))
     told = {e["name"]: e for e in report["estimators"]}
     assert told["physics"]["causal"]
-    assert told["physics"]["outcome"] == "ran"  # the causality check of the run has found nothing
+    assert told["physics"]["outcome"] == "ran"  # the causality check of the run passed
     assert any("shown so far" in note for note in told["physics"]["notes"])
     assert report["self_calibration"]["online"]
     assert told["physics"]["intervals"] == ["intervals: own and parameters"]

@@ -1,4 +1,4 @@
-"""A large log is looked at by its index and a sample of its chunks; what is told is what a whole reading tells."""
+"""A large log is inspected by its index and a sample of its chunks; the result equals a full read."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _text(found: Inspection, width: int = 80) -> str:
 
 
 def _by_times(found: Inspection) -> list[dict[str, object]]:
-    """Return what is told of topics, without the delays."""
+    """Return the entries of topics, without the delays."""
     return [{k: v for k, v in t.items() if not k.startswith("delay")} for t in found.to_dict()["topics"]]
 
 

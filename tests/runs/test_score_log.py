@@ -93,7 +93,7 @@ def test_odometry_gives_the_same_but_for_the_rows_that_it_lacks(annotated: Path,
         for metric in ("rmse", "mae", "bias", "p95_abs", "max_abs", "coverage95"):
             (value, n), (other, m) = state[signal, "all", metric], odometry[signal, "all", metric]
             assert n == m
-            # A message without a sideslip has that of v_y, whose calibrated interval has a factor of its own.
+            # Without a sideslip in the message, v_y gives it, with a different factor on the calibrated interval.
             loose = signal == "sideslip_rad" and metric == "coverage95"
             assert other == pytest.approx(value, rel=0.02 if loose else 1e-3)
             compared += 1
@@ -208,7 +208,7 @@ def test_named_truth_replaces_the_recognised_one(annotated: Path, config: RunCon
     stamps = pl.read_parquet(annotated / "estimates.parquet")
     a, b = (stamps.filter(pl.col("estimator") == n)["vy_m_s"].to_numpy() for n in ("phy-ukf", "zero"))
     difference = (a - b)[np.isfinite(a - b)]
-    # Without a yaw rate nothing measures a latency of this truth, so that the two are compared stamp by stamp.
+    # The latency of ground truth without a yaw rate cannot be measured, so that the two are compared stamp by stamp.
     assert _value(report, "vy_m_s", "rmse") == pytest.approx(math.sqrt(float(np.mean(difference**2))), rel=1e-6)
 
 
@@ -342,4 +342,4 @@ def test_250_lm_speed_is_not_independent_of_its_truth(shared_dir: Path) -> None:
         assert "vx_m_s" in report["truth"]["not_independent"]
         assert _value(report, "vx_m_s", "not_independent") == 1.0
         assert _value(report, "vx_m_s", "rmse") < 1e-5
-        assert {m["signal"] for m in report["metrics"]} == {"vx_m_s"}  # it claims nothing else
+        assert {m["signal"] for m in report["metrics"]} == {"vx_m_s"}  # no other claim

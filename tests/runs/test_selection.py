@@ -1,4 +1,4 @@
-"""What runs by default, and which estimator is the answer: by the car's evidence, else by d2, never by the truth."""
+"""Default estimators and the selected estimate: by the car's evidence, else by consistency, never by ground truth."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_the_interface_for_scripts_runs_the_same_ones(sample_logs_dir: Path) -> 
 def test_the_truth_of_a_log_never_chooses(
     sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calibrate: Any
 ) -> None:
-    """Whatever is best by d2 is taken here, so that a choice by the truth would show."""
+    """The best estimator by consistency is always selected here, so that a choice by ground truth would show."""
     monkeypatch.setattr(selection, "FACTOR", 0.0)
     answers, best = [], set()
     for name, text in (("right", TRUTH), ("shuffled", SHUFFLED)):
@@ -144,7 +144,7 @@ def test_the_truth_of_a_log_never_chooses(
 
 
 def test_a_choice_on_line_depends_on_nothing_that_follows(sample_logs_dir: Path) -> None:
-    """The sensors go wild after 40 s; what is selected until then stays, and what follows may change."""
+    """The sensors fail after 40 s; the selection until then is unchanged, and the later selection may change."""
     car, wild_s = Car.of(default_vehicle()), 40.0
     with read_drive(sample_logs_dir / "road.mcap", car) as drive:
         signals = drive.whole().signals.rows(0, 6000)

@@ -1,4 +1,4 @@
-"""Damaged files of our own: what a run left is changed, then every command that reads it back is run on it."""
+"""Damaged output files: files of a run are changed, then every command that reads them is run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _TEXTS = (b"", b"{}", b"[]", b"null", b"NaN", b'"text"', b'{"logs": 1e999}', b"\
 
 
 def own_file_judge(work: Path, seed: int) -> Callable[[int], Verdict]:
-    """Return what judges one damaged run by its number; the sound one is made first."""
+    """Make the sound run, and return a function that judges one damaged run by its number."""
     sound = work / "sound-run"
     shutil.rmtree(sound, ignore_errors=True)
     ended = _run(sound)
@@ -39,7 +39,7 @@ def own_file_judge(work: Path, seed: int) -> Callable[[int], Verdict]:
 def judge_own_file(work: Path, seed: int, sound: Path, number: int) -> Verdict:
     """Damage a file of a run, or several, read it with a command, and go on with the run.
 
-    After ``--resume`` the tables must be those of the sound run, whatever was damaged.
+    After ``--resume`` the tables must equal the tables of the sound run, for any damage.
     """
     rng = random.Random(f"{seed} own file {number}")
     run = work / "cases" / f"own-{number}"
@@ -65,7 +65,7 @@ def judge_own_file(work: Path, seed: int, sound: Path, number: int) -> Verdict:
 
 
 def judge_told(ended: Ended) -> Verdict:
-    """Return what every end must be; a command that could use nothing says why in a warning at least."""
+    """Return the verdict on the end of a command; without usable input, it must at least warn with a reason."""
     told = any(line.startswith(_TOLD) for line in ended.err.splitlines())
     return judge(Ended(ended.code, ended.out, f"{ended.err}\npdhef\n" if told else ended.err))
 
@@ -84,7 +84,7 @@ def _run(output: Path, *options: str) -> Ended:
 
 
 def _files(run: Path) -> list[Path]:
-    """Return the files that commands read back, those of the first drive alone."""
+    """Return the files that commands read back, from the first drive only."""
     names = ["journal.jsonl", "run.json", "metrics.parquet", "logs/dlc/report.json", "logs/dlc/estimates.parquet"]
     return [*(run / name for name in names), sorted((run / "metrics").rglob("*.parquet"))[0]]
 

@@ -35,7 +35,7 @@ def _yaw_rate(inflation: Inflation) -> tuple[float, ...]:
 
 
 def _samples(rng: np.random.Generator, std: FloatArray, terms: FloatArray, drives: int = 30) -> Samples:
-    """Samples of drives whose errors have a size of their own, [n], as those of real drives have."""
+    """Return samples [n] of drives with a different error size each, as in real drives."""
     n = std.shape[0]
     drive = np.arange(n) * drives // n
     size = np.exp(rng.normal(0.0, 0.2, drives))[drive]
@@ -120,7 +120,7 @@ def test_a_wrong_vehicle_widens_by_what_it_asks_for() -> None:
 
 
 def test_unseen_drives_decide_the_factor() -> None:
-    """Terms that know each drive's own error size by chance fit it, and mean nothing on another drive."""
+    """A term that correlates with each drive's error size by chance fits it, but not on another drive."""
     rng = np.random.default_rng(4)
     drives, each = 10, 200
     drive = np.repeat(np.arange(drives), each)

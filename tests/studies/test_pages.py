@@ -1,4 +1,4 @@
-"""What the pages share, and that the commands and files that documents name are there."""
+"""Shared parts of the pages, and the existence of the commands and files named in documents."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The paper's experiment in small: one noise seed, the shipped network, no pictures, held against bounds.
 
-The bounds stand above what the full run measures (docs/paper.md); a change that loses the gain fails here.
+The bounds are looser than the results of the full run (docs/paper.md); a change that loses the gain fails here.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SIDESLIP_BOUNDS_DEG: dict[tuple[str, str], float] = {
     ("A", "phy-ukf"): 0.40,
     ("B", "phy-ukf"): 0.60,
 }
-#: Least share by which the sideslip RMSE of the first lies below that of the second, by scenario.
+#: Least relative reduction of the sideslip RMSE of the first scheme against the second, by scenario.
 LEAST_GAIN: dict[tuple[str, str, str], float] = {
     ("A", "pd-hef", "phy-ukf"): 0.6,
     ("B", "pd-hef", "phy-ukf"): 0.6,
@@ -77,7 +77,7 @@ def _experiment(ours: dict[tuple[int, int | None], float], theirs: dict[int, flo
 
 def test_improvement_is_that_of_pooled_errors_and_pairs_the_noise_seeds() -> None:
     theirs = {1: 1.0, 2: 2.0, 3: 4.0}
-    # Half the error on every drive: pairs leave nothing to chance, however different the drives are.
+    # Half the error on every drive: paired seeds remove all variation, however different the drives are.
     gain = improvement(_experiment({(s, 0): 0.5 * v for s, v in theirs.items()}, theirs), "A", "ours", "theirs")
     assert gain is not None
     assert (gain.value, gain.low, gain.high) == pytest.approx((0.5, 0.5, 0.5))

@@ -179,7 +179,7 @@ def test_few_drives_are_cut_and_many_are_dealt_out(static: FitDrive, monkeypatch
     gap = float(second.signals.stamps_ns[0] - first.signals.stamps_ns[-1]) * 1e-9
     assert gap == pytest.approx(2.0 * GUARD_S, abs=0.05)
     assert lasts(first) == pytest.approx(lasts(second), abs=0.1)
-    # The cut goes by driving that can be used, not by the clock.
+    # The cut divides usable driving, not time.
     late = replace(long, truth=replace(long.truth, valid=np.arange(len(long.truth)) >= 200))
     (((first,), (second,)), _) = make_folds([late], guess())
     assert usable_seconds(first, guess()) == pytest.approx(usable_seconds(second, guess()), abs=0.1)

@@ -25,7 +25,7 @@ from studies.peers.parameters import OF_CAR, PEAK, pairs_table
 from studies.peers.scoring import DriveErrors, car_means, score
 
 SPEED_M_S, STEP_S, SECONDS = 20.0, 0.01, 30.0
-#: Sideslip RMSE in degrees on the simulated linear car, whose sideslip has an RMS of 0.37°.
+#: Sideslip RMSE in degrees on the simulated linear car, with a sideslip RMS of 0.37°.
 BOUNDS_DEG = {
     "linear-kf": 0.001,
     "learned-single-track": 0.16,  # stationary: sideslip lags behind steering

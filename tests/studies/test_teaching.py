@@ -1,4 +1,4 @@
-"""The study of teaching: its pairs, and that the stored results meet what teaching promises."""
+"""The study of teaching: its pairs, and that the stored results meet the requirements."""
 
 from __future__ import annotations
 

@@ -30,13 +30,13 @@ LOGS, CONFIGS = 40, 12
 
 
 def _quiet(_text: str) -> None:
-    """Say nothing."""
+    """Print no progress."""
 
 
 @pytest.mark.fleet
 @pytest.mark.slow
 def test_mutants_do_no_harm(tmp_path: Path) -> None:
-    """In a process of its own: what the tests hold in memory is not the mutants'."""
+    """Run in a separate process: memory used by the tests must not count for the mutants."""
     options = ["--seed", "2", "--logs", str(LOGS), "--configs", str(CONFIGS), "--jobs", "1", "--only", "mutations"]
     call = [
         sys.executable,
@@ -59,8 +59,8 @@ def test_mutants_do_no_harm(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_numbers_that_did_harm_once(tmp_path: Path) -> None:
     judge_number = log_judge(tmp_path, 1)
-    # A database's time of 2^63 - 1; a run of a log without messages; 55 years of a channel that nothing declares; times
-    # of 1677 in an annotated copy; a pose whose definition lacks a component of its quaternion.
+    # A database's time of 2^63 - 1; a run of a log without messages; 55 years of a channel without a declaration; times
+    # of 1677 in an annotated copy; a pose with a definition that lacks a component of its quaternion.
     for number in (6586, 11008, 12118, 140808, 163083):
         assert judge_number(number).problem == ""
 
