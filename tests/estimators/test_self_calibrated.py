@@ -17,11 +17,8 @@ from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew, default
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter, physics_filter
-from pdhef_logtool.estimators.self_calibrated import (
-    D2_SHARE,
-    OPEN_LOOP,
-    SelfCalibrated,
-)
+from pdhef_logtool.estimators.presets import OPEN_LOOP
+from pdhef_logtool.estimators.self_calibrated import D2_SHARE, SelfCalibrated
 from pdhef_logtool.estimators.table import all_names, make_estimator
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
