@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from typing import Any
 
 import pytest
 
+ROOT = Path(__file__).resolve().parents[2]
 _NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
 #: Time limit for the start of a node, with margin for a busy machine.
 START_S = 120.0
@@ -21,6 +23,8 @@ def cluster_of_one() -> Iterator[Any]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_CLIENT_MODE", "0")  # Ray sets it; the patch restores it
+        patch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)  # nodes import the work of tests
         terminated = signal.getsignal(signal.SIGTERM)
         made = Cluster(initialize_head=True, head_node_args={**_NODE, "include_dashboard": False})
         try:
