@@ -167,6 +167,6 @@ def test_a_calibration_on_line_stays_causal_and_says_so(sample_logs_dir: Path, w
     told = {e["name"]: e for e in report["estimators"]}
     assert told["physics"]["causal"]
     assert told["physics"]["outcome"] == "ran"  # the causality check of the run passed
-    assert any("shown so far" in note for note in told["physics"]["notes"])
+    assert any("calibrated on the log up to each time" in note for note in told["physics"]["notes"])
     assert report["self_calibration"]["online"]
     assert told["physics"]["intervals"] == ["intervals: own and parameters"]
