@@ -29,9 +29,9 @@ import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputState, check_inputs, r_scale, residual_rate
-from pdhef_logtool.estimators.filter_base import VX, FilterState, PosteriorSteps, sideslip_std
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter, of_car
 from pdhef_logtool.estimators.sensor_faults import no_faults
+from pdhef_logtool.estimators.vehicle_model import VX
+from pdhef_logtool.estimators.vehicle_ukf import FilterState, PosteriorSteps, VehicleUkf, of_car, sideslip_std
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
 from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack
@@ -89,20 +89,14 @@ def _gather(dt, likelihood, starts, evidence, out):  # type: ignore[no-untyped-d
             out[k, h] = evidence[h]
 
 
-def gather_evidence(
-    steps: Sequence[PosteriorSteps], before: Sequence[FilterState] | None, evidence: FloatArray | None
-) -> tuple[FloatArray, FloatArray]:
-    """Return Λ [K, H] of the filters' steps, and that after the last.
+def gather_evidence(dt_s: FloatArray, likelihood: FloatArray, starts: BoolArray, evidence: FloatArray) -> FloatArray:
+    """Return Λ [K, H] of steps with durations and starts [K] and log-likelihoods [K, H].
 
-    ``before`` and ``evidence`` [H] are the filters and Λ before the first step, None at the start of a log.
+    ``evidence`` [H] is Λ before the first step and becomes that of the last.
     """
-    before_ns = None if before is None else before[0].last_stamp_ns
-    evidence = np.zeros(len(steps)) if evidence is None else evidence.copy()
-    likelihood = np.stack([s.log_likelihood for s in steps], axis=1)
     out = np.empty_like(likelihood)
-    starts = ~np.isfinite(steps[0].prior[:, VX])
-    _gather(step_durations_s(steps[0].stamps_ns, before_ns), likelihood, starts, evidence, out)
-    return out, evidence
+    _gather(dt_s, likelihood, starts, evidence, out)
+    return out
 
 
 def weigh(evidence: FloatArray, usable: BoolArray) -> FloatArray:
@@ -231,7 +225,7 @@ class AdaptivePhysics:
     version = 1
     options = ("physics", "trust", "adaptive")
 
-    physics: PhysicsFilter
+    physics: VehicleUkf
     network: NetworkService | None = None
     trust: float = 0.0
     adaptive: bool = True
@@ -240,7 +234,7 @@ class AdaptivePhysics:
     notes: tuple[str, ...] = ()
 
     @property
-    def filters(self) -> tuple[PhysicsFilter, ...]:
+    def filters(self) -> tuple[VehicleUkf, ...]:
         """F1, and one filter a cure that the car has."""
         vehicle = self.physics.vehicle
         cures = [cure for cure in CURES if getattr(vehicle.physics, cure)]
@@ -265,7 +259,10 @@ class AdaptivePhysics:
         before: Sequence[FilterState | None] = state.filters if state else [None] * len(filters)
         runs = [f.run(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)]
         steps = tuple(filter_steps for filter_steps, _ in runs)
-        gathered, evidence = gather_evidence(steps, state.filters if state else None, state.evidence if state else None)
+        likelihood, starts = np.stack([s.log_likelihood for s in steps], axis=1), ~np.isfinite(steps[0].prior[:, VX])
+        dt_s = step_durations_s(signals.stamps_ns, state.filters[0].last_stamp_ns if state else None)
+        evidence = state.evidence.copy() if state else np.zeros(len(filters))
+        gathered = gather_evidence(dt_s, likelihood, starts, evidence)
         weights = weigh(gathered, np.stack([filter_steps.valid for filter_steps in steps], axis=1))
         raised = r_scale(faults.extra_r, self.physics.measurement_std)
         after = AdaptiveState(inputs, tuple(state for _, state in runs), evidence)
@@ -278,11 +275,16 @@ class AdaptivePhysics:
             weighed = of_one.valid[step] & (steps.weights[step, h] > 0.0)
             tracks.append(physics_filter.predict(of_one, replace(ahead, usable=ahead.usable & weighed), stamps_ns))
         track = mix(steps.weights[step], tracks) if len(tracks) > 1 else tracks[0]
+        reason = np.where(ahead.arrived, steps.reason[step], 0)
+        return self.described(track, steps.weights[step], steps.r_scale[step], reason)
+
+    def described(self, track: StateTrack, weights: FloatArray, raised: FloatArray, reason: IntArray) -> StateTrack:
+        """Return a track [N] with gain, weight of the cures by weights [N, H], factor on R and reasons [N]."""
         columns: dict[str, Any] = {"network_trust": np.where(track.valid, self.trust, np.nan)}
         if self.adaptive:
-            columns["r_scale"] = np.where(track.valid, steps.r_scale[step], 1.0)
-            columns["mixture_weight"] = np.where(track.valid, 1.0 - steps.weights[step, 0], np.nan)
-            columns["reason"] = np.where(ahead.arrived, steps.reason[step], 0)
+            columns["r_scale"] = np.where(track.valid, raised, 1.0)
+            columns["mixture_weight"] = np.where(track.valid, 1.0 - weights[:, 0], np.nan)
+            columns["reason"] = reason
         return replace(track, name=self.name, **columns)
 
 

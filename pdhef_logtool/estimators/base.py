@@ -47,7 +47,7 @@ class Estimator(Protocol):
 
     @property
     def algorithm(self) -> str:
-        """Stable name of the algorithm, a class attribute, for example ``physics-ukf`` (:mod:`~.algorithm`)."""
+        """Stable name of the algorithm, a class attribute, for example ``vehicle-ukf`` (:mod:`~.algorithm`)."""
         ...
 
     @property
@@ -91,32 +91,12 @@ class ModelPredictor(Protocol):
 
 
 @runtime_checkable
-class LookingAhead(Protocol):
-    """A non-causal estimator, which may use samples after the window."""
+class Smoother(Protocol):
+    """An estimator that is not causal and returns the track of a drive from all of its samples."""
 
-    @property
-    def look_ahead_s(self) -> float:
-        """Look-ahead in s that makes the result independent of the windows."""
+    def smooth(self, signals: Signals) -> StateTrack:
+        """Return the track of a drive at the stamps of its signals [N]."""
         ...
-
-    def run(self, signals: Signals, state: Any | None, ahead: Signals | None = None) -> tuple[Any, Any]:
-        """Process one window as :meth:`Estimator.run`; ``ahead`` has the samples after it, and begins the next window.
-
-        Without ``ahead``, the log ends with the window.
-        """
-        ...
-
-
-def look_ahead_of(estimator: Estimator) -> float:
-    """Return the required look-ahead of an estimator in s; 0 for a causal one."""
-    return estimator.look_ahead_s if isinstance(estimator, LookingAhead) else 0.0
-
-
-def run_steps(estimator: Estimator, signals: Signals, state: Any | None, ahead: Signals | None) -> tuple[Any, Any]:
-    """Run one window; only a non-causal estimator receives ``ahead``."""
-    if isinstance(estimator, LookingAhead):
-        return estimator.run(signals, state, ahead)
-    return estimator.run(signals, state)
 
 
 def predict_track(estimator: Estimator, steps: Any, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:

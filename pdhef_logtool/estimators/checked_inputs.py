@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.estimators.filter_base import FilterState
 from pdhef_logtool.estimators.parallel_physics import run_features
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.sensor_faults import FaultState, SensorFaults, find_faults
+from pdhef_logtool.estimators.vehicle_ukf import FilterState, VehicleUkf
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
 
@@ -53,7 +52,7 @@ class CheckedInputs:
 
 
 def check_inputs(
-    physics: PhysicsFilter, network: NetworkService | None, signals: Signals, state: InputState | None
+    physics: VehicleUkf, network: NetworkService | None, signals: Signals, state: InputState | None
 ) -> tuple[CheckedInputs, InputState]:
     """Detect faults in one window, and run parallel filter and network on the accepted samples.
 
@@ -66,7 +65,7 @@ def check_inputs(
 
 
 def residual_rate(
-    physics: PhysicsFilter,
+    physics: VehicleUkf,
     network: NetworkService | None,
     signals: Signals,
     state: InputState | None,

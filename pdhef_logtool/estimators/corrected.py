@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, AdaptiveState, MixtureSteps
-from pdhef_logtool.estimators.filter_base import U_STEER, VX, VY, YAW_RATE, PosteriorSteps
-from pdhef_logtool.estimators.physics_model import FRONT, REAR
+from pdhef_logtool.estimators.vehicle_model import FRONT, REAR, VX, VY, YAW_RATE
+from pdhef_logtool.estimators.vehicle_ukf import U_STEER, PosteriorSteps
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals

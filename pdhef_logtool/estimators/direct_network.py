@@ -7,15 +7,15 @@ stamp by a_x + v_y r and a_y − v_x r, with a_y corrected for body roll.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.base import AY, VX, VY, YAW_RATE, Steps
-from pdhef_logtool.estimators.filter_base import FilterState
-from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
+from pdhef_logtool.estimators.parallel_physics import run_features
+from pdhef_logtool.estimators.vehicle_ukf import FilterState, nominal_filter
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
@@ -76,7 +76,7 @@ class DirectNetwork:
     def run(self, signals: Signals, state: DirectState | None) -> tuple[Steps, DirectState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(
-            parallel_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
+            replace(nominal_filter(self.vehicle, use_speed=self.use_speed), slip_gate=self.slip_gate),
             signals,
             state.physics if state else None,
         )

@@ -36,8 +36,8 @@ from pdhef_logtool.car.nominal_model import (
 )
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.filter_base import U_STEER, VX
-from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
+from pdhef_logtool.estimators.vehicle_model import VX
+from pdhef_logtool.estimators.vehicle_ukf import U_STEER, nominal_filter
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.steps import step_durations_s
@@ -253,7 +253,7 @@ class FrictionBank:
         signals = without_impossible(signals)
         vehicle = self.vehicle.model_copy(update={"friction": USUAL_FRICTION})
         unknown = replace(signals, friction=np.full(len(signals), np.nan))
-        speed_filter = PhysicsUkf(vehicle, use_speed=self.use_speed)
+        speed_filter = nominal_filter(vehicle, use_speed=self.use_speed)
         steps, _ = speed_filter.run(unknown, None)
         filters = grid, _, prior, models = self._filters
         bank = (prior.copy(), np.zeros((len(grid), 2)), np.zeros((len(grid), 3)), np.zeros(_MEMORY))

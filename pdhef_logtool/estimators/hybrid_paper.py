@@ -23,31 +23,53 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.car.nominal_model import (
-    ModelParameters,
-    dynamic_share,
-    measured_lateral_acceleration,
-    model_parameters,
-    planar_lateral_acceleration,
-    substeps,
-)
-from pdhef_logtool.car.nominal_points import AT_VX, AT_VY, AT_YAW_RATE, advance_points, place, work_size
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators import filter_base as base
-from pdhef_logtool.estimators.filter_base import FilterState
 from pdhef_logtool.estimators.fuzzy_trust import NOMINAL_TRUST, fuzzy_trust
-from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
-from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD, measure_sigma_points, set_points
+from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.speed_slip import believable
-from pdhef_logtool.estimators.unscented import (
-    draw_sigma_points,
-    innovation_moments,
-    kalman_update,
-    mean_and_covariance,
+from pdhef_logtool.estimators.unscented import cholesky, draw, moments, reading_moments, update
+from pdhef_logtool.estimators.vehicle_model import (
+    MOTION,
+    NOMINAL,
+    PLACES,
+    READINGS,
+    VX,
+    WIDTH,
+    Z_AY,
+    advance,
+    planar_ay,
+    push,
+    read,
+)
+from pdhef_logtool.estimators.vehicle_ukf import (
+    MEMORY,
+    PHY_UKF_Q_STD,
+    U_AX,
+    U_AX_KNOWN,
+    U_FRICTION,
+    U_STEER,
+    Belief,
+    FilterState,
+    HeldInputs,
+    PosteriorSteps,
+    StepInputs,
+    VehicleUkf,
+    columns_of,
+    diverges,
+    held_over_step,
+    innovate,
+    is_finite,
+    make_window,
+    no_posterior,
+    no_prediction,
+    nominal_filter,
+    predicted_track,
+    process_noise,
+    remember,
 )
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import Extrapolation
+from pdhef_logtool.records.steps import Extrapolation, last_stamp_ns
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
@@ -56,19 +78,33 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.presets import Options
 
-#: θ of Eq 22 and γ of Eq 26: the paper names no values, docs/method.md#paper-adaptation fixes these.
-FORGETTING = 0.95
-PROCESS_NOISE_GAIN = 3.0
-#: Undisturbed norm of R in the paper's Figure 20; a_y has nearly all of it, so that it is the variance of a_y, m²/s⁴.
-PAPER_R_NORM = 0.1
+#: Memory of the filter, with β and C of Eq 22 for each measurement.
+PAPER_MEMORY = np.dtype([*((name, MEMORY[name]) for name in MEMORY.names or ()), ("trust", np.float64), ("c", np.float64, (READINGS,))])  # fmt: skip
 
-# Behind the entries of the filter base's memory: β, and C of Eq 22 a measurement.
-M_TRUST, M_INNOVATION = base.MEMORY, base.MEMORY + 1
-MEMORY = M_INNOVATION + base.MEASUREMENTS
+
+class Constants(NamedTuple):
+    """Constants without a value in the paper, chosen on training drives (``studies/paper/constants.py``).
+
+    Attributes
+    ----------
+    forgetting : θ (Eq 22). process_noise_gain : γ (Eq 26).
+    deviation_tops_m_s2, intensity_tops : tops of the sets small, medium and large of E_ay and I_dyn (Table 2).
+    ay_variance : least R_0 of a_y in m²/s⁴ (Eq 23); 0.1 is the undisturbed norm of R in Figure 20, nearly all of which
+        is a_y's.
+    """
+
+    forgetting: float = 0.95
+    process_noise_gain: float = 3.0
+    deviation_tops_m_s2: tuple[float, float, float] = (0.3, 1.0, 2.5)
+    intensity_tops: tuple[float, float, float] = (0.3, 0.6, 0.85)
+    ay_variance: float = 0.1
+
+
+CHOSEN = Constants()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PaperSteps(base.PosteriorSteps):
+class PaperSteps(PosteriorSteps):
     """Posteriors, and by step, [K]: ``trust`` is β_k, ``r_scale`` R_k / R_0 of a_y.
 
     ``residual_rate`` is the network's at the step, before β.
@@ -84,175 +120,146 @@ class PaperState:
 
     physics: FilterState
     network: NetworkCarry
-    filter_state: base.FilterState
+    filter_state: FilterState
 
 
 class Parallel(NamedTuple):
-    """Steps of the parallel filter: state [K, 4], state before the update, held inputs, and whether they are right."""
+    """Steps of the parallel filter: state [K, 4], state before the update, held inputs, and whether they are right.
+
+    ``nominal_ay`` [K] is a_y of the state before the update, without residual.
+    """
 
     x: FloatArray
     prior: FloatArray
     inputs: FloatArray
     valid: BoolArray
+    nominal_ay: FloatArray
 
 
 @njit(cache=True)
-def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
-    """Move sigma points [s, 4] by ``dt`` and add the increment of the residual ``rate`` whole at the end (Eq 19).
-
-    A residual counts in the dynamic range of the model, not in the kinematic one. ``points`` is work space.
-    """
-    rate_vy, rate_r = rate
-    share = dynamic_share(chi[0, base.VX], p) * dt
-    set_points(chi, over.steer, over.ax, (0.0, 0.0), points)
-    advance_points(points, over.friction, dt, substeps(chi[0, base.VX], dt, over.friction, p), p)
-    for i in range(chi.shape[0]):
-        place_i = place(i)
-        chi[i, base.VX] = points[place_i + AT_VX]
-        chi[i, base.VY] = points[place_i + AT_VY] + share * rate_vy
-        chi[i, base.YAW_RATE] = points[place_i + AT_YAW_RATE] + share * rate_r
+def _predict(x, P, over, rate, dt, noise_dt, q_std, model, points, E):  # type: ignore[no-untyped-def]
+    """Move state and covariance by ``dt`` s, with the increment of the residual ``rate`` whole at the end (Eq 19)."""
+    layout, places, p, f = model
+    n, vx = x.shape[0], x[VX]
+    L, q = np.zeros((n, n)), np.empty(n)
+    cholesky(P, L)
+    draw(x, L, places, columns_of(n), points)
+    advance(points, columns_of(n), over, dt, layout, p, f)
+    push(points, columns_of(n), vx, rate, dt, p)
+    process_noise(q_std, over.ax_known, noise_dt, layout, q)
+    moments(points, places, columns_of(n), q, x, P, E)
 
 
 @njit(cache=True)
-def adapted_noise(innovation_variance, innovation, predicted_variance, r0):  # type: ignore[no-untyped-def]
+def adapted_noise(innovation_variance, innovation, predicted_variance, r0, forgetting):  # type: ignore[no-untyped-def]
     """Return C_k and R_k of one measurement (Eq 22, 23).
 
     Parameters
     ----------
     innovation_variance : C_{k−1}, NaN before the first sample. innovation : ν.
-    predicted_variance : P_zz, without R. r0 : R_0.
+    predicted_variance : P_zz, without R. r0 : R_0. forgetting : θ.
     """
     if not math.isfinite(innovation_variance):
         innovation_variance = predicted_variance + r0
-    c = FORGETTING * innovation_variance + (1.0 - FORGETTING) * innovation * innovation
+    c = forgetting * innovation_variance + (1.0 - forgetting) * innovation * innovation
     return c, max(r0, c - predicted_variance)
 
 
 @njit(cache=True)
-def _filter(window, tuning, r0, p, parallel, estimate, out, adapted):  # type: ignore[no-untyped-def]
-    """Run over one window; ``estimate`` is moved in place.
+def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted):  # type: ignore[no-untyped-def]
+    """Run over one window; ``belief`` is moved in place.
 
     Where the prior of the parallel filter is missing it starts, and this filter with it. ``r0`` [3] is R_0, and
     ``adapted`` residual gain and scale of R at each step, [K] each.
     """
-    dt, _, _, ay, yaw_rate, speed, _, rate, _ = window
-    q_std, _, initial_std, _, wm, wc, scale, rules = tuning
-    start_x, prior, inputs, start_ok = parallel
-    x, P, memory = estimate
+    forgetting, process_noise_gain, deviation_tops, intensity_tops, _ = constants
+    layout, places, p, f = model
+    start_x, prior, inputs, start_ok, nominal_ay = parallel
+    x, P, memory = belief
     out_x, out_P, _, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_trust, out_r_scale = adapted
-    n = base.STATES
-    chi, L, zeta, z_hat, S, Pxz, nu, _, _, use = base.make_work(n)
-    points = np.empty(work_size(2 * n + 1))
-    for k in range(dt.shape[0]):
-        steer, friction, has_ax, ok = (
-            inputs[k, base.U_STEER],
-            inputs[k, base.U_FRICTION],
-            inputs[k, base.U_AX_KNOWN] > 0.0,
-            start_ok[k],
-        )
-        z_ay = ay[k] if ok else math.nan  # without steering no a_y can be predicted
-        z_speed = speed[k] if rules.use_speed else math.nan
-        now = base.StepInputs(dt[k], steer, inputs[k, base.U_AX], has_ax, friction, ok, ok, z_ay, yaw_rate[k], z_speed)
+    n = x.shape[0]
+    columns, points, E, readings = columns_of(n), np.zeros(PLACES * WIDTH), np.zeros(n * WIDTH), np.zeros(3 * WIDTH)
+    L, z_hat, S, Pxz, nu = np.zeros((n, n)), np.zeros(READINGS), np.zeros((READINGS, READINGS)), np.zeros((READINGS, n)), np.zeros(READINGS)  # fmt: skip
+    use = np.zeros(READINGS, np.bool_)
+    for k in range(window.dt_s.shape[0]):
+        m, ok, dt = memory[0], start_ok[k], window.dt_s[k]
+        steer, friction, has_ax = inputs[k, U_STEER], inputs[k, U_FRICTION], inputs[k, U_AX_KNOWN] > 0.0
+        ay = window.ay[k] if ok else math.nan  # without steering no a_y can be predicted
+        speed = window.speed[k] if tuning.rules.use_speed else math.nan
+        now = StepInputs(dt, steer, inputs[k, U_AX], has_ax, friction, ok, ok, ay, window.yaw_rate[k], speed)
         out_r_scale[k] = 1.0
-        if not math.isfinite(prior[k, base.VX]):
-            memory[base.M_INITIALISED] = 0.0
-        if memory[base.M_INITIALISED] == 0.0:
+        if not math.isfinite(prior[k, VX]):
+            m.runs = 0.0
+        if m.runs == 0.0:
             if ok:
-                memory[base.M_INITIALISED] = 1.0
-                memory[M_TRUST] = NOMINAL_TRUST
-                P[:, :] = 0.0
-                for i in range(n):
-                    x[i] = start_x[k, i]
-                    P[i, i] = initial_std[i] ** 2
-                for i in range(base.MEASUREMENTS):
-                    memory[M_INNOVATION + i] = math.nan
+                m.runs, m.trust = 1.0, NOMINAL_TRUST
+                m.c[:] = math.nan
+                x[:] = start_x[k]
+                P[:, :] = np.diag(tuning.initial_std**2)
                 out_valid[k] = True
         else:
-            nominal = measured_lateral_acceleration(
-                prior[k, base.VX], prior[k, base.VY], prior[k, base.YAW_RATE], steer, friction, p
-            )  # fmt: skip
-            trust = fuzzy_trust(abs(ay[k] - nominal), abs(ay[k]) / (friction * GRAVITY_M_S2))
+            intensity = abs(window.ay[k]) / (friction * GRAVITY_M_S2)
+            trust = fuzzy_trust(abs(window.ay[k] - nominal_ay[k]), intensity, deviation_tops, intensity_tops)
             if math.isfinite(trust):
-                memory[M_TRUST] = trust
-            trust = memory[M_TRUST]
-            rate_vy, rate_r = trust * memory[base.M_RATE_VY], trust * memory[base.M_RATE_R]
-            draw_sigma_points(x, P, scale, L, chi)
-            over = base.held_over_step(now, memory)
-            _propagate(chi, over, (rate_vy, rate_r), dt[k], p, points)
-            mean_and_covariance(chi, wm, wc, x, P)
-            base.add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust) * dt[k])  # Eq 26
-            alive = base.all_finite(x, P)
+                m.trust = trust
+            over, rate = held_over_step(now, m), (m.trust * m.rate_vy, m.trust * m.rate_r)
+            noise_dt = (1.0 + process_noise_gain * m.trust) * dt  # Eq 26
+            _predict(x, P, over, rate, dt, noise_dt, tuning.q_std, model, points, E)
+            alive = is_finite(x, P)
             out_prior[k] = x
             if alive:
-                draw_sigma_points(x, P, scale, L, chi)
-                measure_sigma_points(chi, steer, friction, rate_vy, p, points, zeta)
-                innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
-                nu[base.Z_AY] = now.ay - z_hat[base.Z_AY]
-                nu[base.Z_YAW_RATE] = now.yaw_rate - z_hat[base.Z_YAW_RATE]
-                nu[base.Z_SPEED] = now.speed - z_hat[base.Z_SPEED]
-                for i in range(base.MEASUREMENTS):
+                cholesky(P, L)
+                draw(x, L, places, columns, points)
+                read(points, columns, steer, friction, rate[0], layout, p, f, readings)
+                reading_moments(readings, L, columns, z_hat, S, Pxz)
+                innovate(now, z_hat, nu)
+                for i in range(READINGS):
                     use[i] = math.isfinite(nu[i])
                     r = r0[i]
                     if use[i]:
                         out_nu[k, i] = nu[i]
-                        c, r = adapted_noise(memory[M_INNOVATION + i], nu[i], S[i, i], r0[i])
-                        memory[M_INNOVATION + i] = c
-                    elif math.isfinite(memory[M_INNOVATION + i]):
-                        r = max(r0[i], memory[M_INNOVATION + i] - S[i, i])
-                    if i == base.Z_AY:
+                        m.c[i], r = adapted_noise(m.c[i], nu[i], S[i, i], r0[i], forgetting)
+                    elif math.isfinite(m.c[i]):
+                        r = max(r0[i], m.c[i] - S[i, i])
+                    if i == Z_AY:
                         out_r_scale[k] = r / r0[i]
                     S[i, i] += r
-                nis, dof, out_likelihood[k] = kalman_update(x, P, nu, S, Pxz, use)
+                nis, dof, out_likelihood[k] = update(x, P, nu, S, Pxz, use)
                 if dof > 0:
-                    out_nis[k] = nis
-                    out_dof[k] = dof
-                alive = base.all_finite(x, P)
+                    out_nis[k], out_dof[k] = nis, dof
+                alive = is_finite(x, P)
             out_valid[k] = alive and ok
-            out_diverged[k] = not alive or base.diverges(rules, x, memory)
+            out_diverged[k] = not alive or diverges(tuning.rules, x, m)
             if not alive:
-                memory[base.M_INITIALISED] = 0.0
-        base.remember(k, now, rate, memory)
-        out_trust[k] = memory[M_TRUST]
+                m.runs = 0.0
+        remember(k, now, window.residual_rate, m)
+        out_trust[k] = m.trust
         out_x[k] = x
         out_P[k] = P
 
 
 @njit(cache=True)
-def _predict_outputs(due, held, trust, tuning, p, predicted):  # type: ignore[no-untyped-def]
-    """Predict the steps that are due with inputs, residual and ``trust`` [K] held; planar a_y beside the state."""
+def _predict_outputs(due, held, trust, q_std, process_noise_gain, model, out):  # type: ignore[no-untyped-def]
+    """Predict the steps that are due with inputs, residual and ``trust`` [K] held; the rows of no step are left."""
     step, horizon_s = due
     held_x, held_P, inputs, rate = held
-    out_x, out_P, out_ay = predicted
-    q_std, _, _, _, wm, wc, scale, _ = tuning
-    n = base.STATES
-    chi, points = np.empty((2 * n + 1, n)), np.empty(work_size(2 * n + 1))
-    L = np.empty((n, n))
-    x = np.empty(n)
-    P = np.empty((n, n))
-    for m in range(step.shape[0]):
-        k = step[m]
-        x[:] = math.nan
-        P[:, :] = math.nan
-        out_ay[m] = math.nan
-        if k >= 0:
-            x[:] = held_x[k]
-            P[:, :] = held_P[k]
-            over = base.held_inputs(inputs, k)
-            rate_vy, rate_r = trust[k] * rate[k, 0], trust[k] * rate[k, 1]
-            if horizon_s[m] > 0.0:
-                draw_sigma_points(x, P, scale, L, chi)
-                _propagate(chi, over, (rate_vy, rate_r), horizon_s[m], p, points)
-                mean_and_covariance(chi, wm, wc, x, P)
-                base.add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust[k]) * horizon_s[m])
-            if base.all_finite(x, P):
-                ay = planar_lateral_acceleration(x[base.VX], x[base.VY], x[base.YAW_RATE], over.steer, over.friction, p)
-                out_ay[m] = ay + dynamic_share(x[base.VX], p) * rate_vy
-            else:
-                x[:] = math.nan
-                P[:, :] = math.nan
-        out_x[m] = x
-        out_P[m] = P[:3, :3]
+    out_x, out_P, out_ay = out
+    n = held_x.shape[1]
+    points, E, x, P = np.zeros(PLACES * WIDTH), np.zeros(n * WIDTH), np.empty(n), np.empty((n, n))
+    for row in range(step.shape[0]):
+        k = step[row]
+        if k < 0:
+            continue
+        x[:], P[:, :] = held_x[k], held_P[k]
+        over = HeldInputs(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
+        trusted = (trust[k] * rate[k, 0], trust[k] * rate[k, 1])
+        if horizon_s[row] > 0.0:
+            noise_dt = (1.0 + process_noise_gain * trust[k]) * horizon_s[row]
+            _predict(x, P, over, trusted, horizon_s[row], noise_dt, q_std, model, points, E)
+        if is_finite(x, P):
+            out_x[row], out_P[row] = x, P[:MOTION, :MOTION]
+            out_ay[row] = planar_ay(x, over.steer, over.friction, trusted[0], model.layout, model.p)
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,6 +270,7 @@ class PaperHybridUkf:
     ----------
     q_std : Q_0 as process 1-sigma per √s of [v_x, v_y, r, b_ax].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
+    constants : that the paper leaves open.
     slip_gate : as for ``phy-ukf``: leave out the speed of wheels that spin or lock.
     """
 
@@ -277,6 +285,7 @@ class PaperHybridUkf:
     slip_gate: bool = True
     name: str = "pd-hef-paper"
     causal: bool = True
+    constants: Constants = CHOSEN
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -288,65 +297,64 @@ class PaperHybridUkf:
 
     @property
     def measurement_variance(self) -> FloatArray:
-        """R_0 of [a_y, r, v_x], [3]: the sensors'; a_y has at least the paper's norm."""
+        """R_0 of [a_y, r, v_x], [3]: the sensors'; the constants bound that of a_y from below."""
         s = self.vehicle.sensors
         std = np.array([s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s])
         variance: FloatArray = std**2
-        variance[base.Z_AY] = max(variance[base.Z_AY], PAPER_R_NORM)
+        variance[Z_AY] = max(variance[Z_AY], self.constants.ay_variance)
         return variance
 
     @property
-    def _parameters(self) -> ModelParameters:
-        return model_parameters(self.vehicle)
-
-    @property
-    def _tuning(self) -> base.Tuning:
-        r_std = np.sqrt(self.measurement_variance)
-        return base.make_tuning(self.vehicle, self.q_std, r_std, base.INITIAL_STD, use_speed=self.use_speed)
+    def parallel(self) -> VehicleUkf:
+        """The physics filter in parallel, whose model, initial covariance and Q_0 are those of this filter."""
+        filtered = nominal_filter(self.vehicle, use_speed=self.use_speed, name="parallel")
+        return replace(filtered, slip_gate=self.slip_gate)
 
     def run(self, signals: Signals, state: PaperState | None) -> tuple[PaperSteps, PaperState]:
         """Process one window (see :class:`~.base.Estimator`)."""
-        features, physics, after = run_features(
-            parallel_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
-            signals,
-            state.physics if state else None,
-        )
-        starts = ~np.isfinite(physics.prior[:, base.VX])
+        features, physics, after = run_features(self.parallel, signals, state.physics if state else None)
+        starts = ~np.isfinite(physics.prior[:, VX])
         rate, network = self.network.run(features, starts, state.network if state else None)
-        steps, filter_state = self._filter_steps(signals, physics, rate, state.filter_state if state else None)
+        steps, filter_state = self.filter_steps(signals, physics, rate, state.filter_state if state else None)
         return steps, PaperState(after, network, filter_state)
 
     def predict(self, steps: PaperSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate steps with the nominal model and the residual held (see :class:`~.base.ModelPredictor`)."""
-        held = base.PredictionStart(steps.x, steps.P, steps.inputs, steps.residual_rate)
-        predicted = base.no_prediction(len(stamps_ns), steps.x.shape[1])
-        _predict_outputs(base.pending_predictions(ahead), held, steps.trust, self._tuning, self._parameters, predicted)
-        track = base.predicted_track(self.name, stamps_ns, steps, ahead, predicted)
+        held = (steps.x, steps.P, steps.inputs, steps.residual_rate)
+        predicted = no_prediction(len(stamps_ns), steps.x.shape[1])
+        due, gain = (np.where(ahead.usable, ahead.step, -1), ahead.horizon_s), self.constants.process_noise_gain
+        _predict_outputs(due, held, steps.trust, np.array(self.q_std), gain, self.parallel.parameters, predicted)
+        track = predicted_track(self.name, stamps_ns, steps, ahead, predicted)
         return replace(
             track,
             network_trust=np.where(track.valid, steps.trust[ahead.step], np.nan),
             r_scale=np.where(track.valid, steps.r_scale[ahead.step], np.nan),
         )
 
-    def _filter_steps(
+    def filter_steps(
         self,
         signals: Signals,
-        physics: base.PosteriorSteps,
+        physics: PosteriorSteps,
         rate: FloatArray,
-        state: base.FilterState | None,
-    ) -> tuple[PaperSteps, base.FilterState]:
-        """Filter one window; return its steps, and the state for the next one."""
+        state: FilterState | None,
+    ) -> tuple[PaperSteps, FilterState]:
+        """Filter one window with the results of the parallel filter and the residual ``rate`` [K, 2] of the network.
+
+        Return its steps, and the state for the next window.
+        """
         signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None, gate=self.slip_gate)
-        estimate, count = base.resume(state, base.STATES, MEMORY), len(signals)
-        parallel = Parallel(physics.x, physics.prior, physics.inputs, physics.valid)
-        out, adapted = (
-            base.no_posterior(count, base.STATES)._replace(inputs=physics.inputs),
-            (np.empty(count), np.empty(count)),
-        )
-        window, r0 = base.make_window(signals, state, rate), self.measurement_variance
-        _filter(window, self._tuning, r0, self._parameters, parallel, estimate, out, adapted)
-        steps = PaperSteps(signals.stamps_ns, *out, rate, *adapted)
-        return steps, base.next_state(estimate, signals.stamps_ns, state, slip)
+        count, n, nominal = len(signals), NOMINAL.size, self.parallel
+        belief = Belief(np.zeros(n), np.eye(n), np.zeros(1, PAPER_MEMORY))
+        if state is not None:
+            belief = Belief(*(part.copy() for part in state.belief))
+        nominal_ay = nominal.expected_ay(physics.prior, physics.inputs)
+        parallel = Parallel(physics.x, physics.prior, physics.inputs, physics.valid, nominal_ay)
+        out, adapted = no_posterior(count, n)._replace(inputs=physics.inputs), (np.empty(count), np.empty(count))
+        window, r0 = make_window(signals, state, rate), self.measurement_variance
+        tuning = nominal.tuning._replace(q_std=np.array(self.q_std))
+        _filter(window, tuning, r0, self.constants, nominal.parameters, parallel, belief, out, adapted)
+        after = FilterState(belief, last_stamp_ns(signals.stamps_ns, state.last_stamp_ns if state else None), slip)
+        return PaperSteps(signals.stamps_ns, *out, rate, *adapted), after
 
 
 def build(name: str, car: Car, options: Options) -> PaperHybridUkf:

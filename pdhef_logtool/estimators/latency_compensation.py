@@ -4,7 +4,7 @@ A sample arrives later than it was measured. At a scored stamp t a receiver has 
 of this and all earlier steps had arrived by t (``Signals.ready_ns``). The estimate at t is that step extrapolated
 over the whole latency t - t_k. An estimator returns steps and has no part in this choice.
 
-An estimator that reads later samples is not causal: it has each step at the step's own stamp.
+A smoother (:class:`~.base.Smoother`) reads later samples: it has each estimate at its own stamp.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.estimators.base import Estimator, Steps, look_ahead_of, predict_track, run_steps
+from pdhef_logtool.estimators.base import Estimator, Smoother, Steps, predict_track
 from pdhef_logtool.estimators.causality_check import CausalityCheck, step_columns
 from pdhef_logtool.estimators.plug_ins import contained, package_of, read_only
 from pdhef_logtool.records.errors import EstimatorError
@@ -48,7 +48,6 @@ def run_window(
     estimator: Estimator,
     signals: Signals,
     before: WindowState | None = None,
-    ahead: Signals | None = None,
     causality: CausalityCheck | None = None,
 ) -> tuple[StateTrack, WindowState]:
     """Run an estimator over one window; return its track at the window's stamps, and the state for the next window.
@@ -56,7 +55,6 @@ def run_window(
     Parameters
     ----------
     before : state that the previous window returned, None at the start of a log.
-    ahead : signals that follow the window, for an estimator that is not causal.
     causality : checks the steps of an estimator that declares itself causal.
 
     Raises
@@ -67,10 +65,9 @@ def run_window(
     state = None if before is None else before.estimator
     package = package_of(estimator)
     with contained(estimator.name, package):
-        given, follows = (read_only(s) if package and s is not None else s for s in (signals, ahead))
-        assert given is not None
+        given = read_only(signals) if package else signals
         copied = None if causality is None else causality.state_before(estimator, state)
-        returned = run_steps(estimator, given, state, follows)
+        returned = estimator.run(given, state)
         if not isinstance(returned, tuple) or len(returned) != 2:
             raise _wrong_steps(estimator, "a pair of steps and state", type(returned).__name__)
         steps, state = returned
@@ -93,16 +90,13 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
     EstimatorError
         The estimator did not return one step per sample, or its plug-in failed.
     """
+    if isinstance(estimator, Smoother):
+        return _smoothed(estimator, signals)
     columns: dict[str, Any] = {}
     state = None
     for first in range(0, max(len(signals), 1), PIECE_STEPS):
         piece = signals.rows(first, first + PIECE_STEPS)
-        ahead_ns = round(look_ahead_of(estimator) * 1e9)
-        ahead = None
-        if ahead_ns and first + PIECE_STEPS < len(signals):
-            until = int(np.searchsorted(signals.stamps_ns, piece.stamps_ns[-1] + ahead_ns, side="right"))
-            ahead = signals.rows(first + PIECE_STEPS, until)
-        track, state = run_window(estimator, piece, state, ahead, causality)
+        track, state = run_window(estimator, piece, state, causality)
         if len(piece) == len(signals):
             return track
         for name in (f.name for f in fields(track) if f.name != "name"):
@@ -113,12 +107,23 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
     return replace(track, **columns)
 
 
+def _smoothed(smoother: Smoother, signals: Signals) -> StateTrack:
+    """Return the track of a smoother, which has one row per sample."""
+    name, package = getattr(smoother, "name", type(smoother).__name__), package_of(smoother)
+    with contained(name, package):
+        track = smoother.smooth(read_only(signals) if package else signals)
+        if not isinstance(track, StateTrack) or len(track) != len(signals):
+            got = f"{len(track)} rows" if isinstance(track, StateTrack) else type(track).__name__
+            raise EstimatorError(expected=f"a StateTrack, one row per sample ({len(signals)})", got=got, where=name)
+    return track
+
+
 def compensate(
     estimator: Estimator, signals: Signals, steps: Any, before: PendingSteps | None = None
 ) -> tuple[StateTrack, PendingSteps]:
     """Return the track of an estimator's steps of a window at its stamps, and the steps that stay pending."""
     stamps_ns = signals.stamps_ns
-    ready_ns = stamps_ns if look_ahead_of(estimator) else signals.ready_ns
+    ready_ns = signals.ready_ns
     window = PendingSteps(stamps_ns, ready_ns, steps)
     if before is None:
         chosen = extrapolation(stamps_ns, ready_ns, steps.valid, stamps_ns)

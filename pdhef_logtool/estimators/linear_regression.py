@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,8 +10,9 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import Steps
 from pdhef_logtool.estimators.direct_network import direct_steps
-from pdhef_logtool.estimators.filter_base import VX, FilterState
-from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
+from pdhef_logtool.estimators.parallel_physics import run_features
+from pdhef_logtool.estimators.vehicle_model import VX
+from pdhef_logtool.estimators.vehicle_ukf import FilterState, nominal_filter
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.steps import last_stamp_ns, step_durations_s
 from pdhef_logtool.residual_model.linear_model import LinearModel
@@ -54,7 +55,7 @@ class LinearRegression:
     def run(self, signals: Signals, state: RegressionState | None) -> tuple[Steps, RegressionState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(
-            parallel_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
+            replace(nominal_filter(self.vehicle, use_speed=self.use_speed), slip_gate=self.slip_gate),
             signals,
             state.physics if state else None,
         )

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 from pdhef_logtool.car.parts import SMOOTHING
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.corrected import CorrectedPhysics
-from pdhef_logtool.estimators.physics_filter import of_car
 from pdhef_logtool.estimators.presets import options_of
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
+from pdhef_logtool.estimators.vehicle_ukf import of_car
 
 #: The preset that uses the taught part of a car.
 PRESET = "pd-hef"

@@ -22,8 +22,8 @@ from pdhef_logtool.estimators.adaptive_physics import CURES
 from pdhef_logtool.estimators.calibration.joint import prior_variations
 from pdhef_logtool.estimators.error_features import TERMS, error_terms
 from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter, of_car
 from pdhef_logtool.estimators.self_calibrated import widened
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, of_car
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -40,7 +40,7 @@ class PosteriorBand:
     ``filters`` : the physics filter on the car, then on its variations. All tracks share their runs.
     """
 
-    filters: tuple[PhysicsFilter, ...]
+    filters: tuple[VehicleUkf, ...]
     _signals: Signals | None = None
     _vy: list[FloatArray] = field(default_factory=list)
 
@@ -62,7 +62,7 @@ def posterior_band(car: Car, *, use_speed: bool = True) -> PosteriorBand | None:
     physics, none = of_car(car, use_speed=use_speed), dict.fromkeys(CURES, False)
     read_with = physics.read_with or physics.vehicle
 
-    def on(vehicle: VehicleParameters) -> PhysicsFilter:
+    def on(vehicle: VehicleParameters) -> VehicleUkf:
         bare = vehicle.model_copy(update={"physics": vehicle.physics.model_copy(update=none)})
         return replace(physics, vehicle=bare, read_with=read_with)
 

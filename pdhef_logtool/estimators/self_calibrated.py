@@ -26,7 +26,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import WithoutTruth
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
-from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, predict_track, run_steps
+from pdhef_logtool.estimators.base import Estimator, notes_of, predict_track
 from pdhef_logtool.estimators.intervals import MAX_SIDESLIP_STD_RAD, scaled_covariance
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
@@ -34,7 +34,7 @@ from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack
 
 if TYPE_CHECKING:
-    from pdhef_logtool.estimators.physics_filter import PhysicsFilter
+    from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 
 #: Factor of lateral kinematic consistency, and s_car above; from seven simulated cars and real drives of four cars.
 D2_SHARE, CAR_STD_RAD = 0.7, math.radians(0.15)
@@ -61,9 +61,9 @@ class CalibratedBand:
         return widened(track, self._vy, contradicted, calibration.vehicle.low_speed_blend_m_s, own_share=scale)
 
     @property
-    def _filters(self) -> tuple[PhysicsFilter, ...]:
+    def _filters(self) -> tuple[VehicleUkf, ...]:
         """The physics filter on the calibrated vehicle and on its variations; empty without variations."""
-        from pdhef_logtool.estimators.physics_filter import physics_filter
+        from pdhef_logtool.estimators.vehicle_ukf import physics_filter
 
         calibration = self.calibration
         vehicles = (calibration.vehicle, *calibration.varied) if calibration.varied else ()
@@ -105,20 +105,15 @@ class SelfCalibrated:
         return (*notes_of(self.estimator), self.calibration.note)
 
     @property
-    def look_ahead_s(self) -> float:
-        """Look-ahead of the estimator."""
-        return look_ahead_of(self.estimator)
-
-    @property
     def intervals_note(self) -> str:
         """Components of its intervals; calibrated intervals of another car are not used."""
         parts = ["own", *(["parameters"] if self.calibration.varied else [])]
         parts += ["d2"] if math.isfinite(self.calibration.driven_d2_m_s) else []
         return f"intervals: {', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else "intervals not calibrated"
 
-    def run(self, signals: Signals, state: Any | None, ahead: Signals | None = None) -> tuple[Any, Any]:
+    def run(self, signals: Signals, state: Any | None) -> tuple[Any, Any]:
         """Process one window (see :class:`~.base.Estimator`)."""
-        return run_steps(self.estimator, self.given(signals), state, None if ahead is None else self.given(ahead))
+        return self.estimator.run(self.given(signals), state)
 
     def predict(self, steps: Any, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate as the estimator does."""

@@ -164,7 +164,7 @@ SPECS: tuple[Spec, ...] = (
     ),
     Spec(
         "phy-ukf", "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
-        "phy_ukf:build", _INPUTS, 0x0072B2,
+        "vehicle_ukf:build_nominal", _INPUTS, 0x0072B2,
     ),
     Spec(
         "physics", "best filter with physics only, with the model parts supported by driving data",
@@ -172,7 +172,7 @@ SPECS: tuple[Spec, ...] = (
     ),
     Spec(
         "phy-ukf:tuned", "phy-ukf with the noise of an identified car, corrected for body roll",
-        "phy_ukf:build", _INPUTS, 0x56B4E9, needs_noise=True,
+        "vehicle_ukf:build_nominal", _INPUTS, 0x56B4E9, needs_noise=True,
     ),
     Spec(
         "pure-lstm", "a network that outputs v_y, without a filter (needs a network with baselines)",

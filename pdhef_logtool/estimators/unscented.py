@@ -1,8 +1,13 @@
-"""The scaled unscented transform and the Kalman update on it, compiled (Wan & van der Merwe 2000).
+"""The scaled unscented transform and the Kalman update, compiled (Wan and van der Merwe 2000), without a model.
 
-See docs/method.md#filter.
+Sigma points are the columns of a block [rows · WIDTH], in which the entries of a state have the rows ``places``: the
+centre, x + columns of √n L, x − columns of √n L, and copies of the centre up to whole vectors. With n = x.size and
+α = 1, β = 2, κ = 0 a point has the weight w = 1/(2 n), and the centre 0 in the mean and 2 in the covariance. With the
+deviations e of the points from the centre and their weighted sum δ, which is the change of the mean, the covariance is
 
-All functions operate on small float64 arrays, avoid allocation in inner loops, and contain no vehicle model.
+    2 δ δᵀ + w Σ (e − δ)(e − δ)ᵀ = w Σ e eᵀ + δ δᵀ,
+
+in which the centre's column has δ / √w.
 """
 
 from __future__ import annotations
@@ -12,44 +17,47 @@ import math
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.estimators.vehicle_model import WIDTH
 
 #: Smallest variance on the diagonal of a repaired covariance.
 COVARIANCE_FLOOR = 1e-12
 
-
-def unscented_weights(n: int, alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0) -> tuple[FloatArray, ...]:
-    """Return mean weights [2n+1], covariance weights [2n+1] and [1] the scale c with χ = x ± columns of √(c P).
-
-    The defaults give a centre weight of 0 for the mean and no negative weight, so that a weighted covariance is
-    never indefinite.
-    """
-    lam = alpha**2 * (n + kappa) - n
-    wm = np.full(2 * n + 1, 0.5 / (n + lam))
-    wc = wm.copy()
-    wm[0] = lam / (n + lam)
-    wc[0] = wm[0] + 1.0 - alpha**2 + beta
-    return wm, wc, np.array([n + lam])
+# Sums in any order, so that the compiler can take several terms at a time.
+_compiled = njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract", "reassoc"})
 
 
-@njit(cache=True)
-def cholesky_lower(P, L):  # type: ignore[no-untyped-def]
-    """Write the lower Cholesky factor of P [n, n] to L; return False where P is not positive definite."""
+@_inline
+def _factor(P, L):  # type: ignore[no-untyped-def]
     n = P.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
+    for j in range(n):
+        s = P[j, j]
+        for k in range(j):
+            s -= L[j, k] * L[j, k]
+        if not s > 0.0:
+            if P[j, j] != 0.0:
+                return False
+            L[j:, j] = 0.0  # the entry is known
+            continue
+        L[j, j] = math.sqrt(s)
+        per_root = 1.0 / L[j, j]
+        for i in range(j + 1, n):
             s = P[i, j]
             for k in range(j):
                 s -= L[i, k] * L[j, k]
-            if i == j:
-                if not s > 0.0:
-                    return False
-                L[i, i] = math.sqrt(s)
-            else:
-                L[i, j] = s / L[j, j]
-        for j in range(i + 1, n):
-            L[i, j] = 0.0
+            L[i, j] = s * per_root
     return True
+
+
+@_compiled
+def cholesky(P, L):  # type: ignore[no-untyped-def]
+    """Write the lower Cholesky factor of P [n, n] to L, which is zero above its diagonal; P is repaired if needed.
+
+    An entry without variance has a column of zeros.
+    """
+    if not _factor(P, L):
+        repair_covariance(P)
+        _factor(P, L)
 
 
 @njit(cache=True)
@@ -76,190 +84,126 @@ def repair_covariance(P):  # type: ignore[no-untyped-def]
             P[i, j] = s
 
 
-@njit(cache=True)
-def _partial_root(P, there, L):  # type: ignore[no-untyped-def]
-    """Write the lower Cholesky factor of the entries of P [n, n] that are ``there`` [n]; the others get zeros.
-
-    Returns False where these entries are not positive definite. L is zero above its diagonal and stays so.
-    """
-    n = P.shape[0]
-    for j in range(n):
-        if not there[j]:
-            L[j:, j] = 0.0
-            continue
-        s = P[j, j]
-        for k in range(j):
-            s -= L[j, k] * L[j, k]
-        if not s > 0.0:
-            return False
-        L[j, j] = math.sqrt(s)
-        per_root = 1.0 / L[j, j]
-        for i in range(j + 1, n):
-            s = P[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            L[i, j] = s * per_root
-    return True
-
-
-@njit(cache=True)
-def partial_root(P, places, there, L):  # type: ignore[no-untyped-def]
-    """Write the factor as :func:`_partial_root`; P is repaired in ``places`` if needed."""
-    if _partial_root(P, there, L):
-        return
-    n = places.shape[0]
-    dense = np.empty((n, n))
-    for i in range(n):
-        for j in range(n):
-            dense[i, j] = P[places[i], places[j]]
-    repair_covariance(dense)
-    for i in range(n):
-        for j in range(n):
-            P[places[i], places[j]] = dense[i, j]
-    _partial_root(P, there, L)
-
-
-@njit(cache=True)
-def covariance_root(P, L):  # type: ignore[no-untyped-def]
-    """Write the lower Cholesky factor of P [n, n] to L; P is repaired if needed."""
-    if not cholesky_lower(P, L):
-        repair_covariance(P)
-        cholesky_lower(P, L)
-
-
-@njit(cache=True)
-def draw_sigma_points(x, P, scale, L, chi):  # type: ignore[no-untyped-def]
-    """Write the 2n+1 sigma points of (x, P) to chi [2n+1, n]; L [n, n] is work space. P is repaired if needed."""
+@_compiled
+def draw(x, L, places, columns, points):  # type: ignore[no-untyped-def]
+    """Write the sigma points of the state x [n] with the root L [n, n] of its covariance to a block."""
     n = x.shape[0]
-    covariance_root(P, L)
-    root = math.sqrt(scale)
+    root = math.sqrt(n)
     for j in range(n):
-        chi[0, j] = x[j]
-    for i in range(n):
-        for j in range(n):
-            d = root * L[j, i]
-            chi[1 + i, j] = x[j] + d
-            chi[1 + n + i, j] = x[j] - d
+        row = places[j] * WIDTH
+        for i in range(columns):
+            points[row + i] = x[j]
+        for i in range(j + 1):
+            away = root * L[j, i]
+            points[row + 1 + i] += away
+            points[row + 1 + n + i] -= away
 
 
-@njit(cache=True)
-def mean_and_covariance(chi, wm, wc, x, P):  # type: ignore[no-untyped-def]
-    """Write the weighted mean and covariance of chi [s, n] to x [n] and P [n, n]."""
-    s, n = chi.shape
+@_inline
+def _products(a, row_a, b, row_b, columns):  # type: ignore[no-untyped-def]
+    s = 0.0
+    for i in range(columns):
+        s += a[row_a + i] * b[row_b + i]
+    return s
+
+
+@_inline
+def _deviate(block, row, columns, weight, out, at):  # type: ignore[no-untyped-def]
+    """Write the deviations of a row of a block, with δ / √w in the centre's column; return the mean."""
+    centre, moved = block[row], 0.0
+    for i in range(columns):
+        out[at + i] = block[row + i] - centre
+        moved += out[at + i]
+    out[at] = math.sqrt(weight) * moved
+    return centre + weight * moved
+
+
+@_compiled
+def moments(points, places, columns, q, x, P, E):  # type: ignore[no-untyped-def]
+    """Write mean [n] and covariance [n, n] of sigma points, with ``q`` [n] added to the variances; deviations to E."""
+    n = x.shape[0]
+    weight = 0.5 / n
     for j in range(n):
-        m = 0.0
-        for i in range(s):
-            m += wm[i] * chi[i, j]
-        x[j] = m
+        x[j] = _deviate(points, places[j] * WIDTH, columns, weight, E, j * WIDTH)
     for a in range(n):
         for b in range(a + 1):
-            c = 0.0
-            for i in range(s):
-                c += wc[i] * (chi[i, a] - x[a]) * (chi[i, b] - x[b])
-            P[a, b] = c
-            P[b, a] = c
+            P[a, b] = P[b, a] = weight * _products(E, a * WIDTH, E, b * WIDTH, columns)
+        P[a, a] += q[a]
 
 
-@njit(cache=True)
-def innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
-    """Write predicted measurement [m], its covariance without R [m, m] and the cross covariance [n, m].
+@_compiled
+def reading_moments(readings, L, columns, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
+    """Write mean [m], covariance [m, m] and cross covariance [m, n] of the readings of sigma points with the root L.
 
-    chi [s, n] are the sigma points of mean x, zeta [s, m] their measurements.
+    ``readings`` are replaced by their deviations.
     """
-    s, n = chi.shape
-    m = zeta.shape[1]
-    mean_and_covariance(zeta, wm, wc, z_hat, S)
+    n, m = L.shape[0], z_hat.shape[0]
+    weight, root = 0.5 / n, math.sqrt(n)
     for k in range(m):
+        z_hat[k] = _deviate(readings, k * WIDTH, columns, weight, readings, k * WIDTH)
+        for b in range(k + 1):
+            S[k, b] = S[b, k] = weight * _products(readings, k * WIDTH, readings, b * WIDTH, columns)
         for a in range(n):
-            c = 0.0
-            for i in range(s):
-                c += wc[i] * (chi[i, a] - x[a]) * (zeta[i, k] - z_hat[k])
-            Pxz[a, k] = c
+            s = 0.0
+            for i in range(a + 1):
+                s += L[a, i] * (readings[k * WIDTH + 1 + i] - readings[k * WIDTH + 1 + n + i])
+            Pxz[k, a] = weight * root * s
 
 
-@njit(cache=True)
-def _factor_used(S, index, used, L):  # type: ignore[no-untyped-def]
-    """Factor as :func:`cholesky_lower` the first ``used`` rows and columns of S that ``index`` names."""
-    for i in range(used):
-        for j in range(i + 1):
-            s = S[index[i], index[j]]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                if not s > 0.0:
-                    return False
-                L[i, i] = math.sqrt(s)
-            else:
-                L[i, j] = s / L[j, j]
-    return True
+@_compiled
+def cross_covariance(L, E, columns, out):  # type: ignore[no-untyped-def]
+    """Write the covariance [n, n] of the state before a step, with the root L, and after it, with deviations E."""
+    n = L.shape[0]
+    for a in range(n):
+        for b in range(n):
+            s = 0.0
+            for i in range(a + 1):
+                s += L[a, i] * (E[b * WIDTH + 1 + i] - E[b * WIDTH + 1 + n + i])
+            out[a, b] = 0.5 / math.sqrt(n) * s
 
 
-@njit(cache=True)
-def whiten(nu, S, use, index, L, w):  # type: ignore[no-untyped-def]
-    """Whiten the innovation nu [m], of covariance S [m, m], in the channels of ``use`` (bool [m]).
-
-    Writes which channels are used to ``index`` [m], and in their order the factor of their covariance to L [m, m] and
-    w = L⁻¹ν [m]. Returns the results of :func:`kalman_update`.
-    """
-    used = 0
-    for k in range(nu.shape[0]):
-        if use[k]:
-            index[used] = k
-            used += 1
-    if used == 0:
-        return 0.0, 0, 0.0
-    if not _factor_used(S, index, used, L):
-        A = np.empty((used, used))
-        for i in range(used):
-            for j in range(used):
-                A[i, j] = S[index[i], index[j]]
-        repair_covariance(A)
-        _factor_used(A, np.arange(used), used, L)
-    det, nis = 1.0, 0.0
-    for i in range(used):
-        s = nu[index[i]]
-        for j in range(i):
-            s -= L[i, j] * w[j]
-        w[i] = s / L[i, i]
-        nis += w[i] * w[i]
-        det *= L[i, i]
-    return nis, used, -0.5 * (nis + used * math.log(2.0 * math.pi)) - math.log(det)
-
-
-@njit(cache=True)
-def kalman_update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
+@_compiled
+def update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
     """Update x [n], P [n, n] in place with the channels of ``use`` (bool [m]).
 
-    nu [m] is the innovation, S [m, m] its covariance with R. P −= K S Kᵀ = (P_xz L⁻ᵀ)(P_xz L⁻ᵀ)ᵀ with S = L Lᵀ: a
-    symmetric form; if rounding makes it indefinite it is repaired.
+    ν [m] is the innovation, S [m, m] its covariance with R, P_xz [m, n]. With S = Λ Λᵀ and G = Λ⁻¹ P_xz, the gain is
+    never formed: x += Gᵀ Λ⁻¹ ν, P −= Gᵀ G. The rows of P_xz become G.
 
     Returns
     -------
     nis : νᵀ S⁻¹ ν over the used channels. dof : how many. log_likelihood : of the innovation, Gaussian.
     """
-    n, m = Pxz.shape
-    work = np.empty((n + m + 1, m))  # one allocation, as it takes longer than the computation
-    G, L, w = work[:n], work[n : n + m], work[n + m]
-    index = np.empty(m, dtype=np.int64)
-    nis, d, log_likelihood = whiten(nu, S, use, index, L, w)
-    if d == 0:
-        return nis, d, log_likelihood
-    for a in range(n):  # G = P_xz L⁻ᵀ, by forward substitution
-        for i in range(d):
-            s = Pxz[a, index[i]]
+    n, m, used = x.shape[0], nu.shape[0], 0
+    index, root, w, G = np.empty(m, np.int64), np.zeros((m, m)), np.empty(m), np.zeros((m, n))
+    for k in range(m):
+        if use[k]:
+            index[used] = k
+            used += 1
+    if used == 0:
+        return 0.0, 0, 0.0
+    A = np.empty((used, used))
+    for i in range(used):
+        for j in range(used):
+            A[i, j] = S[index[i], index[j]]
+    cholesky(A, root[:used, :used])
+    det, nis = 1.0, 0.0
+    for i in range(used):
+        w[i] = nu[index[i]]
+        for j in range(i):
+            w[i] -= root[i, j] * w[j]
+        w[i] /= root[i, i]
+        nis += w[i] * w[i]
+        det *= root[i, i]
+        for a in range(n):
+            s = Pxz[index[i], a]
             for j in range(i):
-                s -= L[i, j] * G[a, j]
-            G[a, i] = s / L[i, i]
+                s -= root[i, j] * G[j, a]
+            G[i, a] = s / root[i, i]
+            x[a] += w[i] * G[i, a]
     for a in range(n):
-        for i in range(d):
-            x[a] += G[a, i] * w[i]
         for b in range(a + 1):
             s = P[a, b]
-            for i in range(d):
-                s -= G[a, i] * G[b, i]
-            P[a, b] = s
-            P[b, a] = s
-    check = np.empty((n, n))
-    if not cholesky_lower(P, check):
-        repair_covariance(P)
-    return nis, d, log_likelihood
+            for i in range(used):
+                s -= G[i, a] * G[i, b]
+            P[a, b] = P[b, a] = s
+    return nis, used, -0.5 * (nis + used * math.log(2.0 * math.pi)) - math.log(det)

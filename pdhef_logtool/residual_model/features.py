@@ -49,7 +49,7 @@ ODD_FEATURES = frozenset(
     }
 )
 
-# Entries of the filter's state, as in estimators.filter_base.
+# Entries of the filter's state, as in estimators.vehicle_model.
 _VX, _VY, _YAW_RATE = 0, 1, 2
 
 

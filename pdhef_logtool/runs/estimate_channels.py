@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pdhef_logtool.drive.interpolation import Bracket
-from pdhef_logtool.estimators.filter_base import sideslip_std
+from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import SignalSource, clock_key, fit_clocks, resolve_mapping

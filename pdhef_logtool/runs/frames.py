@@ -71,7 +71,7 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     >>> with read_drive("sample_logs/dlc.mcap", Car.load("saloon")) as drive:
     ...     estimates = estimate(drive, ["zero", "phy-ukf"])
     >>> list(estimates.tracks), estimates.algorithms["phy-ukf"].algorithm, len(estimates.frame())
-    (['truth', 'zero', 'phy-ukf'], 'physics-ukf', 2853)
+    (['truth', 'zero', 'phy-ukf'], 'vehicle-ukf', 2853)
     """
     estimators, skipped = choose(drive, names)
     intervals = calibrator(drive.car, estimators)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters, correct_signals
-from pdhef_logtool.estimators.filter_base import PosteriorSteps
+from pdhef_logtool.estimators.vehicle_ukf import PosteriorSteps
 from pdhef_logtool.evaluation.smoothing import smooth
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals

@@ -24,7 +24,7 @@ from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.reading import Drive, WholeDrive
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.phy_ukf import PHY_UKF_Q_STD
+from pdhef_logtool.estimators.vehicle_ukf import PHY_UKF_Q_STD
 from pdhef_logtool.estimators.table import FEATURES, Options, spec_of
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import DriveRecord, load_drive, no_drive, scorable_stamps

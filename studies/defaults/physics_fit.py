@@ -27,8 +27,7 @@ from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, Tr
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.calibration.calibration import VARIED
 from pdhef_logtool.estimators.calibration.joint import varied_parameters
-from pdhef_logtool.estimators.filter_base import PosteriorSteps
-from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD, physics_filter
+from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD, PosteriorSteps, physics_filter
 from pdhef_logtool.records.signals import FloatArray
 from studies.defaults.axle_forces import (
     PEAK_LOG_STD,

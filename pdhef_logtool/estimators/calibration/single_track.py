@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from pdhef_logtool.car.nominal_points import arctangent, sine
+from pdhef_logtool.car.elementary_functions import arctangent, sine
 from pdhef_logtool.compiled.cache import njit
 
 #: Columns of a drive on its grid.

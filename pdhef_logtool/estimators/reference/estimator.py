@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.estimators.reference.drive import SideslipReference, sideslip_std
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import Extrapolation, StepColumns
+from pdhef_logtool.records.steps import StepColumns
 from pdhef_logtool.records.tracks import INDEPENDENT_SHARE, REFERENCE, StateTrack, make_track
 
 
@@ -35,18 +34,11 @@ class ReferenceEstimator:
     notes: tuple[str, ...] = ()
     name: str = REFERENCE
     causal: bool = False
-    look_ahead_s: float = 1e-3
     intervals_note: str = "intervals of the smoother itself"
 
-    def run(self, signals: Signals, state: Any | None, ahead: Signals | None = None) -> tuple[ReferenceSteps, Any]:
-        """Return the steps at the stamps of a window (see :class:`~..base.LookingAhead`)."""
-        del ahead
-        return steps_at(self.spans, signals.stamps_ns), state
-
-    def predict(self, steps: ReferenceSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
-        """Return the track of the steps, each at its own stamp."""
-        values, covariance, shares = (c[ahead.step] for c in (steps.values, steps.covariance, steps.shares))
-        return self._track(ReferenceSteps(values, covariance, shares, ahead.usable), stamps_ns)
+    def smooth(self, signals: Signals) -> StateTrack:
+        """Return the track of a drive (see :class:`~..base.Smoother`)."""
+        return self.at(signals.stamps_ns)
 
     def at(self, stamps_ns: IntArray) -> StateTrack:
         """Return the track at any stamps [N]."""

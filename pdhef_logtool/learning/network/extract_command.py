@@ -27,10 +27,9 @@ from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.parallel_physics import filter_of
-from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
 from pdhef_logtool.estimators.table import FEATURES, FILTERS, make_estimator
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.learning.drives import (
     DriveRecord,
     drives_document,
@@ -547,7 +546,7 @@ def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) ->
 
 def _residuals(
     drive: Drive,
-    physics: PhysicsFilter | PhysicsUkf,
+    physics: VehicleUkf,
     smoothing: _Smoothing,
     service: _Service,
     reference: TruthAt | None,
@@ -558,7 +557,7 @@ def _residuals(
     period_s = drive.plan.alignment.grid_period_s
     half_window = round(smoothing.half_s / period_s)
     taught = None
-    if service.model is not None and isinstance(physics, PhysicsFilter):
+    if service.model is not None and physics.model == "forces":
         taught = CorrectedPhysics(AdaptivePhysics(physics), service.model)
     noise = smoothing.noise[0] * period_s / math.sqrt(2.0)  # of v_y itself
     return residual_rows(

@@ -29,21 +29,22 @@ from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, s
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.drive.truth import cubic_equations
 from pdhef_logtool.estimators.corrected import CorrectedPhysics
-from pdhef_logtool.estimators.filter_base import U_AX, U_FRICTION, U_STEER, HeldInputs
 from pdhef_logtool.estimators.parallel_physics import run_features
-from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter
-from pdhef_logtool.estimators.physics_model import (
+from pdhef_logtool.estimators.vehicle_model import (
     AX_BIAS,
     FRONT,
+    LANES,
+    PLACES,
     REAR,
-    VX,
+    ROLL,
+    ROLL_RATE,
     VY,
+    WIDTH,
     YAW_RATE,
     advance,
     settle_forces,
-    step_count,
 )
+from pdhef_logtool.estimators.vehicle_ukf import U_AX, U_FRICTION, U_STEER, HeldInputs, VehicleUkf
 from pdhef_logtool.learning.truth import weight_of
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
@@ -149,8 +150,8 @@ _RUN = 5
 @njit(cache=True)
 def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  # type: ignore[no-untyped-def]
     """Write the model's change of v_y and r [N − 1, 2] from each true state; NaN where that state is unknown."""
-    layout, p, f = model
-    points = np.zeros((states.shape[1], 2 * states.shape[1] + 1))
+    layout, places, p, f = model
+    block = np.zeros((PLACES, WIDTH))
     for k in range(states.shape[0] - 1):
         out[k, 0] = math.nan
         out[k, 1] = math.nan
@@ -171,13 +172,14 @@ def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  #
             x[FRONT], x[REAR] = run[1], run[2]
             if layout.roll >= 0:
                 x[layout.roll], x[layout.roll + 1] = run[3], run[4]
-        points[:, 0] = x
-        advance(points, 1, over, dt, step_count(x[VX], dt, over.friction, layout, p, f), layout, p, f)
-        out[k, 0] = points[VY, 0] - x[VY]
-        out[k, 1] = points[YAW_RATE, 0] - x[YAW_RATE]
-        run[0], run[1], run[2] = 1.0, points[FRONT, 0], points[REAR, 0]
+        for i in range(x.shape[0]):
+            block[places[i], :LANES] = x[i]
+        advance(block.reshape(-1), LANES, over, dt, layout, p, f)
+        out[k, 0] = block[VY, 0] - x[VY]
+        out[k, 1] = block[YAW_RATE, 0] - x[YAW_RATE]
+        run[0], run[1], run[2] = 1.0, block[FRONT, 0], block[REAR, 0]
         if layout.roll >= 0:
-            run[3], run[4] = points[layout.roll, 0], points[layout.roll + 1, 0]
+            run[3], run[4] = block[ROLL, 0], block[ROLL_RATE, 0]
 
 
 def physics_increments(
@@ -185,7 +187,7 @@ def physics_increments(
     state: FloatArray,
     x: FloatArray,
     inputs: FloatArray,
-    physics: PhysicsFilter,
+    physics: VehicleUkf,
     *,
     max_step_s: float,
 ) -> FloatArray:
@@ -200,13 +202,13 @@ def physics_increments(
     -------
     Increments of v_y in m/s and r in rad/s; NaN as in :func:`residual_increments`.
     """
-    layout, p, f = physics.parameters
-    good = _dynamic(state, p) & _complete(x) & _complete(inputs)
+    model = physics.parameters
+    good = _dynamic(state, model.p) & _complete(x) & _complete(inputs)
     states = np.zeros_like(x)
     states[:, :3] = np.where(good[:, None], state, 1.0)
     states[:, AX_BIAS] = np.where(good, x[:, AX_BIAS], 0.0)
     moved = np.empty((max(len(stamps_ns) - 1, 0), 2))
-    _run_model(stamps_ns, states, inputs, good, max_step_s, (layout, p, f), np.zeros(_RUN), moved)
+    _run_model(stamps_ns, states, inputs, good, max_step_s, model, np.zeros(_RUN), moved)
     increments: FloatArray = np.diff(state[:, 1:3], axis=0) - moved
     return increments
 
@@ -269,7 +271,7 @@ def difference_noise(stamps_ns: IntArray, values: FloatArray) -> float:
 def residual_rows(
     signals: Signals,
     truth: StateTrack | None,
-    physics: PhysicsFilter | PhysicsUkf,
+    physics: VehicleUkf,
     *,
     period_s: float,
     half_window: int = 0,
@@ -298,7 +300,7 @@ def residual_rows(
     # A predicted steering angle must not affect a residual.
     inputs[~np.isfinite(without_impossible(signals).steer_rad), U_STEER] = np.nan
     stamps_ns, gap_s = signals.stamps_ns, GAP_PERIODS * period_s
-    if isinstance(physics, PhysicsFilter):
+    if physics.model == "forces":
         increments = physics_increments(stamps_ns, state, filtered.x, inputs, physics, max_step_s=gap_s)
     else:
         steer, friction = inputs[:, U_STEER], inputs[:, U_FRICTION]

@@ -1,10 +1,10 @@
-"""The single-track model of ``physics``: axle forces with lag, load transfer, braking, roll, bank.
+"""The single-track models of the vehicle filter: motion f and sensor readings h of many states at once.
 
 See docs/method.md#physics.
 
-State of a point, ISO 8855, SI, at the centre of gravity: [v_x, v_y, r, b_ax, f_f, f_r] and, for cars with the
-respective part, [φ, φ̇], [bank], [s], [b_δ], [b_ay, b_r]. f = F_y / m is an axle's lateral force over the vehicle's
-mass in m/s².
+State, ISO 8855, SI, at the centre of gravity: [v_x, v_y, r, b_ax] and, for the model with axle forces, [f_f, f_r] and
+the car's parts [φ, φ̇], [bank], [s], [b_δ], [b_ay, b_r]. f = F_y / m is an axle's lateral force over the vehicle's mass
+in m/s². Without axle forces it is the nominal model (:mod:`~pdhef_logtool.car.nominal_model`), in RK4 steps. With them:
 
 - **Lag**: (σ / v_x) ḟ + f = f_ss(α). Without it f is the steady force of the tyres.
 - **Roll**: φ̈ = ω² (G a_y − φ) − 2 ζ ω φ̇ with the roll gradient G. The tyres see v_y + h_s φ̇, because the centre of
@@ -20,9 +20,9 @@ mass in m/s².
 - **Bank**: −g · bank in v̇_y only, an Ornstein-Uhlenbeck process.
 - **Force scale**: 1 + s on the tyres' forces, an Ornstein-Uhlenbeck process.
 
-A step processes eight points at once in an inner loop without branches, as in
-:mod:`~pdhef_logtool.car.nominal_points`: each part has a fixed place in the state, with 0 for missing parts
-(:func:`spread_layout`). The tyres are evaluated once per step, at the instant t* at which the exponential kernel of the
+States are the columns of a block: row i has entry i of all states. Each entry has a fixed row, with 0 for missing parts.
+Inner loops process ``LANES`` columns without branches and calls, so that they become vector instructions. In a step of
+the model with axle forces the tyres are evaluated once, at the instant t* at which the exponential kernel of the
 lag has its centroid, with the initial state extrapolated by its derivative. Velocities use the mean of the forces at
 both ends. The method is of second order in the step except for slow quantities (speed in the lag, bank, force scale,
 and the load transfer without roll), and stable for any lag.
@@ -35,21 +35,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.car.nominal_model import KINEMATIC_TIME_CONSTANT_S, MAX_SUBSTEPS, dynamic_share, substeps
-from pdhef_logtool.car.nominal_points import arctangent, sine
+from pdhef_logtool.car.elementary_functions import arctangent, sine
+from pdhef_logtool.car.nominal_model import (
+    KINEMATIC_TIME_CONSTANT_S,
+    MAX_SUBSTEPS,
+    dynamic_share,
+    planar_lateral_acceleration,
+    substeps,
+)
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.records.signals import IntArray
 
-#: Entries of the state of every car, and their number.
-VX, VY, YAW_RATE, AX_BIAS, FRONT, REAR = range(6)
-CORE = 6
-#: Optional entries; in a spread state every part has its place, whether or not the car has it (:func:`spread_layout`).
-#: Number of entries of a spread state.
-ROLL, ROLL_RATE, BANK, FORCE_SCALE, STEER_BIAS, AY_BIAS, RATE_BIAS = range(CORE, CORE + 7)
-PLACES = 13
-#: Points per inner loop, and points per block: a multiple of it.
+#: Rows of a block: one for each entry that a state may have. The first ``CORE`` are those of every model with axle
+#: forces, the first four those of every model.
+VX, VY, YAW_RATE, AX_BIAS, FRONT, REAR, ROLL, ROLL_RATE, BANK, FORCE_SCALE, STEER_BIAS, AY_BIAS, RATE_BIAS = range(13)
+MOTION, CORE, PLACES = 3, 6, 13
+#: Rows of readings.
+Z_AY, Z_YAW_RATE, Z_SPEED = range(3)
+READINGS = 3
+#: Columns of an inner loop, and columns of a block: a multiple of it, for two states an entry and one at the centre.
 LANES = 8
-WIDTH = 3 * LANES
+WIDTH = 4 * LANES
 
 #: Time constant with which the force scale returns to 0, s (docs/method.md#physics).
 FORCE_SCALE_TIME_S = 2.0
@@ -67,57 +74,51 @@ _inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
 
 class Layout(NamedTuple):
-    """Index of each part in the state; −1 if the car lacks the part."""
+    """Index of each part in a state [n]; −1 if the model lacks the part."""
 
     size: int
+    forces: int  # f_f, and f_r behind it
     roll: int  # φ, and φ̇ behind it
     bank: int
     force_scale: int
     steer_bias: int
-    sensor_bias: int  # of a_y, then of the yaw rate; the last entries, as only the sensors depend on them
+    sensor_bias: int  # of a_y, then of the yaw rate
+
+    @property
+    def places(self) -> IntArray:
+        """Row in a block of each entry of a state, [n]."""
+        rows = [VX, VY, YAW_RATE, AX_BIAS]
+        for index, part in zip(self[1:], _ROWS_OF_PARTS, strict=True):
+            rows += part if index >= 0 else ()
+        return np.array(rows)
 
     @property
     def named(self) -> dict[str, int]:
         """Indices of the states with a column in a track, by column name."""
-        places = {
+        columns = {
             "roll_rad": self.roll,
             "bank_rad": self.bank,
             "force_scale": self.force_scale,
-            "steer_bias_rad": self.steer_bias,
+            "steer_bias_rad": self.steer_bias if self.sensor_bias >= 0 else -1,
             "ay_bias_m_s2": self.sensor_bias,
             "yaw_rate_bias_rad_s": self.sensor_bias + 1 if self.sensor_bias >= 0 else -1,
         }
-        return {name: place for name, place in places.items() if place >= 0}
+        return {name: index for name, index in columns.items() if index >= 0}
 
 
-@njit(cache=True)
-def spread_layout(layout):  # type: ignore[no-untyped-def]
-    """Return the layout of a spread state, in which every part has a fixed place; −1 for missing parts."""
-    return Layout(
-        PLACES,
-        ROLL if layout.roll >= 0 else -1,
-        BANK if layout.bank >= 0 else -1,
-        FORCE_SCALE if layout.force_scale >= 0 else -1,
-        STEER_BIAS if layout.steer_bias >= 0 else -1,
-        AY_BIAS if layout.sensor_bias >= 0 else -1,
-    )
+_ROWS_OF_PARTS = ((FRONT, REAR), (ROLL, ROLL_RATE), (BANK,), (FORCE_SCALE,), (STEER_BIAS,), (AY_BIAS, RATE_BIAS))
+#: The layout of the nominal model.
+NOMINAL = Layout(4, -1, -1, -1, -1, -1, -1)
 
 
-@njit(cache=True)
-def places_of(layout):  # type: ignore[no-untyped-def]
-    """Return the index in a spread state of each entry of a state [n], [n]."""
-    places = np.arange(layout.size)
-    for position, place, width in (
-        (layout.roll, ROLL, 2),
-        (layout.bank, BANK, 1),
-        (layout.force_scale, FORCE_SCALE, 1),
-        (layout.steer_bias, STEER_BIAS, 1),
-        (layout.sensor_bias, AY_BIAS, 2),
-    ):
-        for i in range(width):
-            if position >= 0:
-                places[position + i] = place + i
-    return places
+def layout_of(vehicle: VehicleParameters) -> Layout:
+    """Return the layout of the model with axle forces: the parts of a car, and a steering bias."""
+    parts, size, indices = vehicle.physics, AX_BIAS + 1, []
+    has = (True, parts.roll, parts.bank, parts.force_scale, True, parts.biases)
+    for there, rows in zip(has, _ROWS_OF_PARTS, strict=True):
+        indices.append(size if there else -1)
+        size += len(rows) if there else 0
+    return Layout(size, *indices)
 
 
 class PhysicsParameters(NamedTuple):
@@ -136,17 +137,6 @@ class PhysicsParameters(NamedTuple):
     roll_frequency_rad_s: float
     roll_damping: float
     swing_m: float  # h_s
-
-
-def layout_of(vehicle: VehicleParameters) -> Layout:
-    """Return the indices of a car's parts in the state."""
-    parts = vehicle.physics
-    size = CORE
-    places = []
-    for has, width in ((parts.roll, 2), (parts.bank, 1), (parts.force_scale, 1), (parts.biases, 1), (parts.biases, 2)):
-        places.append(size if has else -1)
-        size += width if has else 0
-    return Layout(size, *places)
 
 
 def physics_parameters(vehicle: VehicleParameters) -> PhysicsParameters:
@@ -174,7 +164,6 @@ def physics_parameters(vehicle: VehicleParameters) -> PhysicsParameters:
 class _Step(NamedTuple):
     """Constants of a step, common to all points."""
 
-    angle: float
     cos: float
     r_kin_per_vx: float
     ax: float
@@ -217,7 +206,6 @@ def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
         kept = math.exp(-x)
         tyre_s = h * (1.0 - (1.0 - x * kept / (1.0 - kept)) / x) if x > 1e-3 else h * (0.5 + x / 12.0)
     return _Step(
-        steer,
         math.cos(steer),
         math.tan(steer) / (p.front_m + p.rear_m),
         ax,
@@ -258,12 +246,24 @@ def _tyre_forces(v, vy, r, angle, ay, force, c, p, f):  # type: ignore[no-untype
 
 # positional: numbers and records of numbers, which are free of cost in compiled calls.
 @_compiled
-def advance_block(points, count, vx, over, dt, n, layout, p, f):  # type: ignore[no-untyped-def]
-    """Advance a block of points [PLACES · WIDTH], entry by entry, by ``dt`` s in ``n`` steps.
+def advance(points, columns, over, dt, layout, p, f):  # type: ignore[no-untyped-def]
+    """Advance the first ``columns`` of a block [PLACES · WIDTH], a multiple of ``LANES``, by ``dt`` s; all are finite.
 
-    As :func:`advance`, for spread states. The first ``count`` points are advanced, and the points that fill the last
-    ``LANES``, which must be finite. ``vx`` is the common speed of all points.
+    ``over`` has steering angle, accelerometer's a_x and friction, which are constant. The speed of the first column
+    determines the number of substeps.
     """
+    vx = points[VX * WIDTH]
+    if layout.forces >= 0:
+        n = step_count(vx, dt, over.friction, layout, p, f)
+        _advance_forces(points, columns, vx, over, dt, n, layout, p, f)
+    else:
+        _advance_nominal(points, columns, over, dt, substeps(vx, dt, over.friction, p), p)
+
+
+# positional: as advance.
+@_compiled
+def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ignore[no-untyped-def]
+    """Advance states of the model with axle forces in ``n`` steps."""
     h = dt / n
     c = _prepare(vx, h, over.steer, over.ax, over.friction, p, f)
     per_blend = 1.0 / (p.blend_high_m_s - p.blend_low_m_s)
@@ -277,13 +277,13 @@ def advance_block(points, count, vx, over, dt, n, layout, p, f):  # type: ignore
     scale_kept = math.exp(-h / FORCE_SCALE_TIME_S) if layout.force_scale >= 0 else 1.0
     t, half = c.tyre_s, 0.5 * h
     for _ in range(n):
-        for first in range(0, count, LANES):
+        for first in range(0, columns, LANES):
             block = points[first:]
             for j in range(LANES):
                 vx, vy, r = block[VX * WIDTH + j], block[VY * WIDTH + j], block[YAW_RATE * WIDTH + j]
                 ff, fr = block[FRONT * WIDTH + j], block[REAR * WIDTH + j]
                 phi, phi_dot = block[ROLL * WIDTH + j], block[ROLL_RATE * WIDTH + j]
-                angle = c.angle - block[STEER_BIAS * WIDTH + j]
+                angle = over.steer - block[STEER_BIAS * WIDTH + j]
                 slope = GRAVITY_M_S2 * block[BANK * WIDTH + j]
                 force = max(0.1, 1.0 + block[FORCE_SCALE * WIDTH + j])
                 ax = c.ax - block[AX_BIAS * WIDTH + j]
@@ -330,30 +330,122 @@ def advance_block(points, count, vx, over, dt, n, layout, p, f):  # type: ignore
                 block[FORCE_SCALE * WIDTH + j] *= scale_kept
 
 
-@njit(cache=True)
-def advance(points, count, over, dt, n, layout, p, f):  # type: ignore[no-untyped-def]
-    """Advance the first ``count`` of points [state, S] by ``dt`` s in ``n`` steps with constant inputs.
+@_inline
+def _nominal_accelerations(vx, vy, r, steer, c, p):  # type: ignore[no-untyped-def]
+    """Return a_y in m/s² and the yaw acceleration in rad/s² of the tyres (Eq 1-4)."""
+    v = max(vx, p.blend_low_m_s)
+    front = c.b_front * (steer - arctangent(vy + p.front_m * r, v))
+    rear = -c.b_rear * arctangent(vy - p.rear_m * r, v)
+    front = arctangent(front - p.front_E * (front - arctangent(front, 1.0)), 1.0)
+    rear = arctangent(rear - p.rear_E * (rear - arctangent(rear, 1.0)), 1.0)
+    ff = c.peak_front * c.cos * sine(p.front_C * front)
+    fr = c.peak_rear * sine(p.rear_C * rear)
+    return ff + fr, c.inertia * (p.front_m * ff - p.rear_m * fr)
 
-    ``over`` has steering angle, accelerometer's a_x and friction. The rows of the sensors' biases are ignored. All
-    points have the speed of the first.
+
+@_inline
+def _nominal_derivative(vx, vy, r, ax, steer, c, p):  # type: ignore[no-untyped-def]
+    """Return d/dt [v_x, v_y, r] (Eq 1-4 with the blend to the kinematic model)."""
+    w = min(1.0, max(0.0, (vx - p.blend_low_m_s) / (p.blend_high_m_s - p.blend_low_m_s)))
+    ay, turn = _nominal_accelerations(vx, vy, r, steer, c, p)
+    r_kin = vx * c.r_kin_per_vx
+    follow = (1.0 - w) * (1.0 / KINEMATIC_TIME_CONSTANT_S)
+    vy_dot = w * (ay - vx * r) + (follow * (p.rear_m * r_kin - vy) if w < 1.0 else 0.0)
+    r_dot = w * turn + (follow * (r_kin - r) if w < 1.0 else 0.0)  # tan δ may be infinite
+    return ax + r_dot * p.imu_y_m + r * r * p.imu_x_m + vy * r, vy_dot, r_dot
+
+
+class _Nominal(NamedTuple):
+    """Constants of a step of the nominal model, common to all points."""
+
+    cos: float
+    r_kin_per_vx: float
+    b_front: float
+    b_rear: float
+    peak_front: float
+    peak_rear: float
+    inertia: float
+
+
+@njit(cache=True)
+def _prepare_nominal(steer, friction, p):  # type: ignore[no-untyped-def]
+    """Return the constants of the nominal model at a steering angle."""
+    return _Nominal(
+        math.cos(steer),
+        math.tan(steer) / (p.front_m + p.rear_m),
+        p.front_B / friction if p.front_fixed_stiffness else p.front_B,
+        p.rear_B / friction if p.rear_fixed_stiffness else p.rear_B,
+        friction * p.front_D_n / p.mass_kg,
+        friction * p.rear_D_n / p.mass_kg,
+        p.mass_kg / p.yaw_inertia_kg_m2,
+    )
+
+
+@_compiled
+def _advance_nominal(points, columns, over, dt, n, p):  # type: ignore[no-untyped-def]
+    """Advance states of the nominal model in ``n`` RK4 steps."""
+    c, steer = _prepare_nominal(over.steer, over.friction, p), over.steer
+    h = dt / n
+    g, sixth = 0.5 * h, h / 6.0
+    for _ in range(n):
+        for first in range(0, columns, LANES):
+            block = points[first:]
+            for j in range(LANES):
+                x, y, r = block[VX * WIDTH + j], block[VY * WIDTH + j], block[YAW_RATE * WIDTH + j]
+                ax = over.ax - block[AX_BIAS * WIDTH + j]
+                x1, y1, r1 = _nominal_derivative(x, y, r, ax, steer, c, p)
+                x2, y2, r2 = _nominal_derivative(x + g * x1, y + g * y1, r + g * r1, ax, steer, c, p)
+                x3, y3, r3 = _nominal_derivative(x + g * x2, y + g * y2, r + g * r2, ax, steer, c, p)
+                x4, y4, r4 = _nominal_derivative(x + h * x3, y + h * y3, r + h * r3, ax, steer, c, p)
+                block[VX * WIDTH + j] = x + sixth * (x1 + 2.0 * x2 + 2.0 * x3 + x4)
+                block[VY * WIDTH + j] = y + sixth * (y1 + 2.0 * y2 + 2.0 * y3 + y4)
+                block[YAW_RATE * WIDTH + j] = r + sixth * (r1 + 2.0 * r2 + 2.0 * r3 + r4)
+
+
+# positional: as advance.
+@_compiled
+def push(points, columns, vx, rate, dt, p):  # type: ignore[no-untyped-def]
+    """Add the increments of a residual of v̇_y and ṙ over ``dt`` s, times the force scale of each state.
+
+    A residual counts in the dynamic range of the model, not in the kinematic one.
     """
-    places, block, vx = places_of(layout), np.empty(PLACES * WIDTH), points[VX, 0]
-    for first in range(0, count, WIDTH):
-        here = min(count - first, WIDTH)
-        block[:] = 0.0
-        for i in range(layout.size):
-            offset = places[i] * WIDTH
-            block[offset : offset + WIDTH] = points[i, first]
-            block[offset : offset + here] = points[i, first : first + here]
-        advance_block(block, here, vx, over, dt, n, spread_layout(layout), p, f)
-        for i in range(layout.size):
-            offset = places[i] * WIDTH
-            points[i, first : first + here] = block[offset : offset + here]
+    share = dynamic_share(vx, p) * dt
+    for j in range(columns):
+        force = share * max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j])
+        points[VY * WIDTH + j] += force * rate[0]
+        points[YAW_RATE * WIDTH + j] += force * rate[1]
+
+
+# positional: as advance.
+@_compiled
+def read(points, columns, steer, friction, rate_vy, layout, p, f, readings):  # type: ignore[no-untyped-def]
+    """Write the readings of accelerometer, gyro and speed in the states of a block to ``readings`` [READINGS · WIDTH].
+
+    ``rate_vy`` is the residual of v̇_y, which the accelerometer feels as it does the tyres' forces.
+    """
+    nominal = _prepare_nominal(steer, friction, p)
+    forces = layout.forces >= 0
+    tilt = p.ay_roll_gain if not forces else 0.0 if layout.roll >= 0 else GRAVITY_M_S2 * f.roll_gradient
+    c, inertia = math.cos(steer), p.mass_kg / p.yaw_inertia_kg_m2
+    for j in range(columns):
+        vx, vy, r = points[VX * WIDTH + j], points[VY * WIDTH + j], points[YAW_RATE * WIDTH + j]
+        w = min(1.0, max(0.0, (vx - p.blend_low_m_s) / (p.blend_high_m_s - p.blend_low_m_s)))
+        if forces:
+            front, rear = points[FRONT * WIDTH + j] * c, points[REAR * WIDTH + j]
+            ay, turn = front + rear, inertia * (p.front_m * front - p.rear_m * rear)
+        else:
+            ay, turn = _nominal_accelerations(vx, vy, r, steer, nominal, p)
+        ay = w * (ay + max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j]) * rate_vy) + (1.0 - w) * vx * r
+        ay = (1.0 + tilt) * ay + w * turn * p.imu_x_m - r * r * p.imu_y_m + GRAVITY_M_S2 * points[ROLL * WIDTH + j]
+        readings[Z_AY * WIDTH + j] = ay + points[AY_BIAS * WIDTH + j]
+        readings[Z_YAW_RATE * WIDTH + j] = r + points[RATE_BIAS * WIDTH + j]
+        readings[Z_SPEED * WIDTH + j] = vx
 
 
 @njit(cache=True)
 def settle_forces(x, steer, ax, friction, layout, p, f):  # type: ignore[no-untyped-def]
     """Set the axle forces of a state [n] to the steady tyre forces at their lateral acceleration; without roll."""
+    steer -= x[layout.steer_bias]
     c = _prepare(x[VX], 0.01, steer, ax, friction, p, f)
     v = max(x[VX], p.blend_low_m_s)
     force = max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
@@ -362,35 +454,17 @@ def settle_forces(x, steer, ax, friction, layout, p, f):  # type: ignore[no-unty
         ay = x[FRONT] * c.cos + x[REAR]
         x[FRONT], x[REAR] = _tyre_forces(v, x[VY], x[YAW_RATE], steer, ay, force, c, p, f)
     if layout.roll >= 0:
-        ay = planar_ay(x, steer, p)
+        w = dynamic_share(x[VX], p)
+        ay = w * (x[FRONT] * c.cos + x[REAR]) + (1.0 - w) * x[VX] * x[YAW_RATE]
         x[layout.roll] = f.roll_gradient * ay
 
 
 @njit(cache=True)
-def planar_ay(x, steer, p):  # type: ignore[no-untyped-def]
+def planar_ay(x, steer, friction, rate_vy, layout, p):  # type: ignore[no-untyped-def]
     """Return the lateral acceleration at the centre of gravity in state x [n], m/s², without the bank's part."""
     w = dynamic_share(x[VX], p)
-    return w * (x[FRONT] * math.cos(steer) + x[REAR]) + (1.0 - w) * x[VX] * x[YAW_RATE]
-
-
-@njit(cache=True)
-def sensed_ay(x, steer, layout, p, f, row):  # type: ignore[no-untyped-def]
-    """Return the accelerometer's reading in state x [n], and write its derivative by the state to row [n]."""
-    row[:] = 0.0
-    w = dynamic_share(x[VX], p)
-    c = math.cos(steer)
-    gain = 1.0 if layout.roll >= 0 else 1.0 + GRAVITY_M_S2 * f.roll_gradient
-    turn = w * p.imu_x_m * p.mass_kg / p.yaw_inertia_kg_m2
-    vx, r = x[VX], x[YAW_RATE]
-    row[FRONT] = (gain * w + turn * p.front_m) * c
-    row[REAR] = gain * w - turn * p.rear_m
-    ay = row[FRONT] * x[FRONT] + row[REAR] * x[REAR] + gain * (1.0 - w) * vx * r - r * r * p.imu_y_m
-    row[VX] = gain * (1.0 - w) * r
-    row[YAW_RATE] = gain * (1.0 - w) * vx - 2.0 * r * p.imu_y_m
-    if layout.roll >= 0:
-        row[layout.roll] = GRAVITY_M_S2
-        ay += GRAVITY_M_S2 * x[layout.roll]
-    if layout.sensor_bias >= 0:
-        row[layout.sensor_bias] = 1.0
-        ay += x[layout.sensor_bias]
-    return ay
+    if layout.forces < 0:
+        return planar_lateral_acceleration(x[VX], x[VY], x[YAW_RATE], steer, friction, p) + w * rate_vy
+    force = max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
+    forces = x[FRONT] * math.cos(steer) + x[REAR]
+    return w * (forces + force * rate_vy) + (1.0 - w) * x[VX] * x[YAW_RATE]

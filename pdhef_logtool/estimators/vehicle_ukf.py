@@ -1,0 +1,974 @@
+"""The vehicle filter: one unscented Kalman filter for ``phy-ukf``, ``physics`` and ``pd-hef`` (docs/method.md#filter).
+
+The models f (motion) and h (readings) are in :mod:`~.vehicle_model`; ``phy-ukf`` uses the nominal one, the others that
+with axle forces and the parts of the car. A step is
+
+    χ = x ± columns of √(n P);  χ⁻ = f(χ, u) + residual;  x⁻, P⁻ = mean and covariance of χ⁻, + Q
+    χ = x⁻ ± columns of √(n P⁻);  ζ = h(χ, u);  ẑ, S, P_xz = moments of ζ and χ, + R;  gate
+    x = x⁻ + P_xz S⁻¹ (z − ẑ);  P = P⁻ − P_xz S⁻¹ P_xzᵀ
+
+with the scaled unscented transform at α = 1, β = 2, κ = 0 (Wan and van der Merwe 2000): the centre has the weight 0 in
+the mean and 2 in the covariance. The inputs u are the mean of those at both ends of the step, which are known when the
+step is computed. A network's residual of v̇_y and ṙ (Eq 19) enters half before and half after the model's step, and in
+the predicted a_y; zeros change no bit.
+
+Without steering for longer than it may be held, its error is a state that walks at random: the rear axle's tyres, a_y
+and yaw rate then determine v_y. ``phy-ukf`` waits for the steering instead.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters
+from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
+from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
+from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.estimators.speed_slip import SlipState, believable
+from pdhef_logtool.estimators.unscented import cholesky, cross_covariance, draw, moments, reading_moments, update
+from pdhef_logtool.estimators.vehicle_model import (
+    AX_BIAS,
+    BANK_TIME_S,
+    CORE,
+    FORCE_SCALE_TIME_S,
+    FRONT,
+    LANES,
+    MOTION,
+    NOMINAL,
+    PLACES,
+    READINGS,
+    REAR,
+    VX,
+    VY,
+    WIDTH,
+    YAW_RATE,
+    Z_AY,
+    Z_SPEED,
+    Z_YAW_RATE,
+    Layout,
+    PhysicsParameters,
+    advance,
+    layout_of,
+    physics_parameters,
+    planar_ay,
+    push,
+    read,
+    settle_forces,
+)
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import (
+    RESTART_GAP_S,
+    Extrapolation,
+    StepColumns,
+    last_stamp_ns,
+    step_durations_s,
+)
+from pdhef_logtool.records.tracks import StateTrack, make_track
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.presets import Options
+
+#: The variant of ``phy-ukf`` with the noise of an identified car.
+TUNED = "phy-ukf:tuned"
+#: Process noise, 1-sigma per square root of second, of v_x, v_y, r and the a_x bias. Chosen by innovation likelihood
+#: over simulated drives and frozen: the drives were those of the simulator's first, planar vehicle, and a baseline does
+#: not follow every change of the simulator.
+PHY_UKF_Q_STD = (0.089, 0.31, 0.062, 0.021)
+#: The same of ``physics``, with the axle forces, for cars without fitted noise and as the start of identification, with
+#: lag, load transfer and biases. The present simulator gives 0.078, 0.13, 0.01, 0.062, 0.39.
+PHYSICS_Q_STD = (0.085, 0.12, 0.012, 0.086, 0.41, 0.41)
+#: Speed process noise where the log has no longitudinal accelerometer: the speed is then a random walk
+#: (docs/method.md#frame).
+NO_AX_Q_STD = 3.0
+#: 1-sigma at the start and at a standstill of the motion and the a_x bias; NaN: a standstill leaves the entry as it is.
+INITIAL_STD, STANDSTILL_STD = (0.5, 0.5, 0.1, 0.3), (0.02, 0.01, 0.002, math.nan)
+#: The same of the axles' forces over the mass, m/s², of roll (rad) and roll rate (rad/s); the roll rate's walk per √s.
+_FORCE_STD, _STANDSTILL_FORCE_STD = 0.5, 0.05
+_ROLL_STD, _STANDSTILL_ROLL_STD, _ROLL_WALK = (0.01, 0.03), (0.005, 0.01), 0.02
+#: Spread of the bank, rad: a crowned road has 0.02-0.03, motorway bends to 0.07. Spread of the force scale
+#: (docs/method.md#adaptation).
+_BANK_STD, FORCE_SCALE_STD = 0.02, 0.05
+#: Random walk of the a_y (m/s²), yaw-rate (rad/s) and steering (rad) bias, 1-sigma per square root of second.
+BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
+#: 1-sigma of an unknown steering angle at the start and at most, rad, and its walk per √s (docs/method.md#physics).
+UNKNOWN_STEER_STD, MAX_STEER_STD, UNKNOWN_STEER_WALK = 0.1, 0.2, 0.2
+#: Beyond this share of the grip, the largest of about the last ``LIMIT_TIME_S``, tyre models are least certain
+#: (docs/method.md#limit). ``limit_lag_m`` of a file that neither ground truth nor calibration has validated, in
+#: wheelbases: chosen on simulated cars with right and wrong files. More helps single manoeuvres and harms laps.
+LINEAR_SHARE, LIMIT_TIME_S, FILE_LAG = 0.36, 0.5, 1.1
+
+#: A sample further from its prediction than this many standard deviations is not used ...
+GATE_SIGMA = 6.0
+#: ... unless it has been so for this long: then the filter is wrong, not the sensor (docs/method.md#gate).
+GATE_OPENS_AFTER_S = 0.2
+GATE_INFLATION = 10.0
+STANDSTILL_AFTER_S = 0.3
+#: A standstill is not accepted for longer than this without a speed sample that states so.
+STANDSTILL_SILENCE_S = 1.5
+#: Divergence: the filter's own normalised squared innovations stay this far above 1, averaged over the time.
+DIVERGED_NIS_RATIO = 25.0
+#: Samples that the gate rejects count as well, or a gated filter could never notice; each up to this square.
+DIVERGED_NIS_CAP = 4.0 * GATE_SIGMA**2
+DIVERGED_AVERAGE_S = 1.0
+DIVERGED_SIDESLIP_RAD = math.radians(60.0)
+#: If the speed sensor last read more than this, the car does not roll backwards: a v_x below zero is divergence.
+FORWARD_M_S = 0.5
+#: Time of a rejection at its first sample, s; 0 is "the last sample was accepted".
+_JUST_REJECTED_S = 1e-9
+
+# Inputs of a step; a_x is 0 where U_AX_KNOWN is 0. U_SPEED is the last speed sample that was accepted, 0 before any.
+U_STEER, U_AX, U_FRICTION, U_AX_KNOWN, U_SPEED, U_STEER_KNOWN = range(6)
+INPUTS = 6
+
+#: What a filter remembers of the steps before: whether it runs; last inputs and residual; ages, s; duration of the
+#: standstill, s; mean normalised square of the innovations; last speed sample; largest recent share of the grip that is
+#: used, decaying; time since the first sample of an unbroken rejection of a_y, yaw rate and speed, s.
+MEMORY = np.dtype(
+    [(name, np.float64) for name in (
+        "runs", "steer", "ax", "ax_known", "friction", "rate_vy", "rate_r", "steer_age", "speed_age", "still", "nis",
+        "speed", "grip",
+    )]
+    + [("rejected", np.float64, (READINGS,))]
+)  # fmt: skip
+
+_compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
+_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+
+
+class Window(NamedTuple):
+    """Samples of a window, [K], NaN where missing. ``dt_s`` is the duration before each step, NaN at the start.
+
+    ``residual_rate`` [K, 2] is added to v̇_y and ṙ from the step on, m/s² and rad/s²; ``extra_r`` [K, 2] the
+    variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
+    """
+
+    dt_s: FloatArray
+    steer: FloatArray
+    ax: FloatArray
+    ay: FloatArray
+    yaw_rate: FloatArray
+    speed: FloatArray
+    friction: FloatArray
+    residual_rate: FloatArray
+    extra_r: FloatArray
+
+
+class Rules(NamedTuple):
+    """Settings of the filter, beside its constants."""
+
+    use_speed: bool  # False: the speed sensor only starts the filter
+    still_after_s: float
+    default_friction: float
+    dynamic_speed_m_s: float  # above it a sideslip beyond DIVERGED_SIDESLIP_RAD is divergence
+    steer_hold_s: float
+    still_speed_m_s: float
+    still_yaw_rate_rad_s: float
+    limit_gain: float
+    limit_lag_m: float
+
+
+class Model(NamedTuple):
+    """Arguments of the compiled models."""
+
+    layout: Layout
+    places: IntArray
+    p: ModelParameters
+    f: PhysicsParameters
+
+
+class Tuning(NamedTuple):
+    """Noise by entry of the state [n] and of the readings [3], and the rules.
+
+    ``q_std`` is a random walk's 1-sigma per √s; ``standstill_std`` is NaN for entries that a standstill leaves alone.
+    """
+
+    q_std: FloatArray
+    r_std: FloatArray
+    initial_std: FloatArray
+    standstill_std: FloatArray
+    rules: Rules
+
+
+class Belief(NamedTuple):
+    """State [n], covariance [n, n] and memory [1] of a filter, moved in place."""
+
+    x: FloatArray
+    P: FloatArray
+    memory: np.ndarray
+
+
+class StepInputs(NamedTuple):
+    """Inputs at a step, held if missing, and its measurements.
+
+    ``steers`` states that the filter may start with the steering, ``steer_ok`` that it may go on with it.
+    """
+
+    dt: float
+    steer: float
+    ax: float
+    has_ax: bool
+    friction: float
+    steers: bool
+    steer_ok: bool
+    ay: float
+    yaw_rate: float
+    speed: float
+
+
+class HeldInputs(NamedTuple):
+    """Inputs over a step: the mean of its two ends."""
+
+    steer: float
+    ax: float
+    ax_known: bool
+    friction: float
+
+
+class GateResult(NamedTuple):
+    """Result of the gate: whether it opens, whether a sample is outside, number of samples, sum of squares."""
+
+    opens: bool
+    outside: bool
+    seen: int
+    squares: float
+
+
+# ------------------------------------------------------------------------------------------------ one step
+
+
+@_compiled
+def begin_step(k, window, rules, needs_steer, memory):  # type: ignore[no-untyped-def]
+    """Reset after a time gap and zero-order-hold missing inputs. Return the inputs of step k."""
+    dt, steers, steer, has_ax = window.dt_s[k], math.isfinite(window.steer[k]), window.steer[k], False
+    restart = not dt <= RESTART_GAP_S
+    if restart:
+        memory[:] = np.zeros(1, MEMORY)
+    m = memory[0]
+    steer = steer if steers else m.steer
+    m.steer_age = 0.0 if steers or restart else m.steer_age + dt
+    steer_ok = steers or (m.runs > 0.0 and m.steer_age <= rules.steer_hold_s)
+    if not needs_steer:
+        lateral = math.isfinite(window.yaw_rate[k]) or math.isfinite(window.ay[k])
+        steers = steers or (m.steer_age > rules.steer_hold_s and lateral)
+        steer_ok = True
+    has_ax = math.isfinite(window.ax[k])
+    friction = window.friction[k]
+    if not math.isfinite(friction):
+        friction = m.friction if m.friction > 0.0 else rules.default_friction
+    speed = window.speed[k] if rules.use_speed or m.runs == 0.0 else math.nan
+    if math.isfinite(speed):
+        m.speed = speed
+    ax = window.ax[k] if has_ax else 0.0
+    return StepInputs(dt, steer, ax, has_ax, friction, steers, steer_ok, window.ay[k], window.yaw_rate[k], speed)
+
+
+@_inline
+def held_over_step(now, m):  # type: ignore[no-untyped-def]
+    """Return the mean of the inputs at both ends of a step; if a_x is missing at one end, the other end counts."""
+    ax = now.ax
+    if not now.has_ax:
+        ax = m.ax
+    elif m.ax_known > 0.0:
+        ax = 0.5 * (m.ax + now.ax)
+    return HeldInputs(
+        0.5 * (m.steer + now.steer), ax, now.has_ax or m.ax_known > 0.0, 0.5 * (m.friction + now.friction)
+    )
+
+
+@njit(cache=True)
+def starts(now, unknown_steer, tuning, model, x, P, memory):  # type: ignore[no-untyped-def]
+    """Start with the first sample of speed and steering; return whether this is it.
+
+    The rear axle rolls without slip, the tyres' forces have settled, all other entries are 0.
+    """
+    if not (math.isfinite(now.speed) and now.steers):
+        return False
+    layout, _, p, f = model
+    r = now.yaw_rate if math.isfinite(now.yaw_rate) else 0.0
+    x[:] = 0.0
+    x[VX], x[VY], x[YAW_RATE] = now.speed, p.rear_m * r, r
+    P[:, :] = np.diag(tuning.initial_std**2)
+    if unknown_steer:
+        x[layout.steer_bias] = -(p.front_m + p.rear_m) * r / max(now.speed, p.blend_low_m_s)
+        P[layout.steer_bias, layout.steer_bias] = UNKNOWN_STEER_STD**2
+    if layout.forces >= 0:
+        settle_forces(x, now.steer, now.ax, now.friction, layout, p, f)
+    memory[0].runs = 1.0
+    return True
+
+
+@_inline
+def process_noise(q_std, ax_known, dt, layout, q):  # type: ignore[no-untyped-def]
+    """Write the variance [n] that ``dt`` s add to each entry; without a_x the speed is a random walk too."""
+    for i in range(q.shape[0]):
+        q[i] = q_std[i] * q_std[i] * dt
+    if not ax_known:
+        q[VX] = NO_AX_Q_STD**2 * dt
+    if layout.force_scale >= 0:
+        q[layout.force_scale] += FORCE_SCALE_STD**2 * (1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S))
+    if layout.bank >= 0:
+        q[layout.bank] += _BANK_STD**2 * (1.0 - math.exp(-2.0 * dt / BANK_TIME_S))
+
+
+@_inline
+def yield_to_kinematics(x, friction, dt, rules, p, f, m):  # type: ignore[no-untyped-def]
+    """Return the factor on the process noise of the axle forces, 1 in the linear range, and how they lag beyond it."""
+    most = friction * (p.front_D_n + p.rear_D_n) / p.mass_kg
+    m.grip = max(abs(x[FRONT] + x[REAR]) / most, m.grip * math.exp(-dt / LIMIT_TIME_S))
+    beyond = max(0.0, m.grip - LINEAR_SHARE)
+    if rules.limit_lag_m > 0.0:
+        f = PhysicsParameters(rules.limit_lag_m * beyond, *f[1:])
+    return 1.0 + rules.limit_gain * beyond * beyond, f
+
+
+# positional: to hand structures of arrays on at every step would cost as much as the step.
+@_compiled
+def predict(x, P, L, over, rate, dt, q, layout, places, p, f, points, E):  # type: ignore[no-untyped-def]
+    """Move state and covariance by ``dt`` s with the residual ``rate`` of v̇_y and ṙ; L is the root of P.
+
+    Leaves the deviations of the moved points in E.
+    """
+    columns = columns_of(x.shape[0])
+    given = rate[0] != 0.0 or rate[1] != 0.0
+    vx = x[VX]
+    draw(x, L, places, columns, points)
+    if given:
+        push(points, columns, vx, rate, 0.5 * dt, p)
+    advance(points, columns, over, dt, layout, p, f)
+    if given:
+        push(points, columns, vx, rate, 0.5 * dt, p)
+    moments(points, places, columns, q, x, P, E)
+
+
+@_compiled
+def expect(x, L, now, rate_vy, layout, places, p, f, points, readings, r_std, extra_ay, extra_rate, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
+    """Write the expected readings [3], their covariance with R [3, 3] and the cross covariance [3, n]."""
+    columns = columns_of(x.shape[0])
+    draw(x, L, places, columns, points)
+    read(points, columns, now.steer, now.friction, rate_vy, layout, p, f, readings)
+    reading_moments(readings, L, columns, z_hat, S, Pxz)
+    S[Z_AY, Z_AY] += r_std[Z_AY] * r_std[Z_AY] + extra_ay
+    S[Z_YAW_RATE, Z_YAW_RATE] += r_std[Z_YAW_RATE] * r_std[Z_YAW_RATE] + extra_rate
+    S[Z_SPEED, Z_SPEED] += r_std[Z_SPEED] * r_std[Z_SPEED]
+
+
+@njit
+def columns_of(n):  # type: ignore[no-untyped-def]
+    """Return the columns of a block for the sigma points of n entries: whole vectors; the rest are at the centre."""
+    return (2 * n + LANES) // LANES * LANES
+
+
+@_inline
+def innovate(now, z_hat, nu):  # type: ignore[no-untyped-def]
+    """Write the innovation [3], NaN for missing samples."""
+    nu[Z_AY] = now.ay - z_hat[Z_AY]
+    nu[Z_YAW_RATE] = now.yaw_rate - z_hat[Z_YAW_RATE]
+    nu[Z_SPEED] = now.speed - z_hat[Z_SPEED]
+
+
+@_compiled
+def gate(now, m, nu, S, at_gate, given, use):  # type: ignore[no-untyped-def]
+    """Decide which samples are used; those that are out of the gate for too long open it (docs/method.md#gate).
+
+    Writes which samples there are (``given``), which are used, and the innovation with those beyond it at the gate.
+    """
+    opens, outside, seen, squares = False, False, 0, 0.0
+    for i in range(READINGS):
+        given[i] = math.isfinite(nu[i]) and (i != Z_AY or now.steer_ok)
+        use[i] = given[i]
+        at_gate[i] = nu[i]
+        if m.rejected[i] > 0.0:
+            m.rejected[i] += now.dt
+        if given[i]:
+            square = nu[i] * nu[i] / S[i, i]
+            seen += 1
+            squares += min(square, DIVERGED_NIS_CAP)
+            if square <= GATE_SIGMA**2:
+                m.rejected[i] = 0.0
+            else:
+                outside = True
+                at_gate[i] = math.copysign(GATE_SIGMA * math.sqrt(S[i, i]), nu[i])
+                m.rejected[i] = max(m.rejected[i], _JUST_REJECTED_S)
+                use[i] = m.rejected[i] > GATE_OPENS_AFTER_S
+                opens = opens or use[i]
+    return GateResult(opens, outside, seen, squares)
+
+
+@_compiled
+def settle(now, gated, rules, standstill_std, x, P, m):  # type: ignore[no-untyped-def]
+    """Average the normalised squared innovations, and contain the motion at a standstill; return whether it stands."""
+    if gated.seen > 0:
+        m.nis += min(1.0, now.dt / DIVERGED_AVERAGE_S) * (gated.squares / gated.seen - m.nis)
+    # Standstill: for a while the speed sensor reads zero and the car does not turn.
+    turns = abs(now.yaw_rate) > rules.still_yaw_rate_rad_s
+    if math.isfinite(now.speed):
+        m.speed_age = 0.0
+        m.still = m.still + now.dt if abs(now.speed) < rules.still_speed_m_s and not turns else 0.0
+    elif m.still > 0.0:
+        m.speed_age += now.dt
+        m.still = m.still + now.dt if m.speed_age <= STANDSTILL_SILENCE_S and not turns else 0.0
+    if m.still < rules.still_after_s:
+        return False
+    for i in range(x.shape[0]):
+        if math.isfinite(standstill_std[i]):
+            x[i] = 0.0
+            P[i, :] = 0.0
+            P[:, i] = 0.0
+            P[i, i] = standstill_std[i] ** 2
+    return True
+
+
+@_inline
+def diverges(rules, x, m):  # type: ignore[no-untyped-def]
+    """Return whether innovations stay far beyond their covariance, or the sideslip is impossible."""
+    return m.nis > DIVERGED_NIS_RATIO or (
+        x[VX] > rules.dynamic_speed_m_s and abs(math.atan2(x[VY], x[VX])) > DIVERGED_SIDESLIP_RAD
+    )
+
+
+@_inline
+def remember(k, now, residual_rate, m):  # type: ignore[no-untyped-def]
+    """Keep inputs and residual of step k for the next one."""
+    m.steer, m.ax, m.ax_known, m.friction = now.steer, now.ax, 1.0 if now.has_ax else 0.0, now.friction
+    m.rate_vy, m.rate_r = residual_rate[k, 0], residual_rate[k, 1]
+
+
+@_inline
+def finish_step(k, now, residual_rate, rules, m, inputs):  # type: ignore[no-untyped-def]
+    """Keep inputs and residual of step k for the next one, and write its row of the inputs [K, 6]."""
+    remember(k, now, residual_rate, m)
+    inputs[k, U_STEER] = now.steer
+    inputs[k, U_AX] = now.ax
+    inputs[k, U_FRICTION] = now.friction
+    inputs[k, U_AX_KNOWN] = m.ax_known
+    inputs[k, U_SPEED] = m.speed if rules.use_speed else 0.0
+    inputs[k, U_STEER_KNOWN] = 1.0 if m.steer_age <= rules.steer_hold_s else 0.0
+
+
+@_inline
+def is_finite(x, P):  # type: ignore[no-untyped-def]
+    """Return whether state and variances are numbers; so are all covariances then."""
+    total = 0.0
+    for i in range(x.shape[0]):
+        total += abs(x[i]) + abs(P[i, i])
+    return math.isfinite(total)
+
+
+# ------------------------------------------------------------------------------------------------ a window
+
+
+@njit(cache=True)
+def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyped-def]
+    """Filter one window; ``belief`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
+    q_std, r_std, initial_std, standstill_std, rules = tuning
+    layout, places, p, car = model
+    x, P, memory = belief
+    out_x, out_P, out_inputs, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
+    out_linked, out_predicted_P, out_cross = links
+    linked, n, bias = out_linked.shape[0] > 0, x.shape[0], layout.steer_bias
+    points, readings, E = np.zeros(PLACES * WIDTH), np.zeros(READINGS * WIDTH), np.zeros(n * WIDTH)
+    L, before, q = np.zeros((n, n)), np.zeros((n, n)), np.zeros(n)
+    z_hat, S, Pxz, nu, at_gate = np.zeros(READINGS), np.zeros((READINGS, READINGS)), np.zeros((READINGS, n)), np.zeros(READINGS), np.zeros(READINGS)  # fmt: skip
+    given, use = np.zeros(READINGS, np.bool_), np.zeros(READINGS, np.bool_)
+    q_std = q_std.copy()
+    force_std, steer_std = q_std[FRONT] if layout.forces >= 0 else 0.0, q_std[bias]
+    for k in range(window.dt_s.shape[0]):
+        m = memory[0]
+        was_unknown = bias >= 0 and m.runs > 0.0 and m.steer_age > rules.steer_hold_s
+        if was_unknown:  # the likeliest angle is the input
+            m.steer -= x[bias]
+            x[bias] = 0.0
+        now = begin_step(k, window, rules, bias < 0, memory)
+        unknown = bias >= 0 and m.steer_age > rules.steer_hold_s
+        if bias >= 0:
+            q_std[bias] = UNKNOWN_STEER_WALK if unknown else steer_std
+            if unknown and x[VX] < p.blend_high_m_s and P[bias, bias] > UNKNOWN_STEER_STD**2:
+                q_std[bias] = 0.0  # a slow car shows no steering
+        if was_unknown and not unknown:
+            P[bias, :] = 0.0
+            P[:, bias] = 0.0
+            P[bias, bias] = initial_std[bias] ** 2
+        if m.runs == 0.0:
+            out_valid[k] = starts(now, unknown, tuning, model, x, P, memory)
+        else:
+            over, rate, f = held_over_step(now, m), (m.rate_vy, m.rate_r), car
+            if layout.forces >= 0 and rules.limit_gain > 0.0:
+                factor, f = yield_to_kinematics(x, over.friction, now.dt, rules, p, f, m)
+                q_std[FRONT], q_std[REAR] = factor * force_std, factor * force_std
+            process_noise(q_std, over.ax_known, now.dt, layout, q)
+            cholesky(P, L)
+            if linked:
+                before[:, :] = L
+            predict(x, P, L, over, rate, now.dt, q, layout, places, p, f, points, E)
+            if linked:
+                cross_covariance(before, E, columns_of(n), out_cross[k])
+                out_predicted_P[k] = P
+            out_prior[k] = x
+            alive, stands = is_finite(x, P), False
+            if alive:
+                extra_ay, extra_rate = window.extra_r[k, 0], window.extra_r[k, 1]
+                cholesky(P, L)
+                expect(x, L, now, rate[0], layout, places, p, f, points, readings, r_std, extra_ay, extra_rate, z_hat, S, Pxz)  # fmt: skip
+                innovate(now, z_hat, nu)
+                gated = gate(now, m, nu, S, at_gate, given, use)
+                for i in range(READINGS):
+                    if given[i]:
+                        out_nu[k, i] = nu[i]
+                if gated.outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
+                    _, _, out_likelihood[k] = update(x.copy(), P.copy(), at_gate, S, Pxz, given)
+                if gated.opens:
+                    P *= GATE_INFLATION
+                    if linked:  # to a smoother the inflation is process noise of the step that led here
+                        out_predicted_P[k] = P
+                    cholesky(P, L)
+                    expect(x, L, now, rate[0], layout, places, p, f, points, readings, r_std, extra_ay, extra_rate, z_hat, S, Pxz)  # fmt: skip
+                    innovate(now, z_hat, nu)
+                    for i in range(READINGS):
+                        if use[i]:
+                            m.rejected[i] = 0.0
+                nis, dof, likelihood = update(x, P, nu, S, Pxz, use)
+                if dof > 0:
+                    out_nis[k], out_dof[k] = nis, dof
+                    if not gated.outside:
+                        out_likelihood[k] = likelihood
+                stands = settle(now, gated, rules, standstill_std, x, P, m)
+                alive = is_finite(x, P)
+            # Without steering, a_y and yaw rate the motion is unknown: the filter ends, and waits for them.
+            determined = alive and not (unknown and P[bias, bias] > MAX_STEER_STD**2)
+            out_valid[k] = determined and now.steer_ok
+            out_diverged[k] = not alive or diverges(rules, x, m)
+            if not determined:
+                m.runs = 0.0
+            elif linked:
+                out_linked[k] = not stands
+        finish_step(k, now, window.residual_rate, rules, m, out_inputs)
+        out_x[k] = x
+        out_P[k] = P
+
+
+@njit(cache=True)
+def _predict_outputs(due, held, q_std, model, out):  # type: ignore[no-untyped-def]
+    """Predict the steps that are due with their inputs held; the rows of no step (−1) are left."""
+    step, horizon_s = due
+    held_x, held_P, inputs, residual_rate = held
+    out_x, out_P, out_ay = out
+    layout, places, p, f = model
+    n = held_x.shape[1]
+    points, E, L, q = np.zeros(PLACES * WIDTH), np.zeros(n * WIDTH), np.zeros((n, n)), np.zeros(n)
+    x, P = np.zeros(n), np.zeros((n, n))
+    for row in range(step.shape[0]):
+        k = step[row]
+        if k < 0:
+            continue
+        x[:] = held_x[k]
+        P[:, :] = held_P[k]
+        over = HeldInputs(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
+        rate = (residual_rate[k, 0], residual_rate[k, 1])
+        if horizon_s[row] > 0.0:
+            cholesky(P, L)
+            process_noise(q_std, over.ax_known, horizon_s[row], layout, q)
+            predict(x, P, L, over, rate, horizon_s[row], q, layout, places, p, f, points, E)
+        if is_finite(x, P):
+            out_x[row] = x
+            out_P[row] = P[:MOTION, :MOTION]
+            out_ay[row] = planar_ay(x, over.steer, over.friction, rate[0], layout, p)
+
+
+# ------------------------------------------------------------------------------------------------ records
+
+
+class Posterior(NamedTuple):
+    """Output arrays of a kernel, one row per step (see :class:`PosteriorSteps`)."""
+
+    x: FloatArray
+    P: FloatArray
+    inputs: FloatArray
+    nis: FloatArray
+    nis_dof: FloatArray
+    log_likelihood: FloatArray
+    innovation: FloatArray
+    valid: BoolArray
+    diverged: BoolArray
+    prior: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosteriorSteps(StepColumns):
+    """Filter posteriors on measurement time: [K] each, state [K, n], covariance [K, n, n], inputs [K, 6].
+
+    ``prior`` [K, n] is the state before the update, NaN where the filter starts. ``residual_rate``
+    [K, 2] is added to v̇_y and ṙ from the step on; 0 in the pure physics filter.
+    """
+
+    stamps_ns: IntArray
+    x: FloatArray
+    P: FloatArray
+    inputs: FloatArray
+    nis: FloatArray
+    nis_dof: FloatArray
+    log_likelihood: FloatArray
+    innovation: FloatArray
+    valid: BoolArray
+    diverged: BoolArray
+    prior: FloatArray
+    residual_rate: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilterState:
+    """Filter state between windows."""
+
+    belief: Belief
+    last_stamp_ns: int | None
+    slip: SlipState | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepLinks(StepColumns):
+    """Further inputs of a smoother, one row per step; length 0 if not requested.
+
+    ``linked`` [K]: the state follows from that of the step before; not at a start, a failure or a standstill.
+    ``predicted_P`` [K, n, n] is the covariance before the update, with the inflation by an opened gate; ``cross``
+    [K, n, n] the covariance between the state of the step before (rows) and the predicted state (columns).
+    """
+
+    linked: BoolArray
+    predicted_P: FloatArray
+    cross: FloatArray
+
+
+class _Links(NamedTuple):
+    """The columns of :class:`StepLinks`, for the kernel to write."""
+
+    linked: BoolArray
+    predicted_P: FloatArray
+    cross: FloatArray
+
+
+class Predicted(NamedTuple):
+    """Predictions: state [M, n], covariance of the motion [M, 3, 3], planar a_y [M]; NaN for none."""
+
+    x: FloatArray
+    P: FloatArray
+    ay: FloatArray
+
+
+def make_window(
+    signals: Signals,
+    state: FilterState | None,
+    residual_rate: FloatArray | None = None,
+    extra_r: FloatArray | None = None,
+) -> Window:
+    """Return the window that a kernel reads; without ``residual_rate`` or ``extra_r`` they are 0."""
+    nothing = np.zeros((len(signals), 2))
+    return Window(
+        step_durations_s(signals.stamps_ns, state.last_stamp_ns if state else None),
+        signals.steer_rad,
+        signals.ax_m_s2,
+        signals.ay_m_s2,
+        signals.yaw_rate_rad_s,
+        signals.speed_m_s,
+        signals.friction,
+        nothing if residual_rate is None else residual_rate,
+        nothing if extra_r is None else extra_r,
+    )
+
+
+def no_posterior(count: int, n: int) -> Posterior:
+    """Return the arrays that a kernel writes ``count`` steps of ``n`` states to, with no estimate in them."""
+    return Posterior(
+        x=np.empty((count, n)),
+        P=np.empty((count, n, n)),
+        inputs=np.empty((count, INPUTS)),
+        nis=np.full(count, np.nan),
+        nis_dof=np.zeros(count),
+        log_likelihood=np.zeros(count),
+        innovation=np.full((count, READINGS), np.nan),
+        valid=np.zeros(count, dtype=np.bool_),
+        diverged=np.zeros(count, dtype=np.bool_),
+        prior=np.full((count, n), np.nan),
+    )
+
+
+def no_prediction(count: int, n: int) -> Predicted:
+    """Return empty arrays for predictions of ``n`` states."""
+    return Predicted(*(np.full((count, *shape), np.nan) for shape in ((n,), (MOTION, MOTION), ())))
+
+
+def predicted_track(
+    name: str,
+    stamps_ns: IntArray,
+    steps: PosteriorSteps,
+    ahead: Extrapolation,
+    predicted: Predicted,
+    layout: Layout = NOMINAL,
+) -> StateTrack:
+    """Return the track of predicted states at the scored stamps [M]."""
+    step, x, covariance = ahead.step, predicted.x, predicted.P
+    usable = ahead.usable & np.isfinite(x[:, VX]) & rolls_forward(x[:, VX], steps.inputs[step, U_SPEED])
+    return make_track(
+        name,
+        stamps_ns,
+        vx_m_s=x[:, VX].copy(),
+        vy_m_s=x[:, VY].copy(),
+        yaw_rate_rad_s=x[:, YAW_RATE].copy(),
+        ay_m_s2=predicted.ay,
+        covariance=covariance,
+        sideslip_std_rad=sideslip_std(x[:, VX], x[:, VY], covariance),
+        r_scale=np.ones(len(stamps_ns)),
+        nis=np.where(usable, steps.nis[step], np.nan),
+        nis_dof=np.where(usable, steps.nis_dof[step], 0.0),
+        friction=np.where(usable, steps.inputs[step, U_FRICTION], np.nan),
+        valid=usable,
+        diverged=usable & steps.diverged[step],
+        **{column: np.where(usable, x[:, i], np.nan) for column, i in layout.named.items()},
+    )
+
+
+def rolls_forward(vx_m_s: FloatArray, last_speed_m_s: FloatArray) -> BoolArray:
+    """Return where v_x [N] does not contradict the last speed sample: the sideslip would be at 180 degrees there."""
+    against: BoolArray = (vx_m_s < 0.0) & (last_speed_m_s > FORWARD_M_S)
+    return ~against
+
+
+def sideslip_std(vx_m_s: FloatArray, vy_m_s: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the 1-sigma of β = atan2(v_y, v_x) in rad, [N], to first order from the covariance [N, ≥2, ≥2]."""
+    v2 = np.maximum(vx_m_s**2 + vy_m_s**2, 1e-6)
+    gx, gy = -vy_m_s / v2, vx_m_s / v2
+    variance = gx**2 * covariance[:, VX, VX] + gy**2 * covariance[:, VY, VY] + 2.0 * gx * gy * covariance[:, VX, VY]
+    return np.sqrt(np.maximum(variance, 0.0))
+
+
+# ------------------------------------------------------------------------------------------------ the estimator
+
+
+@dataclass(frozen=True)
+class VehicleUkf:
+    """The filter of this file as an estimator.
+
+    Parameters
+    ----------
+    vehicle : parameters; ``physics`` states which parts it has, ``sensors`` gives R unless ``r_std`` does, and the
+        priors of the biases.
+    model : ``forces`` with axle forces and the car's parts, ``nominal`` without.
+    q_std : process 1-sigma per √s of [v_x, v_y, r, b_ax, f_f, f_r], forces over mass in m/s².
+    r_std : 1-sigma of [a_y, r, v_x].
+    limit_gain : growth of the process noise of the axle forces beyond the linear range; 0: none.
+    limit_lag_m : growth of the length over which they return to the tyres' beyond it, none within; 0: the car's lag.
+    roll_correction : of a_y in the nominal model.
+    use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
+    slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
+    standstill : contain the motion at zero while the car is.
+    read_with : the vehicle with which its signals were read and corrected, where that is another; None: its own.
+    """
+
+    algorithm = "vehicle-ukf"
+    version = 1
+    options = ("model", "slip_gate", "standstill", "limit_gain", "limit_lag_m", "roll_correction")
+
+    vehicle: VehicleParameters
+    model: Literal["forces", "nominal"] = "forces"
+    q_std: tuple[float, ...] = PHYSICS_Q_STD
+    r_std: tuple[float, float, float] | None = None
+    limit_gain: float = 0.0
+    limit_lag_m: float = 0.0
+    roll_correction: bool = False
+    use_speed: bool = True
+    slip_gate: bool = True
+    standstill: bool = True
+    read_with: VehicleParameters | None = None
+    name: str = PHYSICS
+    causal: bool = True
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Where the states of the car's parts are."""
+        return NOMINAL if self.model == "nominal" else layout_of(self.vehicle)
+
+    @cached_property
+    def parameters(self) -> Model:
+        """Arguments of the compiled models."""
+        p = model_parameters(self.vehicle, roll_correction=self.roll_correction)
+        return Model(self.layout, self.layout.places, p, physics_parameters(self.vehicle))
+
+    @property
+    def measurement_std(self) -> FloatArray:
+        """1-sigma of [a_y, r, v_x], [3]."""
+        return np.array(self.r_std or self.vehicle.sensors.measurement_std)
+
+    @property
+    def _rules(self) -> Rules:
+        sensors = self.vehicle.sensors
+        return Rules(
+            self.use_speed,
+            STANDSTILL_AFTER_S if self.standstill else math.inf,
+            self.vehicle.assumed_friction,
+            self.vehicle.low_speed_blend_m_s,
+            sensors.steer_hold_s,
+            sensors.speed_zero_m_s,
+            sensors.still_yaw_rate_rad_s,
+            self.limit_gain,
+            self.limit_lag_m,
+        )
+
+    @cached_property
+    def tuning(self) -> Tuning:
+        """Noise of the states and readings, and rules."""
+        layout, s = self.layout, self.vehicle.sensors
+        walk, initial = np.zeros(layout.size), np.zeros(layout.size)
+        still = np.full(layout.size, math.nan)
+        walk[: len(self.q_std)] = self.q_std
+        initial[: AX_BIAS + 1], still[: AX_BIAS + 1] = INITIAL_STD, STANDSTILL_STD
+        if layout.forces >= 0:
+            initial[FRONT:CORE], still[FRONT:CORE] = _FORCE_STD, _STANDSTILL_FORCE_STD
+        if (i := layout.roll) >= 0:
+            initial[i : i + 2], still[i : i + 2], walk[i + 1] = _ROLL_STD, _STANDSTILL_ROLL_STD, _ROLL_WALK
+        if layout.bank >= 0:
+            initial[layout.bank] = _BANK_STD
+        if layout.force_scale >= 0:
+            initial[layout.force_scale] = FORCE_SCALE_STD
+        if (i := layout.sensor_bias) >= 0:
+            initial[layout.steer_bias : i + 2] = s.steer_bias_std_rad, s.ay_bias_std_m_s2, s.yaw_rate_bias_std_rad_s
+            of_ay, of_rate, of_steer = BIAS_WALK_STD
+            walk[layout.steer_bias : i + 2] = of_steer, of_ay, of_rate
+        return Tuning(walk, self.measurement_std, initial, still, self._rules)
+
+    def corrected(self, signals: Signals) -> Signals:
+        """Return signals as this filter's vehicle corrects them, where they were read with another one."""
+        return signals if self.read_with is None else corrected_anew(signals, self.read_with, self.vehicle)
+
+    def run(
+        self,
+        signals: Signals,
+        state: FilterState | None,
+        residual_rate: FloatArray | None = None,
+        extra_r: FloatArray | None = None,
+    ) -> tuple[PosteriorSteps, FilterState]:
+        """Filter one window (see :class:`~.base.Estimator`).
+
+        ``residual_rate`` [N, 2] is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
+        ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
+        """
+        steps, after, _ = self._steps(signals, state, residual_rate, extra_r, linked=False)
+        return steps, after
+
+    def linked_steps(
+        self,
+        signals: Signals,
+        state: FilterState | None,
+        residual_rate: FloatArray | None = None,
+        extra_r: FloatArray | None = None,
+    ) -> tuple[PosteriorSteps, FilterState, StepLinks]:
+        """Return the result of :meth:`run`, bit for bit, and the links between the steps."""
+        return self._steps(signals, state, residual_rate, extra_r, linked=True)
+
+    def _steps(
+        self,
+        signals: Signals,
+        state: FilterState | None,
+        residual_rate: FloatArray | None,
+        extra_r: FloatArray | None,
+        *,
+        linked: bool,
+    ) -> tuple[PosteriorSteps, FilterState, StepLinks]:
+        signals, slip = believable(
+            self.corrected(signals), self.vehicle.sensors, state.slip if state else None, gate=self.slip_gate
+        )
+        window, count, n = make_window(signals, state, residual_rate, extra_r), len(signals), self.layout.size
+        rows, out = count if linked else 0, no_posterior(count, n)
+        links = _Links(np.zeros(rows, dtype=np.bool_), np.zeros((rows, n, n)), np.zeros((rows, n, n)))
+        belief = resume(state, n)
+        _filter(window, self.tuning, self.parameters, belief, out, links)
+        after = FilterState(belief, last_stamp_ns(signals.stamps_ns, state.last_stamp_ns if state else None), slip)
+        return PosteriorSteps(signals.stamps_ns, *out, window.residual_rate), after, StepLinks(*links)
+
+    def predict(self, steps: PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+        """Extrapolate steps with the filter's model (see :class:`~.base.ModelPredictor`)."""
+        predicted = no_prediction(len(stamps_ns), steps.x.shape[1])
+        due = (np.where(ahead.usable, ahead.step, -1), ahead.horizon_s)
+        held = (steps.x, steps.P, steps.inputs, steps.residual_rate)
+        _predict_outputs(due, held, self.tuning.q_std, self.parameters, predicted)
+        return predicted_track(self.name, stamps_ns, steps, ahead, predicted, self.layout)
+
+    def expected_ay(self, x: FloatArray, inputs: FloatArray) -> FloatArray:
+        """Return the accelerometer's reading [K] in states [K, n] with inputs [K, 6], without residual; NaN for none."""
+        out = np.full(len(x), np.nan)
+        _expected_ay(x, inputs, self.parameters, out)
+        return out
+
+
+@njit(cache=True)
+def _expected_ay(x, inputs, model, out):  # type: ignore[no-untyped-def]
+    layout, places, p, f = model
+    points, readings = np.zeros(PLACES * WIDTH), np.zeros(READINGS * WIDTH)
+    for k in range(x.shape[0]):
+        if math.isfinite(x[k, VX]):
+            for j in range(x.shape[1]):
+                points[places[j] * WIDTH] = x[k, j]
+            read(points, 1, inputs[k, U_STEER], inputs[k, U_FRICTION], 0.0, layout, p, f, readings)
+            out[k] = readings[Z_AY * WIDTH]
+
+
+def resume(state: FilterState | None, n: int) -> Belief:
+    """Return a copy of the state before a window, which the kernel updates in place."""
+    if state is None:
+        return Belief(np.zeros(n), np.eye(n), np.zeros(1, MEMORY))
+    return Belief(*(part.copy() for part in state.belief))
+
+
+# ------------------------------------------------------------------------------------------------ presets
+
+
+def nominal_filter(vehicle: VehicleParameters, *, use_speed: bool = True, name: str = "phy-ukf") -> VehicleUkf:
+    """Return the frozen ``phy-ukf``: the paper's physics baseline, R at sensor level, Q by innovation likelihood."""
+    return VehicleUkf(vehicle, "nominal", PHY_UKF_Q_STD, use_speed=use_speed, name=name)
+
+
+def build_nominal(name: str, car: Car, options: Options) -> VehicleUkf:
+    """Return the frozen ``phy-ukf`` of a car, or its variant ``tuned`` with the car's noise and the roll correction."""
+    nominal = nominal_filter(car.vehicle, use_speed=options.use_speed, name=name)
+    if name != TUNED:
+        return nominal
+    noise = car.noise[name]
+    q_std = (*noise.q_std, *PHY_UKF_Q_STD[len(noise.q_std) :])
+    return replace(nominal, q_std=q_std, r_std=noise.measurement_std(car.vehicle.sensors), roll_correction=True)
+
+
+def physics_filter(
+    vehicle: VehicleParameters, noise: FilterNoise | None = None, *, use_speed: bool = True
+) -> VehicleUkf:
+    """Return the filter with a noise, completed by :data:`PHYSICS_Q_STD` and the sensors' noise."""
+    if noise is None:
+        return VehicleUkf(vehicle, use_speed=use_speed)
+    return VehicleUkf(
+        vehicle,
+        q_std=(*noise.q_std, *PHYSICS_Q_STD[len(noise.q_std) :]),
+        limit_gain=noise.limit_gain,
+        r_std=noise.measurement_std(vehicle.sensors),
+        use_speed=use_speed,
+    )
+
+
+def of_car(car: Car, *, use_speed: bool = True) -> VehicleUkf:
+    """Return ``physics`` of a car, with its identified parts and noise where the car has them.
+
+    A car without identified parts is a static single track with the sensors' noise. If no drive with ground
+    truth has validated it, it gets body roll and lagging axle forces, which may depart from the tyre model for longer
+    the more grip the car uses. Entries that tuned noise does not contain are those of the fitted filter.
+    """
+    vehicle, noise = car.physics_vehicle, car.noise.get(PHYSICS)
+    if noise is not None and car.fitted_physics is not None:
+        fitted = car.fitted_physics.noise.q_std
+        noise = noise.model_copy(update={"q_std": (*noise.q_std, *fitted[len(noise.q_std) :])})
+    physics = physics_filter(vehicle, noise, use_speed=use_speed)
+    if noise is None and not car.has_evidence:
+        parts = vehicle.physics.model_copy(update={"lag": True, "roll": True})
+        vehicle = vehicle.model_copy(update={"physics": parts})
+        physics = replace(physics, vehicle=vehicle, limit_gain=LIMIT_GAIN, limit_lag_m=FILE_LAG * vehicle.wheelbase_m)
+    return physics if vehicle == car.vehicle else replace(physics, read_with=car.vehicle)
