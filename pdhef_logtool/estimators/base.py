@@ -43,7 +43,7 @@ def make_steps(
 
 
 class Estimator(Protocol):
-    """Converts aligned signals to steps; immutable: its only memory is the state that it returns."""
+    """An algorithm with a name: a :class:`StepEstimator` or a :class:`Smoother`."""
 
     @property
     def algorithm(self) -> str:
@@ -64,6 +64,10 @@ class Estimator(Protocol):
     def causal(self) -> bool:
         """Whether each step uses only its own sample and earlier ones; checked in every run."""
         ...
+
+
+class StepEstimator(Estimator, Protocol):
+    """Converts aligned signals to steps; immutable: its only memory is the state that it returns."""
 
     def run(self, signals: Signals, state: Any | None) -> tuple[Any, Any]:
         """Process one window.
@@ -91,7 +95,7 @@ class ModelPredictor(Protocol):
 
 
 @runtime_checkable
-class Smoother(Protocol):
+class Smoother(Estimator, Protocol):
     """An estimator that is not causal and returns the track of a drive from all of its samples."""
 
     def smooth(self, signals: Signals) -> StateTrack:

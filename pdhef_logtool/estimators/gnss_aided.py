@@ -27,12 +27,11 @@ from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import notes_of, predict_track
 from pdhef_logtool.estimators.corrected import CorrectedPhysics
-from pdhef_logtool.estimators.filter_base import sideslip_std
 from pdhef_logtool.estimators.intervals import scaled_covariance
-from pdhef_logtool.estimators.physics_filter import LIMIT_TIME_S, LINEAR_SHARE, PhysicsFilter
 from pdhef_logtool.estimators.reference.gnss import JUMP_M_S, LEAST_COURSE_SPEED_M_S
 from pdhef_logtool.estimators.reference.inputs import GNSS_LAG_S
 from pdhef_logtool.estimators.reference.smoother import BIAS_M_S2, BIAS_S, LAW_S, LAW_WHITE, TILT_SHARE, correct
+from pdhef_logtool.estimators.vehicle_ukf import LIMIT_TIME_S, LINEAR_SHARE, VehicleUkf, sideslip_std
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, ExtendedSteps, Extrapolation, last_stamp_ns, step_durations_s
 from pdhef_logtool.records.tracks import StateTrack
@@ -334,7 +333,7 @@ class GnssAided:
         return self.estimator
 
     @property
-    def _physics(self) -> PhysicsFilter:
+    def _physics(self) -> VehicleUkf:
         physics = self.estimator.physics
         return physics.physics if isinstance(physics, AdaptivePhysics) else physics
 

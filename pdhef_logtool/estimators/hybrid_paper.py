@@ -43,7 +43,7 @@ from pdhef_logtool.estimators.vehicle_model import (
     read,
 )
 from pdhef_logtool.estimators.vehicle_ukf import (
-    MEMORY,
+    MEMORY_FIELDS,
     PHY_UKF_Q_STD,
     U_AX,
     U_AX_KNOWN,
@@ -79,7 +79,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.estimators.presets import Options
 
 #: Memory of the filter, with β and C of Eq 22 for each measurement.
-PAPER_MEMORY = np.dtype([*((name, MEMORY[name]) for name in MEMORY.names or ()), ("trust", np.float64), ("c", np.float64, (READINGS,))])  # fmt: skip
+PAPER_MEMORY = np.dtype([*MEMORY_FIELDS, ("trust", np.float64), ("c", np.float64, (READINGS,))])
 
 
 class Constants(NamedTuple):
@@ -180,8 +180,8 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
     out_trust, out_r_scale = adapted
     n = x.shape[0]
     columns, points, E, readings = columns_of(n), np.zeros(PLACES * WIDTH), np.zeros(n * WIDTH), np.zeros(3 * WIDTH)
-    L, z_hat, S, Pxz, nu = np.zeros((n, n)), np.zeros(READINGS), np.zeros((READINGS, READINGS)), np.zeros((READINGS, n)), np.zeros(READINGS)  # fmt: skip
-    use = np.zeros(READINGS, np.bool_)
+    L, S, Pxz = np.zeros((n, n)), np.zeros((READINGS, READINGS)), np.zeros((READINGS, n))
+    z_hat, nu, use = np.zeros(READINGS), np.zeros(READINGS), np.zeros(READINGS, np.bool_)
     for k in range(window.dt_s.shape[0]):
         m, ok, dt = memory[0], start_ok[k], window.dt_s[k]
         steer, friction, has_ax = inputs[k, U_STEER], inputs[k, U_FRICTION], inputs[k, U_AX_KNOWN] > 0.0

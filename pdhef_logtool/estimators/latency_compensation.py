@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from pdhef_logtool.estimators.base import Estimator, Smoother, Steps, predict_track
+from pdhef_logtool.estimators.base import Estimator, Smoother, StepEstimator, Steps, predict_track
 from pdhef_logtool.estimators.causality_check import CausalityCheck, step_columns
 from pdhef_logtool.estimators.plug_ins import contained, package_of, read_only
 from pdhef_logtool.records.errors import EstimatorError
@@ -45,7 +45,7 @@ class WindowState:
 
 
 def run_window(
-    estimator: Estimator,
+    estimator: StepEstimator,
     signals: Signals,
     before: WindowState | None = None,
     causality: CausalityCheck | None = None,
@@ -96,7 +96,7 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
     state = None
     for first in range(0, max(len(signals), 1), PIECE_STEPS):
         piece = signals.rows(first, first + PIECE_STEPS)
-        track, state = run_window(estimator, piece, state, causality)
+        track, state = run_window(cast("StepEstimator", estimator), piece, state, causality)
         if len(piece) == len(signals):
             return track
         for name in (f.name for f in fields(track) if f.name != "name"):
@@ -109,7 +109,7 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
 
 def _smoothed(smoother: Smoother, signals: Signals) -> StateTrack:
     """Return the track of a smoother, which has one row per sample."""
-    name, package = getattr(smoother, "name", type(smoother).__name__), package_of(smoother)
+    name, package = smoother.name, package_of(smoother)
     with contained(name, package):
         track = smoother.smooth(read_only(signals) if package else signals)
         if not isinstance(track, StateTrack) or len(track) != len(signals):

@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -176,5 +177,4 @@ def blocks(stamps_ns: IntArray, block_s: float) -> Iterator[slice]:
         return
     block = (stamps_ns - stamps_ns[0]) // round(block_s * 1e9)
     edges = [0, *(np.flatnonzero(np.diff(block)) + 1).tolist(), len(block)]
-    for first, end in zip(edges, edges[1:], strict=False):
-        yield slice(first, end)
+    yield from (slice(first, end) for first, end in pairwise(edges))

@@ -151,7 +151,7 @@ def reading_moments(readings, L, columns, z_hat, S, Pxz):  # type: ignore[no-unt
 
 
 @_compiled
-def cross_covariance(L, E, columns, out):  # type: ignore[no-untyped-def]
+def cross_covariance(L, E, out):  # type: ignore[no-untyped-def]
     """Write the covariance [n, n] of the state before a step, with the root L, and after it, with deviations E."""
     n = L.shape[0]
     for a in range(n):

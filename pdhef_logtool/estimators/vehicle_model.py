@@ -20,7 +20,7 @@ in m/s². Without axle forces it is the nominal model (:mod:`~pdhef_logtool.car.
 - **Bank**: −g · bank in v̇_y only, an Ornstein-Uhlenbeck process.
 - **Force scale**: 1 + s on the tyres' forces, an Ornstein-Uhlenbeck process.
 
-States are the columns of a block: row i has entry i of all states. Each entry has a fixed row, with 0 for missing parts.
+States are the columns of a block: row i has entry i of all states. Each entry has a fixed row, 0 for missing parts.
 Inner loops process ``LANES`` columns without branches and calls, so that they become vector instructions. In a step of
 the model with axle forces the tyres are evaluated once, at the instant t* at which the exponential kernel of the
 lag has its centroid, with the initial state extrapolated by its derivative. Velocities use the mean of the forces at
@@ -346,7 +346,7 @@ def _nominal_accelerations(vx, vy, r, steer, c, p):  # type: ignore[no-untyped-d
 @_inline
 def _nominal_derivative(vx, vy, r, ax, steer, c, p):  # type: ignore[no-untyped-def]
     """Return d/dt [v_x, v_y, r] (Eq 1-4 with the blend to the kinematic model)."""
-    w = min(1.0, max(0.0, (vx - p.blend_low_m_s) / (p.blend_high_m_s - p.blend_low_m_s)))
+    w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * c.per_blend))
     ay, turn = _nominal_accelerations(vx, vy, r, steer, c, p)
     r_kin = vx * c.r_kin_per_vx
     follow = (1.0 - w) * (1.0 / KINEMATIC_TIME_CONSTANT_S)
@@ -365,6 +365,7 @@ class _Nominal(NamedTuple):
     peak_front: float
     peak_rear: float
     inertia: float
+    per_blend: float
 
 
 @njit(cache=True)
@@ -378,6 +379,7 @@ def _prepare_nominal(steer, friction, p):  # type: ignore[no-untyped-def]
         friction * p.front_D_n / p.mass_kg,
         friction * p.rear_D_n / p.mass_kg,
         p.mass_kg / p.yaw_inertia_kg_m2,
+        1.0 / (p.blend_high_m_s - p.blend_low_m_s),
     )
 
 
@@ -429,7 +431,7 @@ def read(points, columns, steer, friction, rate_vy, layout, p, f, readings):  # 
     c, inertia = math.cos(steer), p.mass_kg / p.yaw_inertia_kg_m2
     for j in range(columns):
         vx, vy, r = points[VX * WIDTH + j], points[VY * WIDTH + j], points[YAW_RATE * WIDTH + j]
-        w = min(1.0, max(0.0, (vx - p.blend_low_m_s) / (p.blend_high_m_s - p.blend_low_m_s)))
+        w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * nominal.per_blend))
         if forces:
             front, rear = points[FRONT * WIDTH + j] * c, points[REAR * WIDTH + j]
             ay, turn = front + rear, inertia * (p.front_m * front - p.rear_m * rear)

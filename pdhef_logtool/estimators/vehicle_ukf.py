@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -129,13 +129,12 @@ INPUTS = 6
 #: What a filter remembers of the steps before: whether it runs; last inputs and residual; ages, s; duration of the
 #: standstill, s; mean normalised square of the innovations; last speed sample; largest recent share of the grip that is
 #: used, decaying; time since the first sample of an unbroken rejection of a_y, yaw rate and speed, s.
-MEMORY = np.dtype(
-    [(name, np.float64) for name in (
-        "runs", "steer", "ax", "ax_known", "friction", "rate_vy", "rate_r", "steer_age", "speed_age", "still", "nis",
-        "speed", "grip",
-    )]
-    + [("rejected", np.float64, (READINGS,))]
-)  # fmt: skip
+MEMORY_FIELDS: list[tuple[Any, ...]] = [
+    *((name, np.float64) for name in ("runs", "steer", "ax", "ax_known", "friction", "rate_vy", "rate_r", "steer_age")),
+    *((name, np.float64) for name in ("speed_age", "still", "nis", "speed", "grip")),
+    ("rejected", np.float64, (READINGS,)),
+]
+MEMORY = np.dtype(MEMORY_FIELDS)
 
 _compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
 _inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
@@ -200,7 +199,7 @@ class Belief(NamedTuple):
 
     x: FloatArray
     P: FloatArray
-    memory: np.ndarray
+    memory: np.ndarray[Any, Any]
 
 
 class StepInputs(NamedTuple):
@@ -347,15 +346,17 @@ def predict(x, P, L, over, rate, dt, q, layout, places, p, f, points, E):  # typ
 
 
 @_compiled
-def expect(x, L, now, rate_vy, layout, places, p, f, points, readings, r_std, extra_ay, extra_rate, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
-    """Write the expected readings [3], their covariance with R [3, 3] and the cross covariance [3, n]."""
+def expect(x, L, now, rate_vy, r, layout, places, p, f, points, readings, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
+    """Write the expected readings [3], their covariance with R [3, 3] and the cross covariance [3, n].
+
+    L is the root of P, ``r`` [3] the variances of the sensors.
+    """
     columns = columns_of(x.shape[0])
     draw(x, L, places, columns, points)
     read(points, columns, now.steer, now.friction, rate_vy, layout, p, f, readings)
     reading_moments(readings, L, columns, z_hat, S, Pxz)
-    S[Z_AY, Z_AY] += r_std[Z_AY] * r_std[Z_AY] + extra_ay
-    S[Z_YAW_RATE, Z_YAW_RATE] += r_std[Z_YAW_RATE] * r_std[Z_YAW_RATE] + extra_rate
-    S[Z_SPEED, Z_SPEED] += r_std[Z_SPEED] * r_std[Z_SPEED]
+    for i in range(READINGS):
+        S[i, i] += r[i]
 
 
 @njit
@@ -473,8 +474,9 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
     out_linked, out_predicted_P, out_cross = links
     linked, n, bias = out_linked.shape[0] > 0, x.shape[0], layout.steer_bias
     points, readings, E = np.zeros(PLACES * WIDTH), np.zeros(READINGS * WIDTH), np.zeros(n * WIDTH)
-    L, before, q = np.zeros((n, n)), np.zeros((n, n)), np.zeros(n)
-    z_hat, S, Pxz, nu, at_gate = np.zeros(READINGS), np.zeros((READINGS, READINGS)), np.zeros((READINGS, n)), np.zeros(READINGS), np.zeros(READINGS)  # fmt: skip
+    L, before, q, r = np.zeros((n, n)), np.zeros((n, n)), np.zeros(n), np.zeros(READINGS)
+    S, Pxz = np.zeros((READINGS, READINGS)), np.zeros((READINGS, n))
+    z_hat, nu, at_gate = np.zeros(READINGS), np.zeros(READINGS), np.zeros(READINGS)
     given, use = np.zeros(READINGS, np.bool_), np.zeros(READINGS, np.bool_)
     q_std = q_std.copy()
     force_std, steer_std = q_std[FRONT] if layout.forces >= 0 else 0.0, q_std[bias]
@@ -507,14 +509,15 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
                 before[:, :] = L
             predict(x, P, L, over, rate, now.dt, q, layout, places, p, f, points, E)
             if linked:
-                cross_covariance(before, E, columns_of(n), out_cross[k])
+                cross_covariance(before, E, out_cross[k])
                 out_predicted_P[k] = P
             out_prior[k] = x
             alive, stands = is_finite(x, P), False
             if alive:
-                extra_ay, extra_rate = window.extra_r[k, 0], window.extra_r[k, 1]
+                for i in range(READINGS):
+                    r[i] = r_std[i] * r_std[i] + (window.extra_r[k, i] if i < Z_SPEED else 0.0)
                 cholesky(P, L)
-                expect(x, L, now, rate[0], layout, places, p, f, points, readings, r_std, extra_ay, extra_rate, z_hat, S, Pxz)  # fmt: skip
+                expect(x, L, now, rate[0], r, layout, places, p, f, points, readings, z_hat, S, Pxz)
                 innovate(now, z_hat, nu)
                 gated = gate(now, m, nu, S, at_gate, given, use)
                 for i in range(READINGS):
@@ -527,7 +530,7 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
                     if linked:  # to a smoother the inflation is process noise of the step that led here
                         out_predicted_P[k] = P
                     cholesky(P, L)
-                    expect(x, L, now, rate[0], layout, places, p, f, points, readings, r_std, extra_ay, extra_rate, z_hat, S, Pxz)  # fmt: skip
+                    expect(x, L, now, rate[0], r, layout, places, p, f, points, readings, z_hat, S, Pxz)
                     innovate(now, z_hat, nu)
                     for i in range(READINGS):
                         if use[i]:
@@ -897,7 +900,7 @@ class VehicleUkf:
         return predicted_track(self.name, stamps_ns, steps, ahead, predicted, self.layout)
 
     def expected_ay(self, x: FloatArray, inputs: FloatArray) -> FloatArray:
-        """Return the accelerometer's reading [K] in states [K, n] with inputs [K, 6], without residual; NaN for none."""
+        """Return the accelerometer's reading [K] in states [K, n] with inputs [K, 6], without residual."""
         out = np.full(len(x), np.nan)
         _expected_ay(x, inputs, self.parameters, out)
         return out
