@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
 
 #: A drive is smoothed in spans of this length, which overlap by twice the margin: memory does not grow with the drive.
-SPAN_S, MARGIN_S = 1200.0, 30.0
+SPAN_S, MARGIN_S = 600.0, 30.0
 #: A fitted position of the accelerometer replaces the file's if it differs by this number of 1-sigmas.
 SIGNIFICANT = 2.0
 _FILE_STD_M, _FITTED_STD_M, _LEAST_GAIN_STD = 0.05, 0.1, 0.02

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.estimators.reference import inputs, smoother
+from pdhef_logtool.estimators import kinematic_filter as kinematics
+from pdhef_logtool.estimators.reference import inputs
 from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference, refer, sideslip_std
 from pdhef_logtool.estimators.reference.estimator import steps_at
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -223,101 +224,74 @@ def test_spans_cover_a_drive_once():
     np.testing.assert_array_equal(whole.values, joined.values)
 
 
-@settings(max_examples=25, deadline=None)
-@given(
-    seed=st.integers(0, 10_000),
-    size=st.sampled_from([smoother.WITHOUT_GNSS, smoother.WITH_GNSS, smoother.WITH_POSITION]),
-)
-def test_sparse_products_equal_dense_ones(seed, size):
-    rng = np.random.default_rng(seed)
-    root = rng.standard_normal((size, size))
-    p = root @ root.T
-    point = 0.1 * rng.standard_normal(size)
-    point[smoother.VX] = 20.0
-    row = rng.standard_normal(smoother.INPUTS)
-    dense, x = np.zeros((len(smoother.DENSE), size)), point.copy()
-    smoother._transition(x, point, 0.05, row, dense)
-    rows, decay = smoother.structure(size, 0.05)
-    f = np.diag(decay)
-    for i in np.flatnonzero(rows >= 0):
-        f[i] = dense[rows[i]]
-    forward, backward = np.empty_like(p), np.empty_like(p)
-    smoother._propagate(forward, x, p, dense, rows, decay)
-    smoother._pull_back(backward, p, dense, rows, decay)
-    vector = point.copy()
-    smoother._pull_vector(vector, dense, rows, decay)
-    np.testing.assert_allclose(forward, f @ p @ f.T, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(backward, f.T @ p @ f, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(vector, f.T @ point, rtol=1e-9, atol=1e-9)
-
-
 @settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 10_000), east=st.booleans())
-def test_jacobians_equal_differences(seed, east):
-    rng = np.random.default_rng(seed)
-    point, row = _drawn(rng)
-    for function, left_out in (
-        (lambda q, h: smoother._axle_law(q, row, 1.5, h), {smoother.VX, smoother.VY}),
-        (lambda q, h: smoother._gnss(q, row, east, h), _OVER_THE_OFFSET),
-        (lambda q, h: smoother._position(q, row, east, h), set()),
+@given(seed=st.integers(0, 10_000), east=st.booleans(), length=st.booleans())
+def test_jacobians_of_the_measurements_equal_differences(seed, east, length):
+    point, row = _drawn(np.random.default_rng(seed))
+    row[kinematics.LENGTH] = float(length)
+    for measurement, neglected in (
+        (lambda q, h: kinematics.rear_axle(q, row, 1.5, h)[0], {kinematics.VX, kinematics.VY}),
+        (lambda q, h: kinematics.speed(q, row, h)[0], set()),
+        (lambda q, h: kinematics.gnss_velocity(q, row, east, h)[0], _OVER_THE_OFFSET),
+        (lambda q, h: kinematics.no_yaw_rate(q, row, h)[0], set()),
     ):
-        jacobian, scratch = np.zeros(smoother.WITH_POSITION), np.zeros(smoother.WITH_POSITION)
-        function(point, jacobian)
-        for i in set(range(smoother.WITH_POSITION)) - left_out:
-            up, down = point.copy(), point.copy()
-            up[i] += 1e-5
-            down[i] -= 1e-5
-            slope = (function(up, scratch) - function(down, scratch)) / 2e-5
+        jacobian, scratch = np.zeros(kinematics.WITH_GNSS), np.zeros(kinematics.WITH_GNSS)
+        measurement(point, jacobian)
+        for i in set(range(kinematics.WITH_GNSS)) - neglected:
+            up, down = _moved(point, i)
+            slope = (measurement(down, scratch) - measurement(up, scratch)) / 2e-5
             assert jacobian[i] == pytest.approx(slope, abs=2e-5, rel=1e-5), i
 
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10_000), tilts=st.booleans())
-def test_the_jacobian_of_the_transition_equals_differences(seed, tilts):
-    rng = np.random.default_rng(seed)
-    point, row = _drawn(rng)
-    row[smoother.TILT] = float(tilts)
-    dense = np.zeros((len(smoother.DENSE), smoother.WITH_POSITION))
+def test_the_cross_covariance_of_a_step_is_that_of_its_differences(seed, tilts):
+    point, row = _drawn(np.random.default_rng(seed))
+    row[kinematics.TILT] = float(tilts)
+    n = kinematics.WITH_GNSS
 
-    def moved(state: FloatArray) -> FloatArray:
-        out = state.copy()
-        smoother._transition(out, state, 0.05, row, np.zeros_like(dense))
-        return out
+    def step(state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        new, predicted, cross = kinematics.predict(state, np.eye(n), state, 0.05, row, row, np.zeros(3))
+        return new, predicted, cross
 
-    smoother._transition(point.copy(), point, 0.05, row, dense)
-    for i in set(range(smoother.WITH_POSITION)) - _SECOND_ORDER:
-        up, down = point.copy(), point.copy()
-        up[i] += 1e-5
-        down[i] -= 1e-5
-        slope = (moved(up) - moved(down))[list(smoother.DENSE)] / 2e-5
-        np.testing.assert_allclose(dense[:, i], slope, atol=1e-2 if i == smoother.HEADING else 1e-3, err_msg=str(i))
+    _, predicted, cross = step(point)
+    np.testing.assert_allclose(predicted, predicted.T, atol=1e-12)
+    assert (np.linalg.eigvalsh(predicted - cross.T @ cross) > -1e-12).all()
+    for i in set(range(n)) - _SECOND_ORDER:
+        up, down = _moved(point, i)
+        slope = (step(up)[0] - step(down)[0]) / 2e-5
+        np.testing.assert_allclose(cross[i], slope, atol=1e-3, err_msg=str(i))
+
+
+def _moved(point: FloatArray, i: int) -> tuple[FloatArray, FloatArray]:
+    change = 1e-5 * (np.arange(len(point)) == i)
+    return point + change, point - change
 
 
 def _drawn(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Return a state and a row of inputs."""
-    point = 0.05 * rng.standard_normal(smoother.WITH_POSITION)
-    point[smoother.VX] = 15.0
-    point[smoother.HEADING] = rng.uniform(-3.0, 3.0)
-    row = rng.standard_normal(smoother.INPUTS)
-    row[smoother.LAW_STD] = 0.01
+    point = 0.05 * rng.standard_normal(kinematics.WITH_GNSS)
+    point[kinematics.VX] = 15.0
+    point[kinematics.HEADING] = rng.uniform(-3.0, 3.0)
+    row = rng.standard_normal(kinematics.INPUTS)
+    row[kinematics.LAW_STD] = 0.01
     return point, row
 
 
 #: Errors of the IMU over the hundredths of a second between a knot and a GNSS sample, and on the yaw rate.
 _OVER_THE_OFFSET = {
-    smoother.AX_BIAS,
-    smoother.AY_BIAS,
-    smoother.ROLL_GAIN,
-    smoother.AX_GAIN,
-    smoother.IMU_X,
-    smoother.IMU_Y,
-    smoother.IMU_YAW,
-    smoother.YAW_RATE_BIAS,
-    smoother.YAW_RATE_GAIN,
+    kinematics.AX_BIAS,
+    kinematics.AY_BIAS,
+    kinematics.ROLL_GAIN,
+    kinematics.AX_GAIN,
+    kinematics.IMU_X,
+    kinematics.IMU_Y,
+    kinematics.IMU_YAW,
+    kinematics.YAW_RATE_BIAS,
+    kinematics.YAW_RATE_GAIN,
 }
-#: Error terms that the transition neglects: gyro errors in the centripetal term and in the tilt, and acceleration
-#: errors in the position.
-_SECOND_ORDER = {smoother.YAW_RATE_BIAS, smoother.YAW_RATE_GAIN} | (_OVER_THE_OFFSET - {smoother.HEADING})
+#: The transition neglects errors of the gyro in the centripetal term and in the tilt.
+_SECOND_ORDER = {kinematics.YAW_RATE_BIAS, kinematics.YAW_RATE_GAIN}
 
 
 def test_the_noise_of_a_sensor_that_repeats_its_samples_is_that_of_the_new_ones():

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.estimators.reference import smoother as s
+from pdhef_logtool.estimators import kinematic_filter as s
+from pdhef_logtool.estimators import rts
 from pdhef_logtool.estimators.reference.gnss import (
     first_guess,
     gnss_follows_imu,
@@ -23,8 +24,8 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signa
 WHEELBASE_M = 2.7
 #: 1-sigma of the distance of the rear axle, and of the gain of the gyro.
 REAR_AXLE_STD_M, YAW_RATE_GAIN_STD = 0.1, 0.003
-#: 1-sigma of the gains of accelerometers with known tilt; of the IMU's mounting; of the first position.
-TILT_GAIN_STD, IMU_YAW_STD_RAD, FIRST_POSITION_M = 0.02, 0.015, 10.0
+#: 1-sigma of the gains of accelerometers with known tilt; of the IMU's mounting.
+TILT_GAIN_STD, IMU_YAW_STD_RAD = 0.02, 0.015
 MAX_ITERATIONS, TOLERANCE_M_S, UNSETTLED_M_S = 8, 2e-3, 0.05
 #: The drive is rejected if a parameter is further than this from its prior mean, in prior 1-sigmas. Lengths and the
 #: gain of the gyro have narrow priors (bank in bends has the same effect) and limits of 0.45 m, 0.3 m and 3 %.
@@ -132,7 +133,7 @@ def _priors(prior: ReferencePrior, n: int, *, tilts: bool) -> tuple[FloatArray, 
     ``tilts``: roll and pitch rate provide the tilt of the accelerometers, so that a_y and a_x have no gain.
     """
     small = min(1.0, prior.wheelbase_m / WHEELBASE_M)
-    mean, std = np.zeros(s.WITH_POSITION), np.zeros(s.WITH_POSITION)
+    mean, std = np.zeros(s.WITH_GNSS), np.zeros(s.WITH_GNSS)
     x, y = prior.antenna_m
     has_antenna = math.isfinite(x)
     for entry, value, sigma in (
@@ -193,12 +194,10 @@ def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> 
 
 def corrected_inputs(states: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return yaw rate and accelerations of the CG at the knots [K], without the estimated errors of the sensors."""
-    rate = rows[:, s.YAW_RATE] * (1.0 - states[:, s.YAW_RATE_GAIN]) - states[:, s.YAW_RATE_BIAS]
-    x, y, yaw, turning = states[:, s.IMU_X], states[:, s.IMU_Y], states[:, s.IMU_YAW], rows[:, s.YAW_ACCELERATION]
-    slow_ax, slow_ay = rows[:, s.SLOW_AX], rows[:, s.SLOW_AY]
-    ax = rows[:, s.AX] - states[:, s.AX_GAIN] * slow_ax - yaw * slow_ay - states[:, s.AX_BIAS]
-    ay = rows[:, s.AY] - states[:, s.ROLL_GAIN] * slow_ay + yaw * slow_ax - states[:, s.AY_BIAS]
-    return rate, ax + x * rate**2 + y * turning, ay - x * turning + y * rate**2
+    columns = (s.AX, s.AY, s.SLOW_AX, s.SLOW_AY, s.YAW_ACCELERATION)
+    ax, ay, slow_ax, slow_ay, turning = rows.T[list(columns)]
+    rate = s.yaw_rate.py_func(states.T, rows[:, s.YAW_RATE])
+    return rate, *s.accelerations.py_func(states.T, ax, ay, slow_ax, slow_ay, rate, turning)
 
 
 def sideslip_std(vx: FloatArray, vy: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -220,8 +219,7 @@ def _solve(rows: FloatArray, prior: ReferencePrior, noise: FloatArray, *, gnss: 
     alone = _smooth(rows, prior, noise, s.WITHOUT_GNSS)
     if not gnss:
         return alone, alone
-    n = s.WITH_POSITION if np.isfinite(rows[:, s.POSITION_EAST]).any() else s.WITH_GNSS
-    return alone, _smooth(with_gnss_speed(rows), prior, noise, n, first_guess(rows, alone.states))
+    return alone, _smooth(with_gnss_speed(rows), prior, noise, s.WITH_GNSS, first_guess(rows, alone.states))
 
 
 def _smooth(
@@ -233,20 +231,23 @@ def _smooth(
     first = np.flatnonzero(np.isfinite(speed))
     mean[s.VX] = speed[first[0]] if first.size else 0.0
     mean[s.VY] = prior.rear_m * rows[0, s.YAW_RATE]
-    if n >= s.WITH_GNSS:
+    points = np.empty((0, n))
+    if n == s.WITH_GNSS:
         mean[s.HEADING], std[s.HEADING] = (0.0, math.pi) if velocity is None else (velocity[0, 2], 0.3)
-    if n == s.WITH_POSITION:
-        k = int(np.flatnonzero(np.isfinite(rows[:, s.POSITION_EAST]))[0])
-        std[s.EAST_OFFSET] = std[s.NORTH_OFFSET] = rows[k, s.POSITION_OFFSET_STD]
-        std[s.EAST] = std[s.NORTH] = FIRST_POSITION_M + 60.0 * k / RATE_HZ
-    guess = np.empty((0, n))
     if velocity is not None:
-        guess = np.tile(mean, (len(rows), 1))
-        guess[:, [s.VX, s.VY, s.HEADING]] = velocity
-    states, covariance, last, moved = s.smooth(
-        1.0 / RATE_HZ, rows, prior.rear_m, mean, std**2, noise, guess, MAX_ITERATIONS, TOLERANCE_M_S
-    )
-    return _Smoothed(states, covariance, last, moved)
+        points = np.tile(mean, (len(rows), 1))
+        points[:, [s.VX, s.VY, s.HEADING]] = velocity
+    for iteration in range(MAX_ITERATIONS):
+        x, p, predicted_x, predicted_p, cross = s.forward_pass(
+            1.0 / RATE_HZ, rows, prior.rear_m, mean, std**2, noise, points, iteration > 1 or velocity is not None
+        )
+        smoothed = rts.smooth_states(x, predicted_x, predicted_p, cross)
+        before, points = points if len(points) else x, smoothed
+        moved = float(np.sqrt(np.mean((smoothed[:, s.VY] - before[:, s.VY]) ** 2)))
+        if iteration > 2 and moved < TOLERANCE_M_S:
+            break
+    last, p = np.diag(p[-1]), rts.smooth_covariances(p, predicted_p, cross)
+    return _Smoothed(smoothed, p[:, [s.VX, s.VX, s.VY], [s.VX, s.VY, s.VY]], last, moved)
 
 
 def _parameters(smoothed: _Smoothed, prior: ReferencePrior, *, tilts: bool) -> tuple[ReferenceParameter, ...]:

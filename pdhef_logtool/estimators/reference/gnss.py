@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.estimators.reference import smoother as s
+from pdhef_logtool.estimators import kinematic_filter as s
 from pdhef_logtool.estimators.reference.inputs import RATE_HZ
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 

@@ -7,8 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pdhef_logtool.estimators.reference import smoother as s
-from pdhef_logtool.records.geometry import WGS84_A_M
+from pdhef_logtool.estimators import kinematic_filter as s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 
 #: Knots per second.
@@ -34,8 +33,6 @@ ROLL_PER_AY_RAD_S2_M, PITCH_PER_AX_RAD_S2_M = 0.0075, 0.004
 LEAST_SIGN_CORRELATION = 0.3
 #: 1-sigma of the lateral position of an antenna, and its factor in a speed over ground: the error is persistent.
 ANTENNA_Y_STD_M, LENGTH_FACTOR = 0.5, 4.0
-#: White and correlated 1-sigma of a position: with carrier phase, and of a single receiver.
-RTK_M, SINGLE_M, RTK_ACCURACY_M = (0.01, 0.01), (0.3, 2.0), 0.1
 #: Half of the averaging window of accelerations that are multiplied by gains, s.
 SLOW_S = 0.25
 
@@ -78,7 +75,7 @@ def white_noise(stamps_ns: IntArray, values: FloatArray, least: float) -> float:
 def knots(
     signals: Signals, friction: float, ay_bias_m_s2: float, *, speed_over_ground: bool = False
 ) -> tuple[IntArray, FloatArray]:
-    """Return the stamps of the knots [K] and the smoother's inputs [K, INPUTS] there; a_y without its known bias.
+    """Return the stamps of the knots [K] and the filter's inputs [K, INPUTS] there; a_y without its known bias.
 
     ``speed_over_ground``: the speed is the length of a velocity; this is assumed if it equals the GNSS speed.
     """
@@ -240,25 +237,3 @@ def _add_gnss(rows: FloatArray, signals: Signals, knot_s: FloatArray) -> None:
     stated = np.nan_to_num(signals.gnss_velocity_std_m_s[good])
     white = np.hypot(np.maximum(stated, GNSS_STD_M_S), GNSS_LAG_S * acceleration)
     rows[k, s.GNSS_STD] = np.hypot(white, ROLL_ARM_M * rows[k, s.ROLL_RATE])
-    _add_position(rows, signals, knot_s)
-
-
-def _add_position(rows: FloatArray, signals: Signals, knot_s: FloatArray) -> None:
-    """Assign positions, in m from the first, to their nearest knots; they have the delay of the velocity."""
-    good = np.flatnonzero(np.isfinite(signals.gnss_position_deg).all(axis=1))
-    if not good.size:
-        return
-    latitude, longitude = np.radians(signals.gnss_position_deg[good]).T
-    t = (signals.stamps_ns[good] - signals.stamps_ns[0]) * 1e-9
-    k = np.minimum(np.rint(t * RATE_HZ).astype(np.int64), len(knot_s) - 1)
-    north, east = latitude - latitude[0], np.cos(latitude[0]) * (longitude - longitude[0])
-    used = np.isfinite(rows[k, s.GNSS_EAST])
-    stated = np.nan_to_num(signals.gnss_position_std_m[good], nan=SINGLE_M[1])
-    for column, values in (
-        (s.POSITION_EAST, WGS84_A_M * east),
-        (s.POSITION_NORTH, WGS84_A_M * north),
-        (s.POSITION_STD, np.where(stated < RTK_ACCURACY_M, np.maximum(stated, RTK_M[0]), SINGLE_M[0])),
-    ):
-        rows[k[used], column] = values[used]
-    typical = float(np.median(stated))
-    rows[:, s.POSITION_OFFSET_STD] = max(typical, RTK_M[1]) if typical < RTK_ACCURACY_M else max(typical, SINGLE_M[1])
