@@ -96,12 +96,13 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
     columns: dict[str, Any] = {}
     state = None
     for first in range(0, max(len(signals), 1), PIECE_STEPS):
-        piece = signals.rows(first, first + PIECE_STEPS)
+        # Numba compiles a kernel again for read-only arrays: the estimator gets a copy.
+        piece = signals.rows(first, first + PIECE_STEPS).copy()
         ahead_ns = round(look_ahead_of(estimator) * 1e9)
         ahead = None
         if ahead_ns and first + PIECE_STEPS < len(signals):
             until = int(np.searchsorted(signals.stamps_ns, piece.stamps_ns[-1] + ahead_ns, side="right"))
-            ahead = signals.rows(first + PIECE_STEPS, until)
+            ahead = signals.rows(first + PIECE_STEPS, until).copy()
         track, state = run_window(estimator, piece, state, ahead, causality)
         if len(piece) == len(signals):
             return track

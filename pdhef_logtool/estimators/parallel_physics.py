@@ -98,7 +98,6 @@ def run_features(
     friction, predicted = steps.inputs[:, U_FRICTION], np.empty(len(signals))
     body = np.zeros((len(signals), _BODY))
     if isinstance(physics, PhysicsFilter):
-        seen = physics.corrected(seen)
         layout, p, f = physics.parameters
         _physics_ay(steps.x, steps.inputs, layout, p, f, predicted)
         if layout.roll >= 0:

@@ -24,7 +24,7 @@ import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, dynamic_share, model_parameters
 from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators import filter_base as base
 from pdhef_logtool.estimators.filter_base import LINK_WHOLE
@@ -58,7 +58,6 @@ from pdhef_logtool.estimators.physics_model import (
     step_count,
 )
 from pdhef_logtool.estimators.unscented import partial_root, whiten
-from pdhef_logtool.records.signals import Signals
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -543,7 +542,6 @@ class PhysicsFilter(base.LinkedFilter):
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
     slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
     standstill : contain the motion at zero while the car is.
-    read_with : the vehicle with which its signals were read and corrected, where that is another; None: its own.
     """
 
     algorithm = "physics-filter"
@@ -558,7 +556,6 @@ class PhysicsFilter(base.LinkedFilter):
     use_speed: bool = True
     slip_gate: bool = True
     standstill: bool = True
-    read_with: VehicleParameters | None = None
     name: str = PHYSICS
     causal: bool = True
 
@@ -602,10 +599,6 @@ class PhysicsFilter(base.LinkedFilter):
             standstill=self.standstill,
             needs_steer=False,
         )
-
-    def corrected(self, signals: Signals) -> Signals:
-        """Return signals as this filter's vehicle corrects them, where they were read with another one."""
-        return signals if self.read_with is None else corrected_anew(signals, self.read_with, self.vehicle)
 
     def _run_kernel(
         self,
@@ -658,4 +651,4 @@ def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
         parts = vehicle.physics.model_copy(update={"lag": True, "roll": True})
         vehicle = vehicle.model_copy(update={"physics": parts})
         physics = replace(physics, vehicle=vehicle, limit_gain=LIMIT_GAIN, limit_lag_m=FILE_LAG * vehicle.wheelbase_m)
-    return physics if vehicle == car.vehicle else replace(physics, read_with=car.vehicle)
+    return physics
