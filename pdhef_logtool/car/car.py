@@ -13,6 +13,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, AssumedValue
 from pdhef_logtool.car.names import NO_INTERVALS as NO_INTERVALS
 from pdhef_logtool.car.names import SHIPPED_CARS as SHIPPED_CARS
@@ -34,6 +36,7 @@ from pdhef_logtool.car.taught import GROUND_TRUTH, Taught, TaughtParameter
 from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file, with_sensors
 from pdhef_logtool.car.vehicle import DEFAULT_VEHICLE_NAME, Record, VehicleParameters, default_vehicle
 from pdhef_logtool.records.errors import UsageError, VehicleError
+from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
     NO_MODEL,
@@ -94,6 +97,10 @@ class WithoutTruth:
     causal: bool = False
     cg_std_m: float = 0.0
     error_scale: float = 1.0
+
+    def without_estimated_friction(self, signals: Signals) -> Signals:
+        """Return signals [N] without a friction that was estimated with the vehicle file."""
+        return signals if self.told_friction else replace(signals, friction=np.full(len(signals), np.nan))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -81,6 +81,10 @@ class FrictionSource:
             self._filled = signals, replace(signals, friction=self.estimate.friction)
         return self._filled[1]
 
+    def known(self, signals: Signals) -> Signals:
+        """Return the signals of a drive [N] with their friction, which is unknown where it would be estimated."""
+        return self.fill(signals) if self.bank is None else replace(signals, friction=np.full(len(signals), np.nan))
+
     @property
     def from_log(self) -> bool:
         """Whether the log's own friction is used."""

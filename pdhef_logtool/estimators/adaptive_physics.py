@@ -242,7 +242,7 @@ class AdaptivePhysics:
             return (self.physics,)
         parts = [vehicle.physics.model_copy(update={c: c == cure for c in CURES}) for cure in ("", *cures)]
         vehicles = [vehicle.model_copy(update={"physics": p}) for p in parts]
-        return tuple(replace(self.physics, vehicle=v, read_with=self.physics.read_with or vehicle) for v in vehicles)
+        return tuple(replace(self.physics, vehicle=v) for v in vehicles)
 
     def inputs(self, signals: Signals, state: InputState | None) -> tuple[CheckedInputs, InputState]:
         """Return the inputs of the filters, checked signals with the residual at gain 1, and the state."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.base import Estimator, StepEstimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.steps import StepColumns
 
@@ -47,7 +47,7 @@ class CausalityCheck:
             return None
         return (deepcopy(state),)
 
-    def check(self, estimator: Estimator, signals: Signals, before: Any, steps: Any) -> None:
+    def check(self, estimator: StepEstimator, signals: Signals, before: Any, steps: Any) -> None:
         """Compare the ``steps`` of a window with the steps of its first part; ``before`` as returned above."""
         if before is None or len(signals) < 2:
             return

@@ -58,8 +58,7 @@ def check_inputs(
 
     Joined windows give the same bits as one call over the whole log.
     """
-    read_with = physics.read_with or physics.vehicle
-    faults, fault_carry = find_faults(signals, read_with, state.faults if state else None)
+    faults, fault_carry = find_faults(signals, physics.vehicle, state.faults if state else None)
     rate, carried = residual_rate(physics, network, faults.filtered, state, faults)
     return CheckedInputs(faults, rate), InputState(fault_carry, carried.physics, carried.network)
 

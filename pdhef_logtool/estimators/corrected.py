@@ -46,7 +46,7 @@ class CorrectedState:
 
 
 def features_of(
-    physics: AdaptivePhysics, steps: MixtureSteps, signals: Signals, memory: FloatArray | None, before_ns: int | None
+    steps: MixtureSteps, signals: Signals, memory: FloatArray | None, before_ns: int | None
 ) -> tuple[SlowFeatures, FloatArray]:
     """Return the features of a window's steps [K] and the memory for the next window.
 
@@ -55,7 +55,7 @@ def features_of(
     weights = np.where(np.stack([s.valid for s in steps.filters], axis=1), steps.weights, 0.0)
     filters = [np.where(w[:, None] > 0.0, w[:, None] * s.x[:, : REAR + 1], 0.0) for w, s in _pairs(weights, steps)]
     x = np.sum(filters, axis=0)
-    measured = without_impossible(physics.physics.corrected(signals))
+    measured = without_impossible(signals)
     good = np.isfinite(measured.ay_m_s2) & (np.bitwise_and(steps.reason, _BAD_AY) == 0)
     sideslip = x[:, VY] / np.maximum(x[:, VX], 1.0)  # m/s
     columns = [
@@ -99,7 +99,7 @@ class CorrectedPhysics:
         """Process one window (see :class:`~.base.Estimator`)."""
         before_ns = None if state is None else state.last_stamp_ns
         steps, after = self.physics.run(signals, None if state is None else state.physics)
-        features, memory = features_of(self.physics, steps, signals, None if state is None else state.memory, before_ns)
+        features, memory = features_of(steps, signals, None if state is None else state.memory, before_ns)
         residual, std, gain = self.model.evaluate(features)
         corrected = CorrectedSteps(steps, gain * residual, gain * std, gain)
         return corrected, CorrectedState(after, memory, last_stamp_ns(signals.stamps_ns, before_ns))

@@ -28,9 +28,9 @@ from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import notes_of, predict_track
 from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.intervals import scaled_covariance
+from pdhef_logtool.estimators.kinematic_filter import BIAS_M_S2, BIAS_S, LAW_S, LAW_WHITE, TILT_SHARE, correct
 from pdhef_logtool.estimators.reference.gnss import JUMP_M_S, LEAST_COURSE_SPEED_M_S
 from pdhef_logtool.estimators.reference.inputs import GNSS_LAG_S
-from pdhef_logtool.estimators.kinematic_filter import BIAS_M_S2, BIAS_S, LAW_S, LAW_WHITE, TILT_SHARE, correct
 from pdhef_logtool.estimators.vehicle_ukf import LIMIT_TIME_S, LINEAR_SHARE, VehicleUkf, sideslip_std
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, ExtendedSteps, Extrapolation, last_stamp_ns, step_durations_s

@@ -95,7 +95,8 @@ def run_estimator(estimator: Estimator, signals: Signals, causality: CausalityCh
     columns: dict[str, Any] = {}
     state = None
     for first in range(0, max(len(signals), 1), PIECE_STEPS):
-        piece = signals.rows(first, first + PIECE_STEPS)
+        # Numba compiles a kernel again for read-only arrays: the estimator gets a copy.
+        piece = signals.rows(first, first + PIECE_STEPS).copy()
         track, state = run_window(cast("StepEstimator", estimator), piece, state, causality)
         if len(piece) == len(signals):
             return track
@@ -111,7 +112,7 @@ def _smoothed(smoother: Smoother, signals: Signals) -> StateTrack:
     """Return the track of a smoother, which has one row per sample."""
     name, package = smoother.name, package_of(smoother)
     with contained(name, package):
-        track = smoother.smooth(read_only(signals) if package else signals)
+        track = smoother.smooth(read_only(signals) if package else signals.copy())
         if not isinstance(track, StateTrack) or len(track) != len(signals):
             got = f"{len(track)} rows" if isinstance(track, StateTrack) else type(track).__name__
             raise EstimatorError(expected=f"a StateTrack, one row per sample ({len(signals)})", got=got, where=name)

@@ -70,7 +70,7 @@ def run_features(
         body[:, :2] = steps.x[:, layout.roll : layout.roll + 2]
     if layout.forces >= 0:
         body[:, 2:] = steps.x[:, [FRONT, REAR]]
-    usable = without_impossible(physics.corrected(seen))
+    usable = without_impossible(seen)
     features = make_features(
         steps.inputs[:, U_STEER], usable.ay_m_s2, usable.yaw_rate_rad_s, steps.x, steps.prior,
         physics.expected_ay(steps.x, steps.inputs), steps.inputs[:, U_FRICTION], usable.ax_m_s2, body,

@@ -19,10 +19,9 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.adaptive_physics import CURES
+from pdhef_logtool.estimators.calibrated_band import lateral_velocities, widened
 from pdhef_logtool.estimators.calibration.joint import prior_variations
 from pdhef_logtool.estimators.error_features import TERMS, error_terms
-from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.self_calibrated import widened
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, of_car
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -38,16 +37,18 @@ class PosteriorBand:
     """The confidence interval of one car over one drive.
 
     ``filters`` : the physics filter on the car, then on its variations. All tracks share their runs.
+    ``vehicle_file`` : the vehicle that the signals were read with.
     """
 
     filters: tuple[VehicleUkf, ...]
+    vehicle_file: VehicleParameters
     _signals: Signals | None = None
     _vy: list[FloatArray] = field(default_factory=list)
 
     def widen(self, track: StateTrack, signals: Signals) -> StateTrack:
         """Return a track [N] with the 1-sigmas of this module's equation."""
         if signals is not self._signals:
-            self._signals, self._vy = signals, [run_estimator(f, signals).vy_m_s for f in self.filters]
+            self._signals, self._vy = signals, lateral_velocities(self.filters, signals, self.vehicle_file)
         vehicle = self.filters[0].vehicle
         terms = error_terms(track, signals, vehicle.roll_gradient_rad_per_m_s2)
         seen = terms[:, _KINEMATIC] * np.abs(track.vx_m_s)
@@ -60,10 +61,9 @@ def posterior_band(car: Car, *, use_speed: bool = True) -> PosteriorBand | None:
     if not varied:
         return None
     physics, none = of_car(car, use_speed=use_speed), dict.fromkeys(CURES, False)
-    read_with = physics.read_with or physics.vehicle
 
     def on(vehicle: VehicleParameters) -> VehicleUkf:
         bare = vehicle.model_copy(update={"physics": vehicle.physics.model_copy(update=none)})
-        return replace(physics, vehicle=bare, read_with=read_with)
+        return replace(physics, vehicle=bare)
 
-    return PosteriorBand(tuple(on(v) for v in (physics.vehicle, *varied)))
+    return PosteriorBand(tuple(on(v) for v in (physics.vehicle, *varied)), car.vehicle)

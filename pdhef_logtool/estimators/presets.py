@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.car.car import Car, WithoutTruth
     from pdhef_logtool.residual_model.service import NetworkService
 
 #: Options by preset: None for a switch, the allowed range for an option with a value.
@@ -23,6 +23,24 @@ OPTIONS: Mapping[str, Mapping[str, tuple[float, float] | None]] = {
 SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
 #: The open-loop model on the calibrated vehicle.
 OPEN_LOOP = "open-loop:calibrated"
+
+
+def uses_calibration(name: str) -> bool:
+    """Whether an estimator is on the calibrated or identified vehicle; all others are on the vehicle file."""
+    return name == OPEN_LOOP or preset_of(name) in SELF_CALIBRATED
+
+
+def calibration_of(name: str, car: Car) -> WithoutTruth | None:
+    """Return the calibration of the log that an estimator of a car uses; None without one."""
+    return car.self_calibrated if uses_calibration(name) else None
+
+
+def calibration_note(name: str, car: Car) -> str:
+    """Return the note on the calibration that an estimator of a car uses; empty without one."""
+    calibration = calibration_of(name, car)
+    return "" if calibration is None else calibration.note
+
+
 #: Presets that GNSS velocity corrects.
 AIDED = frozenset({"physics", "pd-hef"})
 

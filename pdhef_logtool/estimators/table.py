@@ -10,13 +10,14 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from pdhef_logtool.estimators.plug_ins import contained, package_of
 from pdhef_logtool.estimators.presets import (
     AIDED,
     OPEN_LOOP,
     SELF_CALIBRATED,
+    calibration_of,
     check_options,
     options_of,
     preset_of,
@@ -107,20 +108,17 @@ class Spec:
             build = getattr(import_module(f"{__package__}.{module}"), function)
         if options.gnss and self.name in AIDED:
             build = partial(_aided, build)
-        if car.self_calibrated is None or (self.name != OPEN_LOOP and preset_of(self.name) not in SELF_CALIBRATED):
+        calibration = calibration_of(self.name, car)
+        if calibration is None:
             estimator: Estimator = build(self.name, car, options)
             return estimator
+        if not (calibration.earlier and self.causal):
+            calibrated: Any = build(self.name, car.calibrated_car, options)
+            return cast("Estimator", replace(calibrated, causal=self.causal and calibration.causal))
         from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
-        from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
 
-        calibration = car.self_calibrated
-        online = bool(calibration.earlier) and self.causal
-        stages = []
-        for stage in (*calibration.earlier, calibration) if online else (calibration,):
-            calibrated = replace(car, self_calibrated=stage).calibrated_car
-            causal = self.causal and stage.causal
-            stages.append(SelfCalibrated(build(self.name, calibrated, options), stage, car.vehicle, causal))
-        return OnlineCalibrated(tuple(stages)) if online else stages[0]
+        cars = tuple(replace(car, self_calibrated=stage) for stage in (*calibration.earlier, calibration))
+        return OnlineCalibrated(tuple(build(self.name, c.calibrated_car, options) for c in cars), cars)
 
 
 def _aided(build: Callable[[str, Car, Options], Estimator], name: str, car: Car, options: Options) -> Estimator:

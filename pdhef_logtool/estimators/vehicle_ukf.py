@@ -27,7 +27,7 @@ import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters
 from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
-from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.speed_slip import SlipState, believable
 from pdhef_logtool.estimators.unscented import cholesky, cross_covariance, draw, moments, reading_moments, update
@@ -768,7 +768,6 @@ class VehicleUkf:
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
     slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
     standstill : contain the motion at zero while the car is.
-    read_with : the vehicle with which its signals were read and corrected, where that is another; None: its own.
     """
 
     algorithm = "vehicle-ukf"
@@ -785,7 +784,6 @@ class VehicleUkf:
     use_speed: bool = True
     slip_gate: bool = True
     standstill: bool = True
-    read_with: VehicleParameters | None = None
     name: str = PHYSICS
     causal: bool = True
 
@@ -842,10 +840,6 @@ class VehicleUkf:
             walk[layout.steer_bias : i + 2] = of_steer, of_ay, of_rate
         return Tuning(walk, self.measurement_std, initial, still, self._rules)
 
-    def corrected(self, signals: Signals) -> Signals:
-        """Return signals as this filter's vehicle corrects them, where they were read with another one."""
-        return signals if self.read_with is None else corrected_anew(signals, self.read_with, self.vehicle)
-
     def run(
         self,
         signals: Signals,
@@ -880,9 +874,8 @@ class VehicleUkf:
         *,
         linked: bool,
     ) -> tuple[PosteriorSteps, FilterState, StepLinks]:
-        signals, slip = believable(
-            self.corrected(signals), self.vehicle.sensors, state.slip if state else None, gate=self.slip_gate
-        )
+        slip = state.slip if state else None
+        signals, slip = believable(signals, self.vehicle.sensors, slip, gate=self.slip_gate)
         window, count, n = make_window(signals, state, residual_rate, extra_r), len(signals), self.layout.size
         rows, out = count if linked else 0, no_posterior(count, n)
         links = _Links(np.zeros(rows, dtype=np.bool_), np.zeros((rows, n, n)), np.zeros((rows, n, n)))
@@ -974,4 +967,4 @@ def of_car(car: Car, *, use_speed: bool = True) -> VehicleUkf:
         parts = vehicle.physics.model_copy(update={"lag": True, "roll": True})
         vehicle = vehicle.model_copy(update={"physics": parts})
         physics = replace(physics, vehicle=vehicle, limit_gain=LIMIT_GAIN, limit_lag_m=FILE_LAG * vehicle.wheelbase_m)
-    return physics if vehicle == car.vehicle else replace(physics, read_with=car.vehicle)
+    return physics

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -187,7 +187,7 @@ class Signals:
 
     def __post_init__(self) -> None:
         """Fill missing columns with NaN."""
-        for name in _COLUMNS:
+        for name in SIGNAL_COLUMNS:
             column = getattr(self, name)
             if len(column) != len(self):
                 object.__setattr__(self, name, np.full((len(self), *column.shape[1:]), np.nan))
@@ -198,15 +198,19 @@ class Signals:
 
     def rows(self, start: int, end: int) -> Signals:
         """Return the stamps [start, end)."""
-        return Signals(**{c: getattr(self, c)[start:end] for c in _COLUMNS}, available=self.available)
+        return Signals(**{c: getattr(self, c)[start:end] for c in SIGNAL_COLUMNS}, available=self.available)
+
+    def copy(self) -> Signals:
+        """Return the same signals in arrays that may be written."""
+        return replace(self, **{c: getattr(self, c).copy() for c in SIGNAL_COLUMNS})
 
 
-_COLUMNS = tuple(f.name for f in fields(Signals) if f.name != "available")
+SIGNAL_COLUMNS = tuple(f.name for f in fields(Signals) if f.name != "available")
 
 
 def join_signals(windows: Sequence[Signals]) -> Signals:
     """Join consecutive windows of one drive in time order."""
-    columns = {c: np.concatenate([getattr(w, c) for w in windows]) for c in _COLUMNS}
+    columns = {c: np.concatenate([getattr(w, c) for w in windows]) for c in SIGNAL_COLUMNS}
     return Signals(**columns, available=windows[0].available)
 
 

@@ -12,17 +12,18 @@ from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.drive.truth import valid_as_a_whole
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.calibrated_band import CalibratedBand
 from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.online_calibrated import OnlineBand, OnlineCalibrated
-from pdhef_logtool.estimators.presets import SELF_CALIBRATED, preset_of
-from pdhef_logtool.estimators.self_calibrated import CalibratedBand
+from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
+from pdhef_logtool.estimators.presets import SELF_CALIBRATED, calibration_of, preset_of
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import dead_reckon
 from pdhef_logtool.records.readings import without_impossible_states
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.records.tracks import REFERENCE, StateTrack
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 from pdhef_logtool.results.sink import TRUTH
 
@@ -47,6 +48,7 @@ class Estimated:
 
 def estimate_drive(
     drive: WholeDrive,
+    car: Car,
     estimators: Sequence[Estimator],
     *,
     watched: bool = True,
@@ -59,6 +61,7 @@ def estimate_drive(
 
     Parameters
     ----------
+    car : its estimators; the signals of the drive were read with its vehicle file.
     watched : complete ``diverged`` by the monitor of wrong branches. drawn : dead-reckon poses.
     intervals : calibrates them; None leaves them as the estimators give them.
     causality : collects the estimators that fail, or declare themselves causal and look ahead: they have no track.
@@ -74,11 +77,14 @@ def estimate_drive(
         if not drive.plan.has_truth_pose:
             drawn_truth = dead_reckoned(drawn_truth, start)
         drawn_truth = valid_as_a_whole(drawn_truth, drive.plan.derivation, vehicle.standstill_m_s)
-    tracks = {}
+    corrected, tracks = DriveSignals.of(signals, car), {}
     for number, estimator in enumerate(estimators):
         progress(number / len(estimators))
         try:
-            track = run_estimator(estimator, signals, causality)
+            given = (
+                corrected.file if isinstance(estimator, OnlineCalibrated) else corrected.of_estimator(estimator.name)
+            )
+            track = run_estimator(estimator, given, causality)
         except EstimatorError as error:
             if causality is None:
                 raise
@@ -104,16 +110,15 @@ def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
     algorithms, fixed_notes, posterior = {}, {}, {}
     band = posterior_band(car, use_speed=all(resolve(e).use_speed for e in estimators))
     of_log, banded = car.self_calibrated, SELF_CALIBRATED | (set() if car.fitted_physics else {NOMINAL_MODEL})
-    calibrated = None if of_log is None else CalibratedBand(of_log, car.vehicle)
-    online = None if of_log is None else OnlineBand((*of_log.earlier, of_log), car.vehicle)
+    stages = () if of_log is None else (*of_log.earlier, of_log)
+    whole, online = CalibratedBand(stages[-1:], car.vehicle), CalibratedBand(stages, car.vehicle)
     for estimator in estimators:
         if note := getattr(estimator, "intervals_note", ""):
             fixed_notes[estimator.name] = note
-            if estimator.name == REFERENCE:
-                continue
-            applies = online if isinstance(estimator, OnlineCalibrated) else calibrated
-            if applies is not None:
-                posterior[estimator.name] = applies.widen
+            continue
+        if calibration_of(estimator.name, car) is not None:
+            of_drive = online if isinstance(estimator, OnlineCalibrated) else whole
+            fixed_notes[estimator.name], posterior[estimator.name] = of_drive.note, of_drive.widen
             continue
         other = getattr(estimator, "calibrated_as", None)
         algorithms[estimator.name] = [resolve(e) for e in (estimator, other) if e is not None]

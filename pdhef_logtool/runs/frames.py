@@ -77,7 +77,7 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     intervals = calibrator(drive.car, estimators)
     if intervals.warning and intervals.warning not in drive.notes:
         drive.tell(intervals.warning)
-    estimated = estimate_drive(drive.whole(), estimators, intervals=intervals)
+    estimated = estimate_drive(drive.whole(), drive.car, estimators, intervals=intervals)
     truth = {} if estimated.drawn_truth is None else {TRUTH: estimated.drawn_truth}
     algorithms = {e.name: resolve(e) for e in estimators}
     return Estimates(drive, truth | estimated.tracks, estimated.signals, algorithms, tuple(skipped))

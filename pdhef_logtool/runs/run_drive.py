@@ -107,6 +107,7 @@ def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter)
     causality.failed |= run.failed
     estimated = estimate_drive(
         drive.whole(),
+        run.car,
         run.estimators,
         intervals=run.intervals,
         causality=causality,

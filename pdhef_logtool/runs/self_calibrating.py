@@ -9,17 +9,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.drive.reading import Drive, read_drive
+from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
@@ -74,29 +72,20 @@ def read_driving(drive: Drive) -> Driving:
     """
     from pdhef_logtool.estimators.calibration.driving import driving_of
 
-    signals = drive.whole(fill_friction=_told(drive)).signals
-    return driving_of(_without_log_friction(drive, signals), drive.car.vehicle)
+    return driving_of(drive.friction.known(drive.whole(fill_friction=False).signals), drive.car.vehicle)
 
 
 def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibration | None:
     """Return a calibration with the part of ``d2`` of ``physics`` on it that correlates with the driving."""
     if calibration is None or calibration.refused or calibration.earlier:
         return calibration
-    alone = self_calibrated(drive, replace(calibration, varied=()))  # lateral kinematic consistency needs no interval
-    signals = _without_log_friction(drive, drive.whole(fill_friction=_told(drive)).signals)
-    return replace(calibration, driven_d2_m_s=driven_d2(signals, alone, calibration))
-
-
-def driven_d2(signals: Signals, car: Car, calibration: SelfCalibration) -> float:
-    """Return the part of ``d2`` of ``physics`` that correlates with the driving, in m/s; NaN if unknown.
-
-    ``signals`` : of a drive, read with the vehicle of the car, which has the calibration.
-    """
     from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency, driving_products
 
-    track = run_estimator(make_estimator("physics", car), signals)
+    signals, car = drive.whole().signals, self_calibrated(drive, calibration)
+    track = run_estimator(make_estimator("physics", car), calibrated_signals(signals, car))
     slow, sensors = car.vehicle.low_speed_blend_m_s, log_sensors(car.vehicle, calibration)
-    return driven_consistency(*driving_products(track, signals, low_speed_m_s=slow, sensors=sensors))
+    products = driving_products(track, signals, low_speed_m_s=slow, sensors=sensors)
+    return replace(calibration, driven_d2_m_s=driven_consistency(*products))
 
 
 def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
@@ -113,7 +102,7 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
         return WithoutTruth(
             stage.vehicle,
             stage.noise,
-            told_friction=_told(drive),
+            told_friction=drive.friction.bank is None,
             note=note,
             varied=stage.varied,
             driven_d2_m_s=stage.driven_d2_m_s,
@@ -156,13 +145,3 @@ def log_sensors(
 def _asked(config: RunConfig, car: Car) -> bool:
     """Whether the candidates of the selected estimate take a calibration; the paper's suite has no speed for it."""
     return not car.has_evidence and config.sensors != "esp"
-
-
-def _without_log_friction(drive: Drive, signals: Signals) -> Signals:
-    """Return signals [N] without the friction of the log where the run estimates it."""
-    return signals if _told(drive) else replace(signals, friction=np.full(len(signals), np.nan))
-
-
-def _told(drive: Drive) -> bool:
-    """Whether the friction of a drive is known, not estimated with the unchanged file."""
-    return drive.friction.bank is None

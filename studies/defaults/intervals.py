@@ -117,7 +117,7 @@ def _run_drive(log: LogInput, number: int, task: Task, spread: float) -> tuple[D
         presumed = car if assumed is vehicle else car.with_vehicle(assumed)
         available = drive.plan.alignment.available
         estimators, _ = runnable((ALL_ESTIMATORS,), presumed, available, Options(options.use_speed))
-        estimated = estimate_drive(replace(drive, signals=seen), estimators, watched=False, drawn=False)
+        estimated = estimate_drive(replace(drive, signals=seen), presumed, estimators, watched=False, drawn=False)
         for estimator in estimators:
             track = estimated.tracks[estimator.name]
             part = drive_samples(track, seen, signals, drive.truth, vehicle, number, wrong=wrong)

@@ -23,9 +23,10 @@ from pdhef_logtool.car.parts import FilterNoise, Noise
 from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.reading import Drive, WholeDrive
-from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.vehicle_ukf import PHY_UKF_Q_STD
+from pdhef_logtool.estimators.drive_signals import DriveSignals
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import FEATURES, Options, spec_of
+from pdhef_logtool.estimators.vehicle_ukf import PHY_UKF_Q_STD
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import DriveRecord, load_drive, no_drive, scorable_stamps
 from pdhef_logtool.learning.stages.task import Task
@@ -89,8 +90,9 @@ def tune(task: Task, trials: int) -> Change:
     def objective(name: str, values: Point) -> float:
         car = task.car.with_noise(name, filter_noise(values))
         estimator = spec_of(name).make(car, Options(options.use_speed))
+        given = ((DriveSignals.of(d.signals, car).of_estimator(name), d.truth) for d in drives)
         return objective_deg(
-            [error_rad(run_window(estimator, d.signals)[0], d.truth, slow) for d in drives if d.truth is not None]
+            [error_rad(run_estimator(estimator, s), truth, slow) for s, truth in given if truth is not None]
         )
 
     best = {}

@@ -164,9 +164,9 @@ def read_simulated(scenario: Scenario, noise_seed: int, car: Car) -> ReadDrive:
     return ReadDrive(scenario, noise_seed, whole, facts)
 
 
-def track_of(estimator: Estimator, drive: ReadDrive) -> StateTrack:
-    """Run an estimator over a drive."""
-    window = estimate_drive(drive.whole, [estimator], watched=False, drawn=False)
+def track_of(estimator: Estimator, car: Car, drive: ReadDrive) -> StateTrack:
+    """Run an estimator of a car over a drive."""
+    window = estimate_drive(drive.whole, car, [estimator], watched=False, drawn=False)
     return next(iter(window.tracks.values()))
 
 
@@ -227,7 +227,7 @@ def run_experiment(
                     by_network = bool(spec_of(scheme.name).network)
                     if seed != first and not by_network:
                         continue
-                    track, training_seed = track_of(scheme, drive), seed if by_network else None
+                    track, training_seed = track_of(scheme, on_road, drive), seed if by_network else None
                     runs.append(Run(scenario.name, noise_seed, scheme.name, training_seed, figures_of(track, drive)))
                     if first_drive and seed == first:
                         tracks[scenario.name, scheme.name] = track

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.evaluation.metrics.lag import lag_s
 from pdhef_logtool.learning.network.residuals import residual_rows
@@ -58,7 +59,8 @@ def residual_fit(drive: ReadDrive, car: Car) -> ResidualFit:
     whole = drive.whole
     assert car.network is not None
     parallel, period_s = filter_of(car, car.network.model), whole.plan.alignment.grid_period_s
-    rows = residual_rows(whole.signals, whole.truth, parallel, period_s=period_s)
+    signals = calibrated_signals(whole.signals, car) if car.residual_network is not None else whole.signals
+    rows = residual_rows(signals, whole.truth, parallel, period_s=period_s)
     starts = np.concatenate([[True], np.diff(rows.segment) != 0])
     output, _ = NetworkService(car.network).run(rows.features, starts, None)
     use = rows.weight > 0.0

@@ -32,7 +32,7 @@ def step_times(drive: ReadDrive, car: Car, names: Sequence[str], rounds: int = R
     for number in range(rounds + 1):
         for scheme in schemes:
             start = time.process_time()
-            track_of(scheme, drive)
+            track_of(scheme, car, drive)
             if number:
                 seconds[scheme.name].append(time.process_time() - start)
     return {

@@ -61,8 +61,8 @@ def test_the_monitor_and_poses_change_no_estimate(sample_logs_dir: Path, car: Ca
     estimators = [make_estimator(name, car) for name in ("zero", "kinematic", "phy-ukf")]
     shares: list[float] = []
     with read_drive(sample_logs_dir / "dlc.mcap", car) as drive:
-        full = estimate_drive(drive.whole(), estimators, progress=shares.append)
-        plain = estimate_drive(drive.whole(), estimators, watched=False, drawn=False)
+        full = estimate_drive(drive.whole(), car, estimators, progress=shares.append)
+        plain = estimate_drive(drive.whole(), car, estimators, watched=False, drawn=False)
     assert shares == [0.0, 1 / 3, 2 / 3]
     assert list(full.tracks) == ["zero", "kinematic", "phy-ukf"]
     for name, track in full.tracks.items():

@@ -34,7 +34,7 @@ pytestmark = pytest.mark.slow
 #: With the noise that ``phy-ukf:tuned`` and ``physics`` look for in the car.
 NOISE = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
 VEHICLE = default_vehicle()
-#: Without the self-calibrated estimator, which wraps another one (test_self_calibrated.py).
+#: Without the estimator on a self-calibrated car (test_calibrated_band.py).
 NAMES = tuple(s.name for s in all_specs() if not s.network and s.name != "open-loop:calibrated")
 #: Estimators that compute the lateral velocity from a model or by integration.
 FILTERS = ("phy-ukf", "physics", "phy-ukf:tuned")

@@ -39,7 +39,7 @@ SHIPPED = {
     "pd-hef-paper": ("paper-hybrid-ukf 1", "c13712e0df29"),
 }
 #: Fields that are no option: names, texts, noise, physics and network.
-ROLES = {"name", "causal", "notes", "vehicle", "read_with", "network", "model", "q_std", "r_std", "use_speed"}
+ROLES = {"name", "causal", "notes", "vehicle", "network", "model", "q_std", "r_std", "use_speed"}
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,6 @@ from pdhef_logtool.estimators.calibration.driving import driving_of
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
-from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.runs.estimating import calibrator
@@ -122,13 +121,13 @@ def test_each_stage_has_its_interval() -> None:
 def test_its_identity_names_what_runs_in_it() -> None:
     found = resolve(online())
     assert found.algorithm == "online-calibrated"
-    assert found.options["estimator"] == "self-calibrated"
+    assert found.options["estimator"] == "adaptive-physics"
 
 
 @pytest.mark.parametrize("name", ["physics", "pd-hef-smoothed"])
 def test_what_looks_ahead_takes_the_last_stage(name: str) -> None:
     estimator = make_estimator(name, car_of(calibrated(driven()[0])))
-    assert isinstance(estimator, SelfCalibrated if name == "pd-hef-smoothed" else OnlineCalibrated)
+    assert isinstance(estimator, OnlineCalibrated) is (name == "physics")
 
 
 def test_tracks_of_one_window_share_the_runs_of_the_interval() -> None:

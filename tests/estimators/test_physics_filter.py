@@ -30,6 +30,7 @@ from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, physics_sha256
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, correct_signals
 from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.filter_base import LINK_NONE, LINK_WHOLE, HeldInputs
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
@@ -654,10 +655,10 @@ def test_a_fitted_car_runs_on_its_values_and_on_signals_that_were_read_with_othe
     adaptive = make_estimator("physics", car)
     estimator = adaptive.physics
     fitted = values.applied_to(own)
-    assert (estimator.vehicle, estimator.read_with) == (fitted, own)
+    assert estimator.vehicle == fitted
     assert resolve(adaptive).physics_sha256 == physics_sha256(fitted) != physics_sha256(own)
     assert resolve(estimator).identity == resolve(physics_filter(fitted, FilterNoise())).identity
-    ours, _ = run_window(estimator, correct_signals(noisy, own))
+    ours, _ = run_window(estimator, calibrated_signals(correct_signals(noisy, own), car))
     raw = replace(noisy, steer_rad=noisy.steer_rad * own.steering_ratio / 15.0)
     want, _ = run_window(physics_filter(fitted, FilterNoise()), correct_signals(raw, fitted), None)
     np.testing.assert_allclose(ours.sideslip_rad, want.sideslip_rad, rtol=1e-9, atol=1e-12)

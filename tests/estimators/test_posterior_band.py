@@ -21,9 +21,10 @@ from pdhef_logtool.car.parts import (
     physics_sha256,
 )
 from pdhef_logtool.car.toml_files import part_toml, vehicle_toml
-from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
+from pdhef_logtool.car.vehicle import PhysicsParts, corrected_anew, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.calibration.joint import prior_variations
+from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.error_features import TERMS, error_terms
 from pdhef_logtool.estimators.intervals import POSTERIOR_NOTE
 from pdhef_logtool.estimators.latency_compensation import run_window
@@ -63,7 +64,7 @@ def banded(car: Car, *windows: Signals, name: str = "physics") -> tuple[list[Sta
     applied = calibrator(car, [estimator])
     plain, wide = [], []
     for window in windows:
-        track, carry = run_window(estimator, window, carry)
+        track, carry = run_window(estimator, calibrated_signals(window, car), carry)
         plain.append(track)
         wide.append(applied.apply(track, window))
     return plain, wide
@@ -85,8 +86,8 @@ def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
     assert vehicles[1].tyres.rear != OWN.tyres.rear
     assert vehicles[2].steer_offset_rad == pytest.approx(0.005)
     assert {v.yaw_inertia_kg_m2 for v in vehicles} == {1700.0}
-    filters = [replace(physics_filter(v, NOISE), read_with=OWN) for v in vehicles]
-    middle, *others = (run_window(f, signals)[0].vy_m_s for f in filters)
+    read = [(physics_filter(v, NOISE), corrected_anew(signals, OWN, v)) for v in vehicles]
+    middle, *others = (run_window(f, s)[0].vy_m_s for f, s in read)
     terms = error_terms(plain, signals, car.physics_vehicle.roll_gradient_rad_per_m_s2)
     seen = terms[:, TERMS.index("kinematic")] * plain.vx_m_s
     expected = (OWN_SHARE * plain.vy_std_m_s) ** 2 + seen**2 + sum((vy - middle) ** 2 for vy in others)

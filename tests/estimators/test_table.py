@@ -50,7 +50,7 @@ pytestmark = pytest.mark.slow
 VEHICLE = default_vehicle()
 NOISE = FilterNoise(q_std=(0.1, 0.2, 0.1), r_std={"ay_m_s2": 0.9})
 EVIDENCE = Trust(trust_cap=1.0, evidence="a drive of 300 s")
-#: All rows except the estimator on a self-calibrated car (``test_self_calibrated``).
+#: All rows except the estimator on a self-calibrated car (``test_calibrated_band``).
 LINES = tuple(s for s in all_specs() if s.name != OPEN_LOOP)
 every_spec = pytest.mark.parametrize("spec", LINES, ids=lambda spec: spec.name)
 

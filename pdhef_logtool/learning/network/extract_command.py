@@ -16,7 +16,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import VEHICLE_FILE, Car
 from pdhef_logtool.car.names import NO_INTERVALS
-from pdhef_logtool.car.parts import PHYSICS, physics_sha256
+from pdhef_logtool.car.parts import physics_sha256
 from pdhef_logtool.car.taught import ESTIMATED
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
@@ -26,9 +26,9 @@ from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.corrected import CorrectedPhysics
+from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.parallel_physics import filter_of
-from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
-from pdhef_logtool.estimators.table import FEATURES, FILTERS, make_estimator
+from pdhef_logtool.estimators.table import FEATURES, FILTERS
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.learning.drives import (
     DriveRecord,
@@ -68,7 +68,7 @@ from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import Loss, Signals
+from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, NOMINAL_MODEL, PHYSICS_MODEL
 from pdhef_logtool.residual_model.ladder import LadderModel
 from pdhef_logtool.results.run_report import tool_versions
@@ -469,7 +469,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         smoothing = _choose_smoothing(plan, settings)
         truth = _truth_facts(plan, smoothing, estimated=reference is not None)
         service = _in_service(drive, job)
-        physics = filter_of(service.car, settings.model, use_speed=drive.options.use_speed)
+        physics = filter_of(service.car.calibrated_car, settings.model, use_speed=drive.options.use_speed)
         validated = drive.car.has_evidence
         drive.friction = friction_of(plan, physics.vehicle, drive.options, validated=validated, of_truth=True)
         condition = None if settings.where is None else condition_of(settings.where)
@@ -507,10 +507,9 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Service:
-    """Settings of a run on a drive: car, conversion of the signals, calibration, active residual model."""
+    """Settings of a run on a drive: car, calibration, active residual model."""
 
     car: Car
-    read: Callable[[Signals], Signals]
     calibration: str
     model: LadderModel | None
 
@@ -519,15 +518,11 @@ def _in_service(drive: Drive, job: _Job) -> _Service:
     """Return the car settings of a run on this drive; a trained car is calibrated on each drive."""
     car, taught = job.car, job.car.taught
     if taught is None or job.settings.model != PHYSICS_MODEL:
-        return _Service(car, lambda signals: signals, "", None)
+        return _Service(car, "", None)
     calibration = self_calibrate([read_driving(drive)], car.vehicle, taught=car.taught_prior)
-    on_log = self_calibrated(drive, calibration)
-    estimator = make_estimator(PHYSICS, on_log)
-    if not isinstance(estimator, SelfCalibrated):
-        acts = None if taught.calibrated else taught.residual
-        return _Service(car, lambda signals: signals, f"refused: {calibration.refused}", acts)
-    acts = taught.residual if taught.calibrated else None
-    return _Service(on_log.calibrated_car, estimator.given, calibration.text, acts)
+    text = f"refused: {calibration.refused}" if calibration.refused else calibration.text
+    acts = taught.residual if taught.calibrated != bool(calibration.refused) else None
+    return _Service(self_calibrated(drive, calibration), text, acts)
 
 
 def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) -> DriveResult | None:
@@ -561,7 +556,7 @@ def _residuals(
         taught = CorrectedPhysics(AdaptivePhysics(physics), service.model)
     noise = smoothing.noise[0] * period_s / math.sqrt(2.0)  # of v_y itself
     return residual_rows(
-        service.read(whole.signals),
+        calibrated_signals(whole.signals, service.car) if physics.model == "forces" else whole.signals,
         truth,
         physics,
         period_s=period_s,

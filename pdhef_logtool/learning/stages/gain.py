@@ -13,7 +13,8 @@ from pdhef_logtool.car.parts import LearntOn, Trust
 from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.reading import Drive, WholeDrive
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.drive_signals import calibrated_signals
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import FEATURES, Options, spec_of
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import GAIN, DriveRecord, drives_document, load_drive, no_drive, record_head
@@ -112,10 +113,10 @@ def errors_by_trust(car: Car, drive: WholeDrive, *, use_speed: bool) -> BlockErr
     signals, truth = drive.signals, drive.truth
     assert car.network is not None and truth is not None
     network, slow = RememberingNetwork(car.network), car.vehicle.low_speed_blend_m_s
-    errors = []
+    given, errors = calibrated_signals(signals, car), []
     for share in TRUSTS:
         estimator = spec_of("pd-hef").make(car, Options(use_speed, share, network))
-        errors.append(signal_error(run_window(estimator, signals)[0], truth, "sideslip_rad", slow))
+        errors.append(signal_error(run_estimator(estimator, given), truth, "sideslip_rad", slow))
     excited: BoolArray = np.abs(truth.vx_m_s * signals.yaw_rate_rad_s) > EXCITED_M_S2
     return block_errors(np.stack(errors), truth.sideslip_rad, signals.stamps_ns, excited)
 

@@ -25,8 +25,8 @@ from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, se
 from pdhef_logtool.estimators.calibration.driving import STEP_S
 from pdhef_logtool.estimators.calibration.joint import level_of, like_drives
 from pdhef_logtool.estimators.corrected import features_of
+from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import compensate
-from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
 from pdhef_logtool.estimators.table import FEATURES, make_estimator
 from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
@@ -220,14 +220,11 @@ def _calibration(drive: OpenedDrive, parameters: Sequence[TaughtParameter]) -> S
 def lacking_of(drive: OpenedDrive, calibration: SelfCalibration) -> TaughtDrive:
     """Return the features of a drive and the sideslip error of ``physics`` on its calibrated car, at its stamps."""
     car = self_calibrated(drive.drive, calibration)
-    estimator = make_estimator(PHYSICS, car)
-    physics, signals = estimator, drive.whole.signals
-    if isinstance(estimator, SelfCalibrated):
-        physics, signals = estimator.estimator, estimator.given(signals)
+    physics, signals = make_estimator(PHYSICS, car), calibrated_signals(drive.whole.signals, car)
     assert isinstance(physics, AdaptivePhysics)
     steps, _ = physics.run(signals, None)
     track, _ = compensate(physics, signals, steps)
-    features, _ = features_of(physics, steps, signals, None, None)
+    features, _ = features_of(steps, signals, None, None)
     arrived = release(signals.ready_ns, signals.stamps_ns)
     error = signal_error(track, drive.truth, "sideslip_rad", car.vehicle.low_speed_blend_m_s)
     settled = signals.stamps_ns - signals.stamps_ns[0] > SETTLE_NS

@@ -1,4 +1,4 @@
-"""Estimators on a car that its log has calibrated."""
+"""Estimators on a car that its log has calibrated, and their intervals."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from pdhef_logtool.car.parts import FilterNoise, IntervalEntry, Intervals
 from pdhef_logtool.car.toml_files import vehicle_of_entries
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.calibrated_band import D2_SHARE
+from pdhef_logtool.estimators.drive_signals import DriveSignals, calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import PhysicsFilter, physics_filter
 from pdhef_logtool.estimators.presets import OPEN_LOOP
-from pdhef_logtool.estimators.self_calibrated import D2_SHARE, SelfCalibrated
 from pdhef_logtool.estimators.table import all_names, make_estimator
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
@@ -65,24 +66,22 @@ def tracks(name: str, car: Car, *parts: Signals) -> list[StateTrack]:
     estimator, state, found = make_estimator(name, car), None, []
     intervals = calibrator(car, [estimator])
     for part in parts:
-        track, state = run_window(estimator, part, state)
+        track, state = run_window(estimator, calibrated_signals(part, car), state)
         found.append(intervals.apply(track, part))
     return found
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["physics", "pd-hef"])
-def test_what_takes_it_is_not_causal_and_says_why(name: str) -> None:
+def test_an_estimator_on_a_car_calibrated_by_the_whole_log_is_not_causal(name: str) -> None:
     if name.startswith("pd-hef"):
         pytest.importorskip("torch")
         if Car.load().network is None:
             pytest.skip("no network is shipped")
     car = replace(calibrated(), network=Car.load().network)
     estimator = make_estimator(name, car)
-    assert isinstance(estimator, SelfCalibrated)
     assert not estimator.causal
     assert estimator.name == name
-    assert NOTE in estimator.notes
     assert resolve(estimator).physics_sha256 == car.calibrated_car.physics_sha256
 
 
@@ -100,10 +99,19 @@ def test_the_open_loop_model_runs_once_more_only_on_a_calibrated_car() -> None:
         make_estimator(OPEN_LOOP, Car.of(OWN))
 
 
-def test_it_is_the_estimator_on_signals_that_the_calibrated_vehicle_reads(signals: Signals) -> None:
-    (track,) = tracks(OPEN_LOOP, calibrated(), signals)
-    (own,) = tracks("open-loop", Car.of(FOUND), corrected_anew(signals, OWN, FOUND))
-    np.testing.assert_array_equal(track.vy_m_s, own.vy_m_s)
+def test_a_drive_has_one_table_for_each_vehicle_and_both_are_read_only(signals: Signals) -> None:
+    tables = DriveSignals.of(signals, calibrated())
+    for name in ("zero", "kinematic", "open-loop", "phy-ukf", "pd-hef-paper"):
+        assert tables.of_estimator(name) is tables.file
+    for name in ("physics", "pd-hef", "pd-hef:gain=1", "pd-hef-smoothed", OPEN_LOOP):
+        assert tables.of_estimator(name) is tables.calibrated
+    expected = corrected_anew(signals, OWN, FOUND)
+    for column in ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction"):
+        np.testing.assert_array_equal(getattr(tables.file, column), getattr(signals, column))
+        np.testing.assert_array_equal(getattr(tables.calibrated, column), getattr(expected, column))
+        for table in (tables.file, tables.calibrated):
+            with pytest.raises(ValueError, match="read-only"):
+                getattr(table, column)[0] = 1.0
 
 
 def test_an_estimated_friction_is_not_taken(signals: Signals) -> None:
@@ -122,7 +130,7 @@ def test_estimators_of_a_run_share_what_their_bands_compare(signals: Signals, mo
     intervals = calibrator(car, estimators)
     for number, window in enumerate(windows):
         for i, estimator in enumerate(estimators):
-            track, states[i] = run_window(estimator, window, states[i])
+            track, states[i] = run_window(estimator, calibrated_signals(window, car), states[i])
             track, expected = intervals.apply(track, window), alone[names[i]][number]
             np.testing.assert_array_equal(track.sideslip_std_rad, expected.sideslip_std_rad)
             np.testing.assert_array_equal(track.vy_m_s, expected.vy_m_s)
@@ -165,16 +173,14 @@ def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
 def test_without_d2_its_own_interval_counts_as_it_is(signals: Signals) -> None:
     (plain,), (banded,) = tracks("physics", calibrated(), signals), tracks("physics", with_band(0.0, math.nan), signals)
     np.testing.assert_array_equal(banded.sideslip_std_rad, plain.sideslip_std_rad)
-    told = calibrator(Car.of(OWN), [make_estimator("physics", with_band(0.0, math.nan))])
-    assert told.fixed_notes["physics"] == "intervals: own and parameters"
+    car = with_band(0.0, math.nan)
+    assert calibrator(car, [make_estimator("physics", car)]).fixed_notes["physics"] == "intervals: own and parameters"
 
 
 def test_intervals_of_other_driving_are_not_taken(signals: Signals) -> None:
     estimator = make_estimator("physics", with_band())
-    assert isinstance(estimator, SelfCalibrated)
     inflation = make_inflation((9.0,) * 9, (9.0,) * 3)
-    algorithms = map(resolve, (estimator, estimator.estimator))
-    entries = tuple(IntervalEntry(estimator="e", algorithm=a, inflation=inflation) for a in algorithms)
+    entries = (IntervalEntry(estimator="e", algorithm=resolve(estimator), inflation=inflation),)
     intervals = Intervals(car="c", physics_sha256="ab" * 32, roll_gradient_rad_per_m_s2=0.0, entries=entries)
     track, _ = run_window(estimator, signals)
     applied = calibrator(replace(with_band(), intervals=intervals), [estimator])

@@ -1,0 +1,46 @@
+"""Signals of a drive, corrected once for each vehicle of its car: all estimators receive one of two read-only tables.
+
+A car has a vehicle file, and a vehicle that the log calibrated or that drives with ground truth identified. The two
+differ in steering ratio and offset, biases, and gain of the gyro.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.vehicle import corrected_anew
+from pdhef_logtool.estimators.presets import uses_calibration
+from pdhef_logtool.records.signals import SIGNAL_COLUMNS, Signals
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveSignals:
+    """Signals [N] as the vehicle file corrects them, and as the calibrated or identified vehicle corrects them."""
+
+    file: Signals
+    calibrated: Signals
+
+    @classmethod
+    def of(cls, signals: Signals, car: Car) -> DriveSignals:
+        """Return the read-only tables of signals [N] that were read with the vehicle file of a car."""
+        return cls(_read_only(signals), _read_only(calibrated_signals(signals, car)))
+
+    def of_estimator(self, name: str) -> Signals:
+        """Return the table for the vehicle that an estimator uses."""
+        return self.calibrated if uses_calibration(name) else self.file
+
+
+def calibrated_signals(signals: Signals, car: Car) -> Signals:
+    """Return signals [N] that were read with a car's file as its calibrated or identified vehicle corrects them."""
+    if car.self_calibrated is not None:
+        signals = car.self_calibrated.without_estimated_friction(signals)
+    return corrected_anew(signals, car.vehicle, car.calibrated_car.physics_vehicle)
+
+
+def _read_only(signals: Signals) -> Signals:
+    columns: dict[str, Any] = {name: getattr(signals, name).view() for name in SIGNAL_COLUMNS}
+    for column in columns.values():
+        column.setflags(write=False)
+    return replace(signals, **columns)
