@@ -345,10 +345,9 @@ class GnssAided:
         everywhere = np.ones(count, dtype=np.bool_)
         at_steps = Extrapolation(np.arange(count), everywhere, np.zeros(count), np.asarray(steps.valid))
         track = predict_track(self.estimator, steps, at_steps, stamps_ns)
-        corrected = self._physics.corrected(signals)
         columns = (
-            step_durations_s(stamps_ns, before_ns), (signals.ready_ns - stamps_ns) * 1e-9, corrected.ay_m_s2,
-            corrected.yaw_rate_rad_s, track.vx_m_s, track.vy_m_s, track.valid & np.isfinite(track.vy_m_s),
+            step_durations_s(stamps_ns, before_ns), (signals.ready_ns - stamps_ns) * 1e-9, signals.ay_m_s2,
+            signals.yaw_rate_rad_s, track.vx_m_s, track.vy_m_s, track.valid & np.isfinite(track.vy_m_s),
             *signals.gnss_velocity_m_s.T, signals.gnss_velocity_std_m_s, np.nan_to_num(signals.gnss_late_s),
         )  # fmt: skip
         shapes = ((h, STATES), (h, STATES, STATES), (h, 3), (_END + 1,), (QUEUE, _STD + 1))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.estimators.base import Estimator, notes_of, predict_track
+from pdhef_logtool.estimators.base import StepEstimator, notes_of, predict_track
 from pdhef_logtool.estimators.calibrated_band import runs_of, stages_of
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.records.signals import IntArray, Signals
@@ -36,12 +36,12 @@ class OnlineCalibrated:
     version = 1
     options = ("estimator",)
 
-    stages: tuple[Estimator, ...]
+    stages: tuple[StepEstimator, ...]
     cars: tuple[Car, ...]
     causal: bool = True
 
     @property
-    def estimator(self) -> Estimator:
+    def estimator(self) -> StepEstimator:
         """The last stage; all stages have the same algorithm."""
         return self.stages[-1]
 
