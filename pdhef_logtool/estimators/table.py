@@ -118,7 +118,7 @@ class Spec:
         from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
 
         cars = tuple(replace(car, self_calibrated=stage) for stage in (*calibration.earlier, calibration))
-        return OnlineCalibrated(tuple(build(self.name, c.calibrated_car, options) for c in cars), cars)
+        return OnlineCalibrated(tuple(cast("Any", build(self.name, c.calibrated_car, options)) for c in cars), cars)
 
 
 def _aided(build: Callable[[str, Car, Options], Estimator], name: str, car: Car, options: Options) -> Estimator:

@@ -759,7 +759,7 @@ class VehicleUkf:
     ----------
     vehicle : parameters; ``physics`` states which parts it has, ``sensors`` gives R unless ``r_std`` does, and the
         priors of the biases.
-    model : ``forces`` with axle forces and the car's parts, ``nominal`` without.
+    equations : ``forces`` with axle forces and the car's parts, ``nominal`` without.
     q_std : process 1-sigma per √s of [v_x, v_y, r, b_ax, f_f, f_r], forces over mass in m/s².
     r_std : 1-sigma of [a_y, r, v_x].
     limit_gain : growth of the process noise of the axle forces beyond the linear range; 0: none.
@@ -772,10 +772,10 @@ class VehicleUkf:
 
     algorithm = "vehicle-ukf"
     version = 1
-    options = ("model", "slip_gate", "standstill", "limit_gain", "limit_lag_m", "roll_correction")
+    options = ("equations", "slip_gate", "standstill", "limit_gain", "limit_lag_m", "roll_correction")
 
     vehicle: VehicleParameters
-    model: Literal["forces", "nominal"] = "forces"
+    equations: Literal["forces", "nominal"] = "forces"
     q_std: tuple[float, ...] = PHYSICS_Q_STD
     r_std: tuple[float, float, float] | None = None
     limit_gain: float = 0.0
@@ -790,7 +790,7 @@ class VehicleUkf:
     @cached_property
     def layout(self) -> Layout:
         """Where the states of the car's parts are."""
-        return NOMINAL if self.model == "nominal" else layout_of(self.vehicle)
+        return NOMINAL if self.equations == "nominal" else layout_of(self.vehicle)
 
     @cached_property
     def parameters(self) -> Model:

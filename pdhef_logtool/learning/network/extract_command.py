@@ -552,11 +552,11 @@ def _residuals(
     period_s = drive.plan.alignment.grid_period_s
     half_window = round(smoothing.half_s / period_s)
     taught = None
-    if service.model is not None and physics.model == "forces":
+    if service.model is not None and physics.equations == "forces":
         taught = CorrectedPhysics(AdaptivePhysics(physics), service.model)
     noise = smoothing.noise[0] * period_s / math.sqrt(2.0)  # of v_y itself
     return residual_rows(
-        calibrated_signals(whole.signals, service.car) if physics.model == "forces" else whole.signals,
+        calibrated_signals(whole.signals, service.car) if physics.equations == "forces" else whole.signals,
         truth,
         physics,
         period_s=period_s,

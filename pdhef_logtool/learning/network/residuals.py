@@ -300,7 +300,7 @@ def residual_rows(
     # A predicted steering angle must not affect a residual.
     inputs[~np.isfinite(without_impossible(signals).steer_rad), U_STEER] = np.nan
     stamps_ns, gap_s = signals.stamps_ns, GAP_PERIODS * period_s
-    if physics.model == "forces":
+    if physics.equations == "forces":
         increments = physics_increments(stamps_ns, state, filtered.x, inputs, physics, max_step_s=gap_s)
     else:
         steer, friction = inputs[:, U_STEER], inputs[:, U_FRICTION]
