@@ -181,6 +181,8 @@ SPECS: tuple[Spec, ...] = (
          "peers.linear_kf:LinearKalman.build", _INPUTS, 0x7F7F7F, group=PEERS, one_of=_PLANAR_IMU),
     Spec("linear-kf:open-loop", "peer: linear single track from steering and speed alone (Riekert and Schunck 1940)",
          "peers.linear_kf:LinearKalman.build", _INPUTS, 0xBBBBBB, group=PEERS),
+    Spec("learned-single-track", "peer: single track with parameters learned from the yaw rate (openpilot's paramsd)",
+         "peers.learned_single_track:LearnedSingleTrack.build", _INPUTS | _PLANAR, 0x999933, group=PEERS),
     Spec("washout", "peer: kinematic with a leak to the stationary single track (Piyabongkarn et al. 2009)",
          "peers.washout:Washout.build", FEATURES, 0x88CCEE, group=PEERS),
 )  # fmt: skip

@@ -20,6 +20,7 @@ SPEED_M_S, STEP_S, SECONDS = 20.0, 0.01, 30.0
 BOUNDS_DEG = {
     "linear-kf": 0.001,
     "linear-kf:open-loop": 0.001,
+    "learned-single-track": 0.16,  # stationary: sideslip lags behind steering
     "washout": 0.15,  # the stationary solution lags behind steering
 }
 
