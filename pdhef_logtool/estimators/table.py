@@ -183,6 +183,8 @@ SPECS: tuple[Spec, ...] = (
          "peers.linear_kf:LinearKalman.build", _INPUTS, 0xBBBBBB, group=PEERS),
     Spec("learned-single-track", "peer: single track with parameters learned from the yaw rate (openpilot's paramsd)",
          "peers.learned_single_track:LearnedSingleTrack.build", _INPUTS | _PLANAR, 0x999933, group=PEERS),
+    Spec("slip-ukf", "peer: unscented Kalman filter over speed and sideslip with axle forces (Goblirsch et al. 2024)",
+         "peers.slip_ukf:SlipUkf.build", FEATURES, 0x6699CC, group=PEERS),
     Spec("washout", "peer: kinematic with a leak to the stationary single track (Piyabongkarn et al. 2009)",
          "peers.washout:Washout.build", FEATURES, 0x88CCEE, group=PEERS),
 )  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -21,6 +23,7 @@ BOUNDS_DEG = {
     "linear-kf": 0.001,
     "linear-kf:open-loop": 0.001,
     "learned-single-track": 0.16,  # stationary: sideslip lags behind steering
+    "slip-ukf": 0.1,  # low-passed sensors and a yaw acceleration over 1 s
     "washout": 0.15,  # the stationary solution lags behind steering
 }
 
@@ -65,3 +68,13 @@ def test_a_peer_recovers_a_linear_car_within_its_bound(name, simulated):
     error = np.degrees(np.sqrt(np.mean((track.sideslip_rad - sideslip) ** 2)))
     assert error < BOUNDS_DEG[name]
     assert np.degrees(np.sqrt(np.mean(sideslip**2))) == pytest.approx(0.37, abs=0.01)
+
+
+def test_the_learner_learns_an_offset_of_steering(simulated):
+    signals, sideslip = simulated
+    errors = {}
+    for name in ("learned-single-track", "linear-kf:open-loop"):
+        estimator = make_estimator(name, Car.of(linear_sedan()))
+        track, _ = run_window(estimator, replace(signals, steer_rad=signals.steer_rad + 0.005))
+        errors[name] = abs(np.degrees(np.mean((track.sideslip_rad - sideslip)[-1000:])))  # two periods
+    assert errors["learned-single-track"] < 0.8 * errors["linear-kf:open-loop"]

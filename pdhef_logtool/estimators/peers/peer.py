@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 #: Rate of the published filters, Hz. Their noise per sample is converted from it to the step between two samples.
 PUBLISHED_HZ = 100.0
-#: Time before a window for which its samples are kept; no filter looks back further.
-HISTORY_NS = 1_100_000_000
+#: Time before a window for which its samples are kept: the yaw acceleration of ``slip-ukf`` and held samples.
+HISTORY_NS = 1_600_000_000
 #: v̇_y for the latency compensation is the mean change of v_y over this time.
 RATE_SPAN_NS = 50_000_000
 
