@@ -17,7 +17,7 @@ from pdhef_logtool.car.names import NO_INTERVALS, SHIPPED_CARS, UNSURE
 from pdhef_logtool.car.vehicle import SENSOR_PROFILES
 from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.drive.options import ReadOptions, parse_time
-from pdhef_logtool.estimators.presets import split_names
+from pdhef_logtool.estimators.table import check_names, split_names
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
@@ -188,8 +188,6 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
     for where, entries in ((str(path), raw), ("options", {**raw, **given})):
         config = validated(RunConfig, entries, where, UsageError, expected="the entries of pdhef.toml")
     if config.estimators is not None:
-        from pdhef_logtool.estimators.table import check_names  # inspect takes none, and no compiler
-
         check_names(config.estimators)
     if config.setup is not None and config.setup_from_s is not None:
         raise UsageError(expected="--setup or --setup-from", got="both", where="--setup")
