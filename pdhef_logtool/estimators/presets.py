@@ -10,7 +10,7 @@ from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
-    from pdhef_logtool.residual_model.service import NetworkService
+    from pdhef_logtool.residual_model.interface import ResidualModel
 
 #: Options by preset: None for a switch, the allowed range for an option with a value.
 OPTIONS: Mapping[str, Mapping[str, tuple[float, float] | None]] = {
@@ -41,15 +41,13 @@ class Options:
 
     use_speed: bool = True
     trust: float | None = None
-    network: NetworkService | None = field(default=None, compare=False)
+    network: ResidualModel | None = field(default=None, compare=False)
     gnss: bool = False
 
-    def service(self, car: Car) -> NetworkService:
+    def service(self, car: Car) -> ResidualModel:
         """Return the car's network."""
         assert car.network is not None, "the table lets no estimator run without the network that it needs"
-        from pdhef_logtool.residual_model.service import NetworkService
-
-        return self.network or NetworkService(car.network)
+        return self.network or car.network.service()
 
 
 def preset_of(name: str) -> str:

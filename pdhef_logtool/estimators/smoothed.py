@@ -404,7 +404,9 @@ class SmoothedPhysics:
             valid = np.stack([track.valid for track in smoothed], axis=1)
             weights = weigh(self._two_sided(shared, count, origin_ns), valid)
         raised = r_scale(shared.extra_r[:count], self.filtered.physics.measurement_std)
-        return MixtureSteps(tuple(smoothed), weights, raised, shared.reason[:count]), tuple(following)
+        return MixtureSteps(
+            tuple(smoothed), weights, raised, shared.reason[:count], np.full(count, self.filtered.trust)
+        ), tuple(following)
 
     def predict(self, steps: MixtureSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Mix the smoothed steps, each at its own stamp (see :class:`~.base.ModelPredictor`)."""
