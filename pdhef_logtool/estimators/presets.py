@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car, WithoutTruth
-    from pdhef_logtool.residual_model.service import NetworkService
+    from pdhef_logtool.residual_model.interface import ResidualModel
 
 #: Presets built on ``physics``. They use the calibrated vehicle if available; all others use the vehicle file.
 SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
@@ -49,15 +49,13 @@ class Options:
 
     use_speed: bool = True
     trust: float | None = None
-    network: NetworkService | None = field(default=None, compare=False)
+    network: ResidualModel | None = field(default=None, compare=False)
     gnss: bool = False
 
-    def service(self, car: Car) -> NetworkService:
+    def service(self, car: Car) -> ResidualModel:
         """Return the car's network."""
         assert car.network is not None, "the table lets no estimator run without the network that it needs"
-        from pdhef_logtool.residual_model.service import NetworkService
-
-        return self.network or NetworkService(car.network)
+        return self.network or car.network.service()
 
 
 def preset_of(name: str) -> str:
