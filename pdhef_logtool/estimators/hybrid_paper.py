@@ -316,8 +316,8 @@ class PaperHybridUkf:
         starts = ~np.isfinite(physics.prior[:, VX])
         rate, network = self.network.run(features, starts, state.network if state else None)
         before = (state.filtered, state.adapted) if state else (None, None)
-        steps, *filtered = self.filter_steps(signals, physics, rate, *before)
-        return steps, PaperState(after, network, *filtered)
+        steps, filtered, adapted = self.filter_steps(signals, physics, rate, *before)
+        return steps, PaperState(after, network, filtered, adapted)
 
     def predict(self, steps: PaperSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate steps with the nominal model and the residual held (see :class:`~.base.ModelPredictor`)."""
