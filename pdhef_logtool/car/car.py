@@ -46,6 +46,7 @@ from pdhef_logtool.residual_model.bundle import (
     ModelBundle,
     load_bundle,
 )
+from pdhef_logtool.residual_model.interface import PlugInModel, load_plug_in, plug_in_names
 from pdhef_logtool.storage.documents import read_json, read_toml, validated
 
 VEHICLE_FILE, FIT_FILE, NOISE_FILE, NETWORK_FILE = "vehicle.toml", "fit.toml", "noise.toml", "network.toml"
@@ -125,7 +126,7 @@ class Car:
     vehicle: VehicleParameters
     datasheet: VehicleParameters
     noise: Mapping[str, FilterNoise] = field(default_factory=dict)
-    network: ModelBundle | None = None
+    network: ModelBundle | PlugInModel | None = None
     network_name: str = NO_MODEL
     network_folder: Path | None = None
     trust: Trust | None = None
@@ -150,7 +151,7 @@ class Car:
         Parameters
         ----------
         path : a car's folder, a vehicle.toml, ``saloon`` (the shipped car); None: the default sedan.
-        network : instead of the car's own: a shipped network's name, a folder, ``none``.
+        network : instead of the car's own: the name of a shipped network or an installed model, a folder, ``none``.
         intervals : instead of the car's own: an ``intervals.json``, ``unsure``, ``none``.
         sensors : instead of the car's own: a profile's name, or a file with ``[sensors]``.
 
@@ -171,7 +172,8 @@ class Car:
         if folder is not None:
             car = _with_parts(car, folder)
         name, home = _network_of(car, folder, network)
-        bundle = None if home is None else load_bundle(home)
+        plugged = load_plug_in(name) if home is None and name != NO_MODEL else None
+        bundle = plugged if home is None else load_bundle(home)
         selected = _intervals_of(folder, intervals)
         car = replace(car, network=bundle, network_name=name, network_folder=home, intervals=selected)
         if str(intervals) == NO_INTERVALS and car.fitted_physics is not None:
@@ -224,7 +226,7 @@ class Car:
         return noise_sha256(self.noise)
 
     @property
-    def residual_network(self) -> ModelBundle | None:
+    def residual_network(self) -> ModelBundle | PlugInModel | None:
         """The network if its residual is of ``physics``; the paper's network predicts the residual of ``phy-ukf``."""
         return self.network if self.network is not None and self.network.model == PHYSICS_MODEL else None
 
@@ -382,7 +384,7 @@ def _part(path: Path, kind: type[PartT]) -> PartT | None:
 
 
 def _network_of(car: Car, folder: Path | None, chosen: Place) -> tuple[str, Path | None]:
-    """Return name and folder of the network in force; the folder is None without one."""
+    """Return name and folder of the network in force; the folder is None for a plug-in and without a network."""
     name = str(chosen) if chosen is not None else (SHIPPED if car.trust is None else car.trust.network)
     if name == NO_MODEL:
         return NO_MODEL, None
@@ -392,6 +394,8 @@ def _network_of(car: Car, folder: Path | None, chosen: Place) -> tuple[str, Path
         return (NO_MODEL, None) if chosen is None and not (home / DOCUMENT_FILE).is_file() else (name, home)
     if chosen is None and folder is not None:
         return name, folder / name
+    if name in plug_in_names():
+        return name, None
     home = Path(name)
     # The path may be a car's folder that contains the network.
     return name, home / NETWORK_FOLDER if (home / NETWORK_FOLDER / DOCUMENT_FILE).is_file() else home

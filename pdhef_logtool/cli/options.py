@@ -90,7 +90,7 @@ _OPTIONS: dict[str, Any] = {
         metavar="SECONDS",
     ),
     "estimators": _option(
-        _Text, ESTIMATION, "Comma-separated names, or all. Default: pd-hef, physics, zero.", "--estimators", "-e"
+        _Text, ESTIMATION, "Comma-separated names, all or peers. Default: pd-hef, physics, zero.", "--estimators", "-e"
     ),
     "friction": _option(
         _Text, ESTIMATION, "auto (from the log, else the car, else estimated), file, estimate, or a number."

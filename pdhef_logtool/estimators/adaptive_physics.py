@@ -28,14 +28,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputState, check_inputs, r_scale, residual_rate
+from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputState, check_inputs, r_scale, residual_of
 from pdhef_logtool.estimators.sensor_faults import no_faults
 from pdhef_logtool.estimators.vehicle_model import VX
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, PosteriorSteps, VehicleUkf, of_car, sideslip_std
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
 from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack
-from pdhef_logtool.residual_model.service import NetworkService
+from pdhef_logtool.residual_model.interface import ResidualModel
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -52,12 +52,13 @@ LEAST_WEIGHT = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MixtureSteps(StepColumns):
-    """Steps of all filters [H], and by step, [K]: weights [K, H], factor on R, and the detector's bit mask."""
+    """Steps of all filters [H], and by step, [K]: weights [K, H], factor on R, detector's bit mask, residual gain."""
 
     filters: tuple[PosteriorSteps, ...]
     weights: FloatArray
     r_scale: FloatArray
     reason: IntArray
+    gain: FloatArray
 
     @property
     def valid(self) -> BoolArray:
@@ -226,7 +227,7 @@ class AdaptivePhysics:
     options = ("physics", "trust", "adaptive")
 
     physics: VehicleUkf
-    network: NetworkService | None = None
+    network: ResidualModel | None = None
     trust: float = 0.0
     adaptive: bool = True
     name: str = "pd-hef"
@@ -248,8 +249,8 @@ class AdaptivePhysics:
         """Return the inputs of the filters, checked signals with the residual at gain 1, and the state."""
         if self.adaptive:
             return check_inputs(self.physics, self.network, signals, state)
-        rate, after = residual_rate(self.physics, self.network, signals, state)
-        return CheckedInputs(no_faults(signals), rate), after
+        residual, after = residual_of(self.physics, self.network, signals, state)
+        return CheckedInputs(no_faults(signals), residual), after
 
     def run(self, signals: Signals, state: AdaptiveState | None) -> tuple[MixtureSteps, AdaptiveState]:
         """Process one window (see :class:`~.base.Estimator`)."""
@@ -266,7 +267,7 @@ class AdaptivePhysics:
         weights = weigh(gathered, np.stack([filter_steps.valid for filter_steps in steps], axis=1))
         raised = r_scale(faults.extra_r, self.physics.measurement_std)
         after = AdaptiveState(inputs, tuple(state for _, state in runs), evidence)
-        return MixtureSteps(steps, weights, raised, faults.reason), after
+        return MixtureSteps(steps, weights, raised, faults.reason, self.trust * checked.residual.gain), after
 
     def predict(self, steps: MixtureSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate each filter's steps and mix them (see :class:`~.base.ModelPredictor`)."""
@@ -276,11 +277,14 @@ class AdaptivePhysics:
             tracks.append(physics_filter.predict(of_one, replace(ahead, usable=ahead.usable & weighed), stamps_ns))
         track = mix(steps.weights[step], tracks) if len(tracks) > 1 else tracks[0]
         reason = np.where(ahead.arrived, steps.reason[step], 0)
-        return self.described(track, steps.weights[step], steps.r_scale[step], reason)
+        return self.described(track, steps.weights[step], steps.gain[step], steps.r_scale[step], reason)
 
-    def described(self, track: StateTrack, weights: FloatArray, raised: FloatArray, reason: IntArray) -> StateTrack:
-        """Return a track [N] with gain, weight of the cures by weights [N, H], factor on R and reasons [N]."""
-        columns: dict[str, Any] = {"network_trust": np.where(track.valid, self.trust, np.nan)}
+    # positional: the columns of a track.
+    def described(
+        self, track: StateTrack, weights: FloatArray, gain: FloatArray, raised: FloatArray, reason: IntArray
+    ) -> StateTrack:
+        """Return a track [N] with residual gain, weight of the cures (weights [N, H]), factor on R and reasons [N]."""
+        columns: dict[str, Any] = {"network_trust": np.where(track.valid, gain, np.nan)}
         if self.adaptive:
             columns["r_scale"] = np.where(track.valid, raised, 1.0)
             columns["mixture_weight"] = np.where(track.valid, 1.0 - weights[:, 0], np.nan)

@@ -1,78 +1,69 @@
-"""Common inputs of filters with fault handling: checked signals, and the network's residual computed from them.
+"""Common inputs of filters with fault handling: checked signals, and the residual computed from them.
 
-The detector checks the window; the parallel filter runs on the accepted samples, and the network receives the filter's
-prediction in place of a bad sample. Without a network there is no parallel filter and no residual.
+The detector checks the window; the parallel filter runs on the accepted samples, and the residual model receives the
+filter's prediction in place of a bad sample. Without a model there is no parallel filter and no residual.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.estimators.parallel_physics import run_features
+from pdhef_logtool.estimators.plug_ins import contained, package_of
 from pdhef_logtool.estimators.sensor_faults import FaultState, SensorFaults, find_faults
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, VehicleUkf
 from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
+from pdhef_logtool.records.steps import step_durations_s
+from pdhef_logtool.residual_model.interface import Residual, ResidualModel, checked_residual
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InputState:
-    """State of the detector, the parallel filter and the network between windows; None for a missing part."""
+    """State of the detector, the parallel filter and the residual model between windows; None for a missing part."""
 
     faults: FaultState | None
     physics: FilterState | None = None
-    network: NetworkCarry | None = None
+    model: Any = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedInputs:
-    """Result of the detector, and the network's residual rate [N, 2] in m/s² and rad/s², at gain 1."""
+    """Result of the detector, and the residual of the steps."""
 
     faults: SensorFaults
-    rate: FloatArray
+    residual: Residual
 
     @property
-    def nbytes(self) -> int:
-        """Memory in addition to the input signals."""
-        f = self.faults
-        arrays = [self.rate, f.extra_r, f.noise_std, f.reason]
-        arrays += [x for s in (f.filtered, f.network) for x in (s.ay_m_s2, s.yaw_rate_rad_s)]
-        return sum(a.nbytes for a in arrays)
-
-    def cut(self, first: int, end: int) -> CheckedInputs:
-        """Return the steps ``first`` to ``end`` (exclusive)."""
-        parts = {f.name: getattr(self.faults, f.name) for f in fields(self.faults)}
-        cut: dict[str, Any] = {
-            n: x.rows(first, end) if isinstance(x, Signals) else x[first:end] for n, x in parts.items()
-        }
-        return CheckedInputs(SensorFaults(**cut), self.rate[first:end])
+    def rate(self) -> FloatArray:
+        """Rates of v_y and r within the model's region of validity, [N, 2], m/s² and rad/s²."""
+        return self.residual.gain[:, None] * self.residual.rate
 
 
 def check_inputs(
-    physics: VehicleUkf, network: NetworkService | None, signals: Signals, state: InputState | None
+    physics: VehicleUkf, model: ResidualModel | None, signals: Signals, state: InputState | None
 ) -> tuple[CheckedInputs, InputState]:
-    """Detect faults in one window, and run parallel filter and network on the accepted samples.
+    """Detect faults in one window, and run parallel filter and residual model on the accepted samples.
 
     Joined windows give the same bits as one call over the whole log.
     """
     faults, fault_carry = find_faults(signals, physics.vehicle, state.faults if state else None)
-    rate, carried = residual_rate(physics, network, faults.filtered, state, faults)
-    return CheckedInputs(faults, rate), InputState(fault_carry, carried.physics, carried.network)
+    residual, carried = residual_of(physics, model, faults.filtered, state, faults)
+    return CheckedInputs(faults, residual), InputState(fault_carry, carried.physics, carried.model)
 
 
-def residual_rate(
+def residual_of(
     physics: VehicleUkf,
-    network: NetworkService | None,
+    model: ResidualModel | None,
     signals: Signals,
     state: InputState | None,
     faults: SensorFaults | None = None,
-) -> tuple[FloatArray, InputState]:
-    """Return the network's residual rate [N, 2] in m/s² and rad/s², at gain 1; 0 without a network."""
-    if network is None:
-        return np.zeros((len(signals), 2)), InputState(None)
+) -> tuple[Residual, InputState]:
+    """Return the residual of a window's steps; 0 without a model."""
+    if model is None:
+        return Residual.zero(len(signals)), InputState(None)
     features, steps, after = run_features(
         physics,
         signals,
@@ -80,9 +71,14 @@ def residual_rate(
         seen=None if faults is None else faults.network,
         extra_r=None if faults is None else faults.extra_r,
     )
-    starts = ~np.isfinite(steps.prior[:, 0])
-    rate, said = network.run(features, starts, state.network if state else None)
-    return rate, InputState(None, after, said)
+    dt_s = step_durations_s(signals.stamps_ns, state.physics.last_stamp_ns if state and state.physics else None)
+    dt_s[~np.isfinite(steps.prior[:, 0])] = np.nan
+    package = package_of(model)
+    with contained(f"residual model {type(model).__name__}", package):
+        residual, said = model.residual(features, dt_s, state.model if state else None)
+        if package:
+            residual = checked_residual(residual, len(signals))
+    return residual, InputState(None, after, said)
 
 
 def r_scale(extra_r: FloatArray, r_std: FloatArray) -> FloatArray:

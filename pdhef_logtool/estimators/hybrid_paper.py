@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -43,13 +43,11 @@ from pdhef_logtool.estimators.vehicle_model import (
     read,
 )
 from pdhef_logtool.estimators.vehicle_ukf import (
-    MEMORY_FIELDS,
     PHY_UKF_Q_STD,
     U_AX,
     U_AX_KNOWN,
     U_FRICTION,
     U_STEER,
-    Belief,
     FilterState,
     HeldInputs,
     PosteriorSteps,
@@ -67,6 +65,7 @@ from pdhef_logtool.estimators.vehicle_ukf import (
     predicted_track,
     process_noise,
     remember,
+    resume,
 )
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import Extrapolation, last_stamp_ns
@@ -78,8 +77,8 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.presets import Options
 
-#: Memory of the filter, with β and C of Eq 22 for each measurement.
-PAPER_MEMORY = np.dtype([*MEMORY_FIELDS, ("trust", np.float64), ("c", np.float64, (READINGS,))])
+#: What the mechanism remembers: β, and C of Eq 22 for each measurement.
+ADAPTED = np.dtype([("trust", np.float64), ("c", np.float64, (READINGS,))])
 
 
 class Constants(NamedTuple):
@@ -116,11 +115,12 @@ class PaperSteps(PosteriorSteps):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaperState:
-    """States of the parallel filter, the network and this filter between windows."""
+    """States of the parallel filter, the network and this filter between windows; ``adapted`` [1] is β and C."""
 
     physics: FilterState
     network: NetworkCarry
-    filter_state: FilterState
+    filtered: FilterState
+    adapted: np.ndarray[Any, Any]
 
 
 class Parallel(NamedTuple):
@@ -175,7 +175,7 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
     forgetting, process_noise_gain, deviation_tops, intensity_tops, _ = constants
     layout, places, p, f = model
     start_x, prior, inputs, start_ok, nominal_ay = parallel
-    x, P, memory = belief
+    (x, P, memory), adapted_memory = belief
     out_x, out_P, _, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_trust, out_r_scale = adapted
     n = x.shape[0]
@@ -183,7 +183,7 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
     L, S, Pxz = np.zeros((n, n)), np.zeros((READINGS, READINGS)), np.zeros((READINGS, n))
     z_hat, nu, use = np.zeros(READINGS), np.zeros(READINGS), np.zeros(READINGS, np.bool_)
     for k in range(window.dt_s.shape[0]):
-        m, ok, dt = memory[0], start_ok[k], window.dt_s[k]
+        m, a, ok, dt = memory[0], adapted_memory[0], start_ok[k], window.dt_s[k]
         steer, friction, has_ax = inputs[k, U_STEER], inputs[k, U_FRICTION], inputs[k, U_AX_KNOWN] > 0.0
         ay = window.ay[k] if ok else math.nan  # without steering no a_y can be predicted
         speed = window.speed[k] if tuning.rules.use_speed else math.nan
@@ -193,8 +193,8 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
             m.runs = 0.0
         if m.runs == 0.0:
             if ok:
-                m.runs, m.trust = 1.0, NOMINAL_TRUST
-                m.c[:] = math.nan
+                m.runs, a.trust = 1.0, NOMINAL_TRUST
+                a.c[:] = math.nan
                 x[:] = start_x[k]
                 P[:, :] = np.diag(tuning.initial_std**2)
                 out_valid[k] = True
@@ -202,9 +202,9 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
             intensity = abs(window.ay[k]) / (friction * GRAVITY_M_S2)
             trust = fuzzy_trust(abs(window.ay[k] - nominal_ay[k]), intensity, deviation_tops, intensity_tops)
             if math.isfinite(trust):
-                m.trust = trust
-            over, rate = held_over_step(now, m), (m.trust * m.rate_vy, m.trust * m.rate_r)
-            noise_dt = (1.0 + process_noise_gain * m.trust) * dt  # Eq 26
+                a.trust = trust
+            over, rate = held_over_step(now, m), (a.trust * m.rate_vy, a.trust * m.rate_r)
+            noise_dt = (1.0 + process_noise_gain * a.trust) * dt  # Eq 26
             _predict(x, P, over, rate, dt, noise_dt, tuning.q_std, model, points, E)
             alive = is_finite(x, P)
             out_prior[k] = x
@@ -219,9 +219,9 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
                     r = r0[i]
                     if use[i]:
                         out_nu[k, i] = nu[i]
-                        m.c[i], r = adapted_noise(m.c[i], nu[i], S[i, i], r0[i], forgetting)
-                    elif math.isfinite(m.c[i]):
-                        r = max(r0[i], m.c[i] - S[i, i])
+                        a.c[i], r = adapted_noise(a.c[i], nu[i], S[i, i], r0[i], forgetting)
+                    elif math.isfinite(a.c[i]):
+                        r = max(r0[i], a.c[i] - S[i, i])
                     if i == Z_AY:
                         out_r_scale[k] = r / r0[i]
                     S[i, i] += r
@@ -234,7 +234,7 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
             if not alive:
                 m.runs = 0.0
         remember(k, now, window.residual_rate, m)
-        out_trust[k] = m.trust
+        out_trust[k] = a.trust
         out_x[k] = x
         out_P[k] = P
 
@@ -315,8 +315,9 @@ class PaperHybridUkf:
         features, physics, after = run_features(self.parallel, signals, state.physics if state else None)
         starts = ~np.isfinite(physics.prior[:, VX])
         rate, network = self.network.run(features, starts, state.network if state else None)
-        steps, filter_state = self.filter_steps(signals, physics, rate, state.filter_state if state else None)
-        return steps, PaperState(after, network, filter_state)
+        before = (state.filtered, state.adapted) if state else (None, None)
+        steps, filtered, adapted = self.filter_steps(signals, physics, rate, *before)
+        return steps, PaperState(after, network, filtered, adapted)
 
     def predict(self, steps: PaperSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate steps with the nominal model and the residual held (see :class:`~.base.ModelPredictor`)."""
@@ -336,25 +337,24 @@ class PaperHybridUkf:
         signals: Signals,
         physics: PosteriorSteps,
         rate: FloatArray,
-        state: FilterState | None,
-    ) -> tuple[PaperSteps, FilterState]:
+        state: FilterState | None = None,
+        adapted: np.ndarray[Any, Any] | None = None,
+    ) -> tuple[PaperSteps, FilterState, np.ndarray[Any, Any]]:
         """Filter one window with the results of the parallel filter and the residual ``rate`` [K, 2] of the network.
 
-        Return its steps, and the state for the next window.
+        Return its steps, and the states for the next window.
         """
         signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None, gate=self.slip_gate)
         count, n, nominal = len(signals), NOMINAL.size, self.parallel
-        belief = Belief(np.zeros(n), np.eye(n), np.zeros(1, PAPER_MEMORY))
-        if state is not None:
-            belief = Belief(*(part.copy() for part in state.belief))
+        belief, remembered = resume(state, n), np.zeros(1, ADAPTED) if adapted is None else adapted.copy()
         nominal_ay = nominal.expected_ay(physics.prior, physics.inputs)
         parallel = Parallel(physics.x, physics.prior, physics.inputs, physics.valid, nominal_ay)
-        out, adapted = no_posterior(count, n)._replace(inputs=physics.inputs), (np.empty(count), np.empty(count))
+        out, columns = no_posterior(count, n)._replace(inputs=physics.inputs), (np.empty(count), np.empty(count))
         window, r0 = make_window(signals, state, rate), self.measurement_variance
         tuning = nominal.tuning._replace(q_std=np.array(self.q_std))
-        _filter(window, tuning, r0, self.constants, nominal.parameters, parallel, belief, out, adapted)
+        _filter(window, tuning, r0, self.constants, nominal.parameters, parallel, (belief, remembered), out, columns)
         after = FilterState(belief, last_stamp_ns(signals.stamps_ns, state.last_stamp_ns if state else None), slip)
-        return PaperSteps(signals.stamps_ns, *out, rate, *adapted), after
+        return PaperSteps(signals.stamps_ns, *out, rate, *columns), after, remembered
 
 
 def build(name: str, car: Car, options: Options) -> PaperHybridUkf:

@@ -113,11 +113,11 @@ class SmoothedPhysics:
     def smooth(self, signals: Signals) -> StateTrack:
         """Return the track of a drive (see :class:`~.base.Smoother`)."""
         checked, _ = self.filtered.inputs(signals, None)
-        faults, rate = checked.faults, self.filtered.trust * checked.rate
-        given = faults.filtered, rate, faults.extra_r
-        tracks, weights = self._filtered(*given)
+        faults, gain = checked.faults, self.filtered.trust * checked.residual.gain
+        tracks, weights = self._filtered(faults.filtered, self.filtered.trust * checked.rate, faults.extra_r)
         track = mix(weights, tracks) if len(tracks) > 1 else tracks[0]
-        track = self.filtered.described(track, weights, r_scale(faults.extra_r, self._r_std), faults.reason)
+        raised = r_scale(faults.extra_r, self.filtered.physics.measurement_std)
+        track = self.filtered.described(track, weights, gain, raised, faults.reason)
         return replace(
             track,
             name=self.name,
@@ -125,10 +125,6 @@ class SmoothedPhysics:
             nis_dof=np.zeros(len(signals)),
             mixture_weight=track.mixture_weight if len(tracks) > 1 else np.empty(0),
         )
-
-    @property
-    def _r_std(self) -> FloatArray:
-        return self.filtered.physics.measurement_std
 
     def _filtered(self, signals: Signals, rate: FloatArray, extra_r: FloatArray) -> tuple[list[StateTrack], FloatArray]:
         """Return the smoothed tracks of all filters [H], and their weights [N, H]."""

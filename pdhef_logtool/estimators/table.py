@@ -6,10 +6,12 @@ A name is a preset: ``build`` returns the algorithm for a car and options (:mod:
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
+from itertools import chain
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from pdhef_logtool.estimators.plug_ins import contained, package_of
@@ -18,7 +20,6 @@ from pdhef_logtool.estimators.presets import (
     OPEN_LOOP,
     SELF_CALIBRATED,
     calibration_of,
-    check_options,
     options_of,
     preset_of,
 )
@@ -35,9 +36,11 @@ if TYPE_CHECKING:
 #: Inputs of the vehicle model; a filter uses a_y and yaw rate if the log has them, ``physics`` steering too.
 _SPEED = frozenset({"speed_m_s"})
 _INPUTS = _SPEED | {"steer_rad"}
-_LATERAL = frozenset({"steer_rad", "yaw_rate_rad_s", "ay_m_s2"})
+_PLANAR = _SPEED | {"yaw_rate_rad_s"}
+_PLANAR_IMU = frozenset({"yaw_rate_rad_s", "ay_m_s2"})
+_LATERAL = _PLANAR_IMU | {"steer_rad"}
 #: Signals for the features of a network and the evidence of learning.
-FEATURES: frozenset[str] = _INPUTS | {"ay_m_s2", "yaw_rate_rad_s"}
+FEATURES: frozenset[str] = _INPUTS | _PLANAR_IMU
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +54,7 @@ class Spec:
     needs : required aligned signals. one_of : signals; it requires at least one of them, unless empty.
     colour : 0xRRGGBB in every plot, distinguishable with any colour vision (Okabe and Ito 2008; Tol's muted scheme).
     causal : whether an estimate at t uses only samples available at t.
-    in_all : whether it is one of :data:`ALL_ESTIMATORS`.
+    group : :data:`ALL_ESTIMATORS` or :data:`PEERS`, which name all of their estimators, or empty.
     network : required part of a network bundle; empty: no part; ``optional``: it also runs without.
     needs_noise : whether it requires filter noise in the car.
     """
@@ -62,7 +65,7 @@ class Spec:
     needs: frozenset[str]
     colour: int
     causal: bool = True
-    in_all: bool = True
+    group: Literal["all", "peers", ""] = "all"
     network: Literal["", "optional", "residual", "paper", "pure_lstm", "linear_regression"] = ""
     needs_noise: bool = False
     one_of: frozenset[str] = frozenset()
@@ -105,7 +108,7 @@ class Spec:
         build = self.build
         if isinstance(build, str):
             module, _, function = build.partition(":")
-            build = getattr(import_module(f"{__package__}.{module}"), function)
+            build = attrgetter(function)(import_module(f"{__package__}.{module}"))
         if options.gnss and self.name in AIDED:
             build = partial(_aided, build)
         calibration = calibration_of(self.name, car)
@@ -131,72 +134,57 @@ def _aided(build: Callable[[str, Car, Options], Estimator], name: str, car: Car,
 ENTRY_POINTS = "pdhef.estimators"
 #: Modules that the fork server of workers has loaded.
 FILTERS = ("pdhef_logtool.estimators.*", "pdhef_logtool.compiled.cache:load_kept")
-#: In place of names: every estimator that can run on the car.
-ALL_ESTIMATORS = "all"
-#: Estimators of this package, in the order of the tables.
+#: Groups, in place of names: the estimators of this tool and published ones, as far as they can run on the car.
+ALL_ESTIMATORS, PEERS = "all", "peers"
+#: Options of each preset, after a colon: None for a switch, the allowed range for an option with a value.
+OPTIONS: Mapping[str, Mapping[str, tuple[float, float] | None]] = {
+    "zero": {"no-lateral": None},
+    "open-loop": {"calibrated": None},
+    "phy-ukf": {"tuned": None},
+    "pd-hef": {"gain": (0.0, 1.0), "fixed-r": None},
+    "linear-kf": {"open-loop": None},
+}
+#: Estimators of this package, in the order of the tables. A preset with an option has an entry if it differs.
 SPECS: tuple[Spec, ...] = (
-    Spec(
-        "zero", "sideslip 0; speed, yaw rate and lateral acceleration from the sensors", "pass_through:build",
-        frozenset({"speed_m_s", "yaw_rate_rad_s"}), 0xF0E442,
-    ),
-    Spec(
-        "zero:no-lateral", "the sensors passed through; claims no lateral velocity", "pass_through:build",
-        frozenset({"speed_m_s", "yaw_rate_rad_s"}), 0xCC79A7,
-    ),
-    Spec(
-        "kinematic", "leaky integral of a_y - v_x r", "kinematic:build",
-        frozenset({"ay_m_s2", "yaw_rate_rad_s", "speed_m_s"}), 0x009E73,
-    ),
-    Spec(
-        "open-loop", "nominal single-track model from steering and speed alone", "open_loop:build",
-        _INPUTS, 0xE69F00,
-    ),
-    Spec(
-        OPEN_LOOP, "open-loop on the car calibrated by its log, without ground truth: not causal",
-        "open_loop:build", _INPUTS, 0x661100, causal=False,
-    ),
-    Spec(
-        "linear-regression",
-        "sideslip linear in the network's features, low-passed at 2 Hz (needs a network with baselines)",
-        "linear_regression:build", FEATURES, 0xDDCC77, network="linear_regression",
-    ),
-    Spec(
-        "phy-ukf", "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
-        "vehicle_ukf:build_nominal", _INPUTS, 0x0072B2,
-    ),
-    Spec(
-        "physics", "best filter with physics only, with the model parts supported by driving data",
-        "adaptive_physics:build", _SPEED, 0x44AA99, one_of=_LATERAL,
-    ),
-    Spec(
-        "phy-ukf:tuned", "phy-ukf with the noise of an identified car, corrected for body roll",
-        "vehicle_ukf:build_nominal", _INPUTS, 0x56B4E9, needs_noise=True,
-    ),
-    Spec(
-        "pure-lstm", "a network that outputs v_y, without a filter (needs a network with baselines)",
-        "direct_network:build", FEATURES, 0xAA4499, network="pure_lstm",
-    ),
-    Spec(
-        "pd-hef", "physics plus the residual of its network, with a gain by the car's evidence",
-        "pd_hef:build", _SPEED, 0xD55E00, network="optional", one_of=_LATERAL,
-    ),
-    Spec(
-        "pd-hef:fixed-r", "pd-hef at gain 1 without the adaptive mechanism (needs a network)",
-        "pd_hef:build", _INPUTS, 0x117733, network="residual",
-    ),
-    Spec(
-        "pd-hef-smoothed", "pd-hef smoothed with later samples: not causal, ranked apart",
-        "pd_hef:build_smoothed", _SPEED, 0x332288, causal=False, network="optional", one_of=_LATERAL,
-    ),
-    Spec(
-        "pd-hef:gain=1",
-        "pd-hef at a given residual gain, 0 to 1, with or without evidence (needs a network; not in all)",
-        "pd_hef:build", _INPUTS, 0x882255, in_all=False, network="residual",
-    ),
-    Spec(
-        "pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, unchanged (needs its network)",
-        "hybrid_paper:build", FEATURES, 0xCC6677, network="paper",
-    ),
+    Spec("zero", "sideslip 0; speed, yaw rate and lateral acceleration from the sensors",
+         "pass_through:build", _PLANAR, 0xF0E442),
+    Spec("zero:no-lateral", "the sensors passed through; claims no lateral velocity",
+         "pass_through:build", _PLANAR, 0xCC79A7),
+    Spec("kinematic", "leaky integral of a_y - v_x r", "kinematic:build", _PLANAR | {"ay_m_s2"}, 0x009E73),
+    Spec("open-loop", "nominal single-track model from steering and speed alone",
+         "open_loop:build", _INPUTS, 0xE69F00),
+    Spec(OPEN_LOOP, "open-loop on the car calibrated by its log, without ground truth: not causal",
+         "open_loop:build", _INPUTS, 0x661100, causal=False),
+    Spec("linear-regression", "sideslip linear in the network's features, low-passed at 2 Hz (needs such a model)",
+         "linear_regression:build", FEATURES, 0xDDCC77, network="linear_regression"),
+    Spec("phy-ukf", "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
+         "vehicle_ukf:build_nominal", _INPUTS, 0x0072B2),
+    Spec("physics", "best filter with physics only, with the model parts supported by driving data",
+         "adaptive_physics:build", _SPEED, 0x44AA99, one_of=_LATERAL),
+    Spec("phy-ukf:tuned", "phy-ukf with the noise of an identified car, corrected for body roll",
+         "vehicle_ukf:build_nominal", _INPUTS, 0x56B4E9, needs_noise=True),
+    Spec("pure-lstm", "a network that outputs v_y, without a filter (needs such a model)",
+         "direct_network:build", FEATURES, 0xAA4499, network="pure_lstm"),
+    Spec("pd-hef", "physics plus the residual of its network, with a gain by the car's evidence",
+         "pd_hef:build", _SPEED, 0xD55E00, network="optional", one_of=_LATERAL),
+    Spec("pd-hef:fixed-r", "pd-hef at gain 1 without the adaptive mechanism (needs a network)",
+         "pd_hef:build", _INPUTS, 0x117733, network="residual"),
+    Spec("pd-hef-smoothed", "pd-hef smoothed with later samples: not causal, ranked apart",
+         "pd_hef:build_smoothed", _SPEED, 0x332288, causal=False, network="optional", one_of=_LATERAL),
+    Spec("pd-hef:gain=1", "pd-hef at a residual gain from 0 to 1, with or without evidence (needs a network)",
+         "pd_hef:build", _INPUTS, 0x882255, group="", network="residual"),
+    Spec("pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, unchanged (needs its network)",
+         "hybrid_paper:build", FEATURES, 0xCC6677, network="paper"),
+    Spec("linear-kf", "peer: Kalman filter on the linear single track (Leanza et al. 2021)",
+         "peers.linear_kf:LinearKalman.build", _INPUTS, 0x7F7F7F, group=PEERS, one_of=_PLANAR_IMU),
+    Spec("linear-kf:open-loop", "peer: linear single track from steering and speed alone (Riekert and Schunck 1940)",
+         "peers.linear_kf:LinearKalman.build", _INPUTS, 0xBBBBBB, group=PEERS),
+    Spec("learned-single-track", "peer: single track with parameters learned from the yaw rate (openpilot's paramsd)",
+         "peers.learned_single_track:LearnedSingleTrack.build", _INPUTS | _PLANAR, 0x999933, group=PEERS),
+    Spec("slip-ukf", "peer: unscented Kalman filter over speed and sideslip with axle forces (Goblirsch et al. 2024)",
+         "peers.slip_ukf:SlipUkf.build", FEATURES, 0x6699CC, group=PEERS),
+    Spec("washout", "peer: kinematic with a leak to the stationary single track (Piyabongkarn et al. 2009)",
+         "peers.washout:Washout.build", FEATURES, 0x88CCEE, group=PEERS),
 )  # fmt: skip
 
 
@@ -251,30 +239,51 @@ def spec_of(name: str) -> Spec:
         return lines[name]
     given = options_of(name)
     alike = [s for s in lines.values() if preset_of(s.name) == preset_of(name) and given.keys() & options_of(s.name)]
-    return replace(alike[0], name=name, in_all=False)
+    return replace(alike[0], name=name, group="")
+
+
+def split_names(text: str) -> tuple[str, ...]:
+    """Split a comma-separated list of names; an option belongs to the name before it."""
+    names: list[str] = []
+    for part in filter(None, map(str.strip, text.split(","))):
+        if names and ":" in names[-1] and part.partition("=")[0] in OPTIONS.get(preset_of(names[-1]), ()):
+            names[-1] += f",{part}"
+        else:
+            names.append(part)
+    return tuple(names)
 
 
 def check_names(names: Sequence[str]) -> None:
-    """Raise UsageError for an unknown or repeated name, and for no names; :data:`ALL_ESTIMATORS` must be alone."""
-    if tuple(names) == (ALL_ESTIMATORS,):
-        return
-    presets = list(dict.fromkeys(preset_of(s.name) for s in all_specs()))
+    """Raise UsageError for an unknown or repeated name, an unknown option or value of a preset, and for no names."""
+    presets = [ALL_ESTIMATORS, PEERS, *dict.fromkeys(preset_of(s.name) for s in all_specs())]
     wrong = [n for n in names if preset_of(n) not in presets] + sorted({n for n in names if names.count(n) > 1})
     if wrong or not names:
         raise UsageError(
-            expected=f"{ALL_ESTIMATORS}, or estimators out of {', '.join(presets)}",
-            got=", ".join(wrong) or "none",
-            where="--estimators",
+            expected=f"estimators out of {', '.join(presets)}", got=", ".join(wrong) or "none", where="--estimators"
         )
-    check_options(names)
+    for name in names:
+        allowed, given = OPTIONS.get(preset_of(name), {}), options_of(name)
+        if ":" in name and not (given and all(k in allowed and _fits(v, allowed[k]) for k, v in given.items())):
+            texts = [k if limits is None else f"{k}={limits[0]:g}..{limits[1]:g}" for k, limits in allowed.items()]
+            expected = f"options of {preset_of(name)}: {', '.join(texts) or 'none'}"
+            raise UsageError(expected=expected, got=name, where="--estimators")
 
 
-def all_names(car: Car) -> tuple[str, ...]:
-    """Return the estimators of :data:`ALL_ESTIMATORS`: those that find all required parts in the car.
+def _fits(value: str, limits: tuple[float, float] | None) -> bool:
+    if limits is None:
+        return not value
+    try:
+        return limits[0] <= float(value) <= limits[1]
+    except ValueError:
+        return False
+
+
+def all_names(car: Car, group: str = ALL_ESTIMATORS) -> tuple[str, ...]:
+    """Return the estimators of a group: those that find all required parts in the car.
 
     Baselines and physics first, then estimators with a network.
     """
-    suited = [s for s in all_specs() if s.in_all and not s.missing(car)]
+    suited = [s for s in all_specs() if s.group == group and not s.missing(car)]
     return tuple(s.name for s in sorted(suited, key=lambda s: bool(s.network)))
 
 
@@ -294,14 +303,15 @@ def runnable(
 
     Parameters
     ----------
-    names : of estimators, or :data:`ALL_ESTIMATORS` alone. available : signals of the log.
+    names : of estimators and groups. available : signals of the log.
     refused : signals of the log that failed a check and are not used.
     """
     options = options or Options()
     options = replace(options, gnss=options.gnss and has_gnss(available))
     estimators: list[Estimator] = []
     skipped: list[Skipped] = []
-    for spec in map(spec_of, all_names(car) if tuple(names) == (ALL_ESTIMATORS,) else names):
+    named = (all_names(car, name) if name in (ALL_ESTIMATORS, PEERS) else (name,) for name in names)
+    for spec in map(spec_of, dict.fromkeys(chain.from_iterable(named))):
         lacking = spec.lacking(available)
         bad = sorted(_sources_of(lacking, refused))
         lacks = f"a check of {', '.join(bad)} failed" if bad else f"the log has no {', '.join(lacking)}"

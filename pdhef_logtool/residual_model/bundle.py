@@ -14,6 +14,7 @@ import numpy as np
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES
+from pdhef_logtool.residual_model.interface import ResidualModel
 from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
 from pdhef_logtool.storage.documents import read_json
 from pdhef_logtool.storage.files import PendingFile, open_new, writing
@@ -122,6 +123,12 @@ class ModelBundle:
         scaled = (features[:, self.columns] - np.array(n.feature_mean)) / np.array(n.feature_std)
         limited: FloatArray = np.clip(scaled, -8.0, 8.0)
         return limited
+
+    def service(self) -> ResidualModel:
+        """Return the network as a residual model."""
+        from pdhef_logtool.residual_model.service import NetworkService  # compiled code is imported on demand
+
+        return NetworkService(self)
 
     def _document(self) -> dict[str, Any]:
         other = {} if self.target == RESIDUAL else {"target": self.target}

@@ -13,9 +13,8 @@ import numpy as np
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, OUTPUT_COUNT, RESIDUAL, ModelBundle
 from pdhef_logtool.residual_model.forward_pass import SIDES, ForwardPass, NetworkState
+from pdhef_logtool.residual_model.interface import LIMITS, Residual
 
-#: Limits of residuals, m/s² and rad/s².
-LIMITS = (4.0, 6.0)
 _LIMITS_OF = {RESIDUAL: LIMITS, LATERAL_VELOCITY: (30.0,)}  # m/s
 
 
@@ -61,6 +60,11 @@ class NetworkService:
         target_std = np.array(self.bundle.normalisation.target_std)
         limits = np.array(_LIMITS_OF[self.bundle.target])
         return np.clip(out * target_std, -limits, limits), carry
+
+    def residual(self, features: FloatArray, dt_s: FloatArray, state: NetworkCarry) -> tuple[Residual, NetworkCarry]:
+        """Return the residual of consecutive steps (see :class:`~.interface.ResidualModel`)."""
+        rate, after = self.run(features, np.isnan(dt_s), state)
+        return Residual(rate, np.zeros_like(rate), np.ones(len(rate))), after
 
     def _sequence(self, scaled: FloatArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkState]:
         both = np.zeros((len(scaled), SIDES, scaled.shape[1]), dtype=np.float32)

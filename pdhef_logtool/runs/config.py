@@ -17,10 +17,11 @@ from pdhef_logtool.car.names import NO_INTERVALS, SHIPPED_CARS, UNSURE
 from pdhef_logtool.car.vehicle import SENSOR_PROFILES
 from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.drive.options import ReadOptions, parse_time
-from pdhef_logtool.estimators.presets import split_names
+from pdhef_logtool.estimators.table import check_names, split_names
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
+from pdhef_logtool.residual_model.interface import plug_in_names
 from pdhef_logtool.storage.documents import read_toml, validated
 
 _FILES = ("car", "cars", "mapping", "msgs", "plan", "network", "intervals", "setup", "sensor_profile")
@@ -81,7 +82,7 @@ class RunConfig:
     msgs : folder, zip file or wheel with .msg files of types that a log does not define; or a DBC file, or a folder of
         them, for raw CAN frames in BLF, ASC and MDF files.
     plan : validation plan (plan.toml); None = the default plan, which decides no exit code.
-    network : network folder, ``default`` or ``none``; None = the car's.
+    network : network folder, ``default``, ``none`` or the name of an installed residual model; None = the car's.
     intervals : intervals file, ``none``, or ``unsure`` (wide intervals, for a car that may have changed); None = the
         car's.
     calibrate : calibration of a car without validation data, without ground truth: per ``log``, ``online`` on what the
@@ -188,8 +189,6 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
     for where, entries in ((str(path), raw), ("options", {**raw, **given})):
         config = validated(RunConfig, entries, where, UsageError, expected="the entries of pdhef.toml")
     if config.estimators is not None:
-        from pdhef_logtool.estimators.table import check_names  # inspect takes none, and no compiler
-
         check_names(config.estimators)
     if config.setup is not None and config.setup_from_s is not None:
         raise UsageError(expected="--setup or --setup-from", got="both", where="--setup")
@@ -238,5 +237,6 @@ def _read_file(path: Path) -> dict[str, Any]:
     for key in _FILES:
         value = raw.get(key)
         if isinstance(value, str):
-            raw[key] = Path(value) if value in _KEYWORDS.get(key, ()) else path.parent / value
+            is_name = value in _KEYWORDS.get(key, ()) or (key == "network" and value in plug_in_names())
+            raw[key] = Path(value) if is_name else path.parent / value
     return raw

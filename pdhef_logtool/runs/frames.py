@@ -60,7 +60,7 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     Parameters
     ----------
     drive : of :func:`~pdhef_logtool.drive.reading.read_drive`. names : of estimators; None = those that a run
-        takes; ``["all"]`` = every one that the car suits.
+        takes; ``["all"]`` or ``["peers"]`` = those that the car suits.
 
     Raises
     ------

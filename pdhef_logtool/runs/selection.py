@@ -32,8 +32,8 @@ SIMPLE = ("open-loop", "open-loop:calibrated", "phy-ukf", "physics")
 #: The two tests: lateral consistency within this factor of the lowest one, yaw consistency within the other. On
 #: simulated drives with right and wrong files this selection has the lowest error (docs/method.md#selection).
 FACTOR, YAW_FACTOR = 1.2, 3.0
-#: Its lateral figure is meaningless, because it integrates the residual that ``d2`` measures.
-_NOT_JUDGED = "kinematic"
+#: Their lateral figures are meaningless, because they integrate the residual that ``d2`` measures.
+_NOT_JUDGED = ("kinematic", "slip-ukf", "washout")
 #: Longest driving before a choice on line that decides it.
 _LOOK_BACK_NS = 3600 * 10**9
 #: The baseline of every score. It needs the fewest signals and cannot drift; ``kinematic`` follows the accelerometer's
@@ -59,7 +59,7 @@ def contradiction(rows: Iterable[MetricRow], name: str = PREFERRED) -> Contradic
     """
     d2, yaw = _figures(rows)
     explain = [n for n, value in yaw.items() if n in d2 and value <= YAW_FACTOR * min(yaw.values())]
-    best = min((n for n in explain if n not in (name, _NOT_JUDGED)), key=lambda n: d2[n], default=None)
+    best = min((n for n in explain if n not in (name, *_NOT_JUDGED)), key=lambda n: d2[n], default=None)
     if name not in d2 or best is None:
         return None
     if d2[name] <= FACTOR * d2[best] and (name in explain or name not in yaw):
@@ -120,7 +120,7 @@ def choose_main(names: Sequence[str], rows: Iterable[MetricRow], *, proven: bool
         name = against.best
     elif proven:
         chosen_by, why = "evidence", "driving with ground truth has validated this car"
-    elif name != "kinematic" and any(r.metric == "d2" and r.estimator == name for r in rows):
+    elif name not in _NOT_JUDGED and any(r.metric == "d2" and r.estimator == name for r in rows):
         chosen_by, why = "d2", "no simple estimator agrees better with the sensors"
     else:
         chosen_by, why = "order", "the best that the log's signals allow"

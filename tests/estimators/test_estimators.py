@@ -474,7 +474,7 @@ def test_an_estimator_runs_on_what_it_needs_alone(name, plain):
 def test_what_cannot_run_is_skipped_with_the_reason():
     estimators, skipped = runnable(NAMES, car_of(), frozenset({"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"}))
     assert [e.name for e in estimators] == ["zero", "zero:no-lateral", "kinematic", "physics"]
-    assert [s.name for s in skipped] == ["open-loop", *(name for name in FILTERS if name != "physics")]
+    assert [s.name for s in skipped] == [s.name for s in map(spec_of, NAMES) if "steer_rad" in s.needs]
     assert all("steer_rad" in s.reason and "speed_m_s" not in s.reason for s in skipped)
     assert runnable(NAMES, car_of(), frozenset(ALIGNED_SIGNALS))[1] == []
     skipped = runnable(NAMES, Car.of(VEHICLE), frozenset(ALIGNED_SIGNALS))[1]

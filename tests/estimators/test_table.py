@@ -28,8 +28,11 @@ from pdhef_logtool.estimators.base import LookingAhead
 from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_filter import FILE_LAG, PHYSICS_Q_STD
-from pdhef_logtool.estimators.presets import OPEN_LOOP, OPTIONS, options_of, preset_of, split_names
+from pdhef_logtool.estimators.presets import OPEN_LOOP, options_of, preset_of
 from pdhef_logtool.estimators.table import (
+    ALL_ESTIMATORS,
+    OPTIONS,
+    PEERS,
     SPECS,
     Options,
     all_names,
@@ -38,6 +41,7 @@ from pdhef_logtool.estimators.table import (
     make_estimator,
     runnable,
     spec_of,
+    split_names,
 )
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
@@ -89,7 +93,7 @@ def test_a_line_builds_what_it_says(spec: Any) -> None:
     assert (estimator.name, estimator.causal) == (spec.name, spec.causal)
     assert isinstance(estimator, LookingAhead) == (not spec.causal)
     assert spec_of(spec.name) is spec
-    assert (spec.name in all_names(CAR)) == spec.in_all
+    assert (spec.name in all_names(CAR)) == (spec.group == ALL_ESTIMATORS)
     assert spec.needs <= frozenset(ALIGNED_SIGNALS)
 
 
@@ -136,7 +140,7 @@ def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec: Any) -> None:
         assert "--network" in skipped[0].reason or "noise.toml" in skipped[0].reason
         with pytest.raises(UsageError, match=spec.name):
             make_estimator(spec.name, Car.of(VEHICLE))
-    assert (spec.name in all_names(Car.of(VEHICLE))) == (spec.in_all and not lacks)
+    assert (spec.name in all_names(Car.of(VEHICLE))) == (spec.group == ALL_ESTIMATORS and not lacks)
 
 
 def test_physics_runs_on_any_car_and_without_a_fit_it_has_no_part() -> None:
@@ -165,7 +169,7 @@ def test_tuned_noise_keeps_the_axle_forces_noise_of_the_fit() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("physics-plus", r"expected all, or estimators out of zero, kinematic, open-loop, .*, got physics-plus$"),
+        ("physics-plus", r"expected estimators out of all, peers, zero, kinematic, open-loop, .*, got physics-plus$"),
         ("pd-hef:trust=1", r"expected options of pd-hef: gain=0\.\.1, fixed-r, got pd-hef:trust=1$"),
         ("pd-hef:gain", "got pd-hef:gain$"),
         ("pd-hef:gain=2", "got pd-hef:gain=2$"),
@@ -180,12 +184,22 @@ def test_an_unknown_name_or_option_is_answered_with_those_that_exist(name: str, 
         check_names(("zero", name))
 
 
-def test_ten_presets() -> None:
-    assert len({preset_of(s.name) for s in SPECS}) == 10
+def test_the_options_of_the_presets_are_those_of_the_entries() -> None:
     variants = {
         preset: {o for s in SPECS if preset_of(s.name) == preset for o in options_of(s.name)} for preset in OPTIONS
     }
     assert variants == {preset: set(options) for preset, options in OPTIONS.items()}
+
+
+def test_a_group_names_its_estimators_and_each_runs_once() -> None:
+    everything = frozenset(ALIGNED_SIGNALS)
+    peers = [s.name for s in SPECS if s.group == PEERS]
+    assert [e.name for e in runnable((PEERS,), CAR, everything)[0]] == peers
+    check_names(("linear-kf", "physics", PEERS))
+    named, _ = runnable(("linear-kf", "physics", PEERS), CAR, everything)
+    assert [e.name for e in named] == ["linear-kf", "physics", *(n for n in peers if n != "linear-kf")]
+    both, _ = runnable((ALL_ESTIMATORS, PEERS), CAR, everything)
+    assert [e.name for e in both] == [*all_names(CAR), *peers]
 
 
 def test_options_of_a_name_are_combined() -> None:

@@ -103,9 +103,11 @@ def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) ->
     jsonschema.validate(run, load_schema("run.schema.json"))
     assert run["logs"][0]["outcome"] == "ok"
     names = [e["name"] for e in report["estimators"]]
-    plain = [s.name for s in SPECS if s.in_all and not s.network and not s.needs_noise and s.name != OPEN_LOOP]
+    plain = [s.name for s in SPECS if s.group == "all" and not s.network and not s.needs_noise and s.name != OPEN_LOOP]
     assert names[: len(plain)] == plain
-    assert set(names[len(plain) :]) <= {s.name for s in SPECS if s.network and s.in_all}  # where a network is shipped
+    assert set(names[len(plain) :]) <= {
+        s.name for s in SPECS if s.network and s.group == "all"
+    }  # where a network is shipped
     assert not set(names) & {s.name for s in SPECS if s.needs_noise}  # the file is not an identified one
     assert names == list(all_names(Car.load(sample_logs_dir / "vehicle.toml")))
 

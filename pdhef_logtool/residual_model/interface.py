@@ -1,0 +1,124 @@
+"""Interface of residual models: from the features of the parallel filter to residual rates (Eq 8–10, 18).
+
+A filter adds gain · rate to v̇_y and ṙ of its sigma points (Eq 19). The features are those of :mod:`~.features`, in
+training and in service. Another package adds a model by an entry point of the group :data:`ENTRY_POINTS` that names an
+object with this interface; ``--network NAME`` selects it (docs/estimators.md#residual-models).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.records.signals import FloatArray
+
+ENTRY_POINTS = "pdhef.residual_models"
+#: Limits of the rates of v_y and r, m/s² and rad/s².
+LIMITS = (4.0, 6.0)
+
+
+class Residual(NamedTuple):
+    """Residual of the model from each step on: rates of v_y and r [K, 2], m/s² and rad/s², with their 1-sigma [K, 2].
+
+    ``gain`` : [K], 1 inside the region of validity of the model, 0 outside.
+    """
+
+    rate: FloatArray
+    std: FloatArray
+    gain: FloatArray
+
+    @classmethod
+    def zero(cls, count: int) -> Residual:
+        """Return no residual for ``count`` steps."""
+        return cls(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count))
+
+
+class ResidualModel(Protocol):
+    """A model of the residual; ``sha256`` identifies everything that decides its outputs."""
+
+    @property
+    def sha256(self) -> str:
+        """Digest of the model."""
+
+    def residual(self, features: FloatArray, dt_s: FloatArray, state: Any) -> tuple[Residual, Any]:
+        """Return the residual of consecutive steps and the state for the next ones.
+
+        The result must not depend on how the steps are divided into calls, and may not depend on later steps.
+
+        Parameters
+        ----------
+        features : [K, 15] over :data:`~.features.FEATURES`; a row with NaN has no residual.
+        dt_s : [K], duration before each step; NaN where a sequence starts.
+        state : of the step before the first; None at the start of a drive.
+        """
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlugInModel:
+    """A residual model of another package in place of a network."""
+
+    name: str
+    plug_in: ResidualModel
+    model: str = "physics"
+    pure_lstm: None = None
+    linear_regression: None = None
+    paper_network: None = None
+
+    @property
+    def sha256(self) -> str:
+        """Digest of the model."""
+        return self.plug_in.sha256
+
+    def service(self) -> ResidualModel:
+        """Return the model."""
+        return self.plug_in
+
+
+@cache
+def plug_in_names() -> tuple[str, ...]:
+    """Return the names of the models that installed packages add."""
+    return tuple(sorted(entry.name for entry in entry_points(group=ENTRY_POINTS)))
+
+
+def load_plug_in(name: str) -> PlugInModel:
+    """Return the model of an entry point.
+
+    Raises
+    ------
+    ModelError
+        It cannot be loaded, or lacks the interface.
+    """
+    (entry, *_) = (e for e in entry_points(group=ENTRY_POINTS) if e.name == name)
+    where = f"entry point {entry.name} = {entry.value} ({ENTRY_POINTS})"
+    expected = "a residual model with sha256 and residual(features, dt_s, state)"
+    try:
+        loaded = entry.load()
+        sha256, has_method = loaded.sha256, callable(loaded.residual)
+    except (Exception, SystemExit) as error:
+        raise ModelError(expected=expected, got=f"{type(error).__name__}: {error}", where=where) from error
+    if not has_method or not isinstance(sha256, str):
+        raise ModelError(expected=expected, got=type(loaded).__name__, where=where)
+    return PlugInModel(name, loaded)
+
+
+def checked_residual(residual: Any, count: int) -> Residual:
+    """Return a model's output within :data:`LIMITS`.
+
+    Raises
+    ------
+    ValueError
+        Its shapes or values are wrong.
+    """
+    rate, std, gain = (np.asarray(column, dtype=np.float64) for column in residual)
+    if rate.shape != (count, 2) or std.shape != (count, 2) or gain.shape != (count,):
+        raise ValueError(
+            f"expected rate and std [{count}, 2] and gain [{count}], got {rate.shape}, {std.shape}, {gain.shape}"
+        )
+    if not (np.isfinite(rate).all() and np.isfinite(std).all() and np.all((gain >= 0.0) & (gain <= 1.0))):
+        raise ValueError("expected finite rates and a gain of 0 to 1, got other values")
+    return Residual(np.clip(rate, np.negative(LIMITS), LIMITS), std, gain)
