@@ -167,7 +167,7 @@ def update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
     """Update x [n], P [n, n] in place with the channels of ``use`` (bool [m]).
 
     ν [m] is the innovation, S [m, m] its covariance with R, P_xz [m, n]. With S = Λ Λᵀ and G = Λ⁻¹ P_xz, the gain is
-    never formed: x += Gᵀ Λ⁻¹ ν, P −= Gᵀ G. The rows of P_xz become G.
+    never formed: x += Gᵀ Λ⁻¹ ν, P −= Gᵀ G.
 
     Returns
     -------

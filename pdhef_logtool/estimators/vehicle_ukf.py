@@ -479,7 +479,8 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
     z_hat, nu, at_gate = np.zeros(READINGS), np.zeros(READINGS), np.zeros(READINGS)
     given, use = np.zeros(READINGS, np.bool_), np.zeros(READINGS, np.bool_)
     q_std = q_std.copy()
-    force_std, steer_std = q_std[FRONT] if layout.forces >= 0 else 0.0, q_std[bias]
+    front_std, rear_std = (q_std[FRONT], q_std[REAR]) if layout.forces >= 0 else (0.0, 0.0)
+    steer_std = q_std[bias]
     for k in range(window.dt_s.shape[0]):
         m = memory[0]
         was_unknown = bias >= 0 and m.runs > 0.0 and m.steer_age > rules.steer_hold_s
@@ -502,7 +503,7 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
             over, rate, f = held_over_step(now, m), (m.rate_vy, m.rate_r), car
             if layout.forces >= 0 and rules.limit_gain > 0.0:
                 factor, f = yield_to_kinematics(x, over.friction, now.dt, rules, p, f, m)
-                q_std[FRONT], q_std[REAR] = factor * force_std, factor * force_std
+                q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             process_noise(q_std, over.ax_known, now.dt, layout, q)
             cholesky(P, L)
             if linked:

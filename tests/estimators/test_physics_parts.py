@@ -64,6 +64,14 @@ def test_beyond_the_linear_range_kinematics_count_more():
     np.testing.assert_array_equal(plain, yields)
 
 
+def test_each_axle_keeps_its_own_noise_beyond_the_linear_range():
+    """A vanishing gain changes nothing."""
+    signals = with_noise(drive(slalom(0.09, 0.5), 3.0).signals, 1)
+    physics = VehicleUkf(vehicle(), q_std=(*PHYSICS_Q_STD[:4], 0.2, 2.0))
+    plain, yields = (f.run(signals, None)[0].P for f in (physics, replace(physics, limit_gain=1e-12)))
+    np.testing.assert_allclose(plain, yields, rtol=1e-6, atol=1e-12)
+
+
 def test_a_file_that_nothing_has_validated_yields_at_the_limit():
     """Its tyres are half as stiff as the car's. In the linear range it is the filter of a car without lag."""
     oracle = Oracle(parts("lag", "roll"))
