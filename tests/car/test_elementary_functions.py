@@ -1,4 +1,4 @@
-"""Arctangent and sine of inner loops against those of the C library."""
+"""Arctangent and sine of inner loops against the C library."""
 
 from __future__ import annotations
 

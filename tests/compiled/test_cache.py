@@ -286,7 +286,8 @@ import numpy as np
 from pdhef_logtool.car.nominal_model import model_parameters
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.vehicle_model import NOMINAL, __file__, planar_ay
-print(__file__, planar_ay(np.array([20.0, 0.1, 0.2, 0.0]), 0.05, 0.9, 0.0, NOMINAL, model_parameters(default_vehicle())))
+state = np.array([20.0, 0.1, 0.2, 0.0])
+print(__file__, planar_ay(state, 0.05, 0.9, 0.0, NOMINAL, model_parameters(default_vehicle())))
 """
 _CALLEE, _LINE = "pdhef_logtool/car/nominal_model.py", "    return w * ay + (1.0 - w) * vx * r"
 

@@ -305,16 +305,6 @@ def test_a_car_that_does_not_lean_has_the_load_transfer_of_its_acceleration():
     np.testing.assert_allclose(moved(v, x, over, 0.01)[:6], moved(flat, x, over, 0.01)[:6])
 
 
-@every_set
-def test_left_is_right_in_a_mirror(names):
-    oracle = Oracle(parts(*names), imu=(0.4, 0.0))
-    x, v = state_of(oracle, 0.04, -2.0, 0.8), oracle.as_vehicle()
-    sign = np.where(np.isin(names_of(oracle.has), ["vx", "b_ax", "s"]), 1.0, -1.0)
-    one = moved(v, x, HeldInputs(0.04, -2.0, True, 0.8), 0.01)
-    other = moved(v, sign * x, HeldInputs(-0.04, -2.0, True, 0.8), 0.01)
-    np.testing.assert_allclose(other, sign * one, rtol=1e-12, atol=1e-14)
-
-
 @pytest.mark.parametrize("speed", [25.0, 2.2])
 @every_set
 def test_the_sensors_read_what_the_equations_say(names, speed):
