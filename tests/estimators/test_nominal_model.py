@@ -141,6 +141,17 @@ def test_one_millisecond_needs_no_division_on_the_road():
     assert nominal_model.substeps(25.0, 0.3, FRICTION, P) > 1
 
 
+@pytest.mark.parametrize("mu", [0.2, 0.85, 1.1])
+@pytest.mark.parametrize("front", [True, False])
+def test_a_reference_friction_keeps_the_stiffness_and_scales_the_peak(front, mu):
+    tyres = Tyres(**{name: tyre.model_copy(update={"reference_friction": 0.85}) for name, tyre in SEDAN.tyres})
+    car = SEDAN.model_copy(update={"tyres": tyres})
+    assert car.cornering_stiffness_n_per_rad(front, mu) == pytest.approx(
+        SEDAN.cornering_stiffness_n_per_rad(front, 0.85)
+    )
+    assert car.magic_formula(front, mu)[2] == pytest.approx(mu / 0.85 * SEDAN.magic_formula(front, 0.85)[2])
+
+
 @exact
 @given(st.floats(0.05, 2.0), st.booleans())
 def test_tyre_known_by_its_stiffness(mu, front):
