@@ -1,4 +1,4 @@
-"""The model of ``physics`` in plain Python, from the equations at the head of ``physics_model``, and drives of it.
+"""The model of ``physics`` in plain Python, from the equations at the head of ``vehicle_model``, and drives of it.
 
 It shares no code with the compiled model, nor its integration steps, sigma points or order of evaluation.
 """
@@ -47,7 +47,8 @@ def names_of(has: PhysicsParts) -> list[str]:
         (has.roll, ["phi", "phi_dot"]),
         (has.bank, ["bank"]),
         (has.force_scale, ["s"]),
-        (has.biases, ["b_delta", "b_ay", "b_r"]),
+        (True, ["b_delta"]),
+        (has.biases, ["b_ay", "b_r"]),
     ):
         names += entries if part else []
     return names

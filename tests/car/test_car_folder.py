@@ -43,8 +43,8 @@ from pdhef_logtool.car.parts import (
 from pdhef_logtool.car.store import Change, check_output, update_car
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters, default_vehicle
-from pdhef_logtool.estimators.physics_filter import of_car
 from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.estimators.vehicle_ukf import of_car
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
 from pdhef_logtool.storage import outputs

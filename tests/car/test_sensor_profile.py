@@ -15,9 +15,9 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import SENSOR_PROFILES, Sensors, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.kinematic import Kinematic
 from pdhef_logtool.estimators.pass_through import PassThrough
-from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
 from pdhef_logtool.estimators.sensor_faults import find_faults
 from pdhef_logtool.estimators.speed_slip import without_slip
+from pdhef_logtool.estimators.vehicle_ukf import nominal_filter
 from pdhef_logtool.records import reasons
 from pdhef_logtool.records.errors import VehicleError
 from pdhef_logtool.records.signals import Signals
@@ -108,7 +108,7 @@ def test_speed_and_steering_are_kept_for_the_times_of_the_profile(clean: Signals
     lost = masked(clean, "steer_rad", t > 4.0)
 
     def steered_s(**sensors: float) -> float:
-        steps, _ = PhysicsUkf(vehicle(**sensors)).run(lost, None)
+        steps, _ = nominal_filter(vehicle(**sensors)).run(lost, None)
         return float(t[steps.valid].max())
 
     assert steered_s() == pytest.approx(4.2, abs=0.02)
@@ -129,7 +129,7 @@ def test_a_standstill_has_the_speed_and_the_yaw_rate_of_the_profile() -> None:
     offset = replace(parked, yaw_rate_rad_s=parked.yaw_rate_rad_s + 0.08)
 
     def still(signals: Signals, **sensors: float) -> bool:
-        steps, _ = PhysicsUkf(vehicle(**sensors)).run(signals, None)
+        steps, _ = nominal_filter(vehicle(**sensors)).run(signals, None)
         return bool((steps.x[-100:, 0] == 0.0).any())
 
     assert not still(parked)

@@ -249,7 +249,7 @@ def test_the_code_of_other_sources_of_this_installation_is_removed_and_no_other(
 def test_what_compiled_code_is_made_of() -> None:
     names = {p.relative_to(_ROOT).as_posix() for p in sources.compiled_sources()}
     assert {
-        "pdhef_logtool/estimators/physics_filter.py",
+        "pdhef_logtool/estimators/vehicle_ukf.py",
         "truthsim/motion.py",
         "truthsim/tyres.py",
     } <= names
@@ -285,12 +285,10 @@ _USE = """
 import numpy as np
 from pdhef_logtool.car.nominal_model import model_parameters
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.parallel_physics import __file__, _nominal_ay
-ay = np.zeros(1)
-_nominal_ay(np.array([[20.0, 0.1, 0.2, 0.0]]), np.full((1, 5), 0.05), model_parameters(default_vehicle()), ay)
-print(__file__, ay[0])
+from pdhef_logtool.estimators.vehicle_model import NOMINAL, __file__, planar_ay
+print(__file__, planar_ay(np.array([20.0, 0.1, 0.2, 0.0]), 0.05, 0.9, 0.0, NOMINAL, model_parameters(default_vehicle())))
 """
-_CALLEE, _LINE = "pdhef_logtool/car/nominal_model.py", "    return (1.0 + p.ay_roll_gain) * ay"
+_CALLEE, _LINE = "pdhef_logtool/car/nominal_model.py", "    return w * ay + (1.0 - w) * vx * r"
 
 
 def _used(python: str | Path, **environment: str) -> tuple[Path, float]:

@@ -9,19 +9,18 @@ import pytest
 from reference_car import drive, rolling_drive, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.filter_base import U_SPEED
 from pdhef_logtool.estimators.kinematic import Kinematic
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.open_loop import OpenLoop
-from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.speed_slip import TIMEOUT_S, without_slip
+from pdhef_logtool.estimators.vehicle_ukf import U_SPEED, VehicleUkf, nominal_filter
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import Signals
 
 VEHICLE = default_vehicle()
 SENSORS = VEHICLE.sensors
-ESTIMATORS = (Kinematic(), OpenLoop(VEHICLE), PhysicsUkf(VEHICLE), PhysicsFilter(VEHICLE))
+FILTERS = (nominal_filter(VEHICLE), VehicleUkf(VEHICLE))
+ESTIMATORS = (Kinematic(), OpenLoop(VEHICLE), *FILTERS)
 
 
 def start_and_stop(t: np.ndarray) -> np.ndarray:
@@ -78,12 +77,12 @@ def test_spinning_wheels_are_not_believed(good, size):
     assert np.nanmax(np.abs(dead_reckoned - good.vx)) < 2.0
 
 
-@pytest.mark.parametrize("name", range(len(ESTIMATORS)))
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: e.name)
 @pytest.mark.slow
-def test_all_estimators_heed_it_and_can_do_without(good, name):
+def test_all_estimators_heed_it_and_can_do_without(good, estimator):
     slipping = replace(good.signals, speed_m_s=good.signals.speed_m_s + spin(good.time_s))
-    gated = run_window(ESTIMATORS[name], slipping)[0]
-    plain = run_window(replace(ESTIMATORS[name], slip_gate=False), slipping)[0]
+    always = replace(estimator, slip_gate=False)
+    gated, plain = (run_window(e, slipping)[0] for e in (estimator, always))
 
     def worst(track):
         return np.nanmax(np.abs(track.vx_m_s - good.vx)[good.time_s > 0.5])
@@ -91,10 +90,7 @@ def test_all_estimators_heed_it_and_can_do_without(good, name):
     assert worst(gated) < 1.5
     assert worst(plain) > 5.0
     assert gated.valid.sum() >= plain.valid.sum()
-    same = run_window(ESTIMATORS[name], good.signals)[0]
-    np.testing.assert_array_equal(
-        same.vy_m_s, run_window(replace(ESTIMATORS[name], slip_gate=False), good.signals)[0].vy_m_s
-    )
+    np.testing.assert_array_equal(*(run_window(e, good.signals)[0].vy_m_s for e in (estimator, always)))
 
 
 def test_locked_wheels_are_not_believed_however_long_it_takes():
@@ -109,7 +105,7 @@ def test_locked_wheels_are_not_believed_however_long_it_takes():
     assert np.isnan(out[sliding & np.isfinite(locked.speed_m_s)]).all()
     stands = made.time_s > 14.0
     np.testing.assert_array_equal(out[stands], locked.speed_m_s[stands])
-    track = run_window(PhysicsUkf(VEHICLE), locked)[0]
+    track = run_window(FILTERS[0], locked)[0]
     assert np.abs(track.vx_m_s - made.vx)[sliding].max() < 1.0
     assert np.abs(track.vx_m_s[-100:]).max() < 0.02
 
@@ -191,9 +187,9 @@ def test_nothing_is_seen_ahead(good, first):
     np.testing.assert_array_equal(believed(later)[:first], whole[:first])
 
 
-@pytest.mark.parametrize("maker", [PhysicsUkf, PhysicsFilter])
+@pytest.mark.parametrize("estimator", FILTERS, ids=lambda e: e.name)
 @pytest.mark.slow
-def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(maker, good):
+def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(estimator, good):
     """The accelerometer says braking, the speed sensor falls silent: v_x runs below zero."""
     silent = good.time_s > 9.0
     signals = without_impossible(good.signals)
@@ -202,7 +198,6 @@ def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(maker, g
         speed_m_s=np.where(silent, np.nan, signals.speed_m_s),
         ax_m_s2=np.where(silent, -4.0, signals.ax_m_s2),
     )
-    estimator = maker(VEHICLE)
     steps, _ = estimator.run(signals, None)
     back = steps.x[:, 0] < 0.0
     assert back[-500:].all()

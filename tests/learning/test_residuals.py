@@ -13,8 +13,7 @@ from physics_oracle import Oracle, parts
 from reference_car import Drive
 from residual_car import CAR, FRICTION, START_NS, Measured, Motion, Wave, drive, pick, truth_of, window
 
-from pdhef_logtool.estimators.parallel_physics import parallel_filter
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, nominal_filter
 from pdhef_logtool.learning.network.dataset import DriveArrays
 from pdhef_logtool.learning.network.residuals import (
     ResidualRows,
@@ -48,7 +47,7 @@ def noisy(motion: Motion) -> Measured:
 
 def rows_of(made: Measured, half_window: int = 0, **changes: float) -> ResidualRows:
     car = CAR.model_copy(update=changes)
-    return residual_rows(made.signals, made.truth, parallel_filter(car), period_s=0.01, half_window=half_window)
+    return residual_rows(made.signals, made.truth, nominal_filter(car), period_s=0.01, half_window=half_window)
 
 
 def rates(rows: ResidualRows) -> np.ndarray:
@@ -231,7 +230,7 @@ def test_physics_of_the_car_lacks_nothing_and_a_force_that_it_does_not_know_come
     """Drive the oracle's car by its equations; with 10 % less grip, the model lacks a force in proportion to a_y."""
     oracle = Oracle(parts(*names))
     made = oracle.drive(lambda t: 0.03 * np.sin(3.0 * t), 6.0)
-    physics = PhysicsFilter(oracle.as_vehicle())
+    physics = VehicleUkf(oracle.as_vehicle())
     window_ = oracle_window(oracle, made)
     right = rates(residual_rows(window_.signals, window_.truth, physics, period_s=0.01))
     late = slice(100, -1)
@@ -250,7 +249,7 @@ def test_an_offset_of_the_steering_angle_is_no_residual() -> None:
     made = oracle.drive(lambda t: 0.02 * np.sin(3.0 * t), 12.0)
     off = made.signals.steer_rad + 0.002
     whole = oracle_window(oracle, made, steer_rad=off)
-    rows = residual_rows(whole.signals, whole.truth, PhysicsFilter(oracle.as_vehicle()), period_s=0.01)
+    rows = residual_rows(whole.signals, whole.truth, VehicleUkf(oracle.as_vehicle()), period_s=0.01)
     use = rows.weight > 0
     arrays = DriveArrays(
         rows.stamps_ns[use],

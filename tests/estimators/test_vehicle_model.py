@@ -1,0 +1,348 @@
+"""The models of the vehicle filter against an ODE in plain Python, the nominal model and closed forms."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from physics_oracle import ALL_PARTS, CG_HEIGHT_M, TRACK_M, G, Oracle, names_of, parts, vehicle
+from reference_car import FRICTION, FRONT_M, MASS_KG, REAR_M, WHEELBASE_M, magic_tyre
+
+from pdhef_logtool.car import nominal_model
+from pdhef_logtool.car.nominal_model import model_parameters
+from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.estimators.vehicle_model import (
+    AX_BIAS,
+    CORE,
+    LANES,
+    NOMINAL,
+    PLACES,
+    READINGS,
+    VX,
+    VY,
+    WIDTH,
+    YAW_RATE,
+    Z_AY,
+    Z_SPEED,
+    Z_YAW_RATE,
+    Layout,
+    advance,
+    grip_under_braking,
+    layout_of,
+    physics_parameters,
+    planar_ay,
+    push,
+    read,
+    settle_forces,
+    step_count,
+)
+from pdhef_logtool.estimators.vehicle_ukf import HeldInputs
+
+pytestmark = pytest.mark.slow
+
+#: Sets of parts under test: none, each alone, some that interact, all.
+SETS = ((), *((name,) for name in ALL_PARTS), ("lag", "roll"), ("lag", "load_transfer", "biases"), ALL_PARTS)
+every_set = pytest.mark.parametrize("names", SETS, ids="+".join)
+IMU = (0.4, -0.2)
+TOLERANCE = 1e-12
+ENTRIES = {"vx": 25.0, "vy": 0.2, "r": 0.1, "b_ax": 0.1, "ff": 1.5, "fr": 1.0, "phi": 0.03, "phi_dot": -0.1}
+ENTRIES |= {"bank": 0.03, "s": 0.06, "b_delta": 0.002, "b_ay": 0.1, "b_r": 0.003}
+
+
+def state_of(oracle: Oracle, steer: float, ax: float, mu: float, **changes: float) -> np.ndarray:
+    x = np.array([(ENTRIES | changes)[name] for name in names_of(oracle.has)])
+    return x if oracle.has.lag else oracle.settled(x, steer, ax, mu)
+
+
+def models(v: VehicleParameters) -> tuple[Layout, Any, Any]:
+    return layout_of(v), model_parameters(v), physics_parameters(v)
+
+
+def block_of(layout: Layout, states: np.ndarray) -> np.ndarray:
+    """Return a block [PLACES, WIDTH] with states [k, n] in its first columns, and the first state in the rest."""
+    block = np.zeros((PLACES, WIDTH))
+    block[layout.places] = states[0][:, None]
+    block[layout.places, : len(states)] = states.T
+    return block
+
+
+def moved(v: VehicleParameters, x: np.ndarray, over: HeldInputs, dt: float) -> np.ndarray:
+    """Return the state after one call of the compiled model, which leaves the columns behind the first LANES alone."""
+    layout, p, f = models(v)
+    x = np.append(x, np.zeros(layout.size - len(x)))
+    block = block_of(layout, x[None])
+    advance(block.ravel(), LANES, over, dt, layout, p, f)
+    states = block[layout.places]
+    np.testing.assert_array_equal(states[:, :LANES], np.tile(states[:, :1], LANES))
+    np.testing.assert_array_equal(states[:, LANES], x)
+    return states[:, 0]
+
+
+def readings_of(v: VehicleParameters, x: np.ndarray, steer: float) -> np.ndarray:
+    layout, p, f = models(v)
+    readings = np.zeros((READINGS, WIDTH))
+    read(block_of(layout, x[None]).ravel(), 1, steer, FRICTION, 0.0, layout, p, f, readings.ravel())
+    return readings[:, 0]
+
+
+def settled(v: VehicleParameters, x: list[float], steer: float, ax: float = 0.0) -> np.ndarray:
+    layout, p, f = models(v)
+    state = np.append(x, np.zeros(layout.size - len(x)))
+    settle_forces(state, steer, ax, FRICTION, layout, p, f)
+    return state
+
+
+# --- without axle forces: the nominal model --------------------------------------------------------------------------
+
+SEDAN = default_vehicle().model_copy(
+    update={"imu_position_m": (0.4, -0.3, 0.0), "roll_gradient_rad_per_m_s2": 0.009, "low_speed_blend_m_s": 4.0}
+)
+STIFF = AxleTyre(cornering_stiffness_n_per_rad=105_000.0), AxleTyre(cornering_stiffness_n_per_rad=96_000.0)
+ONE_FRICTION = (
+    AxleTyre(B=11.1, C=1.05, D_n=7991.0, E=-0.51, reference_friction=0.85),
+    AxleTyre(B=10.6, C=1.65, D_n=5708.0, E=0.34, reference_friction=1.0),
+)
+CARS = [SEDAN, *(SEDAN.model_copy(update={"tyres": Tyres(front=a, rear=b)}) for a, b in (STIFF, ONE_FRICTION))]
+
+
+@pytest.mark.parametrize("car", CARS, ids=["magic formula", "cornering stiffness", "formula of one friction"])
+@settings(derandomize=True, deadline=None, max_examples=60)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.floats(0.05, 1.5),
+    st.floats(1e-4, 0.2),
+    st.floats(-0.6, 0.6) | st.sampled_from([-0.5 * math.pi, 0.5 * math.pi]),
+    st.booleans(),
+)
+def test_states_of_a_block_move_and_are_read_as_one_state_of_the_nominal_model(car, seed, mu, dt, steer, fast):
+    """Also with a residual, at any speed and with wheels across the car."""
+    p, f, rng = model_parameters(car, roll_correction=True), physics_parameters(car), np.random.default_rng(seed)
+    vx = rng.uniform(0.0, 60.0 if fast else 6.0, LANES)
+    states = np.column_stack([vx, *(rng.normal(0.0, s, LANES) for s in (2.0, 0.7, 0.3))])
+    ax, rate = rng.normal(0.0, 4.0), (rng.normal(), rng.normal())
+    if nominal_model.substeps(vx.min(), dt, mu, p) > nominal_model.substeps(vx[0], dt, mu, p):
+        dt = 1e-3  # the first state determines the substeps: slow states beside it would grow without bound
+    n, share = nominal_model.substeps(vx[0], dt, mu, p), nominal_model.dynamic_share(vx[0], p)
+    block, readings = block_of(NOMINAL, states), np.zeros((READINGS, WIDTH))
+    read(block.ravel(), LANES, steer, mu, rate[0], NOMINAL, p, f, readings.ravel())
+    push(block.ravel(), LANES, vx[0], rate, 0.5 * dt, p)
+    advance(block.ravel(), LANES, HeldInputs(steer, ax, True, mu), dt, NOMINAL, p, f)
+    push(block.ravel(), LANES, vx[0], rate, 0.5 * dt, p)
+    want, want_readings = states.copy(), np.zeros((READINGS, LANES))
+    for i, state in enumerate(states):
+        half = 0.5 * share * dt * np.array(rate)
+        end = nominal_model.rk4_step(state[0], *(state[1:3] + half), steer, ax - state[AX_BIAS], mu, dt, n, p)
+        want[i, :3] = end[0], *(end[1:] + half)
+        ay = nominal_model.measured_lateral_acceleration(*state[:3], steer, mu, p)
+        ay += (1.0 + p.ay_roll_gain) * nominal_model.dynamic_share(state[0], p) * rate[0]
+        want_readings[[Z_AY, Z_YAW_RATE, Z_SPEED], i] = ay, state[YAW_RATE], state[VX]
+    np.testing.assert_allclose(readings[:, :LANES], want_readings, rtol=TOLERANCE, atol=TOLERANCE)
+    np.testing.assert_allclose(block[[VX, VY, YAW_RATE, AX_BIAS], :LANES].T, want, rtol=TOLERANCE, atol=TOLERANCE)
+
+
+# --- with axle forces and parts --------------------------------------------------------------------------------------
+
+
+def test_the_layout_of_every_combination_of_parts():
+    for choice in range(2 ** len(ALL_PARTS)):
+        names = [name for i, name in enumerate(ALL_PARTS) if choice >> i & 1]
+        layout, entries = layout_of(vehicle(*names)), names_of(parts(*names))
+        assert layout.size == len(entries) == len(layout.places) > CORE
+        assert (np.diff(layout.places) > 0).all()
+        want = [entries.index(e) if e in entries else -1 for e in ("ff", "phi", "bank", "s", "b_delta", "b_ay")]
+        assert list(layout[1:]) == want
+
+
+@pytest.mark.parametrize("ax", [0.1, -4.0])
+@every_set
+def test_a_step_is_that_of_the_equations_to_the_second_order(names, ax):
+    """For steps of 20 ms to 5 ms. First-order terms (bank, force scale, load transfer) only matter below 5 ms."""
+    oracle, steer, mu, whole_s = Oracle(parts(*names), imu=IMU), 0.03, 0.8, 0.2
+    x, v = state_of(oracle, steer, ax, mu), oracle.as_vehicle()
+    want = oracle.after(x, steer, ax, mu, whole_s)
+    errors = []
+    for count in (10, 20, 40):
+        end = x
+        for _ in range(count):
+            end = moved(v, end, HeldInputs(steer, ax, True, mu), whole_s / count)
+        errors.append(np.abs(end - want))
+    late = np.array(errors)
+    assert (late[1] < 2.5e-3).all()
+    assert (np.max(late[:-1], axis=1) / np.max(late[1:], axis=1) > 3.4).all()
+    end, count = x, step_count(x[VX], whole_s, mu, *models(v))
+    for _ in range(count):
+        end = moved(v, end, HeldInputs(steer, ax, True, mu), whole_s / count)
+    np.testing.assert_allclose(moved(v, x, HeldInputs(steer, ax, True, mu), whole_s), end, atol=5e-3)
+
+
+@pytest.mark.parametrize("speed", [2.2, 1.0])
+@pytest.mark.parametrize("names", [(), ("lag", "roll"), ALL_PARTS], ids="+".join)
+def test_at_low_speed_it_rolls_without_slip(names, speed):
+    """Blended to the kinematic model, in steps that its time constant asks for."""
+    oracle, steer = Oracle(parts(*names), imu=IMU), 0.2
+    x, v = state_of(oracle, steer, 0.0, FRICTION, vx=speed, ff=0.3, fr=0.2), oracle.as_vehicle()
+    want, end = oracle.after(x, steer, 0.0, FRICTION, 0.2), x
+    for _ in range(80):
+        end = moved(v, end, HeldInputs(steer, 0.0, True, FRICTION), 0.0025)
+    np.testing.assert_allclose(end[[0, 1, 2]], want[[0, 1, 2]], atol=2e-3)
+
+
+@pytest.mark.parametrize(("vx", "vy", "r", "steer"), [(25.0, 0.4, -0.2, 0.03), (12.0, -0.3, 0.4, -0.05)])
+def test_without_parts_it_is_the_nominal_model(vx, vy, r, steer):
+    """Without lag, the filter uses the tyre forces directly, and its a_y equals the nominal model with roll."""
+    v = vehicle(imu_position_m=(*IMU, 0.0))
+    p = model_parameters(v, roll_correction=True)
+    x = settled(v, [vx, vy, r, 0.0, 7.0, -7.0], steer)
+    want = (
+        magic_tyre(steer - math.atan((vy + FRONT_M * r) / vx), FRICTION, True) / MASS_KG,
+        magic_tyre(-math.atan((vy - REAR_M * r) / vx), FRICTION, False) / MASS_KG,
+    )
+    np.testing.assert_allclose(x[4:6], want, rtol=1e-6)
+    want_ay = nominal_model.measured_lateral_acceleration(vx, vy, r, steer, FRICTION, p)
+    assert readings_of(v, x, steer)[Z_AY] == pytest.approx(want_ay, rel=1e-6)
+    errors = []
+    for h in (0.01, 0.005):
+        end = moved(v, x, HeldInputs(steer, 0.5, True, FRICTION), h)
+        want = nominal_model.rk4_step(vx, vy, r, steer, 0.5, FRICTION, h, 4, p)
+        errors.append(np.abs(end[:3] - want).max())
+    assert errors[0] < 1e-3
+    assert errors[0] / errors[1] > 6.0, "of one step the third order of its length"
+    np.testing.assert_allclose(end[4:6], settled(v, end, steer)[4:6], atol=0.01)
+
+
+def test_a_vanishing_lag_is_no_lag():
+    """From one limit to the other without a jump, and stable where the lag is far below the step."""
+    ends = []
+    for v in (vehicle(), *(vehicle("lag", relaxation_length_m=s) for s in (1e-3, 1e-9))):
+        x = np.array([25.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        for k in range(100):
+            x = moved(v, x, HeldInputs(0.03 * math.sin(0.06 * k), 0.0, True, FRICTION), 0.01)
+        ends.append(x)
+    np.testing.assert_allclose(ends[1:], [ends[0]] * 2, rtol=2e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize("speed", [8.0, 40.0])
+@pytest.mark.parametrize("length", [0.3, 0.7])
+def test_a_force_builds_up_over_the_relaxation_length(speed, length):
+    """At a slip angle that stays (a body too heavy to move): f = f_ss (1 − exp(−v t / σ))."""
+    v = vehicle("lag", mass_kg=1e12, yaw_inertia_kg_m2=1e12, relaxation_length_m=length)
+    x, steer = np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0]), 0.02
+    for k in range(1, 21):
+        x = moved(v, x, HeldInputs(steer, 0.0, True, FRICTION), 0.005)
+        want = magic_tyre(steer, FRICTION, True) / 1e12 * (1.0 - math.exp(-speed * k * 0.005 / length))
+        assert x[4] == pytest.approx(want, rel=1e-5)
+
+
+@pytest.mark.parametrize("ay", [0.0, 3.0, -6.0, 30.0])
+@pytest.mark.parametrize("sensitivity", [0.0, 0.2])
+def test_load_transfer_takes_a_share_of_its_square(ay, sensitivity):
+    """Two wheels in closed form. A stiffness takes the full loss; a tyre formula already includes steady cornering."""
+    x = min(1.0, 2.0 * CG_HEIGHT_M * abs(ay) / (G * TRACK_M))
+    two_wheels = 0.5 * ((1 + x) * (1 - sensitivity * x) + (1 - x) * (1 + sensitivity * x))
+    stiff = AxleTyre(cornering_stiffness_n_per_rad=105_000.0)
+    lean = {"roll_gradient_rad_per_m_s2": 0.0105, "load_sensitivity": sensitivity}
+    plain = np.array([25.0, 0.3, -0.1, 0.0, 0.0, 0.0, 0.0105 * ay, 0.0])
+
+    def asked(v: VehicleParameters) -> np.ndarray:
+        """Return the axle forces at the roll angle for ``ay``, after a step too short to change other states."""
+        return moved(v, plain, HeldInputs(0.02, 0.0, True, FRICTION), 1e-9)[4:6]
+
+    tyres = Tyres(front=stiff, rear=stiff)
+    with_it = asked(vehicle("roll", "load_transfer", tyres=tyres, **lean))
+    np.testing.assert_allclose(with_it, two_wheels * asked(vehicle("roll", tyres=tyres, **lean)), rtol=1e-6)
+    ff, fr = asked(vehicle("roll", **lean))
+    own = [1.0 - sensitivity * (2.0 * CG_HEIGHT_M * a / (G * TRACK_M)) ** 2 for a in (ff * WHEELBASE_M / REAR_M,
+           fr * WHEELBASE_M / FRONT_M)]  # fmt: skip
+    held = asked(vehicle("roll", "load_transfer", **lean))
+    np.testing.assert_allclose(held, np.array([ff, fr]) * two_wheels / own, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("ax", "mu"), [(1.0, 0.8), (0.0, 0.8), (-3.0, 0.8), (-6.0, 0.7), (-50.0, 0.8)])
+def test_braking_moves_load_and_takes_grip(ax, mu):
+    f = physics_parameters(vehicle("braking"))
+    factors = [grip_under_braking(ax, mu, load) for load in (f.front_load_per_ax, f.rear_load_per_ax)]
+    if ax >= 0.0:
+        assert factors == [1.0, 1.0]
+        return
+    left = math.sqrt(max(0.04, 1.0 - (ax / (mu * G)) ** 2))
+    moment = -ax * CG_HEIGHT_M * MASS_KG / WHEELBASE_M
+    loads = [MASS_KG * G * arm / WHEELBASE_M for arm in (REAR_M, FRONT_M)]
+    np.testing.assert_allclose(factors, [left * (1 + moment / loads[0]), left * max(0.2, 1 - moment / loads[1])])
+    none = physics_parameters(vehicle())
+    assert grip_under_braking(ax, mu, none.front_load_per_ax) == 1.0
+
+
+@pytest.mark.parametrize("names", [("roll",), ("lag", "roll", "load_transfer")], ids="+".join)
+def test_roll_settles_where_the_springs_hold_it(names):
+    """In steady state φ = G a_y, and the sensor reads the same as on a car without a roll mode."""
+    v = vehicle(*names)
+    x = np.zeros(layout_of(v).size)
+    x[0] = 20.0
+    for _ in range(1000):  # the speed is put back, so that the bend stays
+        x = moved(v, x, HeldInputs(0.03, 0.0, True, FRICTION), 0.01)
+        x[0] = 20.0
+    layout, p, _ = models(v)
+    ay = planar_ay(x, 0.03, FRICTION, 0.0, layout, p)
+    assert abs(ay) > 2.0
+    assert x[layout.roll] == pytest.approx(0.0105 * ay, rel=1e-6)
+    assert x[layout.roll + 1] == pytest.approx(0.0, abs=1e-9)
+    assert ay == pytest.approx(x[0] * x[2], rel=1e-5)
+    assert readings_of(v, x, 0.03)[Z_AY] == pytest.approx((1.0 + G * 0.0105) * ay, rel=1e-6)
+    started = settled(v, [*x[:6], 9.0, 0.0], 0.03)
+    np.testing.assert_allclose(started[4:7], x[4:7], rtol=1e-4)
+
+
+def test_a_car_that_does_not_lean_has_the_load_transfer_of_its_acceleration():
+    """With a roll gradient of 0, the load transfer follows from a_y, without a division by zero."""
+    v = vehicle("roll", "load_transfer", roll_gradient_rad_per_m_s2=0.0)
+    flat = vehicle("load_transfer", roll_gradient_rad_per_m_s2=0.0)
+    x = np.array([25.0, 0.3, -0.1, 0.0, 3.0, 2.0])
+    over = HeldInputs(0.05, 0.0, True, FRICTION)
+    np.testing.assert_allclose(moved(v, x, over, 0.01)[:6], moved(flat, x, over, 0.01)[:6])
+
+
+@every_set
+def test_left_is_right_in_a_mirror(names):
+    oracle = Oracle(parts(*names), imu=(0.4, 0.0))
+    x, v = state_of(oracle, 0.04, -2.0, 0.8), oracle.as_vehicle()
+    sign = np.where(np.isin(names_of(oracle.has), ["vx", "b_ax", "s"]), 1.0, -1.0)
+    one = moved(v, x, HeldInputs(0.04, -2.0, True, 0.8), 0.01)
+    other = moved(v, sign * x, HeldInputs(-0.04, -2.0, True, 0.8), 0.01)
+    np.testing.assert_allclose(other, sign * one, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("speed", [25.0, 2.2])
+@every_set
+def test_the_sensors_read_what_the_equations_say(names, speed):
+    oracle, steer = Oracle(parts(*names), imu=IMU), 0.05
+    x, v = state_of(oracle, steer, 0.0, FRICTION, vx=speed), oracle.as_vehicle()
+    gyro = x[YAW_RATE] + (ENTRIES["b_r"] if "biases" in names else 0.0)
+    np.testing.assert_allclose(readings_of(v, x, steer), [oracle.sensed_ay(x, steer), gyro, speed], rtol=1e-12)
+
+
+def test_a_residual_pushes_with_the_force_scale_and_the_accelerometer_feels_it():
+    v = vehicle("force_scale")
+    layout, p, f = models(v)
+    x = np.zeros(layout.size)
+    x[VX], x[layout.force_scale] = 20.0, 0.2
+    block, readings = block_of(layout, x[None]), np.zeros((READINGS, WIDTH))
+    push(block.ravel(), LANES, 20.0, (0.5, -0.3), 0.01, p)
+    np.testing.assert_allclose(block[[VY, YAW_RATE], 0], [0.5 * 1.2 * 0.01, -0.3 * 1.2 * 0.01])
+    read(block_of(layout, x[None]).ravel(), 1, 0.0, FRICTION, 0.5, layout, p, f, readings.ravel())
+    assert readings[Z_AY, 0] == pytest.approx((1.0 + G * f.roll_gradient) * 0.5 * 1.2)
+    assert planar_ay(x, 0.0, FRICTION, 0.5, layout, p) == pytest.approx(0.5 * 1.2)
+
+
+def test_long_steps_are_divided_for_the_roll_mode():
+    v, flat = vehicle("roll", roll_frequency_rad_s=60.0), vehicle("lag")
+    for car, most in ((v, 0.5), (flat, 60.0)):
+        n = step_count(25.0, 0.1, FRICTION, *models(car))
+        assert 1 <= n <= 32
+        assert 0.1 / n * 60.0 <= most
+    x = np.zeros(8)
+    x[0], x[6] = 25.0, 0.1
+    assert abs(moved(v, x, HeldInputs(0.0, 0.0, True, FRICTION), 0.1)[6]) < 0.1
