@@ -1,9 +1,9 @@
 """The paper's fuzzy scheduler: residual gain from two indicators of model error (Eq 24, 25, Table 2).
 
 Inputs are E_ay = |a_y,m − a_y,nom| and I_dyn = |a_y,m| / (μ g), each with three overlapping sets. The paper provides
-only Table 2; docs/method.md#paper-adaptation defines the sets: triangles with shoulders, with tops at the constants
-below. The strength of a rule is the smaller of its two memberships (Mamdani's AND); the output is the mean of the
-rules' singletons weighted by strength, which is the centre of gravity of singletons.
+only Table 2; docs/method.md#paper-adaptation defines the sets: triangles with shoulders, between the tops that the
+caller chooses. The strength of a rule is the smaller of its two memberships (Mamdani's AND); the output is the mean of
+the rules' singletons weighted by strength, which is the centre of gravity of singletons.
 """
 
 from __future__ import annotations
@@ -12,10 +12,6 @@ import math
 
 from pdhef_logtool.compiled.cache import njit
 
-#: Tops of the sets small, medium and large of E_ay in m/s².
-DEVIATION_TOPS_M_S2 = (0.3, 1.0, 2.5)
-#: Tops of the sets small, medium and large of I_dyn.
-INTENSITY_TOPS = (0.3, 0.6, 0.85)
 #: Table 2: rows I_dyn small, medium, large; columns E_ay small, medium, large.
 RULES = ((0.1, 0.2, 0.3), (0.3, 0.5, 0.7), (0.5, 0.8, 0.9))
 #: Residual gain without inputs: the rule for undisturbed driving.
@@ -32,12 +28,15 @@ def memberships(value, tops):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def fuzzy_trust(deviation_m_s2, intensity):  # type: ignore[no-untyped-def]
-    """Return β in [0.1, 0.9] for non-negative E_ay in m/s² and I_dyn; NaN for NaN."""
+def fuzzy_trust(deviation_m_s2, intensity, deviation_tops_m_s2, intensity_tops):  # type: ignore[no-untyped-def]
+    """Return β in [0.1, 0.9] for non-negative E_ay in m/s² and I_dyn; NaN for NaN.
+
+    The tops are those of the sets small, medium and large of both inputs.
+    """
     if not (math.isfinite(deviation_m_s2) and math.isfinite(intensity)):
         return math.nan
-    columns = memberships(deviation_m_s2, DEVIATION_TOPS_M_S2)
-    rows = memberships(intensity, INTENSITY_TOPS)
+    columns = memberships(deviation_m_s2, deviation_tops_m_s2)
+    rows = memberships(intensity, intensity_tops)
     total = 0.0
     strengths = 0.0
     for i in range(3):

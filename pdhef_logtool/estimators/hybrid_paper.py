@@ -56,15 +56,30 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.presets import Options
 
-#: θ of Eq 22 and γ of Eq 26: the paper names no values, docs/method.md#paper-adaptation fixes these.
-FORGETTING = 0.95
-PROCESS_NOISE_GAIN = 3.0
-#: Undisturbed norm of R in the paper's Figure 20; a_y has nearly all of it, so that it is the variance of a_y, m²/s⁴.
-PAPER_R_NORM = 0.1
-
 # Behind the entries of the filter base's memory: β, and C of Eq 22 a measurement.
 M_TRUST, M_INNOVATION = base.MEMORY, base.MEMORY + 1
 MEMORY = M_INNOVATION + base.MEASUREMENTS
+
+
+class Constants(NamedTuple):
+    """Constants without a value in the paper, chosen on training drives (``studies/paper/constants.py``).
+
+    Attributes
+    ----------
+    forgetting : θ (Eq 22). process_noise_gain : γ (Eq 26).
+    deviation_tops_m_s2, intensity_tops : tops of the sets small, medium and large of E_ay and I_dyn (Table 2).
+    ay_variance : least R_0 of a_y in m²/s⁴ (Eq 23); 0.1 is the undisturbed norm of R in Figure 20, nearly all of which
+        is a_y's.
+    """
+
+    forgetting: float = 0.95
+    process_noise_gain: float = 3.0
+    deviation_tops_m_s2: tuple[float, float, float] = (0.3, 1.0, 2.5)
+    intensity_tops: tuple[float, float, float] = (0.3, 0.6, 0.85)
+    ay_variance: float = 0.1
+
+
+CHOSEN = Constants()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,27 +129,28 @@ def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def adapted_noise(innovation_variance, innovation, predicted_variance, r0):  # type: ignore[no-untyped-def]
+def adapted_noise(innovation_variance, innovation, predicted_variance, r0, forgetting):  # type: ignore[no-untyped-def]
     """Return C_k and R_k of one measurement (Eq 22, 23).
 
     Parameters
     ----------
     innovation_variance : C_{k−1}, NaN before the first sample. innovation : ν.
-    predicted_variance : P_zz, without R. r0 : R_0.
+    predicted_variance : P_zz, without R. r0 : R_0. forgetting : θ.
     """
     if not math.isfinite(innovation_variance):
         innovation_variance = predicted_variance + r0
-    c = FORGETTING * innovation_variance + (1.0 - FORGETTING) * innovation * innovation
+    c = forgetting * innovation_variance + (1.0 - forgetting) * innovation * innovation
     return c, max(r0, c - predicted_variance)
 
 
 @njit(cache=True)
-def _filter(window, tuning, r0, p, parallel, estimate, out, adapted):  # type: ignore[no-untyped-def]
+def _filter(window, tuning, r0, constants, p, parallel, estimate, out, adapted):  # type: ignore[no-untyped-def]
     """Run over one window; ``estimate`` is moved in place.
 
     Where the prior of the parallel filter is missing it starts, and this filter with it. ``r0`` [3] is R_0, and
     ``adapted`` residual gain and scale of R at each step, [K] each.
     """
+    forgetting, process_noise_gain, deviation_tops, intensity_tops, _ = constants
     dt, _, _, ay, yaw_rate, speed, _, rate, _ = window
     q_std, _, initial_std, _, wm, wc, scale, rules = tuning
     start_x, prior, inputs, start_ok = parallel
@@ -172,7 +188,8 @@ def _filter(window, tuning, r0, p, parallel, estimate, out, adapted):  # type: i
             nominal = measured_lateral_acceleration(
                 prior[k, base.VX], prior[k, base.VY], prior[k, base.YAW_RATE], steer, friction, p
             )  # fmt: skip
-            trust = fuzzy_trust(abs(ay[k] - nominal), abs(ay[k]) / (friction * GRAVITY_M_S2))
+            intensity = abs(ay[k]) / (friction * GRAVITY_M_S2)
+            trust = fuzzy_trust(abs(ay[k] - nominal), intensity, deviation_tops, intensity_tops)
             if math.isfinite(trust):
                 memory[M_TRUST] = trust
             trust = memory[M_TRUST]
@@ -181,7 +198,7 @@ def _filter(window, tuning, r0, p, parallel, estimate, out, adapted):  # type: i
             over = base.held_over_step(now, memory)
             _propagate(chi, over, (rate_vy, rate_r), dt[k], p, points)
             mean_and_covariance(chi, wm, wc, x, P)
-            base.add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust) * dt[k])  # Eq 26
+            base.add_process_noise(P, q_std, over.ax_known, (1.0 + process_noise_gain * trust) * dt[k])  # Eq 26
             alive = base.all_finite(x, P)
             out_prior[k] = x
             if alive:
@@ -196,7 +213,7 @@ def _filter(window, tuning, r0, p, parallel, estimate, out, adapted):  # type: i
                     r = r0[i]
                     if use[i]:
                         out_nu[k, i] = nu[i]
-                        c, r = adapted_noise(memory[M_INNOVATION + i], nu[i], S[i, i], r0[i])
+                        c, r = adapted_noise(memory[M_INNOVATION + i], nu[i], S[i, i], r0[i], forgetting)
                         memory[M_INNOVATION + i] = c
                     elif math.isfinite(memory[M_INNOVATION + i]):
                         r = max(r0[i], memory[M_INNOVATION + i] - S[i, i])
@@ -219,7 +236,7 @@ def _filter(window, tuning, r0, p, parallel, estimate, out, adapted):  # type: i
 
 
 @njit(cache=True)
-def _predict_outputs(due, held, trust, tuning, p, predicted):  # type: ignore[no-untyped-def]
+def _predict_outputs(due, held, trust, tuning, process_noise_gain, p, predicted):  # type: ignore[no-untyped-def]
     """Predict the steps that are due with inputs, residual and ``trust`` [K] held; planar a_y beside the state."""
     step, horizon_s = due
     held_x, held_P, inputs, rate = held
@@ -244,7 +261,7 @@ def _predict_outputs(due, held, trust, tuning, p, predicted):  # type: ignore[no
                 draw_sigma_points(x, P, scale, L, chi)
                 _propagate(chi, over, (rate_vy, rate_r), horizon_s[m], p, points)
                 mean_and_covariance(chi, wm, wc, x, P)
-                base.add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust[k]) * horizon_s[m])
+                base.add_process_noise(P, q_std, over.ax_known, (1.0 + process_noise_gain * trust[k]) * horizon_s[m])
             if base.all_finite(x, P):
                 ay = planar_lateral_acceleration(x[base.VX], x[base.VY], x[base.YAW_RATE], over.steer, over.friction, p)
                 out_ay[m] = ay + dynamic_share(x[base.VX], p) * rate_vy
@@ -263,6 +280,7 @@ class PaperHybridUkf:
     ----------
     q_std : Q_0 as process 1-sigma per √s of [v_x, v_y, r, b_ax].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
+    constants : that the paper leaves open.
     slip_gate : as for ``phy-ukf``: leave out the speed of wheels that spin or lock.
     """
 
@@ -277,6 +295,7 @@ class PaperHybridUkf:
     slip_gate: bool = True
     name: str = "pd-hef-paper"
     causal: bool = True
+    constants: Constants = CHOSEN
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -288,11 +307,11 @@ class PaperHybridUkf:
 
     @property
     def measurement_variance(self) -> FloatArray:
-        """R_0 of [a_y, r, v_x], [3]: the sensors'; a_y has at least the paper's norm."""
+        """R_0 of [a_y, r, v_x], [3]: the sensors'; the constants bound that of a_y from below."""
         s = self.vehicle.sensors
         std = np.array([s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s])
         variance: FloatArray = std**2
-        variance[base.Z_AY] = max(variance[base.Z_AY], PAPER_R_NORM)
+        variance[base.Z_AY] = max(variance[base.Z_AY], self.constants.ay_variance)
         return variance
 
     @property
@@ -313,14 +332,15 @@ class PaperHybridUkf:
         )
         starts = ~np.isfinite(physics.prior[:, base.VX])
         rate, network = self.network.run(features, starts, state.network if state else None)
-        steps, filter_state = self._filter_steps(signals, physics, rate, state.filter_state if state else None)
+        steps, filter_state = self.filter_steps(signals, physics, rate, state.filter_state if state else None)
         return steps, PaperState(after, network, filter_state)
 
     def predict(self, steps: PaperSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate steps with the nominal model and the residual held (see :class:`~.base.ModelPredictor`)."""
         held = base.PredictionStart(steps.x, steps.P, steps.inputs, steps.residual_rate)
         predicted = base.no_prediction(len(stamps_ns), steps.x.shape[1])
-        _predict_outputs(base.pending_predictions(ahead), held, steps.trust, self._tuning, self._parameters, predicted)
+        due, gain = base.pending_predictions(ahead), self.constants.process_noise_gain
+        _predict_outputs(due, held, steps.trust, self._tuning, gain, self._parameters, predicted)
         track = base.predicted_track(self.name, stamps_ns, steps, ahead, predicted)
         return replace(
             track,
@@ -328,14 +348,17 @@ class PaperHybridUkf:
             r_scale=np.where(track.valid, steps.r_scale[ahead.step], np.nan),
         )
 
-    def _filter_steps(
+    def filter_steps(
         self,
         signals: Signals,
         physics: base.PosteriorSteps,
         rate: FloatArray,
         state: base.FilterState | None,
     ) -> tuple[PaperSteps, base.FilterState]:
-        """Filter one window; return its steps, and the state for the next one."""
+        """Filter one window with the results of the parallel filter and the residual ``rate`` [K, 2] of the network.
+
+        Return its steps, and the state for the next window.
+        """
         signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None, gate=self.slip_gate)
         estimate, count = base.resume(state, base.STATES, MEMORY), len(signals)
         parallel = Parallel(physics.x, physics.prior, physics.inputs, physics.valid)
@@ -344,7 +367,7 @@ class PaperHybridUkf:
             (np.empty(count), np.empty(count)),
         )
         window, r0 = base.make_window(signals, state, rate), self.measurement_variance
-        _filter(window, self._tuning, r0, self._parameters, parallel, estimate, out, adapted)
+        _filter(window, self._tuning, r0, self.constants, self._parameters, parallel, estimate, out, adapted)
         steps = PaperSteps(signals.stamps_ns, *out, rate, *adapted)
         return steps, base.next_state(estimate, signals.stamps_ns, state, slip)
 
