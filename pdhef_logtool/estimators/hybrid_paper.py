@@ -46,7 +46,7 @@ from pdhef_logtool.estimators.unscented import (
     kalman_update,
     mean_and_covariance,
 )
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import Extrapolation
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
@@ -68,18 +68,17 @@ class Constants(NamedTuple):
     ----------
     forgetting : θ (Eq 22). process_noise_gain : γ (Eq 26).
     deviation_tops_m_s2, intensity_tops : tops of the sets small, medium and large of E_ay and I_dyn (Table 2).
-    ay_variance : least R_0 of a_y in m²/s⁴ (Eq 23); 0.1 is the undisturbed norm of R in Figure 20, nearly all of which
-        is a_y's.
+    ay_variance : least R_0 of a_y in m²/s⁴ (Eq 23); the undisturbed norm of R in Figure 20 is 0.1.
     """
 
-    forgetting: float = 0.95
-    process_noise_gain: float = 3.0
-    deviation_tops_m_s2: tuple[float, float, float] = (0.3, 1.0, 2.5)
-    intensity_tops: tuple[float, float, float] = (0.3, 0.6, 0.85)
-    ay_variance: float = 0.1
+    forgetting: float
+    process_noise_gain: float
+    deviation_tops_m_s2: tuple[float, float, float]
+    intensity_tops: tuple[float, float, float]
+    ay_variance: float
 
 
-CHOSEN = Constants()
+CHOSEN = Constants(1.0, 0.1, (0.03, 0.1, 0.25), (0.03, 0.06, 0.085), 3.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,15 +99,6 @@ class PaperState:
     physics: FilterState
     network: NetworkCarry
     filter_state: base.FilterState
-
-
-class Parallel(NamedTuple):
-    """Steps of the parallel filter: state [K, 4], state before the update, held inputs, and whether they are right."""
-
-    x: FloatArray
-    prior: FloatArray
-    inputs: FloatArray
-    valid: BoolArray
 
 
 @njit(cache=True)
@@ -147,10 +137,10 @@ def adapted_noise(innovation_variance, innovation, predicted_variance, r0, forge
 def _filter(window, tuning, r0, constants, p, parallel, estimate, out, adapted):  # type: ignore[no-untyped-def]
     """Run over one window; ``estimate`` is moved in place.
 
-    Where the prior of the parallel filter is missing it starts, and this filter with it. ``r0`` [3] is R_0, and
-    ``adapted`` residual gain and scale of R at each step, [K] each.
+    Where the prior of the parallel filter is missing it starts, and this filter with it. ``parallel`` contains its
+    state [K, 4], its prior, its inputs and their validity. ``r0`` [3] is R_0, and ``adapted`` residual gain and scale
+    of R at each step, [K] each.
     """
-    forgetting, process_noise_gain, deviation_tops, intensity_tops, _ = constants
     dt, _, _, ay, yaw_rate, speed, _, rate, _ = window
     q_std, _, initial_std, _, wm, wc, scale, rules = tuning
     start_x, prior, inputs, start_ok = parallel
@@ -189,7 +179,9 @@ def _filter(window, tuning, r0, constants, p, parallel, estimate, out, adapted):
                 prior[k, base.VX], prior[k, base.VY], prior[k, base.YAW_RATE], steer, friction, p
             )  # fmt: skip
             intensity = abs(ay[k]) / (friction * GRAVITY_M_S2)
-            trust = fuzzy_trust(abs(ay[k] - nominal), intensity, deviation_tops, intensity_tops)
+            trust = fuzzy_trust(
+                abs(ay[k] - nominal), intensity, constants.deviation_tops_m_s2, constants.intensity_tops
+            )  # fmt: skip
             if math.isfinite(trust):
                 memory[M_TRUST] = trust
             trust = memory[M_TRUST]
@@ -198,7 +190,8 @@ def _filter(window, tuning, r0, constants, p, parallel, estimate, out, adapted):
             over = base.held_over_step(now, memory)
             _propagate(chi, over, (rate_vy, rate_r), dt[k], p, points)
             mean_and_covariance(chi, wm, wc, x, P)
-            base.add_process_noise(P, q_std, over.ax_known, (1.0 + process_noise_gain * trust) * dt[k])  # Eq 26
+            q_scale = 1.0 + constants.process_noise_gain * trust  # Eq 26
+            base.add_process_noise(P, q_std, over.ax_known, q_scale * dt[k])
             alive = base.all_finite(x, P)
             out_prior[k] = x
             if alive:
@@ -213,7 +206,7 @@ def _filter(window, tuning, r0, constants, p, parallel, estimate, out, adapted):
                     r = r0[i]
                     if use[i]:
                         out_nu[k, i] = nu[i]
-                        c, r = adapted_noise(memory[M_INNOVATION + i], nu[i], S[i, i], r0[i], forgetting)
+                        c, r = adapted_noise(memory[M_INNOVATION + i], nu[i], S[i, i], r0[i], constants.forgetting)
                         memory[M_INNOVATION + i] = c
                     elif math.isfinite(memory[M_INNOVATION + i]):
                         r = max(r0[i], memory[M_INNOVATION + i] - S[i, i])
@@ -285,8 +278,8 @@ class PaperHybridUkf:
     """
 
     algorithm = "paper-hybrid-ukf"
-    version = 1
-    options = ("slip_gate",)
+    version = 2
+    options = ("slip_gate", "constants")
 
     vehicle: VehicleParameters
     network: NetworkService
@@ -361,7 +354,7 @@ class PaperHybridUkf:
         """
         signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None, gate=self.slip_gate)
         estimate, count = base.resume(state, base.STATES, MEMORY), len(signals)
-        parallel = Parallel(physics.x, physics.prior, physics.inputs, physics.valid)
+        parallel = physics.x, physics.prior, physics.inputs, physics.valid
         out, adapted = (
             base.no_posterior(count, base.STATES)._replace(inputs=physics.inputs),
             (np.empty(count), np.empty(count)),

@@ -55,6 +55,8 @@ DRIVES = 800
 #: Sets without training: drives of other cars, and the evidence that the network helps.
 OTHER_DRIVES = {"other_cars": 200, "evidence": 200}
 EPOCHS, BASELINE_EPOCHS = 66, 40
+#: Folders of the paper's network.
+PAPER_DRIVES, PAPER_RESIDUALS = "paper", "paper-residuals"
 #: An epoch of the paper's network is one batch of windows of 6.4 s, so that 200 epochs take less than half an hour.
 PAPER_WINDOWS = {"piece_steps": 640, "pieces_per_epoch": 64, "chunk_steps": 25}
 TRIALS = 64
@@ -86,16 +88,6 @@ class Training:
     def network(self) -> Path:
         """Folder of the trained network: of the shipped car its own; ``pdhef learn`` copies others into the car."""
         return self.car / NETWORK_FOLDER if self.is_shipped else self.work / f"network-{self.seed}"
-
-    @property
-    def paper(self) -> Path:
-        """Drives of the paper's network."""
-        return self.work / "paper"
-
-    @property
-    def paper_residuals(self) -> Path:
-        """Residuals of these drives."""
-        return self.work / "paper-residuals"
 
     @property
     def is_shipped(self) -> bool:
@@ -141,7 +133,7 @@ def simulate(t: Training) -> None:
         count = min(t.drives, OTHER_DRIVES.get(name, t.drives))
         what = ["--count", count, "--seed", seed, "--vehicles", vehicles, "--jobs", t.jobs]
         pdhef("simulate", "suite", *what, "-o", t.work / name)
-    paper_drives.write_drives(t.paper, count=min(t.drives, paper_drives.COUNT), processes=t.jobs)
+    paper_drives.write_drives(t.work / PAPER_DRIVES, count=min(t.drives, paper_drives.COUNT), processes=t.jobs)
 
 
 def fit(t: Training) -> None:
@@ -152,7 +144,7 @@ def fit(t: Training) -> None:
 def extract(t: Training) -> None:
     """Extract residuals: the paper's network and the baselines have the nominal model, as the paper has it."""
     sets = [(t.work / "one_car", t.work / model, model) for model in MODELS]
-    for drives, residuals, model in (*sets, (t.paper, t.paper_residuals, NOMINAL_MODEL)):
+    for drives, residuals, model in (*sets, (t.work / PAPER_DRIVES, t.work / PAPER_RESIDUALS, NOMINAL_MODEL)):
         output = ("-o", residuals, "--filter", model, "--jobs", t.jobs, "--resume")
         pdhef("extract", drives, *t.of_car, *output)
 
@@ -175,7 +167,7 @@ def paper(t: Training) -> None:
     torch.set_num_threads(1)
     recipe = replace(PAPER_RECIPE, seed=t.seed, **PAPER_WINDOWS)
     train_on(
-        dataset_for(t.paper_residuals, NOMINAL_MODEL), t.network / PAPER_FOLDER, recipe, progress=_print_epoch
+        dataset_for(t.work / PAPER_RESIDUALS, NOMINAL_MODEL), t.network / PAPER_FOLDER, recipe, progress=_print_epoch
     )  # fmt: skip
 
 

@@ -121,7 +121,7 @@ def test_noise_rises_in_a_burst_and_only_then(weaving):
     assert track.r_scale[20:100].max() < track.r_scale[240:262].max() / 3
 
 
-def test_the_undisturbed_norm_is_the_papers():
+def test_the_undisturbed_norm_follows_the_constant_of_a_y():
     assert np.linalg.norm(paper_filter().measurement_variance) == pytest.approx(0.1, rel=0.01)
 
 
