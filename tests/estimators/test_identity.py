@@ -36,7 +36,7 @@ SHIPPED = {
         "smoothed-physics 2 (filtered=adaptive-physics, filtered.physics=vehicle-ukf, filtered.trust=0.75)",
         "f20b45e944a7",
     ),
-    "pd-hef-paper": ("paper-hybrid-ukf 1", "c13712e0df29"),
+    "pd-hef-paper": ("paper-hybrid-ukf 2", "87a835dda35a"),
 }
 #: Fields that are no option: names, texts, noise, physics and network.
 ROLES = {"name", "causal", "notes", "vehicle", "network", "model", "q_std", "r_std", "use_speed"}
