@@ -26,7 +26,6 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import notes_of, predict_track
-from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.filter_base import sideslip_std
 from pdhef_logtool.estimators.intervals import scaled_covariance
 from pdhef_logtool.estimators.physics_filter import LIMIT_TIME_S, LINEAR_SHARE, PhysicsFilter
@@ -315,7 +314,7 @@ class GnssAided:
     version = 1
     options = ("estimator",)
 
-    estimator: AdaptivePhysics | CorrectedPhysics
+    estimator: AdaptivePhysics
     causal: bool = True
 
     @property
@@ -329,14 +328,13 @@ class GnssAided:
         return (*notes_of(self.estimator), "GNSS velocity corrects v_y")
 
     @property
-    def calibrated_as(self) -> AdaptivePhysics | CorrectedPhysics:
+    def calibrated_as(self) -> AdaptivePhysics:
         """Estimator that provides the intervals if this one has no calibrated intervals."""
         return self.estimator
 
     @property
     def _physics(self) -> PhysicsFilter:
-        physics = self.estimator.physics
-        return physics.physics if isinstance(physics, AdaptivePhysics) else physics
+        return self.estimator.physics
 
     def run(self, signals: Signals, state: AidedState | None) -> tuple[AidedSteps, AidedState]:
         """Process one window (see :class:`~.base.Estimator`)."""

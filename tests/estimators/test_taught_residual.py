@@ -1,0 +1,165 @@
+"""``pd-hef`` of a taught car: the residual acts in the filter, causally, window by window, within its region."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from made_models import linear_residual
+from reference_car import drive, slalom, with_noise
+
+from pdhef_logtool.car.car import Car, WithoutTruth
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.taught import Taught, TaughtParameter
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.calibration.joint import parameters_of, prior_vehicle, with_taught
+from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.pd_hef import FILTER_ALONE
+from pdhef_logtool.estimators.presets import Options
+from pdhef_logtool.estimators.residual_response import residual_response
+from pdhef_logtool.estimators.self_calibrated import SelfCalibrated
+from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.residual_model.ladder import SPEED_NONE, LadderModel
+
+SEDAN = default_vehicle()
+
+
+def taught_car(residual: LadderModel | None, *, calibrated: bool = False) -> Car:
+    taught = Taught(physics_sha256=Car.of(SEDAN).physics_sha256, residual=residual, calibrated=calibrated)
+    return replace(Car.of(SEDAN), taught=taught)
+
+
+def acts(estimator: Any) -> bool:
+    """Whether an estimator uses the taught residual."""
+    return isinstance(estimator.network, LadderModel) and estimator.trust == 1.0
+
+
+@pytest.fixture(scope="module")
+def signals() -> Signals:
+    s = with_noise(drive(slalom(0.03, 0.5), 6.0, speed=22.0).signals, seed=3)
+    return replace(s, friction=np.full(len(s), 0.85))
+
+
+def track_of(name: str, car: Car, *parts: Signals) -> list[StateTrack]:
+    estimator, state, tracks = make_estimator(name, car), None, []
+    for part in parts:
+        track, state = run_window(estimator, part, state)
+        tracks.append(track)
+    return tracks
+
+
+def test_a_residual_of_zero_is_physics_bit_for_bit(signals: Signals) -> None:
+    (physics,), (hybrid,) = (
+        track_of(name, taught_car(linear_residual(0.0)), signals) for name in ("physics", "pd-hef")
+    )
+    assert np.array_equal(hybrid.vx_m_s, physics.vx_m_s, equal_nan=True)
+    assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
+    assert np.allclose(hybrid.vy_m_s, physics.vy_m_s, atol=1e-12, equal_nan=True)
+    assert np.nanmax(hybrid.network_trust) == 1.0
+
+
+def test_a_smoother_takes_the_prior_and_says_why_not_the_residual() -> None:
+    assert FILTER_ALONE in make_estimator("pd-hef-smoothed", taught_car(linear_residual())).notes
+    assert FILTER_ALONE not in make_estimator("pd-hef-smoothed", taught_car(None)).notes
+
+
+def test_the_residual_acts_in_the_filter(signals: Signals) -> None:
+    (physics,), (hybrid,) = (track_of(name, taught_car(linear_residual()), signals) for name in ("physics", "pd-hef"))
+    added, late = hybrid.sideslip_rad - physics.sideslip_rad, slice(200, None)
+    assert np.nanmax(np.abs(added[late])) > 1e-4
+    assert np.corrcoef(added[late], physics.yaw_rate_rad_s[late])[0, 1] > 0.5
+
+
+def test_its_response_is_the_one_that_teaching_uses(signals: Signals) -> None:
+    estimator = make_estimator("physics", taught_car(None))
+    assert isinstance(estimator, AdaptivePhysics)
+    response = residual_response(estimator, signals, np.arange(len(signals)))
+    rate = 0.2 * np.sin(np.arange(len(signals)) / 30.0)
+    tracks = []
+    for given in (0.0, 1.0):
+        rates = np.stack([given * rate, np.zeros(len(rate))], axis=1)
+        steps, _ = estimator.physics.run(estimator.inputs(signals, None)[0].faults.filtered, None, rates)
+        tracks.append(np.arctan2(steps.x[:, 1], steps.x[:, 0]))
+    expected = tracks[1] - tracks[0]
+    assert np.nanmax(np.abs(expected)) > 1e-4
+    late = slice(50, None)
+    assert np.allclose(response(rate[:, None])[late, 0], expected[late], atol=0.1 * np.nanmax(np.abs(expected)))
+
+
+def test_it_is_causal(signals: Signals) -> None:
+    estimator, check = make_estimator("pd-hef", taught_car(linear_residual())), CausalityCheck()
+    assert estimator.causal
+    run_window(estimator, signals, causality=check)
+    later = replace(signals, yaw_rate_rad_s=np.where(np.arange(len(signals)) > 300, 0.0, signals.yaw_rate_rad_s))
+    ran = [run_window(estimator, s, None)[0].sideslip_rad[:300] for s in (signals, later)]
+    assert np.array_equal(*ran, equal_nan=True)
+
+
+def test_beyond_the_taught_speed_it_is_physics(signals: Signals) -> None:
+    car = taught_car(linear_residual(fastest_m_s=10.0))
+    (physics,), (hybrid,) = (track_of(name, car, signals) for name in ("physics", "pd-hef"))
+    assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
+    assert np.nanmax(hybrid.network_trust) == 0.0
+
+
+def test_two_seconds_after_the_taught_region_it_is_physics_again(signals: Signals) -> None:
+    fast = with_noise(drive(slalom(0.02, 0.5), 8.0, speed=40.0).signals, seed=4)
+    step_ns = int(signals.stamps_ns[-1] - signals.stamps_ns[0]) + 10_000_000
+    moved = {name: getattr(fast, name) + step_ns for name in ("stamps_ns", "ready_ns")}
+    fast = replace(fast, friction=np.full(len(fast), 0.85), **moved)
+    car = taught_car(linear_residual(fastest_m_s=21.0))
+    inside, outside = track_of("pd-hef", car, signals, fast)
+    _, physics = track_of("physics", car, signals, fast)
+    assert np.nanmean(inside.network_trust > 0.0) > 0.5
+    left = int(np.flatnonzero(physics.vx_m_s > SPEED_NONE * 21.0)[0])  # the filter takes the jump of the speed slowly
+    assert len(physics) > left + 250
+    assert np.all(outside.network_trust[left + 200 :] == 0.0)
+    assert np.allclose(outside.sideslip_rad[left + 200 :], physics.sideslip_rad[left + 200 :], atol=1e-5)
+
+
+def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(signals: Signals) -> None:
+    calibration = WithoutTruth(SEDAN, FilterNoise(r_std={"ay_m_s2": 1.0}), True, "calibrated")
+    for calibrated in (False, True):
+        car = taught_car(linear_residual(), calibrated=calibrated)
+        plain, of_log = (make_estimator("pd-hef", c) for c in (car, replace(car, self_calibrated=calibration)))
+        assert isinstance(of_log, SelfCalibrated)
+        assert acts(plain) is not calibrated
+        assert acts(of_log.estimator) is calibrated
+        without = of_log.estimator if not calibrated else plain
+        assert any("residual gain 0" in note for note in without.notes)  # type: ignore[attr-defined]
+    (track,) = track_of(
+        "pd-hef", replace(taught_car(linear_residual(), calibrated=True), self_calibrated=calibration), signals
+    )
+    assert np.nanmax(track.network_trust) == 1.0
+
+
+def test_a_car_without_a_residual_or_with_a_named_gain_does_not_take_it() -> None:
+    assert not acts(make_estimator("pd-hef", taught_car(None)))
+    assert not acts(make_estimator("pd-hef", taught_car(linear_residual()), Options(trust=0.0)))
+
+
+def test_a_taught_prior_moves_mean_and_width_of_the_calibration() -> None:
+    parameters = parameters_of(SEDAN)
+    first = parameters[0]
+    taught = (
+        TaughtParameter(name=first.name, value=1.1 * first.mean, std=0.5 * first.std),
+        TaughtParameter(name=parameters[1].name, value=parameters[1].mean, std=9.0),
+    )
+    moved = with_taught(parameters, taught)
+    assert (moved[0].mean, moved[0].std) == pytest.approx((1.1 * first.mean, 0.5 * first.std))
+    assert moved[1].std == parameters[1].std  # no teaching makes a prior wider
+    assert moved[2:] == parameters[2:]
+    of_road = (taught[0].model_copy(update={"ay_m_s2": 2.0}),)
+    unlike, near, alike = (with_taught(parameters, of_road, level)[0] for level in (8.0, 5.0, 3.0))
+    assert unlike.mean == pytest.approx(first.mean) and unlike.std == first.std
+    assert first.mean < near.mean < alike.mean and first.std > near.std > alike.std
+    assert (alike.mean, alike.std) == pytest.approx((moved[0].mean, moved[0].std))
+    vehicles = (prior_vehicle(SEDAN), prior_vehicle(SEDAN, taught))
+    before, after = (v.cornering_stiffness_n_per_rad(True, v.assumed_friction) for v in vehicles)
+    assert after == pytest.approx(1.1 * before, rel=1e-4)
