@@ -15,11 +15,10 @@ from pdhef_logtool.residual_model.bundle import (
     ModelBundle,
     Normalisation,
 )
-from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
+from pdhef_logtool.residual_model.features import EVEN_COUNT, FEATURES, ODD_COUNT, PAPER_FEATURES
 from pdhef_logtool.residual_model.ladder import LadderModel
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
-from pdhef_logtool.residual_model.slow_features import EVEN_COUNT, ODD_COUNT
 
 
 def random_network(
@@ -55,8 +54,8 @@ def full_network(seed: int = 1) -> ModelBundle:
     return replace(physics, pure_lstm=lstm, linear_regression=regression, paper_network=papers)
 
 
-def linear_residual(weight: float = 0.01, fastest_m_s: float = 40.0) -> LadderModel:
-    """Return a residual of the low-passed yaw rate over 0.3, valid up to a speed."""
+def linear_residual(weight: float = 0.3, fastest_m_s: float = 40.0) -> LadderModel:
+    """Return a residual rate, m/s², of the low-passed yaw rate over 0.3, valid up to a speed."""
     weights = [0.0] * ODD_COUNT
     weights[5] = weight
     return LadderModel(
@@ -68,5 +67,5 @@ def linear_residual(weight: float = 0.01, fastest_m_s: float = 40.0) -> LadderMo
         factor=tuple((0.001,) for _ in range(ODD_COUNT)),
         whitening=tuple(tuple(map(float, 1e-4 * row)) for row in np.eye(ODD_COUNT)),
         speed_m_s=(5.0, fastest_m_s),
-        largest_rad=0.1,
+        largest_m_s2=3.0,
     )

@@ -152,7 +152,7 @@ ROWS: tuple[Row, ...] = (
     Row("paper-a", "double lane change, 100 km/h, friction 0.85, with new sensor errors", _standard("dlc")),
     Row("paper-b", "sine sweep, 60 km/h, friction 0.3, with new sensor errors", _standard("sine-sweep")),
     Row("extrapolation", "cells of manoeuvre, speed and friction without training drives", _held_out),
-    Row("unseen-manoeuvre", "fishhook, not in the training suites", _fishhook),
+    Row("unseen-manoeuvre", "fishhook, which only `pd-hef-paper` has in its training set", _fishhook),
     Row("low-friction", "friction 0.15 to 0.25, below the training range", _slippery),
     Row("friction-plus-20", "friction given 20 % too high", None, {"friction_factor": 1.2}, _IN_DOMAIN),
     Row("friction-minus-20", "friction given 20 % too low", None, {"friction_factor": 0.8}, _IN_DOMAIN),

@@ -1,8 +1,9 @@
 """A training set of any size from one seed: manoeuvre, speed, friction, amplitude and vehicle drawn drive by drive.
 
 Each drive has a random stream by its number, so that it depends neither on the size of the set nor on the number of
-processes. ``fishhook`` is excluded: it is the unseen manoeuvre of the condition table. Cells of manoeuvre × speed ×
-friction at the edge of the range are marked ``extrapolation`` and never used for training.
+processes. ``fishhook`` is excluded: it is the unseen manoeuvre of the condition table; the paper's network has a set of
+its own with it. Cells of manoeuvre × speed × friction at the edge of the range are marked ``extrapolation`` and never
+used for training.
 """
 
 from __future__ import annotations

@@ -26,7 +26,6 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import notes_of, predict_track
-from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.intervals import scaled_covariance
 from pdhef_logtool.estimators.kinematic_filter import BIAS_M_S2, BIAS_S, LAW_S, LAW_WHITE, TILT_SHARE, correct
 from pdhef_logtool.estimators.reference.gnss import JUMP_M_S, LEAST_COURSE_SPEED_M_S
@@ -314,7 +313,7 @@ class GnssAided:
     version = 1
     options = ("estimator",)
 
-    estimator: AdaptivePhysics | CorrectedPhysics
+    estimator: AdaptivePhysics
     causal: bool = True
 
     @property
@@ -328,14 +327,13 @@ class GnssAided:
         return (*notes_of(self.estimator), "GNSS velocity corrects v_y")
 
     @property
-    def calibrated_as(self) -> AdaptivePhysics | CorrectedPhysics:
+    def calibrated_as(self) -> AdaptivePhysics:
         """Estimator that provides the intervals if this one has no calibrated intervals."""
         return self.estimator
 
     @property
     def _physics(self) -> VehicleUkf:
-        physics = self.estimator.physics
-        return physics.physics if isinstance(physics, AdaptivePhysics) else physics
+        return self.estimator.physics
 
     def run(self, signals: Signals, state: AidedState | None) -> tuple[AidedSteps, AidedState]:
         """Process one window (see :class:`~.base.Estimator`)."""

@@ -88,18 +88,17 @@ class Constants(NamedTuple):
     ----------
     forgetting : θ (Eq 22). process_noise_gain : γ (Eq 26).
     deviation_tops_m_s2, intensity_tops : tops of the sets small, medium and large of E_ay and I_dyn (Table 2).
-    ay_variance : least R_0 of a_y in m²/s⁴ (Eq 23); 0.1 is the undisturbed norm of R in Figure 20, nearly all of which
-        is a_y's.
+    ay_variance : least R_0 of a_y in m²/s⁴ (Eq 23); the undisturbed norm of R in Figure 20 is 0.1.
     """
 
-    forgetting: float = 0.95
-    process_noise_gain: float = 3.0
-    deviation_tops_m_s2: tuple[float, float, float] = (0.3, 1.0, 2.5)
-    intensity_tops: tuple[float, float, float] = (0.3, 0.6, 0.85)
-    ay_variance: float = 0.1
+    forgetting: float
+    process_noise_gain: float
+    deviation_tops_m_s2: tuple[float, float, float]
+    intensity_tops: tuple[float, float, float]
+    ay_variance: float
 
 
-CHOSEN = Constants()
+CHOSEN = Constants(1.0, 0.1, (0.03, 0.1, 0.25), (0.03, 0.06, 0.085), 3.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -275,8 +274,8 @@ class PaperHybridUkf:
     """
 
     algorithm = "paper-hybrid-ukf"
-    version = 1
-    options = ("slip_gate",)
+    version = 2
+    options = ("slip_gate", "constants")
 
     vehicle: VehicleParameters
     network: NetworkService

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from pdhef_logtool.car.vehicle import Sensors
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.base import AY, VX, VY, YAW_RATE, Steps
-from pdhef_logtool.estimators.stepwise import StepState, advance_speed, run_stepwise
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.estimators.stepwise import StepState, advance_speed, prepared_steps
+from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S
 
 if TYPE_CHECKING:
@@ -64,15 +64,12 @@ class Kinematic:
 
     def run(self, signals: Signals, state: StepState | None) -> tuple[Steps, StepState]:
         """Process one window (see :class:`~.base.Estimator`)."""
-
-        def step(
-            dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, rates: FloatArray, valid: BoolArray
-        ) -> None:
-            window = (dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s)
-            _kinematic(window, self.leak_s, self.speed_hold_s, self.speed_zero_m_s, state, values, rates, valid)
-
         profile = Sensors(**{name: getattr(self, name) for name in _PROFILE})
-        return run_stepwise(signals, state, 4, step, slip_gate=self.slip_gate, sensors=profile)
+        s, dt, steps, after = prepared_steps(signals, state, 4, slip_gate=self.slip_gate, sensors=profile)
+        window = (dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s)
+        limits = self.leak_s, self.speed_hold_s, self.speed_zero_m_s
+        _kinematic(window, *limits, after.state, steps.values, steps.rates, steps.valid)
+        return steps, after
 
 
 def build(name: str, car: Car, options: Options) -> Kinematic:

@@ -16,8 +16,8 @@ from pdhef_logtool.car.nominal_model import (
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.base import AY, VX, VY, YAW_RATE, Steps
-from pdhef_logtool.estimators.stepwise import StepState, advance_speed, run_stepwise
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.estimators.stepwise import StepState, advance_speed, prepared_steps
+from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S
 
 if TYPE_CHECKING:
@@ -84,16 +84,11 @@ class OpenLoop:
 
     def run(self, signals: Signals, state: StepState | None) -> tuple[Steps, StepState]:
         """Process one window (see :class:`~.base.Estimator`)."""
-        p = model_parameters(self.vehicle)
-        mu = self.vehicle.assumed_friction
-
-        def step(
-            dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, rates: FloatArray, valid: BoolArray
-        ) -> None:
-            inputs = (dt, s.steer_rad, s.ax_m_s2, s.speed_m_s, s.friction)
-            _open_loop(inputs, self.vehicle.sensors.speed_hold_s, mu, p, state, values, rates, valid)
-
-        return run_stepwise(signals, state, 6, step, slip_gate=self.slip_gate, sensors=self.vehicle.sensors)
+        p, mu, sensors = model_parameters(self.vehicle), self.vehicle.assumed_friction, self.vehicle.sensors
+        s, dt, steps, after = prepared_steps(signals, state, 6, slip_gate=self.slip_gate, sensors=sensors)
+        inputs = (dt, s.steer_rad, s.ax_m_s2, s.speed_m_s, s.friction)
+        _open_loop(inputs, sensors.speed_hold_s, mu, p, after.state, steps.values, steps.rates, steps.valid)
+        return steps, after
 
 
 def build(name: str, car: Car, options: Options) -> OpenLoop:

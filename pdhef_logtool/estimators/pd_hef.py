@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from pdhef_logtool.car.parts import SMOOTHING
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.presets import options_of
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
 from pdhef_logtool.estimators.vehicle_ukf import of_car
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.estimators.presets import Options
 
 
-def build(name: str, car: Car, options: Options) -> AdaptivePhysics | CorrectedPhysics:
+def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
     """Return ``physics`` of a car with its taught residual, or with its network.
 
     The residual gain of the network comes from options, name or evidence; a name with options selects the network.
@@ -33,7 +32,7 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics | CorrectedP
     if name == PRESET and options.trust is None and taught is not None and taught.residual is not None:
         physics = AdaptivePhysics(of_car(car, use_speed=options.use_speed), name=name)
         if (car.fitted_physics is not None) == taught.calibrated:
-            return CorrectedPhysics(physics, taught.residual, name, notes=(taught.evidence,))
+            return replace(physics, network=taught.residual, trust=1.0, notes=(taught.evidence,))
         state, other = ("calibrated", "not calibrated") if taught.calibrated else ("not calibrated", "calibrated")
         return replace(physics, notes=(f"residual gain 0: it belongs to a {state} car, this drive has one {other}",))
     return _with_network(name, car, options)

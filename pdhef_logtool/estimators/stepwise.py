@@ -1,9 +1,8 @@
-"""Loop shared by the simple baselines, and the measured speed between its samples."""
+"""Inputs and outputs shared by the simple baselines, and the measured speed between its samples."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,7 @@ from pdhef_logtool.car.vehicle import SENSOR_PROFILES, Sensors
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.base import VX, Steps
 from pdhef_logtool.estimators.speed_slip import SlipState, believable
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.steps import last_stamp_ns, step_durations_s
 
 
@@ -25,45 +24,32 @@ class StepState:
     slip: SlipState | None = None
 
 
-#: (dt [K], signals, state, values [K, 4], rates [K, 4], valid [K]) -> None; writes the last four in place.
-StepFunction = Callable[[FloatArray, Signals, FloatArray, FloatArray, FloatArray, BoolArray], None]
-
-
-def run_stepwise(
+def prepared_steps(
     signals: Signals,
     before: StepState | None,
     state_size: int,
-    step: StepFunction,
     *,
     slip_gate: bool = False,
     sensors: Sensors = SENSOR_PROFILES["production"],
-) -> tuple[Steps, StepState]:
-    """Run ``step`` over a window.
+) -> tuple[Signals, FloatArray, Steps, StepState]:
+    """Return the usable signals of a window, the time ``dt`` [K] before each step, empty steps, and a state to advance.
 
-    ``state`` starts as NaN; ``dt[0]`` is NaN at the start of a log. With ``slip_gate`` the speed of slipping wheels is
-    replaced by the dead-reckoned speed.
+    The state vector starts as NaN; ``dt[0]`` is NaN at the start of a log. With ``slip_gate`` the speed of slipping
+    wheels is replaced by the dead-reckoned speed.
     """
     signals, slip = believable(signals, sensors, before.slip if before else None, gate=slip_gate, reckoned=True)
     count = len(signals)
     state = np.full(state_size, np.nan) if before is None else before.state.copy()
     before_ns = before.last_stamp_ns if before else None
-    dt = step_durations_s(signals.stamps_ns, before_ns)
-    values = np.full((count, 4), np.nan)
-    rates = np.zeros((count, 4))
-    valid = np.zeros(count, dtype=np.bool_)
-    step(dt, signals, state, values, rates, valid)
-    return Steps(values, rates, valid), StepState(state, last_stamp_ns(signals.stamps_ns, before_ns), slip)
+    steps = Steps(np.full((count, 4), np.nan), np.zeros((count, 4)), np.zeros(count, dtype=np.bool_))
+    after = StepState(state, last_stamp_ns(signals.stamps_ns, before_ns), slip)
+    return signals, step_durations_s(signals.stamps_ns, before_ns), steps, after
 
 
 def measured_speed(signals: Signals, hold_s: float, before: StepState | None) -> tuple[FloatArray, StepState]:
     """Return the measured speed at each stamp, [K], integrated by a_x between samples (:func:`advance_speed`)."""
-
-    def step(
-        dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, _rates: FloatArray, _valid: BoolArray
-    ) -> None:
-        _advance_speeds(dt, s.ax_m_s2, s.speed_m_s, hold_s, state, values)
-
-    steps, after = run_stepwise(signals, before, 2, step)
+    signals, dt, steps, after = prepared_steps(signals, before, 2)
+    _advance_speeds(dt, signals.ax_m_s2, signals.speed_m_s, hold_s, after.state, steps.values)
     return steps.values[:, VX], after
 
 

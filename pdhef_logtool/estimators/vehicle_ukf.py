@@ -93,7 +93,7 @@ _FORCE_STD, _STANDSTILL_FORCE_STD = 0.5, 0.05
 _ROLL_STD, _STANDSTILL_ROLL_STD, _ROLL_WALK = (0.01, 0.03), (0.005, 0.01), 0.02
 #: Spread of the bank, rad: a crowned road has 0.02-0.03, motorway bends to 0.07. Spread of the force scale
 #: (docs/method.md#adaptation).
-_BANK_STD, FORCE_SCALE_STD = 0.02, 0.05
+BANK_STD, FORCE_SCALE_STD = 0.02, 0.05
 #: Random walk of the a_y (m/s²), yaw-rate (rad/s) and steering (rad) bias, 1-sigma per square root of second.
 BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
 #: 1-sigma of an unknown steering angle at the start and at most, rad, and its walk per √s (docs/method.md#physics).
@@ -312,7 +312,7 @@ def process_noise(q_std, ax_known, dt, layout, q):  # type: ignore[no-untyped-de
     if layout.force_scale >= 0:
         q[layout.force_scale] += FORCE_SCALE_STD**2 * (1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S))
     if layout.bank >= 0:
-        q[layout.bank] += _BANK_STD**2 * (1.0 - math.exp(-2.0 * dt / BANK_TIME_S))
+        q[layout.bank] += BANK_STD**2 * (1.0 - math.exp(-2.0 * dt / BANK_TIME_S))
 
 
 @_inline
@@ -832,7 +832,7 @@ class VehicleUkf:
         if (i := layout.roll) >= 0:
             initial[i : i + 2], still[i : i + 2], walk[i + 1] = _ROLL_STD, _STANDSTILL_ROLL_STD, _ROLL_WALK
         if layout.bank >= 0:
-            initial[layout.bank] = _BANK_STD
+            initial[layout.bank] = BANK_STD
         if layout.force_scale >= 0:
             initial[layout.force_scale] = FORCE_SCALE_STD
         if (i := layout.sensor_bias) >= 0:

@@ -1,4 +1,4 @@
-"""Linear residual models of increasing order for the sideslip error of ``physics``, from slow or random features.
+"""Linear residual models of increasing order for the rate of v_y, from slow or random features.
 
 Orders: ``none``; ``linear`` in the odd features; ``random`` with additional random Fourier features √2 sin(w·z)
 cos(v·e + p) of the odd features z and the even features e (Rahimi and Recht 2007). All are exactly odd: they have no
@@ -18,7 +18,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.residual_model.slow_features import EVEN_COUNT, ODD_COUNT, SPEED_COLUMN, SlowFeatures
+from pdhef_logtool.residual_model.features import EVEN_COUNT, ODD_COUNT, SPEED_COLUMN, SlowFeatures, slow_features
+from pdhef_logtool.residual_model.interface import Residual
 from pdhef_logtool.storage.documents import digest
 
 if TYPE_CHECKING:
@@ -41,10 +42,10 @@ Rows = Annotated[tuple[Row, ...], Field(strict=False)]
 
 
 class Correction(NamedTuple):
-    """Residual of the sideslip and its 1-sigma per step [K], rad, before the gain; and the gain, 0 to 1."""
+    """Residual rate of v_y and its 1-sigma per step [K], m/s², before the gain; and the gain, 0 to 1."""
 
-    residual_rad: FloatArray
-    std_rad: FloatArray
+    rate_m_s2: FloatArray
+    std_m_s2: FloatArray
     gain: FloatArray
 
 
@@ -55,9 +56,9 @@ class LadderModel(BaseModel):
     ----------
     scale : of the odd features [16]. even_mean, even_scale : of the even features [8].
     odd_directions, even_directions, phases : of the random features, empty for ``linear``.
-    weights : by feature, rad. factor : its product with its transpose is the posterior covariance of the weights.
+    weights : by feature, m/s². factor : its product with its transpose is the posterior covariance of the weights.
     whitening : d² is the squared norm of its product with z. speed_m_s : range of the training drives.
-    largest_rad : largest residual on the training drives.
+    largest_m_s2 : largest residual on the training drives.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True, allow_inf_nan=False)
@@ -73,7 +74,7 @@ class LadderModel(BaseModel):
     factor: Rows
     whitening: Rows
     speed_m_s: Annotated[tuple[float, float], Field(strict=False)]
-    largest_rad: Annotated[float, Field(ge=0)]
+    largest_m_s2: Annotated[float, Field(ge=0)]
 
     @model_validator(mode="after")
     def _one_size(self) -> LadderModel:
@@ -114,6 +115,13 @@ class LadderModel(BaseModel):
             matrix(self.whitening, ODD_COUNT),
         )
 
+    def residual(self, features: FloatArray, dt_s: FloatArray, state: FloatArray | None) -> tuple[Residual, FloatArray]:
+        """Return the residual of consecutive steps (see :class:`~.interface.ResidualModel`)."""
+        slow, memory = slow_features(features, dt_s, state)
+        found = self.evaluate(slow)
+        rate, std = (np.stack([c, np.zeros(len(c))], axis=1) for c in (found.rate_m_s2, found.std_m_s2))
+        return Residual(rate, std, found.gain), memory
+
     def evaluate(self, features: SlowFeatures) -> Correction:
         """Return the residual at each step; residual and gain are 0 where a feature is NaN."""
         from pdhef_logtool.residual_model.ladder_kernels import evaluate
@@ -122,7 +130,7 @@ class LadderModel(BaseModel):
         residual, std, distance2 = np.empty(count), np.empty(count), np.empty(count)
         even_mean, even_scale = np.array(self.even_mean), np.array(self.even_scale)
         evaluate(features.odd, features.even, self._arrays, even_mean, even_scale, residual, std, distance2)
-        limit = LARGEST * self.largest_rad
+        limit = LARGEST * self.largest_m_s2
         residual = np.clip(residual, -limit, limit)
         std = np.hypot(std, SHRINKAGE * residual)
         return Correction(residual, std, self._gain(distance2, features.even[:, SPEED_COLUMN]))

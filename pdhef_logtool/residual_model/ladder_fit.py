@@ -1,5 +1,7 @@
-"""Fit of residual models by ridge regression, with order and λ from nested cross-validation over blocks.
+"""Fit of residual models by ridge regression, with order and λ from nested cross-validation over drives or blocks.
 
+A model is fitted through the response of the filter: the regressors are the changes of the sideslip by each feature as
+a residual rate of v_y. From :data:`LEAST_DRIVES` drives on, whole drives are held out, otherwise blocks of drives.
 The fit includes one constant per drive, which is discarded, because it may be an offset of the ground truth or of a
 sensor. With sums over blocks instead of samples, all fits of the cross-validation are small linear systems.
 """
@@ -7,13 +9,14 @@ sensor. With sums over blocks instead of samples, all fits of the cross-validati
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.residual_model.features import EVEN_COUNT, ODD_COUNT, SPEED_COLUMN, SlowFeatures
 from pdhef_logtool.residual_model.ladder import (
     LINEAR,
     NONE,
@@ -24,7 +27,6 @@ from pdhef_logtool.residual_model.ladder import (
     plain,
 )
 from pdhef_logtool.residual_model.ladder_kernels import expand
-from pdhef_logtool.residual_model.slow_features import EVEN_COUNT, ODD_COUNT, SPEED_COLUMN, SlowFeatures
 
 #: Ridge parameters, in seconds of driving with features of variance 1. Blocks of the same drive favour values down to
 #: 30 s, but on other drives of the car a residual with less than 1000 s often increases the error.
@@ -32,6 +34,9 @@ LAMBDAS = (1000.0, 3000.0, 10000.0)
 #: Blocks of the cross-validation: largest number, shortest length, and time at the end that no fold uses, because the
 #: features of the next block depend on it.
 MOST_BLOCKS, LEAST_BLOCK_S, FORGET_S = 10, 4.0, 2.0
+LEAST_DRIVES = 3
+#: Number of features whose responses are computed together, for the memory of a long drive.
+TOGETHER = 25
 #: A model replaces a simpler one if its squared error in held-out blocks is lower by at least this many standard errors
 #: of the paired differences, and its RMSE by this share. λ is the largest value within one standard error.
 STANDARD_ERRORS, LEAST_GAIN = 1.3, 0.02
@@ -48,15 +53,17 @@ QUANTILE = 0.98
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TaughtDrive:
-    """A drive with ground truth: features of its steps [K] and the missing sideslip of ``physics``, NaN if unknown.
+    """A drive with ground truth: features of its steps and the missing sideslip of ``physics`` [K], NaN if unknown.
 
-    ``weight`` : of this sideslip, from the uncertainty of the ground truth.
+    ``response`` : changes of the sideslip at the stamps [K, m] by rates of v_y at the steps [K, m].
+    ``weight`` : of the sideslip, from the uncertainty of the ground truth.
     """
 
     name: str
     stamps_ns: IntArray
     features: SlowFeatures
     lacking_rad: FloatArray
+    response: Callable[[FloatArray], FloatArray] = np.array
     weight: FloatArray | float = 1.0
 
     @property
@@ -100,10 +107,10 @@ class LadderFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sample:
-    """Data of a drive for a fit [K]: odd and even features, error, its weight in s; duration of a row."""
+    """Data of a drive for a fit [K]: its usable rows, error, its weight in s; duration of a row."""
 
-    odd: FloatArray
-    even: FloatArray
+    drive: TaughtDrive
+    rows: IntArray
     error: FloatArray
     weight_s: FloatArray
     step_s: float
@@ -159,44 +166,75 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
     seconds = math.fsum(s.seconds for s in samples)
     if not samples or seconds < 2.0 * LEAST_BLOCK_S:
         return LadderFit(None, math.inf, (), seconds, 0)
-    odd, even = np.concatenate([s.odd for s in samples]), np.concatenate([s.even for s in samples])
+    odd, even = (np.concatenate([getattr(s.drive.features, n)[s.rows] for s in samples]) for n in ("odd", "even"))
     scale = np.maximum(np.sqrt(np.mean(odd**2, axis=0)), 1e-9)
     even_mean, even_scale = even.mean(axis=0), np.maximum(even.std(axis=0), 1e-3)
     count = RANDOM_FEATURES if RANDOM in rungs and seconds >= RANDOM_LEAST_S else 0
     rng = np.random.default_rng(seed)
-    odd_directions = rng.normal(size=(count, ODD_COUNT)) * FREQUENCY
-    even_directions = rng.normal(size=(count, EVEN_COUNT)) * FREQUENCY
-    phases = rng.uniform(0.0, 2.0 * math.pi, count)
-    z, phi = odd / scale, np.empty((len(odd), ODD_COUNT + count))
-    expand(z, (even - even_mean) / even_scale, odd_directions, even_directions, phases, phi)
-    problem = _problem(samples, np.split(phi, np.cumsum([len(s.error) for s in samples])[:-1]), seconds)
+    basis = _Basis(
+        scale, even_mean, even_scale, rng.normal(size=(count, ODD_COUNT)) * FREQUENCY,
+        rng.normal(size=(count, EVEN_COUNT)) * FREQUENCY, rng.uniform(0.0, 2.0 * math.pi, count),
+    )  # fmt: skip
+    responses = [basis.responses(s) for s in samples]
+    unit = max(float(np.sqrt(np.mean(np.concatenate([r[:, :ODD_COUNT] for r in responses]) ** 2))), 1e-12)
+    problem = _problem(samples, [r / unit for r in responses], seconds)
     linear = problem.only(ODD_COUNT)
     trials, chosen = _climb({LINEAR: linear} | ({RANDOM: problem} if count else {}))
     if chosen == NONE:
         return LadderFit(None, math.inf, trials, seconds, len(problem.blocks))
     taken = linear if chosen == LINEAR else problem
     ridge = _best_ridge(taken, ())
-    weights = _solve(list(taken.whole), ridge)
     random = 0 if chosen == LINEAR else count
-    used = phi[:, : ODD_COUNT + random]
+    used = ODD_COUNT + random
     rmse_rad = math.radians(next(t.rmse_deg for t in trials if t.rung == chosen))
-    normal = ridge * np.eye(used.shape[1]) + sum(_centred(drive)[:-1, :-1] for drive in taken.whole)
+    normal = ridge * np.eye(used) + sum(_centred(drive)[:-1, :-1] for drive in taken.whole)
+    weights = _solve(list(taken.whole), ridge) / unit
+    phi = np.concatenate([basis.features(s.drive.features, s.rows) for s in samples])[:, :used]
     speed = np.quantile(even[:, SPEED_COLUMN], [1.0 - QUANTILE, QUANTILE])
     model = LadderModel(
         rung=chosen,  # type: ignore[arg-type]
         scale=plain(scale),
         even_mean=plain(even_mean),
         even_scale=plain(even_scale),
-        odd_directions=plain(odd_directions[:random]),
-        even_directions=plain(even_directions[:random]),
-        phases=plain(phases[:random]),
+        odd_directions=plain(basis.odd_directions[:random]),
+        even_directions=plain(basis.even_directions[:random]),
+        phases=plain(basis.phases[:random]),
         weights=plain(weights),
-        factor=plain(_factor(normal, used, rmse_rad)),
-        whitening=plain(_whitening(z)),
+        factor=plain(_factor(normal, phi, rmse_rad) / unit),
+        whitening=plain(_whitening(odd / scale)),
         speed_m_s=plain(np.maximum(speed, 0.1)),
-        largest_rad=plain(np.quantile(np.abs(used @ weights), 0.999)),
+        largest_m_s2=plain(np.quantile(np.abs(phi @ weights), 0.999)),
     )
     return LadderFit(model, ridge, trials, seconds, len(problem.blocks))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Basis:
+    """Scales of the features and directions of the random ones."""
+
+    scale: FloatArray
+    even_mean: FloatArray
+    even_scale: FloatArray
+    odd_directions: FloatArray
+    even_directions: FloatArray
+    phases: FloatArray
+
+    def features(self, features: SlowFeatures, rows: IntArray | slice, part: slice = slice(None)) -> FloatArray:
+        """Return the features of rows, 0 where an input is unknown: the odd ones, then a part of the random ones."""
+        z, e = features.odd[rows] / self.scale, (features.even[rows] - self.even_mean) / self.even_scale
+        unknown = ~np.isfinite(z.sum(axis=1) + e.sum(axis=1))
+        z[unknown], e[unknown] = 0.0, 0.0
+        out = np.empty((len(z), ODD_COUNT + len(self.phases[part])))
+        expand(z, e, self.odd_directions[part], self.even_directions[part], self.phases[part], out)
+        return out
+
+    def responses(self, sample: _Sample) -> FloatArray:
+        """Return the changes of the sideslip by each feature as a rate, at the rows of a sample."""
+        drive, columns = sample.drive, []
+        for first in range(0, max(len(self.phases), 1), TOGETHER):
+            phi = self.features(drive.features, slice(None), slice(first, first + TOGETHER))
+            columns.append(drive.response(phi if first == 0 else phi[:, ODD_COUNT:])[sample.rows])
+        return np.concatenate(columns, axis=1)
 
 
 def _thinned(drive: TaughtDrive) -> _Sample:
@@ -205,8 +243,7 @@ def _thinned(drive: TaughtDrive) -> _Sample:
     every = max(1, round(1.0 / (FIT_RATE_HZ * step_s)))
     rows = np.flatnonzero(drive.usable)[::every]
     weight_s = step_s * every * np.broadcast_to(drive.weight, drive.lacking_rad.shape)[rows]
-    columns = drive.features.odd[rows], drive.features.even[rows], drive.lacking_rad[rows]
-    return _Sample(*columns, weight_s, step_s * every)
+    return _Sample(drive, rows, drive.lacking_rad[rows], weight_s, step_s * every)
 
 
 def _problem(samples: Sequence[_Sample], phi: Sequence[FloatArray], seconds: float) -> _Problem:
@@ -217,7 +254,7 @@ def _problem(samples: Sequence[_Sample], phi: Sequence[FloatArray], seconds: flo
         table -= running_mean(table, round(SLOW_S / sample.step_s) // 2, sample.weight_s)
         table = np.column_stack([np.ones(len(table)), table])
         weighted = sample.weight_s[:, None] * table
-        count = max(1, round(sample.seconds / length_s))
+        count = 1 if len(samples) >= LEAST_DRIVES else max(1, round(sample.seconds / length_s))
         whole.append(weighted.T @ table)
         for part in np.array_split(np.arange(len(table)), count):
             inner = part[: max(1, len(part) - round(FORGET_S / sample.step_s))]
@@ -283,6 +320,8 @@ def _whitening(z: FloatArray) -> FloatArray:
 
 def corrected_rmse_deg(drive: TaughtDrive, correction: Correction | None) -> tuple[float, float]:
     """Return the RMSE of a drive's error in degrees with a correction, and the same without its constant."""
-    lacking = drive.lacking_rad if correction is None else drive.lacking_rad - correction.gain * correction.residual_rad
+    lacking = drive.lacking_rad
+    if correction is not None:
+        lacking = lacking - drive.response((correction.gain * correction.rate_m_s2)[:, None])[:, 0]
     error = np.degrees(lacking[drive.usable])
     return float(np.sqrt(np.mean(error**2))), float(np.std(error))

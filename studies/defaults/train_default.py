@@ -4,10 +4,10 @@
 
 Short drives of one simulated car with its correct vehicle file and the true friction. ``physics`` and its noise are
 fitted on five minutes of other drives (:mod:`studies.defaults.fit_physics`); the residual network learns the model
-residual. The direct network, the regression and the paper's network see the same drives, with the nominal model. Filter
-noise of all tuned estimators is chosen on validation drives in one search. Seeds other than 0 train
-networks for spreads and take fit and noise of the shipped car. A second set has other cars of the same kind. Existing
-logs with unchanged settings are kept.
+residual. The direct network and the regression use the same drives, with the nominal model; the paper's network uses
+the drives of :mod:`studies.defaults.paper_drives`. Filter noise of all tuned estimators is chosen on validation drives
+in one search. Seeds other than 0 train networks for spreads and take fit and noise of the shipped car. A second set has
+other cars of the same kind. Existing logs with unchanged settings are kept.
 """
 
 from __future__ import annotations
@@ -35,16 +35,15 @@ from pdhef_logtool.car.car import (
 from pdhef_logtool.car.store import update_car
 from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_toml
 from pdhef_logtool.learning.drives import LearnSettings, choose_drives, open_car
-from pdhef_logtool.learning.network.fit import Recipe
+from pdhef_logtool.learning.network.fit import PAPER_RECIPE, Recipe
 from pdhef_logtool.learning.network.train_command import dataset_for, train_on
 from pdhef_logtool.learning.stages.task import Task
 from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import MODELS, NOMINAL_MODEL, PAPER_FOLDER, PHYSICS_MODEL, SHIPPED
-from pdhef_logtool.residual_model.features import PAPER_FEATURES
 from pdhef_logtool.runs.config import RunConfig
-from studies.defaults import fit_physics
+from studies.defaults import fit_physics, paper_drives
 from studies.defaults.intervals import fit_intervals
 from studies.defaults.noise import tune
 from studies.pages import SAMPLE_VEHICLE, options
@@ -56,7 +55,10 @@ DRIVES = 800
 #: Sets without training: drives of other cars, and the evidence that the network helps.
 OTHER_DRIVES = {"other_cars": 200, "evidence": 200}
 EPOCHS, BASELINE_EPOCHS = 66, 40
-PAPER_EPOCHS = 15
+#: Folders of the paper's network.
+PAPER_DRIVES, PAPER_RESIDUALS = "paper", "paper-residuals"
+#: An epoch of the paper's network is one batch of windows of 6.4 s, so that 200 epochs take less than half an hour.
+PAPER_WINDOWS = {"piece_steps": 640, "pieces_per_epoch": 64, "chunk_steps": 25}
 TRIALS = 64
 #: Relative errors of friction and vehicle files that the intervals allow for: of a usual car (load alone causes such
 #: errors), and of a car that may have changed.
@@ -131,6 +133,7 @@ def simulate(t: Training) -> None:
         count = min(t.drives, OTHER_DRIVES.get(name, t.drives))
         what = ["--count", count, "--seed", seed, "--vehicles", vehicles, "--jobs", t.jobs]
         pdhef("simulate", "suite", *what, "-o", t.work / name)
+    paper_drives.write_drives(t.work / PAPER_DRIVES, count=min(t.drives, paper_drives.COUNT), processes=t.jobs)
 
 
 def fit(t: Training) -> None:
@@ -140,13 +143,14 @@ def fit(t: Training) -> None:
 
 def extract(t: Training) -> None:
     """Extract residuals: the paper's network and the baselines have the nominal model, as the paper has it."""
-    for model in MODELS:
-        output = ("-o", t.work / model, "--filter", model, "--jobs", t.jobs, "--resume")
-        pdhef("extract", t.work / "one_car", *t.of_car, *output)
+    sets = [(t.work / "one_car", t.work / model, model) for model in MODELS]
+    for drives, residuals, model in (*sets, (t.work / PAPER_DRIVES, t.work / PAPER_RESIDUALS, NOMINAL_MODEL)):
+        output = ("-o", residuals, "--filter", model, "--jobs", t.jobs, "--resume")
+        pdhef("extract", drives, *t.of_car, *output)
 
 
 def train(t: Training) -> None:
-    """Train the residual network, the baselines beside it, and the paper's network, on the same drives."""
+    """Train the residual network and the baselines beside it."""
     how = ("--baselines", "--seed", t.seed, "--epochs", BASELINE_EPOCHS)
     beside = _start("train", t.work / NOMINAL_MODEL, "-o", t.network, *how)
     if t.jobs == 1:
@@ -154,13 +158,17 @@ def train(t: Training) -> None:
     torch.set_num_threads(1)  # small networks: a second process is faster than a second thread
     recipe = Recipe(seed=t.seed, epochs=t.epochs)
 
-    def epoch(text: str, _share: float) -> None:
-        print(text, flush=True)
-
-    train_on(dataset_for(t.work / PHYSICS_MODEL, PHYSICS_MODEL), t.network, recipe, progress=epoch)
-    paper = replace(recipe, feature_names=PAPER_FEATURES, hidden=128, dropout=0.2, epochs=PAPER_EPOCHS, odd=False)
-    train_on(dataset_for(t.work / NOMINAL_MODEL, NOMINAL_MODEL), t.network / PAPER_FOLDER, paper, progress=epoch)
+    train_on(dataset_for(t.work / PHYSICS_MODEL, PHYSICS_MODEL), t.network, recipe, progress=_print_epoch)
     _finish(beside)
+
+
+def paper(t: Training) -> None:
+    """Train the paper's network by Table 1."""
+    torch.set_num_threads(1)
+    recipe = replace(PAPER_RECIPE, seed=t.seed, **PAPER_WINDOWS)
+    train_on(
+        dataset_for(t.work / PAPER_RESIDUALS, NOMINAL_MODEL), t.network / PAPER_FOLDER, recipe, progress=_print_epoch
+    )  # fmt: skip
 
 
 def noise(t: Training) -> None:
@@ -183,7 +191,7 @@ def intervals(t: Training) -> None:
 
 
 STEPS: dict[str, Callable[[Training], None]] = {
-    step.__name__: step for step in (simulate, fit, extract, train, noise, gain, intervals)
+    step.__name__: step for step in (simulate, fit, extract, train, paper, noise, gain, intervals)
 }
 #: Seeds other than 0 take these parts from the shipped car.
 ONLY_OF_SEED_0 = ("fit", "noise", "intervals")
@@ -208,6 +216,10 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"[{(time.monotonic() - began) / 60.0:5.1f} min] {name}: {step.__doc__}", flush=True)
             step(training)
     return 0
+
+
+def _print_epoch(text: str, _share: float) -> None:
+    print(text, flush=True)
 
 
 def _start(*words: object) -> subprocess.Popen[bytes]:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_models import random_network
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from reference_car import cut, drive, slalom, tanh_tyre, with_noise
 
 from pdhef_logtool.car.car import Car
@@ -17,7 +18,6 @@ from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import CURES, LEAST_WEIGHT, AdaptivePhysics, mix, weigh
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.table import Options, make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track

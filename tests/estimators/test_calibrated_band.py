@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter, physics_filter
 from reference_car import cut, drive, slalom, with_noise
 
 from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, FRONT_WEIGHT_SHARE, FRONT_WEIGHT_SHARE_SPREAD
@@ -18,7 +19,6 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.calibrated_band import D2_SHARE
 from pdhef_logtool.estimators.drive_signals import DriveSignals, calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter, physics_filter
 from pdhef_logtool.estimators.presets import OPEN_LOOP
 from pdhef_logtool.estimators.table import all_names, make_estimator
 from pdhef_logtool.records.errors import UsageError

@@ -15,7 +15,7 @@ from reference_car import drive, forces, runge_kutta, slalom, with_noise
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.fuzzy_trust import RULES, fuzzy_trust, memberships
-from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf, adapted_noise
+from pdhef_logtool.estimators.hybrid_paper import Constants, PaperHybridUkf, adapted_noise
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.table import check_names, runnable
@@ -29,6 +29,8 @@ from pdhef_logtool.residual_model.service import NetworkService
 pytestmark = pytest.mark.slow
 
 VEHICLE = default_vehicle()
+TOPS = (0.3, 1.0, 2.5), (0.3, 0.6, 0.85)
+CONSTANTS = Constants(0.95, 3.0, *TOPS, 0.1)
 GRAVITY = 9.80665
 
 
@@ -37,7 +39,7 @@ def make_bundle(names: tuple[str, ...] = PAPER_FEATURES) -> ModelBundle:
 
 
 def paper_filter(**options: object) -> PaperHybridUkf:
-    return PaperHybridUkf(VEHICLE, NetworkService(make_bundle()), **options)
+    return PaperHybridUkf(VEHICLE, NetworkService(make_bundle()), constants=CONSTANTS, **options)
 
 
 @pytest.fixture(scope="module")
@@ -62,53 +64,54 @@ def weaving() -> Signals:
 def test_at_the_tops_of_the_sets_trust_is_table_2(row, column):
     table = ((0.1, 0.2, 0.3), (0.3, 0.5, 0.7), (0.5, 0.8, 0.9))
     assert table == RULES
-    assert fuzzy_trust((0.3, 1.0, 2.5)[column], (0.3, 0.6, 0.85)[row]) == pytest.approx(table[row][column], abs=1e-15)
+    deviations, intensities = TOPS
+    assert fuzzy_trust(deviations[column], intensities[row], *TOPS) == pytest.approx(table[row][column], abs=1e-15)
 
 
 def test_between_the_tops_rules_weigh_by_their_strength():
     # E_ay 0.65: half small, half medium. I_dyn 0.3: small. Two rules of strength 1/2.
-    assert fuzzy_trust(0.65, 0.3) == pytest.approx(0.15)
+    assert fuzzy_trust(0.65, 0.3, *TOPS) == pytest.approx(0.15)
     # I_dyn 0.7: medium 0.6, large 0.4; E_ay 1.75: medium 0.5, large 0.5.
     # strengths min: 0.5, 0.5 (medium row), 0.4, 0.4 (large row)
     expected = (0.5 * 0.5 + 0.5 * 0.7 + 0.4 * 0.8 + 0.4 * 0.9) / 1.8
-    assert fuzzy_trust(1.75, 0.7) == pytest.approx(expected)
+    assert fuzzy_trust(1.75, 0.7, *TOPS) == pytest.approx(expected)
 
 
 def test_beyond_the_outer_tops_the_sets_have_shoulders():
-    assert fuzzy_trust(0.0, 0.0) == 0.1
-    assert fuzzy_trust(50.0, 3.0) == 0.9
-    assert fuzzy_trust(50.0, 0.0) == 0.3
-    assert math.isnan(fuzzy_trust(math.nan, 0.5))
-    assert math.isnan(fuzzy_trust(0.5, math.nan))
+    assert fuzzy_trust(0.0, 0.0, *TOPS) == 0.1
+    assert fuzzy_trust(50.0, 3.0, *TOPS) == 0.9
+    assert fuzzy_trust(50.0, 0.0, *TOPS) == 0.3
+    assert math.isnan(fuzzy_trust(math.nan, 0.5, *TOPS))
+    assert math.isnan(fuzzy_trust(0.5, math.nan, *TOPS))
 
 
 @settings(derandomize=True, deadline=None)
 @given(st.floats(0, 5), st.floats(0, 5), st.floats(0, 2))
 def test_trust_never_falls_when_the_model_deviates_more(a, b, intensity):
     low, high = sorted((a, b))
-    sets = memberships(low, (0.3, 1.0, 2.5))
+    sets = memberships(low, TOPS[0])
     assert min(sets) >= 0.0
     assert sum(sets) == pytest.approx(1.0)
-    assert 0.1 <= fuzzy_trust(low, intensity) <= 0.9
+    assert 0.1 <= fuzzy_trust(low, intensity, *TOPS) <= 0.9
     # the weights of min-strengths are not bilinear: between tops they may fall by a little
-    assert fuzzy_trust(high, intensity) >= fuzzy_trust(low, intensity) - 0.03
+    assert fuzzy_trust(high, intensity, *TOPS) >= fuzzy_trust(low, intensity, *TOPS) - 0.03
 
 
 # --- the noise -------------------------------------------------------------------------------------------------------
 
 
 def test_noise_by_hand():
-    c, r = adapted_noise(math.nan, 0.0, 0.2, 0.1)  # C starts at 0.3
+    c, r = adapted_noise(math.nan, 0.0, 0.2, 0.1, 0.95)  # C starts at 0.3
     assert (c, r) == (pytest.approx(0.285), pytest.approx(0.1))
-    c, r = adapted_noise(0.3, 2.0, 0.2, 0.1)
+    c, r = adapted_noise(0.3, 2.0, 0.2, 0.1, 0.95)
     assert c == pytest.approx(0.95 * 0.3 + 0.05 * 4.0)
     assert r == pytest.approx(0.485 - 0.2)
 
 
 @settings(derandomize=True, deadline=None)
-@given(st.floats(0, 1e3), st.floats(-100, 100), st.floats(1e-12, 1e3), st.floats(1e-9, 10))
-def test_noise_never_falls_below_the_sensors(c, nu, predicted, r0):
-    assert adapted_noise(c, nu, predicted, r0)[1] >= r0
+@given(st.floats(0, 1e3), st.floats(-100, 100), st.floats(1e-12, 1e3), st.floats(1e-9, 10), st.floats(0, 1))
+def test_noise_never_falls_below_the_sensors(c, nu, predicted, r0, forgetting):
+    assert adapted_noise(c, nu, predicted, r0, forgetting)[1] >= r0
 
 
 def test_noise_rises_in_a_burst_and_only_then(weaving):
@@ -118,7 +121,7 @@ def test_noise_rises_in_a_burst_and_only_then(weaving):
     assert track.r_scale[20:100].max() < track.r_scale[240:262].max() / 3
 
 
-def test_the_undisturbed_norm_is_the_papers():
+def test_the_undisturbed_norm_follows_the_constant_of_a_y():
     assert np.linalg.norm(paper_filter().measurement_variance) == pytest.approx(0.1, rel=0.01)
 
 
@@ -215,7 +218,7 @@ def numpy_reference(signals: Signals, bundle: ModelBundle) -> dict[str, np.ndarr
 def test_it_is_the_papers_equations_in_plain_numpy(weaving):
     bundle = make_bundle()
     want = numpy_reference(weaving, bundle)
-    track, _ = run_window(PaperHybridUkf(VEHICLE, NetworkService(bundle)), weaving)
+    track, _ = run_window(PaperHybridUkf(VEHICLE, NetworkService(bundle), constants=CONSTANTS), weaving)
     got = {
         "vx": track.vx_m_s, "vy": track.vy_m_s, "r": track.yaw_rate_rad_s, "beta": track.network_trust,
         "r_scale": track.r_scale, "ay": track.ay_m_s2, "vy_var": track.vy_std_m_s**2,

@@ -10,15 +10,15 @@ from typing import Any
 
 import pytest
 
-from pdhef_logtool.car.car import INTERVALS_FILE, SHIPPED_CARS, Car
+from pdhef_logtool.car.car import INTERVALS_FILE, SHIPPED_CARS, UNSURE_FILE, Car, load_intervals
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.errors import UsageError
 from tests.command_line import pdhef
 
-_HYBRID = "adaptive-physics 1 (physics=physics-filter, trust=0.75)"
+_HYBRID = "adaptive-physics 1 (physics=vehicle-ukf, trust=0.75)"
 #: Identity and digest of the presets on the shipped car. The digest covers noise, physics and network as well.
 SHIPPED = {
     "zero": ("pass-through 1 (claims_zero_sideslip=True)", "138e43c5f7aa"),
@@ -26,17 +26,17 @@ SHIPPED = {
     "kinematic": ("kinematic 1", "6a7d76af0e93"),
     "open-loop": ("open-loop 1", "5afc5962fabb"),
     "linear-regression": ("linear-regression 1", "9de17837d3ad"),
-    "phy-ukf": ("physics-ukf 1", "50fddfe0bbfa"),
-    "physics": ("adaptive-physics 1 (physics=physics-filter)", "12c85100356c"),
-    "phy-ukf:tuned": ("physics-ukf 1 (roll_correction=True)", "28232f13c924"),
+    "phy-ukf": ("vehicle-ukf 1 (equations=nominal)", "cead32189ec2"),
+    "physics": ("adaptive-physics 1 (physics=vehicle-ukf)", "da0dc5b4f520"),
+    "phy-ukf:tuned": ("vehicle-ukf 1 (equations=nominal, roll_correction=True)", "2e213229f481"),
     "pure-lstm": ("direct-network 1", "4441758f4188"),
-    "pd-hef": (_HYBRID, "a29a14dbfbf0"),
-    "pd-hef:fixed-r": ("adaptive-physics 1 (adaptive=False, physics=physics-filter, trust=1.0)", "9045ef1e00d9"),
+    "pd-hef": (_HYBRID, "d246eb1c7e30"),
+    "pd-hef:fixed-r": ("adaptive-physics 1 (adaptive=False, physics=vehicle-ukf, trust=1.0)", "4ce8b9b97611"),
     "pd-hef-smoothed": (
-        "smoothed-physics 1 (filtered=adaptive-physics, filtered.physics=physics-filter, filtered.trust=0.75)",
-        "88c546b80f30",
+        "smoothed-physics 2 (filtered=adaptive-physics, filtered.physics=vehicle-ukf, filtered.trust=0.75)",
+        "f20b45e944a7",
     ),
-    "pd-hef-paper": ("paper-hybrid-ukf 1", "c13712e0df29"),
+    "pd-hef-paper": ("paper-hybrid-ukf 2", "87a835dda35a"),
 }
 #: Fields that are no option: names, texts, noise, physics and network.
 ROLES = {"name", "causal", "notes", "vehicle", "network", "model", "q_std", "r_std", "use_speed"}
@@ -52,15 +52,23 @@ def test_the_identities_of_the_shipped_presets_are_frozen(saloon: Car) -> None:
     assert {name: (a.identity, a.sha256[:12]) for name, a in found.items()} == SHIPPED
 
 
+@pytest.mark.parametrize("file", [INTERVALS_FILE, UNSURE_FILE])
+def test_the_shipped_intervals_are_those_of_the_shipped_estimators(file: str, saloon: Car) -> None:
+    entries = load_intervals(SHIPPED_CARS["saloon"] / file).entries
+    assert {e.estimator for e in entries} >= {"phy-ukf", "physics", "pd-hef", "pd-hef-smoothed", "pd-hef-paper"}
+    for entry in entries:
+        assert entry.algorithm == resolve(make_estimator(entry.estimator, saloon)), entry.estimator
+
+
 def test_a_new_option_at_its_default_changes_no_identity(saloon: Car) -> None:
     estimator = make_estimator("pd-hef", saloon)
     assert isinstance(estimator, AdaptivePhysics)
-    kind = make_dataclass("PhysicsFilter", [("probe", bool, False)], bases=(PhysicsFilter,), frozen=True)
-    kind.options = (*PhysicsFilter.options, "probe")  # type: ignore[attr-defined]
-    values = {f.name: getattr(estimator.physics, f.name) for f in fields(PhysicsFilter)}
+    kind = make_dataclass("VehicleUkf", [("probe", bool, False)], bases=(VehicleUkf,), frozen=True)
+    kind.options = (*VehicleUkf.options, "probe")  # type: ignore[attr-defined]
+    values = {f.name: getattr(estimator.physics, f.name) for f in fields(VehicleUkf)}
     assert resolve(replace(estimator, physics=kind(**values))) == resolve(estimator)
     changed = resolve(replace(estimator, physics=kind(**values, probe=True)))
-    assert changed.identity == "adaptive-physics 1 (physics=physics-filter, physics.probe=True, trust=0.75)"
+    assert changed.identity == "adaptive-physics 1 (physics=vehicle-ukf, physics.probe=True, trust=0.75)"
     kind.version = 2  # type: ignore[attr-defined]
     assert "physics.version=2" in resolve(replace(estimator, physics=kind(**values))).identity
 
@@ -100,12 +108,12 @@ def test_intervals_that_do_not_apply_are_named_on_stderr_and_in_the_report(
     arguments = ("--car", car, "-e", "phy-ukf,zero", "--annotate", "none", "--no-report", "--start", "2", "--end", "4")
     pdhef("run", log, "-o", tmp_path / "out", *arguments)
     message = (
-        "the calibrated intervals of phy-ukf are not applied: expected physics-ukf 1 (standstill=False), "
-        "got physics-ukf 1"
+        "the calibrated intervals of phy-ukf are not applied: "
+        "expected vehicle-ukf 1 (equations=nominal, standstill=False), got vehicle-ukf 1 (model=nominal)"
     )
     assert "".join(capsys.readouterr().err.split()).count("".join(message.split())) == 1
     report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())
     (told,) = (e for e in report["estimators"] if e["name"] == "phy-ukf")
     assert told["intervals"] == ["intervals not calibrated", message]
-    assert (told["algorithm"]["algorithm"], told["algorithm"]["version"]) == ("physics-ukf", 1)
+    assert (told["algorithm"]["algorithm"], told["algorithm"]["version"]) == ("vehicle-ukf", 1)
     assert message in report["warnings"]

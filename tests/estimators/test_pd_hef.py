@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 from made_models import random_network
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from physics_oracle import Oracle, parts
 from reference_car import FRICTION
 
@@ -16,7 +17,6 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.latency_compensation import compensate, run_window
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.table import make_estimator, runnable
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pdhef_logtool.estimators.physics_filter import physics_filter
 from reference_car import drive, slalom, with_noise
 
 from pdhef_logtool.car.car import NO_INTERVALS, Car
@@ -28,7 +29,6 @@ from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.error_features import TERMS, error_terms
 from pdhef_logtool.estimators.intervals import POSTERIOR_NOTE
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.physics_filter import physics_filter
 from pdhef_logtool.estimators.posterior_band import OWN_SHARE, posterior_band
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals

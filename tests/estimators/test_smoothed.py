@@ -13,6 +13,9 @@ import pytest
 import test_estimators as properties
 from filterpy.kalman import KalmanFilter
 from made_models import random_network
+from pdhef_logtool.estimators.filter_base import AX_BIAS, LINK_BIASES, LINK_NONE, LINK_WHOLE, PosteriorSteps, StepLinks
+from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
+from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from reference_car import REAR_M, cut, drive, forces, keep, rolling_drive, runge_kutta, slalom, with_noise
 from rich.console import Console
 
@@ -23,10 +26,7 @@ from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.estimators import smoothed
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import LookingAhead, look_ahead_of
-from pdhef_logtool.estimators.filter_base import AX_BIAS, LINK_BIASES, LINK_NONE, LINK_WHOLE, PosteriorSteps, StepLinks
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter
 from pdhef_logtool.estimators.smoothed import ForwardSteps, SmoothedPhysics, smooth_blocks
 from pdhef_logtool.estimators.table import SPECS, make_estimator
 from pdhef_logtool.records.reasons import (

@@ -29,9 +29,8 @@ from pdhef_logtool.learning.network.extract_command import ExtractResult, Extrac
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.records.errors import LogError, OutputError, UsageError
 from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.features import EVEN_COUNT, FEATURES, ODD_COUNT
 from pdhef_logtool.residual_model.ladder import LadderModel, plain
-from pdhef_logtool.residual_model.slow_features import EVEN_COUNT, ODD_COUNT
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.outputs import OutputFolder
@@ -317,7 +316,7 @@ def test_a_taught_car_is_calibrated_and_each_row_has_the_gain_of_its_region(
     model = LadderModel(
         rung="linear", scale=plain(ones), even_mean=plain(np.zeros(EVEN_COUNT)), even_scale=plain(np.ones(EVEN_COUNT)),
         weights=plain(0.01 * ones), factor=plain(0.01 * ones[:, None]), whitening=plain(0.6 * np.eye(ODD_COUNT)),
-        speed_m_s=(5.0, 60.0), largest_rad=0.1,
+        speed_m_s=(5.0, 60.0), largest_m_s2=0.1,
     )  # fmt: skip
     taught = Taught(physics_sha256=Car.load(car, network="none").physics_sha256, residual=model)
     (car / "taught.json").write_text(json.dumps(taught.model_dump(mode="json")))

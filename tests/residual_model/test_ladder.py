@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from pdhef_logtool.residual_model.features import FEATURES, ODD_COUNT, SlowFeatures, slow_features
 from pdhef_logtool.residual_model.ladder import LARGEST, LadderModel
 from pdhef_logtool.residual_model.ladder_fit import (
     LadderFit,
@@ -20,7 +21,6 @@ from pdhef_logtool.residual_model.ladder_fit import (
     corrected_rmse_deg,
     fit_ladder,
 )
-from pdhef_logtool.residual_model.slow_features import ODD_COUNT, SlowFeatures, slow_features
 
 RATE_HZ = 50.0
 
@@ -34,10 +34,19 @@ def driving(seconds: float, seed: int, speed: float = 20.0) -> np.ndarray:
     return np.concatenate([odd, np.full((count, 1), speed), smooth[:, 4:]], axis=1)
 
 
+def table(signals: np.ndarray) -> np.ndarray:
+    """Return the features [K, 15] with these signals."""
+    columns = dict.fromkeys(FEATURES, np.zeros(len(signals)))
+    names = ("steer_rad", "physics_yaw_rate_rad_s", "ay_m_s2", "physics_vy_m_s", "vx_m_s", "ax_m_s2")
+    columns |= dict(zip(names, signals.T, strict=True))
+    columns["physics_vy_m_s"] = columns["physics_vy_m_s"] * np.maximum(columns["vx_m_s"], 1.0)
+    return np.stack([columns[name] for name in FEATURES], axis=1)
+
+
 def features(signals: np.ndarray) -> SlowFeatures:
     dt = np.full(len(signals), 1.0 / RATE_HZ)
     dt[0] = np.nan
-    return slow_features(signals, dt, None)[0]
+    return slow_features(table(signals), dt, None)[0]
 
 
 def taught(seconds: float, seed: int, lacking: object = None, noise_rad: float = 0.002) -> TaughtDrive:
@@ -100,7 +109,7 @@ def test_a_constant_of_the_ground_truth_is_not_learned(offset_rad: float) -> Non
     assert moved is not None
     found = drive.features
     expected, got = linear_model().evaluate(found), moved.evaluate(found)
-    assert np.allclose(got.residual_rad, expected.residual_rad, atol=1e-9)
+    assert np.allclose(got.rate_m_s2, expected.rate_m_s2, atol=1e-9)
     assert np.array_equal(got.gain, expected.gain)
 
 
@@ -109,7 +118,7 @@ def test_each_drive_may_have_its_own_constant() -> None:
     moved = [replace(d, lacking_rad=d.lacking_rad + 0.01 * k) for k, d in enumerate(drives)]
     fits = [fit_ladder(each).model for each in (drives, moved)]
     assert all(f is not None for f in fits)
-    a, b = (f.evaluate(drives[0].features).residual_rad for f in fits if f is not None)
+    a, b = (f.evaluate(drives[0].features).rate_m_s2 for f in fits if f is not None)
     assert np.allclose(a, b, atol=1e-9)
 
 
@@ -120,8 +129,8 @@ def test_the_mirrored_drive_has_the_mirrored_residual(seed: int, size: float) ->
     mirrored = SlowFeatures(-found.odd, found.even)
     for model in (linear_model(), random_model()):
         straight, turned = model.evaluate(found), model.evaluate(mirrored)
-        assert np.array_equal(turned.residual_rad, -straight.residual_rad)
-        assert np.array_equal(turned.gain, straight.gain) and np.array_equal(turned.std_rad, straight.std_rad)
+        assert np.array_equal(turned.rate_m_s2, -straight.rate_m_s2)
+        assert np.array_equal(turned.gain, straight.gain) and np.array_equal(turned.std_m_s2, straight.std_m_s2)
 
 
 @cache
@@ -146,7 +155,7 @@ def test_straight_driving_has_no_residual() -> None:
     signals = np.zeros((200, 6))
     signals[:, 4] = 20.0
     for model in (linear_model(), random_model()):
-        assert np.all(model.evaluate(features(signals)).residual_rad == 0.0)
+        assert np.all(model.evaluate(features(signals)).rate_m_s2 == 0.0)
 
 
 def test_outside_of_the_taught_driving_the_residual_is_zero_within_two_seconds() -> None:
@@ -162,15 +171,15 @@ def test_outside_of_the_taught_driving_the_residual_is_zero_within_two_seconds()
 
 def test_a_residual_is_limited() -> None:
     found = linear_model().evaluate(features(driving(5.0, 1) * np.array([100.0] * 4 + [1.0, 1.0])))
-    assert np.max(np.abs(found.residual_rad)) <= LARGEST * linear_model().largest_rad
+    assert np.max(np.abs(found.rate_m_s2)) <= LARGEST * linear_model().largest_m_s2
 
 
 def test_unknown_features_have_gain_zero_and_the_next_ones_go_on() -> None:
     signals = driving(8.0, 3)
     signals[50:60, 2] = np.nan
     found = linear_model().evaluate(features(signals))
-    assert np.all(found.gain[50:60] == 0.0) and np.all(found.residual_rad[50:60] == 0.0)
-    assert np.all(np.isfinite(found.residual_rad)) and np.mean(found.gain[60:] > 0.0) > 0.5
+    assert np.all(found.gain[50:60] == 0.0) and np.all(found.rate_m_s2[50:60] == 0.0)
+    assert np.all(np.isfinite(found.rate_m_s2)) and np.mean(found.gain[60:] > 0.0) > 0.5
 
 
 def test_the_sums_of_blocks_give_the_weighted_ridge_regression_of_the_samples() -> None:
@@ -202,8 +211,8 @@ def test_a_sideslip_without_weight_teaches_nothing() -> None:
 def test_the_interval_contains_most_of_what_a_strong_ridge_leaves() -> None:
     drive = taught(60.0, 21, linear)
     found = linear_model().evaluate(drive.features)
-    error = found.residual_rad - linear(drive.features)
-    assert np.mean(np.abs(error) <= 1.96 * found.std_rad) > 0.65
+    error = found.rate_m_s2 - linear(drive.features)
+    assert np.mean(np.abs(error) <= 1.96 * found.std_m_s2) > 0.65
 
 
 def test_a_model_survives_its_document_and_damage_is_refused() -> None:
@@ -214,4 +223,4 @@ def test_a_model_survives_its_document_and_damage_is_refused() -> None:
         with pytest.raises(ValidationError):
             LadderModel(**{**model.model_dump(), name: value})
     with pytest.raises(ValidationError):
-        LadderModel(**{**model.model_dump(), "largest_rad": float("nan")})
+        LadderModel(**{**model.model_dump(), "largest_m_s2": float("nan")})

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from studies.peers.models import stiffness
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
@@ -19,7 +20,6 @@ from pdhef_logtool.records.tracks import make_track
 from studies.pages import DOCS, RESULTS
 from studies.peers import __main__ as peers
 from studies.peers.drives import FULL_SIZE, OFFSET, PEER_DRIVES, PeerDrive, beside_mapping, beside_vehicle
-from studies.peers.models import stiffness
 from studies.peers.page import page
 from studies.peers.parameters import OF_CAR, PEAK, pairs_table
 from studies.peers.scoring import DriveErrors, car_means, score

@@ -1,4 +1,4 @@
-"""``learned-single-track``: stationary v_y of a linear single track whose parameters are learned from the yaw rate.
+"""``learned-single-track``: stationary v_y of a linear single track with parameters learned from the yaw rate.
 
 openpilot, ``paramsd`` and ``car_kf`` (2022 to 2025): an extended Kalman filter over stiffness factor, steering ratio i,
 slow and fast steering offset, v_x, v_y, r, steering-wheel angle and road roll φ, with
@@ -8,7 +8,7 @@ slow and fast steering offset, v_x, v_y, r, steering-wheel angle and road roll �
 and all other states constant. Noise and validity limits are the published ones; steering wheel and speed are observed
 at 100 Hz, the rest at 20 Hz. The estimate is the stationary v_y with the learned parameters. Differences: without a
 roll sensor φ is observed as 0 with 10°, as there while the localizer is not valid; the steering ratio starts at 15,
-because a log may contain the road-wheel angle; below 0.5 m/s the car rolls without slip.
+because a log may contain the road-wheel angle.
 """
 
 from __future__ import annotations
@@ -21,27 +21,22 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.peers.gaussian import propagate, update
 from pdhef_logtool.estimators.peers.peer import PUBLISHED_HZ, Peer, Samples
-from pdhef_logtool.estimators.peers.single_track import (
-    LEAST_SPEED_M_S,
-    matrices,
-    parts_of,
-    single_track,
-    stationary,
-)
+from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S, LONGEST_STEP_S, matrices, single_track, solve
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.steps import RESTART_GAP_S
 
-STIFFNESS, RATIO, SLOW_OFFSET, FAST_OFFSET, SPEED, VY, RATE, WHEEL, ROLL = range(9)
-#: Entries of the memory behind state [9] and covariance [9, 9]: time since observations at 100 and at 20 Hz, activity.
-DUE, DUE_SLOW, ACTIVE = 90, 91, 92
-START_RATIO = 15.0
-DEGREE = math.pi / 180.0
-UNIT = np.eye(9)
+N = 9
+STIFFNESS, RATIO, SLOW_OFFSET, FAST_OFFSET, SPEED, VY, RATE, WHEEL, ROLL = range(N)
+#: Entries of the memory behind state and covariance: time since observations at 100 and at 20 Hz, activity.
+DUE, DUE_SLOW, ACTIVE = range(N + N * N, N + N * N + 3)
+START_RATIO, LEAST_PARAMETER = 15.0, 0.1
+DEGREE = math.radians(1.0)
+UNIT = np.eye(N)
 #: Step of the differences.
 DIFFERENCE = 1e-6
 #: Process noise per √s and initial standard deviation.
 STD = np.array([0.0005, 0.01, 0.02 * DEGREE, 0.25 * DEGREE, 0.1, 0.01, 0.1 * DEGREE, 0.1 * DEGREE, DEGREE])
-#: Standard deviations of the observations; without a valid yaw rate 0 is observed with that of the roll.
+#: Standard deviations of the observations; without a valid yaw rate, 0 is observed with ROLL_STD.
 WHEEL_STD, SPEED_STD, ROLL_STD, STIFFNESS_STD, RATIO_STD = 0.05 * DEGREE, 0.1, 10.0 * DEGREE, 0.5, 5.0
 #: Limits for learning.
 LEAST_ACTIVE_M_S, LARGEST_WHEEL, LARGEST_RATE = 1.0, 45.0 * DEGREE, 1.0
@@ -65,11 +60,11 @@ def _rates(x, p):  # type: ignore[no-untyped-def]
 @njit(cache=True, error_model="numpy")
 def _predict(x, cov, p, dt):  # type: ignore[no-untyped-def]
     """Predict state and covariance in place; the Jacobian is by differences."""
-    count = parts_of(dt)
+    count = math.ceil(dt / LONGEST_STEP_S)
     h = dt / count
     for _ in range(count):
-        rates, f = _rates(x, p), np.eye(9)
-        for j in range(9):
+        rates, f = _rates(x, p), np.eye(N)
+        for j in range(N):
             kept = x[j]
             x[j] += DIFFERENCE
             moved = _rates(x, p)
@@ -77,7 +72,7 @@ def _predict(x, cov, p, dt):  # type: ignore[no-untyped-def]
             for i in range(2):
                 f[VY + i, j] += h * (moved[i] - rates[i]) / DIFFERENCE
         propagate(cov, f)
-        for i in range(9):
+        for i in range(N):
             cov[i, i] += h * STD[i] ** 2
         x[VY] += h * rates[0]
         x[RATE] += h * rates[1]
@@ -85,7 +80,7 @@ def _predict(x, cov, p, dt):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def _observe_slow(x, cov, yaw_rate, yaw_rate_std):  # type: ignore[no-untyped-def]
-    """Update in place by the observations at 20 Hz; those of parameters limit their variance."""
+    """Update in place by the observations at 20 Hz; observed parameters limit their own variance."""
     is_valid = abs(yaw_rate) < LARGEST_RATE
     update(x, cov, UNIT[RATE], yaw_rate if is_valid else 0.0, (yaw_rate_std if is_valid else ROLL_STD) ** 2)
     update(x, cov, UNIT[ROLL], 0.0, ROLL_STD**2)
@@ -115,29 +110,29 @@ def _learn(x, cov, memory, p, dt, vx, wheel, yaw_rate, yaw_rate_std):  # type: i
 @njit(cache=True, error_model="numpy")
 def _learned(samples, first, p, yaw_rate_std, memory):  # type: ignore[no-untyped-def]
     steps_s, vx, steer, yaw_rate, states = samples
-    x, cov = memory[:9], memory[9:DUE].reshape(9, 9)
+    x, cov = memory[:N], memory[N:DUE].reshape(N, N)
     for k in range(first, len(vx)):
         if not math.isfinite(memory.sum()):
             memory[:] = 0.0
             x[STIFFNESS], x[RATIO] = 1.0, START_RATIO
-            for i in range(9):
+            for i in range(N):
                 cov[i, i] = STD[i] ** 2
         wheel = steer[k] * START_RATIO
         is_active = vx[k] > LEAST_ACTIVE_M_S and abs(wheel) < LARGEST_WHEEL
         if is_active:
             _learn(x, cov, memory, p, steps_s[k], vx[k], wheel, yaw_rate[k], yaw_rate_std)
         memory[ACTIVE] = is_active
-        states[k, 0], states[k, 1] = p.rear_m * yaw_rate[k], yaw_rate[k]
         if vx[k] >= LEAST_SPEED_M_S:
-            a, b = matrices(vx[k], p, max(x[STIFFNESS], 0.1))
-            states[k, 0] = stationary(a, *_drive(x, b, wheel, max(x[RATIO], 0.1)))[0]
+            a, b = matrices(vx[k], p, max(x[STIFFNESS], LEAST_PARAMETER))
+            drive = _drive(x, b, wheel, max(x[RATIO], LEAST_PARAMETER))
+            states[k, 0], states[k, 1] = solve(a, -drive[0], -drive[1])[0], yaw_rate[k]
 
 
 class LearnedSingleTrack(Peer):
     """The filter of this file as an estimator."""
 
     algorithm = "learned-single-track"
-    memory_size = 93
+    memory_size = ACTIVE + 1
 
     def estimate(self, samples: Samples, first: int, steps_s: FloatArray, memory: FloatArray) -> None:
         """Run the filter (see :class:`~.peer.Peer`)."""

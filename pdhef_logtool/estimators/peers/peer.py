@@ -9,6 +9,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import VX, VY, YAW_RATE, Steps
+from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S
 from pdhef_logtool.estimators.stepwise import StepState, measured_speed
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
@@ -72,9 +73,17 @@ class Peer:
     def estimate(self, samples: Samples, first: int, steps_s: FloatArray, memory: FloatArray) -> None:
         """Fill ``samples.states`` from row ``first`` on, NaN without an estimate; update ``memory`` in place.
 
+        Below :data:`~.single_track.LEAST_SPEED_M_S` they are replaced.
+
         ``steps_s`` [K] is the time before each sample. ``memory`` [``memory_size``] is NaN at the start of a log.
         """
         raise NotImplementedError
+
+    def _roll(self, samples: Samples) -> None:
+        """Let a slow car roll without slip, in place: r = v_x tan δ / l, v_y = l_r r."""
+        slow = samples.vx < LEAST_SPEED_M_S
+        r = (samples.vx * np.tan(samples.held("steer")) / self.vehicle.wheelbase_m)[slow]
+        samples.states[slow] = np.stack([self.vehicle.cg_to_rear_axle_m * r, r], axis=1)
 
     def run(self, signals: Signals, state: PeerState | None) -> tuple[Steps, PeerState]:
         """Process one window (see :class:`~pdhef_logtool.estimators.base.Estimator`)."""
@@ -88,6 +97,7 @@ class Peer:
         stamps_ns, first = samples.stamps_ns, len(samples.vx) - len(vx)
         if len(vx):
             self.estimate(samples, first, step_durations_s(stamps_ns, None), memory)
+        self._roll(samples)
         values, rates = np.full((2, len(stamps_ns), 4), np.nan)
         values[:, VX], values[:, VY], values[:, YAW_RATE] = samples.vx, *samples.states.T
         before = np.searchsorted(stamps_ns, stamps_ns - RATE_SPAN_NS)

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
 
-#: A car that is slower, or drives backward, rolls without slip: the model divides by the speed.
+#: The model divides by the speed: a car that is slower, or drives backward, rolls without slip.
 LEAST_SPEED_M_S = 0.5
 #: Longest integration step.
 LONGEST_STEP_S = 0.005
 
 
 class SingleTrack(NamedTuple):
-    """Parameters in SI units; the stiffness is that of an axle, in N/rad."""
+    """Parameters in SI units; stiffness of an axle in N/rad."""
 
     mass: float
     inertia: float
@@ -44,16 +43,10 @@ def matrices(vx, p, stiffness=1.0):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def solve(a, b0, b1):  # type: ignore[no-untyped-def]
-    """Return the solution (2) of a system (2, 2)."""
+    """Return the solution (2) of a system (2, 2); stationary driving solves A x = −B δ."""
     (a00, a01), (a10, a11) = a
     determinant = a00 * a11 - a01 * a10
     return (b0 * a11 - b1 * a01) / determinant, (a00 * b1 - a10 * b0) / determinant
-
-
-@njit(cache=True, error_model="numpy")
-def stationary(a, drive0, drive1):  # type: ignore[no-untyped-def]
-    """Return v_y and r at which ẋ = A x + drive is 0."""
-    return solve(a, -drive0, -drive1)
 
 
 @njit(cache=True, error_model="numpy")
@@ -64,9 +57,3 @@ def discrete(a, b, h):  # type: ignore[no-untyped-def]
     left = (1.0 - c * a00, -c * a01), (-c * a10, 1.0 - c * a11)
     columns = solve(left, 1.0 + c * a00, c * a10), solve(left, c * a01, 1.0 + c * a11)
     return columns, solve(left, h * b[0], h * b[1])
-
-
-@njit(cache=True, error_model="numpy")
-def parts_of(step_s):  # type: ignore[no-untyped-def]
-    """Return the number of integration steps in a step between samples."""
-    return math.ceil(step_s / LONGEST_STEP_S)

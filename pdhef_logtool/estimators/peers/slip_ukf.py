@@ -8,8 +8,8 @@ Goblirsch, Weinmann and Betz, arXiv 2408.14885 (2024), after Bechtloff, disserta
 with F = D sin(C atan(B α − E (B α − atan B α))) of the vehicle file. Published noise of the forces is scaled with the
 mass, published speed limits with √wheelbase. Differences: a log has neither brake pressures nor drive torque, so that
 the longitudinal axle forces are not measured; two wheel speeds became one. Where the published filter fixes sideslip at
-0 (at its start and at low speed), this one fixes it at that of rolling without slip, and it starts again beyond 86°:
-otherwise it finds the falling part of the tyre curve in slow, tight bends and diverges for good.
+0 (at its start and at low speed), this one fixes it at the angle of rolling without slip. It starts again beyond
+86°: otherwise it finds the falling part of the tyre curve in slow, tight bends and diverges for good.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ LOW_PASS, YAW_SPAN_S = (0.0772218, 0.2452234, 0.3425609, 0.2452234, 0.0772218), 
 #: Initial and process standard deviation of speed and sideslip; variance of z, of a car of MASS_KG.
 START_STD, STD = np.array([0.5, 0.0004]), np.array([0.2, 0.001732])
 FRONT_STD_N, REAR_STD_N, SPEED_VARIANCE = 60.0, 120.0, 0.5
-UNIT = np.eye(5)
+#: Speed and sideslip, measurements v_x, F_f and F_r; entry of the memory behind state and covariance.
+N, AGE = 5, 6
+UNIT = np.eye(N)
 #: Sigma points of n = 2 with α = 0.001, β = 2, κ = 0.
 ALPHA = 0.001
 SPREAD = 2.0 * ALPHA**2
@@ -86,17 +88,17 @@ def _predict(x, cov, sample, car, mean, joint):  # type: ignore[no-untyped-def]
     width = math.sqrt(SPREAD * cov[0, 0])  # Cholesky factor
     slope = SPREAD * cov[1, 0] / width
     depth = math.sqrt(SPREAD * cov[1, 1] - slope**2)
-    points = np.empty((5, 5))
+    points = np.empty((N, N))
     for i, (dv, dbeta) in enumerate(((0.0, 0.0), (width, slope), (-width, -slope), (0.0, depth), (0.0, -depth))):
         _sigma_point(points[i], x[0] + dv, x[1] + dbeta, sample, car)
-    for a in range(5):  # relative to the centre: the weights are of the order of 1e6
+    for a in range(N):  # relative to the centre: the weights are of the order of 1e6
         mean[a] = points[0, a]
-        for i in range(1, 5):
+        for i in range(1, N):
             mean[a] += (points[i, a] - points[0, a]) * 0.5 / SPREAD
-    for a in range(5):
-        for b in range(5):
+    for a in range(N):
+        for b in range(N):
             joint[a, b] = 0.0
-            for i in range(5):
+            for i in range(N):
                 weight = 0.5 / SPREAD if i else 1.0 - 2.0 / SPREAD + 3.0 - ALPHA**2
                 joint[a, b] += weight * (points[i, a] - mean[a]) * (points[i, b] - mean[b])
     for a in range(2):
@@ -117,7 +119,7 @@ def _measure(mean, joint, vx, sample, car):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def _step(x, cov, vx, age_s, sample, car, mean, joint):  # type: ignore[no-untyped-def]
+def _step(x, cov, vx, rolling, age_s, sample, car, mean, joint):  # type: ignore[no-untyped-def]
     """Process a sample in place, ``age_s`` after the start."""
     _predict(x, cov, sample, car, mean, joint)
     is_starting = age_s <= START_S
@@ -129,38 +131,35 @@ def _step(x, cov, vx, age_s, sample, car, mean, joint):  # type: ignore[no-untyp
             cov[i, j] = 0.5 * (joint[i, j] + joint[j, i])
     if is_starting or vx <= SLOW_M_S * car.speed_scale:
         limit = START_LIMIT_M_S if is_starting else SLOW_LIMIT_M_S
-        x[0], x[1] = min(max(x[0], vx - limit), vx + limit), math.atan(car.body.rear_m * sample[4] / vx)
+        x[0], x[1] = min(max(x[0], vx - limit), vx + limit), rolling
 
 
 @njit(cache=True, error_model="numpy")
 def _slip_ukf(samples, first, car, memory):  # type: ignore[no-untyped-def]
     steps_s, vx, steer, ax, ay, yaw_rate, yaw_acceleration, states = samples
-    x, cov = memory[:2], memory[2:6].reshape(2, 2)
-    mean, joint = np.empty(5), np.empty((5, 5))
+    x, cov = memory[:2], memory[2:AGE].reshape(2, 2)
+    mean, joint = np.empty(N), np.empty((N, N))
     for k in range(first, len(vx)):
-        if not math.isfinite(vx[k] * steer[k]):
+        if not (vx[k] >= LEAST_SPEED_M_S and math.isfinite(steer[k])):
             x[1] = math.nan
             continue
-        runs = steps_s[k] <= RESTART_GAP_S and abs(x[1]) < LARGEST_SLIP and vx[k] > LEAST_START_M_S * car.speed_scale
-        states[k, 0], states[k, 1] = car.body.rear_m * yaw_rate[k], yaw_rate[k]
-        if runs:
-            memory[6] += steps_s[k]
+        rolling = math.atan(car.body.rear_m * yaw_rate[k] / vx[k])
+        if steps_s[k] <= RESTART_GAP_S and abs(x[1]) < LARGEST_SLIP and vx[k] > LEAST_START_M_S * car.speed_scale:
+            memory[AGE] += steps_s[k]
             sample = (steps_s[k], steer[k], ax[k], ay[k], yaw_rate[k], yaw_acceleration[k])
-            _step(x, cov, vx[k], memory[6], sample, car, mean, joint)
-            states[k, 0] = vx[k] * math.tan(x[1]) if abs(x[1]) < LARGEST_SLIP else math.nan
+            _step(x, cov, vx[k], rolling, memory[AGE], sample, car, mean, joint)
         else:
-            memory[6] = 0.0
-            x[0], x[1] = vx[k], math.atan(states[k, 0] / max(vx[k], LEAST_SPEED_M_S))
-            for i in range(2):
-                for j in range(2):
-                    cov[i, j] = START_STD[i] ** 2 if i == j else 0.0
+            x[0], x[1], memory[AGE] = vx[k], rolling, 0.0
+            cov[0, 0], cov[0, 1], cov[1, 0], cov[1, 1] = START_STD[0] ** 2, 0.0, 0.0, START_STD[1] ** 2
+        states[k, 0] = vx[k] * math.tan(x[1]) if abs(x[1]) < LARGEST_SLIP else math.nan
+        states[k, 1] = yaw_rate[k]
 
 
 class SlipUkf(Peer):
     """The filter of this file as an estimator."""
 
     algorithm = "slip-ukf"
-    memory_size = 7
+    memory_size = AGE + 1
 
     def estimate(self, samples: Samples, first: int, steps_s: FloatArray, memory: FloatArray) -> None:
         """Run the filter (see :class:`~.peer.Peer`)."""

@@ -5,8 +5,8 @@ Vehicle System Dynamics 32 (1999) 375–388:
 
     v_y = 1 / (1 + T s) · v_y,model + T / (1 + T s) · (a_y − v_x r)
 
-Differences: without a roll sensor, a_y contains the roll angle; T is that of ``kinematic``, which is the same filter
-without a model, chosen on simulated drives.
+Differences: without a roll sensor, a_y contains the roll angle; T is equal to the leak of ``kinematic``, chosen on
+simulated drives.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import math
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.kinematic import LEAK_S
 from pdhef_logtool.estimators.peers.peer import Peer, Samples
-from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S, matrices, single_track, stationary
+from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S, matrices, single_track, solve
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.steps import RESTART_GAP_S
 
@@ -28,15 +28,15 @@ def _washout(samples, first, p, time_constant_s, memory):  # type: ignore[no-unt
     for k in range(first, len(vx)):
         dt = steps_s[k]
         if not vx[k] >= LEAST_SPEED_M_S:
-            vy = p.rear_m * yaw_rate[k] if vx[k] < LEAST_SPEED_M_S else math.nan
+            vy = math.nan
+            continue
+        a, b = matrices(vx[k], p)
+        model, _ = solve(a, -b[0] * steer[k], -b[1] * steer[k])
+        if dt <= RESTART_GAP_S and math.isfinite(vy):  # a step of the implicit Euler rule
+            share = dt / (time_constant_s + dt)
+            vy = (1.0 - share) * (vy + dt * (ay[k] - vx[k] * yaw_rate[k])) + share * model
         else:
-            a, b = matrices(vx[k], p)
-            model, _ = stationary(a, b[0] * steer[k], b[1] * steer[k])
-            if dt <= RESTART_GAP_S and math.isfinite(vy):  # a step of the implicit Euler rule
-                share = dt / (time_constant_s + dt)
-                vy = (1.0 - share) * (vy + dt * (ay[k] - vx[k] * yaw_rate[k])) + share * model
-            else:
-                vy = model
+            vy = model
         states[k, 0], states[k, 1] = vy, yaw_rate[k]
     memory[0] = vy
 

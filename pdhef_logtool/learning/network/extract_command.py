@@ -23,9 +23,7 @@ from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, Tell, friction_of, no_samples, read_drive
 from pdhef_logtool.drive.truth import derive_truth
-from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.calibration import self_calibrate
-from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.estimators.table import FEATURES, FILTERS
@@ -551,9 +549,7 @@ def _residuals(
     truth = whole.truth if reference is None else reference(whole.signals.stamps_ns)
     period_s = drive.plan.alignment.grid_period_s
     half_window = round(smoothing.half_s / period_s)
-    taught = None
-    if service.model is not None and physics.equations == "forces":
-        taught = CorrectedPhysics(AdaptivePhysics(physics), service.model)
+    taught = service.model if physics.equations == "forces" else None
     noise = smoothing.noise[0] * period_s / math.sqrt(2.0)  # of v_y itself
     return residual_rows(
         calibrated_signals(whole.signals, service.car) if physics.equations == "forces" else whole.signals,

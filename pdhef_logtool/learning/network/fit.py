@@ -38,8 +38,6 @@ import torch
 CHECKPOINT = "checkpoint.safetensors"
 
 
-#: Maximum length of a training piece; validation uses whole sequences.
-PIECE_STEPS = 1500
 #: Maximum number of validation steps at once, with the state carried on; an hour at once would need a gigabyte.
 VALIDATION_STEPS = 60_000
 GRADIENT_CLIP = 1.0
@@ -68,6 +66,11 @@ class Recipe:
 
     64 units per layer reach the accuracy of 96 after the same number of epochs (``docs/model_card.md``) in
     two thirds of the time, in training and in operation.
+
+    Attributes
+    ----------
+    piece_steps : maximum length of a training piece; validation uses whole sequences.
+    pieces_per_epoch : number of pieces that an epoch draws at random; None: all.
     """
 
     feature_names: tuple[str, ...] = FEATURES
@@ -78,6 +81,8 @@ class Recipe:
     epochs: int = 30
     batch: int = 16
     chunk_steps: int = 50
+    piece_steps: int = 1500
+    pieces_per_epoch: int | None = None
     learning_rate: float = 3e-3
     schedule: str = "one-cycle"  # or "exponential"
     patience: int = 10
@@ -95,6 +100,7 @@ PAPER_RECIPE = Recipe(
     batch=64,
     learning_rate=1e-3,
     schedule="exponential",
+    patience=200,
     odd=False,
 )
 
@@ -329,8 +335,8 @@ def _scaled(s: FeatureSequence, recipe: Recipe, n: Normalisation) -> _Piece:
 
 def _pieces(sequence: FeatureSequence, recipe: Recipe, n: Normalisation) -> Iterator[_Piece]:
     whole = _scaled(sequence, recipe, n)
-    for first in range(0, whole.features.shape[0], PIECE_STEPS):
-        part = slice(first, first + PIECE_STEPS)
+    for first in range(0, whole.features.shape[0], recipe.piece_steps):
+        part = slice(first, first + recipe.piece_steps)
         if float(whole.weight[part].sum()) > 0.0:
             yield _balanced(_Piece(whole.features[part], whole.target[part], whole.weight[part]))
 
@@ -360,11 +366,11 @@ def _train_epoch(
     epoch: int,
     device: str,
 ) -> tuple[float, float]:
-    """Train once on all pieces in a seeded random order; return mean loss and last learning rate."""
+    """Train once on the pieces of an epoch in a seeded random order; return mean loss and last learning rate."""
     # All randomness of an epoch depends on seed and epoch number only, so that a resumed training is identical.
     torch.manual_seed(recipe.seed * 1_000_003 + epoch)
-    order = torch.randperm(len(pieces)).tolist()
-    batches, signs = max(1, math.ceil(len(pieces) / recipe.batch)), _signs(recipe)
+    order = torch.randperm(len(pieces)).tolist()[: recipe.pieces_per_epoch]
+    batches, signs = max(1, math.ceil(len(order) / recipe.batch)), _signs(recipe)
     network.train()
     losses = []
     for b in range(batches):

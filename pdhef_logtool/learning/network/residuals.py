@@ -28,7 +28,6 @@ import numpy as np
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.drive.truth import cubic_equations
-from pdhef_logtool.estimators.corrected import CorrectedPhysics
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.vehicle_model import (
     AX_BIAS,
@@ -48,7 +47,9 @@ from pdhef_logtool.estimators.vehicle_ukf import U_AX, U_FRICTION, U_STEER, Held
 from pdhef_logtool.learning.truth import weight_of
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import step_durations_s
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.residual_model.ladder import LadderModel
 
 #: Steps longer than this many periods are gaps without an increment.
 GAP_PERIODS = 1.5
@@ -276,7 +277,7 @@ def residual_rows(
     period_s: float,
     half_window: int = 0,
     truth_std_m_s: float = 0.0,
-    taught: CorrectedPhysics | None = None,
+    taught: LadderModel | None = None,
 ) -> ResidualRows:
     """Turn a drive into residual rows, one per stamp.
 
@@ -294,8 +295,10 @@ def residual_rows(
     segment = np.maximum(np.cumsum(fresh) - 1, 0)
     region = np.full(count, np.nan)
     if taught is not None:
-        corrected, _ = taught.run(signals, None)
-        region = np.where(corrected.valid, corrected.gain, np.nan)
+        dt_s = step_durations_s(signals.stamps_ns, None)
+        dt_s[~np.isfinite(filtered.prior[:, 0])] = np.nan
+        residual, _ = taught.residual(features, dt_s, None)
+        region = np.where(filtered.valid, residual.gain, np.nan)
     inputs, state = filtered.inputs.copy(), _true_state(truth, count)
     # A predicted steering angle must not affect a residual.
     inputs[~np.isfinite(without_impossible(signals).steer_rad), U_STEER] = np.nan

@@ -24,9 +24,10 @@ from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import STEP_S
 from pdhef_logtool.estimators.calibration.joint import level_of, like_drives
-from pdhef_logtool.estimators.corrected import features_of
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import compensate
+from pdhef_logtool.estimators.parallel_physics import run_features
+from pdhef_logtool.estimators.residual_response import residual_response
 from pdhef_logtool.estimators.table import FEATURES, make_estimator
 from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
@@ -37,9 +38,10 @@ from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.learning.truth import teaching_reference, weight_of
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError
-from pdhef_logtool.records.signals import FloatArray, IntArray
-from pdhef_logtool.records.steps import release
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import release, step_durations_s
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
+from pdhef_logtool.residual_model.features import SlowFeatures, slow_features
 from pdhef_logtool.residual_model.ladder import NONE
 from pdhef_logtool.residual_model.ladder_fit import (
     LadderFit,
@@ -47,7 +49,6 @@ from pdhef_logtool.residual_model.ladder_fit import (
     corrected_rmse_deg,
     fit_ladder,
 )
-from pdhef_logtool.residual_model.slow_features import SlowFeatures
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.self_calibrating import lacking, read_driving, self_calibrated
 
@@ -218,21 +219,30 @@ def _calibration(drive: OpenedDrive, parameters: Sequence[TaughtParameter]) -> S
 
 
 def lacking_of(drive: OpenedDrive, calibration: SelfCalibration) -> TaughtDrive:
-    """Return the features of a drive and the sideslip error of ``physics`` on its calibrated car, at its stamps."""
+    """Return the features of a drive, the sideslip error of ``physics`` on its calibrated car, and its response."""
     car = self_calibrated(drive.drive, calibration)
     physics, signals = make_estimator(PHYSICS, car), calibrated_signals(drive.whole.signals, car)
     assert isinstance(physics, AdaptivePhysics)
     steps, _ = physics.run(signals, None)
     track, _ = compensate(physics, signals, steps)
-    features, _ = features_of(steps, signals, None, None)
+    features = features_of(physics, signals)
     arrived = release(signals.ready_ns, signals.stamps_ns)
     error = signal_error(track, drive.truth, "sideslip_rad", car.vehicle.low_speed_blend_m_s)
     settled = signals.stamps_ns - signals.stamps_ns[0] > SETTLE_NS
     error = np.where(arrived.arrived & settled, error, np.nan)
-    at_stamps = SlowFeatures(features.odd[arrived.row], features.even[arrived.row])
-    return TaughtDrive(
-        drive.drive.name, signals.stamps_ns, at_stamps, -error, weight_of(np.nan_to_num(drive.truth.sideslip_std_rad))
-    )
+    response = residual_response(physics, signals, arrived.row)
+    weight = weight_of(np.nan_to_num(drive.truth.sideslip_std_rad))
+    return TaughtDrive(drive.drive.name, signals.stamps_ns, features, -error, response, weight)
+
+
+def features_of(physics: AdaptivePhysics, signals: Signals) -> SlowFeatures:
+    """Return the features of a drive's steps, as the filter in service computes them."""
+    faults = physics.inputs(signals, None)[0].faults
+    given = faults.filtered, None
+    table, steps, _ = run_features(physics.physics, *given, seen=faults.network, extra_r=faults.extra_r)
+    dt_s = step_durations_s(signals.stamps_ns, None)
+    dt_s[~np.isfinite(steps.prior[:, 0])] = np.nan
+    return slow_features(table, dt_s, None)[0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

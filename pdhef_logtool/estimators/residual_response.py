@@ -1,0 +1,91 @@
+"""Linear response of the sideslip of ``physics`` to a residual rate of v_y, with the filter in the loop.
+
+Teaching fits a residual through this response, so that the error of the filter with the residual (Eq 18, 19) is least.
+A small change δx of the state estimate follows
+
+    δx_k = A_k δx_{k−1} + b_k f_{k−1},    A_k = P_k (P_k⁻)⁻¹ C_kᵀ P_{k−1}⁻¹,
+
+with the covariances P, P⁻ after and before the update and the cross covariance C of consecutive states (the links of a
+smoother). b is the difference to a run with a constant rate, less the share of A.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, gather_evidence, weigh
+from pdhef_logtool.estimators.vehicle_model import VX, VY
+from pdhef_logtool.estimators.vehicle_ukf import PosteriorSteps, StepLinks
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.steps import step_durations_s
+
+#: Constant rate of the run for b, m/s²: small against the forces of a tyre.
+PROBE_M_S2 = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResidualResponse:
+    """Responses of the filters [H] of a drive.
+
+    ``transition`` : A of the steps [H, K, n, n]. ``drive`` : b [H, K, n]. ``sideslip`` : change of the mixture's
+    sideslip per change of v_y [H, K], rad/(m/s). ``row`` : newest step of each stamp [N].
+    """
+
+    transition: Sequence[FloatArray]
+    drive: Sequence[FloatArray]
+    sideslip: FloatArray
+    row: IntArray
+
+    def __call__(self, rates: FloatArray) -> FloatArray:
+        """Return the changes of the sideslip at the stamps [N, m] by residual rates of v_y at the steps [K, m]."""
+        out = np.zeros(rates.shape)
+        for transition, drive, sideslip in zip(self.transition, self.drive, self.sideslip, strict=True):
+            state = np.zeros((drive.shape[1], rates.shape[1]))
+            for k in range(1, len(rates)):
+                state = transition[k] @ state + np.outer(drive[k], rates[k - 1])
+                out[k] += sideslip[k] * state[VY]
+        return out[self.row]
+
+
+def residual_response(physics: AdaptivePhysics, signals: Signals, row: IntArray) -> ResidualResponse:
+    """Return the response on a drive; ``row`` [N] is the newest step of each stamp."""
+    checked, _ = physics.inputs(signals, None)
+    faults, probe = checked.faults, np.zeros((len(signals), 2))
+    probe[:, 0] = PROBE_M_S2
+    runs, transitions, drives = [], [], []
+    for physics_filter in physics.filters:
+        steps, _, links = physics_filter.linked_steps(faults.filtered, None, None, faults.extra_r)
+        moved, _ = physics_filter.run(faults.filtered, None, probe, faults.extra_r)
+        transition = _transition(steps, links)
+        change = np.nan_to_num((moved.x - steps.x) / PROBE_M_S2)
+        drive = np.zeros_like(change)
+        drive[1:] = change[1:] - np.einsum("kij,kj->ki", transition[1:], change[:-1])
+        drive[~links.linked] = 0.0
+        runs.append(steps)
+        transitions.append(transition)
+        drives.append(drive)
+    likelihood, starts = np.stack([s.log_likelihood for s in runs], axis=1), ~np.isfinite(runs[0].prior[:, VX])
+    evidence = gather_evidence(step_durations_s(signals.stamps_ns, None), likelihood, starts, np.zeros(len(runs)))
+    weights = weigh(evidence, np.stack([steps.valid for steps in runs], axis=1))
+    sideslip = np.stack([w * _sideslip_per_vy(s) for w, s in zip(weights.T, runs, strict=True)])
+    return ResidualResponse(transitions, drives, sideslip, row)
+
+
+def _transition(steps: PosteriorSteps, links: StepLinks) -> FloatArray:
+    """Return A [K, n, n], 0 where a step does not follow the one before it."""
+    out = np.zeros_like(steps.P)
+    linked = np.flatnonzero(links.linked)
+    linked = linked[linked > 0]
+    small = 1e-15 * np.eye(out.shape[1])  # a part that is known exactly has no variance
+    forward = np.linalg.solve(steps.P[linked - 1] + small, links.cross[linked])
+    update = np.linalg.solve(links.predicted_P[linked] + small, steps.P[linked])
+    out[linked] = np.swapaxes(update, 1, 2) @ np.swapaxes(forward, 1, 2)
+    return np.nan_to_num(out)
+
+
+def _sideslip_per_vy(steps: PosteriorSteps) -> FloatArray:
+    vx, vy = steps.x[:, VX], steps.x[:, VY]
+    return np.where(steps.valid, vx / np.maximum(vx**2 + vy**2, 1e-6), 0.0)
