@@ -18,9 +18,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
-from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import FloatArray, IntArray
 from studies.gates.tool import Tool, reports
 from studies.pages import DOCS, DRIVES, RESULTS, ROOT, options, write, write_toml
 from studies.peers.drives import (
@@ -32,12 +30,9 @@ from studies.peers.drives import (
     vehicle_of,
     vehicle_table,
 )
-from studies.peers.models import Peer, open_loop, peers_of
-from studies.peers.page import OURS, page
+from studies.peers.page import ESTIMATORS, OURS, page
 from studies.peers.parameters import pairs_table
-from studies.peers.scoring import DriveErrors, score, usable_sideslip
-
-SEDAN = "open-loop-sedan"
+from studies.peers.scoring import DriveErrors, score
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -66,39 +61,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def drive_errors(drive: PeerDrive, tool: Tool) -> tuple[DriveErrors, dict[str, Any] | None]:
     """Run all estimators on a drive; return their errors and the calibration with the published vehicle file."""
-    log, mapping, vehicle = DRIVES / drive.log, mapping_of(drive), vehicle_of(drive)
-    read = read_peer_drive(log, vehicle, mapping)
-    with_sedan = read_peer_drive(log, default_vehicle(), mapping)
-    estimates = peer_estimates(read.signals, with_sedan.signals, vehicle)
-    runs: dict[tuple[str, str], dict[str, tuple[FloatArray, FloatArray]]] = {}
-    stds: dict[str, FloatArray] = {}
+    read = read_peer_drive(DRIVES / drive.log, vehicle_of(drive), mapping_of(drive))
+    assert read.truth is not None
     missing, calibration = np.full(len(read.signals), np.nan), None
-    for name, (calibrate, car, preset) in OURS.items():
+    estimates: dict[str, FloatArray] = {}
+    stds: dict[str, FloatArray] = {}
+    runs: dict[tuple[str, str], dict[str, tuple[FloatArray, FloatArray]]] = {}
+    for name, (calibrate, car, preset) in ESTIMATORS.items():
         if (calibrate, car) not in runs:
-            folder = tool_run(tool, drive, calibrate, car)
+            presets = [one for *of, one in ESTIMATORS.values() if of == [calibrate, car]]
+            folder = tool_run(tool, drive, calibrate, car, presets)
             runs[calibrate, car] = {} if folder is None else tracks_of(folder, read.signals.stamps_ns)
             if folder is not None and (calibrate, car) == ("log", "file"):
                 (report,) = reports(folder).values()
                 calibration = report["self_calibration"]
-        estimates[name], stds[name] = runs[calibrate, car].get(preset, (missing, missing))
-    assert read.truth is not None
+        estimates[name], std = runs[calibrate, car].get(preset, (missing, missing))
+        if name in OURS:
+            stds[name] = std
     errors = score(drive, estimates, read.truth, stds)
     print(drive.log, {name: round(value, 3) for name, value in errors.rmse_deg.items()}, file=sys.stderr)
     return errors, calibration
 
 
-def peer_estimates(signals: Signals, with_sedan: Signals, vehicle: VehicleParameters) -> dict[str, FloatArray]:
-    """Return the sideslip [N] of the peers by name, from signals read with the vehicle and with the default sedan."""
-    runs = [(peer, signals) for peer in peers_of(vehicle)]
-    runs.insert(-2, (Peer(SEDAN, open_loop, default_vehicle()), with_sedan))
-    return {peer.name: usable_sideslip(run_window(peer, given)[0]) for peer, given in runs}
-
-
-def tool_run(tool: Tool, drive: PeerDrive, calibrate: str, car: str) -> Path | None:
-    """Run the default estimators with the published mapping and vehicle file; None if the run refuses."""
+def tool_run(tool: Tool, drive: PeerDrive, calibrate: str, car: str, presets: Sequence[str]) -> Path | None:
+    """Run estimators with the published mapping and vehicle file; None if the run refuses."""
     name = f"{drive.log.partition('.')[0]}-{calibrate}-{car}"
     mapping = write_toml(tool.work / "mappings" / f"{name}.toml", mapping_table(drive))
     given: tuple[str | Path, ...] = ("--mapping", mapping, "--keep", "estimates", "--calibrate", calibrate)
+    given += ("--estimators", ",".join(presets))
     if car == "file":
         given += ("--car", write_toml(tool.work / "cars" / f"{name}.toml", vehicle_table(drive)))
     try:

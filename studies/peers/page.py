@@ -17,14 +17,22 @@ from studies.peers.scoring import (
     spread,
 )
 
-#: The presets of the tool: calibration, car and track.
-OURS: dict[str, tuple[str, str, str]] = {
+#: Calibration, car and preset of each run. The peers use the vehicle file as it is.
+OURS = {
     "phy-ukf": ("log", "file", "phy-ukf"),
     "physics": ("log", "file", "physics"),
     "pd-hef": ("log", "file", "pd-hef"),
     "pd-hef, online": ("online", "file", "pd-hef"),
     "pd-hef, causal": ("off", "file", "pd-hef"),
     "pd-hef, no file": ("log", "none", "pd-hef"),
+}
+_PUBLISHED = {"open-loop-linear": "linear-kf:open-loop"} | {
+    name: name for name in ("linear-kf", "learned-single-track", "slip-ukf", "washout", "kinematic", "zero")
+}
+ESTIMATORS = {
+    **{name: ("off", "file", preset) for name, preset in _PUBLISHED.items()},
+    "open-loop-sedan": ("off", "none", "linear-kf:open-loop"),
+    **OURS,
 }
 #: Share of missing estimates from which a figure is marked.
 MARKED = 0.05

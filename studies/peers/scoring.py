@@ -60,11 +60,6 @@ class DriveErrors:
         return cls(drive, document["scored_stamps"], offset_deg, document["rmse_deg"], document["missing"], *intervals)
 
 
-def usable_sideslip(track: StateTrack) -> FloatArray:
-    """Return the sideslip [N] of a track in rad, NaN at invalid samples."""
-    return np.where(track.valid, track.sideslip_rad, np.nan)
-
-
 def score(
     drive: PeerDrive,
     estimates: Mapping[str, FloatArray],

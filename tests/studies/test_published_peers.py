@@ -1,21 +1,13 @@
-"""The published estimators of ``studies.peers``: they recover a simulated car, get no ground truth, and are scored."""
+"""The scores and the page of ``studies.peers``."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from studies.peers.models import stiffness
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
-from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 from studies.pages import DOCS, RESULTS
 from studies.peers import __main__ as peers
@@ -23,87 +15,6 @@ from studies.peers.drives import FULL_SIZE, OFFSET, PEER_DRIVES, PeerDrive, besi
 from studies.peers.page import page
 from studies.peers.parameters import OF_CAR, PEAK, pairs_table
 from studies.peers.scoring import DriveErrors, car_means, score
-
-SPEED_M_S, STEP_S, SECONDS = 20.0, 0.01, 30.0
-#: Sideslip RMSE in degrees on the simulated linear car, with a sideslip RMS of 0.37°.
-BOUNDS_DEG = {
-    "linear-kf": 0.001,
-    "learned-single-track": 0.16,  # stationary: sideslip lags behind steering
-    "open-loop-linear": 0.001,
-    "slip-ukf": 0.1,  # low-passed sensors and a yaw acceleration over 1 s
-    "open-loop-sedan": 0.001,
-    "kinematic": 0.3,  # the leak
-    "zero": 0.4,
-}
-
-
-def linear_sedan() -> VehicleParameters:
-    """Return the default sedan with the peak forces so high that its tyres are linear."""
-    sedan = default_vehicle()
-    front, rear = stiffness(sedan)
-    tyres = Tyres(
-        front=AxleTyre(cornering_stiffness_n_per_rad=front), rear=AxleTyre(cornering_stiffness_n_per_rad=rear)
-    )
-    return sedan.model_copy(update={"tyres": tyres, "friction": 2.0})
-
-
-def simulated(vehicle: VehicleParameters) -> tuple[Signals, np.ndarray]:
-    """Return the signals of a linear single track on a slow sine of steering, and its sideslip [N]."""
-    m, iz = vehicle.mass_kg, vehicle.yaw_inertia_kg_m2
-    lf, lr = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
-    cf, cr = stiffness(vehicle)
-
-    def steer(t):
-        return 0.04 * np.sin(2.0 * np.pi * 0.2 * t)
-
-    def forces(t, x):
-        return cf * (steer(t) - (x[0] + lf * x[1]) / SPEED_M_S), -cr * (x[0] - lr * x[1]) / SPEED_M_S
-
-    def rates(t, x):
-        front, rear = forces(t, x)
-        return [(front + rear) / m - SPEED_M_S * x[1], (lf * front - lr * rear) / iz]
-
-    times = np.arange(0.0, SECONDS, STEP_S)
-    vy, r = solve_ivp(rates, (0.0, SECONDS), [0.0, 0.0], t_eval=times, rtol=1e-9, atol=1e-12).y
-    front, rear = forces(times, np.array([vy, r]))
-    stamps = np.round(times * 1e9).astype(np.int64)
-    missing = np.full(len(times), np.nan)
-    signals = Signals(
-        stamps, stamps, steer(times), np.zeros_like(times), (front + rear) / m, r, np.full(len(times), SPEED_M_S),
-        missing, np.full((len(times), 4), np.nan),
-    )  # fmt: skip
-    return signals, np.arctan2(vy, SPEED_M_S)
-
-
-@pytest.mark.fleet  # compiles the peers: a minute
-@pytest.mark.slow
-def test_every_peer_recovers_a_linear_car_within_its_bound():
-    vehicle = linear_sedan()
-    signals, sideslip = simulated(vehicle)
-    rms = np.degrees(np.sqrt(np.mean(sideslip**2)))
-    assert rms == pytest.approx(0.37, abs=0.01)
-    estimates = peers.peer_estimates(signals, signals, vehicle)
-    errors = {name: np.degrees(np.sqrt(np.mean((beta - sideslip) ** 2))) for name, beta in estimates.items()}
-    assert errors.keys() == BOUNDS_DEG.keys()
-    assert {name: error for name, error in errors.items() if not error < BOUNDS_DEG[name]} == {}
-
-
-@pytest.mark.fleet  # compiles the peers: a minute
-@pytest.mark.slow
-def test_ground_truth_changes_no_estimate(sample_logs_dir: Path):
-    log, vehicle = sample_logs_dir / "step.mcap", default_vehicle()
-    with read_drive(log, Car.of(vehicle), options=ReadOptions()) as drive:
-        mapping = drive.mapping
-    truth = {
-        name: replace(source, scale=np.multiply(source.scale, -3.0).tolist()) for name, source in mapping.truth.items()
-    }
-    drives = [peers.read_peer_drive(log, vehicle, given) for given in (mapping, replace(mapping, truth=truth))]
-    assert drives[0].truth is not None
-    assert drives[1].truth is not None
-    assert not np.allclose(drives[0].truth.vx_m_s, drives[1].truth.vx_m_s, equal_nan=True)
-    before, after = (peers.peer_estimates(drive.signals, drive.signals, vehicle) for drive in drives)
-    for name, sideslip in before.items():
-        np.testing.assert_array_equal(sideslip, after[name], err_msg=name)
 
 
 def track(sideslip: np.ndarray, speed: float = 10.0):
