@@ -151,12 +151,8 @@ def _filter(window, tuning, r0, constants, p, parallel, estimate, out, adapted):
     chi, L, zeta, z_hat, S, Pxz, nu, _, _, use = base.make_work(n)
     points = np.empty(work_size(2 * n + 1))
     for k in range(dt.shape[0]):
-        steer, friction, has_ax, ok = (
-            inputs[k, base.U_STEER],
-            inputs[k, base.U_FRICTION],
-            inputs[k, base.U_AX_KNOWN] > 0.0,
-            start_ok[k],
-        )
+        steer, friction = inputs[k, base.U_STEER], inputs[k, base.U_FRICTION]
+        has_ax, ok = inputs[k, base.U_AX_KNOWN] > 0.0, start_ok[k]
         z_ay = ay[k] if ok else math.nan  # without steering no a_y can be predicted
         z_speed = speed[k] if rules.use_speed else math.nan
         now = base.StepInputs(dt[k], steer, inputs[k, base.U_AX], has_ax, friction, ok, ok, z_ay, yaw_rate[k], z_speed)
