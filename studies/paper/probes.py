@@ -11,6 +11,7 @@ from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.evaluation.metrics.lag import lag_s
 from pdhef_logtool.learning.network.residuals import residual_rows
 from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.service import NetworkService
 from studies.paper.experiment import GRAVITY_M_S2, Experiment, ReadDrive
 
@@ -56,7 +57,7 @@ class ResidualFit:
 def residual_fit(drive: ReadDrive, car: Car) -> ResidualFit:
     """Compare the residual of a drive with the network's output, features as in service."""
     whole = drive.whole
-    assert car.network is not None
+    assert isinstance(car.network, ModelBundle)
     parallel, period_s = filter_of(car, car.network.model), whole.plan.alignment.grid_period_s
     rows = residual_rows(whole.signals, whole.truth, parallel, period_s=period_s)
     starts = np.concatenate([[True], np.diff(rows.segment) != 0])
