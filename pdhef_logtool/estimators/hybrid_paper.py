@@ -361,4 +361,5 @@ def build(name: str, car: Car, options: Options) -> PaperHybridUkf:
     del name
     paper = None if car.network is None else car.network.paper_network
     network = options.service(car) if paper is None else NetworkService(paper)
+    assert isinstance(network, NetworkService), "the table lets no other residual model in"
     return PaperHybridUkf(car.vehicle, network, use_speed=options.use_speed)

@@ -12,6 +12,7 @@ from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.evaluation.metrics.lag import lag_s
 from pdhef_logtool.learning.network.residuals import residual_rows
 from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.service import NetworkService
 from studies.paper.experiment import GRAVITY_M_S2, Experiment, ReadDrive
 
@@ -57,7 +58,7 @@ class ResidualFit:
 def residual_fit(drive: ReadDrive, car: Car) -> ResidualFit:
     """Compare the residual of a drive with the network's output, features as in service."""
     whole = drive.whole
-    assert car.network is not None
+    assert isinstance(car.network, ModelBundle)
     parallel, period_s = filter_of(car, car.network.model), whole.plan.alignment.grid_period_s
     signals = calibrated_signals(whole.signals, car) if car.residual_network is not None else whole.signals
     rows = residual_rows(signals, whole.truth, parallel, period_s=period_s)

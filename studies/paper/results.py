@@ -69,7 +69,7 @@ class Results:
     @property
     def networks(self) -> dict[int, ModelBundle]:
         """The cars' networks by training seed."""
-        return {seed: c.network for seed, c in self.cars.items() if c.network is not None}
+        return {seed: c.network for seed, c in self.cars.items() if isinstance(c.network, ModelBundle)}
 
     @property
     def first_seed(self) -> int:

@@ -39,7 +39,7 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
-from pdhef_logtool.residual_model.service import RememberingNetwork
+from pdhef_logtool.residual_model.service import NetworkService, RememberingNetwork
 from pdhef_logtool.results.run_report import json_bytes
 
 FORMAT = "pdhef-trust"
@@ -112,7 +112,9 @@ def errors_by_trust(car: Car, drive: WholeDrive, *, use_speed: bool) -> BlockErr
     """
     signals, truth = drive.signals, drive.truth
     assert car.network is not None and truth is not None
-    network, slow = RememberingNetwork(car.network), car.vehicle.low_speed_blend_m_s
+    network, slow = car.network.service(), car.vehicle.low_speed_blend_m_s
+    if isinstance(network, NetworkService):
+        network = RememberingNetwork(network.bundle)
     given, errors = calibrated_signals(signals, car), []
     for share in TRUSTS:
         estimator = spec_of("pd-hef").make(car, Options(use_speed, share, network))
