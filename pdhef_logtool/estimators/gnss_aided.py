@@ -1,292 +1,249 @@
-"""``physics`` and ``pd-hef`` with GNSS velocity, including its delay (docs/method.md#gnss).
+"""``physics`` and ``pd-hef`` with GNSS velocity, as late as it arrives (docs/method.md#gnss).
 
-A single antenna provides a course but no heading. Hypotheses differ in the uncertainty of the filter's v_y (unchanged,
-good in the linear range of the tyres, poor) and in the position of the accelerometer. For each one a Kalman filter
-estimates [v_y, heading, bias of a_y, bias of the gyro, error of the filter's v_y, antenna x, delay of the receiver,
-accelerometer x] from
+The :mod:`~.kinematic_filter` runs forward at 20 Hz. The v_y of the wrapped filter is one of its measurements, with an
+uncertainty that increases with a_y and beyond the linear range of the tyres; GNSS velocity is another. A single antenna
+provides a course but no heading: the heading is a state, which the filter's v_y determines in normal driving. States
+and inputs of the last second are kept; a late sample corrects the state of its time, from which the filter is run
+again.
 
-    v̇_y = a_y − b − x ṙ − (r − b_r) v_x,   ψ̇ = r − b_r,   v_y,filter = v_y − S v_x d,
+The wrapped filter is better than a course in most driving. Therefore
 
-with d of unit variance and S the uncertainty of the hypothesis, and from the velocity of the antenna across the
-heading; for a late sample, the motion that the sensors measured since then is subtracted from the present velocity. The
-hypotheses are weighted by the likelihood of the GNSS samples, with a forgetting time of seconds, as in
-:mod:`~.adaptive_physics`: unless GNSS contradicts the filter, its estimate is unchanged. Samples between a jump against
-the sensors and a jump back are ignored.
+- the noise of a receiver is enlarged by its innovations (normalized innovation squared, over seconds), so that a
+  receiver with jumps, a wrong accuracy, a lag or exchanged axes has little influence, and
+- its change c of v_y, of variance P, counts with the weight max(0, 1 − (3 σ / c)²), σ² = P: the estimate is unchanged
+  unless GNSS contradicts it by more than three standard deviations (non-negative garrote, Breiman 1995).
 """
 
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.estimators import kinematic_filter as f
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import notes_of, predict_track
 from pdhef_logtool.estimators.intervals import scaled_covariance
-from pdhef_logtool.estimators.kinematic_filter import BIAS_M_S2, BIAS_S, LAW_S, LAW_WHITE, TILT_SHARE, correct
-from pdhef_logtool.estimators.reference.gnss import JUMP_M_S, LEAST_COURSE_SPEED_M_S
-from pdhef_logtool.estimators.reference.inputs import GNSS_LAG_S
+from pdhef_logtool.estimators.reference.gnss import LEAST_COURSE_SPEED_M_S
+from pdhef_logtool.estimators.reference.inputs import RATE_HZ, ROLL_PER_AY_RAD_S2_M, SLOW_S
 from pdhef_logtool.estimators.vehicle_ukf import LIMIT_TIME_S, LINEAR_SHARE, VehicleUkf, sideslip_std
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, ExtendedSteps, Extrapolation, last_stamp_ns, step_durations_s
 from pdhef_logtool.records.tracks import StateTrack
 
-#: Entries of the state of a hypothesis.
-VY, HEADING, AY_BIAS, RATE_BIAS, LAW_ERROR, ANTENNA_X, DELAY, IMU_X, STATES = range(9)
-#: Uncertainty of the filter's v_y over v_x in degrees: constant, per m/s², per m/s³, per square of the share of the
-#: grip beyond the linear range; the logarithm of the prior weight; and 1-sigma of the accelerometer's position in m.
-#: Tuned on simulated drives. A free position in every hypothesis would absorb tyre model errors.
-HYPOTHESES = ((0.01, 0.0, 0.0, 0.0, 0.0, 0.0), (0.06, 0.02, 0.02, 30.0, -5.5, 0.0), (0.06, 0.02, 0.02, 30.0, -6.5, 1.0),
-              (1.0, 0.3, 0.1, 30.0, -9.0, 0.3), (10.0, 0.3, 0.1, 30.0, -13.0, 0.3))  # fmt: skip
-#: Minimum 1-sigma of a GNSS velocity, m/s; gate in 1-sigmas.
-GNSS_STD_M_S, GATE_SIGMA = 0.1, 4.0
-#: Forgetting time constant of the likelihood, s; time of contradicting samples after which the heading is
-#: reinitialized, s.
-FORGET_S, LOST_S = 5.0, 20.0
-#: Height of an antenna over the roll axis and its 1-sigma, m; 1-sigma of antenna x, unknown and known, m.
-ANTENNA_HEIGHT_M, HEIGHT_STD_M, ANTENNA_STD_M, KNOWN_ANTENNA_STD_M = 1.2, 0.5, 0.5, 0.1
-#: Initial 1-sigmas: heading, rad; gyro, rad/s; delay, s.
-HEADING_STD, RATE_STD, DELAY_STD_S = 0.1, 0.002, 0.03
-#: White noise of accelerometer, m/s²/√Hz, and gyro, rad/s/√Hz; random walk of the gyro's bias, rad/s/√s; time interval
-#: of the white part of the filter's error, s, and its floor, m/s.
-AY_NOISE, RATE_NOISE, RATE_WALK, KNOT_S, FLOOR_M_S = 0.05, 0.001, 1e-5, 0.05, 0.005
-#: Low-pass time constants for the magnitude and the derivative of a_y, s; capacity of the queue of late GNSS samples.
-SIZE_S, SLOPE_S, QUEUE = 0.05, 0.1, 64
-_LAW = np.array(HYPOTHESES) * np.array([math.pi / 180.0] * 4 + [1.0, 1.0])
-
-# Entries of the state shared by all hypotheses, and columns of a queued sample.
-_CLOCK, _RATE, _AY, _VX, _TURNED, _MOVED, _SIZE, _SLOPE = range(8)
-_GRIP, _RUNS, _LEFT, _LAST, _JUMP, _SINCE, _AGREES, _FIRST, _END = range(8, 17)
-_EAST, _NORTH, _AT, _ARRIVAL, _TURNED_THEN, _MOVED_THEN, _RATE_THEN, _AY_THEN, _ROLL_THEN, _STD = range(10)
+#: Columns of a queued row after those of the kinematic filter: v_y of the wrapped filter, time of the row, arrival of
+#: its GNSS velocity, and whether that was used.
+FILTER_VY, TIME, ARRIVAL, USED = range(f.INPUTS, f.INPUTS + 4)
+#: Rows in the queue: 1.2 s. A sample that arrives later is not used.
+QUEUE = 24
+#: Uncertainty of the filter's v_y over v_x in degrees: constant, per m/s², per rad/s of roll rate, and per square of
+#: the share of the grip beyond the linear range. Chosen on simulated drives.
+FILTER_DEG = (0.3, 0.15, 5.0, 30.0)
+#: 1-sigma of v_x and its share of the one of v_y, for sliding wheels; minimum of a GNSS velocity, its increase with a_y
+#: (lag), and with roll rate (height of the antenna).
+SPEED_STD_M_S, SPEED_SHARE, GNSS_STD_M_S, LAG_S, HEIGHT_STD_M = 0.1, 0.3, 0.1, 0.02, 0.5
+#: White noise of v_x and of a_y, m/s²/√Hz, of the gyro, rad/s/√Hz, and random walk of its bias, rad/s/√s.
+NOISE, RATE_WALK = np.array([1.0, 0.05, 0.001]), 1e-5
+#: Time constants of the innovation statistic of a receiver that gets worse or better, s, for samples at 10 Hz; its
+#: limit for one sample; its value at which the heading is reinitialized.
+WORSE_S, BETTER_S, SAMPLE_S, LARGEST_NIS, LOST_NIS = 1.0, 10.0, 0.1, 100.0, 60.0
+#: Standard deviations of a change of v_y below which it has no weight; 1-sigma of the errors of a receiver that samples
+#: do not average out, m/s; share of v_x above which a change is a divergence.
+GARROTE, PERSISTENT_M_S, LARGEST_SHARE = 3.0, 0.07, 0.5
+#: Time constant of the low pass of the roll rate, s; height of the antenna over the roll axis, m; 1-sigma of a first
+#: heading, rad; slightly less than the time between rows, s.
+ROLL_S, ANTENNA_HEIGHT_M, HEADING_STD_RAD, KNOT_S = 0.1, 1.2, 0.1, 1.0 / RATE_HZ - 1e-4
+#: 1-sigmas of the first state; other entries are exactly 0. Antenna x: unknown and known.
+START_STD = {
+    f.VX: 0.3, f.VY: 0.1, f.AX_BIAS: f.BIAS_M_S2,
+    f.AY_BIAS: f.BIAS_M_S2, f.LAW_ERROR: 1.0, f.YAW_RATE_BIAS: 0.003,
+    f.YAW_RATE_GAIN: 0.003, f.ROLL_GAIN: 0.02, f.IMU_X: 1.0, f.HEADING: HEADING_STD_RAD,
+    f.EAST_ERROR: f.RECEIVER_M_S,
+    f.NORTH_ERROR: f.RECEIVER_M_S, f.ANTENNA_X: 0.5, f.ANTENNA_Y: 0.3,
+    f.GNSS_DELAY: 0.05, f.ANTENNA_HEIGHT: 0.5,
+}  # fmt: skip
+KNOWN_ANTENNA_STD_M = 0.1
+#: Memory besides the queue: time; time since the last estimate and since the last row; integrals of a_y and yaw rate
+#: since that row, and their last values; share of the grip; innovation statistic; heading change since the last course,
+#: that course, and the agreement of both; number of rows; whether the heading is initialized.
+PROGRESS = np.dtype([(name, np.float64) for name in (
+    "clock", "pause", "elapsed", "ay_sum", "rate_sum", "ay", "rate", "grip", "nis",
+    "heading", "course", "agreement",
+)] + [(name, np.int64) for name in ("rows", "has_heading")])  # fmt: skip
 
 
 class Aiding(NamedTuple):
-    """Memory between windows: states [H, 8] and covariances, facts of each, shared state, queued samples.
-
-    ``facts`` [H, 3]: evidence, whether the heading is initialized, and start of the rejection of samples (−1: none).
-    """
+    """Memory between windows: queue of states [Q, n], covariances and input rows, and a record of ``PROGRESS`` [1]."""
 
     x: FloatArray
     P: FloatArray
-    facts: FloatArray
-    shared: FloatArray
-    waiting: FloatArray
+    rows: FloatArray
+    progress: NDArray[np.void]
 
 
 @njit(cache=True)
-def _start(memory, antenna, imu_x_m, vy, vx):  # type: ignore[no-untyped-def]
-    x, P, facts, shared, _ = memory
-    x[:], P[:], facts[:], shared[:] = 0.0, 0.0, 0.0, 0.0
-    x[:, VY], x[:, ANTENNA_X], x[:, IMU_X], facts[:, 2] = vy, antenna[0], imu_x_m, -1.0
-    for i in range(x.shape[0]):
-        P[i, VY, VY] = 0.01 + (_LAW[i, 0] * vx) ** 2
-        P[i, AY_BIAS, AY_BIAS], P[i, RATE_BIAS, RATE_BIAS] = BIAS_M_S2**2, RATE_STD**2
-        P[i, LAW_ERROR, LAW_ERROR] = 1.0
-        P[i, ANTENNA_X, ANTENNA_X], P[i, DELAY, DELAY] = antenna[1] ** 2, DELAY_STD_S**2
-        P[i, IMU_X, IMU_X] = _LAW[i, 5] ** 2
-
-
-@njit(cache=True)
-def _advance(x, P, dt, vx, ay_slope, kinematic):  # type: ignore[no-untyped-def]
-    """Advance one hypothesis by a step; ``kinematic`` has the integrals of the sensors.
-
-    These are the changes of v_y at the sensors for constant heading, of the heading, and of the yaw rate.
-    """
-    kept, law_kept = math.exp(-dt / BIAS_S), math.exp(-dt / LAW_S)
-    x[VY] += kinematic[0] - dt * (x[AY_BIAS] - x[RATE_BIAS] * vx) - kinematic[2] * x[IMU_X]
-    x[HEADING] += kinematic[1] - dt * x[RATE_BIAS]
-    x[AY_BIAS] *= kept
-    x[LAW_ERROR] *= law_kept
-    for j in range(STATES):  # F P, then (F P) Fᵀ
-        P[VY, j] += dt * (vx * P[RATE_BIAS, j] - P[AY_BIAS, j]) - kinematic[2] * P[IMU_X, j]
-        P[HEADING, j] -= dt * P[RATE_BIAS, j]
-        P[AY_BIAS, j] *= kept
-        P[LAW_ERROR, j] *= law_kept
-    for i in range(STATES):
-        P[i, VY] += dt * (vx * P[i, RATE_BIAS] - P[i, AY_BIAS]) - kinematic[2] * P[i, IMU_X]
-        P[i, HEADING] -= dt * P[i, RATE_BIAS]
-        P[i, AY_BIAS] *= kept
-        P[i, LAW_ERROR] *= law_kept
-    gyro = RATE_NOISE**2 * dt
-    P[VY, VY] += AY_NOISE**2 * dt + gyro * vx * vx
-    P[VY, HEADING] -= gyro * vx
-    P[HEADING, VY] -= gyro * vx
-    P[HEADING, HEADING] += gyro
-    P[AY_BIAS, AY_BIAS] += BIAS_M_S2**2 * (1.0 - kept * kept) + (TILT_SHARE * ay_slope * dt) ** 2
-    P[RATE_BIAS, RATE_BIAS] += RATE_WALK**2 * dt
-    P[LAW_ERROR, LAW_ERROR] += 1.0 - law_kept * law_kept
-
-
-@njit(cache=True)
-def _residual(x, P, facts, sample, shared, h):  # type: ignore[no-untyped-def]
-    """Return the residual of a GNSS velocity across the heading, its own and its total variance; Jacobian in h."""
-    age = shared[_CLOCK] - sample[_AT]
-    turned = shared[_TURNED] - sample[_TURNED_THEN] - age * x[RATE_BIAS]
-    moved = shared[_MOVED] - sample[_MOVED_THEN] - age * (x[AY_BIAS] - x[RATE_BIAS] * shared[_VX])
-    rate = sample[_RATE_THEN] - x[RATE_BIAS]
-    sped = shared[_RATE] - sample[_RATE_THEN]
-    left = (
-        x[VY]
-        - moved
-        + x[IMU_X] * sped
-        + x[ANTENNA_X] * rate
-        - x[DELAY] * sample[_AY_THEN]
-        - ANTENNA_HEIGHT_M * sample[_ROLL_THEN]
-    )
-    if facts[1] == 0.0:
-        x[HEADING] = math.atan2(sample[_NORTH], sample[_EAST]) - math.atan2(left, shared[_VX]) + turned
-        P[HEADING, :], P[:, HEADING] = 0.0, 0.0
-        P[HEADING, HEADING], facts[1] = HEADING_STD**2, 1.0
-    c, s = math.cos(x[HEADING] - turned), math.sin(x[HEADING] - turned)
+def filtered_velocity(point, row, h):  # type: ignore[no-untyped-def]
+    """Measure the wrapped filter's v_y, whose error has a correlated and a white part."""
     h[:] = 0.0
-    h[VY], h[HEADING] = 1.0, c * sample[_EAST] + s * sample[_NORTH]
-    h[ANTENNA_X], h[DELAY], h[IMU_X] = rate, -sample[_AY_THEN], sped
-    white = sample[_STD] ** 2 + (BIAS_M_S2 * age) ** 2
-    variance = white
-    for i in range(STATES):
-        for j in range(STATES):
-            variance += h[i] * P[i, j] * h[j]
-    return c * sample[_NORTH] - s * sample[_EAST] - left, white, variance
+    error_m_s = row[f.LAW_STD] * max(row[f.SPEED], 1.0)
+    h[f.VY], h[f.LAW_ERROR] = 1.0, -error_m_s
+    return row[FILTER_VY] - point[f.VY] + error_m_s * point[f.LAW_ERROR], (f.LAW_WHITE * error_m_s) ** 2 + 0.005**2
 
 
 @njit(cache=True)
-def _use(x, P, facts, sample, shared, h, doubt):  # type: ignore[no-untyped-def]
-    """Update one hypothesis with a GNSS velocity; return the remaining residual. ``doubt``: cost of a misfit."""
-    error, white, variance = _residual(x, P, facts, sample, shared, h)
-    square = error * error / variance
-    facts[0] -= 0.5 * (min(square, GATE_SIGMA**2) + math.log(variance))
-    if square <= GATE_SIGMA**2:
-        facts[2] = -1.0
-        correct(x, P, h, error, white)
-        return error * white / variance
-    facts[0] -= doubt
-    facts[2] = shared[_CLOCK] if facts[2] < 0.0 else facts[2]
-    if shared[_CLOCK] - facts[2] > LOST_S:
-        facts[1], facts[2] = 0.0, -1.0
-    return error
+def _advance(memory, number, h):  # type: ignore[no-untyped-def]
+    """Predict the state of row ``number`` from the previous one, and measure the wrapped filter's velocity."""
+    i, last = number % QUEUE, (number - 1) % QUEUE
+    x, P, row, before = memory.x[i], memory.P[i], memory.rows[i], memory.rows[last]
+    step_s = row[TIME] - before[TIME]
+    x[:], P[:, :], _ = f.predict(memory.x[last], memory.P[last], memory.x[last], step_s, row, before, NOISE)
+    P[f.YAW_RATE_BIAS, f.YAW_RATE_BIAS] += RATE_WALK**2 * step_s
+    point = x.copy()
+    f.use(x, P, point, h, f.speed(point, row, h), False)
+    f.use(x, P, point, h, filtered_velocity(point, row, h), False)
 
 
 @njit(cache=True)
-def _has_jumped(error, sample, shared, facts):  # type: ignore[no-untyped-def]
-    """Return whether GNSS is between a jump against the sensors and a jump back (multipath), at most ``LOST_S``."""
-    change = error - shared[_LEFT]
-    limit = JUMP_M_S + 0.02 * abs(sample[_AY_THEN]) + 0.5 * (sample[_AT] - shared[_LAST]) + abs(sample[_ROLL_THEN])
-    limit += 0.3 * abs(sample[_RATE_THEN])  # an error of v_x becomes one of v_y
-    shared[_LAST] = sample[_AT]
-    if shared[_JUMP] == 0.0 and abs(change) > limit:
-        shared[_JUMP], shared[_SINCE] = change, shared[_CLOCK]
-    elif abs(change + shared[_JUMP]) < 0.5 * abs(shared[_JUMP]):
-        shared[_JUMP] = 0.0
-    elif shared[_JUMP] != 0.0 and shared[_CLOCK] - shared[_SINCE] > LOST_S:
-        shared[_JUMP], shared[_LEFT] = 0.0, 0.0
-        facts[:, 1] = 0.0
-        return True
-    shared[_LEFT] = error
-    return shared[_JUMP] != 0.0
+def _use_gnss(x, P, row, h):  # type: ignore[no-untyped-def]
+    point = x.copy()
+    for east in (True, False):
+        f.use(x, P, point, h, f.gnss_velocity(point, row, east, h), True)
 
 
 @njit(cache=True)
-def _queue(columns, k, p_roll, shared, waiting):  # type: ignore[no-untyped-def]
-    """Queue the GNSS velocity of step k until its arrival; a full queue drops the oldest sample."""
-    east, north, std, late = columns[7:]
-    row, last = waiting[int(shared[_END]) % QUEUE], waiting[int(shared[_END] - 1.0) % QUEUE]
-    if shared[_END] > 0.0:  # a course that turns against the gyro indicates exchanged or mirrored axes
-        turn = last[_EAST] * north[k] - last[_NORTH] * east[k]
-        shared[_AGREES] += turn / (math.hypot(east[k], north[k]) ** 2) * (shared[_TURNED] - last[_TURNED_THEN])
-    row[_EAST], row[_NORTH], row[_AT], row[_ARRIVAL] = east[k], north[k], shared[_CLOCK], shared[_CLOCK] + late[k]
-    row[_TURNED_THEN], row[_MOVED_THEN], row[_ROLL_THEN] = shared[_TURNED], shared[_MOVED], p_roll
-    row[_RATE_THEN], row[_AY_THEN] = shared[_RATE], shared[_AY]
-    stated = max(std[k], GNSS_STD_M_S) if std[k] == std[k] else GNSS_STD_M_S
-    row[_STD] = math.sqrt(stated**2 + (GNSS_LAG_S * shared[_AY]) ** 2 + (HEIGHT_STD_M * p_roll) ** 2)
-    shared[_END] += 1.0
-    shared[_FIRST] = max(shared[_FIRST], shared[_END] - QUEUE)
+def _receive(x, P, row, now, h):  # type: ignore[no-untyped-def]
+    """Judge a sample that has just arrived: update the innovation statistic and enlarge its noise accordingly."""
+    row[USED] = 1.0
+    if now.has_heading == 0:
+        left = x[f.VY] + x[f.ANTENNA_X] * row[f.YAW_RATE]
+        course = math.atan2(row[f.GNSS_NORTH], row[f.GNSS_EAST]) - row[f.GNSS_OFFSET] * row[f.YAW_RATE]
+        x[f.HEADING] = course - math.atan2(left, x[f.VX])
+        P[f.HEADING, :], P[:, f.HEADING] = 0.0, 0.0
+        P[f.HEADING, f.HEADING], now.has_heading = HEADING_STD_RAD**2, 1
+    else:
+        nis = 0.0
+        for east in (True, False):
+            residual, variance = f.gnss_velocity(x, row, east, h)
+            for i in range(h.shape[0]):
+                for j in range(h.shape[0]):
+                    variance += h[i] * P[i, j] * h[j]
+            nis += 0.5 * residual * residual / variance
+        time_s = WORSE_S if nis > now.nis else BETTER_S
+        now.nis += (min(nis, LARGEST_NIS) - now.nis) * (1.0 - math.exp(-SAMPLE_S / time_s))
+        if now.nis > LOST_NIS:
+            now.has_heading, now.nis = 0, 1.0
+    row[f.GNSS_STD] *= math.sqrt(max(1.0, now.nis))
 
 
 @njit(cache=True)
-def _share(columns, k, dt, roll_gradient, grip_m_s2, shared):  # type: ignore[no-untyped-def]
-    """Advance the shared state to step k; return the integrals of the sensors, and the slope of a_y."""
-    ay, rate, vx = columns[2:5]
-    new_rate = rate[k] if math.isfinite(rate[k]) else shared[_RATE]
-    new_ay = ay[k] / (1.0 + GRAVITY_M_S2 * roll_gradient) if math.isfinite(ay[k]) else shared[_AY]
-    if dt == 0.0:
-        shared[_RATE], shared[_AY], shared[_SIZE], shared[_SLOPE], shared[_VX] = new_rate, new_ay, new_ay, new_ay, vx[k]
-    r = 0.5 * (shared[_RATE] + new_rate)
-    turned = dt * r
-    moved = dt * (0.5 * (shared[_AY] + new_ay) - r * 0.5 * (shared[_VX] + vx[k]))
-    sped = new_rate - shared[_RATE]
-    before = shared[_SLOPE]
-    shared[_SIZE] += (new_ay - shared[_SIZE]) * (1.0 - math.exp(-dt / SIZE_S))
-    shared[_SLOPE] += (new_ay - shared[_SLOPE]) * (1.0 - math.exp(-dt / SLOPE_S))
-    shared[_GRIP] = max(abs(shared[_SIZE]) / grip_m_s2, shared[_GRIP] * math.exp(-dt / LIMIT_TIME_S))
-    shared[_CLOCK] += dt
-    shared[_TURNED] += turned
-    shared[_MOVED] += moved
-    shared[_RATE], shared[_AY], shared[_VX] = new_rate, new_ay, vx[k]
-    return (moved, turned, sped), (shared[_SLOPE] - before) / dt if dt > 0.0 else 0.0
-
-
-@njit(cache=True)
-def _mixture(x, P, facts, agrees, vy, out, k):  # type: ignore[no-untyped-def]
-    """Write the correction of v_y at step k by the hypotheses, the weight of the filter, and their variance."""
-    total, mean, variance, most = 0.0, 0.0, 0.0, np.max(facts[:, 0] + _LAW[:, 4])
-    for i in range(x.shape[0]):
-        has_heading = i == 0 or (agrees and facts[i, 1] > 0.0)  # GNSS is not informative without a heading
-        weight = math.exp(facts[i, 0] + _LAW[i, 4] - most) if has_heading else 0.0
-        total += weight
-        if i > 0:
-            mean += weight * (x[i, VY] - vy)
-            variance += weight * (P[i, VY, VY] + (x[i, VY] - vy) ** 2)
+def _take_arrivals(memory, now, until, h):  # type: ignore[no-untyped-def]
+    """Use the samples that arrived ``until`` a time, each at its own row, and run the filter again from the first."""
+    first = -1
+    for number in range(max(0, now.rows - QUEUE), now.rows):
+        i = number % QUEUE
+        row = memory.rows[i]
+        arrived = row[ARRIVAL] <= until
+        if first < 0 and (not arrived or row[USED] > 0.0):
+            continue
+        if first >= 0:
+            _advance(memory, number, h)
         else:
-            out[k, 1] = weight
-    mean /= total
-    out[k, 0], out[k, 1], out[k, 2] = mean, out[k, 1] / total, max(0.0, variance / total - mean * mean)
+            first = number
+        if arrived:
+            if row[USED] == 0.0:
+                _receive(memory.x[i], memory.P[i], row, now, h)
+            _use_gnss(memory.x[i], memory.P[i], row, h)
 
 
 @njit(cache=True)
-def _aid(columns, body, antenna, memory, out):  # type: ignore[no-untyped-def]
-    """Process one window; ``memory`` is updated in place. ``out`` [K, 3] as in :func:`_mixture`."""
-    dts, ready, _, _, vx, vy, usable, east, north, _, _ = columns
-    x, P, facts, shared, waiting = memory
-    h = np.empty(STATES)
+def _start(memory, now, start, start_variance, vx, vy):  # type: ignore[no-untyped-def]
+    """Begin the queue with a first state; the statistic of the receiver stays."""
+    now.rows, now.has_heading, now.grip, now.elapsed, now.ay_sum, now.rate_sum = 1, 0, 0.0, 0.0, 0.0, 0.0
+    now.nis = max(now.nis, 1.0)
+    memory.rows[:, :], memory.rows[:, ARRIVAL] = 0.0, np.inf
+    memory.x[0], memory.P[0] = start, np.diag(start_variance)
+    memory.x[0, f.VX], memory.x[0, f.VY] = vx, vy
+    row = memory.rows[0]
+    row[f.SPEED], row[FILTER_VY], row[TIME] = vx, vy, now.clock
+    row[f.AY] = row[f.MEAN_AY] = row[f.SLOW_AY] = now.ay
+    row[f.YAW_RATE] = row[f.MEAN_YAW_RATE] = now.rate
+
+
+@njit(cache=True)
+def _add_row(memory, now, vx, vy, grip_m_s2):  # type: ignore[no-untyped-def]
+    """Add a row with the inputs since the last one."""
+    before, row, step_s = memory.rows[(now.rows - 1) % QUEUE], memory.rows[now.rows % QUEUE], now.elapsed
+    row[:], row[ARRIVAL], row[TIME] = 0.0, np.inf, now.clock
+    row[f.MEAN_AY] = row[f.AY] = now.ay_sum / step_s
+    row[f.MEAN_YAW_RATE] = now.rate_sum / step_s
+    row[f.YAW_RATE] = 0.5 * (now.rate + row[f.MEAN_YAW_RATE])
+    row[f.YAW_ACCELERATION] = row[f.MEAN_YAW_ACCELERATION] = (row[f.MEAN_YAW_RATE] - before[f.MEAN_YAW_RATE]) / step_s
+    row[f.AY_RATE] = (row[f.MEAN_AY] - before[f.MEAN_AY]) / step_s
+    row[f.SLOW_AY] = before[f.SLOW_AY] + (row[f.AY] - before[f.SLOW_AY]) * (1.0 - math.exp(-step_s / SLOW_S))
+    roll_rate = ROLL_PER_AY_RAD_S2_M * row[f.AY_RATE]
+    row[f.ROLL_RATE] = before[f.ROLL_RATE] + (roll_rate - before[f.ROLL_RATE]) * (1.0 - math.exp(-step_s / ROLL_S))
+    row[f.SPEED], row[FILTER_VY] = vx, vy
+    row[f.MEAN_AX] = row[f.AX] = (vx - before[f.SPEED]) / step_s - vy * now.rate
+    now.grip = max(abs(row[f.AY]) / grip_m_s2, now.grip * math.exp(-step_s / LIMIT_TIME_S))
+    beyond = max(0.0, now.grip - LINEAR_SHARE) ** 2
+    constant, per_ay, per_roll_rate, per_beyond = FILTER_DEG
+    error_deg = constant + per_ay * abs(row[f.AY]) + per_roll_rate * abs(row[f.ROLL_RATE]) + per_beyond * beyond
+    row[f.LAW_STD] = math.radians(error_deg)
+    row[f.SPEED_STD] = SPEED_STD_M_S + SPEED_SHARE * row[f.LAW_STD] * abs(vx)
+    now.rows, now.elapsed, now.ay_sum, now.rate_sum = now.rows + 1, 0.0, 0.0, 0.0
+
+
+@njit(cache=True)
+def _aid(columns, grip_m_s2, start, start_variance, memory, out):  # type: ignore[no-untyped-def]
+    """Process one window; ``memory`` is updated in place.
+
+    ``out`` [K, 3]: correction of v_y, weight of the filter, and variance of v_y in addition to the weighted filter's.
+    """
+    dts, ready, ay, rate, vx, vy, usable, east, north, std, late = columns
+    now, h = memory.progress[0], np.empty(f.WITH_GNSS)
     for k in range(dts.shape[0]):
         out[k, 0], out[k, 1], out[k, 2] = 0.0, 1.0, 0.0
+        now.pause += dts[k]
         if not usable[k]:
-            shared[_RUNS] = 0.0
             continue
-        dt = dts[k]
-        if shared[_RUNS] == 0.0 or not dt <= RESTART_GAP_S:
-            _start(memory, antenna, body[1], vy[k], vx[k])
-            dt = 0.0
-        shared[_RUNS] = 1.0
-        kinematic, ay_slope = _share(columns, k, dt, body[0], body[2], shared)
-        beyond = max(0.0, shared[_GRIP] - LINEAR_SHARE) ** 2
-        for i in range(x.shape[0]):
-            if dt == 0.0:
-                continue
-            facts[i, 0] *= math.exp(-dt / FORGET_S)
-            _advance(x[i], P[i], dt, vx[k], ay_slope, kinematic)
-            law = _LAW[i, 0] + _LAW[i, 1] * abs(shared[_SIZE]) + _LAW[i, 2] * abs(ay_slope) + _LAW[i, 3] * beyond
-            error_m_s = law * max(vx[k], 1.0)
-            h[:] = 0.0
-            h[VY], h[LAW_ERROR] = 1.0, -error_m_s
-            white = (LAW_WHITE * error_m_s) ** 2 * KNOT_S / dt + FLOOR_M_S**2
-            correct(x[i], P[i], h, vy[k] - x[i, VY] + error_m_s * x[i, LAW_ERROR], white)
-        if math.hypot(east[k], north[k]) >= LEAST_COURSE_SPEED_M_S:
-            _queue(columns, k, body[0] * ay_slope, shared, waiting)
-        while shared[_FIRST] < shared[_END]:
-            sample = waiting[int(shared[_FIRST]) % QUEUE]
-            if sample[_ARRIVAL] > shared[_CLOCK] + ready[k]:
-                break
-            shared[_FIRST] += 1.0
-            error, _, _ = _residual(x[-1], P[-1], facts[-1], sample, shared, h)
-            if not _has_jumped(error, sample, shared, facts):
-                for i in range(x.shape[0]):
-                    shared[_LEFT] = _use(x[i], P[i], facts[i], sample, shared, h, min(i, 1))
-        _mixture(x, P, facts, shared[_AGREES] > 0.0, vy[k], out, k)
+        dt, now.pause = now.pause, 0.0
+        now.ay = ay[k] if math.isfinite(ay[k]) else now.ay
+        now.rate = rate[k] if math.isfinite(rate[k]) else now.rate
+        if now.rows == 0 or not dt <= RESTART_GAP_S:
+            _start(memory, now, start, start_variance, vx[k], vy[k])
+            continue
+        now.clock += dt
+        now.elapsed += dt
+        now.ay_sum += dt * now.ay
+        now.rate_sum += dt * now.rate
+        now.heading += dt * now.rate
+        if now.elapsed > KNOT_S:
+            _add_row(memory, now, vx[k], vy[k], grip_m_s2)
+            _advance(memory, now.rows - 1, h)
+        newest = (now.rows - 1) % QUEUE
+        row = memory.rows[newest]
+        if math.hypot(east[k], north[k]) >= LEAST_COURSE_SPEED_M_S and row[ARRIVAL] == np.inf:
+            row[f.GNSS_EAST], row[f.GNSS_NORTH], row[f.GNSS_OFFSET] = east[k], north[k], now.clock - row[TIME]
+            course, now.course = now.course, math.atan2(north[k], east[k])
+            now.agreement += math.sin(now.course - course) * now.heading
+            now.heading = 0.0
+            stated = max(std[k], GNSS_STD_M_S) if math.isfinite(std[k]) else GNSS_STD_M_S
+            row[f.GNSS_STD] = math.sqrt(stated**2 + (LAG_S * now.ay) ** 2 + (HEIGHT_STD_M * row[f.ROLL_RATE]) ** 2)
+            row[ARRIVAL], row[USED] = now.clock + late[k], 0.0
+        _take_arrivals(memory, now, now.clock + ready[k], h)
+        change = memory.x[newest, f.VY] - row[FILTER_VY]
+        variance = memory.P[newest, f.VY, f.VY] + PERSISTENT_M_S**2
+        usable_heading = now.has_heading > 0 and now.agreement > 0.0 and abs(change) < LARGEST_SHARE * vx[k]
+        weight = 1.0 - GARROTE**2 * variance / max(change * change, 1e-12)
+        if usable_heading and weight > 0.0:
+            out[k, 0], out[k, 1] = weight * change, 1.0 - weight
+            out[k, 2] = weight * (variance + (1.0 - weight) * change * change)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -310,7 +267,7 @@ class GnssAided:
     """The estimator of this file; GNSS velocity corrects ``estimator``."""
 
     algorithm = "gnss-aided"
-    version = 1
+    version = 2
     options = ("estimator",)
 
     estimator: AdaptivePhysics
@@ -339,23 +296,30 @@ class GnssAided:
         """Process one window (see :class:`~.base.Estimator`)."""
         before_ns = None if state is None else state.last_stamp_ns
         steps, after = self.estimator.run(signals, None if state is None else state.filter)
-        stamps_ns, count, h = signals.stamps_ns, len(signals), len(HYPOTHESES)
+        stamps_ns, count, n = signals.stamps_ns, len(signals), f.WITH_GNSS
         everywhere = np.ones(count, dtype=np.bool_)
         at_steps = Extrapolation(np.arange(count), everywhere, np.zeros(count), np.asarray(steps.valid))
         track = predict_track(self.estimator, steps, at_steps, stamps_ns)
+        vehicle = self._physics.vehicle
+        ay_m_s2 = signals.ay_m_s2 / (1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2)
         columns = (
-            step_durations_s(stamps_ns, before_ns), (signals.ready_ns - stamps_ns) * 1e-9, signals.ay_m_s2,
+            np.nan_to_num(step_durations_s(stamps_ns, before_ns)), (signals.ready_ns - stamps_ns) * 1e-9, ay_m_s2,
             signals.yaw_rate_rad_s, track.vx_m_s, track.vy_m_s, track.valid & np.isfinite(track.vy_m_s),
             *signals.gnss_velocity_m_s.T, signals.gnss_velocity_std_m_s, np.nan_to_num(signals.gnss_late_s),
         )  # fmt: skip
-        shapes = ((h, STATES), (h, STATES, STATES), (h, 3), (_END + 1,), (QUEUE, _STD + 1))
-        aiding = Aiding(*(np.zeros(s) for s in shapes) if state is None else (a.copy() for a in state.aiding))
+        if state is None:
+            progress = np.zeros(1, PROGRESS)
+            aiding = Aiding(np.zeros((QUEUE, n)), np.zeros((QUEUE, n, n)), np.zeros((QUEUE, USED + 1)), progress)
+        else:
+            aiding = deepcopy(state.aiding)
+        start, start_std = np.zeros(n), np.zeros(n)
+        for entry, value in START_STD.items():
+            start_std[entry] = value
+        start[[f.IMU_X, f.ANTENNA_HEIGHT]] = vehicle.imu_position_m[0], ANTENNA_HEIGHT_M
+        if (antenna := vehicle.gnss_antenna_position_m) is not None:
+            start[f.ANTENNA_X], start_std[f.ANTENNA_X] = antenna[0], KNOWN_ANTENNA_STD_M
         out = np.empty((count, 3))
-        vehicle = self._physics.vehicle
-        antenna = vehicle.gnss_antenna_position_m
-        body = (vehicle.roll_gradient_rad_per_m_s2, vehicle.imu_position_m[0], GRAVITY_M_S2 * vehicle.assumed_friction)
-        prior = (0.0, ANTENNA_STD_M) if antenna is None else (antenna[0], KNOWN_ANTENNA_STD_M)
-        _aid(columns, body, prior, aiding, out)
+        _aid(columns, GRAVITY_M_S2 * vehicle.assumed_friction, start, start_std**2, aiding, out)
         return AidedSteps(steps, out), AidedState(after, aiding, last_stamp_ns(stamps_ns, before_ns))
 
     def predict(self, steps: AidedSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:

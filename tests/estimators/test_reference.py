@@ -119,6 +119,26 @@ def test_the_reference_finds_sideslip_without_tyre_data_and_its_interval_contain
     assert found.valid.mean() > 0.6
 
 
+def test_in_a_slide_the_reference_is_given_with_a_larger_standard_deviation():
+    found = refer(SLIDE.signals, PRIOR)
+    error, std = SLIDE.error_deg(found)
+    seconds = (found.stamps_ns - START_NS) * 1e-9
+    slides = (seconds > 8.5) & (seconds < 11.0)
+    assert found.valid[slides].all()
+    assert std[slides].max() > 3.0 * std[seconds < 7.0].mean()
+    assert np.mean(np.abs(error[slides]) < 1.96 * std[slides]) > 0.9
+
+
+def test_long_after_the_last_linear_driving_the_reference_is_not_valid():
+    found = refer(LONG.signals, PRIOR)
+    seconds = (found.stamps_ns - START_NS) * 1e-9
+    trusted = sideslip_std(found.vx_m_s, found.vy_m_s, found.covariance) < np.radians(0.5)
+    nearest = np.abs(seconds[:, None] - seconds[trusted]).min(axis=1)
+    np.testing.assert_array_equal(found.valid[nearest > 5.1], False)
+    assert found.valid[nearest < 4.9].all()
+    assert nearest.max() > 5.1
+
+
 def test_long_driving_at_the_limit_needs_gnss_and_the_interval_shows_it():
     alone = refer(LONG.signals, PRIOR)
     aided = refer(with_gnss(LONG), PRIOR)
