@@ -12,7 +12,7 @@ from functools import cache, partial
 from importlib import import_module
 from itertools import chain
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
 from pdhef_logtool.estimators.plug_ins import contained, package_of
 from pdhef_logtool.estimators.presets import (
@@ -135,7 +135,8 @@ ENTRY_POINTS = "pdhef.estimators"
 #: Modules that the fork server of workers has loaded.
 FILTERS = ("pdhef_logtool.estimators.*", "pdhef_logtool.compiled.cache:load_kept")
 #: Groups, in place of names: the estimators of this tool and published ones, as far as they can run on the car.
-ALL_ESTIMATORS, PEERS = "all", "peers"
+ALL_ESTIMATORS: Final = "all"
+PEERS: Final = "peers"
 #: Options of each preset, after a colon: None for a switch, the allowed range for an option with a value.
 OPTIONS: Mapping[str, Mapping[str, tuple[float, float] | None]] = {
     "zero": {"no-lateral": None},
