@@ -118,9 +118,9 @@ class LadderModel(BaseModel):
     def residual(self, features: FloatArray, dt_s: FloatArray, state: FloatArray | None) -> tuple[Residual, FloatArray]:
         """Return the residual of consecutive steps (see :class:`~.interface.ResidualModel`)."""
         slow, memory = slow_features(features, dt_s, state)
-        found = self.evaluate(slow)
-        rate, std = (np.stack([c, np.zeros(len(c))], axis=1) for c in (found.rate_m_s2, found.std_m_s2))
-        return Residual(rate, std, found.gain), memory
+        correction = self.evaluate(slow)
+        rate, std = (np.stack([c, np.zeros(len(c))], axis=1) for c in (correction.rate_m_s2, correction.std_m_s2))
+        return Residual(rate, std, correction.gain), memory
 
     def evaluate(self, features: SlowFeatures) -> Correction:
         """Return the residual at each step; residual and gain are 0 where a feature is NaN."""
