@@ -6,8 +6,7 @@ prediction in place of a bad sample. Without a network there is no parallel filt
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,22 +32,6 @@ class CheckedInputs:
 
     faults: SensorFaults
     rate: FloatArray
-
-    @property
-    def nbytes(self) -> int:
-        """Memory in addition to the input signals."""
-        f = self.faults
-        arrays = [self.rate, f.extra_r, f.noise_std, f.reason]
-        arrays += [x for s in (f.filtered, f.network) for x in (s.ay_m_s2, s.yaw_rate_rad_s)]
-        return sum(a.nbytes for a in arrays)
-
-    def cut(self, first: int, end: int) -> CheckedInputs:
-        """Return the steps ``first`` to ``end`` (exclusive)."""
-        parts = {f.name: getattr(self.faults, f.name) for f in fields(self.faults)}
-        cut: dict[str, Any] = {
-            n: x.rows(first, end) if isinstance(x, Signals) else x[first:end] for n, x in parts.items()
-        }
-        return CheckedInputs(SensorFaults(**cut), self.rate[first:end])
 
 
 def check_inputs(

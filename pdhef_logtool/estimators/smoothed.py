@@ -112,12 +112,11 @@ class SmoothedPhysics:
 
     def smooth(self, signals: Signals) -> StateTrack:
         """Return the track of a drive (see :class:`~.base.Smoother`)."""
-        checked, _ = self.filtered.inputs(signals, None)
-        faults, rate = checked.faults, self.filtered.trust * checked.rate
-        given = faults.filtered, rate, faults.extra_r
-        tracks, weights = self._filtered(*given)
+        checked, rate, extra_r, reason = self._inputs(signals)
+        tracks, weights = self._filtered(checked, rate, extra_r)
         track = mix(weights, tracks) if len(tracks) > 1 else tracks[0]
-        track = self.filtered.described(track, weights, r_scale(faults.extra_r, self._r_std), faults.reason)
+        raised = r_scale(extra_r, self.filtered.physics.measurement_std)
+        track = self.filtered.described(track, weights, raised, reason)
         return replace(
             track,
             name=self.name,
@@ -126,9 +125,16 @@ class SmoothedPhysics:
             mixture_weight=track.mixture_weight if len(tracks) > 1 else np.empty(0),
         )
 
-    @property
-    def _r_std(self) -> FloatArray:
-        return self.filtered.physics.measurement_std
+    def _inputs(self, signals: Signals) -> tuple[Signals, FloatArray, FloatArray, IntArray]:
+        """Return checked signals, residual rate times gain [N, 2], variance beyond R [N, 2] and reasons [N]."""
+        state, columns = None, []
+        for part in blocks(signals.stamps_ns, self.block_s):
+            checked, state = self.filtered.inputs(signals.rows(part.start, part.stop), state)
+            faults, rate = checked.faults, self.filtered.trust * checked.rate
+            seen = faults.filtered
+            columns.append((seen.ay_m_s2, seen.yaw_rate_rad_s, rate, faults.extra_r, faults.reason))
+        ay, yaw_rate, rate, extra_r, reason = (np.concatenate(column) for column in zip(*columns, strict=True))
+        return replace(signals, ay_m_s2=ay, yaw_rate_rad_s=yaw_rate), rate, extra_r, reason
 
     def _filtered(self, signals: Signals, rate: FloatArray, extra_r: FloatArray) -> tuple[list[StateTrack], FloatArray]:
         """Return the smoothed tracks of all filters [H], and their weights [N, H]."""
