@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter, physics_filter
-from reference_car import cut, drive, slalom, with_noise
+from reference_car import drive, slalom, with_noise
 
 from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, FRONT_WEIGHT_SHARE, FRONT_WEIGHT_SHARE_SPREAD
 from pdhef_logtool.car.car import Car, WithoutTruth
@@ -18,9 +17,10 @@ from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew, default
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.calibrated_band import D2_SHARE
 from pdhef_logtool.estimators.drive_signals import DriveSignals, calibrated_signals
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.presets import OPEN_LOOP
 from pdhef_logtool.estimators.table import all_names, make_estimator
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, physics_filter
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -62,13 +62,10 @@ def signals() -> Signals:
     return replace(s, friction=np.full(len(s), 0.85))
 
 
-def tracks(name: str, car: Car, *parts: Signals) -> list[StateTrack]:
-    estimator, state, found = make_estimator(name, car), None, []
-    intervals = calibrator(car, [estimator])
-    for part in parts:
-        track, state = run_window(estimator, calibrated_signals(part, car), state)
-        found.append(intervals.apply(track, part))
-    return found
+def track_of(name: str, car: Car, signals: Signals) -> StateTrack:
+    """Return the track of an estimator with its intervals."""
+    estimator = make_estimator(name, car)
+    return calibrator(car, [estimator]).apply(run_estimator(estimator, calibrated_signals(signals, car)), signals)
 
 
 @pytest.mark.slow
@@ -115,31 +112,27 @@ def test_a_drive_has_one_table_for_each_vehicle_and_both_are_read_only(signals: 
 
 
 def test_an_estimated_friction_is_not_taken(signals: Signals) -> None:
-    (told,) = tracks(OPEN_LOOP, calibrated(told_friction=False), replace(signals, friction=signals.friction * 0.5))
-    (own,) = tracks(OPEN_LOOP, calibrated(), signals)
+    told = track_of(OPEN_LOOP, calibrated(told_friction=False), replace(signals, friction=signals.friction * 0.5))
+    own = track_of(OPEN_LOOP, calibrated(), signals)
     np.testing.assert_array_equal(told.vy_m_s, own.vy_m_s)
 
 
 def test_estimators_of_a_run_share_what_their_bands_compare(signals: Signals, monkeypatch: pytest.MonkeyPatch) -> None:
-    car, names, half = with_band(), ("physics", "pd-hef"), len(signals) // 2
-    windows = cut(signals, 0, half), cut(signals, half, len(signals))
-    alone = {name: tracks(name, car, *windows) for name in names}
-    run, asked = PhysicsFilter.run, []
-    monkeypatch.setattr(PhysicsFilter, "run", lambda *given: (asked.append(given[0]), run(*given))[1])
-    estimators, states = [make_estimator(name, car) for name in names], [None, None]
+    car, names = with_band(), ("physics", "pd-hef")
+    alone = [track_of(name, car, signals) for name in names]
+    run, asked = VehicleUkf.run, []
+    monkeypatch.setattr(VehicleUkf, "run", lambda *given: (asked.append(given[0]), run(*given))[1])
+    estimators, read = [make_estimator(name, car) for name in names], calibrated_signals(signals, car)
     intervals = calibrator(car, estimators)
-    for number, window in enumerate(windows):
-        for i, estimator in enumerate(estimators):
-            track, states[i] = run_window(estimator, calibrated_signals(window, car), states[i])
-            track, expected = intervals.apply(track, window), alone[names[i]][number]
-            np.testing.assert_array_equal(track.sideslip_std_rad, expected.sideslip_std_rad)
-            np.testing.assert_array_equal(track.vy_m_s, expected.vy_m_s)
-    own = len(names)  # each estimator is one filter
-    assert len(asked) == (own + 3) * len(windows), "three compared filters per window, not per window and estimator"
+    for estimator, expected in zip(estimators, alone, strict=True):
+        track = intervals.apply(run_estimator(estimator, read), signals)
+        np.testing.assert_array_equal(track.sideslip_std_rad, expected.sideslip_std_rad)
+        np.testing.assert_array_equal(track.vy_m_s, expected.vy_m_s)
+    assert len(asked) == len(names) + 3, "three compared filters in all, not for each estimator"
 
 
 def test_the_band_changes_no_estimate(signals: Signals) -> None:
-    (plain,), (banded,) = (tracks("physics", car, signals) for car in (calibrated(), with_band()))
+    plain, banded = (track_of("physics", car, signals) for car in (calibrated(), with_band()))
     for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "nis"):
         np.testing.assert_array_equal(getattr(banded, column), getattr(plain, column))
     np.testing.assert_array_equal(banded.yaw_rate_std_rad_s, plain.yaw_rate_std_rad_s)
@@ -148,21 +141,21 @@ def test_the_band_changes_no_estimate(signals: Signals) -> None:
 
 @pytest.mark.parametrize("wider", [{"share": 0.3}, {"d2_m_s": 0.3}])
 def test_what_is_known_less_has_the_wider_band(wider: dict[str, float], signals: Signals) -> None:
-    (narrow,), (wide,) = tracks("physics", with_band(), signals), tracks("physics", with_band(**wider), signals)
+    narrow, wide = track_of("physics", with_band(), signals), track_of("physics", with_band(**wider), signals)
     for column in ("sideslip_std_rad", "vy_std_m_s"):
         assert np.mean(getattr(wide, column)) > 1.3 * np.mean(getattr(narrow, column))
 
 
 def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
     """The parameter part is the spread of the filter over the varied vehicles; the d2 part is a velocity."""
-    (plain,), (alone,), (both,) = (
-        tracks("physics", car, signals) for car in (calibrated(), with_band(d2_m_s=0.0), with_band(d2_m_s=0.1))
+    plain, alone, both = (
+        track_of("physics", car, signals) for car in (calibrated(), with_band(d2_m_s=0.0), with_band(d2_m_s=0.1))
     )
     found = with_band().self_calibrated
     assert found is not None
     read = [corrected_anew(signals, OWN, v) for v in (FOUND, *found.varied)]
     filters = [physics_filter(v, NOISE) for v in (FOUND, *found.varied)]
-    middle, *others = (run_window(f, s)[0].vy_m_s for f, s in zip(filters, read, strict=True))
+    middle, *others = (run_estimator(f, s).vy_m_s for f, s in zip(filters, read, strict=True))
     away = sum((vy - middle) ** 2 for vy in others)
     expected = plain.vy_std_m_s**2 + away
     fast = plain.vx_m_s > OWN.low_speed_blend_m_s
@@ -171,7 +164,7 @@ def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
 
 
 def test_without_d2_its_own_interval_counts_as_it_is(signals: Signals) -> None:
-    (plain,), (banded,) = tracks("physics", calibrated(), signals), tracks("physics", with_band(0.0, math.nan), signals)
+    plain, banded = (track_of("physics", car, signals) for car in (calibrated(), with_band(0.0, math.nan)))
     np.testing.assert_array_equal(banded.sideslip_std_rad, plain.sideslip_std_rad)
     car = with_band(0.0, math.nan)
     assert calibrator(car, [make_estimator("physics", car)]).fixed_notes["physics"] == "intervals: own and parameters"
@@ -182,7 +175,7 @@ def test_intervals_of_other_driving_are_not_taken(signals: Signals) -> None:
     inflation = make_inflation((9.0,) * 9, (9.0,) * 3)
     entries = (IntervalEntry(estimator="e", algorithm=resolve(estimator), inflation=inflation),)
     intervals = Intervals(car="c", physics_sha256="ab" * 32, roll_gradient_rad_per_m_s2=0.0, entries=entries)
-    track, _ = run_window(estimator, signals)
+    track = run_estimator(estimator, signals)
     applied = calibrator(replace(with_band(), intervals=intervals), [estimator])
     without = calibrator(with_band(), [estimator]).apply(track, signals)
     np.testing.assert_array_equal(applied.apply(track, signals).sideslip_std_rad, without.sideslip_std_rad)
@@ -195,7 +188,7 @@ def test_the_interval_contains_where_the_centre_of_gravity_is_only_assumed(signa
     known = with_band()
     assert known.self_calibrated is not None
     assumed = replace(known, self_calibrated=replace(known.self_calibrated, cg_std_m=0.3))
-    (narrow,), (wide,) = tracks("physics", known, signals), tracks("physics", assumed, signals)
+    narrow, wide = track_of("physics", known, signals), track_of("physics", assumed, signals)
     added = wide.sideslip_std_rad**2 - narrow.sideslip_std_rad**2
     expected = (0.3 * wide.yaw_rate_rad_s / wide.vx_m_s) ** 2
     fast = wide.valid & (wide.vx_m_s > OWN.low_speed_blend_m_s)

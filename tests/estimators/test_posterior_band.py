@@ -28,9 +28,10 @@ from pdhef_logtool.estimators.calibration.joint import prior_variations
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.error_features import TERMS, error_terms
 from pdhef_logtool.estimators.intervals import POSTERIOR_NOTE
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.posterior_band import OWN_SHARE, posterior_band
 from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.estimators.vehicle_ukf import physics_filter
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.estimating import calibrator
@@ -58,20 +59,15 @@ def signals() -> Signals:
     return replace(s, friction=np.full(len(s), 0.85))
 
 
-def banded(car: Car, *windows: Signals, name: str = "physics") -> tuple[list[StateTrack], list[StateTrack]]:
-    """Return the tracks of windows as the estimator gives them, and with their bands."""
-    estimator, carry = make_estimator(name, car), None
-    applied = calibrator(car, [estimator])
-    plain, wide = [], []
-    for window in windows:
-        track, carry = run_window(estimator, calibrated_signals(window, car), carry)
-        plain.append(track)
-        wide.append(applied.apply(track, window))
-    return plain, wide
+def banded(car: Car, signals: Signals, name: str = "physics") -> tuple[StateTrack, StateTrack]:
+    """Return the track of an estimator, and the same with its band."""
+    estimator = make_estimator(name, car)
+    track = run_estimator(estimator, calibrated_signals(signals, car))
+    return track, calibrator(car, [estimator]).apply(track, signals)
 
 
 def test_no_estimate_changes(signals: Signals) -> None:
-    (plain,), (whole,) = banded(identified(), signals)
+    plain, whole = banded(identified(), signals)
     for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "nis", "yaw_rate_std_rad_s"):
         np.testing.assert_array_equal(getattr(whole, column), getattr(plain, column))
     assert (np.linalg.eigvalsh(whole.covariance[10:]) > 0.0).all()
@@ -80,14 +76,14 @@ def test_no_estimate_changes(signals: Signals) -> None:
 def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
     """The filter runs on the varied vehicles without the states that would compensate the variation."""
     car = identified()
-    (plain,), (wide,) = banded(car, signals)
+    plain, wide = banded(car, signals)
     bare = {"physics": PARTS.model_copy(update={"force_scale": False})}
     vehicles = [v.model_copy(update=bare) for v in (car.physics_vehicle, *car.varied_physics)]
     assert vehicles[1].tyres.rear != OWN.tyres.rear
     assert vehicles[2].steer_offset_rad == pytest.approx(0.005)
     assert {v.yaw_inertia_kg_m2 for v in vehicles} == {1700.0}
     read = [(physics_filter(v, NOISE), corrected_anew(signals, OWN, v)) for v in vehicles]
-    middle, *others = (run_window(f, s)[0].vy_m_s for f, s in read)
+    middle, *others = (run_estimator(f, s).vy_m_s for f, s in read)
     terms = error_terms(plain, signals, car.physics_vehicle.roll_gradient_rad_per_m_s2)
     seen = terms[:, TERMS.index("kinematic")] * plain.vx_m_s
     expected = (OWN_SHARE * plain.vy_std_m_s) ** 2 + seen**2 + sum((vy - middle) ** 2 for vy in others)
@@ -96,7 +92,7 @@ def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
 
 
 def test_what_is_known_less_has_the_wider_band(signals: Signals) -> None:
-    (_, (narrow,)), (_, (wide,)) = (banded(identified(share), signals) for share in (0.05, 0.4))
+    (_, narrow), (_, wide) = (banded(identified(share), signals) for share in (0.05, 0.4))
     assert np.mean(wide.sideslip_std_rad) > 1.3 * np.mean(narrow.sideslip_std_rad)
 
 
@@ -105,13 +101,13 @@ def test_a_file_that_no_drive_has_shown_to_be_right_has_the_interval_of_its_prio
     true = with_noise(drive(slalom(0.03, 0.5), 6.0, speed=22.0).signals, seed=3)
     signals = replace(true, friction=np.full(len(true), 0.85))
     right, wrong = Car.of(OWN), Car.of(OWN.with_stiffness(1.0, 0.6))
-    ((truth,), _), ((plain,), (wide,)) = (banded(car, signals) for car in (right, wrong))
+    (truth, _), (plain, wide) = (banded(car, signals) for car in (right, wrong))
     error = np.abs(plain.sideslip_rad - truth.sideslip_rad)[50:]
     assert np.mean(error <= 1.96 * plain.sideslip_std_rad[50:]) < 0.5
     assert np.mean(error <= 1.96 * wide.sideslip_std_rad[50:]) > 0.95
     assert np.mean(1.96 * wide.sideslip_std_rad[50:]) < 0.03
     np.testing.assert_array_equal(wide.sideslip_rad, plain.sideslip_rad)
-    ((nominal,), (nominal_wide,)) = banded(wrong, signals, name="phy-ukf")
+    nominal, nominal_wide = banded(wrong, signals, name="phy-ukf")
     assert np.median(nominal_wide.sideslip_std_rad / nominal.sideslip_std_rad) > 2.0
     found = FittedPhysics(values=VALUES, noise=NOISE)
     assert posterior_band(Car.of(OWN, fitted_physics=found).with_noise(PHYSICS, NOISE)) is None
@@ -123,7 +119,7 @@ def test_only_what_runs_on_physics_has_it_and_it_is_told(signals: Signals) -> No
     for name, note in (("physics", POSTERIOR_NOTE), ("phy-ukf", "intervals not calibrated")):
         estimator = make_estimator(name, car)
         applied = calibrator(car, [estimator])
-        track, _ = run_window(estimator, signals, None)
+        track = run_estimator(estimator, signals)
         assert (applied.apply(track, signals) is track) == (name == "phy-ukf")
         assert applied.notes(name) == (note,)
 
@@ -131,7 +127,7 @@ def test_only_what_runs_on_physics_has_it_and_it_is_told(signals: Signals) -> No
 def test_calibrated_intervals_come_first(signals: Signals) -> None:
     car = identified()
     estimator = make_estimator("physics", car)
-    track, _ = run_window(estimator, signals, None)
+    track = run_estimator(estimator, signals)
     inflation = make_inflation((0.0, 9.0, *(0.0,) * (len(TERMS) - 2)), (9.0,) * 3)
     entry = IntervalEntry(estimator="physics", algorithm=resolve(estimator), inflation=inflation)
     intervals = Intervals(car="c", physics_sha256="ab" * 32, roll_gradient_rad_per_m_s2=0.0, entries=(entry,))

@@ -25,10 +25,10 @@ from pdhef_logtool.car.parts import (
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.base import LookingAhead
+from pdhef_logtool.estimators.base import Smoother
 from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS
-from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.presets import OPEN_LOOP, options_of, preset_of
+from pdhef_logtool.estimators.latency_compensation import run_estimator
+from pdhef_logtool.estimators.presets import OPEN_LOOP, OPTIONS, options_of, preset_of, split_names
 from pdhef_logtool.estimators.table import (
     ALL_ESTIMATORS,
     OPTIONS,
@@ -43,6 +43,7 @@ from pdhef_logtool.estimators.table import (
     spec_of,
     split_names,
 )
+from pdhef_logtool.estimators.vehicle_ukf import FILE_LAG, PHYSICS_Q_STD
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -71,7 +72,7 @@ def signals() -> Signals:
 
 
 def run(name: str, signals: Signals, car: Car = CAR) -> StateTrack:
-    return run_window(make_estimator(name, car), signals, None)[0]
+    return run_estimator(make_estimator(name, car), signals)
 
 
 def same(a: StateTrack, b: StateTrack, upto: int | None = None) -> bool:
@@ -91,7 +92,7 @@ def test_no_two_lines_share_a_name_or_a_colour() -> None:
 def test_a_line_builds_what_it_says(spec: Any) -> None:
     estimator = make_estimator(spec.name, CAR)
     assert (estimator.name, estimator.causal) == (spec.name, spec.causal)
-    assert isinstance(estimator, LookingAhead) == (not spec.causal)
+    assert isinstance(estimator, Smoother) == (not spec.causal)
     assert spec_of(spec.name) is spec
     assert (spec.name in all_names(CAR)) == (spec.group == ALL_ESTIMATORS)
     assert spec.needs <= frozenset(ALIGNED_SIGNALS)
@@ -267,15 +268,10 @@ def test_other_noise_is_another_basis_of_the_same_identity(name: str) -> None:
     assert told == was
 
 
-def test_options_reach_an_estimator_and_have_defaults() -> None:
-    assert resolve(make_estimator("pd-hef", CAR)) == ran("pd-hef")
-    assert resolve(make_estimator("phy-ukf", CAR)).use_speed is True
-
-
 def test_trust_and_speed_sensor_are_told() -> None:
     assert len({ran("pd-hef", trust=t).identity for t in (0.0, 0.5, 1.0)}) == 3
     assert ran("pd-hef", trust=0.5).options["trust"] == 0.5
-    full, esp = ran("phy-ukf"), ran("phy-ukf", use_speed=False)
+    full, esp = resolve(make_estimator("phy-ukf", CAR)), ran("phy-ukf", use_speed=False)
     assert (full.use_speed, esp.use_speed) == (True, False)
     assert full.sha256 != esp.sha256
 
@@ -294,7 +290,7 @@ def intervals_for(*algorithms: Algorithm, factor: float = 2.0) -> Intervals:
 def with_intervals(car: Car, intervals: Intervals, signals: Signals) -> tuple[float, Sequence[str]]:
     """Return the factor by which intervals widen the 1-sigma sideslip of pd-hef, and the notes."""
     estimator = make_estimator("pd-hef", car)
-    track, _ = run_window(estimator, signals)
+    track = run_estimator(estimator, signals)
     applied = calibrator(replace(car, intervals=intervals), [estimator])
     ratio = applied.apply(track, signals).sideslip_std_rad / track.sideslip_std_rad
     return float(np.nanmedian(ratio)), applied.notes("pd-hef")
@@ -323,17 +319,11 @@ def test_intervals_of_the_one_are_never_put_on_the_other(signals: Signals) -> No
         assert notes == ("intervals calibrated on car for friction and vehicle as given",)
 
 
-def test_without_trust_it_has_the_intervals_of_physics(signals: Signals) -> None:
-    of_physics = ran("physics", BARE)
-    assert with_intervals(BARE, intervals_for(of_physics), signals)[0] == pytest.approx(2.0)
-    assert with_intervals(CAR, intervals_for(of_physics), signals)[0] != pytest.approx(2.0)
-
-
 def test_trust_changes_no_physics_so_that_the_notes_of_other_filters_stay(signals: Signals) -> None:
     """Evidence makes pd-hef another algorithm; the intervals of all others hold, and nobody calls them foreign."""
     entries = intervals_for(ran("phy-ukf", BARE))
     for car in (BARE, CAR):
         estimator = make_estimator("phy-ukf", car)
         applied = calibrator(replace(car, intervals=entries), [estimator])
-        applied.apply(run_window(estimator, signals)[0], signals)
+        applied.apply(run_estimator(estimator, signals), signals)
         assert applied.notes("phy-ukf") == ("intervals calibrated on car for friction and vehicle as given",)

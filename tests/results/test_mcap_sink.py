@@ -51,7 +51,7 @@ OUR_TOPICS = {
 TOPICS = SOURCE_TOPICS | OUR_TOPICS
 NAMES = {"phy_ukf": "phy-ukf", "zero": "zero", "truth": "truth"}
 
-ALGORITHM = {"algorithm": "physics-ukf", "sha256": "ab" * 32, "options": {"slip_gate": True}}
+ALGORITHM = {"algorithm": "vehicle-ukf", "sha256": "ab" * 32, "options": {"slip_gate": True}}
 REPORT = {
     "format": "pdhef.report",
     "log": {"name": "drive", "end_ns": 1_700_000_006_000_000_123},

@@ -306,7 +306,7 @@ def test_what_ran_under_a_name_stands_in_every_record(dlc_run: Path) -> None:
     folder = dlc_run / "logs" / "dlc"
     told = {e["name"]: e["algorithm"] for e in json.loads((folder / "report.json").read_text())["estimators"]}
     assert None not in told.values()
-    assert told["phy-ukf"]["algorithm"] == "physics-ukf"
+    assert told["phy-ukf"]["algorithm"] == "vehicle-ukf"
     for metrics in (dlc_run / "metrics.parquet", folder / "metrics.parquet"):
         rows = pl.read_parquet(metrics).select("estimator", "algorithm").unique()
         of = {name: digest for name, digest in rows.iter_rows() if name in told}
