@@ -276,7 +276,7 @@ class PaperHybridUkf:
 
     algorithm = "paper-hybrid-ukf"
     version = 1
-    options = ("slip_gate",)
+    options = ("slip_gate", "constants")
 
     vehicle: VehicleParameters
     network: NetworkService
