@@ -13,7 +13,8 @@ from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.calibration.joint import FRONT_STIFFNESS, REAR_STIFFNESS
-from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.drive_signals import calibrated_signals
+from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import make_estimator, runnable
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
 from pdhef_logtool.records.tracks import StateTrack
@@ -81,7 +82,7 @@ def with_gap(road: WholeDrive, *names: str) -> tuple[WholeDrive, np.ndarray]:
 
 
 def physics_of(drive: WholeDrive) -> StateTrack:
-    return run_window(make_estimator("physics", SALOON), drive.signals)[0]
+    return run_estimator(make_estimator("physics", SALOON), calibrated_signals(drive.signals, SALOON))
 
 
 @pytest.mark.parametrize("names", [("steer_rad",), ("ay_m_s2",), ("yaw_rate_rad_s",), ("ax_m_s2",), ("speed_m_s",)])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ SIDESLIP_FACTORS = (1.0, 1.5, 0.3, 0.8, 0.5, 0.9, 0.2, 0.6, 0.4)
 INFLATION = make_inflation(SIDESLIP_FACTORS, (0.5, 1.2, 0.7), 1.1, (1.0, 1.3, 2.0))
 ROLL = 0.009
 ALGORITHM = Algorithm(
-    algorithm="physics-ukf",
+    algorithm="vehicle-ukf",
     options={"roll_correction": True},
     noise={"q_std": [0.1, 0.1, 0.1]},
     physics_sha256="ab" * 32,
@@ -93,12 +93,6 @@ def _drive(count: int = 900, seed: int = 0) -> tuple[Signals, StateTrack]:
         sideslip_std_rad=std,
     )
     return signals, track
-
-
-def _cut(record: Any, a: int, b: int) -> Any:
-    """Return stamps a to b of signals or of a track."""
-    changed = {f.name: getattr(record, f.name) for f in fields(record)}
-    return replace(record, **{k: v[a:b] for k, v in changed.items() if isinstance(v, np.ndarray) and len(v)})
 
 
 @pytest.mark.parametrize("at", [100, 460, 700])
@@ -230,15 +224,15 @@ def test_a_sensor_that_the_estimator_has_found_faulty_widens_nothing() -> None:
 
 def test_without_an_entry_a_track_stays_as_it_is() -> None:
     signals, track = _drive(60)
-    other = ALGORITHM.model_copy(update={"algorithm": "physics-filter"})
+    other = ALGORITHM.model_copy(update={"algorithm": "open-loop"})
     for intervals, ran in ((None, ALGORITHM), (_intervals(entries=()), ALGORITHM), (_intervals(), other)):
         calibrator = _calibrator(intervals, ran)
         assert calibrator.apply(track, signals) is track
         assert calibrator.notes("e")[0] == "intervals not calibrated"
         assert calibrator.notes("e")[1:] == ((calibrator.mismatch("e"),) if ran is other else ())
     assert calibrator.mismatch("e") == (
-        "the calibrated intervals of e are not applied: expected physics-ukf 1 (roll_correction=True), "
-        "got physics-filter 1 (roll_correction=True)"
+        "the calibrated intervals of e are not applied: expected vehicle-ukf 1 (roll_correction=True), "
+        "got open-loop 1 (roll_correction=True)"
     )
     assert calibrator.warning == calibrator.mismatch("e")
     # Those of the shipped car were never this car's.

@@ -91,7 +91,7 @@ def test_what_follows_changes_no_earlier_stage() -> None:
 
 def test_the_estimator_is_causal() -> None:
     check = CausalityCheck()
-    run_window(online(), driven()[0], None, None, check)
+    run_window(online(), driven()[0], None, check)
     assert online().causal
     assert not check.failed
 
@@ -128,14 +128,3 @@ def test_its_identity_names_what_runs_in_it() -> None:
 def test_what_looks_ahead_takes_the_last_stage(name: str) -> None:
     estimator = make_estimator(name, car_of(calibrated(driven()[0])))
     assert isinstance(estimator, OnlineCalibrated) is (name == "physics")
-
-
-def test_tracks_of_one_window_share_the_runs_of_the_interval() -> None:
-    signals, _ = driven()
-    car = car_of(calibrated(signals))
-    estimators = [make_estimator(name, car) for name in ("physics", "pd-hef")]
-    tracks = [run_window(e, signals)[0] for e in estimators]
-    together, alone = calibrator(car, estimators), calibrator(car, estimators[1:])
-    first, second = (together.apply(t, signals) for t in tracks)
-    np.testing.assert_array_equal(second.sideslip_std_rad, alone.apply(tracks[1], signals).sideslip_std_rad)
-    np.testing.assert_array_equal(first.sideslip_std_rad, second.sideslip_std_rad)
