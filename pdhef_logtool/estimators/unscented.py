@@ -108,13 +108,13 @@ def _products(a, row_a, b, row_b, columns):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def _deviate(block, row, columns, weight, out, at):  # type: ignore[no-untyped-def]
+def _deviate(block, row, columns, weight, out, first):  # type: ignore[no-untyped-def]
     """Write the deviations of a row of a block, with δ / √w in the centre's column; return the mean."""
     centre, moved = block[row], 0.0
     for i in range(columns):
-        out[at + i] = block[row + i] - centre
-        moved += out[at + i]
-    out[at] = math.sqrt(weight) * moved
+        out[first + i] = block[row + i] - centre
+        moved += out[first + i]
+    out[first] = math.sqrt(weight) * moved
     return centre + weight * moved
 
 
