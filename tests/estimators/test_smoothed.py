@@ -13,9 +13,7 @@ import numpy as np
 import pytest
 import test_estimators as properties
 from made_models import random_network
-from pdhef_logtool.estimators.filter_base import AX_BIAS, LINK_BIASES, LINK_NONE, LINK_WHOLE, PosteriorSteps, StepLinks
-from pdhef_logtool.estimators.phy_ukf import PhysicsUkf
-from pdhef_logtool.estimators.physics_filter import PhysicsFilter
+from pdhef_logtool.estimators.filter_base import PosteriorSteps, StepLinks
 from reference_car import REAR_M, cut, drive, forces, keep, rolling_drive, runge_kutta, slalom, with_noise
 from rich.console import Console
 
