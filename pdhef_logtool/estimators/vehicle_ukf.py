@@ -403,7 +403,7 @@ def gate(now, m, nu, S, at_gate, given, use):  # type: ignore[no-untyped-def]
 
 @_compiled
 def settle(now, gated, rules, standstill_std, x, P, m):  # type: ignore[no-untyped-def]
-    """Average the normalised squared innovations, and contain the motion at a standstill; return whether it stands."""
+    """Average the normalised squared innovations, and contain the motion at rest; return whether the car is at rest."""
     if gated.seen > 0:
         m.nis += min(1.0, now.dt / DIVERGED_AVERAGE_S) * (gated.squares / gated.seen - m.nis)
     # Standstill: for a while the speed sensor reads zero and the car does not turn.
