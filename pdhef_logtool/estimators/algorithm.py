@@ -67,4 +67,4 @@ def _describe(part: Any, prefix: str, facts: dict[str, Any]) -> None:
 
 
 def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
+    return [_plain(v) for v in value] if isinstance(value, tuple) else value

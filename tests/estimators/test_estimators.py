@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_models import full_network, linear_residual
-from reference_car import START_NS, cut, drive, keep, make_signals, rolling_drive, slalom, tanh_tyre, with_noise
+from reference_car import START_NS, cut, drive, keep, rolling_drive, slalom, tanh_tyre, with_noise
 
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.parts import FilterNoise, Trust
@@ -21,9 +21,7 @@ from pdhef_logtool.estimators import latency_compensation
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.latency_compensation import run_estimator, run_window
 from pdhef_logtool.estimators.presets import OPEN_LOOP
-from pdhef_logtool.estimators.smoothed import SmoothedPhysics
-from pdhef_logtool.estimators.table import Options, all_specs, check_names, make_estimator, runnable, spec_of
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.estimators.table import Options, all_specs, make_estimator
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, GNSS_COMPONENTS, TRUTH_UNITS, Signals
 from pdhef_logtool.records.steps import MAX_PREDICTION_S, released_steps
@@ -33,12 +31,16 @@ pytestmark = pytest.mark.slow
 
 #: With the noise that ``phy-ukf:tuned`` and ``physics`` look for in the car.
 NOISE = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
-VEHICLE = default_vehicle()
+#: With all parts that the model of ``physics`` may have; the baselines do not use them.
+PARTS = PhysicsParts(**dict.fromkeys(PhysicsParts.model_fields, True))
+VEHICLE = default_vehicle().model_copy(update={"physics": PARTS})
 #: Without the estimator on a self-calibrated car (test_calibrated_band.py).
-NAMES = tuple(s.name for s in all_specs() if not s.network and s.name != "open-loop:calibrated")
+NAMES = tuple(s.name for s in all_specs() if not s.network and s.name != OPEN_LOOP)
+NETWORKS = ("pd-hef", "pd-hef-paper", "pure-lstm", "linear-regression")
 #: Estimators that compute the lateral velocity from a model or by integration.
 FILTERS = ("phy-ukf", "physics", "phy-ukf:tuned")
 CLAIMING = ("kinematic", "open-loop", *FILTERS)
+MODEL = full_network()
 STIFFNESS_VEHICLE = VEHICLE.model_copy(
     update={
         "tyres": Tyres(
@@ -52,7 +54,9 @@ MIRRORED = ("vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")
 
 
 def car_of(vehicle: VehicleParameters = VEHICLE) -> Car:
-    return Car.of(vehicle, noise={"phy-ukf:tuned": NOISE, "physics": NOISE})
+    """Return a car with all that an estimator may need."""
+    trust = Trust(trust_cap=1.0, evidence="a drive of 300 s")
+    return Car.of(vehicle, network=MODEL, noise={"phy-ukf:tuned": NOISE, "physics": NOISE}, trust=trust)
 
 
 def run(name: str, signals: Signals, **options) -> StateTrack:
@@ -88,42 +92,29 @@ def rough() -> Signals:
 # --- pieces, causality, symmetry -------------------------------------------------------------------------------------
 
 
-def _any_car(**parts) -> Car:
-    """Return a car with all parts of the physics model, and all that an estimator may need."""
-    vehicle = VEHICLE.model_copy(update={"physics": PhysicsParts(**dict.fromkeys(PhysicsParts.model_fields, True))})
-    noise = {"phy-ukf:tuned": NOISE, "physics": NOISE}
-    trust = Trust(trust_cap=1.0, evidence="a drive of 300 s")
-    return replace(Car.of(vehicle, network=full_network(), noise=noise, trust=trust), **parts)
-
-
 def _calibrated(since_s: float = 0.0, **earlier) -> WithoutTruth:
     vehicle = VEHICLE.model_copy(update={"yaw_inertia_kg_m2": 1700.0, "steer_offset_rad": 0.003 + 0.001 * since_s})
     return WithoutTruth(vehicle, NOISE, True, "calibrated", since_ns=START_NS + round(since_s * 1e9), **earlier)
 
 
 def _taught() -> Car:
-    car = Car.of(VEHICLE)
+    car = Car.of(default_vehicle())
     return replace(car, taught=Taught(physics_sha256=car.physics_sha256, residual=linear_residual()))
 
 
-def _smoothed(block_s: float) -> SmoothedPhysics:
-    smoother = make_estimator("pd-hef-smoothed", _any_car())
-    assert isinstance(smoother, SmoothedPhysics)
-    return replace(smoother, block_s=block_s)
-
-
-#: Every estimator of the table, and every wrapper that an option or a part of the car puts around one.
+#: Every estimator with steps, and every wrapper that an option or a part of the car puts around one.
 EVERY = {
-    **{s.name: partial(make_estimator, s.name, _any_car()) for s in all_specs() if s.name != OPEN_LOOP},
-    OPEN_LOOP: partial(make_estimator, OPEN_LOOP, _any_car(self_calibrated=_calibrated())),
-    "physics without parts": partial(make_estimator, "physics", car_of()),
-    "calibrated": partial(make_estimator, "physics", _any_car(self_calibrated=_calibrated())),
+    **{s.name: partial(make_estimator, s.name, car_of()) for s in all_specs() if s.causal},
+    OPEN_LOOP: partial(make_estimator, OPEN_LOOP, replace(car_of(), self_calibrated=_calibrated())),
+    "physics without parts": partial(make_estimator, "physics", car_of(default_vehicle())),
+    "calibrated": partial(make_estimator, "physics", replace(car_of(), self_calibrated=_calibrated())),
     "online": partial(
-        make_estimator, "physics", _any_car(self_calibrated=_calibrated(2.0, earlier=(_calibrated(), _calibrated(1.0))))
+        make_estimator,
+        "physics",
+        replace(car_of(), self_calibrated=_calibrated(2.0, earlier=(_calibrated(), _calibrated(1.0)))),
     ),
     "taught": partial(make_estimator, "pd-hef", _taught()),
-    "GNSS": partial(make_estimator, "physics", _any_car(), Options(gnss=True)),
-    "smoothed in short blocks": partial(_smoothed, 0.7),
+    "GNSS": partial(make_estimator, "physics", car_of(), Options(gnss=True)),
 }
 
 
@@ -156,12 +147,12 @@ def test_pieces_equal_the_whole_bit_for_bit(name, faulty, monkeypatch):
     for size in (37, 210):
         monkeypatch.setattr(latency_compensation, "PIECE_STEPS", size)
         same_bits(run_estimator(estimator, faulty), whole)
-    _, state = run_window(estimator, faulty.rows(0, 100), None, faulty.rows(100, 300))
-    again = [run_window(estimator, faulty.rows(100, 300), state, faulty.rows(300, 500))[0] for _ in range(2)]
+    _, state = run_window(estimator, faulty.rows(0, 100))
+    again = [run_window(estimator, faulty.rows(100, 300), state)[0] for _ in range(2)]
     same_bits(*again)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", (*NAMES, *NETWORKS))
 @settings(derandomize=True, deadline=None, max_examples=25)
 @given(j=st.integers(1, 400), seed=st.integers(0, 2**32 - 1), missing=st.booleans())
 def test_nothing_that_arrives_later_changes_an_output(name, rough, j, seed, missing):
@@ -264,7 +255,7 @@ def test_pass_through_shows_the_newest_arrived_sample(name):
     assert track.valid[3:].all()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", (*NAMES, *NETWORKS))
 def test_what_is_too_late_is_not_predicted(name):
     made = drive(slalom(), 3.0)
     for delay_s, valid in ((MAX_PREDICTION_S - 0.02, True), (MAX_PREDICTION_S + 0.02, False)):
@@ -334,7 +325,7 @@ def check_sane(track: StateTrack, name: str, signals: Signals) -> None:
     columns = ["vx_m_s", "yaw_rate_rad_s"]
     if name != "zero:no-lateral":
         columns += ["vy_m_s", "sideslip_rad"]
-    if name in CLAIMING:
+    if name in (*CLAIMING, *NETWORKS):
         columns += ["ay_m_s2"]
     for column in columns:
         assert np.isfinite(getattr(track, column)[ok]).all(), column
@@ -363,7 +354,7 @@ def plain() -> Signals:
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", (*NAMES, *NETWORKS))
 @pytest.mark.filterwarnings("error", "ignore::ResourceWarning")
 def test_no_fault_breaks_an_estimator(name, fault, plain):
     faulty = FAULTS[fault](plain)
@@ -455,31 +446,7 @@ def test_reverse_and_manoeuvring_are_finite_and_signed(name):
         assert worst(track.vy_m_s - made.vy, moving & (np.abs(made.vx) < 1.4)) < 0.3
 
 
-# --- the table -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_an_estimator_runs_on_what_it_needs_alone(name, plain):
-    estimator = make_estimator(name, car_of())
-    assert estimator.name == name
-    assert estimator.causal
-    dt = np.diff(plain.stamps_ns) * 1e-9
-    bare = make_signals(dt, **{c: getattr(plain, c) for c in spec_of(name).needs | {"yaw_rate_rad_s"}})
-    track, _ = run_window(estimator, bare)
-    assert track.valid[50:].all()
-    assert np.isfinite(track.vx_m_s[50:]).all()
-    assert np.isfinite(track.yaw_rate_rad_s[50:]).all()
-
-
-def test_what_cannot_run_is_skipped_with_the_reason():
-    estimators, skipped = runnable(NAMES, car_of(), frozenset({"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"}))
-    assert [e.name for e in estimators] == ["zero", "zero:no-lateral", "kinematic", "physics"]
-    assert [s.name for s in skipped] == [s.name for s in map(spec_of, NAMES) if "steer_rad" in s.needs]
-    assert all("steer_rad" in s.reason and "speed_m_s" not in s.reason for s in skipped)
-    assert runnable(NAMES, car_of(), frozenset(ALIGNED_SIGNALS))[1] == []
-    skipped = runnable(NAMES, Car.of(VEHICLE), frozenset(ALIGNED_SIGNALS))[1]
-    assert [s.name for s in skipped] == ["phy-ukf:tuned"]
-    assert all(f"no noise for {s.name} in noise.toml" in s.reason for s in skipped)
+# --- what they are ----------------------------------------------------------------------------------------------------
 
 
 def test_the_tuned_filter_takes_its_noise_from_the_car():
@@ -488,14 +455,6 @@ def test_the_tuned_filter_takes_its_noise_from_the_car():
     assert tuned.measurement_std.tolist() == [0.8, *plain_filter.measurement_std[1:]]
     assert tuned.roll_correction
     assert not plain_filter.roll_correction
-
-
-@pytest.mark.parametrize("names", [(), ("zero", "zero"), ("phy-ufk",)])
-def test_wrong_names_are_named(names):
-    with pytest.raises(UsageError, match="--estimators") as caught:
-        check_names(names)
-    assert all(n in str(caught.value) for n in names)
-    assert "\n" not in str(caught.value)
 
 
 def test_signals_hold_no_truth():
