@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pdhef_logtool.estimators.physics_filter import physics_filter
 from reference_car import drive, slalom, with_noise
 
 from pdhef_logtool.car.car import NO_INTERVALS, Car

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import test_estimators as properties
 from made_models import random_network
-from pdhef_logtool.estimators.filter_base import PosteriorSteps, StepLinks
 from reference_car import REAR_M, cut, drive, forces, keep, rolling_drive, runge_kutta, slalom, with_noise
 from rich.console import Console
 

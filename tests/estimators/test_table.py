@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from made_models import full_network
-from pdhef_logtool.estimators.physics_filter import FILE_LAG, PHYSICS_Q_STD
 from reference_car import drive, make_signals, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
@@ -28,7 +27,7 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Smoother
 from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS
 from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.presets import OPEN_LOOP, OPTIONS, options_of, preset_of, split_names
+from pdhef_logtool.estimators.presets import OPEN_LOOP, options_of, preset_of
 from pdhef_logtool.estimators.table import (
     ALL_ESTIMATORS,
     OPTIONS,

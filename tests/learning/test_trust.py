@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_models import random_network
-from pdhef_logtool.estimators.physics_filter import of_car
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import LearntOn

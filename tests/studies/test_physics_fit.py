@@ -8,7 +8,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from pdhef_logtool.estimators.physics_filter import PHYSICS_Q_STD
 from physics_oracle import Oracle, parts
 from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, Drive, drive, keep, with_noise
 
