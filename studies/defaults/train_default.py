@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -58,7 +59,7 @@ EPOCHS, BASELINE_EPOCHS = 66, 40
 #: Folders of the paper's network.
 PAPER_DRIVES, PAPER_RESIDUALS = "paper", "paper-residuals"
 #: An epoch of the paper's network is one batch of windows of 6.4 s, so that 200 epochs take less than half an hour.
-PAPER_WINDOWS = {"piece_steps": 640, "pieces_per_epoch": 64, "chunk_steps": 25}
+PAPER_WINDOWS: dict[str, Any] = {"piece_steps": 640, "pieces_per_epoch": 64, "chunk_steps": 25}
 TRIALS = 64
 #: Relative errors of friction and vehicle files that the intervals allow for: of a usual car (load alone causes such
 #: errors), and of a car that may have changed.

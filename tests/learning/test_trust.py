@@ -20,6 +20,7 @@ from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.vehicle_ukf import of_car
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import LearnSettings, choose_drives, load_drive
 from pdhef_logtool.learning.engine import learn

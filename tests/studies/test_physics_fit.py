@@ -12,6 +12,7 @@ from physics_oracle import Oracle, parts
 from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, Drive, drive, keep, with_noise
 
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD
 from pdhef_logtool.records.tracks import make_track
 from studies.defaults import physics_fit
 from studies.defaults.axle_forces import FitDrive, axle_samples, part_of

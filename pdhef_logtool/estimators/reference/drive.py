@@ -31,9 +31,9 @@ MAX_ITERATIONS, TOLERANCE_M_S, UNSETTLED_M_S = 8, 2e-3, 0.05
 #: gain of the gyro have narrow priors (bank in bends has the same effect) and limits of 0.45 m, 0.3 m and 3 %.
 FAR_STD = 3.0
 FAR_STD_OF = {s.REAR_AXLE: 4.5, s.IMU_X: 6.0, s.YAW_RATE_GAIN: 10.0}
-#: 1-sigma of sideslip below which a knot is trusted; time around trusted knots within which the reference is valid;
+#: 1-sigma of sideslip below which a knot is sure; time around sure knots within which the reference is valid;
 #: additional 1-sigma as a share of the sideslip (gains of the sensors, sliding wheels).
-TRUSTED_STD_RAD, REACH_S, SIDESLIP_SHARE = math.radians(0.5), 5.0, 0.05
+SURE_STD_RAD, REACH_S, SIDESLIP_SHARE = math.radians(0.5), 5.0, 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,20 +187,20 @@ def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> 
     parameters = _parameters(best, prior, tilts=bool(rows[0, s.TILT]))
     refused = _refusal(best, parameters)
     measured = rows[:, s.GAP] == 0.0
-    trusted = measured & (sideslip_std(vx, vy, best.covariance) < TRUSTED_STD_RAD)
+    sure = measured & (sideslip_std(vx, vy, best.covariance) < SURE_STD_RAD)
     error = SIDESLIP_SHARE * np.arctan2(vy, np.abs(vx))
     covariance = best.covariance + (error**2 * np.stack([vy * vy, -vx * vy, vx * vx])).T
     return SideslipReference(
         stamps_ns, vx, vy, rate, ax + vy * rate, ay - vx * rate, covariance, law * (1.0 - gnss_share), gnss_share,
-        measured & _near(trusted) & (not refused), parameters, with_gnss, refused,
+        measured & _near(sure) & (not refused), parameters, with_gnss, refused,
     )  # fmt: skip
 
 
-def _near(trusted: BoolArray) -> BoolArray:
-    """Return the mask of the knots [K] with a trusted one within ``REACH_S``."""
-    counts = np.concatenate([[0], np.cumsum(trusted)])
-    k, n = np.arange(len(trusted)), round(REACH_S * RATE_HZ)
-    return np.asarray(counts[np.minimum(k + n, len(trusted) - 1) + 1] > counts[np.maximum(k - n, 0)])
+def _near(sure: BoolArray) -> BoolArray:
+    """Return the mask of the knots [K] with a sure one within ``REACH_S``."""
+    counts = np.concatenate([[0], np.cumsum(sure)])
+    k, n = np.arange(len(sure)), round(REACH_S * RATE_HZ)
+    return np.asarray(counts[np.minimum(k + n, len(sure) - 1) + 1] > counts[np.maximum(k - n, 0)])
 
 
 def corrected_inputs(states: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
