@@ -32,7 +32,7 @@ help:
 	@echo "make gates    figures of the tool that moved since they were frozen (an hour; make gates-quick: five minutes)"
 	@echo "make bench    speed against peers"
 	@echo "make recalibrate  regenerate all that is derived: shipped cars and networks, evidence pages (hours; resumable)"
-	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
+	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, half an hour or so)"
 	@echo "make samples  write sample_logs/ anew with the simulator"
 	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
 	@echo "make peers    docs/peers.md: published sideslip estimators on the recorded drives in ../shared (three minutes)"

@@ -32,10 +32,8 @@ def _draw(rng: np.random.Generator, manoeuvre: str) -> DriveSpec:
             break
     goal = MANOEUVRES[manoeuvre].peak_share
     amplitude = float(rng.uniform(*FISHHOOK_AMPLITUDES) if goal is None else rng.uniform(*PEAK_SHARES) / goal)
-    seed = int(rng.integers(2**31))
-    return DriveSpec(
-        manoeuvre, round(speed, 2), round(friction, 3), seed, DURATION_S, amplitude=round(amplitude, 4)
-    )  # fmt: skip
+    drawn = round(speed, 2), round(friction, 3), int(rng.integers(2**31))
+    return DriveSpec(manoeuvre, *drawn, DURATION_S, amplitude=round(amplitude, 4))
 
 
 def plan_drives(count: int = COUNT) -> list[Job]:

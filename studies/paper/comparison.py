@@ -16,7 +16,7 @@ LEVEL = 0.95
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Median, smallest and largest of a figure over all noise and training seeds."""
+    """Median, smallest and largest of a figure over the noise seeds."""
 
     median: float
     low: float
@@ -31,20 +31,12 @@ class Improvement:
     Attributes
     ----------
     low, high : percentile bounds, noise seeds drawn in pairs; NaN with fewer than two.
-    seeds_low, seeds_high : the same share by each network alone, smallest and largest.
     """
 
     value: float
     low: float
     high: float
     n: int
-    seeds_low: float
-    seeds_high: float
-
-    @property
-    def proven(self) -> bool:
-        """Whether the whole interval lies above 0."""
-        return bool(self.low > 0.0)
 
 
 def _chosen(runs: Iterable[Run], scenario: str, scheme: str, figure: str) -> list[Run]:
@@ -59,15 +51,6 @@ def spread(experiment: Experiment, scenario: str, scheme: str, figure: str) -> S
     return Spread(float(np.median(values)), min(values), max(values), len(values))
 
 
-def _mean_squares(runs: list[Run], figure: str, training_seed: int | None = None) -> dict[int, float]:
-    """Return the mean square error by noise seed, over all networks or one; schemes without a network always count."""
-    squares_by_seed: dict[int, list[float]] = {}
-    for run in runs:
-        if training_seed is None or run.training_seed in (None, training_seed):
-            squares_by_seed.setdefault(run.noise_seed, []).append(run.values[figure] ** 2)
-    return {seed: float(np.mean(v)) for seed, v in squares_by_seed.items()}
-
-
 def improvement(
     experiment: Experiment, scenario: str, scheme: str, baseline: str, figure: str = "sideslip_deg"
 ) -> Improvement | None:
@@ -76,7 +59,7 @@ def improvement(
     theirs = _chosen(experiment.runs, scenario, baseline, figure)
     if not ours or not theirs:
         return None
-    a, b = _mean_squares(ours, figure), _mean_squares(theirs, figure)
+    a, b = ({r.noise_seed: r.values[figure] ** 2 for r in runs} for runs in (ours, theirs))
     seeds = sorted(a.keys() & b.keys())
     if not seeds:
         return None
@@ -91,10 +74,5 @@ def improvement(
         draws = rng.integers(len(seeds), size=(BOOTSTRAP_DRAWS, len(seeds)))
         bounds = np.percentile(share(squares[draws].sum(axis=1)), [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
         low, high = float(bounds[0]), float(bounds[1])
-    by_network = []
-    for training_seed in sorted({r.training_seed for r in (*ours, *theirs) if r.training_seed is not None}):
-        c, d = _mean_squares(ours, figure, training_seed), _mean_squares(theirs, figure, training_seed)
-        by_network.append(float(share(np.array([[c[s], d[s]] for s in seeds]).sum(axis=0))))
     value = float(share(squares.sum(axis=0)))
-    by_network = by_network or [value]
-    return Improvement(value, low, high, len(seeds), min(by_network), max(by_network))
+    return Improvement(value, low, high, len(seeds))

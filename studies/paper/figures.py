@@ -1,4 +1,4 @@
-"""The pictures of Figures 10 to 22 with our data, in the colours that estimators have everywhere."""
+"""The pictures of Figures 9 to 23 with our data, in the colours that estimators have everywhere."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from studies.paper.experiment import BURST_S, GRAVITY_M_S2, A, B, Experiment
 from studies.paper.probes import RESIDUAL_ROWS, ResidualFit, TrustCurve
 from studies.paper.results import Results
 from studies.paper.schemes import DRAWN
+from studies.paper.step_time import StepTime
 from studies.pictures import STYLE, save, subplots
 
 COLOURS = {"truth": "#8c8c8c", **{s.name: f"#{s.colour:06x}" for s in SPECS}}
@@ -49,6 +50,31 @@ def _thin(name: str) -> dict[str, Any]:
 
 def _time_s(track: StateTrack) -> FloatArray:
     return np.asarray((track.stamps_ns - track.stamps_ns[0]) * 1e-9)
+
+
+def convergence(folder: Path, losses: Mapping[str, Sequence[float]]) -> None:
+    """Figure 9: losses of the paper's network over the epochs; the paper's values after 150 epochs dotted."""
+    fig, axes = subplots(1, 1, 7.4, 3.0, _STYLE)
+    for (name, values), colour, theirs in zip(losses.items(), ("#0072B2", "#D55E00"), published.LOSSES, strict=True):
+        axes[0, 0].semilogy(range(1, len(values) + 1), values, color=colour, label=name.replace("_", " "))
+        axes[0, 0].axhline(theirs, color=colour, linestyle=":", label="paper")
+    axes[0, 0].set(xlabel="epoch", ylabel="mean square of\nnormalised targets")
+    _legend_above(axes[0, 0])
+    save(fig, folder / "figure09_convergence.png")
+
+
+def step_time_bars(folder: Path, times: Mapping[str, StepTime]) -> None:
+    """Figure 23: processor time of a step; the paper's values as dots, and the controller's cycle dotted."""
+    names = [n for n in BARS if n in times][::-1]
+    fig, axes = subplots(1, 1, 7.4, 3.0, _STYLE)
+    axes[0, 0].barh(names, [times[n].median_us for n in names], color=[COLOURS[n] for n in names], height=0.72)
+    theirs = {"phy-ukf": published.STEP_MS["phy-ukf"], "pd-hef-paper": published.STEP_MS["pd-hef"]}
+    axes[0, 0].plot([1e3 * ms for ms in theirs.values()], list(theirs), "o", color="#222222", label="paper, MATLAB")
+    axes[0, 0].axvline(1e3 * published.CYCLE_MS, color="#222222", linestyle=":", label="cycle of a controller")
+    axes[0, 0].set(xscale="log", xlabel="processor time per step, µs")
+    axes[0, 0].grid(axis="y", visible=False)
+    _legend_above(axes[0, 0])
+    save(fig, folder / "figure23_step_time.png")
 
 
 def residuals(folder: Path, name: str, fit: ResidualFit, title: str) -> None:
@@ -198,11 +224,10 @@ def rmse_bars(folder: Path, experiment: Experiment, ran: Sequence[str], scenario
 
 
 def draw(r: Results, folder: Path) -> None:
-    """Write the PNGs of Figures 10 to 22 into a folder, under the names that the page uses."""
+    """Write the PNGs of Figures 9 to 23 into a folder, under the names that the page uses."""
     schemes = [n for n in DRAWN if n in r.ran]
-    seed = r.first_seed
-    residuals(folder, "figure10_residual_fit", r.fits[A.name][0], f"scenario A, training seed {seed}")
-    residuals(folder, "figure19_residual_verification", r.fits[B.name][0], f"scenario B, training seed {seed}")
+    residuals(folder, "figure10_residual_fit", r.fits[A.name], "scenario A")
+    residuals(folder, "figure19_residual_verification", r.fits[B.name], "scenario B")
     for scenario, letter, first in ((A.name, "a", 11), (B.name, "b", 15)):
         position(folder, f"figure{first}_position_{letter}", r.experiment, scenario, schemes)
         for i, signal in enumerate(SIGNALS, start=1):
@@ -212,3 +237,5 @@ def draw(r: Results, folder: Path) -> None:
     if any(r.curves.values()):
         trust(folder, {s: c for s, c in r.curves.items() if c})
     rmse_bars(folder, r.experiment, r.ran, (A.name, B.name))
+    convergence(folder, r.losses)
+    step_time_bars(folder, r.times)

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.parallel_physics import filter_of
-from pdhef_logtool.evaluation.metrics.lag import lag_s
 from pdhef_logtool.learning.network.residuals import residual_rows
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import ModelBundle
@@ -40,30 +38,21 @@ class ResidualFit:
         error = self.output[:, row] - self.target[:, row]
         return float(1.0 - np.mean(error**2) / np.mean(self.target[:, row] ** 2))
 
-    def lag_ms(self, row: int) -> float:
-        """By how much the output follows the target."""
-        stamps = np.round(self.time_s * 1e9).astype(np.int64)
-        return 1e3 * lag_s(stamps, self.output[:, row], self.target[:, row])
-
     def increments(self, row: int) -> tuple[float, float]:
         """Smallest and largest increment over one step that the network gave (Eq 18)."""
         return float(self.output[:, row].min() * self.step_s), float(self.output[:, row].max() * self.step_s)
 
-    def noise(self, row: int) -> tuple[float, float]:
-        """1-sigma of white noise in target and output, from third differences."""
-        third = [np.diff(v[:, row], n=3) for v in (self.target, self.output)]
-        return float(np.sqrt(np.mean(third[0] ** 2) / 20.0)), float(np.sqrt(np.mean(third[1] ** 2) / 20.0))
-
 
 def residual_fit(drive: ReadDrive, car: Car) -> ResidualFit:
-    """Compare the residual of a drive with the network's output, features as in service."""
+    """Compare the residual of a drive with the output of the paper's network, features as in service."""
     whole = drive.whole
     assert isinstance(car.network, ModelBundle)
-    parallel, period_s = filter_of(car, car.network.model), whole.plan.alignment.grid_period_s
-    signals = calibrated_signals(whole.signals, car) if car.residual_network is not None else whole.signals
-    rows = residual_rows(signals, whole.truth, parallel, period_s=period_s)
+    assert car.network.paper_network is not None
+    network, period_s = car.network.paper_network, whole.plan.alignment.grid_period_s
+    parallel = filter_of(car, network.model)
+    rows = residual_rows(whole.signals, whole.truth, parallel, period_s=period_s)
     starts = np.concatenate([[True], np.diff(rows.segment) != 0])
-    output, _ = NetworkService(car.network).run(rows.features, starts, None)
+    output, _ = NetworkService(network).run(rows.features, starts, None)
     use = rows.weight > 0.0
     time_s = (rows.stamps_ns[use] - rows.stamps_ns[0]) * 1e-9
     target = rows.targets[use] / rows.step_s[use, None]
@@ -102,27 +91,19 @@ def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 
 
 @dataclass(frozen=True, slots=True)
 class Inflation:
-    """Factor on R of a scheme: median before the burst, largest within, and the largest of that time without a burst.
-
-    The first half second, in which a filter settles, is left out.
-    """
+    """Factor on R of a scheme: median before the burst and largest within; the first half second is left out."""
 
     before: float
     within: float
-    without_burst: float
 
 
 def inflation(experiment: Experiment, scheme: str, burst_s: tuple[float, float]) -> Inflation | None:
-    """Return how R answered to the burst; None where the scheme did not run or its R stood still."""
-    track, clean = experiment.tracks.get(("A-burst", scheme)), experiment.tracks.get(("A", scheme))
-    if track is None or clean is None:
+    """Return the response of R to the burst; None if the scheme did not run or its R is constant."""
+    if (track := experiment.tracks.get(("A-burst", scheme))) is None:
         return None
     time_s = (track.stamps_ns - track.stamps_ns[0]) * 1e-9
     use = track.valid & np.isfinite(track.r_scale)
     before, within = use & (time_s > 0.5) & (time_s < burst_s[0]), use & (time_s >= burst_s[0]) & (time_s < burst_s[1])
-    calm = clean.valid & np.isfinite(clean.r_scale) & (time_s >= burst_s[0]) & (time_s < burst_s[1])
-    if not before.any() or not within.any() or not calm.any() or np.ptp(track.r_scale[use]) < 1e-9:
+    if not before.any() or not within.any() or np.ptp(track.r_scale[use]) < 1e-9:
         return None
-    return Inflation(
-        float(np.median(track.r_scale[before])), float(track.r_scale[within].max()), float(clean.r_scale[calm].max())
-    )
+    return Inflation(float(np.median(track.r_scale[before])), float(track.r_scale[within].max()))

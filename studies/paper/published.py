@@ -22,5 +22,7 @@ TRUST = (0.1, 0.9)
 R_NORM = (0.1, 3.5)
 #: Network output in rad/s (section 5.4.1).
 NETWORK_OUTPUT_RAD_S = (-0.03, 0.04)
+#: Training and validation loss after 150 epochs (section 5.2), and the cycle of a controller (section 5.5.2).
+LOSSES, CYCLE_MS = (1e-3, 0.05), 10.0
 #: Peak |a_y| of the double lane change (section 5.3.1), and its speed.
 DLC_PEAK_G, DLC_SPEED_KM_H = 0.7, 100.0
