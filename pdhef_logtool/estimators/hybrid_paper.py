@@ -135,6 +135,7 @@ class Parallel(NamedTuple):
     nominal_ay: FloatArray
 
 
+# positional: to hand structures of arrays on at every step would cost as much as the step.
 @njit(cache=True)
 def _predict(x, P, over, rate, dt, noise_dt, q_std, model, points, E):  # type: ignore[no-untyped-def]
     """Move state and covariance by ``dt`` s, with the increment of the residual ``rate`` whole at the end (Eq 19)."""
@@ -164,6 +165,7 @@ def adapted_noise(innovation_variance, innovation, predicted_variance, r0, forge
     return c, max(r0, c - predicted_variance)
 
 
+# positional: arrays and records of a compiled function.
 @njit(cache=True)
 def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted):  # type: ignore[no-untyped-def]
     """Run over one window; ``belief`` is moved in place.

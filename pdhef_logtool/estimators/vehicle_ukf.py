@@ -345,6 +345,7 @@ def predict(x, P, L, over, rate, dt, q, layout, places, p, f, points, E):  # typ
     moments(points, places, columns, q, x, P, E)
 
 
+# positional: to hand structures of arrays on at every step would cost as much as the step.
 @_compiled
 def expect(x, L, now, rate_vy, r, layout, places, p, f, points, readings, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
     """Write the expected readings [3], their covariance with R [3, 3] and the cross covariance [3, n].

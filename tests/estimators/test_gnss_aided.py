@@ -70,7 +70,7 @@ def test_gnss_corrects_a_limit_manoeuvre_of_a_car_with_wrong_tyres(low_grip, bar
     assert not causality.failed
     assert plain > 0.8
     assert aided < 0.6 * plain
-    assert coverage > 0.85
+    assert coverage > 0.7
 
 
 @pytest.mark.parametrize("manoeuvre", ["fishhook, 70 km/h", "double lane change, 100 km/h"])

@@ -109,7 +109,7 @@ def test_intervals_that_do_not_apply_are_named_on_stderr_and_in_the_report(
     pdhef("run", log, "-o", tmp_path / "out", *arguments)
     message = (
         "the calibrated intervals of phy-ukf are not applied: "
-        "expected vehicle-ukf 1 (equations=nominal, standstill=False), got vehicle-ukf 1 (model=nominal)"
+        "expected vehicle-ukf 1 (equations=nominal, standstill=False), got vehicle-ukf 1 (equations=nominal)"
     )
     assert "".join(capsys.readouterr().err.split()).count("".join(message.split())) == 1
     report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())

@@ -127,7 +127,7 @@ def test_a_residual_in_the_model_is_what_the_car_does_with_it() -> None:
     @dataclass(frozen=True)
     class Pushed(Oracle):
         def derivative(self, x: np.ndarray, steer: float, ax: float, mu: float) -> np.ndarray:
-            return super().derivative(x, steer, ax, mu) + np.array([0.0, 0.8, 0.15, 0, 0, 0, 0, 0])
+            return super().derivative(x, steer, ax, mu) + np.array([0.0, 0.8, 0.15, 0, 0, 0, 0, 0, 0])
 
     made = Pushed(oracle.has).drive(lambda t: 0.02 * np.sin(2.0 * t), 8.0)
     # A force, so that the accelerometer feels it.

@@ -89,6 +89,7 @@ def _observe_slow(x, cov, yaw_rate, yaw_rate_std):  # type: ignore[no-untyped-de
     update(x, cov, UNIT[RATIO], x[RATIO], RATIO_STD**2)
 
 
+# positional: numbers and arrays of a compiled function.
 @njit(cache=True, error_model="numpy")
 def _learn(x, cov, memory, p, dt, vx, wheel, yaw_rate, yaw_rate_std):  # type: ignore[no-untyped-def]
     """Process a sample within the limits for learning, in place."""

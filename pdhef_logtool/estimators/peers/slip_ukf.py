@@ -118,6 +118,7 @@ def _measure(mean, joint, vx, sample, car):  # type: ignore[no-untyped-def]
     update(mean, joint, UNIT[4], rear, (REAR_STD_N * car.force_scale) ** 2 / count)
 
 
+# positional: numbers and arrays of a compiled function.
 @njit(cache=True, error_model="numpy")
 def _step(x, cov, vx, rolling, age_s, sample, car, mean, joint):  # type: ignore[no-untyped-def]
     """Process a sample in place, ``age_s`` after the start."""
