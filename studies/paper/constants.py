@@ -20,13 +20,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pdhef_logtool.estimators.filter_base import PosteriorSteps
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.hybrid_paper import Constants, PaperHybridUkf
-from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
+from pdhef_logtool.estimators.parallel_physics import run_features
+from pdhef_logtool.estimators.vehicle_ukf import PosteriorSteps, nominal_filter
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.service import NetworkService
 from studies.condition_drives import as_logged
 from studies.defaults.paper_drives import plan_drives
@@ -67,7 +68,7 @@ class Case:
     @cached_property
     def _inputs(self) -> tuple[Signals, FloatArray, PosteriorSteps, FloatArray]:
         whole = as_logged(self.drive, self.car)
-        physics = parallel_filter(self.car.vehicle, use_speed=self.use_speed)
+        physics = nominal_filter(self.car.vehicle, use_speed=self.use_speed)
         features, steps, _ = run_features(physics, whole.signals, None)
         rate, _ = self._network.run(features, ~np.isfinite(steps.prior[:, 0]), None)
         assert whole.truth is not None
@@ -75,7 +76,7 @@ class Case:
 
     @property
     def _network(self) -> NetworkService:
-        assert self.car.network is not None
+        assert isinstance(self.car.network, ModelBundle)
         assert self.car.network.paper_network is not None
         return NetworkService(self.car.network.paper_network)
 
@@ -83,7 +84,7 @@ class Case:
         """Return the RMSE of the sideslip after each update."""
         signals, truth, physics, rate = self._inputs
         ukf = PaperHybridUkf(self.car.vehicle, self._network, use_speed=self.use_speed, constants=constants)
-        steps, _ = ukf.filter_steps(signals, physics, rate, None)
+        steps, *_ = ukf.filter_steps(signals, physics, rate)
         error = np.arctan2(steps.x[:, 1], steps.x[:, 0]) - truth
         return float(np.degrees(np.sqrt(np.mean(error[steps.valid & np.isfinite(error)] ** 2))))
 

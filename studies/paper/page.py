@@ -158,20 +158,20 @@ def _compared(d: Document) -> Iterator[tuple[str, ...]]:
         fit = d["residuals"][scenario]
         for name, share in zip(("v_y", "yaw rate"), fit["explained"], strict=True):
             yield figure, f"explained share of the residual of {name} in {scenario}", "–", percent(share)
-        theirs, here = (
+        paper_text, here = (
             " … ".join(f"{v:.3g}".replace("-", "−") for v in limits)
             for limits in (published.NETWORK_OUTPUT_RAD_S, fit["yaw_rate_increment_rad_s"])
         )
-        yield figure, f"network output in {scenario}: yaw rate per step, rad/s", theirs, here
+        yield figure, f"network output in {scenario}: yaw rate per step, rad/s", paper_text, here
     yield from _adaptation(d)
     for gain in d["improvements"]:
         if gain["baseline"] == "phy-ukf" and gain["scenario"] in "AB":
             text = f"reduction of the sideslip RMSE against Phy-UKF in {gain['scenario']}, `{gain['scheme']}`"
             yield "22", text, f"above {percent(published.IMPROVEMENT)}", gain_text(gain)
     times = {scheme: t["median_us"] for scheme, t in d["step_time_us"].items()}
-    theirs = number(published.STEP_MS["pd-hef"] / published.STEP_MS["phy-ukf"])
+    ratio = number(published.STEP_MS["pd-hef"] / published.STEP_MS["phy-ukf"])
     for scheme in (PAPER, HYBRID):
-        yield "23", f"step time over Phy-UKF, `{scheme}`", theirs, number(times[scheme] / times["phy-ukf"])
+        yield "23", f"step time over Phy-UKF, `{scheme}`", ratio, number(times[scheme] / times["phy-ukf"])
 
 
 def _at_edges(constants: Document) -> int:

@@ -55,7 +55,7 @@ def test_the_identities_of_the_shipped_presets_are_frozen(saloon: Car) -> None:
 @pytest.mark.parametrize("file", [INTERVALS_FILE, UNSURE_FILE])
 def test_the_shipped_intervals_are_those_of_the_shipped_estimators(file: str, saloon: Car) -> None:
     entries = load_intervals(SHIPPED_CARS["saloon"] / file).entries
-    assert {e.estimator for e in entries} >= {"phy-ukf", "physics", "pd-hef", "pd-hef-smoothed", "pd-hef-paper"}
+    assert {e.estimator for e in entries} >= {"phy-ukf", "physics", "pd-hef", "pd-hef-smoothed"}
     for entry in entries:
         assert entry.algorithm == resolve(make_estimator(entry.estimator, saloon)), entry.estimator
 
