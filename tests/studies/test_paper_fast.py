@@ -93,7 +93,7 @@ def test_improvement_is_that_of_pooled_errors_and_pairs_the_noise_seeds() -> Non
     assert mixed is not None
     expected = 1.0 - math.sqrt((0.1**2 + 2.5**2 + 4.0**2) / (1.0 + 4.0 + 16.0))
     assert mixed.value == pytest.approx(expected)
-    assert mixed.low < 0.0 < mixed.value < mixed.high
+    assert mixed.low < mixed.value < 0.0 < mixed.high
 
 
 def test_one_noise_seed_proves_nothing() -> None:
