@@ -199,10 +199,10 @@ def _not_reproduced(d: Document) -> str:
     epochs, their_train, their_validation = len(d["losses"]["train_loss"]), *published.LOSSES
     return f"""- Figure 9, losses: after {epochs} epochs, the training loss is {number(train)} and the validation loss
   {number(validation)}; the paper shows {their_train:g} and {their_validation:g}.
-- Figures 11 and 15, position: the RMSE of `{PAPER}` in A is {position} m, that of the paper
+- Figures 11 and 15, position: the RMSE of `{PAPER}` in A is {position} m, the RMSE of the paper
   {published.RMSE["A", "position_m"]:g} m. The 1-sigma bias of this gyro alone results in {number(drift_m)} m after
   {number(duration_s)} s.
-- Figure 13, yaw rate: the paper's RMSE in A is higher than that of the gyro itself (`zero:no-lateral`).
+- Figure 13, yaw rate: the paper's RMSE in A is higher than the gyro's (`zero:no-lateral`).
 - Figure 19, residual in B: the network explains {shares[0]} of the residual of v_y and {shares[1]} of the residual of
   the yaw rate.
 - Figure 20, R in the noise burst: R of a_y {factor}; the paper's norm rises by {theirs:g}.
