@@ -7,7 +7,7 @@ stamp by a_x + v_y r and a_y − v_x r, with a_y corrected for body roll.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -76,7 +76,7 @@ class DirectNetwork:
     def run(self, signals: Signals, state: DirectState | None) -> tuple[Steps, DirectState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(
-            replace(nominal_filter(self.vehicle, use_speed=self.use_speed), slip_gate=self.slip_gate),
+            nominal_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
             signals,
             state.physics if state else None,
         )

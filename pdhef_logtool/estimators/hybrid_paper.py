@@ -28,7 +28,7 @@ from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.fuzzy_trust import NOMINAL_TRUST, fuzzy_trust
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.speed_slip import believable
-from pdhef_logtool.estimators.unscented import cholesky, draw, moments, reading_moments, update
+from pdhef_logtool.estimators.unscented import cholesky, draw, moments, update
 from pdhef_logtool.estimators.vehicle_model import (
     MOTION,
     NOMINAL,
@@ -40,7 +40,6 @@ from pdhef_logtool.estimators.vehicle_model import (
     advance,
     planar_ay,
     push,
-    read,
 )
 from pdhef_logtool.estimators.vehicle_ukf import (
     PHY_UKF_Q_STD,
@@ -49,12 +48,14 @@ from pdhef_logtool.estimators.vehicle_ukf import (
     U_FRICTION,
     U_STEER,
     FilterState,
-    HeldInputs,
     PosteriorSteps,
     StepInputs,
     VehicleUkf,
     columns_of,
     diverges,
+    due_predictions,
+    expect,
+    held_inputs,
     held_over_step,
     innovate,
     is_finite,
@@ -180,9 +181,10 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
     out_x, out_P, _, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_trust, out_r_scale = adapted
     n = x.shape[0]
-    columns, points, E, readings = columns_of(n), np.zeros(PLACES * WIDTH), np.zeros(n * WIDTH), np.zeros(3 * WIDTH)
+    points, E, readings = np.zeros(PLACES * WIDTH), np.zeros(n * WIDTH), np.zeros(READINGS * WIDTH)
     L, S, Pxz = np.zeros((n, n)), np.zeros((READINGS, READINGS)), np.zeros((READINGS, n))
     z_hat, nu, use = np.zeros(READINGS), np.zeros(READINGS), np.zeros(READINGS, np.bool_)
+    no_r = np.zeros(READINGS)  # R is added when it is adapted
     for k in range(window.dt_s.shape[0]):
         m, a, ok, dt = memory[0], adapted_memory[0], start_ok[k], window.dt_s[k]
         steer, friction, has_ax = inputs[k, U_STEER], inputs[k, U_FRICTION], inputs[k, U_AX_KNOWN] > 0.0
@@ -210,10 +212,7 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
             alive = is_finite(x, P)
             out_prior[k] = x
             if alive:
-                cholesky(P, L)
-                draw(x, L, places, columns, points)
-                read(points, columns, steer, friction, rate[0], layout, p, f, readings)
-                reading_moments(readings, L, columns, z_hat, S, Pxz)
+                expect(x, P, L, now, rate[0], no_r, layout, places, p, f, points, readings, z_hat, S, Pxz)
                 innovate(now, z_hat, nu)
                 for i in range(READINGS):
                     use[i] = math.isfinite(nu[i])
@@ -253,7 +252,7 @@ def _predict_outputs(due, held, trust, q_std, process_noise_gain, model, out):  
         if k < 0:
             continue
         x[:], P[:, :] = held_x[k], held_P[k]
-        over = HeldInputs(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
+        over = held_inputs(inputs, k)
         trusted = (trust[k] * rate[k, 0], trust[k] * rate[k, 1])
         if horizon_s[row] > 0.0:
             noise_dt = (1.0 + process_noise_gain * trust[k]) * horizon_s[row]
@@ -308,8 +307,7 @@ class PaperHybridUkf:
     @property
     def parallel(self) -> VehicleUkf:
         """The physics filter in parallel, whose model, initial covariance and Q_0 are those of this filter."""
-        filtered = nominal_filter(self.vehicle, use_speed=self.use_speed, name="parallel")
-        return replace(filtered, slip_gate=self.slip_gate)
+        return nominal_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate, name="parallel")
 
     def run(self, signals: Signals, state: PaperState | None) -> tuple[PaperSteps, PaperState]:
         """Process one window (see :class:`~.base.Estimator`)."""
@@ -324,7 +322,7 @@ class PaperHybridUkf:
         """Extrapolate steps with the nominal model and the residual held (see :class:`~.base.ModelPredictor`)."""
         held = (steps.x, steps.P, steps.inputs, steps.residual_rate)
         predicted = no_prediction(len(stamps_ns), steps.x.shape[1])
-        due, gain = (np.where(ahead.usable, ahead.step, -1), ahead.horizon_s), self.constants.process_noise_gain
+        due, gain = due_predictions(ahead), self.constants.process_noise_gain
         _predict_outputs(due, held, steps.trust, np.array(self.q_std), gain, self.parallel.parameters, predicted)
         track = predicted_track(self.name, stamps_ns, steps, ahead, predicted)
         return replace(

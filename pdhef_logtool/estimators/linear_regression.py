@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,7 +55,7 @@ class LinearRegression:
     def run(self, signals: Signals, state: RegressionState | None) -> tuple[Steps, RegressionState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(
-            replace(nominal_filter(self.vehicle, use_speed=self.use_speed), slip_gate=self.slip_gate),
+            nominal_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
             signals,
             state.physics if state else None,
         )

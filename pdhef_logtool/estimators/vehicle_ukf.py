@@ -244,12 +244,12 @@ class GateResult(NamedTuple):
 @_compiled
 def begin_step(k, window, rules, needs_steer, memory):  # type: ignore[no-untyped-def]
     """Reset after a time gap and zero-order-hold missing inputs. Return the inputs of step k."""
-    dt, steers, steer, has_ax = window.dt_s[k], math.isfinite(window.steer[k]), window.steer[k], False
+    dt, steers = window.dt_s[k], math.isfinite(window.steer[k])
     restart = not dt <= RESTART_GAP_S
     if restart:
         memory[:] = np.zeros(1, MEMORY)
     m = memory[0]
-    steer = steer if steers else m.steer
+    steer = window.steer[k] if steers else m.steer
     m.steer_age = 0.0 if steers or restart else m.steer_age + dt
     steer_ok = steers or (m.runs > 0.0 and m.steer_age <= rules.steer_hold_s)
     if not needs_steer:
@@ -278,6 +278,12 @@ def held_over_step(now, m):  # type: ignore[no-untyped-def]
     return HeldInputs(
         0.5 * (m.steer + now.steer), ax, now.has_ax or m.ax_known > 0.0, 0.5 * (m.friction + now.friction)
     )
+
+
+@_inline
+def held_inputs(inputs, k):  # type: ignore[no-untyped-def]
+    """Return the inputs of step k, held during a prediction."""
+    return HeldInputs(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
 
 
 @njit(cache=True)
@@ -329,11 +335,12 @@ def yield_to_kinematics(x, friction, dt, rules, p, f, m):  # type: ignore[no-unt
 # positional: to hand structures of arrays on at every step would cost as much as the step.
 @_compiled
 def predict(x, P, L, over, rate, dt, q, layout, places, p, f, points, E):  # type: ignore[no-untyped-def]
-    """Move state and covariance by ``dt`` s with the residual ``rate`` of v̇_y and ṙ; L is the root of P.
+    """Move state and covariance by ``dt`` s with the residual ``rate`` of v̇_y and ṙ.
 
-    Leaves the deviations of the moved points in E.
+    Leaves the root of the former covariance in L, and the deviations of the moved points in E.
     """
     columns = columns_of(x.shape[0])
+    cholesky(P, L)
     given = rate[0] != 0.0 or rate[1] != 0.0
     vx = x[VX]
     draw(x, L, places, columns, points)
@@ -347,12 +354,13 @@ def predict(x, P, L, over, rate, dt, q, layout, places, p, f, points, E):  # typ
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
 @_compiled
-def expect(x, L, now, rate_vy, r, layout, places, p, f, points, readings, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
+def expect(x, P, L, now, rate_vy, r, layout, places, p, f, points, readings, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
     """Write the expected readings [3], their covariance with R [3, 3] and the cross covariance [3, n].
 
-    L is the root of P, ``r`` [3] the variances of the sensors.
+    ``r`` [3] are the variances of the sensors. Leaves the root of P in L.
     """
     columns = columns_of(x.shape[0])
+    cholesky(P, L)
     draw(x, L, places, columns, points)
     read(points, columns, now.steer, now.friction, rate_vy, layout, p, f, readings)
     reading_moments(readings, L, columns, z_hat, S, Pxz)
@@ -475,7 +483,7 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
     out_linked, out_predicted_P, out_cross = links
     linked, n, bias = out_linked.shape[0] > 0, x.shape[0], layout.steer_bias
     points, readings, E = np.zeros(PLACES * WIDTH), np.zeros(READINGS * WIDTH), np.zeros(n * WIDTH)
-    L, before, q, r = np.zeros((n, n)), np.zeros((n, n)), np.zeros(n), np.zeros(READINGS)
+    L, q, r = np.zeros((n, n)), np.zeros(n), np.zeros(READINGS)
     S, Pxz = np.zeros((READINGS, READINGS)), np.zeros((READINGS, n))
     z_hat, nu, at_gate = np.zeros(READINGS), np.zeros(READINGS), np.zeros(READINGS)
     given, use = np.zeros(READINGS, np.bool_), np.zeros(READINGS, np.bool_)
@@ -506,20 +514,16 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
                 factor, f = yield_to_kinematics(x, over.friction, now.dt, rules, p, f, m)
                 q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             process_noise(q_std, over.ax_known, now.dt, layout, q)
-            cholesky(P, L)
-            if linked:
-                before[:, :] = L
             predict(x, P, L, over, rate, now.dt, q, layout, places, p, f, points, E)
             if linked:
-                cross_covariance(before, E, out_cross[k])
+                cross_covariance(L, E, out_cross[k])
                 out_predicted_P[k] = P
             out_prior[k] = x
             alive, stands = is_finite(x, P), False
             if alive:
                 for i in range(READINGS):
                     r[i] = r_std[i] * r_std[i] + (window.extra_r[k, i] if i < Z_SPEED else 0.0)
-                cholesky(P, L)
-                expect(x, L, now, rate[0], r, layout, places, p, f, points, readings, z_hat, S, Pxz)
+                expect(x, P, L, now, rate[0], r, layout, places, p, f, points, readings, z_hat, S, Pxz)
                 innovate(now, z_hat, nu)
                 gated = gate(now, m, nu, S, at_gate, given, use)
                 for i in range(READINGS):
@@ -531,8 +535,7 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
                     P *= GATE_INFLATION
                     if linked:  # to a smoother the inflation is process noise of the step that led here
                         out_predicted_P[k] = P
-                    cholesky(P, L)
-                    expect(x, L, now, rate[0], r, layout, places, p, f, points, readings, z_hat, S, Pxz)
+                    expect(x, P, L, now, rate[0], r, layout, places, p, f, points, readings, z_hat, S, Pxz)
                     innovate(now, z_hat, nu)
                     for i in range(READINGS):
                         if use[i]:
@@ -573,10 +576,9 @@ def _predict_outputs(due, held, q_std, model, out):  # type: ignore[no-untyped-d
             continue
         x[:] = held_x[k]
         P[:, :] = held_P[k]
-        over = HeldInputs(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
+        over = held_inputs(inputs, k)
         rate = (residual_rate[k, 0], residual_rate[k, 1])
         if horizon_s[row] > 0.0:
-            cholesky(P, L)
             process_noise(q_std, over.ax_known, horizon_s[row], layout, q)
             predict(x, P, L, over, rate, horizon_s[row], q, layout, places, p, f, points, E)
         if is_finite(x, P):
@@ -648,14 +650,6 @@ class StepLinks(StepColumns):
     cross: FloatArray
 
 
-class _Links(NamedTuple):
-    """The columns of :class:`StepLinks`, for the kernel to write."""
-
-    linked: BoolArray
-    predicted_P: FloatArray
-    cross: FloatArray
-
-
 class Predicted(NamedTuple):
     """Predictions: state [M, n], covariance of the motion [M, 3, 3], planar a_y [M]; NaN for none."""
 
@@ -699,6 +693,11 @@ def no_posterior(count: int, n: int) -> Posterior:
         diverged=np.zeros(count, dtype=np.bool_),
         prior=np.full((count, n), np.nan),
     )
+
+
+def due_predictions(ahead: Extrapolation) -> tuple[IntArray, FloatArray]:
+    """Return step (−1 for none) and horizon in s of each prediction, [M], as a kernel reads them."""
+    return np.where(ahead.usable, ahead.step, -1), ahead.horizon_s
 
 
 def no_prediction(count: int, n: int) -> Predicted:
@@ -880,7 +879,7 @@ class VehicleUkf:
         signals, slip = believable(signals, self.vehicle.sensors, slip, gate=self.slip_gate)
         window, count, n = make_window(signals, state, residual_rate, extra_r), len(signals), self.layout.size
         rows, out = count if linked else 0, no_posterior(count, n)
-        links = _Links(np.zeros(rows, dtype=np.bool_), np.zeros((rows, n, n)), np.zeros((rows, n, n)))
+        links = (np.zeros(rows, dtype=np.bool_), np.zeros((rows, n, n)), np.zeros((rows, n, n)))
         belief = resume(state, n)
         _filter(window, self.tuning, self.parameters, belief, out, links)
         after = FilterState(belief, last_stamp_ns(signals.stamps_ns, state.last_stamp_ns if state else None), slip)
@@ -889,7 +888,7 @@ class VehicleUkf:
     def predict(self, steps: PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate steps with the filter's model (see :class:`~.base.ModelPredictor`)."""
         predicted = no_prediction(len(stamps_ns), steps.x.shape[1])
-        due = (np.where(ahead.usable, ahead.step, -1), ahead.horizon_s)
+        due = due_predictions(ahead)
         held = (steps.x, steps.P, steps.inputs, steps.residual_rate)
         _predict_outputs(due, held, self.tuning.q_std, self.parameters, predicted)
         return predicted_track(self.name, stamps_ns, steps, ahead, predicted, self.layout)
@@ -923,9 +922,11 @@ def resume(state: FilterState | None, n: int) -> Belief:
 # ------------------------------------------------------------------------------------------------ presets
 
 
-def nominal_filter(vehicle: VehicleParameters, *, use_speed: bool = True, name: str = "phy-ukf") -> VehicleUkf:
+def nominal_filter(
+    vehicle: VehicleParameters, *, use_speed: bool = True, slip_gate: bool = True, name: str = "phy-ukf"
+) -> VehicleUkf:
     """Return the frozen ``phy-ukf``: the paper's physics baseline, R at sensor level, Q by innovation likelihood."""
-    return VehicleUkf(vehicle, "nominal", PHY_UKF_Q_STD, use_speed=use_speed, name=name)
+    return VehicleUkf(vehicle, "nominal", PHY_UKF_Q_STD, use_speed=use_speed, slip_gate=slip_gate, name=name)
 
 
 def build_nominal(name: str, car: Car, options: Options) -> VehicleUkf:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal, TypeAlias
 
@@ -206,12 +206,6 @@ class Signals:
 
 
 SIGNAL_COLUMNS = tuple(f.name for f in fields(Signals) if f.name != "available")
-
-
-def join_signals(windows: Sequence[Signals]) -> Signals:
-    """Join consecutive windows of one drive in time order."""
-    columns = {c: np.concatenate([getattr(w, c) for w in windows]) for c in SIGNAL_COLUMNS}
-    return Signals(**columns, available=windows[0].available)
 
 
 def has_gnss(names: Collection[str]) -> bool:

@@ -16,7 +16,7 @@ from pdhef_logtool.drive.friction import friction_source, parse_friction
 from pdhef_logtool.estimators import friction_bank
 from pdhef_logtool.estimators.friction_bank import BOUND_SHARE, FORGETTING_S, FrictionBank, FrictionEstimate
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.signals import Signals, join_signals
+from pdhef_logtool.records.signals import SIGNAL_COLUMNS, Signals
 
 pytestmark = pytest.mark.slow
 
@@ -127,7 +127,8 @@ def test_the_acceleration_that_was_reached_is_forgotten_where_saturation_shows()
     """A turn on a dry road, then the excitation of a slippery one."""
     dry, slippery = excited(0.9), excited(0.3)
     later = replace(slippery, stamps_ns=slippery.stamps_ns + dry.stamps_ns[-1] + 10_000_000 - slippery.stamps_ns[0])
-    friction = FrictionBank(VEHICLE).run(join_signals([dry, later])).friction
+    joined = {c: np.concatenate([getattr(dry, c), getattr(later, c)]) for c in SIGNAL_COLUMNS}
+    friction = FrictionBank(VEHICLE).run(replace(dry, **joined)).friction
     assert friction[len(dry)] > 0.7
     assert abs(np.median(friction[-200:]) - 0.3) < 0.1
 
