@@ -64,7 +64,6 @@ def linear_residual(weight: float = 0.3, fastest_m_s: float = 40.0) -> LadderMod
         even_mean=(20.0,) * EVEN_COUNT,
         even_scale=(5.0,) * EVEN_COUNT,
         weights=tuple(weights),
-        factor=tuple((0.001,) for _ in range(ODD_COUNT)),
         whitening=tuple(tuple(map(float, 1e-4 * row)) for row in np.eye(ODD_COUNT)),
         speed_m_s=(5.0, fastest_m_s),
         largest_m_s2=3.0,

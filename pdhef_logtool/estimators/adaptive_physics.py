@@ -6,10 +6,11 @@ network. The mechanism (docs/method.md#adaptation) does not treat model error as
 Bottom layer: :mod:`~.sensor_faults` checks a_y and yaw rate. Its findings apply to every filter here and to the
 parallel one, and keep bad samples from the network.
 
-Top layer: a bank of filters with the same network output, each a hypothesis about the car's model. F1 assumes that it
-is complete; each other filter adds one state: a scale of all forces, or the bank of the road. With both at once, the
-same error moves between them, and the estimate is worse. With Λ the sum of a filter's log-likelihood of its
-measurements, forgotten within seconds, the weight of filter i is
+Top layer: a bank of filters, each a hypothesis about the car's model. F1 assumes that the model with its residual is
+complete; each other filter adds one state: a scale of all forces, or the bank of the road. With both at once, the
+same error moves between them, and the estimate is worse. A residual is trained on one vehicle and level roads: the
+filter of another vehicle, with a force scale, uses half of it, and the filter of a banked road none. With Λ the sum of
+a filter's log-likelihood of its measurements, forgotten within seconds, the weight of filter i is
 
     w_i ∝ exp(Λ_i)
 
@@ -41,8 +42,9 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.presets import Options
 
-#: Possible deficiencies of a model, as parts of ``physics``; each is the state of one filter.
-CURES = ("force_scale", "bank")
+#: Possible deficiencies of a model, as parts of ``physics``; each is the state of one filter, which uses this share of
+#: the residual. The shares were chosen on simulated drives that no table contains.
+CURES = {"force_scale": 0.5, "bank": 0.0}
 #: Time constant with which the likelihood is forgotten, s. Chosen on simulated drives that no table contains; from 1 to
 #: 5 s little changes.
 FORGET_S = 2.0
@@ -217,7 +219,7 @@ class AdaptivePhysics:
     Parameters
     ----------
     physics : the car's filter with its parts and noise.
-    network : of the model's residual, None without; trust : residual gain of all filters, in [0, 1].
+    network : of the model's residual, None without; trust : residual gain of F1, in [0, 1].
     adaptive : False leaves the mechanism out: no detector, and the car's filter alone, with its cures as states.
     notes : texts for the report, such as the reason for its residual gain.
     """
@@ -235,11 +237,20 @@ class AdaptivePhysics:
     notes: tuple[str, ...] = ()
 
     @property
+    def cures(self) -> tuple[str, ...]:
+        """The cures with a filter."""
+        return tuple(cure for cure in CURES if self.adaptive and getattr(self.physics.vehicle.physics, cure))
+
+    @property
+    def residual_shares(self) -> tuple[float, ...]:
+        """Share of the residual in each filter."""
+        return 1.0, *(CURES[cure] for cure in self.cures)
+
+    @property
     def filters(self) -> tuple[VehicleUkf, ...]:
         """F1, and one filter a cure that the car has."""
-        vehicle = self.physics.vehicle
-        cures = [cure for cure in CURES if getattr(vehicle.physics, cure)]
-        if not self.adaptive or not cures:
+        vehicle, cures = self.physics.vehicle, self.cures
+        if not cures:
             return (self.physics,)
         parts = [vehicle.physics.model_copy(update={c: c == cure for c in CURES}) for cure in ("", *cures)]
         vehicles = [vehicle.model_copy(update={"physics": p}) for p in parts]
@@ -255,10 +266,10 @@ class AdaptivePhysics:
     def run(self, signals: Signals, state: AdaptiveState | None) -> tuple[MixtureSteps, AdaptiveState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         checked, inputs = self.inputs(signals, state.inputs if state else None)
-        faults, rate = checked.faults, self.trust * checked.rate
-        filters = self.filters
+        faults, rate, filters = checked.faults, self.trust * checked.rate, self.filters
         before: Sequence[FilterState | None] = state.filters if state else [None] * len(filters)
-        runs = [f.run(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)]
+        members = zip(filters, before, self.residual_shares, strict=True)
+        runs = [f.run(faults.filtered, b, share * rate, faults.extra_r) for f, b, share in members]
         steps = tuple(filter_steps for filter_steps, _ in runs)
         likelihood, starts = np.stack([s.log_likelihood for s in steps], axis=1), ~np.isfinite(steps[0].prior[:, VX])
         dt_s = step_durations_s(signals.stamps_ns, state.filters[0].last_stamp_ns if state else None)

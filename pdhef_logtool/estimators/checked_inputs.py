@@ -13,7 +13,6 @@ import numpy as np
 
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.plug_ins import contained, package_of
-from pdhef_logtool.estimators.residual_validity import ValidityState, consistent_gain
 from pdhef_logtool.estimators.sensor_faults import FaultState, SensorFaults, find_faults
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, VehicleUkf
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -28,7 +27,6 @@ class InputState:
     faults: FaultState | None
     physics: FilterState | None = None
     model: Any = None
-    validity: ValidityState | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,12 +51,7 @@ def check_inputs(
     """
     faults, fault_carry = find_faults(signals, physics.vehicle, state.faults if state else None)
     residual, carried = residual_of(physics, model, faults.filtered, state, faults)
-    checked, validity = CheckedInputs(faults, residual), None
-    if model is not None:
-        before = state.validity if state else None
-        gain, validity = consistent_gain(physics, faults.filtered, checked.rate, faults.extra_r, before)
-        checked = CheckedInputs(faults, residual._replace(gain=gain * residual.gain))
-    return checked, replace(carried, faults=fault_carry, validity=validity)
+    return CheckedInputs(faults, residual), replace(carried, faults=fault_carry)
 
 
 def residual_of(

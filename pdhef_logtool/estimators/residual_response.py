@@ -56,9 +56,9 @@ def residual_response(physics: AdaptivePhysics, signals: Signals, row: IntArray)
     faults, probe = checked.faults, np.zeros((len(signals), 2))
     probe[:, 0] = PROBE_M_S2
     runs, transitions, drives = [], [], []
-    for physics_filter in physics.filters:
+    for physics_filter, share in zip(physics.filters, physics.residual_shares, strict=True):
         steps, _, links = physics_filter.linked_steps(faults.filtered, None, None, faults.extra_r)
-        moved, _ = physics_filter.run(faults.filtered, None, probe, faults.extra_r)
+        moved, _ = physics_filter.run(faults.filtered, None, share * probe, faults.extra_r)
         transition = _transition(steps, links)
         change = np.nan_to_num((moved.x - steps.x) / PROBE_M_S2)
         drive = np.zeros_like(change)

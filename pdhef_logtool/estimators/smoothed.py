@@ -139,7 +139,8 @@ class SmoothedPhysics:
 
     def _filtered(self, signals: Signals, rate: FloatArray, extra_r: FloatArray) -> tuple[list[StateTrack], FloatArray]:
         """Return the smoothed tracks of all filters [H], and their weights [N, H]."""
-        drives = [self._smoothed(f, signals, rate, extra_r) for f in self.filtered.filters]
+        members = zip(self.filtered.filters, self.filtered.residual_shares, strict=True)
+        drives = [self._smoothed(f, signals, share * rate, extra_r) for f, share in members]
         tracks = [d.track for d in drives]
         if len(drives) == 1:
             return tracks, np.ones((len(signals), 1))

@@ -23,19 +23,18 @@ LIMITS = (4.0, 6.0)
 
 
 class Residual(NamedTuple):
-    """Residual of the model from each step on: rates of v_y and r [K, 2], m/s² and rad/s², with their 1-sigma [K, 2].
+    """Residual of the model from each step on: rates of v_y and r [K, 2], m/s² and rad/s².
 
     ``gain`` : [K], 1 inside the region of validity of the model, 0 outside.
     """
 
     rate: FloatArray
-    std: FloatArray
     gain: FloatArray
 
     @classmethod
     def zero(cls, count: int) -> Residual:
         """Return no residual for ``count`` steps."""
-        return cls(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count))
+        return cls(np.zeros((count, 2)), np.zeros(count))
 
 
 class ResidualModel(Protocol):
@@ -114,11 +113,9 @@ def checked_residual(residual: Any, count: int) -> Residual:
     ValueError
         Its shapes or values are wrong.
     """
-    rate, std, gain = (np.asarray(column, dtype=np.float64) for column in residual)
-    if rate.shape != (count, 2) or std.shape != (count, 2) or gain.shape != (count,):
-        raise ValueError(
-            f"expected rate and std [{count}, 2] and gain [{count}], got {rate.shape}, {std.shape}, {gain.shape}"
-        )
-    if not (np.isfinite(rate).all() and np.isfinite(std).all() and np.all((gain >= 0.0) & (gain <= 1.0))):
+    rate, gain = (np.asarray(column, dtype=np.float64) for column in residual)
+    if rate.shape != (count, 2) or gain.shape != (count,):
+        raise ValueError(f"expected rate [{count}, 2] and gain [{count}], got {rate.shape}, {gain.shape}")
+    if not (np.isfinite(rate).all() and np.all((gain >= 0.0) & (gain <= 1.0))):
         raise ValueError("expected finite rates and a gain of 0 to 1, got other values")
-    return Residual(np.clip(rate, np.negative(LIMITS), LIMITS), std, gain)
+    return Residual(np.clip(rate, np.negative(LIMITS), LIMITS), gain)

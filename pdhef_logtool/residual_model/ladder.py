@@ -2,8 +2,7 @@
 
 Orders: ``none``; ``linear`` in the odd features; ``random`` with additional random Fourier features √2 sin(w·z)
 cos(v·e + p) of the odd features z and the even features e (Rahimi and Recht 2007). All are exactly odd: they have no
-constant, and a mirrored drive has the mirrored residual. They are fitted by ridge regression (:mod:`~.ladder_fit`); its
-posterior is part of the interval.
+constant, and a mirrored drive has the mirrored residual. They are fitted by ridge regression (:mod:`~.ladder_fit`).
 
 Region of validity: a gain per step, 1 within the region of the training drives and 0 outside. It depends on the speed
 and on the whitened distance d² = zᵀ (Σ + ρ I)⁻¹ z, divided by its 98 % quantile over the training drives.
@@ -32,8 +31,6 @@ FULL_WITHIN, NONE_BEYOND = 1.0, 3.0
 SPEED_FULL, SPEED_NONE = 1.1, 1.5
 #: Ridge ρ of the distance, for features of variance 1.
 REGION_RIDGE = 0.5
-#: Share of a residual in its 1-sigma, in addition to the posterior: a strong ridge reduces the residual by as much.
-SHRINKAGE = 0.5
 #: A residual is limited to this multiple of the largest one on the training drives.
 LARGEST = 1.5
 
@@ -42,10 +39,9 @@ Rows = Annotated[tuple[Row, ...], Field(strict=False)]
 
 
 class Correction(NamedTuple):
-    """Residual rate of v_y and its 1-sigma per step [K], m/s², before the gain; and the gain, 0 to 1."""
+    """Residual rate of v_y per step [K], m/s², before the gain; and the gain, 0 to 1."""
 
     rate_m_s2: FloatArray
-    std_m_s2: FloatArray
     gain: FloatArray
 
 
@@ -56,9 +52,8 @@ class LadderModel(BaseModel):
     ----------
     scale : of the odd features [16]. even_mean, even_scale : of the even features [8].
     odd_directions, even_directions, phases : of the random features, empty for ``linear``.
-    weights : by feature, m/s². factor : its product with its transpose is the posterior covariance of the weights.
-    whitening : d² is the squared norm of its product with z. speed_m_s : range of the training drives.
-    largest_m_s2 : largest residual on the training drives.
+    weights : by feature, m/s². whitening : d² is the squared norm of its product with z.
+    speed_m_s : range of the training drives. largest_m_s2 : largest residual on the training drives.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True, allow_inf_nan=False)
@@ -71,7 +66,6 @@ class LadderModel(BaseModel):
     even_directions: Rows = ()
     phases: Row = ()
     weights: Row
-    factor: Rows
     whitening: Rows
     speed_m_s: Annotated[tuple[float, float], Field(strict=False)]
     largest_m_s2: Annotated[float, Field(ge=0)]
@@ -82,10 +76,9 @@ class LadderModel(BaseModel):
         shapes = (
             (self.scale, ODD_COUNT), (self.even_mean, EVEN_COUNT), (self.even_scale, EVEN_COUNT),
             (self.odd_directions, random), (self.even_directions, random), (self.weights, count),
-            (self.factor, count), (self.whitening, ODD_COUNT),
+            (self.whitening, ODD_COUNT),
             *((row, ODD_COUNT) for row in (*self.odd_directions, *self.whitening)),
             *((row, EVEN_COUNT) for row in self.even_directions),
-            *((row, len(self.factor[0])) for row in self.factor),
         )  # fmt: skip
         if any(len(values) != size for values, size in shapes):
             raise ValueError("the arrays of a residual model do not have the sizes of its features")
@@ -111,7 +104,6 @@ class LadderModel(BaseModel):
             matrix(self.even_directions, EVEN_COUNT),
             np.array(self.phases, dtype=np.float64),
             np.array(self.weights),
-            matrix(self.factor, len(self.factor[0])),
             matrix(self.whitening, ODD_COUNT),
         )
 
@@ -119,21 +111,19 @@ class LadderModel(BaseModel):
         """Return the residual of consecutive steps (see :class:`~.interface.ResidualModel`)."""
         slow, memory = slow_features(features, dt_s, state)
         correction = self.evaluate(slow)
-        rate, std = (np.stack([c, np.zeros(len(c))], axis=1) for c in (correction.rate_m_s2, correction.std_m_s2))
-        return Residual(rate, std, correction.gain), memory
+        rate = np.stack([correction.rate_m_s2, np.zeros(len(features))], axis=1)
+        return Residual(rate, correction.gain), memory
 
     def evaluate(self, features: SlowFeatures) -> Correction:
         """Return the residual at each step; residual and gain are 0 where a feature is NaN."""
         from pdhef_logtool.residual_model.ladder_kernels import evaluate
 
         count = len(features.odd)
-        residual, std, distance2 = np.empty(count), np.empty(count), np.empty(count)
+        residual, distance2 = np.empty(count), np.empty(count)
         even_mean, even_scale = np.array(self.even_mean), np.array(self.even_scale)
-        evaluate(features.odd, features.even, self._arrays, even_mean, even_scale, residual, std, distance2)
+        evaluate(features.odd, features.even, self._arrays, even_mean, even_scale, residual, distance2)
         limit = LARGEST * self.largest_m_s2
-        residual = np.clip(residual, -limit, limit)
-        std = np.hypot(std, SHRINKAGE * residual)
-        return Correction(residual, std, self._gain(distance2, features.even[:, SPEED_COLUMN]))
+        return Correction(np.clip(residual, -limit, limit), self._gain(distance2, features.even[:, SPEED_COLUMN]))
 
     def _gain(self, distance2: FloatArray, speed: FloatArray) -> FloatArray:
         """Return the gain of the region of validity [K]."""

@@ -42,8 +42,6 @@ TOGETHER = 25
 STANDARD_ERRORS, LEAST_GAIN = 1.3, 0.02
 #: Number of random features, scale of their frequencies, and least duration of driving for them.
 RANDOM_FEATURES, FREQUENCY, RANDOM_LEAST_S = 200, 0.4, 60.0
-#: Number of directions of the posterior.
-DIRECTIONS = 16
 #: Features and errors of a fit are reduced by their means over this time, because slow errors may be due to bank.
 SLOW_S = 5.0
 #: Sample rate of a fit.
@@ -186,8 +184,6 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
     ridge = _best_ridge(taken, ())
     random = 0 if chosen == LINEAR else count
     used = ODD_COUNT + random
-    rmse_rad = math.radians(next(t.rmse_deg for t in trials if t.rung == chosen))
-    normal = ridge * np.eye(used) + sum(_centred(drive)[:-1, :-1] for drive in taken.whole)
     weights = _solve(list(taken.whole), ridge) / unit
     phi = np.concatenate([basis.features(s.drive.features, s.rows) for s in samples])[:, :used]
     speed = np.quantile(even[:, SPEED_COLUMN], [1.0 - QUANTILE, QUANTILE])
@@ -200,7 +196,6 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
         even_directions=plain(basis.even_directions[:random]),
         phases=plain(basis.phases[:random]),
         weights=plain(weights),
-        factor=plain(_factor(normal, phi, rmse_rad) / unit),
         whitening=plain(_whitening(odd / scale)),
         speed_m_s=plain(np.maximum(speed, 0.1)),
         largest_m_s2=plain(np.quantile(np.abs(phi @ weights), 0.999)),
@@ -300,14 +295,6 @@ def _best_ridge(problem: _Problem, without: tuple[int, ...]) -> float:
     spread = np.std(difference, axis=1, ddof=1) * math.sqrt(len(inner))
     near = np.flatnonzero(difference.sum(axis=1) <= spread)
     return LAMBDAS[int(near.max(initial=best))]
-
-
-def _factor(normal: FloatArray, phi: FloatArray, rmse_rad: float) -> FloatArray:
-    """Return L [k, m] with L Lᵀ the posterior covariance in its largest directions."""
-    root = rmse_rad * np.linalg.inv(np.linalg.cholesky(normal)).T
-    moved = phi @ root
-    _, axes = np.linalg.eigh(moved.T @ moved)
-    return np.asarray(root @ axes[:, ::-1][:, :DIRECTIONS], dtype=np.float64)
 
 
 def _whitening(z: FloatArray) -> FloatArray:

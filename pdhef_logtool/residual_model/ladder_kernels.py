@@ -19,7 +19,6 @@ class LadderArrays(NamedTuple):
     even_directions: FloatArray
     phases: FloatArray
     weights: FloatArray
-    factor: FloatArray
     whitening: FloatArray
 
 
@@ -38,11 +37,11 @@ def _features(z, e, odd_directions, even_directions, phases, out):  # type: igno
 
 
 @njit(cache=True)
-def evaluate(odd, even, arrays, even_mean, even_scale, residual, std, distance2):  # type: ignore[no-untyped-def]
-    """Write residual and 1-sigma, rad, and the squared whitened distance of steps [K]."""
+def evaluate(odd, even, arrays, even_mean, even_scale, residual, distance2):  # type: ignore[no-untyped-def]
+    """Write the residual, m/s², and the squared whitened distance of steps [K]."""
     z, e, phi = np.empty(odd.shape[1]), np.empty(even.shape[1]), np.empty(arrays.weights.shape[0])
     for k in range(odd.shape[0]):
-        residual[k], std[k], distance2[k] = 0.0, 0.0, math.nan
+        residual[k], distance2[k] = 0.0, math.nan
         if not math.isfinite(odd[k].sum() + even[k].sum()):
             continue
         for i in range(z.shape[0]):
@@ -52,13 +51,6 @@ def evaluate(odd, even, arrays, even_mean, even_scale, residual, std, distance2)
         _features(z, e, arrays.odd_directions, arrays.even_directions, arrays.phases, phi)
         for i in range(phi.shape[0]):
             residual[k] += phi[i] * arrays.weights[i]
-        variance = 0.0
-        for j in range(arrays.factor.shape[1]):
-            part = 0.0
-            for i in range(phi.shape[0]):
-                part += phi[i] * arrays.factor[i, j]
-            variance += part * part
-        std[k] = math.sqrt(variance)
         distance2[k] = 0.0
         for j in range(z.shape[0]):
             part = 0.0

@@ -64,7 +64,7 @@ class NetworkService:
     def residual(self, features: FloatArray, dt_s: FloatArray, state: NetworkCarry) -> tuple[Residual, NetworkCarry]:
         """Return the residual of consecutive steps (see :class:`~.interface.ResidualModel`)."""
         rate, after = self.run(features, np.isnan(dt_s), state)
-        return Residual(rate, np.zeros_like(rate), np.ones(len(rate))), after
+        return Residual(rate, np.ones(len(rate))), after
 
     def _sequence(self, scaled: FloatArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkState]:
         both = np.zeros((len(scaled), SIDES, scaled.shape[1]), dtype=np.float32)

@@ -157,7 +157,7 @@ def test_cures_of_nothing_cost_little(made):
 
 
 def test_each_filter_has_one_cure_and_only_those_that_the_car_has():
-    for own in ((), ("force_scale",), ("bank",), CURES):
+    for own in ((), ("force_scale",), ("bank",), tuple(CURES)):
         parts = VEHICLE.physics.model_copy(update=dict.fromkeys(own, True))
         physics = replace(PHYSICS, vehicle=VEHICLE.model_copy(update={"physics": parts}))
         filters = AdaptivePhysics(physics).filters

@@ -130,14 +130,13 @@ def test_the_mirrored_drive_has_the_mirrored_residual(seed: int, size: float) ->
     for model in (linear_model(), random_model()):
         straight, turned = model.evaluate(found), model.evaluate(mirrored)
         assert np.array_equal(turned.rate_m_s2, -straight.rate_m_s2)
-        assert np.array_equal(turned.gain, straight.gain) and np.array_equal(turned.std_m_s2, straight.std_m_s2)
+        assert np.array_equal(turned.gain, straight.gain)
 
 
 @cache
 def random_model() -> LadderModel:
     """Return the linear model with random features of small weight."""
     model, rng, count = linear_model(), np.random.default_rng(5), 12
-    rows = np.concatenate([np.array(model.factor), rng.normal(size=(count, len(model.factor[0]))) * 1e-4])
     return LadderModel(
         **{
             **model.model_dump(),
@@ -146,7 +145,6 @@ def random_model() -> LadderModel:
             "even_directions": rng.normal(size=(count, len(model.even_mean))).tolist(),
             "phases": rng.uniform(size=count).tolist(),
             "weights": [*model.weights, *(rng.normal(size=count) * 1e-3).tolist()],
-            "factor": rows.tolist(),
         }
     )
 
@@ -206,13 +204,6 @@ def test_a_sideslip_without_weight_teaches_nothing() -> None:
     first, second = (fit_ladder([d], rungs=("linear",)).model for d in (replace(drive, weight=weight), wrong))
     assert first is not None and second is not None
     assert np.allclose(first.weights, second.weights, rtol=1e-6, atol=1e-9)
-
-
-def test_the_interval_contains_most_of_what_a_strong_ridge_leaves() -> None:
-    drive = taught(60.0, 21, linear)
-    found = linear_model().evaluate(drive.features)
-    error = found.rate_m_s2 - linear(drive.features)
-    assert np.mean(np.abs(error) <= 1.96 * found.std_m_s2) > 0.65
 
 
 def test_a_model_survives_its_document_and_damage_is_refused() -> None:
