@@ -98,6 +98,15 @@ def test_a_right_residual_removes_the_error_that_a_missing_force_makes() -> None
     assert error[1.0] < error[0.5] < error[0.0]
 
 
+def test_the_filter_of_another_vehicle_has_half_of_the_residual_and_that_of_a_banked_road_none() -> None:
+    estimator = hybrid("bank", "force_scale", network=random_network(constant=(0.4, 0.1)), trust=0.5)
+    steps, _ = estimator.run(_signals(), None)
+    unchanged, other_vehicle, banked = (f.residual_rate for f in steps.filters)
+    np.testing.assert_allclose(unchanged[100:], np.tile([0.2, 0.05], (len(unchanged) - 100, 1)))
+    np.testing.assert_array_equal(other_vehicle, 0.5 * unchanged)
+    assert not banked.any()
+
+
 def test_below_the_dynamic_range_the_residual_counts_for_nothing() -> None:
     slow = replace(_signals(speed=1.0), ay_m_s2=np.zeros(800))
     a, _ = run_window(hybrid(network=random_network(constant=(2.0, 1.0))), slow)
