@@ -315,7 +315,7 @@ def test_a_taught_car_is_calibrated_and_each_row_has_the_gain_of_its_region(
     ones = np.ones(ODD_COUNT)
     model = LadderModel(
         rung="linear", scale=plain(ones), even_mean=plain(np.zeros(EVEN_COUNT)), even_scale=plain(np.ones(EVEN_COUNT)),
-        weights=plain(0.01 * ones), factor=plain(0.01 * ones[:, None]), whitening=plain(0.6 * np.eye(ODD_COUNT)),
+        weights=plain(0.01 * ones), whitening=plain(0.6 * np.eye(ODD_COUNT)),
         speed_m_s=(5.0, 60.0), largest_m_s2=0.1,
     )  # fmt: skip
     taught = Taught(physics_sha256=Car.load(car, network="none").physics_sha256, residual=model)
