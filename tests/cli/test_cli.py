@@ -342,18 +342,6 @@ def test_a_bug_of_ours_is_one_line_too(sample_logs_dir: Path, tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_log_without_truth_shows_what_there_is_instead(sample_logs_dir: Path, tmp_path: Path) -> None:
-    log = str(sample_logs_dir / "no_truth.mcap")
-    result = called("run", log, "-o", str(tmp_path), "--annotate", "none", "-e", "zero,open-loop,phy-ukf")
-    assert result.returncode == 0
-    assert "the log contains no ground truth" in " ".join(result.stdout.split())
-    assert "Consistency" in result.stdout
-    assert "from pd-hef °" in result.stdout
-    assert "RMSE" not in result.stdout[: result.stdout.index("id  ")].replace("RMSE °", "")
-    assert "no ground truth of v_x" in result.stdout
-
-
-@pytest.mark.slow
 def test_map_without_a_terminal_writes_what_was_found(sample_logs_dir: Path, tmp_path: Path) -> None:
     result = called("map", str(sample_logs_dir / "dlc.mcap"), "-o", "m.toml", cwd=tmp_path)
     assert result.returncode == 0

@@ -76,23 +76,6 @@ def test_below_the_blend_a_y_says_nothing():
     assert {k[0] for k in residuals(replace(s, speed_m_s=s.speed_m_s * 0.05))} == {"vx_m_s"}
 
 
-def test_white_and_coloured_innovations():
-    rng = np.random.default_rng(0)
-    white = rng.chisquare(2, T.size)
-    noise = rng.normal(size=(T.size, 2))
-    for i in range(1, T.size):  # a first-order process with correlation 0.9, unit variance
-        noise[i] = 0.9 * noise[i - 1] + np.sqrt(1 - 0.81) * noise[i]
-    coloured = (noise**2).sum(axis=1)
-    dof = np.full(T.size, 2.0)
-    for nis, expected, slack in ((white, 0.0, 2.6 / T.size**0.5), (coloured, 0.81, 0.08)):
-        track = make_track("ukf", STAMPS, nis=nis, nis_dof=dof)
-        rows = {r.metric: r.value for r in rows_of([track])}
-        assert rows["nis_autocorrelation"] == pytest.approx(expected, abs=slack)
-        assert rows["nis"] == pytest.approx(2.0, rel=0.1)
-        assert rows["nis_dof"] == 2.0
-    assert not [r for r in rows_of([make_track("zero", STAMPS)]) if r.metric.startswith("nis")]
-
-
 def test_disagreement_is_pairwise_above_the_blend_and_wraps():
     fast = np.where(T < 30, 10.0, 1.0)
 

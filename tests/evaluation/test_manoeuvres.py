@@ -208,8 +208,3 @@ def share_on_roads(seeds, duration_s):
 
 def test_ten_minutes_of_roads_have_few_manoeuvres():
     assert share_on_roads(range(100, 102), 300.0) <= 0.02
-
-
-@pytest.mark.slow
-def test_an_hour_of_roads_has_few_manoeuvres():
-    assert share_on_roads(range(20, 30), 400.0) <= 0.02

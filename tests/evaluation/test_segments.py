@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -145,36 +143,3 @@ def test_intervals_give_the_masks_back():
     for name in masks:
         np.testing.assert_array_equal(rebuilt[name], masks[name])
     assert [i.start_ns for i in found] == sorted(i.start_ns for i in found)
-
-
-def test_nothing_known_is_only_the_whole():
-    t, speed, ax, ay = staged()
-    s = signals(t, speed, ax, ay)
-    nan = np.full(t.size, np.nan)
-    blind = replace(s, ax_m_s2=nan, ay_m_s2=nan, yaw_rate_rad_s=nan, speed_m_s=nan)
-    masks = segment_masks(blind, None, VEHICLE)
-    assert [name for name, mask in masks.items() if mask.any()] == ["all"]
-    empty = replace(
-        s,
-        **{
-            f: getattr(s, f)[:0]
-            for f in ("stamps_ns", "ready_ns", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")
-        },
-    )
-    assert all(mask.size == 0 for mask in segment_masks(empty, None, VEHICLE).values())
-
-
-def test_a_slow_slalom_is_no_string_of_corners():
-    t = np.arange(0, 20, 0.01)
-    ay = np.where((t > 2) & (t < 18), 4.0 * np.sin(2 * np.pi * 0.25 * (t - 2)), 0.0)  # swings of 2 s
-    masks = segment_masks(signals(t, 0 * t + 20, 0 * t, ay), None, VEHICLE)
-    assert masks["slalom"][(t > 2.2) & (t < 17.8)].all()
-    assert not masks["cornering-left"].any()
-    assert not masks["cornering-right"].any()
-
-
-def test_swings_to_one_side_are_no_slalom():
-    t = np.arange(0, 20, 0.01)
-    ay = np.where((t > 2) & (t < 18), 4.0 * np.maximum(np.sin(2 * np.pi * 0.5 * (t - 2)), 0.0), 0.0)
-    masks = segment_masks(signals(t, 0 * t + 20, 0 * t, ay), None, VEHICLE)
-    assert not masks["slalom"].any()

@@ -44,12 +44,6 @@ def test_a_drive_with_truth_has_all_of_it(sample_logs_dir: Path, tmp_path: Path)
     assert report["metadata"]
 
 
-def test_without_truth_there_is_a_reason_and_no_verdict(sample_logs_dir: Path, tmp_path: Path) -> None:
-    report = run("no_truth", sample_logs_dir, tmp_path / "out")
-    assert {v["outcome"] for v in report["verdicts"]} == {"none"}
-    assert report["operating_space"]["cells"]
-
-
 def test_faults_stand_where_they_were_planted(sample_logs_dir: Path, tmp_path: Path) -> None:
     report = run("faults", sample_logs_dir, tmp_path / "out")
     start_ns = report["log"]["start_ns"]

@@ -14,7 +14,7 @@ from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map, load_mapping, mapping_to_toml
 from pdhef_logtool.results.arrow_schema import load_schema
-from pdhef_logtool.runs.config import RunConfig, load_config
+from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.inspection import inspect_log
 
@@ -48,14 +48,6 @@ def test_inspecting_shows_checks_of_the_same_names(sample_logs_dir: Path, wrong_
     assert not found.is_partial
     (check,) = (c for c in json.loads(json.dumps(found.to_dict()))["checks"] if c["verdict"] == "failed")
     assert check["subject"] == "steer_rad"
-
-
-def test_waived_names_come_from_a_file_or_from_flags(tmp_path: Path) -> None:
-    file = tmp_path / "pdhef.toml"
-    file.write_text('waived = ["steer_rad.sign"]\n')
-    assert load_config(file, {}).waived == ("steer_rad.sign",)
-    assert load_config(file, {"waived": ["a.unit", "b.sign"]}).waived == ("a.unit", "b.sign")
-    assert RunConfig().to_dict()["waived"] == []
 
 
 @pytest.mark.slow

@@ -188,14 +188,6 @@ def test_a_log_with_a_dropout_and_losses(shared_dir: Path) -> None:
     assert found.is_partial
 
 
-def test_fields_of_vendor_messages_are_candidates(shared_dir: Path, tmp_path: Path) -> None:
-    found = inspect_log(shared_dir / "data" / "drives" / "lunda_v40")
-    assert found.missing == ()
-    assert found.signals["steering_wheel_rad"].field == "steer_ang_deg"
-    write_mapping(found, tmp_path / "m.toml")
-    assert "steer_ang_deg" in (tmp_path / "m.toml").read_text()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["dlc", "sweep", "road"])
 def test_simulated_drives_need_no_mapping(sample_logs_dir: Path, name: str) -> None:

@@ -19,7 +19,7 @@ from pdhef_logtool.learning.network.extract_command import ExtractSettings, extr
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.results.arrow_schema import load_schema
-from pdhef_logtool.runs.config import RunConfig, load_config
+from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
 
@@ -150,12 +150,3 @@ def test_the_network_is_trained_with_what_a_run_tells(
     assert len(both) > 1000
     # The track shows the friction of the newest step that had arrived, a sample or two earlier.
     assert np.quantile(np.abs(both[:, 0] - both[:, 1]), 0.9) < 0.03
-
-
-def test_flags_and_files_are_understood(tmp_path: Path) -> None:
-    (tmp_path / "pdhef.toml").write_text("friction = 0.4\n")
-    assert load_config(tmp_path / "pdhef.toml", {}).friction == 0.4
-    assert load_config(tmp_path / "pdhef.toml", {"friction": "estimate"}).friction == "estimate"
-    assert load_config(None, {"friction": "0.3"}).friction == 0.3
-    with pytest.raises(UsageError, match="--friction"):
-        load_config(None, {"friction": "icy"})

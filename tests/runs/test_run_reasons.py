@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 import io
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -87,16 +85,3 @@ def test_the_terminal_says_it_in_one_line(stuck_run: tuple[RunResult, Path]) -> 
     (line,) = [one for one in out.getvalue().splitlines() if "gyro stuck" in one]
     assert line.strip().startswith("pd-hef: ")
     assert told(line) == (pytest.approx(START_S, abs=0.11), pytest.approx(END_S, abs=0.11))
-
-
-def test_what_several_estimators_say_stands_once(stuck_run: tuple[RunResult, Path]) -> None:
-    (one,) = stuck_run[0].results
-    report = copy.deepcopy(one.report)
-    assert report is not None
-    one_of_them, other = report["estimators"]
-    one_of_them["reasons"] = other["reasons"]
-    out = io.StringIO()
-    render_run(replace(stuck_run[0], results=(replace(one, document=report),)), Console(file=out, width=200))
-    lines = [line.strip() for line in out.getvalue().splitlines()]
-    assert sum("gyro stuck" in line for line in lines) == 1
-    assert any(line.startswith("phy-ukf, pd-hef: ") for line in lines)

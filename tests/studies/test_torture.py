@@ -189,11 +189,3 @@ def test_what_dies_hangs_or_grows_is_told_and_the_rest_goes_on(tmp_path: Path, m
 )
 def test_what_counts_as_wrong(ended: Ended, wrong: bool) -> None:
     assert bool(judge(ended).problem) is wrong
-
-
-@pytest.mark.slow
-def test_the_memory_of_a_command_is_its_own() -> None:
-    kept = bytearray(b"x") * (300 << 20)
-    process = outside.measured("--version")
-    assert 10 << 20 < process.peak_bytes < len(kept)
-    assert not process.late and not process.left
