@@ -29,7 +29,6 @@ from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from tests.estimators.made_inflation import make_inflation
 
-STEP_NS = 10_000_000
 SIDESLIP_FACTORS = (1.0, 1.5, 0.3, 0.8, 0.5, 0.9, 0.2, 0.6, 0.4)
 INFLATION = make_inflation(SIDESLIP_FACTORS, (0.5, 1.2, 0.7), 1.1, (1.0, 1.3, 2.0))
 ROLL = 0.009
@@ -285,15 +284,8 @@ def _with_entry(**changes: Any) -> dict[str, Any]:
     [
         ({"format": "pdhef-tuning"}, "format: should be 'pdhef-intervals'"),
         ({"version": 2}, "version: should be 1"),
-        ({"physics_sha256": "ab"}, "physics_sha256"),
-        (_with_entry(inflation={"sideslip": {}, "yaw_rate": {}, "vy_factor": 1.0}), "inflation.sideslip.floor"),
         (_with_entry(inflation=_document()["entries"][0]["inflation"] | {"vy_factor": -1.0}), "inflation.vy_factor"),
-        (
-            _with_entry(inflation=_document()["entries"][0]["inflation"] | {"vy_factor": float("nan")}),
-            "inflation.vy_factor",
-        ),
         ({"entries": {}}, "entries: should be a list"),
-        ({"roll_gradient_rad_per_m_s2": None}, "roll_gradient_rad_per_m_s2"),
         ({"estimators": {}}, "estimators: unknown"),
     ],
 )
@@ -306,15 +298,6 @@ def test_a_wrong_file_is_one_clear_error(tmp_path: Path, change: dict[str, Any],
     assert "c.json" in str(caught.value)
     assert "intervals.json" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("content", [None, "{", "[]"])
-def test_no_file_and_no_json(tmp_path: Path, content: str | None) -> None:
-    path = tmp_path / "c.json"
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(VehicleError):
-        load_intervals(path)
 
 
 def test_which_intervals_a_run_takes(tmp_path: Path) -> None:

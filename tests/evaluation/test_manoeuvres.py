@@ -28,11 +28,7 @@ EXPECTED = {
     "mu-jump": "slalom",
 }
 NOISY = SensorNoise(
-    acceleration_m_s2=0.25,
-    yaw_rate_rad_s=0.008,
-    steer_rad=0.0016,
-    steer_bias_rad=0.004,
-    yaw_rate_bias_rad_s=0.004,
+    acceleration_m_s2=0.25, yaw_rate_rad_s=0.008, steer_rad=0.0016, steer_bias_rad=0.004, yaw_rate_bias_rad_s=0.004
 )
 
 
@@ -121,12 +117,7 @@ def test_other_speeds_cars_friction_and_noise(friction, speed, vehicle, noise):
     for number, (name, expected) in enumerate(EXPECTED.items()):
         usual = {"dlc": 90.0, "dlc-3888-2": 52.0, "slalom": 55.0}.get(name, 80.0)
         s = simulated(
-            name,
-            friction=friction,
-            speed_km_h=round(usual * speed),
-            vehicle_name=vehicle,
-            noise=noise,
-            seed=number,
+            name, friction=friction, speed_km_h=round(usual * speed), vehicle_name=vehicle, noise=noise, seed=number
         )
         missed += [(name, names(s))] if names(s) != [expected] else []
     assert not missed

@@ -295,14 +295,7 @@ def test_seconds_with_holes_do_not_count():
     valid[250] = False
     x = truth.x_m.copy()
     x[500] = np.nan  # end of the fifth second and start of the sixth
-    holed = make_track(
-        "truth",
-        truth.stamps_ns,
-        vx_m_s=truth.vx_m_s,
-        x_m=x,
-        y_m=truth.y_m,
-        yaw_rad=truth.yaw_rad,
-    )
+    holed = make_track("truth", truth.stamps_ns, vx_m_s=truth.vx_m_s, x_m=x, y_m=truth.y_m, yaw_rad=truth.yaw_rad)
     estimate = make_track(
         "e", truth.stamps_ns, vx_m_s=truth.vx_m_s, vy_m_s=truth.vy_m_s, yaw_rate_rad_s=truth.yaw_rate_rad_s, valid=valid
     )
@@ -344,11 +337,7 @@ def test_position_figures_do_not_depend_on_place_heading_or_time(turn, dx, dy, s
         )
 
     np.testing.assert_allclose(position_error(wrong(moved), moved), position_error(wrong(truth), truth), atol=1e-7)
-    np.testing.assert_allclose(
-        lateral_errors(wrong(moved), moved),
-        lateral_errors(wrong(truth), truth),
-        atol=1e-7,
-    )
+    np.testing.assert_allclose(lateral_errors(wrong(moved), moved), lateral_errors(wrong(truth), truth), atol=1e-7)
 
 
 # ---- bootstrap ----

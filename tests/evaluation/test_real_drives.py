@@ -9,12 +9,7 @@ import pytest
 
 from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.drive.alignment import align, plan_alignment
-from pdhef_logtool.drive.truth import (
-    Attitude,
-    derive_truth,
-    plan_truth,
-    truth_at,
-)
+from pdhef_logtool.drive.truth import Attitude, derive_truth, plan_truth, truth_at
 from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import fit_clocks, load_mapping, read_signals

@@ -98,11 +98,7 @@ def test_the_truth_is_preferred_and_its_gaps_are_in_no_segment():
     s = signals(t, speed, ax, 0 * ay)
     hole = (t > 27) & (t < 27.3)
     truth = make_track(
-        "truth",
-        s.stamps_ns,
-        vx_m_s=speed,
-        yaw_rate_rad_s=s.yaw_rate_rad_s,
-        ay_m_s2=np.where(hole, np.nan, ay),
+        "truth", s.stamps_ns, vx_m_s=speed, yaw_rate_rad_s=s.yaw_rate_rad_s, ay_m_s2=np.where(hole, np.nan, ay)
     )
     masks = segment_masks(s, truth, VEHICLE)
     assert not masks["straight"][(t > 26) & (t < 29)].any()

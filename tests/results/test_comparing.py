@@ -136,11 +136,7 @@ def test_each_figure_of_a_gate_has_its_limit(tmp_path: Path) -> None:
     others = [row(label, 0.5, signal="vy_m_s", unit="m/s") for label in TEN]
     worse = [row(label, 0.6, signal="vy_m_s", unit="m/s") for label in TEN]
     a, b = write_run(tmp_path / "a", TEN, rows=others), write_run(tmp_path / "b", _scaled(1.2), rows=worse)
-    figures = (
-        Figure(limit=0.25),
-        Figure("vy_m_s", limit=0.1),
-        Figure(metric="max_abs", limit=0.0),
-    )
+    figures = (Figure(limit=0.25), Figure("vy_m_s", limit=0.1), Figure(metric="max_abs", limit=0.0))
     found = _compare(a, b, Gate(figures))
     assert [f.verdict for f in found.figures] == ["not worse", "worse", "no figure"]
     assert found.failures == ("vy_m_s rmse (all): worse", "sideslip_rad max_abs (all): no figure")

@@ -18,12 +18,7 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results import mcap_sink
-from pdhef_logtool.results.mcap_sink import (
-    AnnotatedMcap,
-    metrics_record,
-    thinned_step_ns,
-    topic_of,
-)
+from pdhef_logtool.results.mcap_sink import AnnotatedMcap, metrics_record, thinned_step_ns, topic_of
 from pdhef_logtool.results.sink import Event
 
 STATE = "pdhef_msgs/msg/VehicleStateEstimate"

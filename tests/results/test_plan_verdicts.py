@@ -18,12 +18,7 @@ from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
 from pdhef_logtool.evaluation.requirement_verdicts import RequirementVerdict
 from pdhef_logtool.evaluation.validation_plan import ExposureNeed, Requirement, ValidationPlan
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.results.plan_verdicts import (
-    JudgedDrive,
-    figures_of_file,
-    figures_of_rows,
-    plan_verdicts,
-)
+from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_file, figures_of_rows, plan_verdicts
 from pdhef_logtool.runs.judging import read_validation_plan
 from pdhef_logtool.storage.documents import jsonable
 

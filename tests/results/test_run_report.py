@@ -12,12 +12,7 @@ from pdhef_logtool.evaluation.reasons import Interval, ReasonFacts
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.results.arrow_schema import load_schema
-from pdhef_logtool.results.run_report import (
-    LogOutcome,
-    build_run,
-    report_markdown,
-    write_json,
-)
+from pdhef_logtool.results.run_report import LogOutcome, build_run, report_markdown, write_json
 from pdhef_logtool.results.sink import Event
 from pdhef_logtool.storage.documents import jsonable
 from tests.run_report import SHA, VELOCITY, ran, report, truth

@@ -142,7 +142,7 @@ def test_slice_scores_the_slice_alone(sample_logs_dir: Path, tmp_path: Path) -> 
 
 def test_log_without_truth_still_runs(sample_logs_dir: Path, tmp_path: Path) -> None:
     (tmp_path / "m.toml").write_text(NO_TRUTH_MAPPING)
-    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("all",))
+    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("kinematic", "phy-ukf"))
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     assert result.exit_code == 0
     report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())
@@ -173,7 +173,7 @@ def test_estimates_do_not_depend_on_whether_truth_is_mapped(
 def test_missing_signal_skips_the_estimators_that_need_it(sample_logs_dir: Path, tmp_path: Path) -> None:
     no_steering = NO_TRUTH_MAPPING[NO_TRUTH_MAPPING.index("[signals.ax_m_s2]") :]
     (tmp_path / "m.toml").write_text(no_steering)
-    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("all",))
+    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("zero", "phy-ukf"))
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     assert result.exit_code == 0
     assert result.results[0].report is not None
@@ -228,7 +228,8 @@ def test_an_error_half_way_keeps_the_outputs_of_the_run_before(
     from pdhef_logtool.evaluation import metrics
 
     log = str(sample_logs_dir / "dlc.mcap")
-    run_logs([log], tmp_path, _config(sample_logs_dir))
+    config = _config(sample_logs_dir, estimators=("zero",))
+    run_logs([log], tmp_path, config)
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
 
     def broken(*_: object, **__: object) -> None:
@@ -236,7 +237,7 @@ def test_an_error_half_way_keeps_the_outputs_of_the_run_before(
 
     monkeypatch.setattr(metrics, "evaluate_drive", broken)
     with pytest.raises(RuntimeError, match="on purpose"):
-        run_logs([log], tmp_path, _config(sample_logs_dir))
+        run_logs([log], tmp_path, config)
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
 
 

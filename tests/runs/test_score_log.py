@@ -219,9 +219,7 @@ def test_an_estimate_that_is_the_truth_is_marked(annotated: Path, config: RunCon
 
 
 def _write_log(
-    path: Path,
-    topics: dict[str, dict[str, np.ndarray[Any, Any]]],
-    stamps_ns: dict[str, np.ndarray[Any, Any]],
+    path: Path, topics: dict[str, dict[str, np.ndarray[Any, Any]]], stamps_ns: dict[str, np.ndarray[Any, Any]]
 ) -> None:
     writer = McapLogWriter(path, profile="ros2")
     for name in topics:

@@ -11,14 +11,7 @@ from pdhef_logtool.car.parts import Inflation
 from pdhef_logtool.estimators.error_features import grip_share
 from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS, YAW_RATE_TERMS, combined, grip_factor
 from pdhef_logtool.records.signals import FloatArray
-from studies.defaults.interval_fit import (
-    FOLDS,
-    Samples,
-    covering_factor,
-    fit_coefficients,
-    fit_inflation,
-    folds,
-)
+from studies.defaults.interval_fit import FOLDS, Samples, covering_factor, fit_coefficients, fit_inflation, folds
 
 pytestmark = pytest.mark.slow
 

@@ -16,14 +16,7 @@ from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD
 from pdhef_logtool.records.tracks import make_track
 from studies.defaults import physics_fit
 from studies.defaults.axle_forces import FitDrive, axle_samples, part_of
-from studies.defaults.physics_fit import (
-    STARTS,
-    build_car,
-    choose_parts,
-    drive_errors,
-    fit_physics,
-    make_priors,
-)
+from studies.defaults.physics_fit import STARTS, build_car, choose_parts, drive_errors, fit_physics, make_priors
 
 STATIC = PhysicsParts()
 #: Slope of the true tyres at no slip, N/rad at friction 0.85.

@@ -134,10 +134,7 @@ def against_another_simulator(shared_dir, run: str, friction: float, car: Vehicl
         ("roll", motion.column("roll_rad")),
     ):
         theirs = np.interp(motion.times_s, t, other[column].to_numpy())
-        found[column] = (
-            float(np.abs(mine).max() / np.abs(theirs).max()),
-            float(np.corrcoef(mine, theirs)[0, 1]),
-        )
+        found[column] = (float(np.abs(mine).max() / np.abs(theirs).max()), float(np.corrcoef(mine, theirs)[0, 1]))
     return found
 
 
