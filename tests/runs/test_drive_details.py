@@ -6,12 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import pytest
 
-from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from tests.run_report import follows
 
 pytestmark = pytest.mark.slow
 
@@ -20,7 +19,7 @@ def run(log: str, sample_logs_dir: Path, out: Path, **changes: Any) -> dict[str,
     config = RunConfig(car=Path("saloon"), annotate="none", **changes)
     run_logs([str(sample_logs_dir / f"{log}.mcap")], out, config)
     report = json.loads((out / "logs" / log / "report.json").read_text())
-    jsonschema.validate(report, load_schema("report.schema.json"))
+    follows(report)
     return report
 
 

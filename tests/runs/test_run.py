@@ -16,9 +16,9 @@ from pdhef_logtool.estimators.presets import OPEN_LOOP
 from pdhef_logtool.estimators.table import SPECS, all_names
 from pdhef_logtool.records.errors import EstimatorError, LogError, MappingError, UsageError, VehicleError
 from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from tests.run_report import follows
 
 pytestmark = pytest.mark.slow
 
@@ -93,12 +93,11 @@ def test_the_largest_error_of_the_page_is_that_of_the_figures(dlc_run: Path) -> 
 
 
 def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) -> None:
-    import jsonschema
 
     report = json.loads((dlc_run / "logs/dlc/report.json").read_text())
     run = json.loads((dlc_run / "run.json").read_text())
-    jsonschema.validate(report, load_schema("report.schema.json"))
-    jsonschema.validate(run, load_schema("run.schema.json"))
+    follows(report)
+    follows(run, "run.schema.json")
     assert run["logs"][0]["outcome"] == "ok"
     names = [e["name"] for e in report["estimators"]]
     plain = [s.name for s in SPECS if s.group == "all" and not s.network and not s.needs_noise and s.name != OPEN_LOOP]

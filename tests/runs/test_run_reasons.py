@@ -7,7 +7,6 @@ import json
 import re
 from pathlib import Path
 
-import jsonschema
 import numpy as np
 import pytest
 import torch
@@ -18,12 +17,12 @@ from pdhef_logtool.records.reasons import STUCK_YAW_RATE
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
-from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.results.parquet_sink import read_track
 from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
+from tests.run_report import follows
 from truthsim.drive import simulate_drive, write_drive
 from truthsim.faults import parse_fault
 
@@ -61,7 +60,7 @@ def told(text: str) -> tuple[float, float]:
 def test_the_report_says_when_the_gyro_stuck(stuck_run: tuple[RunResult, Path]) -> None:
     _, folder = stuck_run
     report = json.loads((folder / "report.json").read_text())
-    jsonschema.validate(report, load_schema("report.schema.json"))
+    follows(report)
     filters = {e["name"]: e["reasons"] for e in report["estimators"]}
     assert filters["phy-ukf"] is None
     (stuck,) = [r for r in filters["pd-hef"] if r["name"] == "stuck_yaw_rate"]

@@ -128,18 +128,6 @@ def test_severe_lane_change_stays_between_the_cones(speed_km_h: float) -> None:
         simulate_drive("dlc-3888-2", speed_km_h=90.0)
 
 
-def test_braking_in_a_turn_begins_in_a_steady_bend() -> None:
-    drive = simulate_drive("brake-in-turn")
-    a_x, a_y, t = drive.truth["ax_m_s2"], drive.truth["ay_m_s2"], drive.times_s
-    before, after = (t > 4.0) & (t < 5.0), (t > 5.4) & (t < 6.5)
-    assert a_y[before].mean() == pytest.approx(0.5 * 0.85 * G, rel=0.01)
-    assert abs(a_x[before].mean()) < 0.3 and -4.0 < a_x[after].mean() < -2.5
-    steer = drive.truth["steer_rad"]
-    assert np.ptp(steer[(t > 2.1)]) < 1e-9
-    fx = sum(drive.truth[f"fx_{w}_n"] for w in ("fl", "fr", "rl", "rr"))
-    assert fx[after].max() < -3000.0
-
-
 def test_the_friction_jumps_down_and_up_again() -> None:
     drive = simulate_drive("mu-jump")
     third = 80.0 / 3.6 * 12.0 / 3.0
@@ -164,16 +152,6 @@ def test_a_banked_road_leans_both_ways_and_climbs() -> None:
     assert (bank * np.sign(a_y))[hard].min() < -0.09 and (bank * np.sign(a_y))[hard].max() > 0.05
     assert np.ptp(drive.truth["z_m"]) > 5.0
     assert np.abs(drive.truth["vx_m_s"] * 3.6 - 80.0).max() < 5.0
-
-
-def test_stop_and_go_stands_drives_and_stands() -> None:
-    drive = simulate_drive("stop-and-go", seed=2)
-    speed = np.hypot(drive.truth["vx_m_s"], drive.truth["vy_m_s"])
-    standing = speed < 0.05
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], standing.astype(int), [0]])))
-    stands = [(b - a) * 0.01 for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > 100]
-    assert standing[0] and stands[0] >= 2.9 and len(stands) >= 3
-    assert 20.0 < speed.max() * 3.6 < 52.0
 
 
 @pytest.mark.slow
