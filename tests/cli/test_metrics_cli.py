@@ -123,8 +123,6 @@ def test_failed_gate_wins_over_lost_input_and_both_are_said(sample_logs_dir: Pat
     ("arguments", "code", "said"),
     [
         (("--estimate", "/pdhef/phy_ukf/stat"), 1, "did you mean /pdhef/phy_ukf/state?"),
-        (("--estimate", "vx_m_s=/pdhef/phy_ukf/state.vx"), 1, "did you mean vx_m_s?"),
-        (("--estimate", "/imu/data.angular_velocity.z"), 2, "SIGNAL="),
         ((), 2, "--estimate"),
         ((*ESTIMATE, "--junit", "gate.xml"), 2, "--plan"),
         ((*ESTIMATE, "--plan", "none.toml"), 2, "none.toml"),

@@ -36,44 +36,17 @@ from pdhef_logtool.storage.outputs import OutputFolder
 from tests.command_line import called
 from tests.run_report import follows
 
-MAPPING = """
-[signals.steer_rad]
-topic = "/steer"
-field = "angle"
-stamp = "stamp"
-[signals.ax_m_s2]
-topic = "/imu"
-field = "ax"
-stamp = "stamp"
-[signals.ay_m_s2]
-topic = "/imu"
-field = "ay"
-stamp = "stamp"
-[signals.yaw_rate_rad_s]
-topic = "/imu"
-field = "r"
-stamp = "stamp"
-[signals.speed_m_s]
-topic = "/speed"
-field = "v"
-stamp = "stamp"
-[truth.vx_m_s]
-topic = "/ins"
-field = "vx"
-stamp = "stamp"
-[truth.vy_m_s]
-topic = "/ins"
-field = "vy"
-stamp = "stamp"
-[truth.yaw_rate_rad_s]
-topic = "/ins"
-field = "r"
-stamp = "stamp"
-[truth_quality]
-topic = "/ins"
-field = "fix"
-values = [4]
-"""
+MAPPING = "".join(
+    f'[{place}]\ntopic = "/{topic}"\nfield = "{field}"\nstamp = "stamp"\n'
+    for topic, fields in {
+        "steer": {"signals.steer_rad": "angle"},
+        "imu": {"signals.ax_m_s2": "ax", "signals.ay_m_s2": "ay", "signals.yaw_rate_rad_s": "r"},
+        "speed": {"signals.speed_m_s": "v"},
+        "ins": {"truth.vx_m_s": "vx", "truth.vy_m_s": "vy", "truth.yaw_rate_rad_s": "r"},
+    }.items()
+    for place, field in fields.items()
+)
+MAPPING += '[truth_quality]\ntopic = "/ins"\nfield = "fix"\nvalues = [4]\n'
 
 
 def _topic(stamps: np.ndarray, **columns: np.ndarray) -> FakeTopic:

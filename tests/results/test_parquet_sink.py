@@ -185,19 +185,6 @@ def test_what_is_not_there_is_said(tmp_path, path):
         read_track(tmp_path / "other.parquet", "zero")
 
 
-def test_a_full_disk_leaves_the_old_file(tmp_path, circle, monkeypatch, path):
-    before = path.read_bytes()
-
-    def full_disk(self, table, row_group_size=None):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(pq.ParquetWriter, "write_table", full_disk)
-    with pytest.raises(OutputError, match="No space left"):
-        write_estimates(path, [circle("zero")])
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["estimates.parquet"]
-
-
 def test_empty_log_gives_an_empty_table(tmp_path):
     path = tmp_path / "estimates.parquet"
     write_estimates(path, [])

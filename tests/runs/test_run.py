@@ -25,26 +25,17 @@ pytestmark = pytest.mark.slow
 TABLES = {"estimates.parquet", "metrics.parquet", "recording.rrd", "report.html", "report.json", "setup.toml"}
 OUTPUTS = TABLES | {"annotated.mcap", "foxglove.json", "plotjuggler.xml"}
 
-NO_TRUTH_MAPPING = """
-[signals.steer_rad]
-topic = "/vehicle/status/steering_status"
-field = "steering_tire_angle"
-[signals.ax_m_s2]
-topic = "/imu/data"
-field = "linear_acceleration.x"
-[signals.ay_m_s2]
-topic = "/imu/data"
-field = "linear_acceleration.y"
-[signals.yaw_rate_rad_s]
-topic = "/imu/data"
-field = "angular_velocity.z"
-[signals.wheel_speed_rl_m_s]
-topic = "/vehicle/wheel_speeds"
-field = "rl_m_s"
-[signals.wheel_speed_rr_m_s]
-topic = "/vehicle/wheel_speeds"
-field = "rr_m_s"
-"""
+NO_TRUTH_MAPPING = "".join(
+    f'[signals.{signal}]\ntopic = "{topic}"\nfield = "{field}"\n'
+    for signal, topic, field in (
+        ("steer_rad", "/vehicle/status/steering_status", "steering_tire_angle"),
+        ("ax_m_s2", "/imu/data", "linear_acceleration.x"),
+        ("ay_m_s2", "/imu/data", "linear_acceleration.y"),
+        ("yaw_rate_rad_s", "/imu/data", "angular_velocity.z"),
+        ("wheel_speed_rl_m_s", "/vehicle/wheel_speeds", "rl_m_s"),
+        ("wheel_speed_rr_m_s", "/vehicle/wheel_speeds", "rr_m_s"),
+    )
+)
 
 
 def _config(sample_logs_dir: Path, **changes: Any) -> RunConfig:

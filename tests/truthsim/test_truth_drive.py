@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from pdhef_logtool.records.errors import SimulationError, UsageError
+from pdhef_logtool.records.errors import SimulationError
 from truthsim.drive import Drive, judge, reference_steer_rad, simulate_drive
 from truthsim.faults import parse_fault
 from truthsim.manoeuvres import (
@@ -247,11 +247,6 @@ def test_bad_requests_are_one_clear_line(name: str, options: dict[str, float], w
         simulate_drive(name, **options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     assert all(word in str(caught.value) for word in words)
-
-
-def test_an_unknown_manoeuvre_is_a_usage_error() -> None:
-    with pytest.raises(UsageError, match=r"dlc.*loop-the-loop.*--list"):
-        simulate_drive("loop-the-loop")
 
 
 @pytest.mark.slow
