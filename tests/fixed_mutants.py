@@ -45,15 +45,11 @@ LIBRARIES = (
     "rosbags.typesys", "google.protobuf.descriptor_pb2", "cantools", "fsspec", "safetensors.numpy", "torch", "rerun",
     "matplotlib.figure", "matplotlib.backends.backend_agg", "hypothesis.extra.numpy", "jsonschema",
 )  # fmt: skip
-#: By package, other folders with tests of it.
-SEAMS = {
-    **dict.fromkeys(("estimators", "evaluation", "results"), ("tests/runs",)),
-    "mapping": ("tests/drive", "tests/runs"),
-    "learning": ("tests/studies",),
-}
+#: Other folders with tests of a package, if not ``tests/runs``.
+SEAMS = {"mapping": ("tests/drive", "tests/runs"), "learning": ("tests/studies",)}
 MANY = 20
 #: Limits of CPU time, of one test (a mutant then counts as noticed) and of folders; waiting is five times as long.
-MOST_CPU_S, MOST_CPU_OF_FOLDERS_S = 60, 900
+MOST_CPU_S, MOST_CPU_OF_FOLDERS_S = 60, 1800
 DIED, SURVIVED, GONE = "died", "SURVIVED", "GONE"
 
 
@@ -250,7 +246,7 @@ def main() -> int:
     chosen = [m for m in known if options.only in m.package]
     if options.draw:
         drawn = candidates(options.draw, options.seed, options.only)
-        chosen = [fixed(m, [f"tests/{m.package}", *SEAMS.get(m.package, ())]) for m in drawn]
+        chosen = [fixed(m, [f"tests/{m.package}", *SEAMS.get(m.package, ("tests/runs",))]) for m in drawn]
     if max(options.add, len(chosen)) > MANY:
         for name in LIBRARIES:
             import_module(name)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reference_car import signals_at
 
 from pdhef_logtool.car.car import INTERVALS_FILE, UNSURE_FILE, Car, load_intervals
 from pdhef_logtool.car.parts import Algorithm, Inflation, IntervalEntry, Intervals
@@ -25,7 +26,7 @@ from pdhef_logtool.estimators.intervals import (
 )
 from pdhef_logtool.records.errors import PdhefError, VehicleError
 from pdhef_logtool.records.reasons import STUCK_AY, STUCK_YAW_RATE
-from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
+from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from tests.estimators.made_inflation import make_inflation
 
@@ -64,18 +65,9 @@ def _drive(count: int = 900, seed: int = 0) -> tuple[Signals, StateTrack]:
     vy, rate, vx = 0.3 * np.sin(3.0 * t), 0.25 * np.sin(3.0 * t + 0.4), np.full(count, 22.0)
     ay = np.gradient(vy, t) + vx * rate + rng.normal(0.0, 0.12, count)
     ay[rng.random(count) < 0.05] = np.nan
-    signals = Signals(
-        stamps_ns=stamps,
-        ready_ns=np.maximum.accumulate(stamps + rng.integers(1_000_000, 35_000_000, count)),
-        steer_rad=np.zeros(count),
-        ax_m_s2=np.zeros(count),
-        ay_m_s2=ay,
-        yaw_rate_rad_s=rate + rng.normal(0.0, 0.004, count),
-        speed_m_s=vx,
-        friction=np.full(count, 0.8),
-        wheel_speed_m_s=np.full((count, 4), np.nan),
-        available=frozenset(ALIGNED_SIGNALS),
-    )
+    ready = np.maximum.accumulate(stamps + rng.integers(1_000_000, 35_000_000, count))
+    columns = {"ay_m_s2": ay, "yaw_rate_rad_s": rate + rng.normal(0.0, 0.004, count), "speed_m_s": vx}
+    signals = signals_at(stamps, ready, steer_rad=0.0, ax_m_s2=0.0, friction=0.8, **columns)
     covariance = np.tile(np.diag([0.01, 0.02, 1e-5]), (count, 1, 1))
     covariance[:, 0, 1] = covariance[:, 1, 0] = 0.004
     covariance[:, 1, 2] = covariance[:, 2, 1] = 1e-4

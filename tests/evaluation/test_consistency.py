@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from reference_car import signals_at
 
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow, evaluate_drive
 from pdhef_logtool.records.signals import Signals
@@ -20,17 +21,9 @@ def drive() -> Signals:
     """Speed 20 + 4 sin(0.3 t), yaw rate 0.1 sin(0.5 t), no slip: a_x = v̇, a_y = v r exactly."""
     speed = 20 + 4 * np.sin(0.3 * T)
     rate = 0.1 * np.sin(0.5 * T)
-    return Signals(
-        stamps_ns=STAMPS,
-        ready_ns=STAMPS,
-        steer_rad=np.zeros(T.size),
-        ax_m_s2=1.2 * np.cos(0.3 * T),
-        ay_m_s2=speed * rate,
-        yaw_rate_rad_s=rate,
-        speed_m_s=np.where(np.arange(T.size) % 5 == 0, speed, np.nan),
-        friction=np.full(T.size, np.nan),
-        wheel_speed_m_s=np.full((T.size, 4), np.nan),
-    )
+    measured = np.where(np.arange(T.size) % 5 == 0, speed, np.nan)
+    columns = {"ax_m_s2": 1.2 * np.cos(0.3 * T), "ay_m_s2": speed * rate, "yaw_rate_rad_s": rate}
+    return signals_at(STAMPS, steer_rad=0.0, speed_m_s=measured, **columns)
 
 
 def rows_of(tracks, signals=None, names=None, masks=None) -> list[MetricRow]:

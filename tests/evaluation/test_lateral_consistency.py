@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from reference_car import signals_at
 
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow, evaluate_drive
 from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency, driving_products
@@ -25,17 +26,8 @@ def signals(sensors: SensorErrors) -> Signals:
     """Return the readings of such sensors for the motion above."""
     felt = VY_RATE + SPEED * RATE
     ay = sensors.ay_gain * felt + sensors.lever_m * YAW_ACCELERATION + sensors.ay_bias_m_s2
-    return Signals(
-        stamps_ns=STAMPS,
-        ready_ns=STAMPS,
-        steer_rad=np.zeros(T.size),
-        ax_m_s2=np.zeros(T.size),
-        ay_m_s2=ay,
-        yaw_rate_rad_s=RATE + sensors.yaw_rate_bias_rad_s,
-        speed_m_s=np.where(np.arange(T.size) % 5 == 0, SPEED, np.nan),
-        friction=np.full(T.size, np.nan),
-        wheel_speed_m_s=np.full((T.size, 4), np.nan),
-    )
+    speed, rate = np.where(np.arange(T.size) % 5 == 0, SPEED, np.nan), RATE + sensors.yaw_rate_bias_rad_s
+    return signals_at(STAMPS, steer_rad=0.0, ax_m_s2=0.0, ay_m_s2=ay, yaw_rate_rad_s=rate, speed_m_s=speed)
 
 
 def track(vy: np.ndarray) -> StateTrack:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference_car import signals_at
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES, RULES, find_manoeuvres, manoeuvre_masks
 from pdhef_logtool.evaluation.segments import SEGMENTS, segment_masks
-from pdhef_logtool.records.signals import Signals
 from truthsim.drive import simulate_drive
 from truthsim.sensors import SensorNoise
 from truthsim.vehicle_choice import choose_vehicle
@@ -34,18 +34,8 @@ NOISY = SensorNoise(
 
 def signals(t, steer, speed, yaw_rate, ax, ay, start_ns=T0):
     stamps = start_ns + np.round(np.asarray(t) * 1e9).astype(np.int64)
-    nan = np.full(len(stamps), np.nan)
-    return Signals(
-        stamps_ns=stamps,
-        ready_ns=stamps,
-        steer_rad=np.asarray(steer, dtype=float),
-        ax_m_s2=np.asarray(ax, dtype=float),
-        ay_m_s2=np.asarray(ay, dtype=float),
-        yaw_rate_rad_s=np.asarray(yaw_rate, dtype=float),
-        speed_m_s=np.asarray(speed, dtype=float),
-        friction=nan,
-        wheel_speed_m_s=np.full((len(stamps), 4), np.nan),
-    )
+    columns = {"ax_m_s2": ax, "ay_m_s2": ay, "yaw_rate_rad_s": yaw_rate, "speed_m_s": speed}
+    return signals_at(stamps, steer_rad=steer, **columns)
 
 
 def as_signals(drive):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from reference_car import signals_at
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.evaluation.segments import find_intervals, segment_masks
 from pdhef_logtool.evaluation.smoothing import smooth
-from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 
 T0 = 1_700_000_000_000_000_000
@@ -30,16 +30,14 @@ def signals(t, speed, ax, ay, noise=0.0, friction=np.nan):
     n = t.size
     measured = np.where(np.arange(n) % 5 == 0, speed, np.nan)  # a measurement every 50 ms
     rate = np.where(speed > 1, ay / np.maximum(speed, 1), 0.0)
-    return Signals(
-        stamps_ns=T0 + np.round(t * 1e9).astype(np.int64),
-        ready_ns=T0 + np.round(t * 1e9).astype(np.int64),
+    return signals_at(
+        T0 + np.round(t * 1e9).astype(np.int64),
         steer_rad=ay * (2.87 / np.maximum(speed, 1.0) ** 2 + 0.003),
         ax_m_s2=ax + rng.normal(0, noise, n),
         ay_m_s2=ay + rng.normal(0, noise, n),
         yaw_rate_rad_s=rate,
         speed_m_s=measured,
-        friction=np.full(n, friction),
-        wheel_speed_m_s=np.full((n, 4), np.nan),
+        friction=friction,
     )
 
 
