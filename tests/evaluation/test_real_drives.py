@@ -16,9 +16,6 @@ from pdhef_logtool.mapping import fit_clocks, load_mapping, read_signals
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 DRIVES = {
-    "revs_250lm_a.mcap": ("revs_250lm", "revs_250lm"),
-    "f1tenth_hoons_run2.bag": ("f1tenth", "f1tenth"),
-    "f1tenth_xray_run24.bag": ("f1tenth", "f1tenth"),
     "comma2k19_segment.mcap": ("comma2k19", "comma2k19_rav4"),
     "lunda_v40": ("lunda_v40", "lunda_v40"),
     "v40_slalom.mcap": ("../../../studies/peers/v40_gnss", "lunda_v40"),
