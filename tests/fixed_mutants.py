@@ -1,11 +1,11 @@
 """Fixed mutants: a list of faults that the tests notice; all must still be noticed after a change.
 
-    python tests/fixed_mutants.py [--jobs 2] [--only estimators] [--file LIST.json] [--add 20 --seed 1]
+    python tests/fixed_mutants.py [--jobs 2] [--only estimators] [--file LIST.json] [--draw 30 | --add 20] [--seed 1]
 
 An entry of ``fixed_mutants.json`` has the file, its lines that contain the fault (``old``, once in the file), the same
 lines with the fault (``new``) and the tests that fail. If these tests are gone, the quick tests of the package replace
-them. An entry is reported if its lines no longer exist; ``--add`` removes it and draws new mutants like
-``tests/mutants.py``.
+them. An entry is reported if its lines no longer exist; ``--add`` removes it, draws new mutants (``mutants.py``) and
+keeps those that a quick test notices. ``--draw`` runs the tests of their packages on new mutants and lists survivors.
 
 Each mutant runs in a fork of this process, which has imported libraries only. The fault is inserted at import: no file
 changes, and numba's cache remains valid. A fault in a compiled function (``compiled``) runs without the compiler, as
@@ -45,9 +45,11 @@ LIBRARIES = (
     "rosbags.typesys", "google.protobuf.descriptor_pb2", "cantools", "fsspec", "safetensors.numpy", "torch", "rerun",
     "matplotlib.figure", "matplotlib.backends.backend_agg", "hypothesis.extra.numpy", "jsonschema",
 )  # fmt: skip
+#: Other folders with tests of a package, if not ``tests/runs``.
+SEAMS = {"mapping": ("tests/drive", "tests/runs"), "learning": ("tests/studies",)}
 MANY = 20
-#: Limits of a mutant that never ends, which counts as noticed: CPU time and waiting time.
-MOST_CPU_S, MOST_WALL_S = 60, 300
+#: Limits of CPU time, of one test (a mutant then counts as noticed) and of folders; waiting is five times as long.
+MOST_CPU_S, MOST_CPU_OF_FOLDERS_S = 60, 1800
 DIED, SURVIVED, GONE = "died", "SURVIVED", "GONE"
 
 
@@ -121,8 +123,9 @@ def _in_child(mutant: FixedMutant | None, tests: Sequence[str], to: Path) -> int
         os.dup2(nothing, number)
     os.chdir(ROOT)
     if mutant is not None:
-        resource.setrlimit(resource.RLIMIT_CPU, (MOST_CPU_S, MOST_CPU_S))
-        signal.alarm(MOST_WALL_S)
+        most = MOST_CPU_S if "::" in tests[0] else MOST_CPU_OF_FOLDERS_S
+        resource.setrlimit(resource.RLIMIT_CPU, (most, most))
+        signal.alarm(5 * most)
         if mutant.compiled:
             os.environ["NUMBA_DISABLE_JIT"] = "1"
             import_module("numba").core.config.reload_config()
@@ -177,8 +180,10 @@ def write_list(found: Iterable[FixedMutant], file: Path = LIST) -> None:
 
 
 def is_there(test: str) -> bool:
-    """Tell whether the function of a test is in its file."""
+    """Tell whether the function of a test is in its file, or the folder of tests exists."""
     file, _, name = test.partition("[")[0].partition("::")
+    if not name:
+        return (ROOT / file).is_dir()
     return (ROOT / file).is_file() and f"def {name.rpartition('::')[2]}(" in (ROOT / file).read_text()
 
 
@@ -189,9 +194,11 @@ def judge(mutants_: Sequence[FixedMutant], jobs: int) -> Iterator[tuple[FixedMut
         if mutant.source() is None:
             yield mutant, GONE
         else:
-            work.append((mutant, mutant, [t for t in mutant.tests if is_there(t)] or quick_tests(mutant.package)))
+            tests = [t for t in mutant.tests if is_there(t)]
+            work.append((mutant, mutant, tests or quick_tests(mutant.package)))
     for mutant, code, _ in run_forked(work, jobs):
-        yield mutant, SURVIVED if code in (0, 3, 4, 5) else DIED
+        unclear = code < 0 and "::" not in mutant.tests[0]  # the folders' time was up
+        yield mutant, SURVIVED if unclear or code in (0, 3, 4, 5) else DIED
 
 
 def quick_tests(package: str) -> list[str]:
@@ -216,11 +223,11 @@ def stored_test(node: str) -> str:
     return node if re.fullmatch(r"[\w.\- ]*\]", parameters, re.ASCII) else name
 
 
-def candidates(count: int, seed: int) -> list[mutants.Mutant]:
-    """Draw mutants over all packages by their size, at most one a function."""
-    packages = sorted(p.parent.name for p in (ROOT / mutants.SOURCES).glob("*/__init__.py"))
+def candidates(count: int, seed: int, only: str = "") -> list[mutants.Mutant]:
+    """Draw mutants over the packages, whose names contain ``only``, by their size; at most one a function."""
+    packages = sorted(p.parent.name for p in (ROOT / mutants.SOURCES).glob("*/__init__.py") if only in p.parent.name)
     sizes = {p: len(mutants.possible(p)) for p in packages if (ROOT / "tests" / p).is_dir()}
-    drawn = [m for p, n in sizes.items() for m in mutants.draw([p], -(-count * n // sum(sizes.values())), seed)]
+    drawn = [m for p, n in sizes.items() for m in mutants.draw(p, -(-count * n // sum(sizes.values())), seed)]
     random.Random(seed).shuffle(drawn)
     return drawn[:count]
 
@@ -229,19 +236,23 @@ def main() -> int:
     """Judge the list, or add to it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--jobs", type=int, default=2, help="mutants at a time")
-    parser.add_argument("--only", help="packages whose names contain this")
+    parser.add_argument("--only", default="", help="packages whose names contain this")
     parser.add_argument("--file", type=Path, default=LIST, help="the list")
     parser.add_argument("--add", type=int, default=0, help="draw so many, and add those that a quick test notices")
+    parser.add_argument("--draw", type=int, default=0, help="judge so many new ones in place of the list")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     known = read_list(options.file)
-    chosen = [m for m in known if (options.only or "") in m.package]
+    chosen = [m for m in known if options.only in m.package]
+    if options.draw:
+        drawn = candidates(options.draw, options.seed, options.only)
+        chosen = [fixed(m, [f"tests/{m.package}", *SEAMS.get(m.package, ("tests/runs",))]) for m in drawn]
     if max(options.add, len(chosen)) > MANY:
         for name in LIBRARIES:
             import_module(name)
     if options.add:
-        drawn = [(m, fixed(m)) for m in candidates(options.add, options.seed)]
-        work = ((f, f, quick_tests(m.package)) for m, f in drawn if not f.compiled)
+        drawn = candidates(options.add, options.seed, options.only)
+        work = ((f, f, quick_tests(f.package)) for f in map(fixed, drawn) if not f.compiled)
         new = list(_noticed(work, options.jobs))
         there = {(m.file, m.old): m for m in (*new, *known) if m.source() is not None}
         write_list(there.values(), options.file)

@@ -89,14 +89,18 @@ class Drive:
 def make_signals(dt: np.ndarray, delay_ns: int | np.ndarray = 0, **columns: np.ndarray) -> Signals:
     """Columns on stamps that start at START_NS and are ``dt`` apart; omitted columns are missing."""
     stamps = START_NS + np.concatenate([[0], np.cumsum(np.round(dt * 1e9).astype(np.int64))])
-    n = len(stamps)
+    return signals_at(stamps, np.maximum.accumulate(stamps + delay_ns), **columns)
+
+
+def signals_at(stamps: np.ndarray, ready: np.ndarray | None = None, **columns: float | np.ndarray) -> Signals:
+    """Columns on stamps, which arrive at once if not ``ready``; a number is each value, omitted columns are missing."""
     names = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")
     return Signals(
         stamps_ns=stamps,
-        ready_ns=np.maximum.accumulate(stamps + delay_ns),
-        wheel_speed_m_s=np.full((n, 4), np.nan),
+        ready_ns=stamps if ready is None else ready,
+        wheel_speed_m_s=np.full((len(stamps), 4), np.nan),
         available=frozenset(columns),
-        **{c: np.array(columns.get(c, np.full(n, np.nan)), dtype=float) for c in names},
+        **{c: np.full(len(stamps), columns.get(c, np.nan), dtype=float) for c in names},
     )
 
 

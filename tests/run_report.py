@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jsonschema import Draft202012Validator
+from jsonschema.exceptions import best_match
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.standing import Standing
+from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.results.run_report import build_report, estimator_entry, tool_versions
 from pdhef_logtool.results.selected_estimate import MainFacts
 
 SHA = "ab" * 32
 MODEL = {"physics_sha256": SHA, "options": {"trust": 0.5}}
 MAIN = MainFacts("pd-hef", "evidence", "", False, "zero", ("pd-hef", "physics", "zero"), named=False)
+
+
+@functools.cache
+def _validator(schema: str) -> Draft202012Validator:
+    return Draft202012Validator(load_schema(schema))  # ``tests/car/test_schemas.py`` checks the schemas
+
+
+def follows(document: Any, schema: str = "report.schema.json") -> None:
+    """Raise a ``ValidationError`` if a document does not follow a schema."""
+    if error := best_match(_validator(schema).iter_errors(document)):
+        raise error
 
 
 def truth(*quantities: tuple[str, str, str], **changes: Any) -> dict[str, Any]:

@@ -28,20 +28,12 @@ def mapping(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("parameter", ["log", "car", "mapping", "msgs"])
-def test_read_drive(dlc: Path, sample_logs_dir: Path, mapping: Path, tmp_path: Path, kind: Any, parameter: str) -> None:
-    (tmp_path / "msgs").mkdir()
-    (tmp_path / "msgs" / "Any.msg").write_text("float64 a\n")
-    given: dict[str, Any] = {"log": dlc, "car": pdhef.Car.load("saloon"), "mapping": None}
-    options = {}
-    if parameter == "msgs":
-        options = {"options": pdhef.ReadOptions(msgs=kind(tmp_path / "msgs"))}
-    else:
-        places = {"log": dlc, "car": sample_logs_dir / "vehicle.toml", "mapping": mapping}
-        given[parameter] = kind(places[parameter])
-    with pdhef.read_drive(*given.values(), **options) as drive:
+def test_read_drive(dlc: Path, sample_logs_dir: Path, mapping: Path, tmp_path: Path, kind: Any) -> None:
+    (tmp_path / "Any.msg").write_text("float64 a\n")
+    options = pdhef.ReadOptions(msgs=kind(tmp_path))
+    with pdhef.read_drive(kind(dlc), kind(sample_logs_dir / "vehicle.toml"), kind(mapping), options=options) as drive:
         assert "yaw_rate_rad_s" in drive.available
-        assert (drive.mapping.origin == "file") == (parameter == "mapping")
+        assert drive.mapping.origin == "file"
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -23,7 +23,7 @@ def test_the_list_has_different_mutants_of_most_packages_each_with_a_test() -> N
 
 @pytest.mark.slow
 def test_a_drawn_mutant_is_fixed_by_lines_that_are_once_in_its_file() -> None:
-    for drawn in mutants.draw(["results"], 20, seed=1):
+    for drawn in mutants.draw("results", 20, seed=1):
         mutant = fixed_mutants.fixed(drawn, ["tests/results"])
         text = (mutants.ROOT / mutant.file).read_text()
         assert text.count(mutant.old) == 1

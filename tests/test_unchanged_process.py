@@ -31,19 +31,8 @@ def test_interrupt():
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="looks for processes in /proc")
 def test_what_a_test_leaves_is_its_error_even_in_the_background_of_a_shell(tmp_path: Path) -> None:
     (tmp_path / "test_leaving.py").write_text(LEAVING)
-    call = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-p",
-        "tests.conftest",
-        "-p",
-        "no:randomly",
-        "-rE",
-        "--rootdir",
-        str(tmp_path),
-    ]
-    shell = ["sh", "-c", 'trap "" INT; exec "$@"', "sh", *call, str(tmp_path)]
+    call = [sys.executable, "-m", "pytest", "-p", "tests.conftest", "-p", "no:randomly", "-rE", "--rootdir"]
+    shell = ["sh", "-c", 'trap "" INT; exec "$@"', "sh", *call, str(tmp_path), str(tmp_path)]
     done = subprocess.run(shell, capture_output=True, text=True, cwd=ROOT, check=False)
     assert set(re.findall(r"^ERROR .*::test_(\w+)", done.stdout, re.MULTILINE)) == {
         "signal", "variable", "removed", "folder", "process", "interrupt",

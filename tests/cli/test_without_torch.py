@@ -74,11 +74,7 @@ def test_what_trains_no_network_works_without_it(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_what_trains_one_ends_with_one_line(tmp_path: Path) -> None:
     trained = ("train", tmp_path, "-o", tmp_path / "network")
-    ended = ended_without_torch(
-        tmp_path,
-        trained,
-        (*trained, "--baselines"),
-    )
+    ended = ended_without_torch(tmp_path, trained, (*trained, "--baselines"))
     remedy = "got an installation without it; pip install 'pdhef-logtool[train]'"
     for line in ended:
         assert line.startswith("train 2 ") and remedy in line, line

@@ -16,7 +16,6 @@ from pdhef_logtool.estimators.calibration.joint import FRONT_STIFFNESS, REAR_STI
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import make_estimator, runnable
-from pdhef_logtool.records.signals import ALIGNED_SIGNALS
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.frames import estimate, score
@@ -132,22 +131,3 @@ def test_without_a_y_the_yaw_rate_calibrates(sample_logs_dir: Path) -> None:
         both, alone = (fit[name] for fit in fits)
         assert both.sd < alone.sd
         assert abs(np.log(both.value / alone.value)) < 1.96 * np.hypot(both.sd, alone.sd)
-
-
-def test_a_recorded_drive_without_steering(shared_dir: Path) -> None:
-    from studies.peers.drives import PEER_DRIVES, mapping_of, vehicle_of
-
-    peer = next(d for d in PEER_DRIVES if d.log == "v40_slalom.mcap")
-    folder = shared_dir / "data" / "drives"
-    car, mapping = Car.of(vehicle_of(peer, folder)), mapping_of(peer, folder)
-    with read_drive(folder / peer.log, car, mapping, adjust=without(*STEERING)) as drive:  # type: ignore[arg-type]
-        names = ("zero", "physics")
-        rows = score(estimate(drive, names)).filter(signal="sideslip_rad", segment="all", metric="rmse")
-    errors = dict(zip(rows["estimator"], rows["value"], strict=True))
-    assert errors["physics"] <= 1.02 * errors["zero"]
-
-
-def test_every_lateral_signal_alone_lets_physics_run() -> None:
-    for name in ("steer_rad", "yaw_rate_rad_s", "ay_m_s2"):
-        assert len(runnable(("physics",), SALOON, frozenset({"speed_m_s", name}))[0]) == 1
-    assert frozenset({"speed_m_s", "steer_rad"}) <= frozenset(ALIGNED_SIGNALS)

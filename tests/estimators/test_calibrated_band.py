@@ -16,7 +16,7 @@ from pdhef_logtool.car.toml_files import vehicle_of_entries
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.calibrated_band import D2_SHARE
-from pdhef_logtool.estimators.drive_signals import DriveSignals, calibrated_signals
+from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.presets import OPEN_LOOP
 from pdhef_logtool.estimators.table import all_names, make_estimator
@@ -94,21 +94,6 @@ def test_the_open_loop_model_runs_once_more_only_on_a_calibrated_car() -> None:
     assert OPEN_LOOP not in all_names(Car.of(OWN))
     with pytest.raises(UsageError, match="has not calibrated"):
         make_estimator(OPEN_LOOP, Car.of(OWN))
-
-
-def test_a_drive_has_one_table_for_each_vehicle_and_both_are_read_only(signals: Signals) -> None:
-    tables = DriveSignals.of(signals, calibrated())
-    for name in ("zero", "kinematic", "open-loop", "phy-ukf", "pd-hef-paper"):
-        assert tables.of_estimator(name) is tables.file
-    for name in ("physics", "pd-hef", "pd-hef:gain=1", "pd-hef-smoothed", OPEN_LOOP):
-        assert tables.of_estimator(name) is tables.calibrated
-    expected = corrected_anew(signals, OWN, FOUND)
-    for column in ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction"):
-        np.testing.assert_array_equal(getattr(tables.file, column), getattr(signals, column))
-        np.testing.assert_array_equal(getattr(tables.calibrated, column), getattr(expected, column))
-        for table in (tables.file, tables.calibrated):
-            with pytest.raises(ValueError, match="read-only"):
-                getattr(table, column)[0] = 1.0
 
 
 def test_an_estimated_friction_is_not_taken(signals: Signals) -> None:

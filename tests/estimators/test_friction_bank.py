@@ -13,7 +13,6 @@ from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, drive, keep, slalom, t
 
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, default_vehicle
 from pdhef_logtool.drive.friction import friction_source, parse_friction
-from pdhef_logtool.estimators import friction_bank
 from pdhef_logtool.estimators.friction_bank import BOUND_SHARE, FORGETTING_S, FrictionBank, FrictionEstimate
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import SIGNAL_COLUMNS, Signals
@@ -216,41 +215,3 @@ def test_what_is_no_friction_is_refused(text):
 @pytest.mark.parametrize(("text", "want"), [("auto", "auto"), ("0.3", 0.3), (0.85, 0.85), ("estimate", "estimate")])
 def test_choices_and_numbers_are_understood(text, want):
     assert parse_friction(text) == want
-
-
-@pytest.mark.parametrize(
-    ("ay", "rate"), [(2.1, 0.11), (9.0, 0.11), (2.1, 0.6), (9.0, -0.6), (math.nan, 0.6), (9.0, math.nan)]
-)
-def test_a_step_is_the_textbook_update_with_a_larger_r_for_outliers(ay: float, rate: float) -> None:
-    p = friction_bank.model_parameters(VEHICLE)
-    v, steer, mu, dt = 20.0, 0.02, 0.7, 0.01
-    x, P = np.array([0.3, 0.1]), np.array([0.04, 0.001, 0.002])
-
-    def model(state: np.ndarray) -> np.ndarray:
-        steps = friction_bank.substeps(v, dt, mu, p)
-        return np.array(friction_bank._advance(v, state[0], state[1], steer, mu, dt, steps, p))
-
-    def measured(state: np.ndarray) -> np.ndarray:
-        return np.array([friction_bank.measured_lateral_acceleration(v, state[0], state[1], steer, mu, p), state[1]])
-
-    def slopes(function, at: np.ndarray) -> np.ndarray:
-        steps = np.diag([0.02, 0.002])
-        return np.stack([(function(at + h) - function(at)) / h.sum() for h in steps], axis=1)
-
-    F, noise = slopes(model, x), np.diag([friction_bank.Q_VY**2, friction_bank.Q_YAW_RATE**2])
-    prior = F @ np.array([[P[0], P[1]], [P[1], P[2]]]) @ F.T + noise * dt
-    state = model(x)
-    known = np.isfinite([ay, rate])
-    H, R = (
-        slopes(measured, state)[known],
-        np.diag([friction_bank.R_AY**2, friction_bank.R_YAW_RATE**2])[known][:, known],
-    )
-    nu = (np.array([ay, rate]) - measured(state))[known]
-    S = H @ prior @ H.T + R
-    square, dof, m = nu @ np.linalg.solve(S, nu), friction_bank.STUDENT_DOF, int(known.sum())
-    wider = S + (max((dof + square) / (dof + m), 1.0) - 1.0) * R
-    K = prior @ H.T @ np.linalg.inv(wider)
-    likelihood = friction_bank._step(x, P, (v, steer), (v, steer, ay, rate), mu, dt, p)
-    np.testing.assert_allclose(likelihood, -0.5 * (dof + m) * math.log(1.0 + square / dof), rtol=1e-7)
-    np.testing.assert_allclose(x, state + K @ nu, rtol=1e-7)
-    np.testing.assert_allclose(P, (prior - K @ H @ prior)[[0, 0, 1], [0, 1, 1]], rtol=1e-6, atol=1e-12)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reference_car import signals_at
 
 from pdhef_logtool.car.car import INTERVALS_FILE, UNSURE_FILE, Car, load_intervals
 from pdhef_logtool.car.parts import Algorithm, Inflation, IntervalEntry, Intervals
@@ -25,11 +26,10 @@ from pdhef_logtool.estimators.intervals import (
 )
 from pdhef_logtool.records.errors import PdhefError, VehicleError
 from pdhef_logtool.records.reasons import STUCK_AY, STUCK_YAW_RATE
-from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
+from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from tests.estimators.made_inflation import make_inflation
 
-STEP_NS = 10_000_000
 SIDESLIP_FACTORS = (1.0, 1.5, 0.3, 0.8, 0.5, 0.9, 0.2, 0.6, 0.4)
 INFLATION = make_inflation(SIDESLIP_FACTORS, (0.5, 1.2, 0.7), 1.1, (1.0, 1.3, 2.0))
 ROLL = 0.009
@@ -65,18 +65,9 @@ def _drive(count: int = 900, seed: int = 0) -> tuple[Signals, StateTrack]:
     vy, rate, vx = 0.3 * np.sin(3.0 * t), 0.25 * np.sin(3.0 * t + 0.4), np.full(count, 22.0)
     ay = np.gradient(vy, t) + vx * rate + rng.normal(0.0, 0.12, count)
     ay[rng.random(count) < 0.05] = np.nan
-    signals = Signals(
-        stamps_ns=stamps,
-        ready_ns=np.maximum.accumulate(stamps + rng.integers(1_000_000, 35_000_000, count)),
-        steer_rad=np.zeros(count),
-        ax_m_s2=np.zeros(count),
-        ay_m_s2=ay,
-        yaw_rate_rad_s=rate + rng.normal(0.0, 0.004, count),
-        speed_m_s=vx,
-        friction=np.full(count, 0.8),
-        wheel_speed_m_s=np.full((count, 4), np.nan),
-        available=frozenset(ALIGNED_SIGNALS),
-    )
+    ready = np.maximum.accumulate(stamps + rng.integers(1_000_000, 35_000_000, count))
+    columns = {"ay_m_s2": ay, "yaw_rate_rad_s": rate + rng.normal(0.0, 0.004, count), "speed_m_s": vx}
+    signals = signals_at(stamps, ready, steer_rad=0.0, ax_m_s2=0.0, friction=0.8, **columns)
     covariance = np.tile(np.diag([0.01, 0.02, 1e-5]), (count, 1, 1))
     covariance[:, 0, 1] = covariance[:, 1, 0] = 0.004
     covariance[:, 1, 2] = covariance[:, 2, 1] = 1e-4
@@ -285,15 +276,8 @@ def _with_entry(**changes: Any) -> dict[str, Any]:
     [
         ({"format": "pdhef-tuning"}, "format: should be 'pdhef-intervals'"),
         ({"version": 2}, "version: should be 1"),
-        ({"physics_sha256": "ab"}, "physics_sha256"),
-        (_with_entry(inflation={"sideslip": {}, "yaw_rate": {}, "vy_factor": 1.0}), "inflation.sideslip.floor"),
         (_with_entry(inflation=_document()["entries"][0]["inflation"] | {"vy_factor": -1.0}), "inflation.vy_factor"),
-        (
-            _with_entry(inflation=_document()["entries"][0]["inflation"] | {"vy_factor": float("nan")}),
-            "inflation.vy_factor",
-        ),
         ({"entries": {}}, "entries: should be a list"),
-        ({"roll_gradient_rad_per_m_s2": None}, "roll_gradient_rad_per_m_s2"),
         ({"estimators": {}}, "estimators: unknown"),
     ],
 )
@@ -306,15 +290,6 @@ def test_a_wrong_file_is_one_clear_error(tmp_path: Path, change: dict[str, Any],
     assert "c.json" in str(caught.value)
     assert "intervals.json" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("content", [None, "{", "[]"])
-def test_no_file_and_no_json(tmp_path: Path, content: str | None) -> None:
-    path = tmp_path / "c.json"
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(VehicleError):
-        load_intervals(path)
 
 
 def test_which_intervals_a_run_takes(tmp_path: Path) -> None:

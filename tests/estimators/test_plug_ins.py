@@ -18,7 +18,6 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators import table
 from pdhef_logtool.estimators.base import Steps, make_steps
-from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import Spec, runnable
 from pdhef_logtool.records.errors import EXIT_PARTIAL, EstimatorError
@@ -114,13 +113,6 @@ def test_what_a_plug_in_prints_goes_to_stderr_and_its_folder_is_left_again(
     finally:
         os.chdir(folder)
     assert capsys.readouterr() == ("", "hello\n")
-
-
-def test_rounding_in_single_precision_is_no_looking_ahead(signals: Signals) -> None:
-    check = CausalityCheck()
-    network = PlugIn(lambda s, _: (replace(sound(s), values=sound(s).values * (1.0 + 1e-10 * len(s))), None))
-    run_window(network, signals, causality=check)
-    assert check.failed == {}
 
 
 def _spec(name: str, misbehave: Callable[[Signals, Any], Any]) -> Spec:

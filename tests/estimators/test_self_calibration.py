@@ -96,13 +96,6 @@ def test_the_position_of_the_accelerometer_is_found(metres: float) -> None:
     assert abs(position.value - metres) < 1.96 * position.sd
 
 
-def test_a_wrong_steering_gain_is_found() -> None:
-    signals = with_noise(wide().signals, 8)
-    by = {p.name: p for p in found(replace(signals, steer_rad=1.1 * signals.steer_rad), RIGHT).parameters}
-    ratio = by["steering ratio"]
-    assert abs(math.log(ratio.value / (1.1 * RIGHT.steering_ratio))) < 1.96 * ratio.sd
-
-
 @pytest.mark.parametrize("share", [0.5, 0.3])
 def test_a_slippery_road_is_found_although_the_file_is_of_a_dry_one(share: float) -> None:
     """The file's tyres have the stiffness of the car's and more grip, as a file for asphalt has of a car on ice."""

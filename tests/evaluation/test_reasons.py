@@ -16,7 +16,7 @@ from pdhef_logtool.evaluation.reasons import (
     sensor_faults,
     summarise_reasons,
 )
-from pdhef_logtool.records.reasons import MISSING_AY, REASONS, SPIKE_AY, STUCK_AY, STUCK_YAW_RATE
+from pdhef_logtool.records.reasons import REASONS, SPIKE_AY, STUCK_AY, STUCK_YAW_RATE
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 STEP_NS = 10_000_000
@@ -74,34 +74,11 @@ def test_a_break_longer_than_half_a_second_parts_two_intervals() -> None:
         assert len(reason_intervals(track_of(stamps(len(reason)), reason))["stuck_ay"]) == intervals
 
 
-def test_a_sensor_of_half_the_rate_is_missing_at_half_of_the_stamps() -> None:
-    reason = np.where(np.arange(1001) % 2 == 1, MISSING_AY, 0)
-    (facts,) = summarise_reasons(track_of(stamps(1001), reason)) or ()
-    assert (facts.name, facts.intervals) == ("missing_ay", 1)
-    assert (facts.share, facts.share_within) == (pytest.approx(500 / 1001), pytest.approx(500 / 999))
-
-
-def test_the_three_longest_are_named_in_order_of_time() -> None:
-    reason = np.zeros(1000, dtype=np.int64)
-    for at, length in ((0, 5), (100, 2), (200, 9), (300, 1), (400, 7)):
-        reason[at : at + length] = SPIKE_AY
-    (facts,) = summarise_reasons(track_of(stamps(1000), reason)) or ()
-    assert facts.intervals == 5
-    assert [(i.start_ns - START_NS) // STEP_NS for i in facts.longest] == [0, 200, 400]
-
-
 def test_an_estimator_that_does_not_look_has_none_and_one_that_found_nothing_an_empty_list() -> None:
     assert summarise_reasons(make_track("phy-ukf", stamps(5))) is None
     assert summarise_reasons(make_track("pd-hef", stamps(5), reason=np.zeros(5, dtype=np.int64))) == ()
     (facts,) = summarise_reasons(make_track("pd-hef", stamps(5), reason=np.full(5, STUCK_YAW_RATE))) or ()
     assert (facts.text, facts.share) == ("gyro stuck", 1.0)
-
-
-def test_every_bit_is_one_of_its_own_with_its_pair_beside_it() -> None:
-    assert [r.bit for r in REASONS] == [1 << i for i in range(10)]
-    for ay, rate in zip(REASONS[::2], REASONS[1::2], strict=True):
-        assert rate.bit == ay.bit << 1
-        assert (ay.name.removesuffix("_ay"), "gyro") == (rate.name.removesuffix("_yaw_rate"), rate.text.split()[0])
 
 
 def test_faults_are_told_by_sensor_and_kind_with_the_longest_intervals() -> None:

@@ -52,10 +52,7 @@ def result(toy: str, sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFac
     text = f'[[requirement]]\nid = "toy"\nsignal = "sideslip_rad"\n{limits}'
     (out / "plan.toml").write_text(text, encoding="utf-8")
     config = RunConfig(
-        car=sample_logs_dir / "vehicle.toml",
-        estimators=("physics", "zero"),
-        annotate="sidecar",
-        plan=out / "plan.toml",
+        car=sample_logs_dir / "vehicle.toml", estimators=("physics", "zero"), annotate="sidecar", plan=out / "plan.toml"
     )
     return run_logs([str(sample_logs_dir / "dlc.mcap")], out / "out", config)
 

@@ -135,16 +135,3 @@ def test_the_bounds_of_a_quantile_are_exact() -> None:
     found = [quantile(rng.uniform(size=60), 0.9, 0.95) for _ in range(400)]
     assert np.mean([f.low <= 0.9 for f in found]) >= 0.95
     assert np.mean([f.high >= 0.9 for f in found]) >= 0.95
-
-
-def test_a_filter_that_is_its_own_baseline_is_named() -> None:
-    same = drives([0.01] * 6, [0.01] * 6, same=True)
-    verdict = judge(replace(RATIO, baseline="physics"), same)
-    assert verdict.value == 1.0 and verdict.notes == ("pd-hef equals physics in these drives (residual gain 0)",)
-
-
-def test_without_any_figure_the_reason_is_given() -> None:
-    verdict = judge(LIMIT, [], "no ground truth of sideslip_rad")
-    assert (verdict.outcome, verdict.value, verdict.margin) == ("INCONCLUSIVE", None, None)
-    assert verdict.reason == "no ground truth of sideslip_rad"
-    assert verdict.next == "record drives with ground truth"

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from reference_car import signals_at
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.evaluation.segments import find_intervals, segment_masks
 from pdhef_logtool.evaluation.smoothing import smooth
-from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 
 T0 = 1_700_000_000_000_000_000
@@ -32,16 +30,14 @@ def signals(t, speed, ax, ay, noise=0.0, friction=np.nan):
     n = t.size
     measured = np.where(np.arange(n) % 5 == 0, speed, np.nan)  # a measurement every 50 ms
     rate = np.where(speed > 1, ay / np.maximum(speed, 1), 0.0)
-    return Signals(
-        stamps_ns=T0 + np.round(t * 1e9).astype(np.int64),
-        ready_ns=T0 + np.round(t * 1e9).astype(np.int64),
+    return signals_at(
+        T0 + np.round(t * 1e9).astype(np.int64),
         steer_rad=ay * (2.87 / np.maximum(speed, 1.0) ** 2 + 0.003),
         ax_m_s2=ax + rng.normal(0, noise, n),
         ay_m_s2=ay + rng.normal(0, noise, n),
         yaw_rate_rad_s=rate,
         speed_m_s=measured,
-        friction=np.full(n, friction),
-        wheel_speed_m_s=np.full((n, 4), np.nan),
+        friction=friction,
     )
 
 
@@ -100,11 +96,7 @@ def test_the_truth_is_preferred_and_its_gaps_are_in_no_segment():
     s = signals(t, speed, ax, 0 * ay)
     hole = (t > 27) & (t < 27.3)
     truth = make_track(
-        "truth",
-        s.stamps_ns,
-        vx_m_s=speed,
-        yaw_rate_rad_s=s.yaw_rate_rad_s,
-        ay_m_s2=np.where(hole, np.nan, ay),
+        "truth", s.stamps_ns, vx_m_s=speed, yaw_rate_rad_s=s.yaw_rate_rad_s, ay_m_s2=np.where(hole, np.nan, ay)
     )
     masks = segment_masks(s, truth, VEHICLE)
     assert not masks["straight"][(t > 26) & (t < 29)].any()
@@ -145,36 +137,3 @@ def test_intervals_give_the_masks_back():
     for name in masks:
         np.testing.assert_array_equal(rebuilt[name], masks[name])
     assert [i.start_ns for i in found] == sorted(i.start_ns for i in found)
-
-
-def test_nothing_known_is_only_the_whole():
-    t, speed, ax, ay = staged()
-    s = signals(t, speed, ax, ay)
-    nan = np.full(t.size, np.nan)
-    blind = replace(s, ax_m_s2=nan, ay_m_s2=nan, yaw_rate_rad_s=nan, speed_m_s=nan)
-    masks = segment_masks(blind, None, VEHICLE)
-    assert [name for name, mask in masks.items() if mask.any()] == ["all"]
-    empty = replace(
-        s,
-        **{
-            f: getattr(s, f)[:0]
-            for f in ("stamps_ns", "ready_ns", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")
-        },
-    )
-    assert all(mask.size == 0 for mask in segment_masks(empty, None, VEHICLE).values())
-
-
-def test_a_slow_slalom_is_no_string_of_corners():
-    t = np.arange(0, 20, 0.01)
-    ay = np.where((t > 2) & (t < 18), 4.0 * np.sin(2 * np.pi * 0.25 * (t - 2)), 0.0)  # swings of 2 s
-    masks = segment_masks(signals(t, 0 * t + 20, 0 * t, ay), None, VEHICLE)
-    assert masks["slalom"][(t > 2.2) & (t < 17.8)].all()
-    assert not masks["cornering-left"].any()
-    assert not masks["cornering-right"].any()
-
-
-def test_swings_to_one_side_are_no_slalom():
-    t = np.arange(0, 20, 0.01)
-    ay = np.where((t > 2) & (t < 18), 4.0 * np.maximum(np.sin(2 * np.pi * 0.5 * (t - 2)), 0.0), 0.0)
-    masks = segment_masks(signals(t, 0 * t + 20, 0 * t, ay), None, VEHICLE)
-    assert not masks["slalom"].any()

@@ -59,12 +59,3 @@ def test_what_nobody_scores_has_no_figure() -> None:
     made = tracks(30.0, own=0.1, physics=0.3)
     assert standing(made, "physics", signal="yaw_rate_rad_s").rmse is None
     assert standing(made).rival is None
-
-
-def test_a_day_has_no_more_blocks_than_an_hour_has_times_some() -> None:
-    n = 40_000
-    stamps = np.arange(n, dtype=np.int64) * 2_000_000_000
-    truth = make_track("truth", stamps, vx_m_s=np.full(n, 20.0), vy_m_s=np.zeros(n))
-    own = make_track("own", stamps, vx_m_s=np.full(n, 20.0), vy_m_s=np.full(n, 0.1))
-    found = standings("own", (), {"own": own}.get, truth, SLOW)[0]
-    assert found.rmse is not None and found.rmse.blocks <= 1000 and found.block_s > 10.0

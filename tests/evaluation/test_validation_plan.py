@@ -9,13 +9,12 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import pytest
 
 from pdhef_logtool.evaluation.plan_example import EXAMPLE
 from pdhef_logtool.evaluation.validation_plan import PlanTable, default_plan, load_plan, plan_from_dict
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.results.arrow_schema import load_schema
+from tests.run_report import follows
 
 SCHEMA = Path(__file__).parents[2] / "schemas" / "plan.schema.json"
 WHOLE = {"id": "A", "signal": "sideslip_rad", "limit_deg": 0.5}
@@ -34,7 +33,7 @@ def test_the_schema_is_what_the_model_says() -> None:
 
 
 def test_the_example_is_valid_and_is_read(tmp_path: Path) -> None:
-    jsonschema.validate(tomllib.loads(EXAMPLE), load_schema("plan.schema.json"))
+    follows(tomllib.loads(EXAMPLE), "plan.schema.json")
     (tmp_path / "plan.toml").write_text(EXAMPLE, encoding="utf-8")
     plan = load_plan(tmp_path / "plan.toml")
     assert (plan.file, [r.id for r in plan.requirements]) == ("plan.toml", [f"SR-{i}" for i in range(1, 6)])
@@ -62,7 +61,6 @@ def test_degrees_manoeuvres_and_quantiles() -> None:
         ({**WHOLE, "exposure": [{"car": "golf"}]}, "give drives or minutes"),
         ({**WHOLE, "id": "a b"}, "requirement[0].id"),
         ({**WHOLE, "limit": 0.1}, "give one of limit, limit_deg, limit_deg_s, or baseline"),
-        ({"id": "A", "signal": "sideslip_rad"}, "give one of limit"),
         ({**WHOLE, "signal": "vx_m_s"}, "vx_m_s rmse is in m/s, not in rad"),
         ({**WHOLE, "baseline": "zero", "max_ratio": 1.0}, "give limit_deg or baseline, not both"),
         ({"id": "A", "signal": "sideslip_rad", "baseline": "zero"}, "max_ratio: is missing"),
@@ -71,8 +69,6 @@ def test_degrees_manoeuvres_and_quantiles() -> None:
         ({**WHOLE, "metric": "nees"}, "requirement[0].metric = nees: unknown"),
         ({**WHOLE, "segment": "curves"}, "requirement[0].segment = curves: unknown"),
         ({**WHOLE, "segment": "all", "manoeuvre": "slalom"}, "give segment or manoeuvre, not both"),
-        ({**WHOLE, "confidence": 1.0}, "requirement[0].confidence"),
-        ({**WHOLE, "statistic": "median"}, "requirement[0].statistic"),
     ],
 )
 def test_a_wrong_entry_is_named(table: dict[str, Any], problem: str) -> None:

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import polars as pl
 import pytest
@@ -35,46 +34,19 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.outputs import OutputFolder
 from tests.command_line import called
+from tests.run_report import follows
 
-SCHEMA = json.loads((Path(__file__).parents[2] / "schemas/dataset.schema.json").read_text(encoding="utf-8"))
-MAPPING = """
-[signals.steer_rad]
-topic = "/steer"
-field = "angle"
-stamp = "stamp"
-[signals.ax_m_s2]
-topic = "/imu"
-field = "ax"
-stamp = "stamp"
-[signals.ay_m_s2]
-topic = "/imu"
-field = "ay"
-stamp = "stamp"
-[signals.yaw_rate_rad_s]
-topic = "/imu"
-field = "r"
-stamp = "stamp"
-[signals.speed_m_s]
-topic = "/speed"
-field = "v"
-stamp = "stamp"
-[truth.vx_m_s]
-topic = "/ins"
-field = "vx"
-stamp = "stamp"
-[truth.vy_m_s]
-topic = "/ins"
-field = "vy"
-stamp = "stamp"
-[truth.yaw_rate_rad_s]
-topic = "/ins"
-field = "r"
-stamp = "stamp"
-[truth_quality]
-topic = "/ins"
-field = "fix"
-values = [4]
-"""
+MAPPING = "".join(
+    f'[{place}]\ntopic = "/{topic}"\nfield = "{field}"\nstamp = "stamp"\n'
+    for topic, fields in {
+        "steer": {"signals.steer_rad": "angle"},
+        "imu": {"signals.ax_m_s2": "ax", "signals.ay_m_s2": "ay", "signals.yaw_rate_rad_s": "r"},
+        "speed": {"signals.speed_m_s": "v"},
+        "ins": {"truth.vx_m_s": "vx", "truth.vy_m_s": "vy", "truth.yaw_rate_rad_s": "r"},
+    }.items()
+    for place, field in fields.items()
+)
+MAPPING += '[truth_quality]\ntopic = "/ins"\nfield = "fix"\nvalues = [4]\n'
 
 
 def _topic(stamps: np.ndarray, **columns: np.ndarray) -> FakeTopic:
@@ -208,7 +180,7 @@ def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 def test_manifest_follows_its_schema(dataset: ExtractResult, sample_logs_dir: Path) -> None:
     document = json.loads((dataset.output / MANIFEST).read_text(encoding="utf-8"))
-    jsonschema.validate(document, SCHEMA)
+    follows(document, "dataset.schema.json")
     assert is_sealed(document) and {k: v for k, v in document.items() if k != "digest"} == dataset.manifest
     assert document["features"] == list(FEATURES)
     by_log = {d["log"]: d for d in document["drives"]}
@@ -270,41 +242,6 @@ def test_reading_back_gives_arrays_for_training(dataset: ExtractResult) -> None:
         )
 
 
-def _slow(values: np.ndarray, dt_s: np.ndarray, tau_s: float) -> np.ndarray:
-    """Return a causal first-order low pass of columns [N, c], as METHOD has it for any framework."""
-    out = np.zeros_like(values)
-    for k in range(1, len(values)):
-        out[k] = out[k - 1] + min(dt_s[k] / tau_s, 1.0) * (values[k] - out[k - 1])
-    return out
-
-
-def test_a_plain_ridge_is_trained_from_the_file_alone(sample_logs_dir: Path, tmp_path: Path) -> None:
-    """The front axle of the file is too soft: a ridge trained on every second block lowers the error on the others."""
-    text = (sample_logs_dir / "vehicle.toml").read_text()
-    (tmp_path / "soft.toml").write_text(text[: text.index("[network]")] + "\n" + text[text.index("[sensors]") :])
-    soft = (tmp_path / "soft.toml").read_text().replace("B = 11.146", "B = 7.0")
-    (tmp_path / "soft.toml").write_text(soft)
-    config = RunConfig(car=tmp_path / "soft.toml", start="60", end="120")
-    extract([str(sample_logs_dir / "road.mcap")], tmp_path / "set", ExtractSettings(config))
-    (file,) = (tmp_path / "set").rglob("part-*.parquet")
-    rows = pl.read_parquet(file, hive_partitioning=False).filter(pl.col("weight") > 0)[::5]
-    column = {name: rows[name].cast(pl.Float64).to_numpy() for name in rows.columns if rows[name].dtype.is_numeric()}
-    physics = np.arctan2(column["physics_vy_m_s"], column["vx_m_s"])
-    residual = np.arctan2(column["truth_vy_m_s"], column["truth_vx_m_s"]) - physics
-    signals = np.stack([column["steer_rad"], column["yaw_rate_rad_s"], column["ay_m_s2"], physics], axis=1)
-    dt_s = np.diff(column["stamp_ns"], prepend=column["stamp_ns"][0]) * 1e-9
-    z = np.concatenate([_slow(signals, dt_s, tau) for tau in (0.05, 0.3, 1.5)], axis=1)
-    seconds = (column["stamp_ns"] - column["stamp_ns"][0]) * 1e-9
-    taught = (seconds // 4.0) % 2.0 == 0.0
-    z /= z[taught].std(axis=0)
-    weight = (column["weight"] * dt_s)[taught]
-    centred = z[taught] - np.average(z[taught], axis=0, weights=weight)  # a constant is free and not kept
-    normal = centred.T @ (weight[:, None] * centred) + 10.0 * np.eye(z.shape[1])
-    ridge = np.linalg.solve(normal, centred.T @ (weight * residual[taught]))
-    error = (residual - z @ ridge)[~taught]
-    assert error.std() < 0.5 * residual[~taught].std()
-
-
 def test_a_taught_car_is_calibrated_and_each_row_has_the_gain_of_its_region(
     sample_logs_dir: Path, tmp_path: Path
 ) -> None:
@@ -323,7 +260,7 @@ def test_a_taught_car_is_calibrated_and_each_row_has_the_gain_of_its_region(
     config = RunConfig(car=car)
     result = extract([str(sample_logs_dir / "dlc.mcap")], tmp_path / "set", ExtractSettings(config))
     (entry,) = result.manifest["drives"]
-    jsonschema.validate(json.loads((tmp_path / "set" / MANIFEST).read_text()), SCHEMA)
+    follows(json.loads((tmp_path / "set" / MANIFEST).read_text()), "dataset.schema.json")
     assert entry["taught_sha256"] == model.sha256 and "stiffness" in entry["calibration"]
     (file,) = (tmp_path / "set").rglob("part-*.parquet")
     region = pl.read_parquet(file, hive_partitioning=False)["region"].drop_nulls().to_numpy()
@@ -387,7 +324,7 @@ def test_one_bad_log_stops_no_other(sample_logs_dir: Path, tmp_path: Path) -> No
     told: list[str] = []
     result = extract([str(logs)], tmp_path / "out", ExtractSettings(RunConfig()), reporter=Reporter(warn=told.append))
     assert result.exit_code == 3
-    jsonschema.validate(result.manifest, SCHEMA)
+    follows(result.manifest, "dataset.schema.json")
     assert [f["log"] for f in result.manifest["failed"]] == ["bad"]
     assert any(t.startswith("bad is left out: ") for t in told)
     assert [d.name for d in read_dataset(tmp_path / "out").drives] == ["good"]
@@ -420,7 +357,7 @@ def test_manifest_beside_the_logs_decides_and_the_option_wins(sample_logs_dir: P
     found = {d["log"]: (d["split"], d["split_from"]) for d in result.manifest["drives"]}
     assert found["a"] == ("extrapolation", "manifest")
     assert found["b"] == choose_split(hash_log(tmp_path / "b.mcap"), 3)
-    jsonschema.validate(result.manifest, SCHEMA)
+    follows(result.manifest, "dataset.schema.json")
     chosen = extract(logs, tmp_path / "out", ExtractSettings(RunConfig(), split="validation"))
     assert {(d["split"], d["split_from"]) for d in chosen.manifest["drives"]} == {("validation", "option")}
     # Files in another split's folder are deleted, as they would be read with the rest.
@@ -443,7 +380,7 @@ def test_calls_add_up_by_log_and_slice(sample_logs_dir: Path, tmp_path: Path) ->
     second = ExtractSettings(RunConfig(start=10.0, end=14.0), split="validation")
     extract([log], out, first)
     both = extract([log], out, second).manifest
-    jsonschema.validate(both, SCHEMA)
+    follows(both, "dataset.schema.json")
     assert [(d["name"], d["split"]) for d in both["drives"]] == [
         ("road.0-8.0", "train"),
         ("road.10.0-14.0", "validation"),
@@ -496,7 +433,7 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     rtk = called("extract", log, "-o", str(tmp_path / "rtk"), "--set", "prefer_truth=rtk", "--split", "train", "--json")
     assert rtk.returncode == 0, rtk.stderr
     document = json.loads(rtk.stdout)
-    jsonschema.validate(document["manifest"], SCHEMA)
+    follows(document["manifest"], "dataset.schema.json")
     (entry,) = document["manifest"]["drives"]
     assert entry["truth"]["kind"] == "recorded" and entry["truth"]["smoothing_half_s"] > 0
     # The two truths of one drive tell of the same residual.

@@ -31,6 +31,10 @@ pytestmark = pytest.mark.slow
 SMALL = Recipe(FEATURES[:8], hidden=12, layers=1, head=(8,), epochs=6, batch=4, learning_rate=2e-2)
 
 
+class Stop(Exception):  # noqa: N818
+    """Stops a training."""
+
+
 def make_sequences(seed: int, count: int, steps: int = 400) -> list[FeatureSequence]:
     """Targets are a lagged, nonlinear function of two features: a network without memory cannot learn them."""
     rng = np.random.default_rng(seed)
@@ -56,19 +60,16 @@ def test_network_learns_a_residual_with_memory_and_serves_it(tmp_path: Path) -> 
 
 
 def test_same_seed_same_weights_other_seed_others(tmp_path: Path) -> None:
-    training, validation = make_sequences(0, 6), make_sequences(1, 2)
-    a, _ = train(training, validation, SMALL, tmp_path / "a")
-    b, _ = train(training, validation, SMALL, tmp_path / "b")
-    c, _ = train(training, validation, replace(SMALL, seed=1), tmp_path / "c")
+    training, validation, few = make_sequences(0, 6), make_sequences(1, 2), replace(SMALL, epochs=2)
+    a, _ = train(training, validation, few, tmp_path / "a")
+    b, _ = train(training, validation, few, tmp_path / "b")
+    c, _ = train(training, validation, replace(few, seed=1), tmp_path / "c")
     assert a.sha256 == b.sha256 != c.sha256
 
 
 def test_training_that_stopped_half_way_ends_as_if_it_had_not(tmp_path: Path) -> None:
     training, validation = make_sequences(0, 6), make_sequences(1, 2)
     whole, history = train(training, validation, SMALL, tmp_path / "whole")
-
-    class Stop(Exception):  # noqa: N818
-        pass
 
     def stop(epoch: object, _of: int) -> None:
         if getattr(epoch, "epoch", 0) == 3:
@@ -98,21 +99,13 @@ def test_a_killed_training_resumes(tmp_path: Path) -> None:
     process.wait()
     seen: list[int] = []
 
-    class Stop(Exception):  # noqa: N818
-        pass
-
     def stop(epoch: object, _of: int) -> None:
         seen.append(getattr(epoch, "epoch", 0))
         raise Stop
 
+    recipe = replace(SMALL, epochs=400, patience=400)
     with pytest.raises(Stop):
-        train(
-            make_sequences(0, 8),
-            make_sequences(1, 2),
-            replace(SMALL, epochs=400, patience=400),
-            tmp_path,
-            progress=stop,
-        )
+        train(make_sequences(0, 8), make_sequences(1, 2), recipe, tmp_path, progress=stop)
     assert seen[0] > 1
 
 
@@ -147,8 +140,9 @@ def test_samples_without_weight_teach_nothing(tmp_path: Path) -> None:
         weight[100:150] = 0.0
         spoiled.append(replace(s, target=target, weight=weight))
     clean = [replace(s, weight=t.weight) for s, t in zip(training, spoiled, strict=True)]
-    a, _ = train(spoiled, validation, SMALL, tmp_path / "a")
-    b, _ = train(clean, validation, SMALL, tmp_path / "b")
+    few = replace(SMALL, epochs=2)
+    a, _ = train(spoiled, validation, few, tmp_path / "a")
+    b, _ = train(clean, validation, few, tmp_path / "b")
     assert a.sha256 == b.sha256
     assert normalisation_of(spoiled, FEATURES) == normalisation_of(clean, FEATURES)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -115,19 +116,27 @@ def test_a_network_learns_a_velocity(velocity_network):
     assert np.sqrt(np.mean((vy - target) ** 2)) < 0.3 * np.sqrt(np.mean(target**2))
 
 
-def save_model(folder: Path, velocity_network: ModelBundle) -> None:
-    recipe = replace(SMALL, epochs=1)
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, velocity_network: ModelBundle) -> Path:
+    """A network with its baselines."""
+    folder = tmp_path_factory.mktemp("model")
     sequences = [replace(s, target=np.repeat(s.target, 2, axis=1)) for s in velocity_sequences(0, 2)]
-    residual, _ = train(sequences, sequences, recipe, folder / "work")
+    residual, _ = train(sequences, sequences, replace(SMALL, epochs=1), folder / "work")
     residual.save(folder)
     velocity_network.save(folder / PURE_LSTM_FOLDER)
     model = LinearModel(NAMES, (0.1, 0.2, 0.3, 0.4), 0.01, 2.0, {"dataset_sha256": "a"})
     (folder / LINEAR_REGRESSION_FILE).write_text(model.to_json())
+    return folder
 
 
-def test_baselines_come_with_the_model(tmp_path, velocity_network):
-    save_model(tmp_path, velocity_network)
-    bundle = load_bundle(tmp_path)
+@pytest.fixture
+def saved(tmp_path: Path, whole: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(whole, tmp_path / "model"))
+
+
+def test_baselines_come_with_the_model(whole, velocity_network):
+    bundle = load_bundle(whole)
     assert bundle.pure_lstm is not None
     assert bundle.pure_lstm.sha256 == velocity_network.sha256
     assert bundle.linear_regression == LinearModel(NAMES, (0.1, 0.2, 0.3, 0.4), 0.01, 2.0)
@@ -136,35 +145,31 @@ def test_baselines_come_with_the_model(tmp_path, velocity_network):
     assert alone.sha256 == bundle.sha256  # the network's own
 
 
-@pytest.mark.parametrize("damage", ["no json", "list", "version", "coefficient", "feature", "count", "entry", "text"])
-def test_a_damaged_regression_is_one_clear_error(tmp_path, velocity_network, damage):
-    save_model(tmp_path, velocity_network)
-    file = tmp_path / LINEAR_REGRESSION_FILE
-    document = json.loads(file.read_text())
-    changed = {
-        "list": [],
-        "version": {**document, "version": 99},
-        "coefficient": {**document, "coefficients": [0.1, 0.2, 0.3, 0.5]},
-        "feature": {**document, "features": ["truth", *NAMES[1:]]},
-        "count": {**document, "coefficients": [0.1]},
-        "entry": {k: v for k, v in document.items() if k != "low_pass_hz"},
-        "text": {**document, "coefficients": "abc"},
-    }
-    file.write_text("{" if damage == "no json" else json.dumps(changed[damage]))
-    for load in (lambda: load_linear_model(file), lambda: load_bundle(tmp_path)):
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"version": 99},
+        {"coefficients": [0.1, 0.2, 0.3, 0.5]},
+        {"features": ["truth", *NAMES[1:]]},
+        {"coefficients": [0.1]},
+    ],
+)
+def test_a_damaged_regression_is_one_clear_error(saved, damage):
+    file = saved / LINEAR_REGRESSION_FILE
+    file.write_text(json.dumps({**json.loads(file.read_text()), **damage}))
+    for load in (lambda: load_linear_model(file), lambda: load_bundle(saved)):
         with pytest.raises(ModelError, match=r"linear-regression\.json") as caught:
             load()
         assert len(str(caught.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize("damage", ["missing", "weights", "target", "shape"])
-def test_a_damaged_pure_lstm_is_one_clear_error(tmp_path, velocity_network, damage):
-    save_model(tmp_path, velocity_network)
-    folder = tmp_path / PURE_LSTM_FOLDER
+def test_a_damaged_pure_lstm_is_one_clear_error(saved, damage):
+    folder = saved / PURE_LSTM_FOLDER
     if damage == "missing":
         (folder / "weights.safetensors").unlink()
     elif damage == "weights":
-        (folder / "weights.safetensors").write_bytes((tmp_path / "weights.safetensors").read_bytes())
+        (folder / "weights.safetensors").write_bytes((saved / "weights.safetensors").read_bytes())
     else:
         document = json.loads((folder / "model.json").read_text())
         if damage == "target":
@@ -173,7 +178,7 @@ def test_a_damaged_pure_lstm_is_one_clear_error(tmp_path, velocity_network, dama
             document["normalisation"]["target_std"] = []
         (folder / "model.json").write_text(json.dumps(document))
     with pytest.raises(ModelError, match="pure-lstm") as caught:
-        load_bundle(tmp_path)
+        load_bundle(saved)
     assert len(str(caught.value).splitlines()) == 1
 
 

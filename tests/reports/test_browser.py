@@ -193,9 +193,8 @@ def test_the_keyboard_zooms(browser, tmp_path):
 
 
 @pytest.mark.skipif(AXE is None, reason="axe-core is not installed (pip install axe-core-python)")
-@pytest.mark.parametrize("scheme", ["dark", "light"])
-@pytest.mark.parametrize("width", [390, 1280])
-def test_axe_finds_nothing_serious(tmp_path, scheme, width):
+@pytest.mark.parametrize(("scheme", "width"), [("dark", 390), ("light", 1280)])
+def test_axe_finds_nothing_serious_and_nothing_is_wider_than_the_screen(tmp_path, scheme, width):
     ground = {"dark": "rgb(20, 24, 29)", "light": "rgb(255, 255, 255)"}[scheme]
     run = open_run(write_run(tmp_path / "made", drive_tracks(3.0), plan=plan_of("PASS", "FAIL", "INCONCLUSIVE")))
     cells = [
@@ -215,11 +214,4 @@ def test_axe_finds_nothing_serious(tmp_path, scheme, width):
             browser.open(page)
             assert browser.value("getComputedStyle(document.body).backgroundColor") == ground
             assert serious(browser) == []
-
-
-@pytest.mark.parametrize("width", [390, 1280])
-def test_nothing_is_wider_than_the_screen(tmp_path, width):
-    file = page_of(write_run(tmp_path, drive_tracks(3.0), plan=plan_of("PASS", "FAIL", "INCONCLUSIVE")))
-    with Browser(width, 900) as narrow:
-        narrow.open(file)
-        assert narrow.value("document.documentElement.scrollWidth") <= width
+            assert browser.value("document.documentElement.scrollWidth") <= width

@@ -62,16 +62,6 @@ def test_cells_are_a_tenth_of_a_second_finer_for_short_drives_and_never_emptied_
     assert np.isfinite(envelope(grid, at, np.ones(n))).all()
 
 
-def test_ten_hours_have_no_more_cells_than_one():
-    at = stamps(3_600_000)
-    assert grid_of(at).cells == pytest.approx(MOST_CELLS, abs=2)
-
-
-def test_one_stamp_is_one_cell():
-    at = stamps(1)
-    assert envelope(grid_of(at), at, np.array([2.0])).tolist() == [[2.0, 2.0]]
-
-
 def test_points_are_the_first_known_stamp_of_each_cell():
     at = stamps(100)
     grid = grid_of(at)

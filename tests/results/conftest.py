@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from reference_car import signals_at
 
 from pdhef_logtool.records.reasons import SPIKE_AY, STUCK_YAW_RATE
 from pdhef_logtool.records.signals import Signals
@@ -71,17 +72,8 @@ def circle_signals() -> Callable[..., Signals]:
     def make(first: int = 0, n: int = 200) -> Signals:
         at = np.arange(first, first + n)
         stamps_ns = START_NS + STEP_NS * at.astype(np.int64)
-        return Signals(
-            stamps_ns=stamps_ns,
-            ready_ns=stamps_ns + 2_000_000,
-            steer_rad=np.full(n, 0.07),
-            ax_m_s2=np.zeros(n),
-            ay_m_s2=np.full(n, 2.5),
-            yaw_rate_rad_s=np.full(n, 0.25),
-            speed_m_s=np.where(at % 2 == 0, SPEED_M_S, np.nan),
-            friction=np.full(n, np.nan),
-            wheel_speed_m_s=np.full((n, 4), np.nan),
-            available=frozenset({"steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"}),
-        )
+        columns = {"steer_rad": 0.07, "ax_m_s2": 0.0, "ay_m_s2": 2.5, "yaw_rate_rad_s": 0.25}
+        speed = np.where(at % 2 == 0, SPEED_M_S, np.nan)
+        return signals_at(stamps_ns, stamps_ns + 2_000_000, speed_m_s=speed, **columns)
 
     return make

@@ -40,22 +40,15 @@ def _report(folder: Path, label: str, **vehicle: Any) -> None:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    folder = write_run(
-        tmp_path / "out",
-        {},
-        entries=[entry("a"), entry("b"), entry("no_truth"), entry("bad", outcome="failed: empty", main=None)],
-    )
+    entries = [entry("a"), entry("b"), entry("no_truth"), entry("bad", outcome="failed: empty", main=None)]
+    folder = write_run(tmp_path / "out", {}, entries=entries)
     slip = np.zeros(N)
     slip[100:111] = np.deg2rad(np.linspace(1.0, 3.0, 11))
     slip[130:141] = -np.deg2rad(4.0)
     speed = np.full(N, 20.0)
     speed[:50] = 2.0
     still = {"vx_m_s": speed, "vy_m_s": np.zeros(N), "sideslip_rad": np.zeros(N)}
-    wild = {
-        "vx_m_s": speed,
-        "vy_m_s": np.zeros(N),
-        "sideslip_rad": np.full(N, np.pi) * np.where(np.arange(N) < 50, 1, 0),
-    }
+    wild = {**still, "sideslip_rad": np.where(np.arange(N) < 50, np.pi, 0.0)}
     valid = np.ones(N, dtype=np.bool_)
     valid[105:] = False
     write_estimates(folder, "a", truth=still, pd_hef={**still, "sideslip_rad": slip}, physics=still)
@@ -236,23 +229,7 @@ def test_a_condition_reads_no_file(where: str, tmp_path: Path, monkeypatch: pyte
         event_condition(where.format(file=tmp_path / "file.csv"))
 
 
-WORDS = [
-    "speed_m_s",
-    "valid",
-    "truth.vx_km_h",
-    "abs(",
-    "(",
-    ")",
-    "and",
-    "or",
-    "not",
-    "in",
-    "0.5",
-    "case",
-    "<",
-    "-",
-    "*",
-]
+WORDS = ["speed_m_s", "truth.vx_km_h", "abs(", "(", ")", "and", "or", "not", "in", "0.5", "case", "<", "-", "*"]
 
 
 @given(st.one_of(st.text(max_size=60), st.lists(st.sampled_from(WORDS), max_size=12).map(" ".join)))

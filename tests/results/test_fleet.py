@@ -108,13 +108,6 @@ def test_ranking_follows_the_drives_and_one_wild_drive_decides_nothing(run: Run)
     assert against is not None and against.value == pytest.approx(0.25) and against.low == pytest.approx(0.25)
 
 
-def test_what_chance_can_do_ranks_nobody(run: Run) -> None:
-    rng = np.random.default_rng(1)
-    for i in range(12):
-        run.add(f"d{i}", {name: float(rng.lognormal()) for name in ("pd-hef", "b", "c", "d", "e")})
-    assert {r.place for r in run.read().ranking} == {None}
-
-
 def test_drives_without_independent_truth_stand_apart_and_score_nothing(run: Run) -> None:
     run.add("good", {"pd-hef": 0.01})
     run.add("none", truth=NO_TRUTH)
@@ -130,13 +123,6 @@ def test_drives_without_independent_truth_stand_apart_and_score_nothing(run: Run
     ]
     (answer, _) = found.distributions
     assert (answer.estimator, answer.drives) == (ANSWER, 1)
-
-
-def test_recorded_estimates_are_told_by_the_first_of_them(run: Run) -> None:
-    estimators = [{"name": n, "outcome": "ran"} for n in ("esc", "ins")]
-    run.add("a", {"ins": 0.02, "esc": 0.01}, answer=None, estimators=estimators)
-    (drive,) = run.read().scored
-    assert (drive.main, drive.error()) == ("esc", 0.01)
 
 
 def test_failures_are_told_by_reason_and_bad_reports_among_them(run: Run) -> None:
@@ -208,12 +194,6 @@ def test_the_operating_space_adds_up_and_empty_cells_are_empty(run: Run) -> None
     assert found.seconds[4, 1] == 10.0 and found.seconds.sum() == 11.0
     assert found.rmse_rad[4, 1] == pytest.approx(0.01) and found.rmse_rad[0, 2] == pytest.approx(0.03)
     assert np.isnan(found.rmse_rad[1, 1])
-
-
-def test_a_run_of_nothing_is_told_too(run: Run) -> None:
-    run.add("a", outcome="failed: empty")
-    found = run.read()
-    assert found.drives == () and found.space is None and found.ranking == () and found.worst == ()
 
 
 def test_folders_part_drives(run: Run) -> None:

@@ -135,10 +135,7 @@ def test_panels_have_the_settings_that_foxglove_publishes(written: Path) -> None
         assert conforms(config, published[kind]), name
         assert not conforms({**config, "further": 1}, published[kind])
         if kind == "3D":
-            by_kind = {
-                "path": fl.BaseRendererPosesTopicSettings,
-                "odometry": fl.BaseRendererPoseTopicSettings,
-            }
+            by_kind = {"path": fl.BaseRendererPosesTopicSettings, "odometry": fl.BaseRendererPoseTopicSettings}
             assert all(conforms(s, by_kind[topic.rpartition("/")[2]]) for topic, s in config["topics"].items())
     assert seen == set(published)
     assert not conforms({"paths": [{"value": "/a.b", "lineSize": "1"}]}, fl.PlotConfig)

@@ -53,27 +53,18 @@ ESTIMATE_COLUMNS = {name: kind for name, (kind, _) in COLUMNS.items()}
 #: Those that none of these tracks has.
 OPTIONAL = {"mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUMNS}
 UNITS = {name: unit for name, (_, unit) in COLUMNS.items()}
-METRIC_COLUMNS = {
-    "log": pl.String,
-    "estimator": pl.String,
-    "signal": pl.String,
-    "segment": pl.String,
-    "metric": pl.String,
-    "value": pl.Float64,
-    "unit": pl.String,
-    "n": pl.Int64,
-    "algorithm": pl.String,
-}
+METRIC_COLUMNS = ["log", "estimator", "signal", "segment", "metric", "value", "unit", "n", "algorithm"]
 NAMES = ("phy-ukf", "zero", "truth")
 
 
-def write(path: Path, circle, rows_a_group: int = 256) -> None:
-    write_estimates(path, [circle(name, 0, 600) for name in NAMES], rows_a_group=rows_a_group)
+@pytest.fixture
+def path(tmp_path, circle) -> Path:
+    """The file of three tracks of 600 stamps."""
+    write_estimates(tmp_path / "estimates.parquet", [circle(name, 0, 600) for name in NAMES], rows_a_group=256)
+    return tmp_path / "estimates.parquet"
 
 
-def test_polars_reads_every_column_with_its_type(tmp_path, circle):
-    path = tmp_path / "estimates.parquet"
-    write(path, circle)
+def test_polars_reads_every_column_with_its_type(circle, path):
     frame = pl.read_parquet(path)
     assert list(frame.schema.items()) == list(ESTIMATE_COLUMNS.items())
     assert frame.height == 3 * 3 * 200
@@ -86,9 +77,7 @@ def test_polars_reads_every_column_with_its_type(tmp_path, circle):
         assert all(rows[column].null_count() == rows.height for column in OPTIONAL)
 
 
-def test_unknown_is_null_for_polars(tmp_path, circle):
-    path = tmp_path / "estimates.parquet"
-    write(path, circle)
+def test_unknown_is_null_for_polars(circle, path):
     frame = pl.read_parquet(path)
     assert frame.filter(pl.col("estimator") == "truth")["nis"].null_count() == 600
     nis = circle("phy-ukf", 0, 600).nis
@@ -96,9 +85,7 @@ def test_unknown_is_null_for_polars(tmp_path, circle):
     assert mean == pytest.approx(nis[np.isfinite(nis)].mean())
 
 
-def test_units_stand_in_the_file(tmp_path, circle):
-    path = tmp_path / "estimates.parquet"
-    write(path, circle)
+def test_units_stand_in_the_file(path):
     metadata = pl.read_parquet_metadata(path)
     assert metadata["format"] == "pdhef.estimates"
     assert metadata["version"] == "1"
@@ -106,9 +93,7 @@ def test_units_stand_in_the_file(tmp_path, circle):
     assert {f.name: f.metadata[b"unit"].decode() for f in pq.read_schema(path)} == UNITS
 
 
-def test_file_is_zstd_with_dictionary_and_one_estimator_a_row_group(tmp_path, circle):
-    path = tmp_path / "estimates.parquet"
-    write(path, circle)
+def test_file_is_zstd_with_dictionary_and_one_estimator_a_row_group(path):
     metadata = pq.ParquetFile(path).metadata
     assert metadata.num_row_groups == 9
     for g in range(metadata.num_row_groups):
@@ -122,9 +107,7 @@ def test_file_is_zstd_with_dictionary_and_one_estimator_a_row_group(tmp_path, ci
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_one_track_comes_back(tmp_path, circle, name):
-    path = tmp_path / "estimates.parquet"
-    write(path, circle)
+def test_one_track_comes_back(circle, name, path):
     assert list_estimators(path) == NAMES
     track = read_track(path, name)
     whole = circle(name, 0, 600)
@@ -154,17 +137,13 @@ def test_weights_and_reasons_come_back_where_there_are_some(tmp_path, circle):
     assert rows["mixture_weight"].null_count() == rows["reason"].null_count() == 600
 
 
-def test_a_file_without_a_column_is_one_line(tmp_path, circle):
-    path = tmp_path / "estimates.parquet"
-    write(path, circle)
+def test_a_file_without_a_column_is_one_line(path):
     pl.read_parquet(path).drop("mixture_weight", "reason").write_parquet(path)
     with pytest.raises(OutputError, match="a Parquet file without mixture_weight, reason; run the log again"):
         read_track(path, "phy-ukf", ["sideslip_rad"])
 
 
-def test_mixed_row_groups_of_other_writers_are_read(tmp_path, circle):
-    path = tmp_path / "estimates.parquet"
-    write(path, circle)
+def test_mixed_row_groups_of_other_writers_are_read(tmp_path, circle, path):
     shuffled = tmp_path / "by_stamp.parquet"
     pl.read_parquet(path).sort("stamp_ns", "estimator").write_parquet(shuffled)
     track = read_track(shuffled, "phy-ukf")
@@ -191,9 +170,7 @@ def test_a_second_copy_joins_the_selected_estimators_and_causal_rows_are_marked(
     assert list_estimators(path) == ("phy-ukf", "zero")
 
 
-def test_what_is_not_there_is_said(tmp_path, circle):
-    path = tmp_path / "estimates.parquet"
-    write(path, circle)
+def test_what_is_not_there_is_said(tmp_path, path):
     with pytest.raises(OutputError, match=r"expected one of phy-ukf, zero, truth, got pd-hef"):
         read_track(path, "pd-hef")
     with pytest.raises(OutputError, match="no_such_column"):
@@ -206,21 +183,6 @@ def test_what_is_not_there_is_said(tmp_path, circle):
     pl.DataFrame({"stamp_ns": [1]}).write_parquet(tmp_path / "other.parquet")
     with pytest.raises(OutputError, match=r"estimates\.parquet"):
         read_track(tmp_path / "other.parquet", "zero")
-
-
-def test_a_full_disk_leaves_the_old_file(tmp_path, circle, monkeypatch):
-    path = tmp_path / "estimates.parquet"
-    write(path, circle)
-    before = path.read_bytes()
-
-    def full_disk(self, table, row_group_size=None):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(pq.ParquetWriter, "write_table", full_disk)
-    with pytest.raises(OutputError, match="No space left"):
-        write(path, circle)
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["estimates.parquet"]
 
 
 def test_empty_log_gives_an_empty_table(tmp_path):
@@ -239,7 +201,8 @@ def test_polars_reads_the_metrics(tmp_path):
     path = tmp_path / "metrics.parquet"
     write_metrics(path, ROWS)
     frame = pl.read_parquet(path)
-    assert list(frame.schema.items()) == list(METRIC_COLUMNS.items())
+    kinds = {"value": pl.Float64, "n": pl.Int64}
+    assert list(frame.schema.items()) == [(name, kinds.get(name, pl.String)) for name in METRIC_COLUMNS]
     assert frame.rows() == [
         ("drive", "phy-ukf", "sideslip_rad", "all", "rmse", 0.0123, "rad", 600, "0123456789ab"),
         ("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", None, "rad", 0, ""),

@@ -19,13 +19,6 @@ def folder(path: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in path.iterdir()}
 
 
-def test_the_file_takes_its_name_when_it_is_complete_and_leaves_nothing_else(tmp_path: Path) -> None:
-    with PendingFile(tmp_path / "out.bin") as pending:
-        pending.path.write_bytes(b"new")
-        assert not (tmp_path / "out.bin").exists()
-    assert folder(tmp_path) == DONE
-
-
 def test_what_was_there_stays_until_the_new_file_is_complete(tmp_path: Path) -> None:
     (tmp_path / "out.bin").write_bytes(b"old")
     with PendingFile(tmp_path / "out.bin") as pending:
@@ -117,11 +110,6 @@ def test_a_temporary_file_that_cannot_be_removed_does_not_hide_the_failure(tmp_p
 def test_the_longest_name_is_written(tmp_path: Path) -> None:
     write_bytes(tmp_path / ("n" * 255), b"new")
     assert folder(tmp_path) == {"n" * 255: b"new"}
-
-
-def test_missing_folders_are_made(tmp_path: Path) -> None:
-    write_bytes(tmp_path / "a" / "b" / "out.bin", b"new")
-    assert folder(tmp_path / "a" / "b") == DONE
 
 
 def test_a_file_in_the_way_of_the_folder_is_an_output_error_at_once(tmp_path: Path) -> None:

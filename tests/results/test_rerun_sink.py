@@ -371,7 +371,7 @@ except OutputError as error:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("writes", [0, 5, 1000])
+@pytest.mark.parametrize("writes", [0, 1000])
 def test_a_disk_that_hangs_is_given_up_and_the_process_ends(tmp_path, writes):
     done = subprocess.run(
         [sys.executable, "-c", HANGING, str(tmp_path / "recording.rrd"), str(writes)],

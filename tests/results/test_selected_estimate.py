@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
-from run_report import GNSS, MAIN, SHA, TRUTH, errors_deg, figures, friction, ran, report, truth
+from run_report import GNSS, MAIN, TRUTH, errors_deg, figures, friction, ran, report, truth
 
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.results.run_report import report_markdown
@@ -113,16 +112,6 @@ def test_what_was_assumed_of_car_friction_and_network() -> None:
     assert texts(replace(MAIN, name="zero"))["assumed"] == "no vehicle model (zero needs none)"
 
 
-def test_a_calibrated_car_is_said_to_be_and_a_refusal_with_its_reason() -> None:
-    estimators = [ran("pd-hef", causal=False, algorithm={"physics_sha256": SHA, "options": {}})]
-    told = {"refused": None, "logs": 1, "parameters": [{}], "understeer": {"contradicts": True}}
-    said = texts(vehicle={"proven": False}, estimators=estimators, self_calibration=told)
-    assert "car golf; calibrated on this log without ground truth, therefore not causal" in said["assumed"]
-    assert "the understeer gradient of the drive contradicts the file" in said["assumed"]
-    said = texts(vehicle={"proven": False}, self_calibration={"refused": "too short", "logs": 1, "understeer": None})
-    assert "parameters of its file, not validated; not calibrated on this log: too short" in said["assumed"]
-
-
 def test_the_next_steps_are_few_and_the_most_important_first() -> None:
     lacking = [
         ran("physics", outcome="skipped", reason="the log has no steer_rad", algorithm=None),
@@ -137,21 +126,6 @@ def test_the_next_steps_are_few_and_the_most_important_first() -> None:
     assert "pd-hef contradicts" in said["assumed"]
     assert said["next"].startswith("check the vehicle file")
     assert texts()["next"] == ""
-
-
-def test_a_taught_car_is_called_taught_and_is_not_to_be_taught_again() -> None:
-    untaught = texts(metrics=errors_deg(pd_hef=0.1), vehicle={"proven": False})
-    taught = texts(metrics=errors_deg(pd_hef=0.1), vehicle={"proven": False, "taught": "ground truth"})
-    assert "teach the car with this ground truth: pdhef learn LOG --car golf" in untaught["next"]
-    assert "pdhef learn" not in taught["next"]
-    assert "car golf, taught by ground truth" in taught["assumed"] and "not validated" not in taught["assumed"]
-
-
-def test_hindsight_is_said_apart_and_chooses_nothing() -> None:
-    answer = report(metrics=errors_deg(pd_hef=0.3, physics=0.2, zero=0.1))["answer"]
-    assert answer["main"] == "pd-hef"
-    assert answer["best_in_hindsight"] == {"name": "zero", "causal": True, "sideslip_rmse_rad": np.deg2rad(0.1)}
-    assert report(truth=truth())["answer"]["best_in_hindsight"] is None
 
 
 def test_the_words_stand_in_the_markdown() -> None:

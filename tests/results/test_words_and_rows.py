@@ -18,16 +18,9 @@ SECOND = 10**9
 def test_colours_are_red_green_blue_and_a_names_own() -> None:
     assert colour_rgb("phy-ukf", {"phy-ukf": 0x12_34_56}) == (0x12, 0x34, 0x56)
     assert colour_rgb("truth", {}) == (0x8A, 0x8A, 0x8A)
-    palette = {
-        (0xD5, 0x5E, 0),
-        (0, 0x72, 0xB2),
-        (0xE6, 0x9F, 0),
-        (0, 0x9E, 0x73),
-        (0xCC, 0x79, 0xA7),
-        (0x56, 0xB4, 0xE9),
-    }
+    palette = "d55e00 0072b2 e69f00 009e73 cc79a7 56b4e9"
     found = [colour_rgb(f"recorded {i}", {"phy-ukf": 0}) for i in range(40)]
-    assert set(found) == palette
+    assert set(found) == {tuple(bytes.fromhex(colour)) for colour in palette.split()}
     assert colour_rgb("recorded 7", {}) == found[7]
 
 

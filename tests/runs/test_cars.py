@@ -7,17 +7,16 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import pytest
 
 from pdhef_logtool.logs.discovery import LogInput, find_logs
 from pdhef_logtool.logs.open_log import log_metadata
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import RunConfig, load_config
 from pdhef_logtool.runs.fleet import run_logs
+from tests.run_report import follows
 
 
 @pytest.fixture
@@ -129,7 +128,7 @@ def test_a_run_says_which_car_each_log_had_and_one_without_stops_no_other(fleet:
     result = run_logs([str(fleet / "fleet")], fleet / "out", config, reporter=Reporter(warn=said.append))
     assert result.exit_code == 3
     run = json.loads((fleet / "out/run.json").read_text())
-    jsonschema.validate(run, load_schema("run.schema.json"))
+    follows(run, "run.schema.json")
     cars = {log["log"]: log["car"] for log in run["logs"]}
     assert {name: car and car["file"] for name, car in cars.items()} == {
         "golf__day__golf_1": "golf.toml", "mini__day__mini_1": "mini.toml", "lost": None,
@@ -138,11 +137,3 @@ def test_a_run_says_which_car_each_log_had_and_one_without_stops_no_other(fleet:
     assert any("a car for every log" in log["outcome"] for log in run["logs"] if log["log"] == "lost")
     report = json.loads((fleet / "out/logs/mini__day__mini_1/report.json").read_text())
     assert report["vehicle"]["file"] == "mini.toml"
-
-
-@pytest.mark.slow
-def test_outputs_never_replace_a_car_of_the_table(fleet: Path) -> None:
-    (fleet / "cars.toml").write_text('default = "run.json"\n')
-    shutil.copy(fleet / "golf.toml", fleet / "run.json")
-    with pytest.raises(UsageError, match="would replace the input"):
-        run_logs([str(fleet / "fleet/golf")], fleet, RunConfig(cars=fleet / "cars.toml"))

@@ -168,10 +168,7 @@ def test_where_nothing_is_usable_the_exit_code_is_1(out: Path) -> None:
     assert (report.code, events.code) == (1, 1)
     assert (len(warnings(report)), len(warnings(events))) == (2, 2)
     flip(out / "metrics.parquet")
-    for name, call in {
-        "metrics.parquet": ("compare", str(out), str(out)),
-        "run.json": ("report", str(out)),
-    }.items():
+    for name, call in {"metrics.parquet": ("compare", str(out), str(out)), "run.json": ("report", str(out))}.items():
         if name == "run.json":
             flip(out / name)
         ended = command(*call)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import jsonschema
 import pytest
 
 from pdhef_logtool.car.car import Car
@@ -13,10 +12,10 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map, load_mapping, mapping_to_toml
-from pdhef_logtool.results.arrow_schema import load_schema
-from pdhef_logtool.runs.config import RunConfig, load_config
+from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.inspection import inspect_log
+from tests.run_report import follows
 
 
 @pytest.fixture
@@ -50,14 +49,6 @@ def test_inspecting_shows_checks_of_the_same_names(sample_logs_dir: Path, wrong_
     assert check["subject"] == "steer_rad"
 
 
-def test_waived_names_come_from_a_file_or_from_flags(tmp_path: Path) -> None:
-    file = tmp_path / "pdhef.toml"
-    file.write_text('waived = ["steer_rad.sign"]\n')
-    assert load_config(file, {}).waived == ("steer_rad.sign",)
-    assert load_config(file, {"waived": ["a.unit", "b.sign"]}).waived == ("a.unit", "b.sign")
-    assert RunConfig().to_dict()["waived"] == []
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("waived", "code"), [((), 3), (("steer_rad.sign",), 0), (("steer_rad.unit",), 3)])
 def test_the_exit_code_of_a_run(
@@ -69,7 +60,7 @@ def test_the_exit_code_of_a_run(
     result = run_logs([str(sample_logs_dir / "sweep.mcap")], tmp_path / "out", config)
     assert result.exit_code == code
     report = json.loads((tmp_path / "out" / "logs" / "sweep" / "report.json").read_text())
-    jsonschema.validate(report, load_schema("report.schema.json"))
+    follows(report)
     (failed,) = (c for c in report["checks"] if c["verdict"] == "failed")
     assert failed["waived"] == ("steer_rad.sign" in waived)
     assert report["log"]["name"] == "sweep"

@@ -16,7 +16,6 @@ from mcap.writer import Writer
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.runs.inspection import inspect_log
 from pdhef_logtool.runs.inspection.page import inspection_page, sparkline
-from pdhef_logtool.runs.inspection.step_statistics import COLUMNS, outline
 from tests.command_line import called
 from tests.reports.browser import AXE, CHROMIUM, WHY_NOT, Browser, serious
 
@@ -73,17 +72,6 @@ def test_a_sparkline_shows_each_run_of_finite_values_within_its_box(values: list
     if finite.sum() > 1 and np.ptp(v[finite]) > 0.0:
         ys = {int(y) for y in re.findall(r"[ML]\d+ (\d+)", drawn)}
         assert {2, 58} <= ys
-
-
-def test_an_outline_keeps_extremes_where_they_were() -> None:
-    stamps = 10**18 + np.arange(1000, dtype=np.int64) * 1_000_000
-    values = np.zeros(1000)
-    values[503], values[507] = 5.0, -3.0
-    low, high = outline(stamps, values, 1_000_000_000)
-    assert (high.argmax(), low.argmin()) == (50, 50)
-    assert (high.max(), low.min()) == (5.0, -3.0)
-    assert np.isfinite(low).all()
-    assert low.shape == (COLUMNS,)
 
 
 def _page(path: Path) -> str:
@@ -147,14 +135,6 @@ def test_the_log_is_never_replaced_and_fields_stand_alone(tmp_path: Path) -> Non
     assert "would replace the input" in result.stderr
     assert log.read_bytes() == before
     assert called("inspect", str(log), "--fields", "--report", str(tmp_path / "x.html")).returncode == 2
-
-
-@pytest.mark.parametrize("name", ["v40_slalom.vbo", "v40_swd.mf4", "gti_pole_aa.mat"])
-def test_every_format_has_a_page(shared_dir: Path, name: str) -> None:
-    log = shared_dir / "data" / "formats" / name
-    page = _page(log)
-    assert page.count('<path d="M') > 5
-    assert len(page) < _MOST_BYTES
 
 
 @pytest.mark.slow

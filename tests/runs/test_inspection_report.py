@@ -188,28 +188,6 @@ def test_a_log_with_a_dropout_and_losses(shared_dir: Path) -> None:
     assert found.is_partial
 
 
-def test_fields_of_vendor_messages_are_candidates(shared_dir: Path, tmp_path: Path) -> None:
-    found = inspect_log(shared_dir / "data" / "drives" / "lunda_v40")
-    assert found.missing == ()
-    assert found.signals["steering_wheel_rad"].field == "steer_ang_deg"
-    write_mapping(found, tmp_path / "m.toml")
-    assert "steer_ang_deg" in (tmp_path / "m.toml").read_text()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["dlc", "sweep", "road"])
-def test_simulated_drives_need_no_mapping(sample_logs_dir: Path, name: str) -> None:
-    found = inspect_log(sample_logs_dir / f"{name}.mcap")
-    assert found.missing == ()
-    assert found.ambiguities == ()
-    assert not [c for c in found.checks if c.verdict == "failed"]
-    assert found.lost == ()
-    text = text_of(found, 80)
-    assert max(len(line) for line in text.splitlines()[1:]) <= 80
-    assert "wheel_speed_fl_m_s " in text
-    assert "pose.pose.orientation.{w,x,y,z}" in text_of(found, 110)
-
-
 @pytest.mark.slow
 def test_signal_and_truth_of_one_name_keep_their_own_comments(shared_dir: Path, tmp_path: Path) -> None:
     write_mapping(inspect_log(shared_dir / "data" / "drives" / "f1tenth_hoons_run2.bag"), tmp_path / "m.toml")

@@ -18,10 +18,10 @@ from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.results.arrow_schema import load_schema
-from pdhef_logtool.runs.config import RunConfig, load_config
+from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
+from tests.run_report import follows
 
 pytestmark = pytest.mark.slow
 
@@ -60,9 +60,8 @@ def slippery(files: Path, sample_logs_dir: Path, tmp_path_factory: pytest.TempPa
 
 def test_a_slippery_road_is_found(slippery: Any) -> None:
     _, report, track = slippery
-    import jsonschema
 
-    jsonschema.validate(report, load_schema("report.schema.json"))
+    follows(report)
     said = report["friction"]
     assert (said["source"], said["estimated"]) == ("estimate", True)
     last = track.filter(estimator="phy-ukf")["friction"].to_numpy()[-200:]
@@ -150,12 +149,3 @@ def test_the_network_is_trained_with_what_a_run_tells(
     assert len(both) > 1000
     # The track shows the friction of the newest step that had arrived, a sample or two earlier.
     assert np.quantile(np.abs(both[:, 0] - both[:, 1]), 0.9) < 0.03
-
-
-def test_flags_and_files_are_understood(tmp_path: Path) -> None:
-    (tmp_path / "pdhef.toml").write_text("friction = 0.4\n")
-    assert load_config(tmp_path / "pdhef.toml", {}).friction == 0.4
-    assert load_config(tmp_path / "pdhef.toml", {"friction": "estimate"}).friction == "estimate"
-    assert load_config(None, {"friction": "0.3"}).friction == 0.3
-    with pytest.raises(UsageError, match="--friction"):
-        load_config(None, {"friction": "icy"})

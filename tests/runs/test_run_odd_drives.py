@@ -21,7 +21,6 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
 from studies.torture.hours import Drive, read_samples, write_samples
-from tests.runs.numeric_drives import NUMERICS
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,12 @@ def _run(change: Callable[[Drive], Drive], folder: Path, sample_logs_dir: Path, 
 
 
 def test_standstill_alone_is_no_failure_and_is_said(tmp_path: Path, sample_logs_dir: Path) -> None:
-    result = _run(NUMERICS["standstill"][0], tmp_path, sample_logs_dir, "zero", "phy-ukf")  # type: ignore[arg-type]
+    def standing(drive: Drive) -> Drive:
+        level = {"w": 1.0}
+        still = {t: {k: np.full_like(v, level.get(k[-1], 0.0)) for k, v in s.values.items()} for t, s in drive.items()}
+        return {t: replace(s, values=still[t]) for t, s in drive.items()}
+
+    result = _run(standing, tmp_path, sample_logs_dir, "zero", "phy-ukf")
     assert result.exit_code == 0
     (log,) = result.results
     assert log.report is not None

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import io
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
-import jsonschema
 import numpy as np
 import pytest
 import torch
@@ -20,12 +17,12 @@ from pdhef_logtool.records.reasons import STUCK_YAW_RATE
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
-from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.results.parquet_sink import read_track
 from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
+from tests.run_report import follows
 from truthsim.drive import simulate_drive, write_drive
 from truthsim.faults import parse_fault
 
@@ -63,7 +60,7 @@ def told(text: str) -> tuple[float, float]:
 def test_the_report_says_when_the_gyro_stuck(stuck_run: tuple[RunResult, Path]) -> None:
     _, folder = stuck_run
     report = json.loads((folder / "report.json").read_text())
-    jsonschema.validate(report, load_schema("report.schema.json"))
+    follows(report)
     filters = {e["name"]: e["reasons"] for e in report["estimators"]}
     assert filters["phy-ukf"] is None
     (stuck,) = [r for r in filters["pd-hef"] if r["name"] == "stuck_yaw_rate"]
@@ -87,16 +84,3 @@ def test_the_terminal_says_it_in_one_line(stuck_run: tuple[RunResult, Path]) -> 
     (line,) = [one for one in out.getvalue().splitlines() if "gyro stuck" in one]
     assert line.strip().startswith("pd-hef: ")
     assert told(line) == (pytest.approx(START_S, abs=0.11), pytest.approx(END_S, abs=0.11))
-
-
-def test_what_several_estimators_say_stands_once(stuck_run: tuple[RunResult, Path]) -> None:
-    (one,) = stuck_run[0].results
-    report = copy.deepcopy(one.report)
-    assert report is not None
-    one_of_them, other = report["estimators"]
-    one_of_them["reasons"] = other["reasons"]
-    out = io.StringIO()
-    render_run(replace(stuck_run[0], results=(replace(one, document=report),)), Console(file=out, width=200))
-    lines = [line.strip() for line in out.getvalue().splitlines()]
-    assert sum("gyro stuck" in line for line in lines) == 1
-    assert any(line.startswith("phy-ukf, pd-hef: ") for line in lines)

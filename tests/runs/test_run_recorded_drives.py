@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
@@ -18,53 +17,17 @@ pytestmark = pytest.mark.slow
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 
 
-def _run(
-    log: Path, mapping: str, vehicle: str, out: Path, estimators: tuple[str, ...] = ("all",)
-) -> tuple[pl.DataFrame, pl.DataFrame, int]:
-    config = RunConfig(
-        mapping=REFERENCE / "mappings" / mapping,
-        car=REFERENCE / "vehicles" / vehicle,
-        estimators=estimators,
-        annotate="sidecar" if estimators == ("all",) else "none",
-    )
+def _run(log: Path, out: Path) -> tuple[pl.DataFrame, int]:
+    mapping, car = (REFERENCE / folder / "revs_250lm.toml" for folder in ("mappings", "vehicles"))
+    config = RunConfig(mapping=mapping, car=car, estimators=("phy-ukf",), annotate="none")
     result = run_logs([str(log)], out, config, report=False)
     folder = out / "logs" / result.results[0].outcome.log
-    return pl.read_parquet(out / "metrics.parquet"), pl.read_parquet(folder / "estimates.parquet"), result.exit_code
-
-
-def _sideslip_rmse_deg(metrics: pl.DataFrame) -> dict[str, float]:
-    rows = metrics.filter(
-        (pl.col("signal") == "sideslip_rad") & (pl.col("metric") == "rmse") & (pl.col("segment") == "all")
-    )
-    return {e: math.degrees(v) for e, v in rows.select("estimator", "value").iter_rows()}
+    return pl.read_parquet(folder / "estimates.parquet"), result.exit_code
 
 
 @pytest.fixture(scope="module")
-def intact(shared_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[pl.DataFrame, pl.DataFrame, int]:
-    log = shared_dir / "data/drives/revs_250lm_a.mcap"
-    out = tmp_path_factory.mktemp("intact")
-    return _run(log, "revs_250lm.toml", "revs_250lm.toml", out, ("phy-ukf", "zero", "kinematic"))
-
-
-def test_250_lm_physics_filter_beats_zero_and_kinematic(intact: tuple[pl.DataFrame, pl.DataFrame, int]) -> None:
-    metrics, estimates, code = intact
-    rmse = _sideslip_rmse_deg(metrics)
-    assert code == 0
-    assert rmse["phy-ukf"] < min(rmse["zero"], rmse["kinematic"])
-    dependent = metrics.filter(pl.col("metric") == "not_independent")
-    assert set(dependent["signal"]) == {"vx_m_s", "yaw_rate_rad_s"}
-    assert estimates.filter(pl.col("estimator") == "phy-ukf")["valid"].mean() > 0.999
-
-
-@pytest.mark.parametrize("name", ["f1tenth_hoons_run2.bag", "f1tenth_xray_run24.bag"])
-def test_f1tenth_bags_run(shared_dir: Path, tmp_path: Path, name: str) -> None:
-    metrics, estimates, code = _run(shared_dir / "data/drives" / name, "f1tenth.toml", "f1tenth.toml", tmp_path)
-    rmse = _sideslip_rmse_deg(metrics)
-    assert code == 0
-    assert {"zero", "kinematic", "open-loop", "phy-ukf"} <= rmse.keys()
-    assert all(math.isfinite(v) and v < 90.0 for v in rmse.values())
-    assert "not_independent" not in set(metrics["metric"])
-    assert estimates.filter(pl.col("estimator") == "phy-ukf")["valid"].mean() > 0.99
+def whole(shared_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> pl.DataFrame:
+    return _run(shared_dir / "data/drives/revs_250lm_a.mcap", tmp_path_factory.mktemp("intact"))[0]
 
 
 #: Its IMU is silent for half a minute.
@@ -89,15 +52,14 @@ def _single_losses_s(shared_dir: Path, name: str) -> list[float]:
 
 @pytest.mark.parametrize(("name", "exit_code", "first_loss_s", "last_gap_s"), FAULTY)
 def test_damage_costs_what_it_hit_and_nothing_else(
-    shared_dir: Path, tmp_path: Path, intact: tuple[pl.DataFrame, pl.DataFrame, int], name: str, exit_code: int,
+    shared_dir: Path, tmp_path: Path, whole: pl.DataFrame, name: str, exit_code: int,
     first_loss_s: float | None, last_gap_s: float | None,
 ) -> None:  # fmt: skip
     log = shared_dir / "data/drives/faulty" / name
-    _, hurt, code = _run(log, "revs_250lm.toml", "revs_250lm.toml", tmp_path, ("phy-ukf",))
+    hurt, code = _run(log, tmp_path)
     assert code == exit_code
     if name == SILENT:
         _tells_the_silence_of_the_imu(tmp_path)
-    whole = intact[1]
     start = whole["stamp_ns"].min()
     assert isinstance(start, int)
     columns = [c for c in whole.columns if c != "estimator"]

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import polars as pl
 import pytest
@@ -18,12 +17,12 @@ from pdhef_logtool.drive.reading import Tell, read_drive
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping
-from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.results.parquet_sink import list_estimators, read_track
 from pdhef_logtool.runs import selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, read_driving
+from tests.run_report import follows
 
 pytestmark = pytest.mark.slow
 
@@ -62,7 +61,7 @@ def rmse(out: Path, estimator: str) -> float:
 
 def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the_file(calibrated: Path) -> None:
     report = json.loads((calibrated / "logs/road/report.json").read_text())
-    jsonschema.validate(report, load_schema("report.schema.json"))
+    follows(report)
     told = {e["name"]: e for e in report["estimators"]}
     for name in ("physics", "open-loop:calibrated"):
         assert not told[name]["causal"]
@@ -139,7 +138,7 @@ def test_an_estimate_that_contradicts_the_sensors_is_not_selected_and_keeps_its_
     report = run(
         sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, estimators=("zero", "phy-ukf", "pd-hef"), end=None
     )
-    jsonschema.validate(report, load_schema("report.schema.json"))
+    follows(report)
     assert any(w.startswith("WARNING: pd-hef contradicts the sensors") for w in report["warnings"])
     assert report["selected_estimate"] == report["answer"]["main"] == "physics"
     file = tmp_path / "logs" / "sweep" / "estimates.parquet"
@@ -163,7 +162,7 @@ def test_a_car_with_evidence_keeps_its_estimate_and_is_warned_of(
 
 def test_a_calibration_on_line_stays_causal_and_says_so(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
     report = run(sample_logs_dir / "road.mcap", wrong_car, tmp_path, calibrate="online", estimators=NAMES)
-    jsonschema.validate(report, load_schema("report.schema.json"))
+    follows(report)
     told = {e["name"]: e for e in report["estimators"]}
     assert told["physics"]["causal"]
     assert told["physics"]["outcome"] == "ran"  # the causality check of the run passed

@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import json
 import math
-import struct
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import polars as pl
 import pytest
-from mcap.writer import Writer
 
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import MappingError, UsageError
 from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.recorded_estimates import score_log
+from tests.run_report import follows
 
-REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 ERRORS = ("rmse", "rmse_relative", "mae", "bias", "p95_abs", "max_abs", "coverage95", "lag_s", "availability", "nees")
 
 Key = tuple[str, str, str]
@@ -133,9 +129,9 @@ def test_outputs_are_those_of_a_run(annotated: Path, config: RunConfig, tmp_path
     assert {p.name for p in folder.iterdir()} == {"estimates.parquet", "metrics.parquet", "report.json"}
     assert {p.name for p in tmp_path.iterdir()} == {"logs", "metrics.parquet", "run.json"}
     report = json.loads((folder / "report.json").read_text())
-    jsonschema.validate(report, load_schema("report.schema.json"))
+    follows(report)
     run = json.loads((tmp_path / "run.json").read_text())
-    jsonschema.validate(run, load_schema("run.schema.json"))
+    follows(run, "run.schema.json")
     assert run["config"]["estimates"]["phy-ukf"]["vx_m_s"] == "/pdhef/phy_ukf/state.vx_m_s"
     again = pl.read_parquet(folder / "estimates.parquet")
     of_run = pl.read_parquet(annotated / "estimates.parquet")
@@ -222,9 +218,7 @@ def test_an_estimate_that_is_the_truth_is_marked(annotated: Path, config: RunCon
 
 
 def _write_log(
-    path: Path,
-    topics: dict[str, dict[str, np.ndarray[Any, Any]]],
-    stamps_ns: dict[str, np.ndarray[Any, Any]],
+    path: Path, topics: dict[str, dict[str, np.ndarray[Any, Any]]], stamps_ns: dict[str, np.ndarray[Any, Any]]
 ) -> None:
     writer = McapLogWriter(path, profile="ros2")
     for name in topics:
@@ -283,63 +277,3 @@ def test_other_stamps_than_the_truths_without_any_imu(tmp_path: Path) -> None:
     assert report["truth"]["latency_s"] is None
     assert any("latency" in note and "0" in note for note in report["truth"]["notes"])
     assert any("no IMU" in text for text in said)
-
-
-DBC = """VERSION ""
-NS_ :
-BS_:
-BU_: ECU
-BO_ 256 Esc: 4 ECU
- SG_ Beta : 0|16@1- (0.01,0) [-300|300] "deg" ECU
- SG_ Speed : 16|16@1+ (0.01,0) [0|600] "km/h" ECU
-"""
-
-
-def test_estimate_of_a_control_unit_on_can(tmp_path: Path) -> None:
-    """Sideslip in hundredths of a degree and speed in km/h, from raw frames, against a truth in JSON."""
-    start = 1_700_000_000_000_000_000
-    with (tmp_path / "esc.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        number = {"type": "number"}
-        frame = {"type": "object", "properties": {"id": number, "data": {"type": "array", "items": number}}}
-        truth = {"type": "object", "properties": {"vx": number, "vy": number}}
-        channels = {}
-        for topic, schema in (("can.raw", frame), ("ref.v", truth)):
-            schema_id = writer.register_schema(topic, "jsonschema", json.dumps(schema).encode())
-            channels[topic] = writer.register_channel(topic, "json", schema_id)
-        for i in range(400):
-            stamp = start + i * 20_000_000
-            beta_deg, speed = 2.0 * math.sin(i / 20.0), 20.0
-            state = {"vx": speed * math.cos(math.radians(beta_deg)), "vy": speed * math.sin(math.radians(beta_deg))}
-            raw = struct.pack("<hH", round(100.0 * beta_deg) + 50, round(360.0 * state["vx"]))
-            for topic, message in (("ref.v", state), ("can.raw", {"id": 256, "data": list(raw)})):
-                writer.add_message(channels[topic], stamp, json.dumps(message).encode(), stamp)
-        writer.finish()
-    (tmp_path / "esc.dbc").write_text(DBC)
-    (tmp_path / "m.toml").write_text(
-        '[can]\ndbc = "esc.dbc"\n'
-        '[estimates.esc.sideslip_rad]\ntopic = "can.raw"\nfield = "can:Esc.Beta"\nscale = 0.017453292519943295\n'
-        '[estimates.esc.vx_m_s]\ntopic = "can.raw"\nfield = "can:Esc.Speed"\nscale = 0.2777777777777778\n'
-    )
-    config = RunConfig(mapping=tmp_path / "m.toml")
-    named = ["vx_m_s=ref.v.vx", "vy_m_s=ref.v.vy"]
-    report = score_log(str(tmp_path / "esc.mcap"), config, truth=named).results[0].report
-    assert report is not None
-    assert _value(report, "sideslip_rad", "bias") == pytest.approx(math.radians(0.5), abs=math.radians(0.002))
-    assert _value(report, "vx_m_s", "max_abs") < 0.01 / 3.6
-    assert {m["signal"] for m in report["metrics"]} == {"vx_m_s", "vy_m_s", "sideslip_rad"}
-
-
-def test_250_lm_speed_is_not_independent_of_its_truth(shared_dir: Path) -> None:
-    log = shared_dir / "data/drives/revs_250lm_a.mcap"
-    config = RunConfig(car=REFERENCE / "vehicles/revs_250lm.toml", start="0", end="60")
-    estimate = "vx_m_s=/vehicle/status/velocity_status.longitudinal_velocity"
-    truth = [f"{s}=/ins/odometry.twist.twist.linear.{a}" for s, a in (("vx_m_s", "x"), ("vy_m_s", "y"))]
-    for named in ((), truth):
-        report = score_log(str(log), config, estimates=[estimate], truth=named).results[0].report
-        assert report is not None
-        assert "vx_m_s" in report["truth"]["not_independent"]
-        assert _value(report, "vx_m_s", "not_independent") == 1.0
-        assert _value(report, "vx_m_s", "rmse") < 1e-5
-        assert {m["signal"] for m in report["metrics"]} == {"vx_m_s"}  # no other claim

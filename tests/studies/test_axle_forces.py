@@ -77,19 +77,6 @@ def test_axle_forces_follow_from_newton_and_euler() -> None:
     assert axle_samples([FitDrive("t", two, short)], CAR).front_force_n.size == 0
 
 
-def test_forces_at_another_friction_are_those_of_one_curve() -> None:
-    """Similarity: force over friction by slip over friction; without it, or without a friction, as they are."""
-    n = len(DRIVE.signals)
-    plain = axle_samples([DRIVE], CAR)
-    icy = replace(DRIVE, signals=replace(DRIVE.signals, friction=np.full(n, 0.34)))
-    one = axle_samples([icy], CAR, similar=True)
-    grip = 0.34 / 0.85
-    for name in ("front_slip_rad", "front_force_n", "rear_slip_rad", "rear_force_n"):
-        np.testing.assert_allclose(getattr(one, name), getattr(plain, name) / grip)
-        np.testing.assert_array_equal(getattr(axle_samples([icy], CAR), name), getattr(plain, name))
-        np.testing.assert_array_equal(getattr(axle_samples([DRIVE], CAR, similar=True), name), getattr(plain, name))
-
-
 def test_the_curve_is_the_magic_formula() -> None:
     curve = AxleCurve(100_000.0, 8000.0, 1.3)
     assert curve.force_n(np.array([1e-6]))[0] == pytest.approx(0.1)
@@ -117,17 +104,6 @@ def test_the_fit_minimises_the_cost_of_method_14(count: int) -> None:
         aside = at.copy()
         aside[i] += sign * 2e-3
         assert cost(aside) > cost(at)
-
-
-def test_a_peak_stays_above_what_was_seen_and_few_samples_say_nothing() -> None:
-    slip = np.linspace(-0.2, 0.2, 2000)
-    flat = 6000.0 * np.tanh(slip / 0.02)
-    found = fit_axle(slip, flat, prior=AxleCurve(90_000.0, 5000.0, 1.35), mass_kg=1500.0, independent=1e6)
-    assert found.peak_n == pytest.approx(6600.0, rel=1e-3)
-    assert 1.0 <= found.shape <= 1.9
-    prior = AxleCurve(90_000.0, 5000.0, 1.35)
-    assert fit_axle(slip[:9], flat[:9], prior=prior, mass_kg=1500.0, independent=9.0) is prior
-    assert fit_axle(slip[:10], flat[:10], prior=prior, mass_kg=1500.0, independent=9.0) != prior
 
 
 # ---- priors ----

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 
-import numpy as np
 import pytest
 
 from pdhef_logtool.car.car import Car
@@ -18,7 +17,7 @@ from studies.pages import DOCS, RESULTS
 from studies.paper.comparison import improvement, spread
 from studies.paper.constants import FILE, GRID, choose
 from studies.paper.experiment import FIRST_NOISE_SEED, A, B, Experiment, Run, run_experiment
-from studies.paper.page import number, percent, write_page
+from studies.paper.page import write_page
 
 pytestmark = pytest.mark.slow
 
@@ -126,14 +125,3 @@ def test_constants_are_chosen_by_cycles_until_nothing_changes() -> None:
     assert all(goal(chosen) <= goal(chosen._replace(**{name: v})) for name, values in GRID.items() for v in values)
     assert chosen.ay_variance == 0.1
     assert chosen.deviation_tops_m_s2 in GRID["deviation_tops_m_s2"]
-
-
-def test_numbers_have_three_digits_and_no_powers() -> None:
-    rng = np.random.default_rng(0)
-    for value in 10.0 ** rng.uniform(-6.0, 5.0, 200) * rng.choice([-1.0, 1.0], 200):
-        text = number(float(value))
-        assert "e" not in text
-        assert float(text.replace("−", "-")) == pytest.approx(value, rel=0.0051)
-    assert number(0.0336) == "0.0336"
-    assert percent(-0.005) == "−0.5 %"
-    assert number(math.nan) == "unknown"

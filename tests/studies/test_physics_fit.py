@@ -16,17 +16,7 @@ from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD
 from pdhef_logtool.records.tracks import make_track
 from studies.defaults import physics_fit
 from studies.defaults.axle_forces import FitDrive, axle_samples, part_of
-from studies.defaults.physics_fit import (
-    GUARD_S,
-    STARTS,
-    build_car,
-    choose_parts,
-    drive_errors,
-    fit_physics,
-    make_folds,
-    make_priors,
-    usable_seconds,
-)
+from studies.defaults.physics_fit import STARTS, build_car, choose_parts, drive_errors, fit_physics, make_priors
 
 STATIC = PhysicsParts()
 #: Slope of the true tyres at no slip, N/rad at friction 0.85.
@@ -97,22 +87,6 @@ def test_stiffness_is_found_within_the_posteriors_interval(static: FitDrive) -> 
     assert 0.3 < after.nis < 3.0
 
 
-def test_errors_count_where_truth_is_usable_and_the_filter_has_settled(static: FitDrive) -> None:
-    priors = make_priors(guess(), STATIC, axle_samples([static], guess()), 24.0)
-    vehicle, noise = build_car(guess(), STATIC, priors, np.zeros(len(priors)))
-    (whole,) = drive_errors([static], guess(), vehicle, noise)
-    assert whole.error.size == math.ceil(len(static.signals) / 2)  # 50 Hz: every other one, 25 a second
-    assert (whole.error[:51] == 0.0).all() and (whole.error[51:] != 0.0).all()
-    assert whole.counted == whole.error.size - 51
-    assert whole.seconds == pytest.approx(22.0, abs=0.05)
-    assert whole.rms == pytest.approx(math.sqrt(np.mean(whole.error[51:] ** 2)))
-    hidden = replace(static, truth=replace(static.truth, valid=np.arange(len(static.signals)) < 600))
-    (half,) = drive_errors([hidden], guess(), vehicle, noise)
-    assert (half.error[300:] == 0.0).all()
-    assert half.counted == 300 - 51
-    np.testing.assert_array_equal(half.error[:300], whole.error[:300])
-
-
 # ---- priors and the car that they make ----
 
 CORE = [f"{axle} {what}" for axle in ("front", "rear") for what in ("cornering stiffness", "peak force", "shape")]
@@ -163,35 +137,6 @@ def test_the_car_at_theta_has_its_values_and_keeps_the_rest() -> None:
 
 
 # ---- parts ----
-
-
-def lasts(drive: FitDrive) -> float:
-    return float(drive.signals.stamps_ns[-1] - drive.signals.stamps_ns[0]) * 1e-9
-
-
-@pytest.mark.slow
-def test_few_drives_are_cut_and_many_are_dealt_out(static: FitDrive, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(physics_fit, "LEAST_FOLD_S", 20.0)
-    long = static_drive(3, 50.0)
-    (one, other), back = make_folds([long], guess())
-    assert back == (other, one)
-    ((first,), (second,)) = one, other
-    gap = float(second.signals.stamps_ns[0] - first.signals.stamps_ns[-1]) * 1e-9
-    assert gap == pytest.approx(2.0 * GUARD_S, abs=0.05)
-    assert lasts(first) == pytest.approx(lasts(second), abs=0.1)
-    # The cut divides usable driving, not time.
-    late = replace(long, truth=replace(long.truth, valid=np.arange(len(long.truth)) >= 200))
-    (((first,), (second,)), _) = make_folds([late], guess())
-    assert usable_seconds(first, guess()) == pytest.approx(usable_seconds(second, guess()), abs=0.1)
-    assert lasts(first) > lasts(second) + 3.0
-    many = [replace(static, name=str(i)) for i in range(5)]
-    idle = replace(static, name="idle", truth=replace(static.truth, valid=np.zeros(len(static.truth), dtype=bool)))
-    ((one, other), back) = make_folds([idle, *many], guess())
-    assert [[d.name for d in half] for half in (one, other)] == [["0", "2", "4"], ["1", "3"]]
-    assert back == (other, one)
-    assert make_folds([part_of(long, 0, 2200)], guess()) == []  # 44 s, of which the guard takes 5
-    assert make_folds([], guess()) == []
-    assert make_folds([idle], guess()) == []
 
 
 @pytest.fixture

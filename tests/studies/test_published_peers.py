@@ -13,7 +13,7 @@ from studies.pages import DOCS, RESULTS
 from studies.peers import __main__ as peers
 from studies.peers.drives import FULL_SIZE, OFFSET, PEER_DRIVES, PeerDrive, beside_mapping, beside_vehicle
 from studies.peers.page import page
-from studies.peers.parameters import OF_CAR, PEAK, pairs_table
+from studies.peers.parameters import pairs_table
 from studies.peers.scoring import DriveErrors, car_means, score
 
 
@@ -78,31 +78,3 @@ def test_the_page_shows_the_stored_errors_of_every_drive():
     text = page([DriveErrors.of(d) for d in documents], pairs_table(parameters))
     assert (DOCS / "peers.md").read_text(encoding="utf-8") == text
     assert sum(drive.group == FULL_SIZE for drive in PEER_DRIVES) == 9
-
-
-def test_parameters_are_compared_between_drives_of_one_car():
-    """Of three GTI drives stiffness and peak of one are 3 sigma off. The two logs of one V40 drive are no pair."""
-
-    def of(log: str, factor: float):
-        fitted = [
-            {
-                "name": n,
-                "value": factor if n in (OF_CAR[0], PEAK) else 1.0,
-                "prior": 1.0,
-                "sd": 0.1,
-                "log": n in (OF_CAR[0], PEAK),
-                "excited": True,
-            }
-            for n in OF_CAR
-        ]
-        return {"log": log, "parameters": fitted}
-
-    logs = ("niki_gti_1khz.mcap", "gti_pole_aa.mcap", "gti_low_speed.mcap", "lunda_v40", "v40_swd_gnss.mcap")
-    off = float(np.exp(3.0 * np.hypot(0.1, 0.1)))
-    rows = pairs_table([of(log, off if i == 0 else 1.0) for i, log in enumerate(logs)]).splitlines()[2:]
-    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
-    assert cells[0] == [OF_CAR[0], "3", "33%", "2.45", "3", "33%"]
-    assert cells[1] == [OF_CAR[1], "3", "100%", "0.00", "3", "100%"]
-    assert cells[OF_CAR.index(PEAK)] == [PEAK, "3", "33%", "2.45", "3", "33%"]
-    assert cells[-1][:3] == ["all", str(3 * len(OF_CAR)), f"{1.0 - 4.0 / (3 * len(OF_CAR)):.0%}"]
-    assert cells[-1][-1] == f"{1.0 - 4.0 / (3 * len(OF_CAR)):.0%}"

@@ -102,10 +102,3 @@ def test_no_stage_of_the_project_needs_the_output_of_a_later_one() -> None:
         assert not any(i.startswith("@") for i in stage.inputs)
         files = [p for p in stage.inputs if p.startswith(("studies", "benchmarks", "pdhef_logtool/", "truthsim"))]
         assert all(list(ROOT.glob(p)) for p in files)
-
-
-def test_the_list_states_the_duration_of_each_stage(project: Recalibration) -> None:
-    project.run(["first"])
-    rows = project.listed().splitlines()[2:]
-    assert [row.split(" | ")[3] for row in rows] == ["no", "yes", "yes"]
-    assert all("not measured" in row for row in rows)

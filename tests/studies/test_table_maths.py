@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from studies.table_maths import (
-    median_ratio,
-    percentiles,
-    pooled_mean,
-    pooled_rmse,
-    verdict,
-)
+from studies.table_maths import median_ratio, percentiles, pooled_mean, pooled_rmse, verdict
 
 
 def test_pooling_equals_the_rmse_of_all_samples_together():

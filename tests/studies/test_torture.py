@@ -38,16 +38,8 @@ def _quiet(_text: str) -> None:
 def test_mutants_do_no_harm(tmp_path: Path) -> None:
     """Run in a separate process: memory used by the tests must not count for the mutants."""
     options = ["--seed", "2", "--logs", str(LOGS), "--configs", str(CONFIGS), "--jobs", "1", "--only", "mutations"]
-    call = [
-        sys.executable,
-        "-m",
-        "studies.torture",
-        *options,
-        "--work",
-        str(tmp_path),
-        "--out",
-        str(tmp_path / "none.md"),
-    ]
+    places = ["--work", str(tmp_path), "--out", str(tmp_path / "none.md")]
+    call = [sys.executable, "-m", "studies.torture", *options, *places]
     done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=False)
     found = json.loads((tmp_path / "mutations.json").read_text())
     assert [p for part in found.values() for p in part["problems"]] == []
@@ -72,9 +64,7 @@ _LARGE = ("GiB", "MB", "channels", "million")
 @pytest.mark.slow
 @pytest.mark.parametrize("bomb", [b for b in BOMBS if not any(w in b.name for w in _LARGE)][::6], ids=lambda b: b.name)
 def test_a_bomb_ends_in_time_with_its_exit_code(bomb: Bomb, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "studies.torture.bombs.LIMIT_S", 120.0
-    )  # only ends a hang: other processes may load the machine
+    monkeypatch.setattr("studies.torture.bombs.LIMIT_S", 120.0)  # only ends a hang: others may load the machine
     assert judge_bomb(bomb, tmp_path).problem == ""
 
 
@@ -189,11 +179,3 @@ def test_what_dies_hangs_or_grows_is_told_and_the_rest_goes_on(tmp_path: Path, m
 )
 def test_what_counts_as_wrong(ended: Ended, wrong: bool) -> None:
     assert bool(judge(ended).problem) is wrong
-
-
-@pytest.mark.slow
-def test_the_memory_of_a_command_is_its_own() -> None:
-    kept = bytearray(b"x") * (300 << 20)
-    process = outside.measured("--version")
-    assert 10 << 20 < process.peak_bytes < len(kept)
-    assert not process.late and not process.left

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pdhef_logtool.records.errors import OutputError, SimulationError, UsageError, VehicleError
+from pdhef_logtool.records.errors import SimulationError, UsageError, VehicleError
 from pdhef_logtool.workers.supervisor import Ended, Failure
 from truthsim import batch
-from truthsim.batch import BINS, DriveSpec, Job, make_drive, run_jobs, sensor_noise, time_in_bins_s
-from truthsim.conditions import ROW_NAMES, plan_conditions, write_conditions
+from truthsim.batch import BINS, DriveSpec, Job, make_drive, run_jobs, time_in_bins_s
+from truthsim.conditions import ROW_NAMES, write_conditions
 from truthsim.suite import SHARES, is_held_out, plan_suite, write_suite
 from truthsim.vehicle import Vehicle
 from truthsim.vehicle_choice import choose_vehicle
@@ -147,13 +147,6 @@ def test_drives_whose_process_died_are_told_and_the_others_made(
     assert run_jobs(jobs, tmp_path, {}, processes=1)["complete"]
 
 
-def test_what_cannot_be_written_ends_a_batch(tmp_path: Path) -> None:
-    jobs = plan_suite(1, 3, duration_s=4.0)
-    (tmp_path / jobs[0].file).mkdir()
-    with pytest.raises(OutputError):
-        run_jobs(jobs, tmp_path, {}, processes=1)
-
-
 def test_a_drive_that_spins_gives_way_to_the_next_and_is_reported(tmp_path: Path) -> None:
     # Swapped tyres with soft rears spin in the severe lane change.
     spun = DriveSpec("dlc-3888-2", 70.0, 0.2, 1, 8.0, vehicle="sedan,cg=0.45")
@@ -247,11 +240,6 @@ def test_bad_requests_are_refused(wrong, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_every_job_has_a_file_of_its_own() -> None:
-    jobs, rows = plan_conditions(4, 1)
-    assert len({job.file for job in jobs}) == len(jobs) == 4 * sum(row.draw is not None for row in rows)
-
-
 def test_a_vehicle_is_named_in_one_word() -> None:
     sedan = load_vehicle("sedan")
     assert choose_vehicle("sedan") == sedan == Vehicle()
@@ -282,10 +270,3 @@ def test_a_vehicle_is_named_in_one_word() -> None:
 def test_what_is_no_vehicle_is_refused(text: str) -> None:
     with pytest.raises((SimulationError, VehicleError)):
         choose_vehicle(text)
-
-
-def test_sensor_values_are_checked_by_name_and_value() -> None:
-    assert sensor_noise({"jitter_s": 0.004, "imu_x_m": -0.3}).jitter_s == 0.004
-    for wrong in ({"gps": 1.0}, {"jitter_s": -1.0}, {"yaw_rate_rad_s": float("nan")}):
-        with pytest.raises(UsageError):
-            sensor_noise(wrong)

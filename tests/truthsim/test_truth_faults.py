@@ -16,7 +16,6 @@ from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
 from truthsim.faults import FIELDS, KINDS, TARGETS, apply_faults, parse_fault
 from truthsim.manoeuvres import Plan
 from truthsim.motion import simulate_motion
-from truthsim.recording import PARTS
 from truthsim.sensors import STEER_PHASE_S, WHEEL_PHASE_S, SensorChannel, SensorNoise, sense
 from truthsim.vehicle import Vehicle
 
@@ -205,20 +204,3 @@ def test_a_log_tells_its_faults_as_events_and_in_its_metadata(tmp_path: Path) ->
     wheel = np.array([m.angle_rad for m in messages["/vehicle/steering_wheel"]])
     road = np.array([m.steering_tire_angle for m in messages["/vehicle/status/steering_status"]])
     assert wheel == pytest.approx(16.0 * road, abs=1e-5)
-
-
-def test_parts_can_be_left_out(tmp_path: Path) -> None:
-    drive = simulate_drive("step-steer", faults=[parse_fault("stuck:ay:1:2")])
-    write_drive(drive, tmp_path / "blind.mcap", without=["rtk", "perfect", "events"])
-    messages, _ = read(tmp_path / "blind.mcap")
-    assert set(messages) == {"/imu/data", "/vehicle/status/steering_status", "/vehicle/wheel_speeds"}
-    with pytest.raises(UsageError, match="gps"):
-        write_drive(drive, tmp_path / "x.mcap", without=["gps"])
-    write_drive(drive, tmp_path / "x.mcap")
-    assert {topic for part in PARTS.values() for topic in part} == set(read(tmp_path / "x.mcap")[0])
-
-
-def test_a_sensor_that_never_speaks_leaves_an_empty_topic(tmp_path: Path) -> None:
-    drive = simulate_drive("step-steer", faults=[parse_fault("dropout:wheels:0:end")])
-    write_drive(drive, tmp_path / "x.mcap")
-    assert "/vehicle/wheel_speeds" not in read(tmp_path / "x.mcap")[0]

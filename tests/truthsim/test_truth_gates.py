@@ -339,12 +339,8 @@ GATES: dict[Gate, list[Wrong]] = {
         times(1.1, "cg_to_front_axle_m"),
         code("vehicle.py", "", "0.5 * vehicle.mass_kg * GRAVITY_M_S2", "0.55 * vehicle.mass_kg * GRAVITY_M_S2"),
     ],
-    left_is_right: [
-        code("vehicle.py", "side = ", "1.0 if wheel == 0 else -1.0", "1.0 if wheel == 0 else 1.0"),
-    ],
-    steps_are_fine_enough: [
-        code("motion.py", "", RK4, RK4.replace("2.0 * k2", "2.2 * k2")),
-    ],
+    left_is_right: [code("vehicle.py", "side = ", "1.0 if wheel == 0 else -1.0", "1.0 if wheel == 0 else 1.0")],
+    steps_are_fine_enough: [code("motion.py", "", RK4, RK4.replace("2.0 * k2", "2.2 * k2"))],
     forces_lag_by_the_relaxation_length: [
         tyres(1.1, "lateral_relaxation_m"),
         tyres(-1.0, "lateral_relaxation_m"),
@@ -390,11 +386,9 @@ GATES: dict[Gate, list[Wrong]] = {
             "road_x * v_y - ",
             "road_y * v_x",
             "(road_y + 0.1 * heading_rate * math.sin(road[BANK])) * v_x",
-        ),
+        )
     ],
-    a_hill_pulls: [
-        code("vehicle.py", "weight_x = ", "-GRAVITY_M_S2", "GRAVITY_M_S2"),
-    ],
+    a_hill_pulls: [code("vehicle.py", "weight_x = ", "-GRAVITY_M_S2", "GRAVITY_M_S2")],
     coasting_is_slowed_by_air_and_tyres: [
         times(1.1, "drag_area_m2"),
         times(-1.0, "drag_area_m2"),

@@ -14,10 +14,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pdhef_logtool.car.toml_files import read_vehicle_file
-from pdhef_logtool.records.errors import OutputError
 from studies.defaults import fit_nominal_tyres
 from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
-from truthsim.samples import SAMPLES, write_sample, write_samples
+from truthsim.samples import SAMPLES, write_sample
 
 pytestmark = pytest.mark.slow
 
@@ -164,12 +163,6 @@ def test_a_long_drive_is_written_in_pieces_without_a_seam(tmp_path: Path) -> Non
     assert set(np.diff(log_times["/rtk/odometry"])) == {20_000_000}
 
 
-def test_a_folder_that_cannot_be_made_is_one_clear_line(drive: Drive, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError):
-        write_drive(drive, tmp_path / "file" / "x.mcap")
-
-
 @pytest.fixture(scope="module")
 def manifest() -> list[dict]:
     return tomllib.loads((ROOT / "sample_logs" / "manifest.toml").read_text(encoding="utf-8"))["log"]
@@ -244,30 +237,6 @@ def test_the_rosbag2_sample_holds_what_its_mcap_would(tmp_path: Path) -> None:
     assert {t: len(m) for t, m in found.items()} == {t: len(m) for t, m in messages.items()}
     for (time, new), (log_time, _, old) in zip(found["/imu/data"], messages["/imu/data"], strict=True):
         assert time == log_time and new.angular_velocity.z == pytest.approx(old.angular_velocity.z, abs=2e-4)
-
-
-def test_write_samples_repeats_itself_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    chosen = tuple(s for s in SAMPLES if s.file in ("dlc.mcap", "step_rosbag2"))
-    monkeypatch.setattr("truthsim.samples.SAMPLES", chosen)
-    manifests = []
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        write_samples(tmp_path / name)
-        manifests.append((tmp_path / name / "manifest.toml").read_bytes())
-    assert manifests[0] == manifests[1]
-    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["dlc.mcap", "manifest.toml", "step_rosbag2"]
-    write_samples(tmp_path / "a")  # over existing files
-    assert (tmp_path / "a" / "manifest.toml").read_bytes() == manifests[0]
-
-
-def test_vehicle_files_are_the_fit_to_the_truth_vehicle(tmp_path: Path) -> None:
-    fit_nominal_tyres.main(tmp_path)
-    for name, friction in (("vehicle.toml", 0.85), ("vehicle_mu03.toml", 0.3)):
-        old, new = read_vehicle_file(ROOT / "sample_logs" / name).vehicle, read_vehicle_file(tmp_path / name).vehicle
-        assert old.friction == new.friction == friction
-        for front in (True, False):
-            assert new.magic_formula(front, friction) == pytest.approx(old.magic_formula(front, friction), rel=0.01)
-        assert new.roll_gradient_rad_per_m_s2 == pytest.approx(old.roll_gradient_rad_per_m_s2, rel=0.01)
 
 
 @pytest.mark.parametrize(("name", "friction"), [("vehicle.toml", 0.85), ("vehicle_mu03.toml", 0.3)])

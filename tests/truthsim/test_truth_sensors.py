@@ -17,7 +17,6 @@ from truthsim.sensors import (
     SensorNoise,
     ahead_by_play,
     sense,
-    slow_walk,
     student_t,
 )
 from truthsim.vehicle import Vehicle
@@ -100,14 +99,6 @@ def test_biases_are_drawn_per_drive() -> None:
         assert np.ptp(errors, axis=1).max() < 0.1 * sigma + 0.005, field
 
 
-def test_slow_walk_has_its_spread_and_its_time_constant() -> None:
-    walk = slow_walk(np.random.default_rng(2), 0.02, 2.0, 0.01, 400_000)
-    assert walk.std() == pytest.approx(0.02, rel=0.1)
-    for lag_s in (0.5, 2.0):
-        n = round(lag_s / 0.01)
-        assert np.corrcoef(walk[n:], walk[:-n])[0, 1] == pytest.approx(np.exp(-lag_s / 2.0), abs=0.06)
-
-
 def test_messages_arrive_late_by_the_bus_and_keep_their_order(lane_change: Motion) -> None:
     channels = sense(lane_change, Vehicle(), SensorNoise(), 1, 100)
     for name in ("imu", "steering", "wheels"):
@@ -170,14 +161,6 @@ def test_rtk_is_good_to_centimetres_and_consistent_in_itself(lane_change: Motion
     assert rms["vy_m_s"] == pytest.approx(np.hypot(0.012, 27.7 * 0.0005), rel=0.2)
 
 
-def test_rtk_rates() -> None:
-    motion = record(Plan(20.0, 10.0, steer_rad=np.zeros(10_001)))
-    for rate in (10, 20, 50, 100):
-        channels = sense(motion, Vehicle(), SensorNoise(), 1, rate)
-        assert np.diff(channels["rtk"].times_s) == pytest.approx(1.0 / rate)
-        assert np.diff(channels["fix"].times_s) == pytest.approx(0.1)
-
-
 def test_fix_is_the_position_in_geodetic_coordinates(lane_change: Motion) -> None:
     channels = sense(lane_change, Vehicle(), SensorNoise(), 1, 100)
     fix, rtk = channels["fix"].fields, channels["rtk"].fields
@@ -222,20 +205,6 @@ def test_an_imu_away_from_the_cg_feels_the_turning() -> None:
         assert np.array_equal(moved[name], at_cg[name])
 
 
-def test_a_bank_and_a_grade_are_felt_as_gravity() -> None:
-    road = np.zeros((400, 4))
-    road[:, :2], road[:, 2], road[:, 3] = 0.85, 0.05, 0.04
-    n = 8001
-    motion = record(Plan(15.0, 8.0, steer_rad=np.zeros(n), road=road))
-    imu = sense(motion, Vehicle(), NO_NOISE, 1, 100)["imu"].fields
-    late = motion.times_s > 3.0
-    # Uphill pushes into the back as an acceleration would; leaning to the right, the left side is pushed.
-    assert np.mean(imu["ax_m_s2"][late] - motion.column("ax_m_s2")[late]) == pytest.approx(G * 0.04, rel=0.1)
-    felt = imu["ay_m_s2"][late] - motion.column("ay_m_s2")[late]
-    assert np.mean(felt) == pytest.approx(G * 0.05, rel=0.12)
-    assert np.mean(np.diff(motion.column("z_m")) / 0.01) == pytest.approx(15.0 * 0.04, rel=0.1)
-
-
 def test_sensors_end_at_their_full_scale(lane_change: Motion) -> None:
     imu = sense(lane_change, Vehicle(), NO_NOISE._replace(acceleration_range_m_s2=4.0, rate_range_rad_s=0.2), 1, 100)
     free = sense(lane_change, Vehicle(), NO_NOISE, 1, 100)
@@ -259,20 +228,6 @@ def test_the_bus_loses_its_share_of_messages(straight: Motion) -> None:
         for field, column in lossy[name].fields.items():
             assert np.array_equal(column, usual[name].fields[field][there]), field
     assert np.array_equal(lossy["rtk"].times_s, usual["rtk"].times_s)
-
-
-@pytest.mark.slow
-def test_the_steering_ratio_is_known_to_its_share(lane_change: Motion) -> None:
-    clean = lane_change.column("steer_rad", 1)
-    gains = [
-        np.polyfit(
-            clean,
-            sense(lane_change, Vehicle(), NO_NOISE._replace(steer_gain=0.02), s, 100)["steering"].fields["steer_rad"],
-            1,
-        )[0]
-        for s in range(200)
-    ]
-    assert np.mean(gains) == pytest.approx(1.0, abs=0.005) and np.std(gains) == pytest.approx(0.02, rel=0.15)
 
 
 def test_play_lets_the_steering_wheel_turn_alone_behind_a_reversal(lane_change: Motion) -> None:

@@ -59,23 +59,6 @@ def test_resultant_never_exceeds_friction_and_mirrors(load: float, kappa: float,
     assert fx * kappa >= 0.0 and fy * alpha >= 0.0
 
 
-def test_braking_takes_from_the_side_force() -> None:
-    free = forces_n(TYRE, 0.0, 0.05, 3530.0, 0.85)[1]
-    braked = forces_n(TYRE, -0.08, 0.05, 3530.0, 0.85)[1]
-    assert 0.3 * free < braked < 0.85 * free
-
-
-def test_load_transfer_costs_force() -> None:
-    # docs/method.md#physics: F_y(F_z0 + d) + F_y(F_z0 - d) < 2 F_y(F_z0), at small and at large slip.
-    for alpha in (0.01, 0.05, 0.15):
-        pair = sum(forces_n(TYRE, 0.0, alpha, 3530.0 + d, 0.85)[1] for d in (1500.0, -1500.0))
-        assert pair < 0.99 * 2.0 * forces_n(TYRE, 0.0, alpha, 3530.0, 0.85)[1]
-
-
-def test_no_load_no_force() -> None:
-    assert forces_n(TYRE, 0.3, 0.3, 0.0, 0.85)[:2] == (0.0, 0.0)
-
-
 @pytest.mark.parametrize("speed", [5.0, 20.0, 40.0])
 def test_slip_builds_up_over_the_relaxation_length(speed: float) -> None:
     # A wheel at constant small slip: 1 - e^-1 of it is there after sigma / v.

@@ -47,18 +47,14 @@ def test_vehicles_differ_in_what_they_are() -> None:
     ("old", "new", "words"),
     [
         ("mass_kg = 1440.0\n", "", ("mass_kg: is missing",)),
-        ("mass_kg = 1440.0", "mass_kg = -1.0", ("mass_kg", "-1.0", "greater than 0")),
-        ("mass_kg = 1440.0", 'mass_kg = "heavy"', ("mass_kg", "heavy", "number")),
         ("mass_kg = 1440.0", "mass_kg = nan", ("mass_kg", "nan", "finite")),
         ("track_m = ", "trakc_m = ", ("track_m: is missing", "trakc_m: unknown, did you mean track_m?")),
         ("ackermann = 0.5", "ackermann = 1.5", ("ackermann", "1.5")),
-        ("[rear_tyre]", "[rear_tire]", ("rear_tire: unknown, did you mean rear_tyre?",)),
         ("front_unsprung_mass_kg = 35.0", "front_unsprung_mass_kg = 400.0", ("unsprung",)),
         ("front_unsprung_mass_kg = 35.0", "front_unsprung_mass_kg = 1.0", ("300 rad/s",)),
         ("cg_height_m = 0.64", "cg_height_m = 6.4", ("upright",)),
         ("front_roll_centre_height_m = 0.1", "front_roll_centre_height_m = 0.9", ("roll and pitch centres",)),
         ("lateral_relaxation_min_m = 0.3", "lateral_relaxation_min_m = 0.9", ("front_tyre", "lateral_relaxation")),
-        ("track_m = 1.57", "track_m = = 2", ("TOML",)),
     ],
 )
 def test_a_wrong_file_is_one_clear_line(tmp_path: Path, old: str, new: str, words: tuple[str, ...]) -> None:
