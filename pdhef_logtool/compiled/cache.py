@@ -174,6 +174,9 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
             super().__init__(function)
         finally:
             config.CACHE_DIR = usual
+        # The folder names the digest of all sources: their place and time do not matter.
+        self._impl.locator._cache_path = self._cache_path = str(folder / function.__module__)
+        self._cache_file = caching.IndexDataCacheFile(self._cache_path, self._impl.filename_base, "")
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         overload = None

@@ -99,6 +99,21 @@ def test_code_of_a_read_only_installation_is_copied_and_not_compiled_again(
     assert _code_files(tmp_path / "home")
 
 
+def test_code_serves_the_same_sources_at_another_place_and_time(
+    module_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _load(module_file).more(1) == 2
+    shutil.copytree(tmp_path / "installed", tmp_path / "other")
+    elsewhere = tmp_path / "other" / module_file.relative_to(tmp_path / "installed")
+    os.utime(elsewhere, (1, 1))
+    monkeypatch.setattr(sources, "ROOT", tmp_path / "other")
+    cache.kept_in.cache_clear()
+    capsys.readouterr()
+    monkeypatch.setattr(cache, "announced", False)
+    assert _load(elsewhere).more(1) == 2
+    assert capsys.readouterr().err == ""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("length", [0, 1, 40])
 def test_a_file_that_was_cut_short_is_compiled_anew(module_file: Path, length: int) -> None:
