@@ -24,17 +24,16 @@ from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
 from pdhef_logtool.records.signals import BoolArray, Loss
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
 
 #: Stages of ``pdhef learn``. ``teach``, the default: prior of the calibration and residual of a car, from drives
-#: with ground truth. ``calibrate``: the car from its sensors alone. ``gain``: residual gain of a network.
-TEACH, CALIBRATE, GAIN = STAGES = ("teach", "calibrate", "gain")
-#: Splits of a simulated set: those for results, and those for training and model selection.
-HELD_OUT, SEEN = ("test", "extrapolation"), ("train", "validation")
+#: with ground truth. ``calibrate``: the car from its sensors alone.
+TEACH, CALIBRATE = STAGES = ("teach", "calibrate")
+#: Splits of a simulated set for results.
+HELD_OUT = ("test", "extrapolation")
 #: Entries of the configuration that affect the result of learning.
 _SETTINGS = (
-    "car", "mapping", "network", "start", "end", "sensors", "friction", "prefer_truth", "reference", "gnss",
+    "car", "mapping", "start", "end", "sensors", "friction", "prefer_truth", "reference", "gnss",
 )  # fmt: skip
 #: Value of ``split`` that accepts every drive.
 ANY_SPLIT = "any"
@@ -48,7 +47,7 @@ class LearnSettings:
 
     Attributes
     ----------
-    config : car, network, mapping, slice, sensors, truth channel.
+    config : car, mapping, slice, sensors, truth channel.
     stage : one of :data:`STAGES`.
     seed : seed of every random draw.
     split : use only drives that their set's manifest assigns to this split; "any" accepts drives of all splits, also
@@ -74,33 +73,6 @@ class LearnSettings:
         return {**{k: document[k] for k in _SETTINGS}, **values}
 
 
-def open_car(config: RunConfig, warn: Tell) -> Car:
-    """Return the car that a command requires; raises UsageError if none is named."""
-    if config.car is None:
-        raise UsageError(
-            expected="a car",
-            got="none",
-            where="--car",
-            remedy="pdhef learn LOG... --car vehicle.toml -o CAR makes one",
-        )
-    car = Car.load(config.car, network=config.network, intervals=config.intervals)
-    for note in car.notes:
-        warn(note)
-    return car
-
-
-def record_head(kind: str, version: int, settings: LearnSettings, car: Car) -> dict[str, Any]:
-    """Return the common first entries of the records; without a date, so that equal commands give equal bytes."""
-    return {
-        "format": kind,
-        "version": version,
-        "versions": tool_versions(),
-        "settings": settings.to_dict(),
-        "car": {"name": car.vehicle.name, "physics_sha256": car.physics_sha256},
-        "network_sha256": None if car.network is None else car.network.sha256,
-    }
-
-
 def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInput], dict[str, str]]:
     """Return the logs to use, and by name the split that a set's manifest assigns to a log.
 
@@ -121,17 +93,14 @@ def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInp
                 got=f"drives of {there}" if there else "drives without a set's manifest beside them",
                 where="--split",
             )
-    gain_only = settings.stage == GAIN
-    refused = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in (SEEN if gain_only else HELD_OUT)]
+    refused = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in HELD_OUT]
     if refused and settings.split != ANY_SPLIT and settings.stage != CALIBRATE:
         more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
         raise UsageError(
-            expected="drives that no network was trained on" if gain_only else "drives that no result is reported on",
+            expected="drives that no result is reported on",
             got=", ".join(refused[:_NAMED]) + more,
             where="learn",
-            remedy="use --split test, or --split any if this network was not trained on them"
-            if gain_only
-            else "drives used by a stage are no longer test drives: use --split validation, or --split any",
+            remedy="drives used by a stage are no longer test drives: use --split validation, or --split any",
         )
     return list(inputs), {i.stem: splits[i.stem] for i in inputs if splits[i.stem]}
 
