@@ -4,26 +4,19 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import LearntOn
-from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.plan import DrivePlan
-from pdhef_logtool.drive.reading import MAX_BYTES, Drive, Tell, WholeDrive, lost_texts, read_drive
-from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, lost_texts
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
-from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
-from pdhef_logtool.records.signals import BoolArray, Loss
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
 
 #: Stages of ``pdhef learn``. ``teach``, the default: prior of the calibration and residual of a car, from drives
@@ -129,7 +122,6 @@ class DriveRecord:
     ----------
     seconds : from first to last stamp. span_s : these stamps in seconds from the log's start.
     truth : sources of the ground truth. friction_from : source of the friction. notes : notes of the reader.
-    counts : counts of the command, by name.
     """
 
     name: str
@@ -143,7 +135,6 @@ class DriveRecord:
     losses: tuple[Loss, ...] = ()
     notes: tuple[str, ...] = ()
     left_out: str = ""
-    counts: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def learnt_on(self) -> LearntOn:
@@ -159,13 +150,10 @@ class DriveRecord:
     def to_dict(self) -> dict[str, Any]:
         """Return the record as JSON-able values."""
         document = asdict(self)
-        for key in ("counts", "left_out"):
-            del document[key]
-        if self.left_out:
-            document["reason"] = self.left_out
+        if reason := document.pop("left_out"):
+            document["reason"] = reason
         return {
             **document,
-            **self.counts,
             "seconds": round(self.seconds, 3),
             "span_s": None if self.span_s is None else [round(s, 3) for s in self.span_s],
         }
@@ -231,45 +219,3 @@ def no_true_sideslip(plan: DrivePlan) -> str:
     if "sideslip_rad" in plan.dependent:
         return f"its ground truth is invalid: {plan.dependent['sideslip_rad']}"
     return ""
-
-
-def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
-    """Return a mask [N]: sideslip of the ground truth available, speed above the low-speed limit."""
-    finite: BoolArray = np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))
-    return finite
-
-
-def load_drive(
-    log_input: LogInput,
-    car: Car,
-    mapping: SignalMapping | None,
-    options: ReadOptions,
-    *,
-    refuse: Callable[[Drive], str] = lambda _drive: "",
-    fill_friction: bool = True,
-    least_scored: int = 0,
-) -> tuple[DriveRecord, WholeDrive | None]:
-    """Read a drive with a true sideslip into memory; None with the reason in the record if it cannot be used.
-
-    Parameters
-    ----------
-    refuse : returns why a command cannot use the drive, empty if it can; called before all of the log is read.
-    least_scored : required number of stamps with a true sideslip above the car's low-speed limit.
-
-    Raises
-    ------
-    PdhefError
-        The log cannot be read, or is too large for the memory.
-    """
-    with read_drive(log_input, car, mapping, options) as drive:
-        left_out = no_true_sideslip(drive.plan) or refuse(drive)
-        if left_out:
-            return record_of(drive, left_out=left_out), None
-        whole = drive.whole(fill_friction=fill_friction, max_bytes=MAX_BYTES)
-        assert whole.truth is not None
-        slow = car.vehicle.low_speed_blend_m_s
-        scored = int(np.count_nonzero(scorable_stamps(whole.truth, slow)))
-        if scored < least_scored or not np.isfinite(whole.truth.sideslip_rad).any():
-            left_out = f"{scored} stamps with a true sideslip above {slow:g} m/s"
-            return record_of(drive, left_out=left_out), None
-        return replace(record_of(drive, whole=whole), counts={"scored_stamps": scored}), whole

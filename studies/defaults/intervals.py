@@ -19,13 +19,14 @@ from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, runnable
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ
 from pdhef_logtool.evaluation.smoothing import smooth
-from pdhef_logtool.learning.drives import DriveRecord, load_drive
+from pdhef_logtool.learning.drives import DriveRecord
 from pdhef_logtool.learning.stages.task import Task
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.run_report import json_bytes, tool_versions
 from pdhef_logtool.runs.estimating import estimate_drive
+from studies.defaults.drives import load_drive
 from studies.defaults.interval_fit import (
     COVERED,
     FOLDS,
