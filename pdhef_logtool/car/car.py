@@ -331,9 +331,9 @@ def _network_of(folder: Path | None, chosen: Place) -> tuple[str, Path | None]:
     name = SHIPPED if chosen is None else str(chosen)
     if name == NO_MODEL:
         return NO_MODEL, None
-    own = None if folder is None or folder in SHIPPED_CARS.values() else folder / NETWORK_FOLDER
-    if chosen is None and own is not None and (own / DOCUMENT_FILE).is_file():
-        return NETWORK_FOLDER, own
+    inside = None if folder is None or folder in SHIPPED_CARS.values() else folder / NETWORK_FOLDER
+    if chosen is None and inside is not None and (inside / DOCUMENT_FILE).is_file():
+        return NETWORK_FOLDER, inside
     if name in SHIPPED_FOLDERS:
         home = SHIPPED_FOLDERS[name]
         # A source tree without shipped networks still runs the estimators that need none.

@@ -6,8 +6,8 @@ Short drives of one simulated car with its correct vehicle file and the true fri
 fitted on five minutes of other drives (:mod:`studies.defaults.fit_physics`); the residual network learns the model
 residual. The direct network and the regression use the same drives, with the nominal model; the paper's network uses
 the drives of :mod:`studies.defaults.paper_drives`. Filter noise of all tuned estimators is chosen on validation drives
-in one search. Seeds other than 0 train networks for spreads and take fit and noise of the shipped car. A second set has
-other cars of the same kind. Existing logs with unchanged settings are kept.
+in one search. Seeds other than 0 train networks for spreads and take fit and noise of the shipped car. Existing logs
+with unchanged settings are kept.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from pdhef_logtool.learning.stages.task import Task
 from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.residual_model.bundle import MODELS, NOMINAL_MODEL, PAPER_FOLDER, PHYSICS_MODEL, SHIPPED
+from pdhef_logtool.residual_model.bundle import MODELS, NOMINAL_MODEL, PAPER_FOLDER, PHYSICS_MODEL
 from pdhef_logtool.runs.config import RunConfig
 from studies.defaults import fit_physics, paper_drives
 from studies.defaults.intervals import fit_intervals
@@ -51,11 +51,8 @@ from studies.defaults.noise import tune
 from studies.pages import SAMPLE_VEHICLE, options
 
 HOME = SHIPPED_CARS["saloon"]
-#: Seeds and vehicles of the sets. The condition table, the paper and the tests use other seeds.
-SETS = {"one_car": (1000, "default"), "other_cars": (2000, "randomised")}
-DRIVES = 800
-#: Drives of other cars, not for training.
-OTHER_DRIVES = {"other_cars": 200}
+#: Seed of the drives. The condition table, the paper and the tests use other seeds.
+SEED, DRIVES = 1000, 800
 #: Residual gain of the car: of 0, 0.25, 0.5, 0.75 and 1 the one with the lowest sideslip RMSE on 200 other drives.
 GAIN = 0.75
 EPOCHS, BASELINE_EPOCHS = 66, 40
@@ -94,30 +91,24 @@ class Training:
         return self.car / NETWORK_FOLDER
 
     @property
-    def is_shipped(self) -> bool:
-        """Whether the output is the car of the package."""
-        return self.car.resolve() == HOME.resolve()
-
-    @property
     def of_car(self) -> tuple[object, ...]:
         """Options that name the car and the mapping."""
         return "--car", self.car, "--mapping", self.work / "mapping.toml"
 
     def validation_task(self) -> Task:
         """Return the validation drives with car and network."""
-        network = Path(SHIPPED) if self.is_shipped else self.network
-        config = RunConfig(car=self.car, mapping=self.work / "mapping.toml", network=network)
+        config = RunConfig(car=self.car, mapping=self.work / "mapping.toml")
         settings = LearnSettings(config=config, split="validation")
         inputs, splits = choose_drives([str(self.work / "one_car")], settings)
         reporter = Reporter(warn=print)
-        car, mapping = Car.load(config.car, network=network), mapping_of(config.mapping)
+        car, mapping = Car.load(config.car), mapping_of(config.mapping)
         return Task(
             car=car, settings=settings, logs=tuple(inputs), mapping=mapping, set_splits=splits, reporter=reporter
         )
 
 
 def simulate(t: Training) -> None:
-    """Write the vehicle file, the mapping and the sets of drives."""
+    """Write the vehicle file, the mapping and the drives."""
     t.work.mkdir(parents=True, exist_ok=True)
     t.car.mkdir(parents=True, exist_ok=True)
     text = vehicle_toml(
@@ -128,10 +119,8 @@ def simulate(t: Training) -> None:
         for part in (FIT_FILE, NOISE_FILE):
             shutil.copyfile(HOME / part, t.car / part)
     (t.work / "mapping.toml").write_text(MAPPING, encoding="utf-8")
-    for name, (seed, vehicles) in SETS.items():
-        count = min(t.drives, OTHER_DRIVES.get(name, t.drives))
-        what = ["--count", count, "--seed", seed, "--vehicles", vehicles, "--jobs", t.jobs]
-        pdhef("simulate", "suite", *what, "-o", t.work / name)
+    what = ("--count", t.drives, "--seed", SEED, "--vehicles", "default", "--jobs", t.jobs)
+    pdhef("simulate", "suite", *what, "-o", t.work / "one_car")
     paper_drives.write_drives(t.work / PAPER_DRIVES, count=min(t.drives, paper_drives.COUNT), processes=t.jobs)
 
 
@@ -198,7 +187,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("-o", "--output", type=Path, default=HOME, help="the car's folder")
     parser.add_argument("--work", type=Path, default=Path("out/train-default"), help="logs and dataset; kept")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
-    parser.add_argument("--drives", type=int, default=DRIVES, help="of each of the two sets")
+    parser.add_argument("--drives", type=int, default=DRIVES, help="number of drives")
     parser.add_argument("--epochs", type=int, default=EPOCHS)
     parser.add_argument("--trials", type=int, default=TRIALS, help="of each tuned estimator")
     parser.add_argument("--steps", nargs="+", choices=STEPS, default=list(STEPS), help="default: all")
