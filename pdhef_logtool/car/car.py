@@ -28,8 +28,6 @@ from pdhef_logtool.car.parts import (
     Intervals,
     LearntOn,
     Noise,
-    Trust,
-    noise_sha256,
     physics_sha256,
 )
 from pdhef_logtool.car.taught import GROUND_TRUTH, Taught, TaughtParameter
@@ -49,29 +47,18 @@ from pdhef_logtool.residual_model.bundle import (
 from pdhef_logtool.residual_model.interface import PlugInModel, load_plug_in, plug_in_names
 from pdhef_logtool.storage.documents import read_json, read_toml, validated
 
-VEHICLE_FILE, FIT_FILE, NOISE_FILE, NETWORK_FILE = "vehicle.toml", "fit.toml", "noise.toml", "network.toml"
+VEHICLE_FILE, FIT_FILE, NOISE_FILE = "vehicle.toml", "fit.toml", "noise.toml"
 INTERVALS_FILE, UNSURE_FILE, HISTORY_FILE = "intervals.json", "intervals-unsure.json", "history.jsonl"
 NETWORK_FOLDER = "network"
 TAUGHT_FILE = "taught.json"
+#: Gain limit of a network in cars of version 0.2.
+OLD_GAIN_FILE = "network.toml"
 #: Number of digits of a hash in messages.
 SHOWN_DIGITS = 12
 
 PartT = TypeVar("PartT", bound=Record)
 #: A file or folder, or the name of a shipped one.
 Place = Path | str | None
-
-
-@dataclass(frozen=True, slots=True)
-class AllowedTrust:
-    """The gain limit in [0, 1], and its reason as text."""
-
-    cap: float
-    reason: str
-
-    @property
-    def note(self) -> str:
-        """Text for the report."""
-        return f"residual gain {self.cap:g}: {self.reason}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +102,8 @@ class Car:
     noise : of filters, by the name of :data:`~.parts.NOISY_FILTERS`; only noise that belongs to ``vehicle``.
     fitted_physics : values and noise identified with the filter ``physics``, None without.
     taught : prior and residual from drives with ground truth, for the calibration of later drives; None without.
-    network, network_name, network_folder : the residual network, None without; trust : evidence for it.
+    network, network_name : the residual network, None without.
+    network_gain : residual gain of ``pd-hef``; None: 1 with a network that was trained with these physics, otherwise 0.
     intervals : calibrated 95 % intervals, None without.
     learnt_on : drives on which ``vehicle`` was identified.
     self_calibrated : the vehicle as calibrated on the current log, for the estimators that use it; None without.
@@ -128,8 +116,7 @@ class Car:
     noise: Mapping[str, FilterNoise] = field(default_factory=dict)
     network: ModelBundle | PlugInModel | None = None
     network_name: str = NO_MODEL
-    network_folder: Path | None = None
-    trust: Trust | None = None
+    network_gain: float | None = None
     intervals: Intervals | None = None
     learnt_on: tuple[LearntOn, ...] = ()
     fitted_physics: FittedPhysics | None = None
@@ -161,29 +148,24 @@ class Car:
             A file is missing or wrong; the error lists all wrong entries.
 
         >>> car = Car.load("saloon")
-        >>> car.vehicle.mass_kg, sorted(car.noise), car.allowed_trust.cap
+        >>> car.vehicle.mass_kg, sorted(car.noise), car.residual_gain
         (1440.0, ['phy-ukf:tuned', 'physics'], 0.75)
         """
         source = SHIPPED_CARS.get(str(path), None if path is None else Path(path))
         folder = source if source is not None and source.is_dir() else None
         file = _file_of(source, folder)
         vehicle = file.vehicle if sensors is None else with_sensors(file.vehicle, sensors)
-        car = cls(vehicle, vehicle, trust=file.trust, assumed=file.assumed, source=source)
+        car = cls(vehicle, vehicle, network_gain=file.network_gain, assumed=file.assumed, source=source)
         if folder is not None:
             car = _with_parts(car, folder)
-        name, home = _network_of(car, folder, network)
+        name, home = _network_of(folder, network)
         plugged = load_plug_in(name) if home is None and name != NO_MODEL else None
         bundle = plugged if home is None else load_bundle(home)
         selected = _intervals_of(folder, intervals)
-        car = replace(car, network=bundle, network_name=name, network_folder=home, intervals=selected)
+        car = replace(car, network=bundle, network_name=name, intervals=selected)
         if str(intervals) == NO_INTERVALS and car.fitted_physics is not None:
             car = replace(car, fitted_physics=car.fitted_physics.model_copy(update={"varied": ()}))
         stale = list(car.notes)
-        if other := car._other_than_tried:
-            stale.append(
-                f"{NETWORK_FILE} allows no residual gain: it was fitted with {other}; "
-                "pdhef learn --stages gain creates it again"
-            )
         has_intervals_file = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
         if has_intervals_file and selected is not None and selected.physics_sha256 != car.physics_sha256:
             stale.append(f"{INTERVALS_FILE} was made with other physics")
@@ -221,52 +203,16 @@ class Car:
         return noise.physics_sha256 in (None, self.physics_of(name))
 
     @property
-    def noise_sha256(self) -> str:
-        """Digest of the filters' noise."""
-        return noise_sha256(self.noise)
-
-    @property
     def residual_network(self) -> ModelBundle | PlugInModel | None:
         """The network if its residual is of ``physics``; the paper's network predicts the residual of ``phy-ukf``."""
         return self.network if self.network is not None and self.network.model == PHYSICS_MODEL else None
 
     @property
-    def tried_with(self) -> tuple[str, str]:
-        """Digests of the physics and of the noise of ``pd-hef``, to which the evidence for its network refers."""
-        return self.physics_of(PHYSICS), noise_sha256({n: noise for n, noise in self.noise.items() if n == PHYSICS})
-
-    @property
-    def allowed_trust(self) -> AllowedTrust:
-        """Limit of the residual gain of ``pd-hef`` on this car, with the reason (docs/method.md#gain).
-
-        Only ground truth shows whether a network helps on a car without training data; innovations do not. Evidence is
-        valid for the network, physics and noise of its evaluation; a part written by hand is valid for all.
-        """
-        trust = self.trust
-        if trust is None or not trust.has_evidence:
-            why = f"no evidence that this network helps on {self.vehicle.name}"
-            return AllowedTrust(0.0, f"{why}; a drive with ground truth and pdhef learn --stages gain give it")
-        here = "" if self.network is None else self.network.sha256
-        if trust.network_sha256 is not None and trust.network_sha256 != here:
-            return AllowedTrust(
-                0.0,
-                f"the car's evidence is about network {trust.network_sha256[:SHOWN_DIGITS]}, this one is "
-                f"{here[:SHOWN_DIGITS]}; pdhef learn --stages gain tries it",
-            )
-        if other := self._other_than_tried:
-            return AllowedTrust(
-                0.0, f"the car's evidence was found with {other}; pdhef learn --stages gain creates it again"
-            )
-        return AllowedTrust(trust.trust_cap, trust.evidence)
-
-    @property
-    def _other_than_tried(self) -> str:
-        """Difference between the car and the evaluation of its network; empty without one."""
-        trust = self.trust
-        physics, noise = self.tried_with
-        if trust is not None and trust.physics_sha256 not in (None, physics):
-            return "other physics"
-        return "other noise" if trust is not None and trust.noise_sha256 not in (None, noise) else ""
+    def residual_gain(self) -> float:
+        """Residual gain of ``pd-hef`` with the network of this car (docs/method.md#gain)."""
+        if self.network_gain is not None:
+            return self.network_gain
+        return float(self.network is not None and self.network.physics_sha256 == self.physics_of(PHYSICS))
 
     @property
     def taught_prior(self) -> tuple[TaughtParameter, ...]:
@@ -275,10 +221,8 @@ class Car:
 
     @property
     def has_evidence(self) -> bool:
-        """Whether drives confirm this vehicle: it was fitted, or its network was evaluated with it."""
-        fitted = bool(self.learnt_on) or self.fitted_physics is not None
-        tried = self.trust is not None and self.trust.has_evidence and not self._other_than_tried
-        return fitted or tried
+        """Whether drives confirm this vehicle: it was fitted, or its network was trained with it."""
+        return bool(self.learnt_on) or self.fitted_physics is not None or self.residual_gain > 0.0
 
     @property
     def cg_std_m(self) -> float:
@@ -299,7 +243,7 @@ class Car:
         return car.with_noise(PHYSICS, calibrated.noise)
 
     def with_fit(self, fit: Fit) -> Car:
-        """Return the car with identified parameters; evidence for a network with other parameters is dropped."""
+        """Return the car with identified parameters; a residual gain of other parameters is dropped."""
         vehicle = fit.values.applied_to(self.datasheet)
         fitted_car = replace(self, vehicle=vehicle, fitted_physics=fit.physics)
         how = "(calibrated without ground truth)" if fit.without_truth else "(identified)"
@@ -308,8 +252,8 @@ class Car:
         noise = {n: noise for n, noise in self.noise.items() if fitted_car.owns_noise(n, noise)} | fit.filter
         if fit.physics is not None:
             noise[PHYSICS] = fit.physics.noise
-        trust = self.trust if vehicle == self.datasheet else None
-        return replace(fitted_car, vehicle=vehicle, noise=noise, trust=trust, learnt_on=fit.drives)
+        gain = self.network_gain if vehicle == self.datasheet else None
+        return replace(fitted_car, vehicle=vehicle, noise=noise, network_gain=gain, learnt_on=fit.drives)
 
     def with_noise(self, name: str, noise: FilterNoise) -> Car:
         """Return the car with different noise of one filter."""
@@ -320,16 +264,14 @@ class Car:
 
         Values that were identified with ``physics`` are kept, except the changed entries, which they would overwrite.
         """
-        trust, physics = self.trust, self.fitted_physics
+        physics = self.fitted_physics
         other = {k: v for k, v in vehicle if v != getattr(self.vehicle, k)}
         if physics is not None:
             overridden = {k: None for k in FittedValues.model_fields if k in other}
             values, *varied = (v.model_copy(update=overridden) for v in (physics.values, *physics.varied))
             physics = physics.model_copy(update={"values": values, "varied": tuple(varied)})
-        if trust is not None and trust.physics_sha256 == self.tried_with[0]:
-            trust = trust.model_copy(update={"physics_sha256": None})
-        datasheet = self.datasheet.model_copy(update=other)
-        return replace(self, vehicle=vehicle, datasheet=datasheet, trust=trust, fitted_physics=physics)
+        datasheet, gain = self.datasheet.model_copy(update=other), self.residual_gain
+        return replace(self, vehicle=vehicle, datasheet=datasheet, network_gain=gain, fitted_physics=physics)
 
 
 def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:
@@ -344,11 +286,13 @@ def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:
 
 
 def _with_parts(car: Car, folder: Path) -> Car:
-    """Return the car with the valid parts of its folder: ``taught.json``, or fit, noise and residual gain."""
+    """Return the car with the valid parts of its folder: ``taught.json``, or fit and noise."""
     notes: list[str] = []
+    if (folder / OLD_GAIN_FILE).is_file():
+        notes.append(f"{OLD_GAIN_FILE} is no longer read: the residual gain follows from network and drive")
     taught = _part(folder / TAUGHT_FILE, Taught)
     if taught is not None and taught.physics_sha256 == physics_sha256(car.datasheet):
-        others = [name for name in (FIT_FILE, NOISE_FILE, NETWORK_FILE) if (folder / name).is_file()]
+        others = [name for name in (FIT_FILE, NOISE_FILE) if (folder / name).is_file()]
         if others:
             notes.append(f"{', '.join(others)}: not used, {TAUGHT_FILE} takes their place")
         if taught.truth != GROUND_TRUTH:
@@ -366,8 +310,7 @@ def _with_parts(car: Car, folder: Path) -> Car:
     if stale := [n for n, of_filter in noise.items() if not car.owns_noise(n, of_filter)]:
         notes.append(f"noise of {', '.join(stale)} is not used: it belongs to other physics")
     noise = {**car.noise, **{n: of_filter for n, of_filter in noise.items() if n not in stale}}
-    trust = _part(folder / NETWORK_FILE, Trust) or car.trust
-    return replace(car, noise=noise, trust=trust, notes=tuple(notes))
+    return replace(car, noise=noise, notes=tuple(notes))
 
 
 def _stale(what: str, why: str, stage: str) -> str:
@@ -383,17 +326,18 @@ def _part(path: Path, kind: type[PartT]) -> PartT | None:
     return validated(kind, raw, str(path), VehicleError, expected=f"the entries of {what}")
 
 
-def _network_of(car: Car, folder: Path | None, chosen: Place) -> tuple[str, Path | None]:
+def _network_of(folder: Path | None, chosen: Place) -> tuple[str, Path | None]:
     """Return name and folder of the network in force; the folder is None for a plug-in and without a network."""
-    name = str(chosen) if chosen is not None else (SHIPPED if car.trust is None else car.trust.network)
+    name = SHIPPED if chosen is None else str(chosen)
     if name == NO_MODEL:
         return NO_MODEL, None
+    inside = None if folder is None or folder in SHIPPED_CARS.values() else folder / NETWORK_FOLDER
+    if chosen is None and inside is not None and (inside / DOCUMENT_FILE).is_file():
+        return NETWORK_FOLDER, inside
     if name in SHIPPED_FOLDERS:
         home = SHIPPED_FOLDERS[name]
         # A source tree without shipped networks still runs the estimators that need none.
         return (NO_MODEL, None) if chosen is None and not (home / DOCUMENT_FILE).is_file() else (name, home)
-    if chosen is None and folder is not None:
-        return name, folder / name
     if name in plug_in_names():
         return name, None
     home = Path(name)

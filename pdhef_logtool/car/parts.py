@@ -1,4 +1,4 @@
-"""Parts of a car, one per command: fit, noise, network with its residual gain, intervals.
+"""Parts of a car, one per command: fit, noise, intervals.
 
 Each part contains the digest of its inputs. If an input has changed, the part is stale and is not used.
 """
@@ -6,7 +6,6 @@ Each part contains the digest of its inputs. If an input has changed, the part i
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -217,33 +216,6 @@ class Noise(Record):
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
 
 
-class Trust(Record):
-    """``network.toml``, written by ``pdhef learn --stages gain``: network of this car, its gain limit and evidence.
-
-    Attributes
-    ----------
-    network : a shipped network's name, or the folder ``network`` of the car. network_sha256 : of it.
-    trust_cap : limit of the residual gain of ``pd-hef``, in [0, 1]. evidence : text with figures.
-    physics_sha256, noise_sha256 : of the evaluation; None for a part written by hand, which applies to any.
-    """
-
-    format: Literal["pdhef-network"] = "pdhef-network"
-    version: Literal[1] = 1
-    network: str = "default"
-    network_sha256: Sha256 | None = None
-    trust_cap: Annotated[float, Field(ge=0, le=1)] = 0.0
-    evidence: str = "none"
-    physics_sha256: Sha256 | None = None
-    noise_sha256: Sha256 | None = None
-    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
-    figures: dict[str, Any] = Field(default_factory=dict)
-
-    @property
-    def has_evidence(self) -> bool:
-        """Whether the part contains evidence; without it, the gain limit is not used."""
-        return self.evidence.strip().lower() not in ("", "none")
-
-
 class YawRateCoefficients(Record):
     """Coefficients by term of the yaw rate's variance; ``filter``: the variance of the filter."""
 
@@ -347,11 +319,3 @@ class HistoryLine(Record):
     version: str
     settings: dict[str, Any] = Field(default_factory=dict)
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
-
-
-def noise_sha256(noise: Mapping[str, FilterNoise]) -> str:
-    """Return the digest of the noise values alone, by filter."""
-    values = {
-        name: [list(n.q_std), dict(n.r_std), *([n.limit_gain] if n.limit_gain else [])] for name, n in noise.items()
-    }
-    return digest(values)

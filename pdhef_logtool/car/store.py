@@ -38,14 +38,12 @@ class Change:
     ----------
     command : its name. part : the file of the part that it wrote, by name in the folder.
     files : content of the part's file and of related files (records, plots), by name in the folder.
-    folders : folders to copy into the car's folder, by name.
     settings, drives : of the command, for the history.
     """
 
     command: str
     part: str
     files: Mapping[str, bytes]
-    folders: Mapping[str, Path] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     drives: Iterable[LearntOn] = ()
 
@@ -107,10 +105,6 @@ def update_car(source: Car, output: Path, change: Change) -> Path:
                 shutil.copytree(base, fresh, dirs_exist_ok=True, ignore=shutil.ignore_patterns(f"{LOCK_FILE}*"))
             else:
                 write_bytes(fresh / VEHICLE_FILE, vehicle_file(source))
-            for name, folder in change.folders.items():
-                if (fresh / name).exists() and folder.resolve() != (output / name).resolve():
-                    shutil.rmtree(fresh / name)
-                shutil.copytree(folder, fresh / name, dirs_exist_ok=True)
             for name, content in change.files.items():
                 write_bytes(fresh / name, content)
             _log(fresh, change)

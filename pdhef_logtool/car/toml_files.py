@@ -10,7 +10,6 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 
 from pdhef_logtool.car.assumed_values import AssumedValue, completed
-from pdhef_logtool.car.parts import Trust
 from pdhef_logtool.car.vehicle import REMEDY, SENSOR_PROFILES, Record, Sensors, VehicleParameters
 from pdhef_logtool.records.errors import VehicleError
 from pdhef_logtool.storage.documents import read_toml, validated
@@ -18,8 +17,7 @@ from pdhef_logtool.storage.toml_text import toml_text
 
 
 class _Network(Record):
-    trust_cap: Annotated[float, Field(ge=0, le=1)]
-    evidence: str
+    gain: Annotated[float, Field(ge=0, le=1)]
 
 
 def _what_may_be_left_out(schema: dict[str, Any]) -> None:
@@ -30,7 +28,7 @@ def _what_may_be_left_out(schema: dict[str, Any]) -> None:
 
 
 class VehicleEntries(VehicleParameters):
-    """A vehicle.toml: physics and sensors, and optionally the residual gain of its author, with the reason."""
+    """A vehicle.toml: physics and sensors, and optionally the residual gain that its author chose."""
 
     model_config = ConfigDict(json_schema_extra=_what_may_be_left_out)
 
@@ -42,7 +40,7 @@ class VehicleFile:
     """Contents of a vehicle.toml: physics and sensors, the assumed values, and the table ``[network]``."""
 
     vehicle: VehicleParameters
-    trust: Trust | None
+    network_gain: float | None
     assumed: tuple[AssumedValue, ...]
 
 
@@ -84,8 +82,7 @@ def vehicle_of_entries(raw: Mapping[str, Any], *, where: str) -> VehicleFile:
     vehicle = VehicleParameters.model_construct(
         file.model_fields_set & fields.keys(), **{name: getattr(file, name) for name in fields}
     )
-    trust = None if file.network is None else Trust(**file.network.model_dump())
-    return VehicleFile(vehicle, trust, assumed)
+    return VehicleFile(vehicle, None if file.network is None else file.network.gain, assumed)
 
 
 def part_toml(part: Record, head: str, comments: Mapping[str, str] | None = None) -> str:

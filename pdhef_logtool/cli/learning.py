@@ -21,16 +21,14 @@ commands = typer.Typer()
     commands,
     "pdhef learn drives/ --car guess.toml -o mycar",
     "pdhef learn logs/ --car guess.toml -o mycar --stages calibrate",
-    "pdhef learn lap.mcap --car mycar -o mycar --start 155 --stages gain",
     panel=panels.LEARN,
     notes="""The default stage, teach, uses all driving with ground truth, at least 20 s: it learns the prior for the
 calibration of later drives, and the residual of physics after the calibration (taught.json in the car's folder). With
 --set reference=on, the sideslip reference replaces missing ground truth.
 
-Stage calibrate calibrates the car by the sensors of several logs without ground truth; stage gain finds the residual
-gain of a network (--network). Drives of the splits test and extrapolation of a simulated set are rejected; for gain,
-drives of train and validation; --split any permits them (docs/learn.md).""",
-    shared="sensors friction network",
+Stage calibrate calibrates the car by the sensors of several logs without ground truth. Drives of the splits test and
+extrapolation of a simulated set are rejected; --split any permits them (docs/learn.md).""",
+    shared="sensors friction",
     car="Car to start from (mass, geometry, sensor noise, priors)",
 )
 def learn(
@@ -40,15 +38,15 @@ def learn(
         Path, Option("--output", "-o", metavar="CAR", help="Folder of the car to write; may equal --car.")
     ],
     config: RunConfig,
-    stages: Annotated[str, Option(help="Stage: teach, calibrate or gain.")] = "teach",
-    seed: Annotated[int, Option(help="Seed of the residual's random features and of bootstraps.")] = 0,
+    stages: Annotated[str, Option(help="Stage: teach or calibrate.")] = "teach",
+    seed: Annotated[int, Option(help="Seed of the residual's random features.")] = 0,
     split: Annotated[
         str | None,
         Option(help="Only drives of this split of a simulated set; any: also of splits that are refused by default."),
     ] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Learn the prior and the residual of a car, calibrate it, or find the residual gain of its network."""
+    """Learn the prior and the residual of a car, or calibrate it."""
     from pdhef_logtool.learning.drives import LearnSettings
     from pdhef_logtool.learning.engine import learn as run_stage
 

@@ -45,19 +45,6 @@ def _calibration(figures: Mapping[str, Any], console: Console) -> None:
     console.print(f"  {calibration['text']}")
 
 
-def _gain(figures: Mapping[str, Any], console: Console) -> None:
-    """Print the sideslip error at each residual gain, its difference to gain 0 with bounds, and the limit."""
-    errors = table(">residual\ngain", ">sideslip\nRMSE °", ">squared error minus\nvalue at 0, deg²", ">\n95 % bounds")
-    columns = (figures[key] for key in ("trusts", "rmse_deg", "against_trust_0"))
-    for gain, rmse, b in zip(*columns, strict=True):
-        bounds = f"{b['low_deg2']:.4f} to {b['high_deg2']:.4f}" if gain and b["low_deg2"] is not None else "-"
-        errors.add_row(f"{gain:g}", f"{rmse:.4f}", f"{b['value_deg2']:.4f}" if gain else "-", bounds)
-    console.print(errors)
-    seconds = f"{figures['scored_s']:.0f} s scored, {figures['excited_s']:.0f} s of them excited"
-    console.print(f"{figures['blocks']} blocks, {seconds}")
-    console.print(f"residual gain limit {figures['trust_cap']:g}: {figures['reason']}")
-
-
 def _teaching(figures: Mapping[str, Any], console: Console) -> None:
     """Print the tested residual models, the improvement by teaching, and the recommended drives."""
     rungs = table("residual model", ">RMSE °, held-out\nblocks", ">difference °²", ">± 1 se", "outcome")
@@ -81,7 +68,7 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         console.print(f"  {text}")
 
 
-_RENDER = {"teach": _teaching, "calibrate": _calibration, "gain": _gain}
+_RENDER = {"teach": _teaching, "calibrate": _calibration}
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:

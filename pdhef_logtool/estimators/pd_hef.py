@@ -1,6 +1,7 @@
 """``pd-hef`` and its variants: ``physics`` of the car plus residual gain times the network's residual.
 
-The gain depends on the car's evidence; without a network or evidence it is 0, and ``pd-hef`` equals ``physics``.
+The network acts on the car that it was trained for; without such a network the gain is 0, and ``pd-hef`` equals
+``physics``.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ if TYPE_CHECKING:
 def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
     """Return ``physics`` of a car with its taught residual, or with its network.
 
-    The residual gain of the network comes from options, name or evidence; a name with options selects the network.
+    The residual gain of the network comes from the name or the car; a name with options selects the network.
     """
     taught = car.taught
-    if name == PRESET and options.trust is None and taught is not None and taught.residual is not None:
+    if name == PRESET and taught is not None and taught.residual is not None:
         physics = AdaptivePhysics(of_car(car, use_speed=options.use_speed), name=name)
         if (car.fitted_physics is not None) == taught.calibrated:
             return replace(physics, network=taught.residual, trust=1.0, notes=(taught.evidence,))
@@ -40,14 +41,14 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
 
 def _with_network(name: str, car: Car, options: Options) -> AdaptivePhysics:
     """Return ``physics`` of a car with its network."""
-    trust, notes = _trust(name, car, options)
+    gain, note = _gain(name, car)
     return AdaptivePhysics(
         of_car(car, use_speed=options.use_speed),
-        options.service(car) if trust > 0.0 else None,
-        trust,
+        options.service(car) if gain > 0.0 else None,
+        gain,
         adaptive="fixed-r" not in options_of(name),
         name=name,
-        notes=notes,
+        notes=(f"residual gain {gain:g}: {note}",) if note else (),
     )
 
 
@@ -60,13 +61,11 @@ def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
     return SmoothedPhysics(filtered, name=name, notes=(NOT_CAUSAL, *taught, *filtered.notes))
 
 
-def _trust(name: str, car: Car, options: Options) -> tuple[float, tuple[str, ...]]:
+def _gain(name: str, car: Car) -> tuple[float, str]:
+    """Return the residual gain of the network, and a note; empty for a gain that the name states."""
     if car.residual_network is None:
-        why = "the car has no network" if car.network is None else "the network is for phy-ukf, as in the paper"
-        return 0.0, (f"residual gain 0: {why}",)
-    if options.trust is not None:
-        return options.trust, ()
+        return 0.0, "the car has no network" if car.network is None else "the network is for phy-ukf, as in the paper"
     if chosen := options_of(name):
-        return float(chosen.get("gain", 1.0)), ()
-    allowed = car.allowed_trust
-    return allowed.cap, (allowed.note,)
+        return float(chosen.get("gain", 1.0)), ""
+    gain = car.residual_gain
+    return gain, "within its region of validity" if gain else "the network was not trained with the physics of this car"

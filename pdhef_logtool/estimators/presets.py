@@ -42,13 +42,11 @@ class Options:
     Attributes
     ----------
     use_speed : False is the paper's ``esp`` suite for the filters: the speed sensor only initializes them.
-    trust : residual gain of the hybrid filters, in [0, 1]; None: by the car's evidence.
     gnss : whether GNSS velocity corrects :data:`AIDED` if the log has it.
     network : the car's network, shared by several estimators; None: each estimator loads it.
     """
 
     use_speed: bool = True
-    trust: float | None = None
     network: ResidualModel | None = field(default=None, compare=False)
     gnss: bool = False
 

@@ -39,7 +39,7 @@ _INPUTS = _SPEED | {"steer_rad"}
 _PLANAR = _SPEED | {"yaw_rate_rad_s"}
 _PLANAR_IMU = frozenset({"yaw_rate_rad_s", "ay_m_s2"})
 _LATERAL = _PLANAR_IMU | {"steer_rad"}
-#: Signals for the features of a network and the evidence of learning.
+#: Signals for the features of a network.
 FEATURES: frozenset[str] = _INPUTS | _PLANAR_IMU
 
 
@@ -166,13 +166,13 @@ SPECS: tuple[Spec, ...] = (
          "vehicle_ukf:build_nominal", _INPUTS, 0x56B4E9, needs_noise=True),
     Spec("pure-lstm", "a network that outputs v_y, without a filter (needs such a model)",
          "direct_network:build", FEATURES, 0xAA4499, network="pure_lstm"),
-    Spec("pd-hef", "physics plus the residual of its network, with a gain by the car's evidence",
+    Spec("pd-hef", "physics plus the residual of the car's network, within its region of validity",
          "pd_hef:build", _SPEED, 0xD55E00, network="optional", one_of=_LATERAL),
     Spec("pd-hef:fixed-r", "pd-hef at gain 1 without the adaptive mechanism (needs a network)",
          "pd_hef:build", _INPUTS, 0x117733, network="residual"),
     Spec("pd-hef-smoothed", "pd-hef smoothed with later samples: not causal, ranked apart",
          "pd_hef:build_smoothed", _SPEED, 0x332288, causal=False, network="optional", one_of=_LATERAL),
-    Spec("pd-hef:gain=1", "pd-hef at a residual gain from 0 to 1, with or without evidence (needs a network)",
+    Spec("pd-hef:gain=1", "pd-hef at a residual gain from 0 to 1 on any car (needs a network)",
          "pd_hef:build", _INPUTS, 0x882255, group="", network="residual"),
     Spec("pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, unchanged (needs its network)",
          "hybrid_paper:build", FEATURES, 0xCC6677, network="paper"),

@@ -4,37 +4,29 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import LearntOn
-from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.plan import DrivePlan
-from pdhef_logtool.drive.reading import MAX_BYTES, Drive, Tell, WholeDrive, lost_texts, read_drive
-from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, lost_texts
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
-from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
-from pdhef_logtool.records.signals import BoolArray, Loss
-from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.run_report import tool_versions
+from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
 
 #: Stages of ``pdhef learn``. ``teach``, the default: prior of the calibration and residual of a car, from drives
-#: with ground truth. ``calibrate``: the car from its sensors alone. ``gain``: residual gain of a network.
-TEACH, CALIBRATE, GAIN = STAGES = ("teach", "calibrate", "gain")
-#: Splits of a simulated set: those for results, and those for training and model selection.
-HELD_OUT, SEEN = ("test", "extrapolation"), ("train", "validation")
+#: with ground truth. ``calibrate``: the car from its sensors alone.
+TEACH, CALIBRATE = STAGES = ("teach", "calibrate")
+#: Splits of a simulated set for results.
+HELD_OUT = ("test", "extrapolation")
 #: Entries of the configuration that affect the result of learning.
 _SETTINGS = (
-    "car", "mapping", "network", "start", "end", "sensors", "friction", "prefer_truth", "reference", "gnss",
+    "car", "mapping", "start", "end", "sensors", "friction", "prefer_truth", "reference", "gnss",
 )  # fmt: skip
 #: Value of ``split`` that accepts every drive.
 ANY_SPLIT = "any"
@@ -48,7 +40,7 @@ class LearnSettings:
 
     Attributes
     ----------
-    config : car, network, mapping, slice, sensors, truth channel.
+    config : car, mapping, slice, sensors, truth channel.
     stage : one of :data:`STAGES`.
     seed : seed of every random draw.
     split : use only drives that their set's manifest assigns to this split; "any" accepts drives of all splits, also
@@ -74,33 +66,6 @@ class LearnSettings:
         return {**{k: document[k] for k in _SETTINGS}, **values}
 
 
-def open_car(config: RunConfig, warn: Tell) -> Car:
-    """Return the car that a command requires; raises UsageError if none is named."""
-    if config.car is None:
-        raise UsageError(
-            expected="a car",
-            got="none",
-            where="--car",
-            remedy="pdhef learn LOG... --car vehicle.toml -o CAR makes one",
-        )
-    car = Car.load(config.car, network=config.network, intervals=config.intervals)
-    for note in car.notes:
-        warn(note)
-    return car
-
-
-def record_head(kind: str, version: int, settings: LearnSettings, car: Car) -> dict[str, Any]:
-    """Return the common first entries of the records; without a date, so that equal commands give equal bytes."""
-    return {
-        "format": kind,
-        "version": version,
-        "versions": tool_versions(),
-        "settings": settings.to_dict(),
-        "car": {"name": car.vehicle.name, "physics_sha256": car.physics_sha256},
-        "network_sha256": None if car.network is None else car.network.sha256,
-    }
-
-
 def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInput], dict[str, str]]:
     """Return the logs to use, and by name the split that a set's manifest assigns to a log.
 
@@ -121,17 +86,14 @@ def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInp
                 got=f"drives of {there}" if there else "drives without a set's manifest beside them",
                 where="--split",
             )
-    gain_only = settings.stage == GAIN
-    refused = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in (SEEN if gain_only else HELD_OUT)]
+    refused = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in HELD_OUT]
     if refused and settings.split != ANY_SPLIT and settings.stage != CALIBRATE:
         more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
         raise UsageError(
-            expected="drives that no network was trained on" if gain_only else "drives that no result is reported on",
+            expected="drives that no result is reported on",
             got=", ".join(refused[:_NAMED]) + more,
             where="learn",
-            remedy="use --split test, or --split any if this network was not trained on them"
-            if gain_only
-            else "drives used by a stage are no longer test drives: use --split validation, or --split any",
+            remedy="drives used by a stage are no longer test drives: use --split validation, or --split any",
         )
     return list(inputs), {i.stem: splits[i.stem] for i in inputs if splits[i.stem]}
 
@@ -160,7 +122,6 @@ class DriveRecord:
     ----------
     seconds : from first to last stamp. span_s : these stamps in seconds from the log's start.
     truth : sources of the ground truth. friction_from : source of the friction. notes : notes of the reader.
-    counts : counts of the command, by name.
     """
 
     name: str
@@ -174,7 +135,6 @@ class DriveRecord:
     losses: tuple[Loss, ...] = ()
     notes: tuple[str, ...] = ()
     left_out: str = ""
-    counts: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def learnt_on(self) -> LearntOn:
@@ -190,13 +150,10 @@ class DriveRecord:
     def to_dict(self) -> dict[str, Any]:
         """Return the record as JSON-able values."""
         document = asdict(self)
-        for key in ("counts", "left_out"):
-            del document[key]
-        if self.left_out:
-            document["reason"] = self.left_out
+        if reason := document.pop("left_out"):
+            document["reason"] = reason
         return {
             **document,
-            **self.counts,
             "seconds": round(self.seconds, 3),
             "span_s": None if self.span_s is None else [round(s, 3) for s in self.span_s],
         }
@@ -262,45 +219,3 @@ def no_true_sideslip(plan: DrivePlan) -> str:
     if "sideslip_rad" in plan.dependent:
         return f"its ground truth is invalid: {plan.dependent['sideslip_rad']}"
     return ""
-
-
-def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
-    """Return a mask [N]: sideslip of the ground truth available, speed above the low-speed limit."""
-    finite: BoolArray = np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))
-    return finite
-
-
-def load_drive(
-    log_input: LogInput,
-    car: Car,
-    mapping: SignalMapping | None,
-    options: ReadOptions,
-    *,
-    refuse: Callable[[Drive], str] = lambda _drive: "",
-    fill_friction: bool = True,
-    least_scored: int = 0,
-) -> tuple[DriveRecord, WholeDrive | None]:
-    """Read a drive with a true sideslip into memory; None with the reason in the record if it cannot be used.
-
-    Parameters
-    ----------
-    refuse : returns why a command cannot use the drive, empty if it can; called before all of the log is read.
-    least_scored : required number of stamps with a true sideslip above the car's low-speed limit.
-
-    Raises
-    ------
-    PdhefError
-        The log cannot be read, or is too large for the memory.
-    """
-    with read_drive(log_input, car, mapping, options) as drive:
-        left_out = no_true_sideslip(drive.plan) or refuse(drive)
-        if left_out:
-            return record_of(drive, left_out=left_out), None
-        whole = drive.whole(fill_friction=fill_friction, max_bytes=MAX_BYTES)
-        assert whole.truth is not None
-        slow = car.vehicle.low_speed_blend_m_s
-        scored = int(np.count_nonzero(scorable_stamps(whole.truth, slow)))
-        if scored < least_scored or not np.isfinite(whole.truth.sideslip_rad).any():
-            left_out = f"{scored} stamps with a true sideslip above {slow:g} m/s"
-            return record_of(drive, left_out=left_out), None
-        return replace(record_of(drive, whole=whole), counts={"scored_stamps": scored}), whole

@@ -10,20 +10,16 @@ from typing import Any
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.names import NO_INTERVALS
 from pdhef_logtool.car.store import check_output, update_car
-from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.learning.drives import (
     CALIBRATE,
-    GAIN,
     TEACH,
     DriveRecord,
     LearnSettings,
     choose_drives,
     drives_document,
     exit_code,
-    open_car,
 )
 from pdhef_logtool.learning.stages.calibrate import calibrate
-from pdhef_logtool.learning.stages.gain import find_gain
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.learning.stages.teach import teach
 from pdhef_logtool.logs.discovery import Logs
@@ -33,7 +29,7 @@ from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.storage.outputs import check_no_input, local_path
 
-RUN: dict[str, Callable[[Task], StageOutput]] = {TEACH: teach, CALIBRATE: calibrate, GAIN: find_gain}
+RUN: dict[str, Callable[[Task], StageOutput]] = {TEACH: teach, CALIBRATE: calibrate}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +84,9 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
         raise UsageError(
             expected="a car's folder", got=output.name, where="--output", remedy="a car has more than a file contains"
         )
-    car = _open(settings, reporter.warn)
+    car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
+    if config.car is None:
+        reporter.warn(f"no --car: mass, geometry and priors come from the default {car.datasheet.name}")
     check_output(car, output)
     inputs, set_splits = choose_drives(arguments, settings)
     read = [*(i.local for i in inputs), *(path for path in config.files if path != config.car)]
@@ -105,14 +103,3 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
     update_car(car, output, stage.change)
     reporter.progress("done", 1.0)
     return LearnResult(output, stage.records, settings.stage, stage.text, stage.figures)
-
-
-def _open(settings: LearnSettings, warn: Tell) -> Car:
-    """Return the car to start from; all stages but ``gain`` use only its vehicle file."""
-    config = settings.config
-    if settings.stage == GAIN:
-        return open_car(config, warn)
-    car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
-    if config.car is None:
-        warn(f"no --car: mass, geometry and priors come from the default {car.datasheet.name}")
-    return car

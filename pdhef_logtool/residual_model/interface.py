@@ -64,6 +64,7 @@ class PlugInModel:
     name: str
     plug_in: ResidualModel
     model: str = "physics"
+    physics_sha256: str = ""
     pure_lstm: None = None
     linear_regression: None = None
     paper_network: None = None

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import TypeAlias
@@ -74,19 +73,3 @@ class NetworkService:
         said, after = self._network.run(both, self._network.initial_state() if carry is None else carry)
         straight, mirrored = said[:, 0].astype(np.float64), said[:, 1]
         return 0.5 * (straight - mirrored) if self.bundle.odd else straight, after
-
-
-@dataclass(frozen=True)
-class RememberingNetwork(NetworkService):
-    """A network that caches its predictions, which do not depend on the gain or noise of a filter."""
-
-    _known: dict[bytes, tuple[FloatArray, NetworkCarry]] = field(default_factory=dict, compare=False)
-
-    def run(self, features: FloatArray, starts: BoolArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkCarry]:
-        """Return the predictions; only predictions of whole drives, from their start, are cached."""
-        if carry is not None:
-            return super().run(features, starts, carry)
-        key = hashlib.sha256(np.ascontiguousarray(features).tobytes() + starts.tobytes()).digest()
-        if key not in self._known:
-            self._known[key] = super().run(features, starts, None)
-        return self._known[key]

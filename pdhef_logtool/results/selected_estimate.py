@@ -239,8 +239,8 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
     algorithm = estimator["algorithm"] or {"options": {}}
     trust = algorithm["options"].get("trust", 0.0 if algorithm.get("algorithm") == "adaptive-physics" else None)
     if trust is not None:
-        network_text = f"residual gain of the network {trust:g}, from the car's validation data"
-        said.append(network_text if trust else "network not used: no validation data show that it helps")
+        unused = "residual not used: no network was trained with the physics of this car"
+        said.append(f"residual gain {trust:g} within the region of validity" if trust else unused)
     return said
 
 

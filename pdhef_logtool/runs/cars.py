@@ -178,7 +178,7 @@ def car_record(car: Car) -> dict[str, Any]:
         "the car's fit": [_plain(car.fitted_physics), [_plain(d) for d in car.learnt_on]],
         "the car's noise": {name: _plain(noise) for name, noise in car.noise.items()},
         "the network": network,
-        "the car's gain limit": _plain(car.trust),
+        "the residual gain": car.network_gain,
         "the car's intervals": _plain(car.intervals),
     }
     return {"name": car.file_name or "", "network": network, "parts": {k: digest_of(v) for k, v in parts.items()}}

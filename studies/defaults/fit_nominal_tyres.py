@@ -151,8 +151,7 @@ truth_position_m = [0.0, 0.0, 0.0]
 low_speed_blend_m_s = 3.0
 
 [network]
-trust_cap = 1.0
-evidence = "the shipped network was trained on drives of this simulated car (docs/model_card.md)"
+gain = 1.0  # the shipped network was trained on drives of this simulated car (docs/model_card.md)
 
 [sensors]
 ax_std_m_s2 = {NOISE.acceleration_m_s2}

@@ -19,13 +19,14 @@ from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, runnable
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ
 from pdhef_logtool.evaluation.smoothing import smooth
-from pdhef_logtool.learning.drives import DriveRecord, load_drive
+from pdhef_logtool.learning.drives import DriveRecord
 from pdhef_logtool.learning.stages.task import Task
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.run_report import json_bytes, tool_versions
 from pdhef_logtool.runs.estimating import estimate_drive
+from studies.defaults.drives import load_drive
 from studies.defaults.interval_fit import (
     COVERED,
     FOLDS,
@@ -98,7 +99,7 @@ def fit_intervals(task: Task, spread: float) -> Change:
 def _run_drive(log: LogInput, number: int, task: Task, spread: float) -> tuple[DriveRecord, _Ran | None]:
     """Run the estimators on a drive, once as given and some times with a wrong vehicle; return errors and terms."""
     car, vehicle, options = task.car, task.car.vehicle, task.options
-    record, drive = load_drive(log, car, task.mapping, options, fill_friction=False)
+    record, drive = load_drive(log, task, fill_friction=False)
     if drive is None or drive.truth is None:
         return record, None
     signals = drive.signals

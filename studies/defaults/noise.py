@@ -22,17 +22,18 @@ from pdhef_logtool.car.car import NOISE_FILE, Car
 from pdhef_logtool.car.parts import FilterNoise, Noise
 from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.toml_files import part_toml
-from pdhef_logtool.drive.reading import Drive, WholeDrive
+from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import FEATURES, Options, spec_of
 from pdhef_logtool.estimators.vehicle_ukf import PHY_UKF_Q_STD
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.learning.drives import DriveRecord, load_drive, no_drive, scorable_stamps
+from pdhef_logtool.learning.drives import DriveRecord, no_drive
 from pdhef_logtool.learning.stages.task import Task
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
+from studies.defaults.drives import load_drive
 
 #: Filters with a searched noise; the noise of ``physics`` is identified together with its values.
 TUNED = ("phy-ukf:tuned",)
@@ -76,12 +77,8 @@ def tune(task: Task, trials: int) -> Change:
     """
     options, slow = task.options, task.car.vehicle.low_speed_blend_m_s
 
-    def lacking(drive: Drive) -> str:
-        missing = sorted(FEATURES - drive.available)
-        return f"the filters need {', '.join(missing)}" if missing else ""
-
     def read(log: LogInput) -> tuple[DriveRecord, WholeDrive | None]:
-        return load_drive(log, task.car, task.mapping, options, refuse=lacking, least_scored=MIN_SCORED_STAMPS)
+        return load_drive(log, task, needs=FEATURES, least_scored=MIN_SCORED_STAMPS)
 
     records, drives = task.read(read)
     if not drives:
@@ -145,7 +142,7 @@ def error_rad(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -> 
     """
     error = signal_error(estimate, truth, "sideslip_rad", low_speed_m_s)
     error = error[np.isfinite(error)]
-    scorable = truth.sideslip_rad[scorable_stamps(truth, low_speed_m_s)]
+    scorable = truth.sideslip_rad[np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))]
     rms, zero = (float(np.sqrt(np.mean(x**2))) if x.size else math.nan for x in (error, scorable))
     if error.size == 0:
         return zero

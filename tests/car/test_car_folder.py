@@ -19,7 +19,6 @@ from pdhef_logtool.car.car import (
     FIT_FILE,
     HISTORY_FILE,
     INTERVALS_FILE,
-    NETWORK_FILE,
     NETWORK_FOLDER,
     NOISE_FILE,
     SHIPPED_CARS,
@@ -36,7 +35,6 @@ from pdhef_logtool.car.parts import (
     Noise,
     Record,
     TriedParts,
-    Trust,
     car_folder,
     physics_sha256,
 )
@@ -110,21 +108,6 @@ def add_noise(folder: Path, name: str = OURS, **entries: Any) -> FilterNoise:
     return noise
 
 
-def add_trust(folder: Path, network: str = "default") -> Trust:
-    car = load(folder, network)
-    assert car.network is not None
-    trust = Trust(
-        network=network,
-        network_sha256=car.network.sha256,
-        trust_cap=0.5,
-        evidence="a gain on one drive",
-        physics_sha256=car.tried_with[0],
-        noise_sha256=car.tried_with[1],
-    )
-    write_part(folder / NETWORK_FILE, trust)
-    return trust
-
-
 def edit(folder: Path, old: str, new: str) -> None:
     text = (folder / VEHICLE_FILE).read_text()
     assert text.count(old) == 1
@@ -138,7 +121,7 @@ def test_a_folder_with_a_persons_file_alone_is_a_car(folder: Path) -> None:
     car = load(folder)
     assert (car.vehicle, car.source) == (car.datasheet, folder)
     assert car.vehicle == load(folder / VEHICLE_FILE).vehicle
-    assert (dict(car.noise), car.trust, car.network, car.learnt_on, car.notes) == ({}, None, None, (), ())
+    assert (dict(car.noise), car.network, car.learnt_on, car.notes) == ({}, None, (), ())
 
 
 def test_the_shipped_car_is_found_by_name_and_none_is_the_default_sedan() -> None:
@@ -148,7 +131,7 @@ def test_the_shipped_car_is_found_by_name_and_none_is_the_default_sedan() -> Non
     assert Car.load(SHIPPED_CARS["saloon"]).physics_sha256 == saloon.physics_sha256
     default = Car.load()
     assert (default.vehicle, default.source) == (default_vehicle(), None)
-    assert default.allowed_trust.cap == 0.0
+    assert default.residual_gain == 0.0
 
 
 def test_a_car_without_network_has_no_residual_network_and_one_for_physics_is_it() -> None:
@@ -171,11 +154,6 @@ def test_parts_come_one_by_one(folder: Path) -> None:
     noise = add_noise(folder)
     car = load(folder)
     assert dict(car.noise) == {**fit.filter, OURS: noise}
-    trust = add_trust(folder)
-    car = load(folder, "default")
-    assert car.trust == trust
-    assert (car.allowed_trust.cap, car.allowed_trust.reason) == (0.5, "a gain on one drive")
-    assert Car.load(folder).network_name == "default"
     assert car.notes == ()
 
 
@@ -194,12 +172,8 @@ def test_a_fit_of_biases_leaves_the_other_sensors(folder: Path) -> None:
 
 def test_a_cars_network_may_be_its_own_or_named_by_the_cars_folder(folder: Path, tmp_path: Path) -> None:
     shutil.copytree(SHIPPED_FOLDERS["default"], folder / NETWORK_FOLDER)
-    add_trust(folder)
-    text = (folder / NETWORK_FILE).read_text()
-    (folder / NETWORK_FILE).write_text(text.replace('"default"', '"network"'))
     car = Car.load(folder)
-    assert (car.network_name, car.network_folder) == ("network", folder / NETWORK_FOLDER)
-    assert car.allowed_trust.cap == 0.5
+    assert car.network_name == NETWORK_FOLDER
     (tmp_path / "bare.toml").write_text(PERSONS)
     other = Car.load(tmp_path / "bare.toml", network=folder)
     assert other.network is not None and car.network is not None
@@ -274,10 +248,9 @@ def test_other_physics_leave_it_out(folder: Path) -> None:
         ("[tyres.front]", "[sensors]\nay_bias_m_s2 = 0.1\n[tyres.front]"),
     ],
 )
-def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, old: str, new: str) -> None:
+def test_other_physics_leave_fit_and_noise_out_and_say_so(folder: Path, old: str, new: str) -> None:
     add_fit(folder)
     add_noise(folder)
-    add_trust(folder)
     edit(folder, old, new)
     car = load(folder, "default")
     assert car.vehicle == car.datasheet
@@ -286,11 +259,7 @@ def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, ol
     assert car.notes == (
         "fit.toml is not used: vehicle.toml has changed since; pdhef learn --stages calibrate creates it again",
         "noise of physics is not used: it belongs to other physics",
-        "network.toml allows no residual gain: it was fitted with other physics; "
-        "pdhef learn --stages gain creates it again",
     )
-    assert car.allowed_trust.cap == 0.0
-    assert "other physics; pdhef learn --stages gain creates it again" in car.allowed_trust.note
 
 
 @pytest.mark.parametrize(
@@ -307,14 +276,12 @@ def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, ol
 def test_what_is_no_physics_makes_nothing_stale(folder: Path, old: str, new: str) -> None:
     add_fit(folder)
     add_noise(folder)
-    add_trust(folder)
     before = load(folder, "default")
     edit(folder, old, new)
     car = load(folder, "default")
     assert car.notes == before.notes == ()
     assert dict(car.noise) == dict(before.noise)
-    assert car.allowed_trust == before.allowed_trust
-    assert (car.physics_sha256, car.noise_sha256) == (before.physics_sha256, before.noise_sha256)
+    assert car.physics_sha256 == before.physics_sha256
 
 
 def test_an_entry_that_a_later_version_adds_makes_no_car_stale(tmp_path: Path) -> None:
@@ -329,49 +296,24 @@ def test_an_entry_that_a_later_version_adds_makes_no_car_stale(tmp_path: Path) -
 def test_another_fit_leaves_the_noise_of_the_first_out(folder: Path) -> None:
     add_fit(folder)
     add_noise(folder)
-    add_trust(folder)
     fit = add_fit(folder, friction=0.7)
     car = load(folder, "default")
     assert car.vehicle.friction == 0.7
     assert dict(car.noise) == fit.filter
-    assert [note.split(":")[0] for note in car.notes] == [
-        "noise of physics is not used",
-        "network.toml allows no residual gain",
-    ]
-    assert car.allowed_trust.cap == 0.0
+    assert [note.split(":")[0] for note in car.notes] == ["noise of physics is not used"]
 
 
-def test_other_noise_takes_the_trust_but_nothing_else(folder: Path) -> None:
-    add_fit(folder)
-    add_trust(folder)
-    add_noise(folder)
+def test_the_gain_limit_of_an_earlier_version_is_named_and_not_used(folder: Path) -> None:
+    (folder / "network.toml").write_text('format = "pdhef-network"\ntrust_cap = 1.0\n')
     car = load(folder, "default")
-    assert car.notes == (
-        "network.toml allows no residual gain: it was fitted with other noise; "
-        "pdhef learn --stages gain creates it again",
-    )
-    assert car.allowed_trust.cap == 0.0
-    assert "other noise" in car.allowed_trust.reason
+    assert car.notes == ("network.toml is no longer read: the residual gain follows from network and drive",)
+    assert car.residual_gain == 0.0
 
 
-def test_evidence_about_another_network_makes_nothing_stale(folder: Path) -> None:
-    add_noise(folder)
-    write_part(folder / NETWORK_FILE, add_trust(folder).model_copy(update={"network_sha256": "ab" * 32}))
-    assert load(folder, "default").notes == ()
-    assert "the car's evidence is about network" in load(folder, "default").allowed_trust.reason
-
-
-def test_trust_changes_no_physics_so_that_intervals_stay_those_of_the_car(folder: Path) -> None:
+def test_intervals_are_of_the_physics_of_a_car(folder: Path) -> None:
     intervals = json.loads((SHIPPED_CARS["saloon"] / INTERVALS_FILE).read_text())
     (folder / INTERVALS_FILE).write_text(json.dumps(intervals | {"physics_sha256": load(folder).physics_sha256}))
-    before = Car.load(folder, network="default")
-    add_trust(folder)
-    after = Car.load(folder, network="default")
-    assert after.allowed_trust.cap > before.allowed_trust.cap
-    assert after.physics_sha256 == before.physics_sha256
-    assert after.intervals == before.intervals
-    assert after.intervals is not None and after.intervals.physics_sha256 == after.physics_sha256
-    assert after.notes == ()
+    assert Car.load(folder).notes == ()
     edit(folder, "mass_kg = 1440.0 ", "mass_kg = 1450.0 ")
     assert "intervals.json was made with other physics" in Car.load(folder).notes
     assert not any("intervals" in note for note in load(folder).notes)  # they are not in force
@@ -389,7 +331,6 @@ def test_a_network_is_no_car(tmp_path: Path) -> None:
 
 NOISE = f'format = "pdhef-noise"\nversion = 1\n[filter."{TUNED}"]\n'
 FIT = f'format = "pdhef-fit"\nversion = 1\nphysics_sha256 = "{"ab" * 32}"\n'
-TRUST = 'format = "pdhef-network"\nversion = 1\n'
 
 
 @pytest.mark.parametrize(
@@ -397,7 +338,7 @@ TRUST = 'format = "pdhef-network"\nversion = 1\n'
     [
         (VEHICLE_FILE, PERSONS.replace("friction", "frictoin"), "frictoin: unknown, did you mean friction?"),
         (VEHICLE_FILE, PERSONS.replace("[tyres.rear]", "[tyres.reer]"), "did you mean tyres.rear?"),
-        (VEHICLE_FILE, PERSONS + "[network]\ntrust = 1.0\n", "network.trust: unknown, did you mean network.trust_cap?"),
+        (VEHICLE_FILE, PERSONS + "[network]\ngian = 1.0\n", "network.gian: unknown, did you mean network.gain?"),
         (FIT_FILE, FIT + "drive = []\n[values]\n", "drive: unknown, did you mean drives?"),
         (FIT_FILE, FIT + "[values]\nmass_kg = 3.0\n", "values.mass_kg: unknown"),
         (FIT_FILE, FIT + "[values]\nsteering_ration = 3.0\n", "did you mean values.steering_ratio?"),
@@ -409,9 +350,6 @@ TRUST = 'format = "pdhef-network"\nversion = 1\n'
         (NOISE_FILE, NOISE + "q_std = [1.0]\n", "q_std needs 3 or 4 entries"),
         (NOISE_FILE, NOISE + f"q_std = {[0.1] * 6}\n", "6 are physics's"),
         (NOISE_FILE, NOISE.replace("noise", "fit"), "format: should be 'pdhef-noise'"),
-        (NETWORK_FILE, TRUST + "trust_kap = 1.0\n", "trust_kap: unknown, did you mean trust_cap?"),
-        (NETWORK_FILE, TRUST + "trust_cap = 1.5\n", "trust_cap: "),
-        (NETWORK_FILE, TRUST + 'network_sha256 = "ab"\n', "network_sha256: "),
         (INTERVALS_FILE, '{"entris": []}', "entris: unknown, did you mean entries?"),
         (
             INTERVALS_FILE,
@@ -496,19 +434,6 @@ def test_the_same_folder_is_updated_and_every_command_leaves_a_line(folder: Path
     assert lines[0]["drives"] == [DRIVES[0].model_dump(mode="json")]
     assert lines[1]["sha256"] == digest((folder / NOISE_FILE).read_text()) != lines[0]["sha256"]
     assert [p.name for p in folder.parent.iterdir()] == [folder.name]
-
-
-def test_a_network_is_copied_whole_and_replaces_the_one_before(folder: Path) -> None:
-    (folder / NETWORK_FOLDER / "baselines").mkdir(parents=True)
-    (folder / NETWORK_FOLDER / "baselines" / "old.json").write_text("{}")
-    shipped = SHIPPED_FOLDERS["default"]
-    change = Change("trust", NETWORK_FILE, {NETWORK_FILE: b"x = 1\n"}, {NETWORK_FOLDER: shipped})
-    update_car(load(folder), folder, change)
-    assert files_of(folder / NETWORK_FOLDER) == files_of(shipped)
-    again = Change("trust", NETWORK_FILE, {NETWORK_FILE: b"x = 2\n"}, {NETWORK_FOLDER: folder / NETWORK_FOLDER})
-    (folder / NETWORK_FILE).unlink()
-    update_car(load(folder), folder, again)
-    assert files_of(folder / NETWORK_FOLDER) == files_of(shipped)
 
 
 def _raise(error: BaseException) -> Callable[..., Any]:

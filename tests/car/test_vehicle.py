@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import Noise, Trust
+from pdhef_logtool.car.parts import Noise
 from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_of_entries
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.records.errors import VehicleError
@@ -72,11 +72,11 @@ def problem(path: Path) -> str:
 
 
 def test_every_entry_of_the_example_is_read(tmp_path):
-    tried = '[network]\ntrust_cap = 0.3\nevidence = "a drive"\n'
-    file = read_vehicle_file(write(tmp_path, EXAMPLE + tried))
-    vehicle, trust = file.vehicle, file.trust
-    assert trust == Trust(trust_cap=0.3, evidence="a drive")
-    assert "network.trust_cap" in problem(write(tmp_path, EXAMPLE + tried.replace("0.3", "1.3")))
+    network = "[network]\ngain = 0.3\n"
+    file = read_vehicle_file(write(tmp_path, EXAMPLE + network))
+    vehicle = file.vehicle
+    assert file.network_gain == 0.3
+    assert "network.gain" in problem(write(tmp_path, EXAMPLE + network.replace("0.3", "1.3")))
     raw = tomllib.loads(EXAMPLE)
     given = {k: v for k, v in vehicle.model_dump(exclude_unset=True).items() if k in raw}
     assert as_plain(given) == raw
@@ -90,7 +90,7 @@ def test_defaults_of_what_the_file_leaves_out(tmp_path):
     assert vehicle.friction is None
     assert vehicle.assumed_friction == 1.0
     assert vehicle.imu_position_m == (0.0, 0.0, 0.0)
-    assert Car.load(tmp_path / "car.toml", network="none").allowed_trust.cap == 0.0
+    assert Car.load(tmp_path / "car.toml", network="none").residual_gain == 0.0
     assert vehicle.sensors.ay_std_m_s2 == 0.12
 
 

@@ -17,7 +17,7 @@ from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import CURES, LEAST_WEIGHT, AdaptivePhysics, mix, weigh
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.table import Options, make_estimator
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
@@ -230,9 +230,7 @@ def test_trust_scales_the_network_in_all_filters(made):
 
 def test_its_noise_comes_from_the_car():
     tuned = Car.of(VEHICLE, network=SILENT.bundle, noise={"physics": FilterNoise(r_std={"ay_m_s2": 2.0})})
-    found = [
-        make_estimator(n, tuned, Options(trust=t)) for n, t in (("physics", None), ("pd-hef", 0.0), ("pd-hef", 1.0))
-    ]
+    found = [make_estimator(name, tuned) for name in ("physics", "pd-hef:gain=0", "pd-hef:gain=1")]
     for estimator in found:
         assert isinstance(estimator, AdaptivePhysics)
         assert estimator.physics.measurement_std[0] == 2.0

@@ -14,7 +14,7 @@ from made_models import full_network, linear_residual
 from reference_car import START_NS, cut, drive, keep, rolling_drive, slalom, tanh_tyre, with_noise
 
 from pdhef_logtool.car.car import Car, WithoutTruth
-from pdhef_logtool.car.parts import FilterNoise, Trust
+from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.taught import Taught
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators import latency_compensation
@@ -55,8 +55,7 @@ MIRRORED = ("vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")
 
 def car_of(vehicle: VehicleParameters = VEHICLE) -> Car:
     """Return a car with all that an estimator may need."""
-    trust = Trust(trust_cap=1.0, evidence="a drive of 300 s")
-    return Car.of(vehicle, network=MODEL, noise={"phy-ukf:tuned": NOISE, "physics": NOISE}, trust=trust)
+    return Car.of(vehicle, network=MODEL, noise={"phy-ukf:tuned": NOISE, "physics": NOISE}, network_gain=1.0)
 
 
 def run(name: str, signals: Signals, **options) -> StateTrack:

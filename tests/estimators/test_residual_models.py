@@ -96,6 +96,6 @@ def test_a_model_without_the_interface_is_refused(tmp_path: Path, monkeypatch: p
         Car.load(network=name)
 
 
-def test_a_model_has_no_gain_without_evidence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_has_no_gain_unless_the_estimator_names_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     name = with_model(tmp_path, CONSTANT.format(line="pass"), monkeypatch, "constant_model")
-    assert Car.load(network=name).allowed_trust.cap == 0.0
+    assert Car.load(network=name).residual_gain == 0.0

@@ -17,7 +17,6 @@ from reference_car import REAR_M, cut, drive, forces, keep, rolling_drive, runge
 from rich.console import Console
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import Trust
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
@@ -338,12 +337,12 @@ def test_links_cost_the_filter_no_bit(rough):
 
 
 def test_what_it_says_of_itself(rough):
-    trusted = Car.of(VEHICLE, network=BUNDLE, trust=Trust(trust_cap=0.6, evidence="a drive of 300 s"))
+    trusted = Car.of(VEHICLE, network=BUNDLE, network_gain=0.6)
     estimator = make_estimator("pd-hef-smoothed", trusted)
     assert isinstance(estimator, SmoothedPhysics) and isinstance(estimator, Smoother)
     assert (estimator.name, estimator.causal, estimator.filtered.trust) == ("pd-hef-smoothed", False, 0.6)
     assert "not causal" in estimator.notes[0]
-    assert "a drive of 300 s" in estimator.notes[1]
+    assert "residual gain 0.6" in estimator.notes[1]
     assert [s.name for s in SPECS if not s.causal] == ["open-loop:calibrated", "pd-hef-smoothed"]
     track = run_estimator(estimator, rough)
     assert track.valid[0], "it needs no arrival"

@@ -19,7 +19,6 @@ from pdhef_logtool.car.parts import (
     FittedValues,
     IntervalEntry,
     Intervals,
-    Trust,
 )
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
@@ -53,7 +52,6 @@ pytestmark = pytest.mark.slow
 
 VEHICLE = default_vehicle()
 NOISE = FilterNoise(q_std=(0.1, 0.2, 0.1), r_std={"ay_m_s2": 0.9})
-EVIDENCE = Trust(trust_cap=1.0, evidence="a drive of 300 s")
 #: All rows except the estimator on a self-calibrated car (``test_calibrated_band``).
 LINES = tuple(s for s in all_specs() if s.name != OPEN_LOOP)
 every_spec = pytest.mark.parametrize("spec", LINES, ids=lambda spec: spec.name)
@@ -61,7 +59,7 @@ every_spec = pytest.mark.parametrize("spec", LINES, ids=lambda spec: spec.name)
 
 MODEL = full_network()
 #: It has all that any estimator needs.
-CAR = Car.of(VEHICLE, network=MODEL, noise={"phy-ukf:tuned": NOISE, "physics": NOISE}, trust=EVIDENCE)
+CAR = Car.of(VEHICLE, network=MODEL, noise={"phy-ukf:tuned": NOISE, "physics": NOISE}, network_gain=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -230,7 +228,6 @@ def test_names_stand_for_different_algorithms() -> None:
     identities: dict[str, list[str]] = {}
     for spec in LINES:
         identities.setdefault(ran(spec.name).identity, []).append(spec.name)
-    # CAR allows all of the trust.
     assert [n for n in identities.values() if len(n) > 1] == [["pd-hef", "pd-hef:gain=1"]]
 
 
@@ -267,17 +264,16 @@ def test_other_noise_is_another_basis_of_the_same_identity(name: str) -> None:
     assert told == was
 
 
-def test_trust_and_speed_sensor_are_told() -> None:
-    assert len({ran("pd-hef", trust=t).identity for t in (0.0, 0.5, 1.0)}) == 3
-    assert ran("pd-hef", trust=0.5).options["trust"] == 0.5
+def test_gain_and_speed_sensor_are_told() -> None:
+    assert len({ran(f"pd-hef:gain={gain}").identity for gain in (0.0, 0.5, 1.0)}) == 3
     full, esp = resolve(make_estimator("phy-ukf", CAR)), ran("phy-ukf", use_speed=False)
     assert (full.use_speed, esp.use_speed) == (True, False)
     assert full.sha256 != esp.sha256
 
 
-# --- pd-hef without trust is physics ---------------------------------------------------------------------------------
+# --- pd-hef without residual is physics ------------------------------------------------------------------------------
 
-BARE = replace(CAR, trust=None, noise={})
+BARE = replace(CAR, network_gain=None, noise={})
 
 
 def intervals_for(*algorithms: Algorithm, factor: float = 2.0) -> Intervals:
@@ -295,7 +291,7 @@ def with_intervals(car: Car, intervals: Intervals, signals: Signals) -> tuple[fl
     return float(np.nanmedian(ratio)), applied.notes("pd-hef")
 
 
-def test_evidence_decides_what_pd_hef_is() -> None:
+def test_the_gain_decides_what_pd_hef_is() -> None:
     trusted, cautious = make_estimator("pd-hef", CAR), make_estimator("pd-hef", BARE)
     assert trusted.name == cautious.name == "pd-hef"
     assert resolve(trusted).identity != resolve(cautious).identity
@@ -318,8 +314,8 @@ def test_intervals_of_the_one_are_never_put_on_the_other(signals: Signals) -> No
         assert notes == ("intervals calibrated on car for friction and vehicle as given",)
 
 
-def test_trust_changes_no_physics_so_that_the_notes_of_other_filters_stay(signals: Signals) -> None:
-    """Evidence makes pd-hef another algorithm; the intervals of all others hold, and nobody calls them foreign."""
+def test_a_gain_changes_no_physics_so_that_the_notes_of_other_filters_stay(signals: Signals) -> None:
+    """A gain makes pd-hef another algorithm; the intervals of all others hold, and nobody calls them foreign."""
     entries = intervals_for(ran("phy-ukf", BARE))
     for car in (BARE, CAR):
         estimator = make_estimator("phy-ukf", car)

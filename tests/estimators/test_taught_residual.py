@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_models import linear_residual
+from made_models import linear_residual, random_network
 from reference_car import drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car, WithoutTruth
@@ -19,7 +19,6 @@ from pdhef_logtool.estimators.calibration.joint import parameters_of, prior_vehi
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.pd_hef import FILTER_ALONE
-from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.residual_response import residual_response
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
@@ -139,7 +138,8 @@ def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(signals: Signal
 
 def test_a_car_without_a_residual_or_with_a_named_gain_does_not_take_it() -> None:
     assert not acts(make_estimator("pd-hef", taught_car(None)))
-    assert not acts(make_estimator("pd-hef", taught_car(linear_residual()), Options(trust=0.0)))
+    with_network = replace(taught_car(linear_residual()), network=random_network())
+    assert not acts(make_estimator("pd-hef:gain=1", with_network)) and acts(make_estimator("pd-hef", with_network))
 
 
 def test_a_taught_prior_moves_mean_and_width_of_the_calibration() -> None:

@@ -17,7 +17,7 @@ from unittest.mock import patch
 import numpy as np
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.learning.network.cells import EVERYTHING
+from pdhef_logtool.learning.network.cells import pick
 from pdhef_logtool.learning.network.dataset import (
     drive_file,
     read_dataset,
@@ -59,7 +59,7 @@ def write_set(folder: Path, drives: int, steps: int = STEPS) -> Path:
             "name": f"d{number:05}", "log": f"d{number:05}", "split": split, "rows": steps, "usable_rows": steps - 1,
             "period_s": 0.01, "signals_sha256": None, "cells": {}, "car": "a car", "vehicle_sha256": "f" * 64,
         }  # fmt: skip
-        write_drive(drive_file(folder, entry), rows, EVERYTHING.of(rows), entry)
+        write_drive(drive_file(folder, entry), rows, pick(rows), entry)
         entries.append(entry)
     vehicle = vehicle_entry("f" * 64, Car.load(None).datasheet)
     write_manifest(folder, entries, [], settings={"model": "physics"}, seed=0, vehicles={"f" * 64: vehicle})

@@ -16,13 +16,13 @@ from test_network_parts import arrays
 
 from pdhef_logtool.learning.network.cells import (
     COUNT,
-    Picking,
     cell_of,
     cells,
     condition_of,
     draw_limits,
     draw_of,
     is_chosen,
+    pick,
 )
 from pdhef_logtool.learning.network.dataset import MANIFEST, read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
@@ -86,9 +86,9 @@ def test_conditions_are_on_the_columns_of_a_row() -> None:
     columns = [made.stamps_ns, made.features, made.targets, made.step_s, made.weight, made.segment, made.truth_velocity]
     rows = ResidualRows(*columns, none, none)
     vx, ay = (rows.features[:, FEATURES.index(n)] for n in ("vx_m_s", "ay_m_s2"))
-    holds = Picking(condition_of("abs(ay_m_s2) > 0.5 and not vx_km_h < 1.8 or truth_vx_m_s < 0")).of(rows).chosen
+    holds = pick(rows, condition_of("abs(ay_m_s2) > 0.5 and not vx_km_h < 1.8 or truth_vx_m_s < 0")).chosen
     np.testing.assert_array_equal(holds, (np.abs(ay) > 0.5) & ~(vx * 3.6 < 1.8))
-    assert Picking().of(rows).chosen.all() and not Picking(condition_of("not 1 < 2")).of(rows).chosen.any()
+    assert pick(rows).chosen.all() and not pick(rows, condition_of("not 1 < 2")).chosen.any()
     for wrong in ("sideslip_rad > 1", "truth.vx_m_s > 1", "vx_m_s > 1 and (select 1)", "vx_m_s", "friction > 1 and"):
         with pytest.raises(UsageError, match="--where"):
             condition_of(wrong)

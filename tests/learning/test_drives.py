@@ -34,10 +34,10 @@ def logs(folder: Path, names: str) -> list[str]:
 
 
 def test_a_record_in_json_and_as_a_car_remembers_it() -> None:
-    full = record("a", seconds=1.23456, span_s=(0.12345, 9.87654), counts={"runs": 3}, split="test")
+    full = record("a", seconds=1.23456, span_s=(0.12345, 9.87654), split="test")
     document = full.to_dict()
-    assert (document["seconds"], document["span_s"], document["runs"]) == (1.235, [0.123, 9.877], 3)
-    assert not {"counts", "left_out", "reason"} & document.keys()
+    assert (document["seconds"], document["span_s"]) == (1.235, [0.123, 9.877])
+    assert not {"left_out", "reason"} & document.keys()
     assert full.learnt_on == LearntOn(name="a", sha256="a" * 64, start_s=0.12, end_s=9.88)
     without = record("b", span_s=None, left_out="no ground truth")
     assert without.to_dict()["span_s"] is None and without.to_dict()["reason"] == "no ground truth"

@@ -31,7 +31,7 @@ def _losses_by_command(log: Path, out: Path, config: RunConfig) -> dict[str, tup
     physics = replace(config, network=Path("none"), estimators=("phy-ukf",))
     commands = {
         "extract": lambda tell: extract(logs, out / "2", ExtractSettings(physics), reporter=Reporter(warn=tell)),
-        "gain": lambda tell: run_stage("gain", logs, out / "4", config, reporter=Reporter(warn=tell)),
+        "teach": lambda tell: run_stage("teach", logs, out / "4", config, reporter=Reporter(warn=tell)),
         "run": lambda tell: run_logs(logs, out / "6", replace(physics, annotate="none"), reporter=Reporter(warn=tell)),
     }
     for name, command in commands.items():

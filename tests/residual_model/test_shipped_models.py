@@ -34,8 +34,7 @@ def test_noise_evidence_and_calibration_are_of_the_shipped_network() -> None:
     model, car = open_model(None), Car.load("saloon")
     assert model is not None
     assert car.network is not None and car.network.sha256 == model.sha256
-    assert car.trust is not None and car.trust.network_sha256 == model.sha256
-    assert car.allowed_trust.cap == 0.75
+    assert (car.residual_gain, model.physics_sha256) == (0.75, car.physics_of("physics"))
     assert car.notes == ()
     assert {"phy-ukf:tuned", "physics"} == set(car.noise)
     for chosen in (None, UNSURE):

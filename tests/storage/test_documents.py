@@ -91,7 +91,6 @@ LOADERS = [
     Loader("vehicle.toml", read_vehicle_file, tomllib.loads((CAR / "vehicle.toml").read_text())),
     Loader("fit.toml", _part, VALID_FIT),
     Loader("noise.toml", _part, tomllib.loads((CAR / "noise.toml").read_text())),
-    Loader("network.toml", _part, tomllib.loads((CAR / "network.toml").read_text())),
     Loader("intervals.json", load_intervals, json.loads((CAR / "intervals.json").read_text())),
     Loader(DOCUMENT_FILE, _model, json.loads((SHIPPED / DOCUMENT_FILE).read_text())),
     Loader(
@@ -101,7 +100,7 @@ LOADERS = [
     ),
 ]
 every_loader = pytest.mark.parametrize("loader", LOADERS, ids=lambda loader: loader.name)
-every_toml = pytest.mark.parametrize("loader", LOADERS[:7], ids=lambda loader: loader.name)
+every_toml = pytest.mark.parametrize("loader", LOADERS[:6], ids=lambda loader: loader.name)
 
 
 def to_toml(value: Any, top: bool = False) -> str:

@@ -22,8 +22,7 @@ def test_noise_and_intervals_of_a_car_are_made_from_its_validation_drives(
 ) -> None:
     car, work = tmp_path / "car", tmp_path / "work"
     shutil.copytree(train_default.HOME, car)
-    shutil.copytree(car / "network", work / "network-0")
-    (work / "one_car").mkdir()
+    (work / "one_car").mkdir(parents=True)
     for name in LOGS:
         source = "dlc" if name == "again" else name
         shutil.copy(sample_logs_dir / f"{source}.mcap", work / "one_car" / f"{name}.mcap")

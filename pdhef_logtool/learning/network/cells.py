@@ -41,25 +41,6 @@ def condition_of(text: str) -> Condition:
     return parse_condition(text, COLUMNS, of_tracks=False)
 
 
-@dataclass(frozen=True, slots=True)
-class Picking:
-    """Selection of the rows to train on: a condition (None: all rows), and the key of the random numbers."""
-
-    condition: Condition | None = None
-    key: str = ""
-
-    def of(self, rows: ResidualRows) -> Picked:
-        """Return condition, cell and random number of the rows."""
-        chosen = np.ones(len(rows), dtype=np.bool_)
-        if self.condition is not None:
-            columns = dict(zip(COLUMNS, [*rows.features.T, *rows.truth_velocity.T], strict=True))
-            chosen = self.condition.is_true(columns)
-        return Picked(chosen, cell_of(rows.features), draw_of(rows.stamps_ns, self.key))
-
-
-EVERYTHING = Picking()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Picked:
     """Condition, cell and random number of each row [N]."""
@@ -67,6 +48,15 @@ class Picked:
     chosen: BoolArray
     cell: NDArray[np.int16]
     draw: NDArray[np.float32]
+
+
+def pick(rows: ResidualRows, condition: Condition | None = None, key: str = "") -> Picked:
+    """Return condition (None: all rows), cell and random number of rows; ``key`` is of the random numbers."""
+    chosen = np.ones(len(rows), dtype=np.bool_)
+    if condition is not None:
+        columns = dict(zip(COLUMNS, [*rows.features.T, *rows.truth_velocity.T], strict=True))
+        chosen = condition.is_true(columns)
+    return Picked(chosen, cell_of(rows.features), draw_of(rows.stamps_ns, key))
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,7 +36,7 @@ from pdhef_logtool.learning.drives import (
     set_manifest,
     tell_drive,
 )
-from pdhef_logtool.learning.network.cells import Picked, Picking, condition_of, rows_by_cell
+from pdhef_logtool.learning.network.cells import Picked, condition_of, pick, rows_by_cell
 from pdhef_logtool.learning.network.dataset import (
     FORMAT,
     FORMAT_VERSION,
@@ -474,7 +474,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         rows = _residuals(drive, physics, smoothing, service, reference)
         if not len(rows):
             raise no_samples(job.log_input.path)
-        picked = Picking(condition, f"{settings.seed}:{source}").of(rows)
+        picked = pick(rows, condition, f"{settings.seed}:{source}")
         progress(1.0)
         friction = drive.friction
         entry = {
@@ -687,7 +687,7 @@ def _fingerprint(job: _Job, split: str) -> str:
         },
         "split": split,
         "seed": job.settings.seed,
-        "vehicle": [job.physics[0], job.car.noise_sha256],
+        "vehicle": [job.physics[0], {name: noise.model_dump(mode="json") for name, noise in job.car.noise.items()}],
         "taught": None if job.car.taught is None else digest(job.car.taught.model_dump(mode="json")),
         **({} if job.log_input.span_s is None else {"span_s": job.log_input.span_s}),
         "mapping": None if mapping is None else hash_log(Path(mapping)),

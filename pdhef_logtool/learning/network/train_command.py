@@ -14,7 +14,6 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.network.dataset import SPLITS, Dataset, DatasetDrive, DriveArrays, read_dataset
 from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
-from pdhef_logtool.learning.plots import new_figure, png_bytes
 from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.bundle import (
@@ -279,7 +278,10 @@ def _history_table(history: Iterable[Epoch]) -> bytes:
 
 
 def _plot_history(history: list[Epoch]) -> bytes:
-    figure = new_figure(7.0, 4.0)
+    """Return the loss by epoch as a PNG without time stamp and version, so that equal losses give equal bytes."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 4.0), dpi=110, layout="constrained")
     axes = figure.subplots()
     epochs = [e.epoch for e in history]
     axes.semilogy(epochs, [e.train_loss for e in history], label="training", color="#0072B2")
@@ -287,4 +289,6 @@ def _plot_history(history: list[Epoch]) -> bytes:
     axes.set(xlabel="epoch", ylabel="mean square of normalised targets")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
-    return png_bytes(figure)
+    content = io.BytesIO()
+    figure.savefig(content, format="png", metadata={"Software": None})
+    return content.getvalue()

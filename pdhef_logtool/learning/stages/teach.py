@@ -154,7 +154,7 @@ def teach(task: Task) -> StageOutput:
     taught = learn_from(drives, seed=task.settings.seed, progress=task.reporter.progress)
     part = taught.part(car, records)
     files = {TAUGHT_FILE: (json.dumps(part.model_dump(mode="json"), indent=1) + "\n").encode()}
-    change = Change(f"learn --stages {TEACH}", TAUGHT_FILE, files, {}, task.settings.to_dict(), part.drives)
+    change = Change(f"learn --stages {TEACH}", TAUGHT_FILE, files, task.settings.to_dict(), part.drives)
     return StageOutput(change, records, taught.evidence, part.figures)
 
 

@@ -1,1 +1,0 @@
-"""Residual gain of a network, and calibrated intervals."""
