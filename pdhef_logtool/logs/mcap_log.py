@@ -12,7 +12,7 @@ from array import array
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -129,12 +129,14 @@ class McapContainer(FileContainer):
         self._data_end: tuple[int, int] | None = None  # extent of the record
         self._footer: int | None = None  # place of the record
         self._statistics: Statistics | None = None
+        self._has_end = False  # whether the file ends with its magic bytes
         self._opened_chunks = 0  # number of chunks that the summary does not describe
         super().__init__(path, shown_path, meter)
 
     def _walk(self) -> None:
         source, size = self.source, self.source.size
         indexed = self._indexed_places()
+        self._has_end = source.read(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) == MCAP_MAGIC
         places, n = [*sorted(indexed), size], 0
         header_seen = False
         for offset in self._places():
@@ -209,21 +211,37 @@ class McapContainer(FileContainer):
         if not isinstance(indexed, IndexedChunk):
             self._attachment_at.append(indexed)
             return indexed[1]
-        ordered = self.source.is_remote or self._is_ordered(indexed)
-        span = Span(0, indexed.first_ns, indexed.last_ns + 1, indexed.counts, ordered)
-        self.add_span(_Extent(indexed.start, indexed.end, True, indexed.index_end), span)
+        extent, ordered = _Extent(indexed.start, indexed.end, True, indexed.index_end), self.source.is_remote
+        if not ordered:
+            named = self._span_by_indexes(extent)
+            ordered = named is not None and named.ordered
+            if named is None or named.counts != indexed.counts:
+                self._lose_indexes(extent)
+        self.add_span(extent, Span(0, indexed.first_ns, indexed.last_ns + 1, indexed.counts, ordered))
         return indexed.index_end
 
-    def _is_ordered(self, chunk: IndexedChunk) -> bool:
-        """Return whether no channel of a chunk steps back in time; message indexes unlike the summary are a loss."""
-        indexes = _message_indexes(self.source.read(chunk.end, chunk.index_end - chunk.end), 0)
-        if indexes is None or {id_: len(times) for id_, times, _ in indexes if len(times)} != chunk.counts:
-            self._lose_indexes(chunk.start)
-            return False
-        return all(bool((times[1:] >= times[:-1]).all()) for _, times, _ in indexes)
+    def _indexes(self, extent: _Extent) -> list[tuple[int, UintArray, UintArray]] | None:
+        """Return channel, log times [N] and offsets [N] of each message index of a chunk; None if one is malformed."""
+        return _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
 
-    def _lose_indexes(self, start: int) -> None:
-        what = f"the message indexes of the chunk at byte {start} are damaged: its messages are found without them"
+    def _span_by_indexes(self, extent: _Extent) -> Span | None:
+        """Return the span that the message indexes of a chunk describe; None if one of them is malformed."""
+        indexes = self._indexes(extent)
+        if indexes is None:
+            return None
+        counts = {id_: len(its) for id_, its, _ in indexes if len(its)}
+        if not counts:
+            return Span(0, 0, 0, counts)
+        times = np.concatenate([its for _, its, _ in indexes])
+        falls = times[1:] < times[:-1]
+        falls[np.cumsum([*counts.values()])[:-1] - 1] = False  # from a channel to the next one
+        first, last = (min(int(ns), MAX_TIME_NS) for ns in (times.min(), times.max()))
+        return Span(0, first, last + 1, counts, ordered=not falls.any())
+
+    def _lose_indexes(self, extent: _Extent) -> None:
+        what = (
+            f"the message indexes of the chunk at byte {extent.start} are damaged: its messages are found without them"
+        )
         self.lose("bad-record", what)
 
     def _read_header(self, offset: int, length: int) -> None:
@@ -252,7 +270,7 @@ class McapContainer(FileContainer):
             return end
         self._end_run()
         if opcode == _OP_CHUNK:
-            return self._open_chunk(start, end)
+            return self._add_chunk(start, end)
         if opcode == Opcode.ATTACHMENT:
             self._check_attachment(start, end)
         elif opcode == Opcode.DATA_END:
@@ -339,28 +357,34 @@ class McapContainer(FileContainer):
                 _Extent(run.start, run.end, False, run.end), Span(0, first, last + 1, run.counts, run.ordered)
             )
 
-    def _open_chunk(self, start: int, end: int) -> int:
-        """Add a chunk by its content; a damaged chunk is a loss. Return the end of its message indexes."""
+    def _add_chunk(self, start: int, end: int) -> int:
+        """Add a chunk that no summary describes; return the end of its message indexes.
+
+        Its content describes it. In a file without an end, message indexes that agree with the head of the chunk do.
+        """
         index_end, size = end, self.source.size
         while index_end + _INDEX_RECORD.size <= size:
             opcode, length = RECORD.unpack(self.source.read(index_end, RECORD.size))
             if opcode & ~_FIRST_PRIVATE != _OP_MESSAGE_INDEX or index_end + RECORD.size + length > size:
                 break  # one wrong bit makes an index a private record
             index_end += RECORD.size + length
-        first, last, unpacked, _, _ = _CHUNK.unpack(self.source.read(start + RECORD.size, _CHUNK.size))
-        self._opened_chunks += 1
         extent = _Extent(start, end, True, index_end)
-        indexes = _message_indexes(self.source.read(end, index_end - end), 0)
-        if indexes is None:
-            self._lose_indexes(start)
-        counts = {id_: len(times) for id_, times, _ in indexes or ()}
-        if sum(counts.values()) * MESSAGE_HEAD.itemsize > unpacked:
-            counts = {}
-        claimed = Span(0, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS) + 1, counts)
+        first, last, unpacked, _, _ = _CHUNK.unpack(self.source.read(start + RECORD.size, _CHUNK.size))
+        claimed = Span(0, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS) + 1, {})
+        named = self._span_by_indexes(extent)
+        if named is None:
+            self._lose_indexes(extent)
+        elif sum(named.counts.values()) * MESSAGE_HEAD.itemsize <= unpacked:
+            claimed = replace(claimed, counts=named.counts, ordered=named.ordered)
+            is_known = bool(named.counts) and named.counts.keys() <= self._raw_channels.keys()
+            if not self._has_end and is_known and named == claimed and unpacked <= self.meter.limits.chunk_bytes:
+                self.add_span(extent, claimed)
+                return index_end
+        self._opened_chunks += 1
         block = self.add_content(extent, claimed, lambda: self._decoded(extent, declare=True))
         if block is not None:
             held = block.counts
-            missing = sum(max(n - held.get(id_, 0), 0) for id_, n in counts.items())
+            missing = sum(max(n - held.get(id_, 0), 0) for id_, n in claimed.counts.items())
             if missing:
                 what = f"{missing} messages that the index names are not in the chunk at byte {start}"
                 self.lose("missing-messages", what, claimed.start_ns, claimed.end_ns, missing)
@@ -561,7 +585,7 @@ class McapContainer(FileContainer):
     def times(self, span: Span) -> tuple[IntArray, IntArray]:
         """Return a span's channels and log times; of a chunk, read its message indexes if they agree with the span."""
         extent = self.chunks[span.index]
-        indexes = _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
+        indexes = self._indexes(extent)
         if indexes and {id_: len(times) for id_, times, _ in indexes if len(times)} == span.counts:
             channel = np.concatenate([np.full(len(times), id_, dtype=np.int64) for id_, times, _ in indexes])
             log_time = _held_times(np.concatenate([times for _, times, _ in indexes]))

@@ -174,11 +174,13 @@ class LayoutReader:
         self.size = layout.size
         self._names: dict[Steps, str] = {}
         self._empty: dict[Steps, np.dtype[Any]] = {}
-        checked = [(offset, _WORD, expected) for offset, expected in layout.lengths]
+        self._expected: dict[str, int] = {}
+        places: dict[str, tuple[int, np.dtype[Any]]] = {}
         if wire == "cdr":
-            checked.append((0, _CDR_HEAD, _LITTLE_ENDIAN_CDR))
-        self._expected = {f"length{i}": expected for i, (_, _, expected) in enumerate(checked)}
-        places = {f"length{i}": (offset, dtype) for i, (offset, dtype, _) in enumerate(checked)}
+            places["head"], self._expected["head"] = (0, _CDR_HEAD), _LITTLE_ENDIAN_CDR
+        for offset, length in layout.lengths:
+            name = f"length{offset}"
+            places[name], self._expected[name] = (offset, _WORD), length
         for steps in wanted:
             leaf = leaf_at(layout, steps)
             if leaf is not None and leaf.count == 0:
