@@ -13,6 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from mcap.records import Attachment, Metadata
 
 from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.compression import decompress_messages
@@ -188,9 +189,13 @@ class ColumnarLog(DriveLog):
         if self.given_databases:
             return self.given_databases
         if self._databases is None:
-            stored = [(a.name, a.data) for c in self.containers for a in c.attachments() if a.name.endswith(".dbc")]
-            records = [record for c in self.containers for record in c.metadata_records()]
-            texts = [(r.name, key, text) for r in records for key, text in r.metadata.items() if _DBC.search(text)]
+            stored = [(a.name, a.data) for a in self.attachments() if a.name.endswith(".dbc")]
+            texts = [
+                (r.name, k, text)
+                for r in self.metadata_records()
+                for k, text in r.metadata.items()
+                if _DBC.search(text)
+            ]
             names = [key if key.endswith(".dbc") else f"{name}.{key}.dbc" for name, key, _ in texts]
             stored += [(name, text.encode()) for name, (_, _, text) in zip(names, texts, strict=True)]
             self._databases = tuple(self._extract(name, data) for name, data in stored)
@@ -212,13 +217,18 @@ class ColumnarLog(DriveLog):
     def metadata(self) -> dict[str, str]:
         """Return the entries of metadata records by ``key`` and ``record.key``, and rosbag2's ``custom_data``."""
         entries: dict[str, str] = {}
-        for container in self.containers:
-            for record in container.metadata_records():
-                entries |= {
-                    **record.metadata,
-                    **{f"{record.name}.{key}": value for key, value in record.metadata.items()},
-                }
+        for record in self.metadata_records():
+            entries |= record.metadata
+            entries |= {f"{record.name}.{key}": value for key, value in record.metadata.items()}
         return entries | dict(self._custom)
+
+    def attachments(self) -> Iterator[Attachment]:
+        """Yield the files that the log contains."""
+        return (attachment for container in self.containers for attachment in container.attachments())
+
+    def metadata_records(self) -> Iterator[Metadata]:
+        """Yield the metadata records."""
+        return (record for container in self.containers for record in container.metadata_records())
 
     @property
     def is_remote(self) -> bool:

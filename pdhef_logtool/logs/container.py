@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from mcap.records import Metadata
+from mcap.records import Attachment, Metadata
 
 from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, raise_source_error
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -177,17 +177,6 @@ class RawChunk:
     def start_ns(self) -> int:
         """First log time."""
         return int(self.log_time_ns.min())
-
-
-@dataclass(frozen=True, slots=True)
-class Attachment:
-    """A file inside a log."""
-
-    name: str
-    media_type: str
-    data: bytes
-    log_time_ns: int
-    create_time_ns: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from contextlib import closing
-from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +17,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
-from pdhef_logtool.logs.source_copy import (
-    iterate_attachments,
-    iterate_copy,
-    iterate_metadata,
-    register_channels,
-    source_profile,
-)
+from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
 from pdhef_logtool.logs.table_columns import field_name, unique
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import LogError, OutputError
@@ -59,9 +52,9 @@ def convert_log(
                 channels = register_channels(writer, source)
                 lost = channels.lost
                 writer.write([], raws=iterate_copy(source, channels))
-                for attachment in iterate_attachments(source):
-                    writer.attachment(*astuple(attachment))
-                for record in iterate_metadata(source):
+                for attachment in source.attachments():
+                    writer.attachment(attachment)
+                for record in source.metadata_records():
                     writer.metadata(record.name, record.metadata)
         return (*lost, *log.lost), sum(topic.messages for topic in log.topics)
 

@@ -131,29 +131,21 @@ class ChannelDecoder:
         return {path: column[back] for path, column in joined.items()}
 
     def _read_records(self, block: Block, rows: IntArray, left: IntArray, partial: _Parts) -> IntArray:
-        """Read messages of a fixed layout; return the other rows."""
-        no_layout: list[IntArray] = []
-        tried = 0
-        while left.size and tried <= len(self._layouts):
-            if tried == len(self._layouts):
-                if tried >= _LAYOUTS_PER_CHANNEL:
-                    break
+        """Read messages of the first few layouts of the channel; return the other rows."""
+        for number in range(_LAYOUTS_PER_CHANNEL):
+            if not left.size:
+                break
+            if number == len(self._layouts):
                 message = block.message(rows[left[0]])
                 try:
                     layout = layout_of_message(self.schema.root, self.schema.wire, message)
                     self._check_widths(layout, len(rows))
                 except NoLayoutError:
-                    no_layout.append(left[:1])
-                    left = left[1:]
-                    if len(no_layout) >= _LAYOUTS_PER_CHANNEL:
-                        break
-                    continue
+                    break
                 wanted = [steps for s in self.selections for steps in s.components]
                 self._layouts.append(LayoutReader(layout, self.schema.wire, wanted))
-            reader = self._layouts[tried]
-            tried += 1
-            left = self._read_layout(reader, block, rows, left, partial)
-        return np.concatenate([*no_layout, left]) if no_layout else left
+            left = self._read_layout(self._layouts[number], block, rows, left, partial)
+        return left
 
     def _check_widths(self, layout: WireLayout, n: int) -> None:
         """Refuse a layout with an array that has too many elements for N rows of columns."""
@@ -175,13 +167,12 @@ class ChannelDecoder:
             candidates, offset = left[sized], offset[sized]
             if not candidates.size:
                 return left
-        fits, parts = layout.gather(block.buffer, offset)
+        fits, records = layout.gather(block.buffer, offset)
         read = candidates if fits is None else candidates[fits]
         if not read.size:
             return left
-        n = len(read)
-        partial.append((read, {s.path: _record_column(layout, parts, n, s) for s in self.selections}))
-        return left[:0] if n == len(left) else np.setdiff1d(left, read, assume_unique=True)
+        partial.append((read, {s.path: _record_column(layout, records, s) for s in self.selections}))
+        return left[:0] if len(read) == len(left) else np.setdiff1d(left, read, assume_unique=True)
 
     def _read_singly(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         decode = self.single_decoder()
@@ -330,8 +321,8 @@ def missing_column(selection: Selection, n: int) -> NDArray[Any]:
     return np.full((n, *empty.shape[1:]), fill, dtype=empty.dtype)
 
 
-def _record_column(layout: LayoutReader, parts: Sequence[NDArray[Any]], n: int, selection: Selection) -> NDArray[Any]:
-    values = [layout.values(parts, n, steps) for steps in selection.components]
+def _record_column(layout: LayoutReader, records: NDArray[Any], selection: Selection) -> NDArray[Any]:
+    values, n = [layout.values(records, steps) for steps in selection.components], len(records)
     if selection.shape == "time":
         seconds, nanoseconds = values
         if seconds is None or nanoseconds is None:

@@ -1,7 +1,6 @@
 """The summary of an MCAP as an index: extents and contents of its chunks, without walking the file.
 
-For remote files: each read is a request. An index is used only if it is complete, if its sums equal the statistics of
-the file, and if its times ascend as in a sound recording; otherwise the file is walked as a local file is.
+An index is used only if it is complete and its sums equal the statistics of the file.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ _UNREADABLE = (McapError, struct.error, ValueError, CutError)
 
 @dataclass(frozen=True, slots=True)
 class IndexedChunk:
-    """A chunk record in bytes [start, end), its message indexes up to ``index_end``; times as the record has them."""
+    """A chunk record in bytes [start, end), its message indexes up to ``index_end``, its first and last log time."""
 
     start: int
     end: int
@@ -48,12 +47,16 @@ class IndexedChunk:
 
 @dataclass(frozen=True, slots=True)
 class McapIndex:
-    """Content of a summary: schemas and channels by id, chunks and attachments [start, end) in file order."""
+    """Content of a summary: schemas and channels by id, chunks and attachments [start, end) in file order.
+
+    ``in_order``: whether the times of the chunks ascend as in a sound recording.
+    """
 
     schemas: Mapping[int, Schema]
     channels: Mapping[int, Channel]
     chunks: tuple[IndexedChunk, ...]
     attachments: tuple[tuple[int, int], ...]
+    in_order: bool
 
 
 def read_index(source: ByteSource, limits: ResourceLimits = DEFAULT_LIMITS) -> McapIndex | None:
@@ -118,9 +121,10 @@ def _index(summary: bytes, start: int, limits: ResourceLimits) -> McapIndex | No
         if isinstance(r, Statistics)
     )
     declared = counts.keys() <= channels.keys() and len(channels) <= limits.channels
-    if not (agrees and declared and _apart(chunks, attachments, start) and _in_order(chunks)):
+    ascend = all(chunk.first_ns <= chunk.last_ns for chunk in chunks)
+    if not (agrees and declared and ascend and _apart(chunks, attachments, start)):
         return None
-    return McapIndex(schemas, channels, tuple(chunks), tuple(attachments))
+    return McapIndex(schemas, channels, tuple(chunks), tuple(attachments), _in_order(chunks))
 
 
 def _chunk(record: ChunkIndex) -> IndexedChunk:
@@ -138,9 +142,8 @@ def _chunk(record: ChunkIndex) -> IndexedChunk:
             counts[id_] = n
     if not counts or places[0] != end:
         raise ValueError("a chunk without message indexes")
-    return IndexedChunk(
-        record.chunk_start_offset, end, index_end, record.message_start_time, record.message_end_time, counts
-    )
+    first_ns, last_ns = (min(ns, MAX_TIME_NS) for ns in (record.message_start_time, record.message_end_time))
+    return IndexedChunk(record.chunk_start_offset, end, index_end, first_ns, last_ns, counts)
 
 
 def _apart(chunks: list[IndexedChunk], attachments: list[tuple[int, int]], limit: int) -> bool:
@@ -151,10 +154,10 @@ def _apart(chunks: list[IndexedChunk], attachments: list[tuple[int, int]], limit
 
 
 def _in_order(chunks: list[IndexedChunk]) -> bool:
-    """Return whether the chunks' times are plausible for a sound recording; other files are walked."""
+    """Return whether the chunks' times are plausible for a sound recording."""
     newest: dict[int, int] = {}
     for chunk in chunks:
-        if not 0 <= chunk.last_ns - chunk.first_ns < SILENCE_NS or chunk.last_ns >= MAX_TIME_NS:
+        if chunk.last_ns - chunk.first_ns >= SILENCE_NS or chunk.last_ns >= MAX_TIME_NS:
             return False
         for id_ in chunk.counts:
             if chunk.first_ns < newest.get(id_, 0) - STEP_BACK_NS:

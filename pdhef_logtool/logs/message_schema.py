@@ -434,7 +434,8 @@ def stated_units(definition: bytes) -> dict[str, str]:
     return {match[1]: match[2] for match in _STATED_UNIT.finditer(main_type)}
 
 
-_PART = re.compile(r"([^.\[\]]+)|\[(\d*)\]|\.")
+_PART = r"[^.\[\]]+(?:\[\d+\])*"
+_PATH = re.compile(rf"{_PART}(?:\.{_PART})*")
 
 
 def parse_path(path: str) -> tuple[Step, ...]:
@@ -444,26 +445,11 @@ def parse_path(path: str) -> tuple[Step, ...]:
     ------
     MappingError : the text is no path.
     """
-    steps: list[Step] = []
-    position, after_dot = 0, True
     text = path.removesuffix("[]")
-    while position < len(text):
-        match = _PART.match(text, position)
-        valid = match is not None and (match[0] != "." or not after_dot) and (not match[1] or after_dot)
-        if match is None or not valid or match[2] == "" or (match[2] is not None and after_dot):
-            after_dot = True
-            break
-        if match[1]:
-            steps.append(match[1])
-        elif match[2]:
-            steps.append(int(match[2]))
-        after_dot = match[0] == "."
-        position = match.end()
-    if after_dot:
-        raise MappingError(
-            expected="a dotted path such as twist.linear.x or data[0]", got=repr(path), where="field path"
-        )
-    return tuple(steps)
+    if not _PATH.fullmatch(text):
+        expected = "a dotted path such as twist.linear.x or data[0]"
+        raise MappingError(expected=expected, got=repr(path), where="field path")
+    return tuple(name or int(index) for index, name in re.findall(r"\[(\d+)\]|([^.\[\]]+)", text))
 
 
 def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:

@@ -95,13 +95,18 @@ def _groups(source: Any, paths: Sequence[str], file: TableFile, losses: list[Los
         group = source.metadata.row_group(number)
         where, rows = f"{file.name}, row group {number}", group.num_rows
         part: dict[str, Any] = {}
+        errors: dict[str, str] = {}
         try:
             claimed += max(8 * rows * max(1, len(paths)), group.total_byte_size)
             file.limits.check_table(claimed, file.size, where)
-            errors = dict(_read(source, number, rows, paths, part))
         except LogError as error:
             losses.append(Loss("bad-rows", str(error), where, count=rows))
             continue
+        for path in paths:
+            try:
+                part[path] = _column_of_group(source, number, path, rows)
+            except Exception as error:  # noqa: BLE001  any error of a damaged page
+                errors[path] = describe_damage(error)[1]
         if errors:
             bad = ", ".join(errors) if part else "all columns"
             losses.append(Loss("bad-rows", f"{bad}: cannot be read: {next(iter(errors.values()))}", where, count=rows))
@@ -113,23 +118,16 @@ def _groups(source: Any, paths: Sequence[str], file: TableFile, losses: list[Los
     return parts
 
 
-def _read(source: Any, number: int, rows: int, paths: Sequence[str], part: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Add the columns of a row group to ``part``; yield each that cannot be read, and why."""
+def _column_of_group(source: Any, number: int, path: str, rows: int) -> Any:
+    """Return a column of a row group, out of the structs around it; ValueError if it has another length."""
     import pyarrow as pa
 
-    try:
-        table = source.read_row_group(number, columns=[*paths], use_threads=False)
-        while any(map(pa.types.is_struct, table.schema.types)):
-            table = table.flatten()
-        if table.num_rows != rows or {*table.column_names} != {*paths}:
-            raise ValueError(f"{table.num_rows} of {rows} rows")
-        part.update({path: table[path] for path in paths})
-    except Exception as error:  # noqa: BLE001  any error of a damaged page
-        if len(paths) == 1:
-            yield paths[0], describe_damage(error)[1]
-            return
-        for half in (paths[: len(paths) // 2], paths[len(paths) // 2 :]):
-            yield from _read(source, number, rows, half, part)
+    table = source.read_row_group(number, columns=[path], use_threads=False)
+    while pa.types.is_struct(table.schema.types[0]):
+        table = table.flatten()
+    if table.num_rows != rows or table.column_names != [path]:
+        raise ValueError(f"{table.num_rows} of {rows} rows")
+    return table[path]
 
 
 def _column(column: Any, kind: str, name: str, file: TableFile, losses: list[Loss]) -> Any:

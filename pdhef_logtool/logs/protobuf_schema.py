@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
 from pdhef_logtool.logs.message_schema import (
@@ -66,24 +67,17 @@ def protobuf_schema(type_name: str, data: bytes, limits: ResourceLimits = DEFAUL
 
 def _in_order(files: dict[str, Any]) -> list[str]:
     """Return the files' names, imported ones first; well-known files that are not there are added."""
-    ordered: dict[str, None] = {}
-    open_: set[str] = set()
-
-    def visit(name: str, importer: str) -> None:
-        if name in ordered:
-            return
-        if name in open_:
-            raise SchemaError(f"{name} imports itself")
-        if name not in files:
-            files[name] = _well_known_file(name, importer)
-        open_.add(name)
-        for dependency in files[name].dependency:
-            visit(dependency, name)
-        ordered[name] = None
-
-    for name in list(files):
-        visit(name, "")
-    return list(ordered)
+    pending = list(files)
+    while pending:
+        importer = pending.pop()
+        for name in files[importer].dependency:
+            if name not in files:
+                files[name] = _well_known_file(name, importer)
+                pending.append(name)
+    try:
+        return [*TopologicalSorter({name: file.dependency for name, file in files.items()}).static_order()]
+    except CycleError as error:
+        raise SchemaError(f"{error.args[1][0]} imports itself") from error
 
 
 def _well_known_file(name: str, importer: str) -> Any:
@@ -143,29 +137,25 @@ def compile_getter(schema: MessageSchema, selection: Selection) -> Callable[[Any
 
 
 def _compile_steps(descriptor: Any, steps: Sequence[Step]) -> Callable[[Any], object]:
-    """Compile steps from a message of one type; every step is (name, whether it can be absent, index or -1)."""
-    plan: list[tuple[str, bool, int]] = []
-    field = None
+    """Compile steps from a message of one type."""
+    plan: list[tuple[Step, bool]] = []  # and whether it can be absent
+    field: Any = None
     for step in steps:
-        if isinstance(step, int):
-            name, optional, _ = plan[-1]
-            plan[-1] = (name, optional, step)
-            continue
-        field = descriptor.fields_by_name[step]
+        if isinstance(step, str):
+            field = descriptor.fields_by_name[step]
+            descriptor = field.message_type
         # A default that the type declares (proto2) replaces an absent value.
-        plan.append((step, field.has_presence and not field.has_default_value, -1))
-        descriptor = field.message_type
-    whole = bool(plan) and plan[-1][2] < 0 and field is not None and _is_array(field)
+        plan.append((step, isinstance(step, str) and field.has_presence and not field.has_default_value))
+    whole = field is not None and isinstance(steps[-1], str) and _is_array(field)
 
     def get(message: Any) -> object:
-        for name, optional, index in plan:
-            if message is None or (optional and not message.HasField(name)):
+        for step, can_be_absent in plan:
+            if message is None or (can_be_absent and not message.HasField(step)):
                 return None
-            message = getattr(message, name)
-            if index >= 0:
-                if index >= len(message):
-                    return None
-                message = message[index]
+            if isinstance(step, str):
+                message = getattr(message, step)
+            else:
+                message = message[step] if step < len(message) else None
         return list(message) if whole and message is not None else message
 
     return get

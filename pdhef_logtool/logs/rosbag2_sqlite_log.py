@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+from array import array
 from collections import Counter
-from itertools import accumulate, pairwise
+from itertools import accumulate
 from pathlib import Path
 from urllib.parse import quote
 
@@ -128,40 +129,27 @@ class SqliteContainer(Container):
 
     def _read_pages(self) -> None:
         rows = self._db.execute("SELECT id, topic_id, timestamp, length(data), typeof(data) FROM messages ORDER BY id")
-        first = last = size = total = 0
-        times: list[int] = []
-        counts: Counter[int] = Counter()
-        unknown = row_count = 0
-
-        def close_page() -> None:
-            if times:
-                ordered = all(a <= b for a, b in pairwise(times))
-                self.spans.append(Span(len(self.spans), min(times), max(times) + 1, dict(counts), ordered))
-                self._pages.append((first, last))
-                self._ends.append(total)
-            times.clear()
-            counts.clear()
-
+        listed = array("q")
+        row_count = last = 0
         try:
             for id_, topic, timestamp, length, kind in rows:
                 row_count += 1
-                if topic not in self.channels or not isinstance(timestamp, int) or kind != "blob":
-                    unknown += 1
-                    continue
-                if not times:
-                    first, size = id_, 0
-                last = id_
-                times.append(min(timestamp, MAX_TIME_NS))
-                counts[topic] += 1
-                size += length
-                total += length
-                if len(times) >= _PAGE_ROWS or size >= _PAGE_BYTES:
-                    close_page()
+                if topic in self.channels and isinstance(id_, int) and isinstance(timestamp, int) and kind == "blob":
+                    listed.extend((id_, topic, min(timestamp, MAX_TIME_NS), length))
+                    last = id_
         except sqlite3.Error as error:
             what = f"the rows after id {last} cannot be read: {describe_damage(self._late or error)[1]}"
-            self.lose("over-budget" if self._late else "truncated", what, max(times) + 1 if times else None)
-        close_page()
-        if unknown:
+            self.lose("over-budget" if self._late else "truncated", what, listed[-2] + 1 if listed else None)
+        ids, topics, times, lengths = np.frombuffer(listed, np.int64).reshape(-1, 4).T
+        ends = np.cumsum(lengths)
+        page = ends // _PAGE_BYTES + np.arange(len(ids)) // _PAGE_ROWS
+        for part in np.split(np.arange(len(ids)), np.flatnonzero(np.diff(page)) + 1) if len(ids) else ():
+            stamps, counts = times[part], Counter(topics[part].tolist())
+            ordered = bool((np.diff(stamps) >= 0).all())
+            self.spans.append(Span(len(self.spans), int(stamps.min()), int(stamps.max()) + 1, counts, ordered))
+            self._pages.append((int(ids[part[0]]), int(ids[part[-1]])))
+            self._ends.append(int(ends[part[-1]]))
+        if unknown := row_count - len(ids):
             what = f"{unknown} messages of topics that the database does not name, or without a time or data"
             self.lose("unknown-channel", what, count=unknown)
         if not self.lost:

@@ -13,10 +13,8 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
-from mcap.records import Metadata
-
 from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
-from pdhef_logtool.logs.container import Attachment, Block, ChannelRecord, RawChunk, Span
+from pdhef_logtool.logs.container import Block, ChannelRecord, RawChunk, Span
 from pdhef_logtool.logs.message_schema import SchemaError, parsing, ros_schema
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
@@ -55,8 +53,7 @@ class SourceChannels:
 
 def source_profile(log: ColumnarLog) -> str:
     """Return the MCAP profile that a full copy should carry: the source's own, or ``ros2`` for bags."""
-    profiles = [getattr(c, "profile", "ros2") for c in log.containers]
-    return str(profiles[0]) if profiles else "ros2"
+    return log.containers[0].profile if log.containers else "ros2"
 
 
 #: Entries of channel metadata that state how messages are sent.
@@ -215,18 +212,6 @@ def _in_file_order_where_overlapping(
         if all(unchanged[c].issuperset(span.counts) for c, span in group):
             group.sort(key=lambda item: (item[0], item[1].index))
     return [item for group in groups for item in group]
-
-
-def iterate_attachments(log: ColumnarLog) -> Iterator[Attachment]:
-    """Yield the attachments of a log."""
-    for container in log.containers:
-        yield from container.attachments()
-
-
-def iterate_metadata(log: ColumnarLog) -> Iterator[Metadata]:
-    """Yield the metadata records of a log."""
-    for container in log.containers:
-        yield from container.metadata_records()
 
 
 def _with_definition(channel: ChannelRecord) -> ChannelRecord:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -26,8 +26,6 @@ _MOST_PLACES = 1 << 16
 _CDR_HEAD = np.dtype("<u2")
 _LITTLE_ENDIAN_CDR = 0x0100  # the bytes 0, 1
 _WORD = np.dtype("<u4")
-#: Bytes between two places up to which copying them along is quicker than a second look.
-_STRETCH_GAP_BYTES = 512
 
 Steps: TypeAlias = tuple[Step, ...]
 
@@ -164,8 +162,7 @@ class _Builder:
 class LayoutReader:
     """Reads chosen leaves of the messages that have one layout.
 
-    The places needed (leaves, and the lengths that identify the layout) are gathered in stretches: one copy per stretch
-    and message.
+    The places needed (leaves, and the lengths that identify the layout) are gathered by one copy per message.
 
     Parameters
     ----------
@@ -175,93 +172,62 @@ class LayoutReader:
 
     def __init__(self, layout: WireLayout, wire: str, wanted: Iterable[Steps]) -> None:
         self.size = layout.size
-        self._places: dict[Steps, tuple[int, str]] = {}
-        self._stretches: list[_Stretch] = []
+        self._names: dict[Steps, str] = {}
         self._empty: dict[Steps, np.dtype[Any]] = {}
-        places: list[tuple[int, np.dtype[Any], int | Steps]] = []
+        self._expected: dict[str, int] = {}
+        places: dict[str, tuple[int, np.dtype[Any]]] = {}
         if wire == "cdr":
-            places.append((0, _CDR_HEAD, _LITTLE_ENDIAN_CDR))
-        places += [(offset, _WORD, expected) for offset, expected in layout.lengths]
+            places["head"], self._expected["head"] = (0, _CDR_HEAD), _LITTLE_ENDIAN_CDR
+        for offset, length in layout.lengths:
+            name = f"length{offset}"
+            places[name], self._expected[name] = (offset, _WORD), length
         for steps in wanted:
             leaf = leaf_at(layout, steps)
             if leaf is not None and leaf.count == 0:
                 self._empty[steps] = leaf.dtype
             elif leaf is not None:
-                dtype = leaf.dtype if leaf.count is None else np.dtype((leaf.dtype, (leaf.count,)))
-                places.append((leaf.offset, dtype, steps))
-        places.sort(key=lambda place: place[0])
-        group: list[tuple[int, np.dtype[Any], int | Steps]] = []
-        end = 0
-        for place in places:
-            if group and place[0] - end > _STRETCH_GAP_BYTES:
-                self._add(group)
-                group = []
-            group.append(place)
-            end = max(end, place[0] + place[1].itemsize)
-        if group:
-            self._add(group)
-
-    def _add(self, group: Sequence[tuple[int, np.dtype[Any], int | Steps]]) -> None:
-        start = group[0][0]
-        end = max(offset + dtype.itemsize for offset, dtype, _ in group)
-        record = np.dtype(
+                name = self._names[steps] = f"leaf{len(self._names)}"
+                places[name] = leaf.offset, leaf.dtype if leaf.count is None else np.dtype((leaf.dtype, (leaf.count,)))
+        offsets, formats = zip(*places.values(), strict=True) if places else ((), ())
+        self._start = min(offsets, default=0)
+        end = max((offset + dtype.itemsize for offset, dtype in places.values()), default=0)
+        self._record = np.dtype(
             {
-                "names": [f"f{i}" for i in range(len(group))],
-                "formats": [dtype for _, dtype, _ in group],
-                "offsets": [offset - start for offset, _, _ in group],
-                "itemsize": end - start,
+                "names": [*places],
+                "formats": [*formats],
+                "offsets": [offset - self._start for offset in offsets],
+                "itemsize": end - self._start,
             }
         )
-        lengths = []
-        for i, (_, _, what) in enumerate(group):
-            if isinstance(what, int):
-                lengths.append((f"f{i}", what))
-            else:
-                self._places[what] = (len(self._stretches), f"f{i}")
-        self._stretches.append(_Stretch(start, np.dtype((np.void, end - start)), record, tuple(lengths)))
 
     def gather(
         self, buffer: bytes | memoryview, offset: NDArray[np.int64]
-    ) -> tuple[NDArray[np.bool_] | None, list[NDArray[Any]]]:
+    ) -> tuple[NDArray[np.bool_] | None, NDArray[Any]]:
         """Gather the messages of ``size`` bytes at these offsets [N].
 
         Returns
         -------
-        fits : which of them have the layout [N]; None: all. stretches : of those that have it, for :meth:`values`.
+        fits : which of them have the layout [N]; None: all. records : those that have it, for :meth:`values`.
         """
-        parts: list[NDArray[Any]] = []
-        fits: NDArray[np.bool_] | None = None
-        for stretch in self._stretches:
-            # An overlapping item at every byte: indexing then copies items. As plain bytes, which need no alignment
-            # and are copied as a whole.
-            places = len(buffer) - stretch.start - stretch.plain.itemsize + 1
-            view = np.ndarray((places,), dtype=stretch.plain, buffer=buffer, offset=stretch.start, strides=(1,))
-            part = view[offset].view(stretch.record)
-            parts.append(part)
-            for name, expected in stretch.lengths:
-                right = part[name] == expected
-                fits = right if fits is None else fits & right
-        if fits is None or fits.all():
-            return None, parts
-        return fits, [part[fits] for part in parts]
+        if not self._record.itemsize:
+            return None, np.empty(len(offset), self._record)
+        # An overlapping item at every byte: indexing then copies items. As plain bytes, which need no alignment
+        # and are copied as a whole.
+        plain = np.dtype((np.void, self._record.itemsize))
+        places = len(buffer) - self._start - plain.itemsize + 1
+        view = np.ndarray((places,), dtype=plain, buffer=buffer, offset=self._start, strides=(1,))
+        records = view[offset].view(self._record)
+        fits = np.ones(len(offset), np.bool_)
+        for name, expected in self._expected.items():
+            fits &= records[name] == expected
+        return (None, records) if fits.all() else (fits, records[fits])
 
-    def values(self, parts: Sequence[NDArray[Any]], n: int, steps: Steps) -> NDArray[Any] | None:
+    def values(self, records: NDArray[Any], steps: Steps) -> NDArray[Any] | None:
         """Return a leaf of N gathered messages, [N] or [N, k] in its own type; None if the layout lacks it."""
-        place = self._places.get(steps)
-        if place is not None:
-            values: NDArray[Any] = parts[place[0]][place[1]]
+        if steps in self._names:
+            values: NDArray[Any] = records[self._names[steps]]
             return values
-        return np.empty((n, 0), dtype=self._empty[steps]) if steps in self._empty else None
-
-
-@dataclass(frozen=True, slots=True)
-class _Stretch:
-    """Bytes of a message that are gathered together: as plain bytes, and the same bytes as named places."""
-
-    start: int
-    plain: np.dtype[Any]
-    record: np.dtype[Any]
-    lengths: tuple[tuple[str, int], ...]
+        return np.empty((len(records), 0), dtype=self._empty[steps]) if steps in self._empty else None
 
 
 def leaf_at(layout: WireLayout, steps: Steps) -> Leaf | None:

@@ -84,49 +84,61 @@ class RawMessage:
     data: bytes
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Records:
-    """Complete message records of one channel: equal sizes as a matrix [N, size]."""
-
-    channel: int
-    log_time_ns: IntArray
-    rows: NDArray[np.uint8]
+#: Message records to be written: log time, channel, bytes, and where they are: number of the source and row in it.
+_LISTED = np.dtype([("log", "<i8"), ("channel", "<i8"), ("length", "<i8"), ("source", "<i8"), ("row", "<i8")])
 
 
 class _Merged:
-    """Message records of several channels in order of log time, taken from the front."""
+    """Message records of several topics in order of log time, taken from the front.
 
-    def __init__(self, records: Sequence[_Records]) -> None:
-        self.rows = [r.rows for r in records]
-        log_time = np.concatenate([np.empty(0, dtype=np.int64), *[r.log_time_ns for r in records]])
-        order = np.argsort(log_time, kind="stable")
-        each = [len(r.rows) for r in records]
-        self.log_time_ns: IntArray = log_time[order]
-        self.channel: IntArray = np.repeat(np.array([r.channel for r in records], dtype=np.int64), each)[order]
-        self.length: IntArray = np.repeat(np.array([r.rows.shape[1] for r in records], dtype=np.int64), each)[order]
-        self.source: IntArray = np.repeat(np.arange(len(records)), each)[order]
-        self.row: IntArray = (order - np.repeat(np.cumsum([0, *each])[:-1], each)[order]).astype(np.int64)
-        self.ends: IntArray = np.cumsum(self.length)
+    Parameters
+    ----------
+    topics : channel, log times [N] and complete records uint8 [N, size] of each topic.
+    """
+
+    def __init__(self, topics: Sequence[tuple[int, IntArray, NDArray[np.uint8]]]) -> None:
+        self.sources = [records for _, _, records in topics]
+        self.listed = _in_order(
+            [_listed(log, channel, records.shape[1], i) for i, (channel, log, records) in enumerate(topics)]
+        )
+        self.ends: IntArray = np.cumsum(self.listed["length"])
         self.position = 0
 
-    def take_until(self, until_ns: int | None) -> slice:
+    def take_until(self, until_ns: int | None) -> NDArray[np.void]:
         """Remove and return the records before a time (None: all)."""
-        first, self.position = self.position, len(self.log_time_ns)
+        first, self.position = self.position, len(self.listed)
         if until_ns is not None:
-            self.position = max(first, int(np.searchsorted(self.log_time_ns, until_ns, side="left")))
-        return slice(first, self.position)
+            self.position = max(first, int(np.searchsorted(self.listed["log"], until_ns, side="left")))
+        return self.listed[first : self.position]
 
-    def take_chunk(self) -> slice:
+    def take_chunk(self) -> NDArray[np.void]:
         """Remove and return the records of one chunk."""
-        first = self.position
-        base = int(self.ends[first - 1]) if first else 0
-        self.position = max(int(np.searchsorted(self.ends, base + CHUNK_BYTES, side="right")), first + 1)
-        return slice(first, self.position)
+        first, self.position = self.position, _end_of_chunk(self.ends, self.position)
+        return self.listed[first : self.position]
 
     @property
     def next_ns(self) -> int | None:
         """Log time of the first record that is left."""
-        return int(self.log_time_ns[self.position]) if self.position < len(self.log_time_ns) else None
+        return int(self.listed["log"][self.position]) if self.position < len(self.listed) else None
+
+
+def _listed(log_time_ns: Any, channel: Any, length: Any, source: int) -> NDArray[np.void]:
+    listed = np.empty(len(log_time_ns), _LISTED)
+    listed["log"], listed["channel"], listed["length"], listed["source"] = log_time_ns, channel, length, source
+    listed["row"] = np.arange(len(listed))
+    return listed
+
+
+def _in_order(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
+    """Return lists of records as one, in order of log time; of equal times the earlier list comes first."""
+    listed = np.concatenate([np.empty(0, _LISTED), *parts])
+    return listed[np.argsort(listed["log"], kind="stable")]
+
+
+def _end_of_chunk(ends: IntArray, first: int) -> int:
+    """Return the record behind the chunk that begins with a record; ``ends`` are sums of bytes [N]."""
+    base = int(ends[first - 1]) if first else 0
+    return max(int(np.searchsorted(ends, base + CHUNK_BYTES, side="right")), first + 1)
 
 
 class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
@@ -297,12 +309,7 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         Raw messages are consumed as they come (in ascending log time) and not held. Raw chunks are written as they
         are; the batches then become separate chunks, and all chunks are sorted by their first log times.
         """
-        records = [self._encode(batch) for batch in batches if len(batch.log_time_ns)]
-        for record in records:
-            if np.any(np.diff(record.log_time_ns) < 0):
-                topic = self._channels[record.channel].topic
-                raise MappingError(expected="ascending log times", got="a step back", where=topic)
-        merged = _Merged(records)
+        merged = _Merged([self._encode(batch) for batch in batches if len(batch.log_time_ns)])
         group: list[RawMessage] = []
         size = 0
         for raw in raws:
@@ -322,9 +329,12 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
                 group, size = [], 0
         self._write_merged(group, merged, merged.take_until(None))
 
-    def _encode(self, batch: TopicBatch) -> _Records:
+    def _encode(self, batch: TopicBatch) -> tuple[int, IntArray, NDArray[np.uint8]]:
+        """Return channel, log times and message records of a batch."""
         if batch.topic not in self._encoders:
             raise MappingError(expected="a topic of this file", got="an unknown one", where=batch.topic)
+        if np.any(np.diff(batch.log_time_ns) < 0):
+            raise MappingError(expected="ascending log times", got="a step back", where=batch.topic)
         channel, encoder = self._encoders[batch.topic]
         n = len(batch.log_time_ns)
         rows = encoder.encode(n, batch.fields, head=MESSAGE_HEAD.itemsize)
@@ -337,41 +347,29 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         head["publish"] = batch.publish_time_ns
         self._sequences[channel] += n
         rows[:, : MESSAGE_HEAD.itemsize] = head.view(np.uint8).reshape(n, MESSAGE_HEAD.itemsize)
-        return _Records(channel, batch.log_time_ns.astype(np.int64), rows)
+        return channel, batch.log_time_ns.astype(np.int64), rows
 
-    def _write_merged(self, raws: Sequence[RawMessage], merged: _Merged, part: slice) -> None:
-        """Merge raw messages and a part of the batch rows by log time and cut into chunks."""
-        if not raws and part.start == part.stop:
-            return
-        raw_bytes = [
+    def _write_merged(self, raws: Sequence[RawMessage], merged: _Merged, listed: NDArray[np.void]) -> None:
+        """Merge raw messages and listed records by log time and cut into chunks."""
+        raw_records = [
             _PACKED_HEAD.pack(Opcode.MESSAGE, 22 + len(r.data), r.channel, r.sequence, r.log_time_ns, r.publish_time_ns)
             + r.data
             for r in raws
         ]
-        log_time, channel, length = merged.log_time_ns[part], merged.channel[part], merged.length[part]
-        source, row = merged.source[part], merged.row[part]
         if raws:
-            n = len(raws)
-            log_time = np.concatenate([np.array([r.log_time_ns for r in raws], dtype=np.int64), log_time])
-            channel = np.concatenate([np.array([r.channel for r in raws], dtype=np.int64), channel])
-            length = np.concatenate([np.array([len(b) for b in raw_bytes], dtype=np.int64), length])
-            source = np.concatenate([np.full(n, -1), source])
-            row = np.concatenate([np.arange(n), row])
-            order = np.argsort(log_time, kind="stable")
-            log_time, channel, length = log_time[order], channel[order], length[order]
-            source, row = source[order], row[order]
-        ends = np.cumsum(length)
+            log_time, channel = [r.log_time_ns for r in raws], [r.channel for r in raws]
+            listed = _in_order([_listed(log_time, channel, [*map(len, raw_records)], -1), listed])
+        ends = np.cumsum(listed["length"])
         first = 0
-        while first < len(log_time):
-            base = int(ends[first - 1]) if first else 0
-            last = max(int(np.searchsorted(ends, base + CHUNK_BYTES, side="right")), first + 1)
-            start = ends[first:last] - length[first:last] - base
-            content = np.empty(int(ends[last - 1]) - base, dtype=np.uint8)
-            part_source, part_row = source[first:last], row[first:last]
-            for i in np.unique(part_source).tolist():
-                mine = part_source == i
-                scatter(content, start[mine], part_row[mine], raw_bytes if i < 0 else merged.rows[i])
-            self.write_chunk(content.data, channel[first:last], log_time[first:last], start)
+        while first < len(listed):
+            last = _end_of_chunk(ends, first)
+            part = listed[first:last]
+            start = ends[first:last] - part["length"] - (ends[first] - part["length"][0])
+            content = np.empty(int(part["length"].sum()), dtype=np.uint8)
+            for i in np.unique(part["source"]).tolist():
+                its = part["source"] == i
+                scatter(content, start[its], part["row"][its], raw_records if i < 0 else merged.sources[i])
+            self.write_chunk(content.data, part["channel"], part["log"], start)
             first = last
 
     def write_chunk(
@@ -427,21 +425,18 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         self._first_ns = start_ns if self._first_ns is None else min(self._first_ns, start_ns)
         self._last_ns = max(self._last_ns, end_ns)
 
-    def attachment(self, name: str, media_type: str, data: bytes, log_time_ns: int, create_time_ns: int) -> None:
+    def attachment(self, record: Attachment) -> None:
         """Add a file."""
-        record = Attachment(
-            create_time=create_time_ns, log_time=log_time_ns, name=name, media_type=media_type, data=data
-        )
         start, length = self._emit_record(record)
         self._attachment_indexes.append(
             AttachmentIndex(
                 offset=start,
                 length=length,
-                create_time=create_time_ns,
-                log_time=log_time_ns,
-                data_size=len(data),
-                name=name,
-                media_type=media_type,
+                create_time=record.create_time,
+                log_time=record.log_time,
+                data_size=len(record.data),
+                name=record.name,
+                media_type=record.media_type,
             )
         )
 

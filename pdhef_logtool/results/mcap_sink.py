@@ -7,23 +7,17 @@ import math
 import re
 import struct
 from collections.abc import Container, Iterator, Mapping, Sequence
-from dataclasses import astuple
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
 import numpy as np
+from mcap.records import Attachment
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.container import Attachment, RawChunk
+from pdhef_logtool.logs.container import RawChunk
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.schema_files import message_definition
-from pdhef_logtool.logs.source_copy import (
-    iterate_attachments,
-    iterate_copy,
-    iterate_metadata,
-    register_channels,
-    source_profile,
-)
+from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import quat_from_yaw
@@ -211,16 +205,16 @@ class AnnotatedMcap:
         self._write_paths(tracks)
         self._write_log(log_lines(report, events, tracks))
         if self._source is not None and self._left_out is None:
-            for attachment in iterate_attachments(self._source):
+            for attachment in self._source.attachments():
                 if not _is_our_report(attachment):
-                    self._writer.attachment(*astuple(attachment))
-            for record in iterate_metadata(self._source):
+                    self._writer.attachment(attachment)
+            for record in self._source.metadata_records():
                 if record.name != METRICS_RECORD:
                     self._writer.metadata(record.name, record.metadata)
         self._writer.metadata(METRICS_RECORD, metrics_record(report))
         end_ns = int(report["log"]["end_ns"])
         text = json.dumps(jsonable(_attached(report)), sort_keys=True, separators=(",", ":"), allow_nan=False)
-        self._writer.attachment(REPORT_ATTACHMENT, "application/json", text.encode(), end_ns, end_ns)
+        self._writer.attachment(Attachment(end_ns, end_ns, REPORT_ATTACHMENT, "application/json", text.encode()))
         self._writer.close()
 
     def _add_topics(self, estimator: str) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mcap.records import Attachment
 
 if TYPE_CHECKING:
     from studies.strangers.containers import Topic
@@ -93,7 +94,7 @@ def _mcap(frames: Sequence[_Frame], databases: dict[str, str], path: Path) -> Pa
                 topic, "can_msgs/msg/Frame", constants={"dlc": 8.0}, definition=definition("can_msgs/msg/Frame")
             )
             batches.append(TopicBatch(topic, stamps, stamps, fields))
-            writer.attachment(f"{name}.dbc", "text/plain", text.encode(), int(stamps[0]), int(stamps[0]))
+            writer.attachment(Attachment(int(stamps[0]), int(stamps[0]), f"{name}.dbc", "text/plain", text.encode()))
         writer.write(batches)
     return path
 

@@ -113,6 +113,7 @@ def test_messages_that_an_index_or_a_header_hides_are_read_or_lost(tmp_path: Pat
         struct.pack_into("<QQ", data, chunk + 9, T0 + 2**50, T0 + 2**50 + 1)
     else:
         data[chunk] ^= 0x80
+        data[-9] ^= 1  # the CRC of the summary, by which the chunk would be found
     path.write_bytes(data)
     log = open_log(path)
     b = len(log.read({"/b": ["x"]})["/b"])
@@ -122,7 +123,7 @@ def test_messages_that_an_index_or_a_header_hides_are_read_or_lost(tmp_path: Pat
     read, lost, claimed = _outcome(path)
     assert read == claimed
     assert (read == 2 * N) != (place == "kind of a chunk")
-    assert bool(lost) == (place in ("channel of an index", "kind of a chunk"))
+    assert bool(lost) == (place != "times of a chunk")
 
 
 def _mcap_of_chunk(path: Path, size: int, compression: bytes, stored: bytes, crc: int = 0) -> Path:
@@ -366,7 +367,7 @@ def test_a_folder_does_not_lead_out_of_itself(tmp_path: Path) -> None:
 
 _ENDS = {
     "noindex_flip.mcap": "at byte",
-    "index_claims_2e8.mcap": "names 2684",
+    "index_claims_2e8.mcap": "message indexes",
     "zstd_claims_100g.mcap": "chunk at byte",
     "bz2_6g.bag": "chunk at byte",
     "gather_overflow1.mcap": "chunk at byte",

@@ -85,7 +85,7 @@ _BOMBS = {
     "imports": (
         "protobuf",
         _descriptors(*({"name": f"f{i}", "dependency": [f"f{i + 1}"]} for i in range(3000))),
-        "nested too deeply",
+        "which the descriptors lack",
     ),
     "files": ("protobuf", _descriptors(*({"name": f"f{i}"} for i in range(30_000))), "schema leaves"),
 }

@@ -8,16 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.records import Attachment
 from recorded import decoded_by_rosbags
 
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.source_copy import (
-    iterate_attachments,
-    iterate_copy,
-    iterate_metadata,
-    register_channels,
-    source_profile,
-)
+from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
 
 pytestmark = pytest.mark.slow
@@ -31,9 +26,9 @@ def _copy(source: Path, target: Path) -> None:
         channels = register_channels(writer, log)
         assert channels.lost == ()
         writer.write([], iterate_copy(log, channels))
-        for a in iterate_attachments(log):
-            writer.attachment(a.name, a.media_type, a.data, a.log_time_ns, a.create_time_ns)
-        for m in iterate_metadata(log):
+        for a in log.attachments():
+            writer.attachment(a)
+        for m in log.metadata_records():
             writer.metadata(m.name, m.metadata)
     log.close()
 
@@ -87,7 +82,7 @@ def _many_sided_source(path: Path) -> None:
                 for i, t in enumerate(times)
             ],
         )
-        writer.attachment("notes.txt", "text/plain", b"windy", T0, T0 - 1)
+        writer.attachment(Attachment(T0 - 1, T0, "notes.txt", "text/plain", b"windy"))
         writer.metadata("car", {"tyres": "used"})
 
 
