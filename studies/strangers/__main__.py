@@ -1,6 +1,6 @@
 """Third-party logs, scored: ``docs/third_party_logs.md``.
 
-    python -m studies.strangers [--only NAME ...] [--held-out [GROUP ...]] [--work out/strangers] [--out docs/third_party_logs.md]
+    python -m studies.strangers [--only NAME ...] [--held-out [GROUP ...]] [--work FOLDER] [--out FILE]
 
 ``--only`` takes parts of names, prints the messages of the tool for these logs, and writes no page. ``--held-out`` adds
 layouts that were built last: its groups, by default ``held-out``. Exit code 1: something is wrong and not reported.
@@ -28,7 +28,7 @@ from studies.strangers.scoring import Score, look, score_log
 #: First results of held-out layouts, present and former.
 FIRST_RUNS = {
     "held_out": "held-out layouts were built last",
-    "recorders": "layouts of recorders (first contact: tables and messages with published columns) were built last, too",
+    "recorders": "layouts of recorders (first contact: tables and messages) were built last, too",
     "repositories": "layouts of files and messages in public repositories were held out before",
     "phones": "layouts of phones, games, makers and plotting tools were held out before",
     "stacks": "layouts of public stacks and loggers were held out before",

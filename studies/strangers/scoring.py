@@ -53,6 +53,8 @@ WEAK_SHARE = 0.6
 BIAS_M_S2 = 0.3
 #: A share of right samples from which a channel counts as right: some logs contain invalid samples.
 RIGHT_BINS = 0.95
+#: The same of a course: the rest are stops.
+MOVING_BINS = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,8 +202,9 @@ def agrees(channel: Channel, right: Series, floor: float, bias: float = 0.0) -> 
     difference = got[both] - wanted[both]
     difference -= np.clip(np.median(difference), -bias, bias)
     apart = np.sqrt(np.mean(difference**2, axis=1))
-    # A few bins may contain invalid samples; the others must agree as a whole.
-    kept = np.sort(apart)[: int(np.ceil(RIGHT_BINS * apart.shape[0]))]
+    # A few bins may contain invalid samples; the others must agree as a whole. The course of a car at rest is noise.
+    share = MOVING_BINS if channel.values.ndim == 2 and "course" in channel.name else RIGHT_BINS
+    kept = np.sort(apart)[: int(np.ceil(share * apart.shape[0]))]
     # Of a weak signal the floor is no more than a share: noise is accepted, another sign is not.
     return bool(np.sqrt(np.mean(kept**2)) <= max(SHARE * rms, min(floor, WEAK_SHARE * rms)))
 
