@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -72,36 +72,42 @@ def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
     first = {m.quantity: path for path, m in reversed(meanings.items())}
     if not {"latitude", "longitude"} <= set(first) or is_command(topic.name):
         return {}
-    angles = [p for p, m in meanings.items() if m.quantity in ("course", "heading")]
+    angles = [p for q in ("course", "heading") for p, m in meanings.items() if m.quantity == q]
     velocity = next(_horizontal(fields), {})
-    speeds = [p for p, m in meanings.items() if m.quantity == "speed" and m.scale is not None]
     pieces = Pieces(log)
-    paths = [*velocity.values(), *angles, *speeds, first["latitude"], first["longitude"]]
-    samples = pieces.read({topic.name: [*dict.fromkeys(paths)]})
-    seen = {path: samples[topic.name, path] for path in paths if (topic.name, path) in samples}
+    samples = pieces.read(
+        {topic.name: [*dict.fromkeys([*velocity.values(), *angles, *(first[q] for q in _PLACES.values())])]}
+    )
+    seen = {path: values for (_, path), values in samples.items()}
     places = {n: SignalSource(n, topic.name, first[q], stamp) for n, q in _PLACES.items()}
     if not all(_is_place(seen.get(first[q]), most) for q, most in (("latitude", 90.0), ("longitude", 180.0))):
         return {}
-    found = {f"gnss_{q}_deg": replace(places[n], name=f"gnss_{q}_deg") for n, q in _PLACES.items()}
+    found = [replace(places[n], name=f"gnss_{q}_deg") for n, q in _PLACES.items()]
     course = _course(places, samples, topic.name, pieces)
-    if {"n", "e"} <= velocity.keys() <= seen.keys() | {"n", "e", "u", "d"}:
+    sides = {side: seen[velocity[side]].cells for side in "ne" if velocity.get(side, "") in seen}
+    if course is not None and len(sides) > 1 and _median_off(np.arctan2(sides["n"], sides["e"]) - course) < NEAR_RAD:
         unit = unit_of(velocity["n"].rpartition(".")[2], "speed")[1] or 1.0
-        north, east = (seen[velocity[side]].cells for side in "ne")
-        if course is not None and _median_off(np.arctan2(north, east) - course) < NEAR_RAD:
-            for side, name in (("e", "east"), ("n", "north")):
-                found[name] = SignalSource(f"gnss_velocity_{name}_m_s", topic.name, velocity[side], stamp, unit)
-            return {source.name: source for source in found.values()}
-    # A course over ground is clockwise from north by definition; the path confirms this and determines the unit.
-    for path in angles if course is not None and speeds else ():
+        named = (("gnss_velocity_east_m_s", "e"), ("gnss_velocity_north_m_s", "n"))
+        found += [SignalSource(name, topic.name, velocity[side], stamp, unit) for name, side in named]
+    elif course is not None:
+        found += _speed_and_course(topic.name, stamp, meanings, {p: seen[p] for p in angles if p in seen}, course)
+    return {source.name: source for source in found}
+
+
+def _speed_and_course(
+    topic: str, stamp: str, meanings: Mapping[str, Meaning], angles: Mapping[str, Seen], course: FloatArray
+) -> Iterator[SignalSource]:
+    """Yield the first speed with a unit and the first of the angles that is the path's course, if both exist."""
+    speed = next((p for p, m in meanings.items() if m.quantity == "speed" and m.scale is not None), None)
+    for path, seen in angles.items() if speed is not None else ():
+        # A course over ground is clockwise from north by definition; the path confirms this and determines the unit.
         unit = meanings[path].scale
         fitting = [c[1:] for c in _CONVENTIONS[:2] if unit is None or math.isclose(-c[1], unit)]
-        fitting = [c for c in fitting if path in seen and _off(seen[path], course, *c) < NEAR_RAD]
-        if fitting:
-            speed = speeds[0]
-            found["course"] = SignalSource("gnss_course_rad", topic.name, path, stamp, *fitting[0])
-            found["speed"] = SignalSource("gnss_speed_m_s", topic.name, speed, stamp, meanings[speed].scale or 1.0)
-            break
-    return {source.name: source for source in found.values()}
+        fitting = [c for c in fitting if _off(seen, course, *c) < NEAR_RAD]
+        if fitting and speed is not None:
+            yield SignalSource("gnss_course_rad", topic, path, stamp, *fitting[0])
+            yield SignalSource("gnss_speed_m_s", topic, speed, stamp, meanings[speed].scale or 1.0)
+            return
 
 
 def _meanings(topic: TopicInfo, fields: tuple[FieldInfo, ...]) -> dict[str, Meaning]:

@@ -199,7 +199,7 @@ def auto_map(
     weighed = _weigh_the_rest(draft, topics, vendors)
     _map_navigation(draft, topics, vendors)
     _fall_back(draft, topics)
-    _map_gnss(draft, topics)
+    _map_gnss(draft, topics, vendors)
     mapping = Mapping(draft.signals, draft.truth, draft.quality, "auto", tuple(draft.notes))
     mapping = replace(mapping, checks=(*draft.checks, *weighed.checks), open_signs=weighed.open_signs)
     candidates = weighed.candidates
@@ -338,13 +338,13 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
     draft.notes.append(truth[1])
 
 
-def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
+def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
     """Take GNSS as a sensor, from ground truth without heading, else from a receiver that is not ground truth."""
     draft.signals |= gnss_signals(draft.signals, draft.truth)
     instruments = {_device(source.topic) for source in draft.truth.values()} if has_heading(draft.truth) else set()
     topics = [t for t in topics if not _words(t.name) & TRUTH_WORDS]
     others = [t for t in topics if _device(t.name) not in instruments]
-    receivers = list(_receivers(draft, topics, others))
+    receivers = list(_receivers(draft, topics, others, vendors))
     for signals in sorted(receivers, key=lambda s: not has_gnss(s)):
         if has_gnss(signals) if not has_gnss(draft.signals) else not set(signals) & set(draft.signals):
             draft.signals |= signals
@@ -354,12 +354,12 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
             draft.signals |= next((signals for signals in receivers if not has_gnss(signals)), {})
 
 
-def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo]) -> Iterator[dict[str, SignalSource]]:
+def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo], vendors: Vendors) -> Iterator[_Sources]:
     """Yield the signals of each receiver among ``others``, and of any topic with the course of a single antenna."""
     for topic in topics:
         fields = () if _type(topic).startswith(NO_SENSORS) else draft.log.fields(topic.name, quiet=True)
         if fields and (topic in others or has_path(fields, RAW_COURSE)):
-            signals = receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields})
+            signals = receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
             by_name = not signals and not _is_well_known(topic) and _role(topic) in ("navigation", "sensor")
             signals = named_gnss(draft.log, topic) if by_name else signals
             if signals:

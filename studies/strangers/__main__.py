@@ -29,6 +29,7 @@ from studies.strangers.scoring import Score, look, score_log
 FIRST_RUNS = {
     "held_out": "held-out layouts were built last",
     "recorders": "layouts of recorders (first contact: tables and messages) were built last, too",
+    "contact": "layouts of recorders were built after that, and scored once",
     "repositories": "layouts of files and messages in public repositories were held out before",
     "phones": "layouts of phones, games, makers and plotting tools were held out before",
     "stacks": "layouts of public stacks and loggers were held out before",
