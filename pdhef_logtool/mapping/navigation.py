@@ -171,7 +171,7 @@ def side_of(struct: str, leaf: str) -> str:
     side = side or (_SIDES[words[-1]] if len(words) > 1 and words[-1] in "neud" else "")
     if {"std", "stddev", "stdev", "var", "cov", "accuracy", "sigma", "acc"} & set(words):
         return ""
-    frame = next((f for f in ("ned", "enu") if f in words and words[-1] in "xyz"), "")
+    frame = next((f for f in ("ned", "enu") if f in words and words[-1] in {*"xyz"}), "")
     side = {"x": frame[:1], "y": frame[1:2], "z": frame[2:]}[words[-1]] if frame else side
     is_speed = {"velocity", "vel", "speed"} & {*words, *words_of(struct)} or re.fullmatch("(v|vel)[neud]", short)
     return side if is_speed else ""
