@@ -19,7 +19,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
-from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
+from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen, is_enumeration
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
 from pdhef_logtool.mapping.naming import UNIT_TEXTS, UNITS, Meaning, is_command, meaning_of, words_of
 from pdhef_logtool.mapping.records import SignalSource
@@ -35,6 +35,8 @@ Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 _NAVIGATION = frozenset({"gps", "gnss", "ins", "rtk"})
 #: Words for the axes of a car, for which only the sign is unknown.
 _CAR_AXES = frozenset({"lat", "lateral", "long", "longitudinal", "lng", "trans", "transverse", "transversal", "down"})
+#: Last words of names of enumerations, and of what is measured.
+_STATES = (("status",), ("state",), ("states",))
 #: Controls; a steering signal in the same struct may be a control, too.
 _PEDALS = frozenset({"throttle", "brake", "gas"})
 #: Affix that distinguishes the name of a sign from the name of its magnitude.
@@ -62,6 +64,8 @@ MOST = {
     "acceleration": 80.0, "rate": 9.0, "steering": 16.0, "sideslip": math.pi, "speed": 110.0, "velocity": 60.0,
     "wheel speed": 130.0, "wheel rate": 400.0, "latitude": 90.0, "longitude": 180.0,
 }  # fmt: skip
+#: The same where no other unit is possible: five turns of a truck's steering wheel, in degrees.
+MOST_OTHERWISE = {**MOST, "steering": 32.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +186,7 @@ class Field:
         source = SignalSource(name, self.topic.name, self.path, self.stamp, self.scale, self.offset)
         if self.sign_path:
             source = replace(source, field=(self.path, self.sign_path), scale=(self.scale, 1.0), combine="signed")
-        most = MOST.get(self.meaning.quantity)
+        most = MOST_OTHERWISE.get(self.meaning.quantity)
         finite = self.seen.values[np.isfinite(self.seen.values)] * self.scale + self.offset
         if most is not None and finite.shape[0] and float(np.abs(finite).max()) > most:
             source = replace(source, valid_min=-most, valid_max=most)
@@ -294,6 +298,8 @@ def _weighable(
             continue
         if role == "sensor" and set(words_of(name)) & _NAVIGATION:
             role = "navigation"
+        if words_of(name)[-1:] in _STATES and is_enumeration(seen.values):
+            continue
         factors = _factors(its, seen)
         if its.quantity == "wheel speed" and not factors:  # too large for a speed: rotational
             its = replace(its, quantity="wheel rate")
@@ -370,12 +376,14 @@ def anchor_of(source: SignalSource, results: Sequence[Field]) -> Field | None:
 
 def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:
     """Return the units that are possible by a field's range; a unit in its name excludes all others."""
-    most = MOST.get(meaning.quantity)
-    if meaning.scale is not None:  # beyond a car's range the unit in the name is wrong
-        return () if most is not None and seen.largest * meaning.scale > most else ((meaning.unit, meaning.scale),)
-    every = HYPOTHESES.get(meaning.quantity, ())
     largest = seen.largest
-    return tuple(u for u in every if most is None or not largest * u[1] > most)
+    named = () if meaning.scale is None else ((meaning.unit, meaning.scale),)
+    for limits in (MOST_OTHERWISE,) if named else (MOST, MOST_OTHERWISE):
+        most = limits.get(meaning.quantity, math.inf)
+        # Beyond a car's range, the unit in the name is wrong.
+        if within := tuple(u for u in named or HYPOTHESES.get(meaning.quantity, ()) if not largest * u[1] > most):
+            return within
+    return ()
 
 
 def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:

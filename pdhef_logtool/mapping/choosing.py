@@ -7,7 +7,7 @@ from typing import Literal
 
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping.checking import check_mapping
-from pdhef_logtool.mapping.recognition import Ambiguity, auto_map
+from pdhef_logtool.mapping.recognition import RUN, Ambiguity, auto_map
 from pdhef_logtool.mapping.records import Mapping
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
@@ -45,6 +45,13 @@ def choose_mapping(
         missing = tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
         return ChosenMapping(mapping, missing, (), (*mapping.notes, *_borrowed(log, mapping)))
     auto = auto_map(log, prefer_truth=prefer_truth)
+    if runs := next((a.candidates for a in auto.ambiguities if a.subject == RUN), ()):
+        raise MappingError(
+            expected="signals and ground truth of one run",
+            got=f"{len(runs)} runs: {', '.join(runs)}",
+            where=str(log.path),
+            remedy="name the topics of one of them in a mapping file; pdhef map LOG helps to write it",
+        )
     if require_signals and not auto.mapping.signals:
         raise MappingError(
             expected="fields that are a car's sensors",

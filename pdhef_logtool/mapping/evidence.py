@@ -157,6 +157,12 @@ def ratio(y: FloatArray, x: FloatArray, slow: float) -> float | None:
     return float(middle) if high - low < 0.1 * abs(middle) else None
 
 
+def is_enumeration(values: FloatArray) -> bool:
+    """Return whether all values are whole numbers, and few."""
+    single = np.unique(values[np.isfinite(values)])
+    return single.shape[0] <= MOST_COLUMNS and bool((single == np.rint(single)).all())
+
+
 def is_of_one_sign(values: FloatArray) -> bool:
     """Return whether no value is negative."""
     finite = values[np.isfinite(values)]

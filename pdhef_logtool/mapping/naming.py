@@ -61,14 +61,18 @@ _SIDES = re.compile(r"(?<=[a-z_])(Fr|Re)([LR])(?![a-z])")
 _CORNER_AT_END = re.compile(
     r"(?<![A-Za-z])(?:[LR][FR]|[FR][LR])(?=[a-z]{2})|(?<=SPEED|speed)(?:[FR][LR]|[fr][lr])(?![A-Za-z])"
 )
-#: A wheel or an axis after a word without a capital between: ``wsfl``, ``accx``.
-_CORNER_SPEED = re.compile(r"(?:ws|vw|w|v|n)(?=(?:fl|fr|rl|rr)$)|(?:acc|accel|gyro?|vel|speed)(?=[xyz]$)")
+#: A wheel, an axis or g after a word without a capital between: ``wsfl``, ``accx``, ``lateralg``.
+_CORNER_SPEED = re.compile(
+    r"(?:ws|vw|w|v|n)(?=(?:fl|fr|rl|rr)$)|(?:acc|accel|gyro?|vel|speed)(?=[xyz]$)"
+    r"|(?:lat|lateral|long?|longitudinal|lineal|inline|vert|vertical)(?=g$)"
+)
 
 
 def _unglued(piece: str) -> list[str]:
     """Split a piece into known words; return the piece itself if it contains other letters."""
-    if letters := _CORNER_SPEED.match(piece):
-        return [letters[0], piece[letters.end() :]]
+    if piece not in _WORDS["lexicon"] and (letters := _CORNER_SPEED.match(piece)):
+        first = letters[0]
+        return [*_SYNONYMS.get(first, first).split(), piece[letters.end() :]]
     if piece in _WORDS["lexicon"] or len(piece) < 5:
         return [piece]
     best: list[list[str] | None] = [[]] + [None] * len(piece)
@@ -110,8 +114,8 @@ def is_command(*names: str) -> bool:
 
 
 def is_unlabelled(name: str) -> bool:
-    """Return whether a name is empty or consists of letters, numbers and counting words only."""
-    return all(len(w) == 1 or w.isdigit() or w in _WORDS["counting"] for w in words_of(name))
+    """Return whether a name is empty or consists of letters, numbers and words that count or are symbols only."""
+    return all(len(w) == 1 or w.isdigit() or w in _WORDS["counting"] | _WORDS["symbols"] for w in words_of(name))
 
 
 def _plain_unit(text: str) -> str:
@@ -155,8 +159,10 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
     outer = (*words_of(topic), *words_of(type_name.rpartition("/")[2].rpartition(".")[2]))
     if not leaf_words or _WORDS["other_devices"] & set(outer):
         return None
-    # "current" before other words is an adjective; "state" before them is the topic of an export.
-    kept = {w for w in leaf_words[:-1] if w not in ("current", "state", "states", "status")} | {*leaf_words[-1:]}
+    # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured.
+    states = ("state", "states", "status")
+    kept = {w for w in leaf_words[:-1] if w not in ("current", *states)}
+    kept |= {w for w in leaf_words[-1:] if w not in states or len(leaf_words) == 1}
     if _WORDS["not_values"] & kept or _WORDS["not_values"] & set(inner) - {"state", "status", "orientation"}:
         return None
     index = re.search(r"\[(\d+)\]$", leaf)

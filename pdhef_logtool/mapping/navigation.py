@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -18,7 +19,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen
-from pdhef_logtool.mapping.naming import meaning_of, unit_of, words_of
+from pdhef_logtool.mapping.naming import Meaning, is_command, meaning_of, unit_of, words_of
 from pdhef_logtool.mapping.path import DEGREE_M
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.signals import FloatArray
@@ -48,46 +49,77 @@ _CONVENTIONS = (
 NavigationTruth: TypeAlias = tuple[dict[str, SignalSource], str]
 
 
-def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo]) -> NavigationTruth | None:
+def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool = False) -> NavigationTruth | None:
     """Return the ground truth of the topic with most quantities of position, velocity and heading, or None.
 
     Parameters
     ----------
     topics : of navigation systems and references with undocumented types.
+    whole : whether only a velocity with a heading counts.
     """
     truths = [truth for t in topics if (truth := _of_topic(log, t)) is not None]
+    truths = [t for t in truths if not whole or {"enu_velocity_m_s", "yaw_rad"} <= set(t[0])]
     return max(truths, key=lambda t: len(t[0]), default=None)
 
 
 def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
-    """Return a receiver's speed and course over ground by the names of its fields, if they agree with its path."""
+    """Return position, velocity or speed and course over ground by the names of a topic's fields.
+
+    A velocity must agree with the path. A heading that is the direction of the path is a course.
+    """
     fields = log.fields(topic.name, quiet=True)
-    meanings = {f.path: meaning_of(topic.name, topic.type_name, f.path, f.unit) for f in fields if f.kind == "number"}
-    first = {m.quantity: (path, m.scale) for path, m in reversed([*meanings.items()]) if m is not None}
-    if not {"speed", "course", "latitude", "longitude"} <= set(first):
+    stamp, meanings = stamp_path_of(fields), _meanings(topic, fields)
+    first = {m.quantity: path for path, m in reversed(meanings.items())}
+    if not {"latitude", "longitude"} <= set(first) or is_command(topic.name):
         return {}
-    pieces, stamp = Pieces(log), stamp_path_of(fields)
-    samples = pieces.read({topic.name: [path for path, _ in first.values()]})
-    places = {n: SignalSource(n, topic.name, first[q][0], stamp) for n, q in _PLACES.items()}
-    if not all((topic.name, source.paths[0]) in samples for source in places.values()):
+    angles = [p for q in ("course", "heading") for p, m in meanings.items() if m.quantity == q]
+    velocity = next(_horizontal(fields), {})
+    pieces = Pieces(log)
+    samples = pieces.read(
+        {topic.name: [*dict.fromkeys([*velocity.values(), *angles, *(first[q] for q in _PLACES.values())])]}
+    )
+    seen = {path: values for (_, path), values in samples.items()}
+    places = {n: SignalSource(n, topic.name, first[q], stamp) for n, q in _PLACES.items()}
+    if not all(_is_place(seen.get(first[q]), most) for q, most in (("latitude", 90.0), ("longitude", 180.0))):
         return {}
-    (course, unit), (speed, scale) = first["course"], first["speed"]
-    direction, seen = _course(places, samples, topic.name, pieces), samples.get((topic.name, course))
-    # A course over ground is clockwise from north by definition; the path confirms this and determines the unit.
-    clockwise = (c[1:] for c in _CONVENTIONS[:2] if unit is None or math.isclose(-c[1], unit))
-    if seen is None or direction is None or scale is None:
-        return {}
-    fitting = [c for c in clockwise if _off(seen, direction, *c) < NEAR_RAD]
-    sources = [SignalSource("gnss_course_rad", topic.name, course, stamp, *c) for c in fitting[:1]]
-    return {s.name: s for s in (*sources, SignalSource("gnss_speed_m_s", topic.name, speed, stamp, scale)) if sources}
+    found = [replace(places[n], name=f"gnss_{q}_deg") for n, q in _PLACES.items()]
+    course = _course(places, samples, topic.name, pieces)
+    sides = {side: seen[velocity[side]].cells for side in "ne" if velocity.get(side, "") in seen}
+    if course is not None and len(sides) > 1 and _median_off(np.arctan2(sides["n"], sides["e"]) - course) < NEAR_RAD:
+        unit = unit_of(velocity["n"].rpartition(".")[2], "speed")[1] or 1.0
+        named = (("gnss_velocity_east_m_s", "e"), ("gnss_velocity_north_m_s", "n"))
+        found += [SignalSource(name, topic.name, velocity[side], stamp, unit) for name, side in named]
+    elif course is not None:
+        found += _speed_and_course(topic.name, stamp, meanings, {p: seen[p] for p in angles if p in seen}, course)
+    return {source.name: source for source in found}
+
+
+def _speed_and_course(
+    topic: str, stamp: str, meanings: Mapping[str, Meaning], angles: Mapping[str, Seen], course: FloatArray
+) -> Iterator[SignalSource]:
+    """Yield the first speed with a unit and the first of the angles that is the path's course, if both exist."""
+    speed = next((p for p, m in meanings.items() if m.quantity == "speed" and m.scale is not None), None)
+    for path, seen in angles.items() if speed is not None else ():
+        # A course over ground is clockwise from north by definition; the path confirms this and determines the unit.
+        unit = meanings[path].scale
+        fitting = [c[1:] for c in _CONVENTIONS[:2] if unit is None or math.isclose(-c[1], unit)]
+        fitting = [c for c in fitting if _off(seen, course, *c) < NEAR_RAD]
+        if fitting and speed is not None:
+            yield SignalSource("gnss_course_rad", topic, path, stamp, *fitting[0])
+            yield SignalSource("gnss_speed_m_s", topic, speed, stamp, meanings[speed].scale or 1.0)
+            return
+
+
+def _meanings(topic: TopicInfo, fields: tuple[FieldInfo, ...]) -> dict[str, Meaning]:
+    named = ((f.path, meaning_of(topic.name, topic.type_name, f.path, f.unit)) for f in fields if f.kind == "number")
+    return {path: meaning for path, meaning in named if meaning is not None}
 
 
 def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
     fields = log.fields(topic.name, quiet=True)
     stamp = stamp_path_of(fields)
     truth = {s.name: s for s in (*_enu_velocities(topic, fields, stamp), *_ecef_vectors(topic, fields, stamp))}
-    named = ((f.path, meaning_of(topic.name, topic.type_name, f.path)) for f in fields if f.kind == "number")
-    meanings = {path: meaning for path, meaning in named if meaning is not None}
+    meanings = _meanings(topic, fields)
     first = {m.quantity: path for path, m in reversed(meanings.items())}
     places = {n: SignalSource(n, topic.name, first[q], stamp) for n, q in _PLACES.items() if q in first}
     headings = {p: m.scale for p, m in meanings.items() if m.quantity == "heading"}
@@ -112,19 +144,23 @@ def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
 
 def _enu_velocities(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str) -> Iterator[SignalSource]:
     """Yield the first velocity east, north, up (or down) by the field names of one struct."""
-    structs: dict[str, dict[str, str]] = {}
-    for info in fields:
-        prefix, _, leaf = info.path.rpartition(".")
-        if info.kind == "number" and "ecef" not in info.path.lower() and (side := side_of(prefix, leaf)):
-            structs.setdefault(prefix, {}).setdefault(side, info.path)
-    for paths_of in structs.values():
-        vertical = next((s for s in "ud" if s in paths_of), "")
-        if {"n", "e"} <= set(paths_of) and vertical:
+    for paths_of in _horizontal(fields):
+        if vertical := next((s for s in "ud" if s in paths_of), ""):
             paths = (paths_of["e"], paths_of["n"], paths_of[vertical])
             factor = unit_of(paths[0].rpartition(".")[2], "speed")[1] or 1.0
             scale = (factor, factor, factor if vertical == "u" else -factor)
             yield SignalSource("enu_velocity_m_s", topic.name, paths, stamp, scale)
             return
+
+
+def _horizontal(fields: tuple[FieldInfo, ...]) -> Iterator[dict[str, str]]:
+    """Yield by struct the paths of a velocity with at least north and east, by direction."""
+    structs: dict[str, dict[str, str]] = {}
+    for info in fields:
+        prefix, _, leaf = info.path.rpartition(".")
+        if info.kind == "number" and "ecef" not in info.path.lower() and (side := side_of(prefix, leaf)):
+            structs.setdefault(prefix, {}).setdefault(side, info.path)
+    yield from (paths_of for paths_of in structs.values() if {"n", "e"} <= set(paths_of))
 
 
 def side_of(struct: str, leaf: str) -> str:
@@ -135,6 +171,8 @@ def side_of(struct: str, leaf: str) -> str:
     side = side or (_SIDES[words[-1]] if len(words) > 1 and words[-1] in "neud" else "")
     if {"std", "stddev", "stdev", "var", "cov", "accuracy", "sigma", "acc"} & set(words):
         return ""
+    frame = next((f for f in ("ned", "enu") if f in words and words[-1] in {*"xyz"}), "")
+    side = {"x": frame[:1], "y": frame[1:2], "z": frame[2:]}[words[-1]] if frame else side
     is_speed = {"velocity", "vel", "speed"} & {*words, *words_of(struct)} or re.fullmatch("(v|vel)[neud]", short)
     return side if is_speed else ""
 
@@ -192,8 +230,13 @@ def _convention(seen: Seen | None, course: FloatArray | None, unit: float | None
     return conventions[int(np.argmin(off))]
 
 
-def _off(seen: Seen, course: FloatArray, scale: float, angle: float) -> float:
-    """Return the median difference of an angle ``scale * raw + angle`` from the course, rad; infinite if unknown."""
-    away = np.abs(np.angle(np.exp(1j * (scale * seen.cells + angle - course))))
+def _median_off(angles: FloatArray) -> float:
+    """Return the median magnitude of angles; infinite with too few."""
+    away = np.abs(np.angle(np.exp(1j * angles)))
     away = away[np.isfinite(away)]
     return float(np.median(away)) if away.shape[0] >= FEWEST_CELLS else math.inf
+
+
+def _off(seen: Seen, course: FloatArray, scale: float, angle: float) -> float:
+    """Return the median difference of an angle ``scale * raw + angle`` from the course, rad; infinite if unknown."""
+    return _median_off(scale * seen.cells + angle - course)

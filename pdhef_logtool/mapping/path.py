@@ -12,6 +12,8 @@ from pdhef_logtool.records.signals import FloatArray
 
 #: Half of the window for a course from positions, in cells.
 _HALF = 5
+#: Quantities of positions.
+PLACES = ("latitude", "longitude", "position")
 #: Length of a degree of latitude in m.
 DEGREE_M = 111_200.0
 
@@ -35,10 +37,17 @@ def _path(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
     return None
 
 
+def path_velocity(fields: Fields) -> tuple[FloatArray, FloatArray] | None:
+    """Return the velocity north and east along the path of positions, m/s [M]; None without positions."""
+    steps = _path(fields)
+    seconds = 2 * _HALF * CELL_NS * 1e-9
+    return None if steps is None else (steps[0] / seconds, steps[1] / seconds)
+
+
 def path_speed(fields: Fields) -> FloatArray | None:
     """Return the speed along the path of positions, m/s [M]; None without positions."""
-    steps = _path(fields)
-    return None if steps is None else np.hypot(*steps) / (2 * _HALF * CELL_NS * 1e-9)
+    velocity = path_velocity(fields)
+    return None if velocity is None else np.hypot(*velocity)
 
 
 def _step(fields: Fields, cells: FloatArray) -> FloatArray:

@@ -15,14 +15,16 @@ from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.clocks import with_usable_stamps
 from pdhef_logtool.mapping.gnss_signals import RAW_COURSE, gnss_signals, has_heading, receiver_signals
-from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, length_of, speed_over_ground
+from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, Axes, length_of, speed_over_ground, twist_axes
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command
 from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth, side_of
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
+from pdhef_logtool.mapping.units import mounting_checks
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighed, weigh
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
 
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
@@ -36,11 +38,14 @@ FROM_COMMAND = "steer_rad comes from the command"
 PERFECT_PREFIX = "/truth/perfect"
 OWN_PREFIX = "/pdhef/"
 
+#: Subject of a choice between runs, and formats of files that may contain several.
+RUN, RUN_KINDS = "run", frozenset({"mat", "mat-7.3"})
 PROBE_NS = 2_000_000_000
 PROBE_AT = (0.0, 0.25, 0.5, 0.75, 1.0)
-#: Largest difference of the mean acceleration from 1 for accelerations in g; samples between the positions of a course;
-#: shortest distance between them; length of the mean unit vector of headings above which a path is straight.
-NEAR_1_G, COURSE_SAMPLES, COURSE_M, STRAIGHT = 0.08, 10, 0.3, 0.995
+#: Largest difference of the mean acceleration from 1 for accelerations in g.
+NEAR_1_G = 0.08
+#: Share of gravity in a mean acceleration that shows the vertical; largest mean acceleration in g.
+GRAVITY_SHARE, MOST_IN_G = 0.75, 3.0
 
 #: Types with velocities in the body frame by convention.
 BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove.Odometry"})
@@ -109,6 +114,7 @@ class _Draft:
     quality: QualityGate | None = None
     ambiguities: list[Ambiguity] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    checks: list[Check] = field(default_factory=list)
 
     def values(self, topic: str, path: str) -> FloatArray:
         return self.samples.get(topic, {}).get(path, np.empty(0))
@@ -180,7 +186,7 @@ def auto_map(
     draft.notes += [
         f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
     ]
-    topics, decoded = _decode(draft, topics)
+    topics, decoded = _decode(draft, _of_one_run(draft, topics))
     _map_imu(draft, topics)
     _map_steering(draft, topics)
     _map_speed(draft, topics)
@@ -193,15 +199,33 @@ def auto_map(
     weighed = _weigh_the_rest(draft, topics, vendors)
     _map_navigation(draft, topics, vendors)
     _fall_back(draft, topics)
-    _map_gnss(draft, topics)
+    _map_gnss(draft, topics, vendors)
     mapping = Mapping(draft.signals, draft.truth, draft.quality, "auto", tuple(draft.notes))
-    mapping = replace(mapping, checks=weighed.checks, open_signs=weighed.open_signs)
+    mapping = replace(mapping, checks=(*draft.checks, *weighed.checks), open_signs=weighed.open_signs)
     candidates = weighed.candidates
     if decoded is not None:
         mapping = decoded.as_mapped(mapping)
         candidates = tuple(replace(c, source=decoded.as_source(c.source)) for c in candidates)
     mapping = with_usable_stamps(log, mapping)
     return AutoMapping(mapping, tuple(draft.ambiguities), missing_signals(mapping), candidates)
+
+
+def _of_one_run(draft: _Draft, topics: list[TopicInfo]) -> list[TopicInfo]:
+    """Return the topics of the run with most of them; note the choice if a table contains several runs.
+
+    Runs are the beginnings of names before the same devices with the same fields.
+    """
+    devices: dict[str, set[tuple[str, frozenset[str]]]] = {}
+    for topic in topics if draft.log.kind in RUN_KINDS else ():
+        fields = frozenset(f.path for f in draft.log.fields(topic.name, quiet=True))
+        for place in (i for i, letter in enumerate(topic.name) if letter == "_"):
+            devices.setdefault(topic.name[:place], set()).add((topic.name[place:], fields))
+    runs = [run for run, d in devices.items() if any(len(d & o) > 1 for r, o in devices.items() if r != run)]
+    runs = sorted(r for r in runs if not any(r.startswith(f"{o}_") for o in runs))
+    if not runs:
+        return topics
+    draft.doubt(RUN, tuple(runs), runs[0], "signals and ground truth are of one run, here the first")
+    return [t for t in topics if t.name.startswith(f"{runs[0]}_")]
 
 
 def _decode(draft: _Draft, topics: list[TopicInfo]) -> tuple[list[TopicInfo], CanSignalLog | None]:
@@ -305,20 +329,22 @@ def _map_navigation(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) ->
     if set(draft.truth) - {"lat_deg", "lon_deg", "alt_m", "course_rad"}:
         return
     unknown = [t for t in topics if not _is_well_known(t) and not vendors.of(t.type_name).fields]
+    # A table has no topic with the name of an instrument: velocity north and east with a heading are those of an INS.
     truth = navigation_truth(draft.log, [t for t in unknown if _role(t) in ("navigation", "truth")])
+    truth = truth or navigation_truth(draft.log, [t for t in unknown if _role(t) == "sensor"], whole=True)
     if truth is None or (draft.truth and len(truth[0]) <= len(draft.truth)):
         return
     draft.replace_truth(truth[0])
     draft.notes.append(truth[1])
 
 
-def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
+def _map_gnss(draft: _Draft, topics: list[TopicInfo], vendors: Vendors) -> None:
     """Take GNSS as a sensor, from ground truth without heading, else from a receiver that is not ground truth."""
     draft.signals |= gnss_signals(draft.signals, draft.truth)
     instruments = {_device(source.topic) for source in draft.truth.values()} if has_heading(draft.truth) else set()
     topics = [t for t in topics if not _words(t.name) & TRUTH_WORDS]
     others = [t for t in topics if _device(t.name) not in instruments]
-    receivers = list(_receivers(draft, topics, others))
+    receivers = list(_receivers(draft, topics, others, vendors))
     for signals in sorted(receivers, key=lambda s: not has_gnss(s)):
         if has_gnss(signals) if not has_gnss(draft.signals) else not set(signals) & set(draft.signals):
             draft.signals |= signals
@@ -328,31 +354,46 @@ def _map_gnss(draft: _Draft, topics: list[TopicInfo]) -> None:
             draft.signals |= next((signals for signals in receivers if not has_gnss(signals)), {})
 
 
-def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo]) -> Iterator[dict[str, SignalSource]]:
+def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo], vendors: Vendors) -> Iterator[_Sources]:
     """Yield the signals of each receiver among ``others``, and of any topic with the course of a single antenna."""
     for topic in topics:
         fields = () if _type(topic).startswith(NO_SENSORS) else draft.log.fields(topic.name, quiet=True)
         if fields and (topic in others or has_path(fields, RAW_COURSE)):
-            signals = receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields})
+            signals = receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
+            by_name = not signals and not _is_well_known(topic) and _role(topic) in ("navigation", "sensor")
+            signals = named_gnss(draft.log, topic) if by_name else signals
             if signals:
                 yield signals
 
 
 def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
-    """Take the GNSS velocity from a twist over ground."""
-    for topic in topics:
-        if _type(topic) not in TWIST_FIELDS or _type(topic) in BODY_TWIST_TYPES or not _is_truth(topic):
-            continue
+    """Take the GNSS velocity from a twist over ground, of a navigation system first."""
+    twists = [t for t in topics if _type(t) in TWIST_FIELDS and _type(t) not in BODY_TWIST_TYPES]
+    twists = [t for t in twists if not _words(t.name) & (_TOPICS["command"] | _TOPICS["estimate"])]
+    for topic in sorted(twists, key=lambda t: not _is_truth(t)):
         paths = tuple(_twist(topic, "linear", axis) for axis in "xy")
-        if _looks_like_body_frame(*(draft.values(topic.name, path) for path in paths)) is False:
-            for name, path in zip(("gnss_velocity_east_m_s", "gnss_velocity_north_m_s"), paths, strict=True):
-                draft.take(draft.signals, name, topic.name, path)
+        axes = _axes(draft, topic, topics)
+        if axes not in ("", "body"):
+            for name, path in zip(("east", "north"), paths[::-1] if axes == "north, east" else paths, strict=True):
+                draft.take(draft.signals, f"gnss_velocity_{name}_m_s", topic.name, path)
             return
-    for topic in topics:
-        of_others = _is_well_known(topic) or _role(topic) not in ("navigation", "sensor")
-        if named := {} if of_others else named_gnss(draft.log, topic):
-            draft.signals |= named
-            return
+
+
+def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> Axes:
+    """Return the axes of a twist by the path of its pose or of a fix, and by the yaw rate."""
+    x, y = (_twist(twist, "linear", axis) for axis in "xy")
+    if not (draft.is_given(twist.name, x) and draft.is_given(twist.name, y)):
+        return ""
+    places: _Sources = {}
+    if _has_pose(draft, twist):
+        for axis in "xy":
+            draft.take(places, f"{axis}_m", twist.name, _join(_FIELDS["pose"][_type(twist)], f"position.{axis}"))
+    elif fix := next((t for t in topics if _has_fix(draft, t)), None):
+        for name, path in (("lat_deg", "latitude"), ("lon_deg", "longitude")):
+            draft.take(places, name, fix.name, path)
+    rate = draft.signals.get("yaw_rate_rad_s")
+    references = [*places.values(), *([] if rate is None else [rate])]
+    return twist_axes(draft.log, SignalSource("speed_m_s", twist.name, (x, y)), references)
 
 
 def _device(topic: str) -> str:
@@ -533,6 +574,9 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
         draft.notes.append(f"{imu.name} provides no acceleration (covariance -1)")
     else:
         means = [_mean(draft.values(imu.name, path)) for path in _GRAVITY_PATHS]
+        size = float(np.linalg.norm(means))
+        if size > GRAVITY_SHARE * (1.0 if size < MOST_IN_G else G_M_S2):
+            draft.checks += mounting_checks(np.array(means) / size, f"{imu.name}.linear_acceleration")
         in_g = abs(abs(means[2]) - 1.0) < NEAR_1_G and np.hypot(means[0], means[1]) < 0.5 * abs(means[2])
         if in_g:
             fast = np.abs(draft.values(imu.name, "angular_velocity.z"))
@@ -580,9 +624,12 @@ def _map_speed(draft: _Draft, topics: list[TopicInfo]) -> None:
         if _type(topic) not in TWIST_FIELDS or _is_truth(topic) or _words(topic.name) & _TOPICS["command"]:
             continue
         words = _words(topic.name)
-        if words & _TOPICS["vehicle"] and not words & _TOPICS["estimate"]:
+        is_body = _type(topic) in BODY_TWIST_TYPES or _axes(draft, topic, topics) in ("", "body")
+        if is_body and words & _TOPICS["vehicle"] and not words & _TOPICS["estimate"]:
             twists.append(topic)
             continue
+        if not is_body:
+            continue  # a velocity over ground: _map_twist
         neither = "a speed sensor nor ground truth"
         if words & _TOPICS["estimate"]:
             neither = "a sensor nor ground truth, but an estimate"
@@ -653,25 +700,28 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
     )
     if chosen is None:
         return None
-    forward = draft.values(chosen.name, _twist(chosen, "linear", "x"))
-    left = draft.values(chosen.name, _twist(chosen, "linear", "y"))
-    body, over_ground = _looks_like_body_frame(forward, left), _is_over_ground(draft, chosen, forward, left)
-    receives = _type(chosen) not in BODY_TWIST_TYPES and bool(_words(chosen.name) & NAVIGATION_WORDS)
-    if over_ground or (receives and body is not True):
-        # Receivers and some simulators publish their velocity in east, north, up with the same type.
+    axes, is_body = _axes(draft, chosen, candidates), _type(chosen) in BODY_TWIST_TYPES
+    receives = not is_body and bool(_words(chosen.name) & NAVIGATION_WORDS)
+    if axes in ("east, north", "north, east") or (receives and axes != "body"):
+        # Receivers and some simulators publish their velocity in axes of the earth with the same type.
+        is_down = axes == "north, east"
+        earth = "north, east, down" if is_down else "east, north, up"
+        readings = (f"{chosen.name} as body velocity", f"{chosen.name} as {earth}")
         up = draft.values(chosen.name, _twist(chosen, "linear", "z"))
-        readings = (f"{chosen.name} as body velocity", f"{chosen.name} as east, north, up")
-        if not over_ground and (body is None or not np.isfinite(up).any()):
+        if not axes or (not is_body and not np.isfinite(up).any()):
             draft.doubt("ground-truth velocity frame", readings, None, "too little motion to identify the frame")
             return None
-        why = "it has the direction of its path" if over_ground else "x is not the direction of travel"
+        why = "x is not the direction of travel" if axes == "not ahead" else "it has the direction of its path"
         draft.doubt("ground-truth velocity frame", readings, readings[1], why)
-        paths = tuple(_twist(chosen, "linear", a) for a in "xyz")
+        paths = tuple(_twist(chosen, "linear", a) for a in ("yxz" if is_down else "xyz"))
         draft.take(draft.truth, "enu_velocity_m_s", chosen.name, paths)
-        if over_ground:
+        if is_down:
+            draft.truth["enu_velocity_m_s"] = replace(draft.truth["enu_velocity_m_s"], scale=(1.0, 1.0, -1.0))
+        rates = draft.values(chosen.name, _twist(chosen, "angular", "z"))
+        if is_body and _span(rates) > 0.0:
             draft.take(draft.truth, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
         return chosen
-    if body is False:
+    if axes == "not ahead":
         draft.doubt(
             "ground-truth velocity frame",
             (f"{chosen.name} as body velocity",),
@@ -685,36 +735,6 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
         if draft.is_given(chosen.name, full) and not filler:
             draft.take(draft.truth, name, chosen.name, full)
     return chosen
-
-
-def _is_over_ground(draft: _Draft, topic: TopicInfo, x: FloatArray, y: FloatArray) -> bool:
-    """Return whether a twist is in the axes of its pose, as in some simulators, instead of the body's."""
-    if not _has_pose(draft, topic):
-        return False
-    base = _FIELDS["pose"][_type(topic)]
-    places = np.stack([draft.values(topic.name, _join(base, f"position.{a}")) for a in "xy"])
-    w, z = (draft.values(topic.name, _join(base, f"orientation.{a}")) for a in "wz")
-    if places.shape[1] <= COURSE_SAMPLES or not w.shape == z.shape == x.shape == y.shape:
-        return False
-    way = places[:, COURSE_SAMPLES:] - places[:, :-COURSE_SAMPLES]
-    middle = slice(COURSE_SAMPLES // 2, -(COURSE_SAMPLES - COURSE_SAMPLES // 2))
-    twist = np.exp(1j * (np.arctan2(y, x)[middle] - np.arctan2(way[1], way[0])))
-    heading = 2.0 * np.arctan2(z, w)[middle]
-    if not abs(np.mean(np.exp(1j * heading))) < STRAIGHT:  # not observable on a straight path
-        return False
-    moves = np.isfinite(twist) & (np.hypot(*way) > COURSE_M)
-    off_world, off_body = (np.abs(np.angle(t[moves])) for t in (twist, twist * np.exp(1j * heading)))
-    return bool(moves.sum() > COURSE_SAMPLES) and float(np.median(off_world)) < 0.1 < float(np.quantile(off_body, 0.8))
-
-
-def _looks_like_body_frame(forward: FloatArray, left: FloatArray) -> bool | None:
-    """Return whether x is the direction of travel in most moving samples; None without motion."""
-    with np.errstate(invalid="ignore"):
-        moving = np.hypot(forward, left) > 1.0
-        along = (forward > 0.0) & (np.abs(left) < forward)
-    if np.count_nonzero(moving) < 10:
-        return None
-    return bool(np.mean(along[moving]) > 0.6)
 
 
 def _has_twist(draft: _Draft, topic: TopicInfo) -> bool:

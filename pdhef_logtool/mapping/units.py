@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -42,30 +43,41 @@ def _by_gravity(fields: Fields) -> None:
     for item in fields.candidates:
         if item.meaning.quantity == "acceleration" and item.is_axis:
             groups.setdefault(triad_of(item), {})[item.meaning.part] = item
+        elif item.meaning.quantity == "acceleration" and item.meaning.part == "z":  # named vertical, without a triad
+            _use_gravity(item, float(np.nanmean(item.seen.values)), [item])
     for axes in groups.values():
         if set(axes) != set("xyz"):
             continue
         means = np.array([np.nanmean(axes[a].seen.values) for a in "xyz"])
         size = float(np.linalg.norm(means))
         _say_mounting(fields, axes["z"], means / size if size > 0.0 else means)
-        for item in axes.values():
-            if item.unit_known or item.fixed:
-                continue
-            near = [u for u, s in item.factors if abs(size * s / G_M_S2 - 1.0) < 0.08]
-            if near:
-                item.use(near[0])
-                item.reasons.append(f"gravity: the mean of its three axes is {size:.4g}, so it is in {near[0]}")
+        _use_gravity(axes["z"], size, [*axes.values()])
+
+
+def _use_gravity(z: Field, size: float, axes: Sequence[Field]) -> None:
+    """Select the unit of accelerations in which their mean of this size is gravity."""
+    for item in axes:
+        near = [u for u, s in item.factors if abs(abs(size) * s / G_M_S2 - 1.0) < 0.08]
+        if near and not (item.unit_known or item.fixed):
+            item.use(near[0])
+            item.reasons.append(f"gravity: the mean of {triad_of(z)} is {size:.4g}, so it is in {near[0]}")
 
 
 def _say_mounting(fields: Fields, z: Field, gravity: FloatArray) -> None:
     """Report an accelerometer with named axes and gravity not along +z: its axes differ from the car's."""
-    if z.fixed or gravity[2] > MOST_TILTED or z.role in ("command", "estimate", "truth"):
-        return
-    along = "xyz"[int(np.argmax(np.abs(gravity)))]
-    sense = "-" if gravity["xyz".index(along)] < 0.0 else "+"
-    evidence = f"gravity is along {sense}{along} of {triad_of(z)}, not along +z: its axes are not the car's"
+    if not z.fixed and z.role not in ("command", "estimate", "truth"):
+        fields.checks += mounting_checks(gravity, triad_of(z))
+
+
+def mounting_checks(gravity: FloatArray, where: str) -> list[Check]:
+    """Return the check of a sensor with gravity [3], a unit vector, elsewhere than along its +z; empty for others."""
+    along = int(np.argmax(np.abs(gravity)))
+    if gravity[2] > MOST_TILTED or not np.abs(gravity[along]) > 0.0:
+        return []
+    sense = "-" if gravity[along] < 0.0 else "+"
+    evidence = f"gravity is along {sense}{'xyz'[along]} of {where}, not along +z: its axes are not the car's"
     remedy = 'turn them in a mapping file, or --waive "imu.mounting"'
-    fields.checks.append(Check("imu.mounting", "ay_m_s2", "undecided", evidence, remedy))
+    return [Check("imu.mounting", "ay_m_s2", "undecided", evidence, remedy)]
 
 
 def _rank(fields: Fields) -> None:

@@ -43,6 +43,8 @@ LEAST_AY_M_S2 = 0.4
 COPY = 0.98
 #: Minimum correlation of a column sent twice.
 ITSELF = 0.999
+#: Strength of a name that is a letter; physics has priority over it.
+BY_LETTER = 0.6
 #: Minimum correlation of a steering angle with the path's curvature.
 STEERS = 0.9
 _UNITS = HYPOTHESES | {"acceleration": (("m/s²", 1.0), ("g", G_M_S2))}
@@ -125,8 +127,8 @@ def identified(fields: Fields, unlabelled: Sequence[Field]) -> tuple[list[Field]
     others = (c for c in order if best is not None and c.ahead_s > 0.0 and not _same(best, c))
     if best is None or any(c.score > best.score - CLEARER for c in others):
         return [], "", ""
-    topic = next(f.topic.name for f in best.columns if _open(f))
-    return _as_chosen(fields, unlabelled, best, best.evidence), topic, best.evidence
+    meant = _as_chosen(fields, unlabelled, best, best.evidence)
+    return meant, meant[0].topic.name if meant else "", best.evidence
 
 
 def _as_chosen(fields: Fields, unlabelled: Sequence[Field], choice: _Choice, why: str) -> list[Field]:
@@ -142,6 +144,10 @@ def _as_chosen(fields: Fields, unlabelled: Sequence[Field], choice: _Choice, why
         (choice.x, Meaning("acceleration", "x", 1.0, *unit, why), signs[1]),
     ]
     results = [_named(f, m, sign, sure=f is not choice.v or speed_is_sure) for f, m, sign in meanings if _open(f)]
+    for item, meaning, _ in meanings:
+        if not _open(item) and _is_raw(item) and (item is not choice.v or speed_is_sure):
+            item.use(meaning.unit)
+            item.reasons.append(f"unit {meaning.unit}, as {why}")
     rest = [f for f in unlabelled if not any(f is c for c in choice.columns)]
     return results + _steering(fields, rest, _values(choice.v) * speed_unit[1], _values(choice.r) * rate_unit[1])
 
@@ -208,7 +214,7 @@ def _explained(
     v, r, y, x = columns
     ways = []
     for speed, rate, unit in itertools.product(_units(v, "speed"), _units(r, "rate"), _units(y, "acceleration")):
-        slopes = abs(turning.slope) * unit[1] / rate[1], abs(speeding.slope) * (unit[1] if _open(x) else 1.0)
+        slopes = abs(turning.slope) * unit[1] / rate[1], abs(speeding.slope) * (unit[1] if _is_raw(x) else 1.0)
         off = [abs(math.log(slope / speed[1])) for slope in slopes]
         if max(off) < math.log(LOOSE_SLOPE):
             ways.append((sum(off), (speed, rate, unit), max(off)))
@@ -216,7 +222,9 @@ def _explained(
 
 
 def _units(item: Field, quantity: str) -> tuple[tuple[str, float], ...]:
-    return _UNITS[quantity] if _open(item) else (("", 1.0),)
+    if not _is_raw(item):
+        return (("", 1.0),)
+    return _UNITS[quantity] if _open(item) else tuple(u for u in _UNITS[quantity] if u in item.factors)
 
 
 def _open(item: Field) -> bool:
@@ -224,15 +232,20 @@ def _open(item: Field) -> bool:
     return not item.meaning.quantity
 
 
+def _is_raw(item: Field) -> bool:
+    """Return whether a column has no name, or a name without a unit."""
+    return _open(item) or not (item.unit_known or item.fixed)
+
+
 def _values(item: Field) -> FloatArray:
-    return item.seen.cells if _open(item) else item.si
+    return item.seen.cells if _is_raw(item) else item.si
 
 
 def _known(fields: Fields, what: str) -> list[Field]:
-    """Return the surest named field of a quantity with a known unit, as a list of at most one."""
+    """Return the surest named field of a quantity, with a known unit first, as a list of at most one."""
     kind = {"speed": ("speed", None), "rate": ("rate", "z"), "ay": ("acceleration", "y"), "ax": ("acceleration", "x")}
-    every = [f for f in fields.all(*kind[what]) if (f.unit_known or f.fixed) and f.seen.changes]
-    return every[:1]
+    every = [f for f in fields.all(*kind[what]) if f.seen.changes and (f.meaning.strength > BY_LETTER or f.fixed)]
+    return sorted(every, key=_is_raw)[:1]
 
 
 def _is_forward(item: Field) -> bool:
@@ -296,9 +309,10 @@ def _is_copy(a: Field, b: Field) -> bool:
 
 
 def needs_unlabelled(signals: Mapping[str, object], named: Sequence[Meaning]) -> bool:
-    """Return whether the speed, the yaw rate or an acceleration is neither mapped nor named."""
+    """Return whether the yaw rate, an acceleration or the steering is neither mapped nor named."""
     kinds = {(m.quantity, m.part) for m in named}
     missing = {
         "yaw_rate_rad_s": ("rate", "z"), "ax_m_s2": ("acceleration", "x"), "ay_m_s2": ("acceleration", "y"),
     }  # fmt: skip
-    return any(name not in signals and kind not in kinds for name, kind in missing.items())
+    steers = any(n.startswith("steer") for n in signals) or any(quantity == "steering" for quantity, _ in kinds)
+    return not steers or any(name not in signals and kind not in kinds for name, kind in missing.items())

@@ -75,6 +75,16 @@ class _TypeTable(BaseModel):
     fields: list[_FieldTable]
 
 
+class _ReceiverTable(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
+
+    message: str
+    page: str
+    has: list[str]
+    without: list[str] = []
+    fields: list[_FieldTable]
+
+
 @dataclass(frozen=True, slots=True)
 class VendorField:
     """A documented field: ``value_SI = scale * raw + offset``.
@@ -116,20 +126,23 @@ class VendorType:
     Attributes
     ----------
     left_out : why no field is used; empty if fields are used.
-    has : fields that identify a recorder's export, which has no type name; it may contain other channels.
+    has : fields that identify a recorder's export, which has no type name; it may contain other channels. Of a
+        receiver's message, at any depth. without : fields of an attitude, by which a message is ground truth.
     """
 
     fields: Mapping[str, VendorField] = field(default_factory=dict)
     vectors: tuple[SignalSource, ...] = ()
     left_out: str = ""
     has: frozenset[str] = frozenset()
+    without: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
 class Vendors:
-    """Documented types by name in the spelling of ROS 2 without ``/msg``."""
+    """Documented types by name in the spelling of ROS 2 without ``/msg``, and messages of GNSS receivers."""
 
     types: Mapping[str, VendorType] = field(default_factory=dict)
+    receivers: tuple[VendorType, ...] = ()
 
     def typed(self, topic: TopicInfo, fields: Iterable[FieldInfo]) -> TopicInfo:
         """Return an untyped topic with the type name of the export that its fields match, if any."""
@@ -158,7 +171,8 @@ def load_vendors(path: Path | None = None) -> Vendors:
     given = path or (Path(os.environ[USERS_FILE]) if os.environ.get(USERS_FILE) else None)
     if given is None:
         return _shipped()
-    return Vendors({**_shipped().types, **_read(given).types})
+    ours, users = _shipped(), _read(given)
+    return Vendors({**ours.types, **users.types}, (*users.receivers, *ours.receivers))
 
 
 @cache
@@ -168,7 +182,9 @@ def _shipped() -> Vendors:
 
 def _read(path: Path) -> Vendors:
     raw = read_toml(path, "a TOML file of vendors' types", MappingFileError)
-    problems = [f"{key}: not known, expected [[types]]" for key in raw if key != "types"]
+    problems = [
+        f"{key}: not known, expected [[types]] or [[receivers]]" for key in raw if key not in ("types", "receivers")
+    ]
     types: dict[str, VendorType] = {}
     entries = raw.get("types", [])
     for number, table in enumerate(entries if isinstance(entries, list) else [], 1):
@@ -181,6 +197,20 @@ def _read(path: Path) -> Vendors:
         several = tuple(_vector(f) for f in model.fields if isinstance(f.field, list))
         kind = VendorType(fields, several, model.leave_out, frozenset(model.has))
         types |= {_plain(name): kind for name in model.type}
+    tables = raw.get("receivers", [])
+    made = [
+        checked(_ReceiverTable, t, f"receivers[{i}]", problems)
+        for i, t in enumerate(tables if isinstance(tables, list) else [], 1)
+    ]
+    receivers = tuple(
+        VendorType(
+            {f.field: _field(f, f.scale, m.page) for f in m.fields if isinstance(f.field, str)},
+            has=frozenset(m.has),
+            without=frozenset(m.without),
+        )
+        for m in made
+        if m is not None
+    )
     if problems:
         raise MappingFileError(
             expected="entries as in docs/formats.md",
@@ -188,7 +218,7 @@ def _read(path: Path) -> Vendors:
             where=str(path),
             remedy="see docs/formats.md for every entry",
         )
-    return Vendors(types)
+    return Vendors(types, receivers)
 
 
 def _field(table: _FieldTable, scale: float, page: str) -> VendorField:

@@ -28,7 +28,9 @@ from pdhef_logtool.mapping.checking import has_path
 from pdhef_logtool.mapping.evidence import Fit, fit, is_of_both_signs, is_of_one_sign, ratio, spread
 from pdhef_logtool.mapping.fields import CLEAR, Fields, agree, mean_of
 from pdhef_logtool.mapping.gnss_signals import has_heading
+from pdhef_logtool.mapping.ground_speed import axes_of
 from pdhef_logtool.mapping.naming import words_of
+from pdhef_logtool.mapping.path import path_velocity
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.units import RADII_M, decide_units
 from pdhef_logtool.mapping.unlabelled_fields import identified, needs_unlabelled, unlabelled_columns
@@ -197,26 +199,24 @@ class _Weighing:
         return usable
 
     def _drop_vectors_over_ground(self) -> None:
-        """Drop velocities x, y that are not in the body frame."""
+        """Take velocities x, y over ground as those of a receiver; they are no velocities of the body."""
+        steps, rates = path_velocity(self.fields), self.fields.open("rate", "z")
         for y in [f for f in self.fields.candidates if f.meaning.quantity == "velocity" and f.is_axis and not f.fixed]:
             beside = (f for f in self.fields.candidates if f.meaning.quantity == "speed" and triad_of(f) == triad_of(y))
             x = next((f for f in beside if f.meaning.part == "x" and f.seen.changes), None)
-            if x is not None and y.seen.changes and self._is_over_ground(x, y):
-                self.fields.candidates = [f for f in self.fields.candidates if f is not x and f is not y]
-                self.notes.append(f"{x.topic.name}.{x.path} is not used: its vector is not in the car's axes")
-
-    def _is_over_ground(self, x: Field, y: Field) -> bool:
-        """Return whether a velocity is not in the body frame: x is not forward, or it rotates with the yaw rate."""
-        length, rates = np.hypot(x.si, y.si), self.fields.open("rate", "z")[:1]
-        speeds = (f.si for f in self.fields.open("speed") if f is not x)
-        moving = length > SLOW_M_S
-        if moving.any() and np.mean((x.si > np.abs(y.si))[moving]) < 0.6:
-            return True
-        turning = self.fields.pieces.rate_of(np.where(moving, np.arctan2(y.si, x.si), np.nan))
-        fits = [fit(np.sin(turning), self.fields.pieces.smooth(rate.si)) for rate in rates]
-        if any(f is not None and abs(f.correlation) > CLEAR for f in fits):
-            return True
-        return any(agree(v, length) and not agree(v, x.si) for v in speeds)
+            if x is None or not y.seen.changes:
+                continue
+            axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
+            length, speeds = np.hypot(x.si, y.si), [f.si for f in self.fields.open("speed") if f is not x]
+            if axes in ("", "body") and not any(agree(v, length) and not agree(v, x.si) for v in speeds):
+                continue
+            self.fields.candidates = [f for f in self.fields.candidates if f is not x and f is not y]
+            note = f"{x.topic.name}.{x.path} is not used as a speed: its vector is not in the car's axes"
+            if axes in ("east, north", "north, east") and x.role in ("sensor", "navigation"):
+                for name, item in zip(axes.split(", "), (x, y), strict=True):
+                    self.taken[f"gnss_velocity_{name}_m_s"] = item
+                note += f"; x and y are {axes.replace(', ', ' and ')}"
+            self.notes.append(note)
 
     def note_unlabelled(self, topic: str, evidence: str) -> None:
         """Add a note that the fields of a topic were identified by their values only."""

@@ -1,9 +1,9 @@
 """Third-party logs, scored: ``docs/third_party_logs.md``.
 
-    python -m studies.strangers [--only NAME ...] [--held-out] [--work out/strangers] [--out docs/third_party_logs.md]
+    python -m studies.strangers [--only NAME ...] [--held-out [GROUP ...]] [--work FOLDER] [--out FILE]
 
 ``--only`` takes parts of names, prints the messages of the tool for these logs, and writes no page. ``--held-out`` adds
-the layouts that were built last. Exit code 1: something is wrong and not reported.
+layouts that were built last: its groups, by default ``held-out``. Exit code 1: something is wrong and not reported.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from studies.strangers.scoring import Score, look, score_log
 #: First results of held-out layouts, present and former.
 FIRST_RUNS = {
     "held_out": "held-out layouts were built last",
+    "recorders": "layouts of recorders (first contact: tables and messages) were built last, too",
+    "contact": "layouts of recorders were built after that, and scored once",
     "repositories": "layouts of files and messages in public repositories were held out before",
     "phones": "layouts of phones, games, makers and plotting tools were held out before",
     "stacks": "layouts of public stacks and loggers were held out before",
@@ -146,13 +148,14 @@ def main() -> int:
     """Make the logs, score them, write the page."""
     parser = options("strangers", __doc__)
     parser.add_argument("--only", nargs="+", default=[], help="parts of names of logs")
-    parser.add_argument("--held-out", action="store_true", help="with the layouts that were built last")
+    parser.add_argument("--held-out", nargs="*", metavar="GROUP", help="with layouts that were built last")
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "strangers", help="folder for the logs")
     parser.add_argument("--out", type=Path, default=DOCS / "third_party_logs.md", help="the page")
     parser.add_argument("--keep", type=Path, help="write the results as JSON, to compare with later")
     given = parser.parse_args()
     given.work.mkdir(parents=True, exist_ok=True)
-    made = chain(mountings(), layouts("fault", "layout"), layouts("held-out") if given.held_out else ())
+    last = () if given.held_out is None else given.held_out or ("held-out",)
+    made = chain(mountings(), layouts("fault", "layout", *last))
     recordings = [r for r in made if _wanted(r.name, given.only)]
     kinds: dict[str, list[Result]] = {}
     for kind, result in chain(score_own(recordings, given.work), score_others(given.only)):
@@ -162,7 +165,7 @@ def main() -> int:
         for result in chain.from_iterable(kinds.values()):
             _show(result)
     else:
-        remark = first_run() + ("" if given.held_out else "Without the held-out layouts.\n\n")
+        remark = first_run() + ("" if last else "Without the held-out layouts.\n\n")
         write(given.out, page(results, remark + others_without_answers()))
     if given.keep:
         write(given.keep, json.dumps({r.name: r.as_json() for r in results}, indent=1, sort_keys=True) + "\n")

@@ -14,24 +14,26 @@ GROUPS = {
     "fault": "logs with a fault",
     "layout": "published layouts",
     "held-out": "held-out layouts",
+    "recorders": "layouts of recorders, first contact",
+    "contact": "layouts of recorders, second contact",
     "recording": "third-party recordings",
 }
 #: Groups with sound and excited logs: checks may neither fail nor stay undecided.
-SOUND = ("layout", "held-out")
+SOUND = ("layout", "held-out", "recorders", "contact")
 
 _INTRO = """# Third-party logs
 
 This page shows how many signals the tool recognises without a mapping in logs with unknown layouts: <!-- counts -->.
 Command: `make strangers`; `python -m studies.strangers --only NAME` shows one log.
 
-**Scoring.** The expected values of each log are series in SI units and ISO 8855 axes. A mapped channel is right if
-its values agree (means of 0.25 s, within 4 % or the floor of the unit; accelerations up to a bias of 0.3 m/s²); field
-names do not count. Items: steering, a_x, a_y, yaw rate, speed, wheel speeds, and velocity and yaw rate of the ground
-truth. *Reported* means that a failed or undecided check, or a remark, names the wrong channel. Logs of one kind count
-as one, with the worst result of each item: the 24 mountings in steps of 90 degrees are one log. A cause counts as named
-if a message contains a word of it. Layouts have the fields, units and axes of their published definitions, without
-device status. The motion comes from truthsim: drives of three cars with noise, bias and delay of its usual sensors.
-"""
+**Scoring.** The expected values of each log are series in SI units and ISO 8855 axes. A mapped channel is right if its
+values agree (means of 0.25 s, within 4 % or the floor of the unit; accelerations up to a bias of 0.3 m/s²); field names
+do not count. Items: steering, a_x, a_y, yaw rate, speed, wheel speeds, and velocity and yaw rate of the ground truth;
+for layouts of recorders also position, course and heading. *Reported* means that a failed or undecided check, or a
+remark, names the wrong channel. Logs of one kind count as one, with the worst result of each item: the 24 mountings in
+steps of 90 degrees are one log. A cause counts as named if a message contains a word of it. Layouts have the fields,
+units and axes of their published definitions, without device status. The motion comes from truthsim: drives of three
+cars with noise, bias and delay of its usual sensors. """
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +103,7 @@ def page(results: Sequence[Result], remark: str) -> str:
     ----------
     results : one a kind. remark : text below the score.
     """
-    generated = [r for r in results if r.group in ("fault", "layout", "held-out")]
+    generated = [r for r in results if r.group != "recording"]
     others = [r for r in results if r.group == "recording"]
     counts = f"{len(generated)} generated logs and {len(others)} third-party recordings"
     parts = [
@@ -125,7 +127,7 @@ def _score(results: Sequence[Result]) -> str:
         here = [r for r in results if r.group == group]
         if here:
             rows.append(_score_row(title, here))
-    total = [r for r in results if r.group != "held-out"]
+    total = [r for r in results if r.group not in ("held-out", "recorders", "contact")]
     rows.append(_score_row("all except held-out layouts", total))
     head = ["logs", "count", "items", "right", "missing", "wrong, reported", "wrong, not reported", "causes named"]
     return table(head, rows, right_from=1) + "\n"

@@ -36,7 +36,12 @@ ITEMS: dict[str, tuple[str, ...]] = {
         "truth.ecef_velocity_m_s",
     ),
     "ground truth: yaw rate": ("truth.yaw_rate_rad_s",),
+    "position": ("truth.lat_deg", "truth.lon_deg", "gnss_latitude_deg", "gnss_longitude_deg"),
+    "course": ("truth.course_rad", "gnss_course_rad", "gnss_velocity_east_m_s", "gnss_velocity_north_m_s"),
+    "heading": ("truth.yaw_rad", "gnss_heading_rad"),
 }
+#: Items of a navigation system, scored only where a layout names them.
+NAVIGATION = ("position", "course", "heading")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +82,7 @@ def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
     """Return the right channels of the parts of a log.
 
     ``parts`` of ``imu``, ``yaw rate``, ``steer``, ``steering wheel``, ``speed``, ``wheels`` (rims in m/s),
-    ``wheel rates`` (rad/s), ``truth``, ``truth rate``.
+    ``wheel rates`` (rad/s), ``truth``, ``truth rate``, ``position``, ``course``, ``heading``.
     """
     east_north_up = Series(
         car.velocity.stamps_ns,
@@ -88,6 +93,7 @@ def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
     yaw_rates = (car.rate[2], car.yaw_rate)
     # All quantities accepted as speed: rims, the body's forward velocity, the speed over ground.
     speeds = (car.speed, car.body_velocity[0], car.ground_speed)
+    course = Series(car.velocity.stamps_ns, car.velocity.arrival_ns, np.arctan2(*car.velocity.values.T[::-1]))
     by_part: dict[str, dict[str, tuple[Series, ...]]] = {
         "imu": {"ax_m_s2": (car.force[0],), "ay_m_s2": (car.force[1],), "yaw_rate_rad_s": yaw_rates},
         "yaw rate": {"yaw_rate_rad_s": yaw_rates},
@@ -103,6 +109,17 @@ def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
             "truth.enu_velocity_m_s": (east_north_up,),
         },
         "truth rate": {"truth.yaw_rate_rad_s": yaw_rates},
+        "position": {
+            f"{name}_deg": (car.fix[i],)
+            for i, names in enumerate((("truth.lat", "gnss_latitude"), ("truth.lon", "gnss_longitude")))
+            for name in names
+        },
+        "course": {
+            **dict.fromkeys(("truth.course_rad", "gnss_course_rad"), (course,)),
+            "gnss_velocity_east_m_s": (car.velocity[0],),
+            "gnss_velocity_north_m_s": (car.velocity[1],),
+        },
+        "heading": dict.fromkeys(("truth.yaw_rad", "gnss_heading_rad"), (car.attitude[2],)),
     }
     return {name: series for part in parts for name, series in by_part[part].items()}
 

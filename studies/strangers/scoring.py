@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,10 @@ from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import fit_clocks, read_signals
 from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.records.signals import Channel, FloatArray
+from pdhef_logtool.records.signals import POSITIONS, Channel, FloatArray
 from pdhef_logtool.runs.inspection.report import inspect_drive_log
 from studies.strangers.cars import Series
-from studies.strangers.recordings import ITEMS
+from studies.strangers.recordings import ITEMS, NAVIGATION
 
 #: Values are compared as means over so long: noise and a late stamp of a few milliseconds count little.
 BIN_S = 0.25
@@ -45,12 +45,16 @@ FLOORS: dict[str, float] = {
     "truth.enu_velocity_m_s": 0.15,
     "truth.ecef_velocity_m_s": 0.15,
     "truth.yaw_rate_rad_s": 0.004,
+    **dict.fromkeys(("truth.lat_deg", "truth.lon_deg", "gnss_latitude_deg", "gnss_longitude_deg"), 1e-4),
+    **dict.fromkeys(("truth.course_rad", "gnss_course_rad", "truth.yaw_rad", "gnss_heading_rad"), 0.05),
 }
 WEAK_SHARE = 0.6
 #: Largest constant (m/s²) that counts as accelerometer bias: it cannot be distinguished from a tilt of two degrees.
 BIAS_M_S2 = 0.3
 #: A share of right samples from which a channel counts as right: some logs contain invalid samples.
 RIGHT_BINS = 0.95
+#: The same of a course: the rest are stops.
+MOVING_BINS = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,16 +173,22 @@ def agrees(channel: Channel, right: Series, floor: float, bias: float = 0.0) -> 
     """Return whether a channel has the values of a series, but for noise, a few milliseconds and a bias."""
     if not len(channel) or not len(right.stamps_ns):
         return False
+    if channel.name.endswith(("course_rad", "yaw_rad", "heading_rad")):
+        channel = replace(channel, values=_on_circle(channel.values))
+        right = replace(right, values=_on_circle(right.values))
+    if channel.name in POSITIONS:
+        place = float(np.median(right.values))
+        channel, right = replace(channel, values=channel.values - place), right.times(1.0, -place)
     width = round(BIN_S * 1e9)
     start = max(int(channel.stamps_ns[0]), int(right.stamps_ns[0]))
     end = min(int(channel.stamps_ns[-1]), int(right.stamps_ns[-1]))
     count = (end - start) // width
     if count < 1:
         return False
-    if np.median(np.diff(channel.stamps_ns)) > width and right.values.ndim == 1:
+    if np.median(np.diff(channel.stamps_ns)) > width:
         # A channel this slow contains samples, not means.
-        got = channel.values[:, None]
-        wanted = np.interp(channel.stamps_ns - start, right.stamps_ns - start, right.values)[:, None]
+        got = channel.values.reshape(len(channel), -1)
+        wanted = right.along(Series(channel.stamps_ns, channel.arrival_ns, got)).values.reshape(len(channel), -1)
         count = len(channel)
     else:
         got = _means(channel.stamps_ns - start, channel.values, width, count)
@@ -192,10 +202,16 @@ def agrees(channel: Channel, right: Series, floor: float, bias: float = 0.0) -> 
     difference = got[both] - wanted[both]
     difference -= np.clip(np.median(difference), -bias, bias)
     apart = np.sqrt(np.mean(difference**2, axis=1))
-    # A few bins may contain invalid samples; the others must agree as a whole.
-    kept = np.sort(apart)[: int(np.ceil(RIGHT_BINS * apart.shape[0]))]
+    # A few bins may contain invalid samples; the others must agree as a whole. The course of a car at rest is noise.
+    share = MOVING_BINS if channel.values.ndim == 2 and "course" in channel.name else RIGHT_BINS
+    kept = np.sort(apart)[: int(np.ceil(share * apart.shape[0]))]
     # Of a weak signal the floor is no more than a share: noise is accepted, another sign is not.
     return bool(np.sqrt(np.mean(kept**2)) <= max(SHARE * rms, min(floor, WEAK_SHARE * rms)))
+
+
+def _on_circle(angles_rad: FloatArray) -> FloatArray:
+    """Return the points [N, 2] of angles on the unit circle, so that full turns do not count."""
+    return np.stack([np.cos(angles_rad), np.sin(angles_rad)], axis=1)
 
 
 def _means(at_ns: Any, values: FloatArray, width: int, count: int) -> FloatArray:
@@ -256,6 +272,8 @@ def score_log(
     for item, names in ITEMS.items():
         mapped = [n for n in names if n in channels]
         present = any(n in right for n in names)
+        if item in NAVIGATION and not present:
+            continue
         if not mapped:
             if present:
                 findings.append(Finding(item, "missing", True, frozenset(), ""))

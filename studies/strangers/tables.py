@@ -118,6 +118,32 @@ def _units_row(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
     path.write_text("\n".join([*head, _text(clock, columns, [], ",")]), encoding="utf-8")
 
 
+def _keyed(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write a logger's export: quoted keys and values above the titles, units and an empty line below them."""
+    names = [_split(title) for title in columns]
+    head = [["Format", "Logger CSV File"], ["Vehicle", "car 3"], ["Date", "Monday, November 24, 2025"]]
+    head += [["Time", "2:05 PM"], ["Sample Rate", "100"], ["Duration", "90.000"], ["Segment Times", "1:30.000"], []]
+    head += [["Time", *(n for n, _ in names)], ["sec", *(u for _, u in names)], []]
+    rows = [",".join(f'"{cell}"' for cell in row) for row in head]
+    clock = [f"{s / 1e9:.3f}" for s in (stamps - stamps[0]).tolist()]
+    path.write_text("\r\n".join([*rows, *_text(clock, columns, [], ",").split("\n")]), encoding="utf-8")
+
+
+def _remarks(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write an inertial sensor's export: remarks, and columns between tabulators."""
+    remarks = ["// General information:", "//  ProductCode: INS", "// Coordinate system: ENU"]
+    clock = [f"{i % 65536}\t{(s // 100_000) % 2**32}" for i, s in enumerate(stamps.tolist())]
+    text = _text(clock, columns, ["PacketCounter", "SampleTimeFine", *columns], "\t")
+    path.write_text("\n".join([*remarks, text]), encoding="utf-8")
+
+
+def _frame(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write a data frame with its index, which has no title, and times as texts."""
+    texts = np.datetime_as_string(stamps.astype("datetime64[ns]"), "us").tolist()
+    clock = [f"{i},{text.replace('T', ' ')}" for i, text in enumerate(texts)]
+    path.write_text(_text(clock, columns, ["", "Zeitstempel", *columns], ","), encoding="utf-8")
+
+
 def _long_rows(topics: Sequence[Topic]) -> list[tuple[int, str, float, str]]:
     """Return a row for each value: time in ns, signal, value, unit."""
     rows = [
@@ -171,8 +197,11 @@ def _nested_parquet(path: Path, stamps: IntArray, columns: dict[str, Any]) -> No
     pq.write_table(table.set_column(0, "event_time", clock), path)
 
 
-def _vbo(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
-    """Write the columns of one topic: titles with units belong to input modules, and come last."""
+def _vbo(path: Path, stamps: IntArray, columns: dict[str, Any], fewer: int = 0) -> None:
+    """Write the columns of one topic: titles with units belong to input modules, and come last.
+
+    ``fewer`` units than modules are written.
+    """
     titles = list(columns)
     modules = [_split(t) for t in titles if "[" in t]
     named = [t for t in titles if "[" not in t]
@@ -181,7 +210,7 @@ def _vbo(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
     created = dt.datetime.fromtimestamp(int(stamps[0] // 10**9), tz=dt.UTC)
     header = ["satellites", "time", *named, *(name for name, _ in modules)]
     lines = [f"File created on {created:%d/%m/%Y @ %H:%M}", "", "[header]", *header, "", "[channel units]"]
-    lines += [*(unit for _, unit in modules), "", "[comments]", "", "[data]"]
+    lines += [*(unit for _, unit in modules[: len(modules) - fewer]), "", "[comments]", "", "[data]"]
     table = np.stack([columns[t] for t in [*named, *(t for t in titles if "[" in t)]], axis=1)
     lines += [
         f"012 {t:010.3f} " + " ".join(f"{v:+.8E}" for v in row)
@@ -197,6 +226,18 @@ def _mat(path: Path, topics: Sequence[Topic]) -> None:
     for topic in topics:
         structs[topic.name.strip("/")] = {"time": topic.arrival_ns * 1e-9, **topic.fields}
     savemat(path, structs)
+
+
+def _mat_runs(path: Path, topics: Sequence[Topic]) -> None:
+    """Write several runs: a struct for each, with the topics ``/RUN/DEVICE`` as structs of vectors."""
+    from scipy.io import savemat
+
+    runs: dict[str, dict[str, Any]] = {}
+    for topic in topics:
+        _, run, device = topic.name.split("/")
+        seconds = (topic.arrival_ns - topics[0].arrival_ns[0]) * 1e-9
+        runs.setdefault(run, {})[device] = {"time": seconds, **topic.fields}
+    savemat(path, runs)
 
 
 def _mat_series(path: Path, topics: Sequence[Topic]) -> None:
@@ -295,15 +336,20 @@ _TABLES: dict[str, tuple[str, Callable[[Path, IntArray, dict[str, Any]], None]]]
     "csv-sources": (".csv", _sources),
     "csv-pipes": (".csv", _pipes),
     "csv-units": (".csv", _units_row),
+    "csv-keyed": (".csv", _keyed),
+    "csv-remarks": (".txt", _remarks),
+    "csv-frame": (".csv", _frame),
     "parquet-nested": (".parquet", _nested_parquet),
     "parquet": (".parquet", _parquet),
     "vbo": (".vbo", _vbo),
+    "vbo-fewer": (".vbo", partial(_vbo, fewer=1)),
 }
 _GROUPS: dict[str, tuple[str, Callable[[Path, Sequence[Topic]], None]]] = {
     "csv-long": (".csv", _long_csv),
     "csv-records": (".csv", _records_csv),
     "parquet-long": (".parquet", _long_parquet),
     "mat": (".mat", _mat),
+    "mat-runs": (".mat", _mat_runs),
     "mat-series": (".mat", _mat_series),
     "mat-recorder": (".mat", _mat_recorder),
     "mat-7.3": (".mat", _mat_hdf5),

@@ -121,3 +121,59 @@ def test_joints_that_change_their_order_are_not_used_and_said() -> None:
 def test_joints_of_a_command_are_no_sensor() -> None:
     auto = found(joint_command=joints({"name": list(NAMES)}))
     assert "steer_rad" not in auto.mapping.signals
+
+
+@pytest.mark.parametrize("swap", [False, True])
+@pytest.mark.parametrize("name", ["vel", "gnss_velocity", "gps_speed"])
+def test_a_twist_that_turns_with_the_car_is_a_receivers_velocity(name: str, swap: bool) -> None:
+    """The car drives mostly to the east, so that x alone looks like a forward velocity."""
+    sides = {"twist.linear.x": NORTH if swap else EAST, "twist.linear.y": EAST if swap else NORTH}
+    fields = {**sides, "twist.linear.z": 0.0 * S}
+    fix = topic("sensor_msgs/msg/NavSatFix", FIX)
+    mapping = found(**{name: topic("geometry_msgs/msg/TwistStamped", fields)}, fix=fix).mapping
+    assert not {"vx_m_s", "vy_m_s"} & set(mapping.truth)
+    east, north = (mapping.signals[f"gnss_velocity_{side}_m_s"].paths[0] for side in ("east", "north"))
+    assert (east, north) == (("twist.linear.y", "twist.linear.x") if swap else ("twist.linear.x", "twist.linear.y"))
+
+
+def test_a_vector_of_letters_over_ground_in_a_table_is_a_receivers_velocity() -> None:
+    table = {"Acc_X": IMU["linear_acceleration.x"], "Acc_Y": IMU["linear_acceleration.y"], "Gyr_Z": RATE}
+    signals = auto_map(
+        FakeLog({"csv": FakeTopic("table", T, {**table, "Vel_X": EAST, "Vel_Y": NORTH})})
+    ).mapping.signals
+    assert signals["gnss_velocity_east_m_s"].paths == ("Vel_X",)
+    assert signals["gnss_velocity_north_m_s"].paths == ("Vel_Y",)
+
+
+def test_position_speed_and_heading_of_one_table_are_a_receivers() -> None:
+    heading = 90.0 - np.degrees(YAW)
+    table = {"LATITUDE": FIX["latitude"], "LONGITUDE": FIX["longitude"], "SPEED_KPH": 3.6 * V, "HEADING_DEG": heading}
+    signals = auto_map(FakeLog({"csv": FakeTopic("table", T, table)})).mapping.signals
+    assert {"gnss_latitude_deg", "gnss_longitude_deg", "gnss_speed_m_s", "gnss_course_rad"} <= set(signals)
+    assert signals["gnss_speed_m_s"].scale == pytest.approx(1.0 / 3.6)
+
+
+def test_letters_are_signals_where_physics_shows_them() -> None:
+    delta = 2.9 * RATE / V
+    table = {"u": V, "v": 0.3 * RATE, "r": RATE, "delta": delta, "a_x": IMU["linear_acceleration.x"]}
+    table["a_y"] = np.roll(V * RATE, -8)
+    mapping = auto_map(FakeLog({"csv": FakeTopic("table", T, table)})).mapping
+    paths = {n: s.paths[0] for n, s in mapping.signals.items()}
+    assert paths["speed_m_s"] == "u"
+    assert paths["yaw_rate_rad_s"] == "r"
+    assert {c.name for c in mapping.checks} >= {"mapping.names"}
+
+
+@pytest.mark.parametrize("name", ["steer_angle_status", "steer_angle_state"])
+def test_a_status_that_is_an_angle_is_read_and_an_enumeration_is_not(name: str) -> None:
+    angles, modes = 2.9 * RATE / V, np.rint(S) % 3.0
+    table = {"yaw_rate": RATE, "speed": V, "accel_y": V * RATE}
+    for values, is_read in ((angles, True), (modes, False)):
+        signals = auto_map(FakeLog({"csv": FakeTopic("table", T, {**table, name: values})})).mapping.signals
+        assert ("steer_rad" in signals or "steering_wheel_rad" in signals) == is_read
+
+
+def test_an_imu_with_z_down_is_undecided_without_a_drive_that_shows_it() -> None:
+    imu = {**IMU, "linear_acceleration.z": -IMU["linear_acceleration.z"]}
+    auto = auto_map(FakeLog({"/imu": topic("sensor_msgs/msg/Imu", imu)}))
+    assert [(c.name, c.verdict) for c in auto.mapping.checks] == [("imu.mounting", "undecided")]

@@ -222,7 +222,7 @@ def test_a_fix_alone_is_the_truth_with_a_gate() -> None:
 
 
 def test_a_fix_beside_a_velocity_gives_the_position() -> None:
-    auto = found({"/ins/twist": twist("geometry_msgs/msg/TwistStamped", "twist", 9 + S, 0.1 * S), "/fix": fix()})
+    auto = found({"/truth/twist": twist("geometry_msgs/msg/TwistStamped", "twist", 9 + S, 0.1 * S), "/fix": fix()})
     assert {"vx_m_s", "vy_m_s", "lat_deg", "lon_deg"} <= set(auto.mapping.truth)
     assert auto.mapping.quality is None
 
