@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import tomllib
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import Noise
 from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_of_entries
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.records.errors import VehicleError
@@ -141,24 +138,6 @@ def test_a_wrong_entry_is_named(tmp_path, old, new, named):
     assert named in problem(write(tmp_path, EXAMPLE.replace(old, new, 1)))
 
 
-@pytest.mark.parametrize(
-    ("name", "entries", "wrong"),
-    [
-        ("phy-ukf:tuned", (), ""),
-        ("phy-ukf:tuned", (0.02,) * 3, ""),
-        ("phy-ukf:tuned", (0.02,) * 4, ""),
-        ("physics", (0.02,) * 6, ""),
-        ("phy-ukf:tuned", (0.02,), "q_std needs 3 or 4 entries"),
-        ("physics", (0.02,) * 9, "q_std needs 3 or 4 entries"),
-        ("phy-ukf:tuned", (0.02,) * 6, "q_std of phy-ukf:tuned needs 3 or 4"),
-        ("phy-ukf:tuned", (0.02, -0.006, 0.002), "greater than or equal to 0"),
-    ],
-)
-def test_noise_has_an_entry_a_state(name: str, entries: tuple[float, ...], wrong: str) -> None:
-    with pytest.raises(ValueError, match=wrong) if wrong else contextlib.nullcontext():
-        Noise.model_validate({"filter": {name: {"q_std": entries}}})
-
-
 def test_a_mass_in_tonnes_contradicts_the_other_entries(tmp_path):
     said = problem(write(tmp_path, EXAMPLE.replace("mass_kg = 1440.0", "mass_kg = 1.44")))
     assert "mass_kg, yaw_inertia_kg_m2, cg_to_front_axle_m, cg_to_rear_axle_m contradict one another" in said
@@ -193,14 +172,6 @@ def test_relations_find_a_slip_that_the_ranges_let_pass(tmp_path, entry, factor,
         vehicle_of_entries(raw, where="car.toml")
     assert named in str(caught.value)
     assert entry in str(caught.value) or f"tyres.{'rear' if entry.startswith('corn') else 'front'}" in str(caught.value)
-
-
-def test_a_small_car_needs_no_height_track_or_speed_limit(tmp_path):
-    """Missing dimensions of a 1:10 car are derived from its wheelbase."""
-    text = (FILES / "f1tenth.toml").read_text().replace("track_m", "# track_m").replace("cg_height_m", "# cg_height_m")
-    vehicle = read_vehicle_file(write(tmp_path, text)).vehicle
-    assert 0.1 < vehicle.track_m < 0.3
-    assert 0.03 < vehicle.cg_height_m < 0.1
 
 
 #: Published values: mass, yaw inertia, l_f, l_r, stiffness of the axles, other parameters.
@@ -276,32 +247,8 @@ def test_plausible_vehicles_of_any_size_are_taken(
     assert again == vehicle
 
 
-def test_a_missing_file_is_said_to_be_missing(tmp_path):
-    assert "no such file" in problem(tmp_path / "nowhere.toml")
-
-
 @pytest.mark.parametrize("content", ["mass_kg = ", "just words\n", b"\xff\xfe\x00", b"\x89MCAP0\r\n"])
-def test_what_is_no_toml_is_one_line(tmp_path, content):
+def test_what_is_no_vehicle_file_is_one_line(tmp_path, content):
     problem(write(tmp_path, content))
-
-
-def test_a_folder_is_no_vehicle_file(tmp_path):
     problem(tmp_path)
-
-
-@settings(derandomize=True, deadline=None, max_examples=50)
-@given(st.floats(0.05, 2.0))
-def test_axle_quantities(friction):
-    vehicle = vehicle_of_entries(tomllib.loads(EXAMPLE), where="example").vehicle
-    assert vehicle.wheelbase_m == pytest.approx(2.87)
-    weight = 1440.0 * 9.80665
-    assert vehicle.axle_load_n(True) + vehicle.axle_load_n(False) == pytest.approx(weight)
-    assert vehicle.axle_load_n(True) * 1.16 == pytest.approx(vehicle.axle_load_n(False) * 1.71)  # moments about the CG
-    assert vehicle.cornering_stiffness_n_per_rad(True, friction) == pytest.approx(12.3 * 1.41 * 7600.0 * friction)
-    assert vehicle.cornering_stiffness_n_per_rad(False, friction) == pytest.approx(108_000.0)
-    assert vehicle.magic_formula(False, friction)[2] == pytest.approx(friction * vehicle.axle_load_n(False))
-
-
-def test_records_are_frozen():
-    with pytest.raises(ValidationError):
-        default_vehicle().mass_kg = 1.0
+    assert "no such file" in problem(tmp_path / "nowhere.toml")

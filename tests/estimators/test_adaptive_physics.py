@@ -6,18 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from made_models import random_network
 from reference_car import drive, slalom, tanh_tyre, with_noise
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.adaptive_physics import CURES, LEAST_WEIGHT, AdaptivePhysics, mix, weigh
-from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.adaptive_physics import CURES, AdaptivePhysics, mix
 from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
@@ -176,20 +170,6 @@ def test_a_banked_road_is_taken_for_one(made):
     assert abs(np.nanmean(run_estimator(adaptive(), noisy(made, 7)).bank_rad)) < 0.01
 
 
-@given(st.lists(st.tuples(st.floats(-800, 800), st.booleans()), min_size=1, max_size=4))
-def test_weights_are_shares_of_what_can_be_used(filters):
-    evidence = np.array([[e for e, _ in filters]])
-    usable = np.array([[u for _, u in filters]])
-    weights = weigh(evidence, usable)
-    assert (weights[~usable] == 0.0).all()
-    assert weights.sum() == pytest.approx(1.0 if usable.any() else 0.0)
-    for i, j in [(i, j) for i in range(len(filters)) for j in range(len(filters)) if weights[0, i] and weights[0, j]]:
-        assert np.log(weights[0, i] / weights[0, j]) == pytest.approx(evidence[0, i] - evidence[0, j], abs=1e-6)
-    best = np.max(evidence, where=usable, initial=-np.inf)
-    lost = usable & (weights == 0.0)
-    assert (evidence[lost] < best + np.log(LEAST_WEIGHT) + np.log(len(filters)) + 1e-9).all()
-
-
 def test_the_mixture_has_the_moments_of_its_samples():
     rng = np.random.default_rng(0)
     means = np.array([[20.0, 0.5, 0.1], [20.4, 0.2, 0.16]])
@@ -226,15 +206,6 @@ def test_trust_scales_the_network_in_all_filters(made):
     b = run_estimator(adaptive(SILENT, trust=1.0), signals)
     assert same(a, b)
     assert not same(run_estimator(adaptive(wrong), signals), b)
-
-
-def test_its_noise_comes_from_the_car():
-    tuned = Car.of(VEHICLE, network=SILENT.bundle, noise={"physics": FilterNoise(r_std={"ay_m_s2": 2.0})})
-    found = [make_estimator(name, tuned) for name in ("physics", "pd-hef:gain=0", "pd-hef:gain=1")]
-    for estimator in found:
-        assert isinstance(estimator, AdaptivePhysics)
-        assert estimator.physics.measurement_std[0] == 2.0
-    assert resolve(found[0]) == resolve(found[1]) != resolve(found[2])
 
 
 def test_another_tyre_is_not_noise():

@@ -20,7 +20,7 @@ from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.presets import OPEN_LOOP
 from pdhef_logtool.estimators.table import all_names, make_estimator
-from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, physics_filter
+from pdhef_logtool.estimators.vehicle_ukf import physics_filter
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -102,33 +102,12 @@ def test_an_estimated_friction_is_not_taken(signals: Signals) -> None:
     np.testing.assert_array_equal(told.vy_m_s, own.vy_m_s)
 
 
-def test_estimators_of_a_run_share_what_their_bands_compare(signals: Signals, monkeypatch: pytest.MonkeyPatch) -> None:
-    car, names = with_band(), ("physics", "pd-hef")
-    alone = [track_of(name, car, signals) for name in names]
-    run, asked = VehicleUkf.run, []
-    monkeypatch.setattr(VehicleUkf, "run", lambda *given: (asked.append(given[0]), run(*given))[1])
-    estimators, read = [make_estimator(name, car) for name in names], calibrated_signals(signals, car)
-    intervals = calibrator(car, estimators)
-    for estimator, expected in zip(estimators, alone, strict=True):
-        track = intervals.apply(run_estimator(estimator, read), signals)
-        np.testing.assert_array_equal(track.sideslip_std_rad, expected.sideslip_std_rad)
-        np.testing.assert_array_equal(track.vy_m_s, expected.vy_m_s)
-    assert len(asked) == len(names) + 3, "three compared filters in all, not for each estimator"
-
-
 def test_the_band_changes_no_estimate(signals: Signals) -> None:
     plain, banded = (track_of("physics", car, signals) for car in (calibrated(), with_band()))
     for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "nis"):
         np.testing.assert_array_equal(getattr(banded, column), getattr(plain, column))
     np.testing.assert_array_equal(banded.yaw_rate_std_rad_s, plain.yaw_rate_std_rad_s)
     assert (np.linalg.eigvalsh(banded.covariance[10:]) > 0.0).all()
-
-
-@pytest.mark.parametrize("wider", [{"share": 0.3}, {"d2_m_s": 0.3}])
-def test_what_is_known_less_has_the_wider_band(wider: dict[str, float], signals: Signals) -> None:
-    narrow, wide = track_of("physics", with_band(), signals), track_of("physics", with_band(**wider), signals)
-    for column in ("sideslip_std_rad", "vy_std_m_s"):
-        assert np.mean(getattr(wide, column)) > 1.3 * np.mean(getattr(narrow, column))
 
 
 def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:

@@ -155,14 +155,6 @@ def test_every_shipped_estimator_is_what_it_declares(signals: Signals) -> None:
             assert reason(estimator, signals, (0, 150), (150, len(signals))) == "", name
 
 
-def test_the_newest_step_that_had_arrived_is_scored_and_no_newer_one(signals: Signals) -> None:
-    """Samples come each 10 ms and arrive 16 ms late: at a stamp, the step of two samples before is the newest."""
-    rate = np.arange(len(signals), dtype=np.float64)
-    track, _ = run_window(Cheat(lambda _: rate), signals)
-    assert not track.valid[:2].any()
-    np.testing.assert_array_equal(track.yaw_rate_rad_s[2:], rate[:-2])
-
-
 # --- in a run --------------------------------------------------------------------------------------------------------
 
 

@@ -24,7 +24,7 @@ from pdhef_logtool.estimators.presets import OPEN_LOOP
 from pdhef_logtool.estimators.table import Options, all_specs, make_estimator
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, GNSS_COMPONENTS, TRUTH_UNITS, Signals
-from pdhef_logtool.records.steps import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.records.steps import MAX_PREDICTION_S
 from pdhef_logtool.records.tracks import StateTrack
 
 pytestmark = pytest.mark.slow
@@ -184,16 +184,6 @@ def test_an_arrived_sample_is_used(name, rough, of_rough):
     assert not np.array_equal(a.yaw_rate_rad_s[at : at + 5], b.yaw_rate_rad_s[at : at + 5])
 
 
-@settings(derandomize=True, deadline=None, max_examples=100)
-@given(st.lists(st.integers(0, 30), max_size=30), st.lists(st.integers(0, 40), max_size=30))
-def test_released_steps_is_the_newest_arrived(ready, stamps):
-    ready, stamps = np.sort(np.array(ready, dtype=np.int64)), np.sort(np.array(stamps, dtype=np.int64))
-    want = [max((k for k in range(len(ready)) if ready[k] <= t), default=-1) for t in stamps]
-    got = released_steps(ready, stamps)
-    assert got.tolist() == want
-    assert got.dtype == np.int64
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_left_and_right_are_mirrored(name, rough, of_rough):
     mirrored = replace(rough, **{c: sign * getattr(rough, c) for c, sign in SIGNS.items()})
@@ -267,15 +257,6 @@ def test_what_is_too_late_is_not_predicted(name):
         assert track.valid[100:].all() == valid
         assert track.valid.any() == valid
         assert np.isfinite(track.yaw_rate_rad_s).any() == valid
-
-
-def test_uncertainty_grows_with_the_prediction():
-    made = drive(slalom(), 4.0)
-    stds = [
-        run("phy-ukf", replace(made.signals, ready_ns=made.signals.stamps_ns + delay)).vy_std_m_s[-1]
-        for delay in (0, 50_000_000, 200_000_000)
-    ]
-    assert stds[0] < stds[1] < stds[2]
 
 
 # --- bad signals -----------------------------------------------------------------------------------------------------

@@ -1,21 +1,17 @@
-"""The paper's filter: its rules by hand, its noise by hand, and the whole of it against plain numpy."""
+"""The paper's filter against plain numpy, its norm, and its place in the table."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from made_models import random_network
 from reference_car import drive, forces, runge_kutta, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.fuzzy_trust import RULES, fuzzy_trust, memberships
-from pdhef_logtool.estimators.hybrid_paper import Constants, PaperHybridUkf, adapted_noise
+from pdhef_logtool.estimators.hybrid_paper import Constants, PaperHybridUkf
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.table import check_names, runnable
@@ -57,63 +53,6 @@ def weaving() -> Signals:
     s.friction[:200] = 0.85
     s.friction[200:] = 0.8
     return replace(s, ready_ns=s.stamps_ns + 25_000_000)
-
-
-# --- the rules -------------------------------------------------------------------------------------------------------
-
-
-def trust_at(deviation: float, intensity: float) -> float:
-    return fuzzy_trust(deviation, intensity, *TOPS)
-
-
-@pytest.mark.parametrize("row", range(3))
-@pytest.mark.parametrize("column", range(3))
-def test_at_the_tops_of_the_sets_trust_is_table_2(row, column):
-    table = ((0.1, 0.2, 0.3), (0.3, 0.5, 0.7), (0.5, 0.8, 0.9))
-    assert table == RULES
-    assert trust_at((0.3, 1.0, 2.5)[column], (0.3, 0.6, 0.85)[row]) == pytest.approx(table[row][column], abs=1e-15)
-    assert fuzzy_trust(1.0 + column, 4.0 + row, (1, 2, 3), (4, 5, 6)) == pytest.approx(table[row][column], abs=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("deviation", "intensity", "expected"),
-    [
-        (0.65, 0.3, 0.15),  # half small, half medium; small: two rules of strength 1/2
-        # medium 0.5, large 0.5; medium 0.6, large 0.4: two rules of strength 0.5 and two of 0.4
-        (1.75, 0.7, (0.5 * 0.5 + 0.5 * 0.7 + 0.4 * 0.8 + 0.4 * 0.9) / 1.8),
-        (0.0, 0.0, 0.1),  # shoulders
-        (50.0, 3.0, 0.9),
-        (50.0, 0.0, 0.3),
-        (math.nan, 0.5, math.nan),
-        (0.5, math.nan, math.nan),
-    ],
-)
-def test_between_and_beyond_the_tops_rules_weigh_by_their_strength(deviation, intensity, expected):
-    assert trust_at(deviation, intensity) == pytest.approx(expected, nan_ok=True)
-
-
-@settings(derandomize=True, deadline=None)
-@given(st.floats(0, 5), st.floats(0, 5), st.floats(0, 2))
-def test_trust_never_falls_when_the_model_deviates_more(a, b, intensity):
-    low, high = sorted((a, b))
-    sets = memberships(low, (0.3, 1.0, 2.5))
-    assert min(sets) >= 0.0
-    assert sum(sets) == pytest.approx(1.0)
-    assert 0.1 <= trust_at(low, intensity) <= 0.9
-    # the weights of min-strengths are not bilinear: between tops they may fall by a little
-    assert trust_at(high, intensity) >= trust_at(low, intensity) - 0.03
-
-
-# --- the noise -------------------------------------------------------------------------------------------------------
-
-
-def test_noise_by_hand():
-    c, r = adapted_noise(math.nan, 0.0, 0.2, 0.1, 0.95)  # C starts at 0.3
-    assert (c, r) == (pytest.approx(0.285), pytest.approx(0.1))
-    for forgetting in (0.95, 0.8):
-        c, r = adapted_noise(0.3, 2.0, 0.2, 0.1, forgetting)
-        assert c == pytest.approx(forgetting * 0.3 + (1.0 - forgetting) * 4.0)
-        assert r == pytest.approx(c - 0.2)
 
 
 def test_the_undisturbed_norm_is_the_papers():

@@ -51,19 +51,6 @@ def test_derivative_is_the_published_model(vx, vy, r, steer, ax, mu):
 
 
 @exact
-@given(st.floats(0.0, 70.0), lateral, yaw_rates, steering, friction)
-def test_left_and_right_are_mirrored(vx, vy, r, steer, mu):
-    for car in (SEDAN, STIFFNESS_CAR):
-        p = model_parameters(car)
-        left = nominal_model.state_derivative(vx, vy, r, steer, 0.0, mu, p)
-        right = nominal_model.state_derivative(vx, -vy, -r, -steer, 0.0, mu, p)
-        assert left == (right[0], -right[1], -right[2])
-        assert nominal_model.measured_lateral_acceleration(vx, vy, r, steer, mu, p) == (
-            -nominal_model.measured_lateral_acceleration(vx, -vy, -r, -steer, mu, p)
-        )
-
-
-@exact
 @given(lateral, yaw_rates, steering, friction)
 def test_blend_has_no_step_in_speed(vy, r, steer, mu):
     # At both ends of the blend, and inside it, a speed change of 1e-9 m/s causes no jump in any output.
@@ -136,11 +123,6 @@ def test_steps_are_divided_until_they_are_stable(vx, dt, mu, steer):
     assert abs(state[1]) < 50 and abs(state[2]) < 10
 
 
-def test_one_millisecond_needs_no_division_on_the_road():
-    assert nominal_model.substeps(25.0, 0.001, FRICTION, P) == 1
-    assert nominal_model.substeps(25.0, 0.3, FRICTION, P) > 1
-
-
 @pytest.mark.parametrize("mu", [0.2, 0.85, 1.1])
 @pytest.mark.parametrize("front", [True, False])
 def test_a_reference_friction_keeps_the_stiffness_and_scales_the_peak(front, mu):
@@ -171,12 +153,6 @@ def test_tyre_known_by_its_stiffness(mu, front):
     assert max(sweep) <= mu * load * (1 + 1e-12)
     assert max(sweep) > 0.99 * mu * load or mu > 1.5  # the stiffest road needs more slip than the sweep has
     assert STIFFNESS_CAR.cornering_stiffness_n_per_rad(front, mu) == pytest.approx(stiffness, rel=1e-12)
-
-
-def test_magic_formula_stiffness_is_proportional_to_friction():
-    tyre = (P.front_B, P.front_C, P.front_D_n, P.front_E, P.front_fixed_stiffness)
-    slopes = [nominal_model.magic_formula_force(1e-7, *tyre, mu) / 1e-7 for mu in (0.3, 0.6)]
-    assert slopes == pytest.approx([12.3 * 1.41 * 7600 * 0.3, 12.3 * 1.41 * 7600 * 0.6], rel=1e-6)
 
 
 @exact

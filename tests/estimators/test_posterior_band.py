@@ -90,11 +90,6 @@ def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
     np.testing.assert_allclose(wide.vy_std_m_s[fast] ** 2, expected[fast], rtol=1e-9)
 
 
-def test_what_is_known_less_has_the_wider_band(signals: Signals) -> None:
-    (_, narrow), (_, wide) = (banded(identified(share), signals) for share in (0.05, 0.4))
-    assert np.mean(wide.sideslip_std_rad) > 1.3 * np.mean(narrow.sideslip_std_rad)
-
-
 def test_a_file_that_no_drive_has_shown_to_be_right_has_the_interval_of_its_prior() -> None:
     """Errors of a file with a wrong rear axle are inside; an identified car's interval contains its posterior only."""
     true = with_noise(drive(slalom(0.03, 0.5), 6.0, speed=22.0).signals, seed=3)

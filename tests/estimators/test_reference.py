@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.estimators import kinematic_filter as kinematics
-from pdhef_logtool.estimators.reference import inputs
 from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference, refer, sideslip_std
 from pdhef_logtool.estimators.reference.estimator import steps_at
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -312,14 +311,6 @@ _OVER_THE_OFFSET = {
 }
 #: The transition neglects errors of the gyro in the centripetal term and in the tilt.
 _SECOND_ORDER = {kinematics.YAW_RATE_BIAS, kinematics.YAW_RATE_GAIN}
-
-
-def test_the_noise_of_a_sensor_that_repeats_its_samples_is_that_of_the_new_ones():
-    rng = np.random.default_rng(0)
-    noise = np.repeat(0.2 * rng.standard_normal(500), 4)
-    held = replace(SLALOM.signals.rows(0, 2000), ay_m_s2=noise)
-    found = inputs.white_noise(held.stamps_ns, held.ay_m_s2, 0.0)
-    assert found == pytest.approx(0.2 * np.sqrt(0.04), rel=0.15)
 
 
 def test_gnss_that_does_not_change_as_the_imu_is_not_used():

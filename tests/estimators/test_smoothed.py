@@ -24,7 +24,7 @@ from pdhef_logtool.estimators.base import Smoother
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.smoothed import BLOCK_S, ForwardSteps, SmoothedPhysics, smooth_steps
 from pdhef_logtool.estimators.table import SPECS, make_estimator
-from pdhef_logtool.estimators.vehicle_ukf import PosteriorSteps, StepLinks, VehicleUkf
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.reasons import BURST_YAW_RATE, DEAD_YAW_RATE, STUCK_YAW_RATE
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -321,19 +321,6 @@ def test_its_weights_know_what_comes_later():
     later, now = (run_estimator(e, signals).mixture_weight for e in (estimator, estimator.filtered))
     assert now[:10].max() < 0.6
     assert later.min() > 0.99
-
-
-def test_links_cost_the_filter_no_bit(rough):
-    physics = smoother().filtered.physics
-    plain, after = physics.run(rough, None)
-    steps, again, links = physics.linked_steps(rough, None)
-    for name in (f.name for f in fields(PosteriorSteps)):
-        np.testing.assert_array_equal(getattr(plain, name), getattr(steps, name))
-    np.testing.assert_array_equal(after.belief.P, again.belief.P)
-    starts = ~np.isfinite(steps.prior[:, 0])
-    np.testing.assert_array_equal(links.linked, ~starts)
-    assert starts.sum() == 2
-    assert isinstance(links, StepLinks)
 
 
 def test_what_it_says_of_itself(rough):

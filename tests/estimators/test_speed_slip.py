@@ -177,16 +177,6 @@ def test_without_an_accelerometer_nothing_is_gated(good):
     assert without_slip(blind, SENSORS, None)[0] is blind
 
 
-@pytest.mark.parametrize("first", [150, 400, 700])
-def test_nothing_is_seen_ahead(good, first):
-    slip = spin(good.time_s, size=12.0)
-    rough = with_wheels(good.signals, good.signals.speed_m_s + slip, good.signals.speed_m_s + 0.7 * slip)
-    whole = believed(rough)
-    assert np.isnan(whole).sum() > np.isnan(rough.speed_m_s).sum()
-    later = replace(rough, speed_m_s=np.where(np.arange(len(rough)) >= first, 3.0, rough.speed_m_s))
-    np.testing.assert_array_equal(believed(later)[:first], whole[:first])
-
-
 @pytest.mark.parametrize("estimator", FILTERS, ids=lambda e: e.name)
 @pytest.mark.slow
 def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(estimator, good):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -17,14 +16,11 @@ from pdhef_logtool.car.parts import (
     FilterNoise,
     FittedPhysics,
     FittedValues,
-    IntervalEntry,
-    Intervals,
 )
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Smoother
-from pdhef_logtool.estimators.intervals import SIDESLIP_TERMS
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.presets import OPEN_LOOP, options_of, preset_of
 from pdhef_logtool.estimators.table import (
@@ -45,8 +41,6 @@ from pdhef_logtool.estimators.vehicle_ukf import FILE_LAG, PHYSICS_Q_STD
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.runs.estimating import calibrator
-from tests.estimators.made_inflation import make_inflation
 
 pytestmark = pytest.mark.slow
 
@@ -113,17 +107,6 @@ def test_what_it_needs_is_what_it_needs(spec: Any, signals: Signals) -> None:
         assert [s.reason for s in skipped] == [f"the log has no {lacking}"]
         without = replace(bare, **{lacking: np.full(len(bare), np.nan)})
         assert not same(run(spec.name, without), track), lacking
-
-
-@every_spec
-def test_only_what_is_causal_sees_nothing_of_what_comes(spec: Any, signals: Signals) -> None:
-    at = 300
-    later = np.arange(len(signals)) >= at
-    changed = replace(
-        signals, ay_m_s2=np.where(later, 9.0, signals.ay_m_s2), speed_m_s=np.where(later, 5.0, signals.speed_m_s)
-    )
-    before = int(np.searchsorted(signals.stamps_ns, signals.ready_ns[at]))
-    assert same(run(spec.name, changed), run(spec.name, signals), before) == spec.causal
 
 
 @every_spec
@@ -276,21 +259,6 @@ def test_gain_and_speed_sensor_are_told() -> None:
 BARE = replace(CAR, network_gain=None, noise={})
 
 
-def intervals_for(*algorithms: Algorithm, factor: float = 2.0) -> Intervals:
-    inflation = make_inflation([factor * (k == 1) for k in range(len(SIDESLIP_TERMS))], (0.0, 1.0, 0.0))
-    entries = tuple(IntervalEntry(estimator="pd-hef", algorithm=a, inflation=inflation) for a in algorithms)
-    return Intervals(car="car", physics_sha256=CAR.physics_sha256, roll_gradient_rad_per_m_s2=0.0, entries=entries)
-
-
-def with_intervals(car: Car, intervals: Intervals, signals: Signals) -> tuple[float, Sequence[str]]:
-    """Return the factor by which intervals widen the 1-sigma sideslip of pd-hef, and the notes."""
-    estimator = make_estimator("pd-hef", car)
-    track = run_estimator(estimator, signals)
-    applied = calibrator(replace(car, intervals=intervals), [estimator])
-    ratio = applied.apply(track, signals).sideslip_std_rad / track.sideslip_std_rad
-    return float(np.nanmedian(ratio)), applied.notes("pd-hef")
-
-
 def test_the_gain_decides_what_pd_hef_is() -> None:
     trusted, cautious = make_estimator("pd-hef", CAR), make_estimator("pd-hef", BARE)
     assert trusted.name == cautious.name == "pd-hef"
@@ -300,25 +268,3 @@ def test_the_gain_decides_what_pd_hef_is() -> None:
     assert ran("pd-hef", without) == ran("physics", without)
     papers = replace(CAR, network=MODEL.paper_network)
     assert ran("pd-hef", papers) == ran("physics", papers)
-
-
-def test_intervals_of_the_one_are_never_put_on_the_other(signals: Signals) -> None:
-    hybrid, cautious = ran("pd-hef"), ran("pd-hef", BARE)
-    for car, algorithm in ((BARE, hybrid), (CAR, cautious)):
-        ratio, notes = with_intervals(car, intervals_for(algorithm), signals)
-        assert ratio != pytest.approx(2.0)  # the interval of the parameters' prior
-        assert not any(note.startswith("intervals calibrated on car") for note in notes)
-    for car, algorithm in ((CAR, hybrid), (BARE, cautious)):
-        ratio, notes = with_intervals(car, intervals_for(algorithm), signals)
-        assert ratio == pytest.approx(2.0)
-        assert notes == ("intervals calibrated on car for friction and vehicle as given",)
-
-
-def test_a_gain_changes_no_physics_so_that_the_notes_of_other_filters_stay(signals: Signals) -> None:
-    """A gain makes pd-hef another algorithm; the intervals of all others hold, and nobody calls them foreign."""
-    entries = intervals_for(ran("phy-ukf", BARE))
-    for car in (BARE, CAR):
-        estimator = make_estimator("phy-ukf", car)
-        applied = calibrator(replace(car, intervals=entries), [estimator])
-        applied.apply(run_estimator(estimator, signals), signals)
-        assert applied.notes("phy-ukf") == ("intervals calibrated on car for friction and vehicle as given",)

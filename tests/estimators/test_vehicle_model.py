@@ -10,14 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physics_oracle import ALL_PARTS, CG_HEIGHT_M, TRACK_M, G, Oracle, names_of, parts, vehicle
-from reference_car import FRICTION, FRONT_M, MASS_KG, REAR_M, WHEELBASE_M, magic_tyre
+from reference_car import FRICTION, FRONT_M, MASS_KG, REAR_M, WHEELBASE_M
 
 from pdhef_logtool.car import nominal_model
 from pdhef_logtool.car.nominal_model import model_parameters
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.vehicle_model import (
     AX_BIAS,
-    CORE,
     LANES,
     NOMINAL,
     PLACES,
@@ -34,7 +33,6 @@ from pdhef_logtool.estimators.vehicle_model import (
     grip_under_braking,
     layout_of,
     physics_parameters,
-    planar_ay,
     push,
     read,
     settle_forces,
@@ -147,16 +145,6 @@ def test_states_of_a_block_move_and_are_read_as_one_state_of_the_nominal_model(c
 # --- with axle forces and parts --------------------------------------------------------------------------------------
 
 
-def test_the_layout_of_every_combination_of_parts():
-    for choice in range(2 ** len(ALL_PARTS)):
-        names = [name for i, name in enumerate(ALL_PARTS) if choice >> i & 1]
-        layout, entries = layout_of(vehicle(*names)), names_of(parts(*names))
-        assert layout.size == len(entries) == len(layout.places) > CORE
-        assert (np.diff(layout.places) > 0).all()
-        want = [entries.index(e) if e in entries else -1 for e in ("ff", "phi", "bank", "s", "b_delta", "b_ay")]
-        assert list(layout[1:]) == want
-
-
 @pytest.mark.parametrize("ax", [0.1, -4.0])
 @every_set
 def test_a_step_is_that_of_the_equations_to_the_second_order(names, ax):
@@ -191,29 +179,6 @@ def test_at_low_speed_it_rolls_without_slip(names, speed):
     np.testing.assert_allclose(end[[0, 1, 2]], want[[0, 1, 2]], atol=2e-3)
 
 
-@pytest.mark.parametrize(("vx", "vy", "r", "steer"), [(25.0, 0.4, -0.2, 0.03), (12.0, -0.3, 0.4, -0.05)])
-def test_without_parts_it_is_the_nominal_model(vx, vy, r, steer):
-    """Without lag, the filter uses the tyre forces directly, and its a_y equals the nominal model with roll."""
-    v = vehicle(imu_position_m=(*IMU, 0.0))
-    p = model_parameters(v, roll_correction=True)
-    x = settled(v, [vx, vy, r, 0.0, 7.0, -7.0], steer)
-    want = (
-        magic_tyre(steer - math.atan((vy + FRONT_M * r) / vx), FRICTION, True) / MASS_KG,
-        magic_tyre(-math.atan((vy - REAR_M * r) / vx), FRICTION, False) / MASS_KG,
-    )
-    np.testing.assert_allclose(x[4:6], want, rtol=1e-6)
-    want_ay = nominal_model.measured_lateral_acceleration(vx, vy, r, steer, FRICTION, p)
-    assert readings_of(v, x, steer)[Z_AY] == pytest.approx(want_ay, rel=1e-6)
-    errors = []
-    for h in (0.01, 0.005):
-        end = moved(v, x, HeldInputs(steer, 0.5, True, FRICTION), h)
-        want = nominal_model.rk4_step(vx, vy, r, steer, 0.5, FRICTION, h, 4, p)
-        errors.append(np.abs(end[:3] - want).max())
-    assert errors[0] < 1e-3
-    assert errors[0] / errors[1] > 6.0, "of one step the third order of its length"
-    np.testing.assert_allclose(end[4:6], settled(v, end, steer)[4:6], atol=0.01)
-
-
 def test_a_vanishing_lag_is_no_lag():
     """From one limit to the other without a jump, and stable where the lag is far below the step."""
     ends = []
@@ -223,18 +188,6 @@ def test_a_vanishing_lag_is_no_lag():
             x = moved(v, x, HeldInputs(0.03 * math.sin(0.06 * k), 0.0, True, FRICTION), 0.01)
         ends.append(x)
     np.testing.assert_allclose(ends[1:], [ends[0]] * 2, rtol=2e-3, atol=2e-3)
-
-
-@pytest.mark.parametrize("speed", [8.0, 40.0])
-@pytest.mark.parametrize("length", [0.3, 0.7])
-def test_a_force_builds_up_over_the_relaxation_length(speed, length):
-    """At a slip angle that stays (a body too heavy to move): f = f_ss (1 − exp(−v t / σ))."""
-    v = vehicle("lag", mass_kg=1e12, yaw_inertia_kg_m2=1e12, relaxation_length_m=length)
-    x, steer = np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0]), 0.02
-    for k in range(1, 21):
-        x = moved(v, x, HeldInputs(steer, 0.0, True, FRICTION), 0.005)
-        want = magic_tyre(steer, FRICTION, True) / 1e12 * (1.0 - math.exp(-speed * k * 0.005 / length))
-        assert x[4] == pytest.approx(want, rel=1e-5)
 
 
 @pytest.mark.parametrize("ay", [0.0, 3.0, -6.0, 30.0])
@@ -276,26 +229,6 @@ def test_braking_moves_load_and_takes_grip(ax, mu):
     assert grip_under_braking(ax, mu, none.front_load_per_ax) == 1.0
 
 
-@pytest.mark.parametrize("names", [("roll",), ("lag", "roll", "load_transfer")], ids="+".join)
-def test_roll_settles_where_the_springs_hold_it(names):
-    """In steady state φ = G a_y, and the sensor reads the same as on a car without a roll mode."""
-    v = vehicle(*names)
-    x = np.zeros(layout_of(v).size)
-    x[0] = 20.0
-    for _ in range(1000):  # the speed is put back, so that the bend stays
-        x = moved(v, x, HeldInputs(0.03, 0.0, True, FRICTION), 0.01)
-        x[0] = 20.0
-    layout, p, _ = models(v)
-    ay = planar_ay(x, 0.03, FRICTION, 0.0, layout, p)
-    assert abs(ay) > 2.0
-    assert x[layout.roll] == pytest.approx(0.0105 * ay, rel=1e-6)
-    assert x[layout.roll + 1] == pytest.approx(0.0, abs=1e-9)
-    assert ay == pytest.approx(x[0] * x[2], rel=1e-5)
-    assert readings_of(v, x, 0.03)[Z_AY] == pytest.approx((1.0 + G * 0.0105) * ay, rel=1e-6)
-    started = settled(v, [*x[:6], 9.0, 0.0], 0.03)
-    np.testing.assert_allclose(started[4:7], x[4:7], rtol=1e-4)
-
-
 def test_a_car_that_does_not_lean_has_the_load_transfer_of_its_acceleration():
     """With a roll gradient of 0, the load transfer follows from a_y, without a division by zero."""
     v = vehicle("roll", "load_transfer", roll_gradient_rad_per_m_s2=0.0)
@@ -312,19 +245,6 @@ def test_the_sensors_read_what_the_equations_say(names, speed):
     x, v = state_of(oracle, steer, 0.0, FRICTION, vx=speed), oracle.as_vehicle()
     gyro = x[YAW_RATE] + (ENTRIES["b_r"] if "biases" in names else 0.0)
     np.testing.assert_allclose(readings_of(v, x, steer), [oracle.sensed_ay(x, steer), gyro, speed], rtol=1e-12)
-
-
-def test_a_residual_pushes_with_the_force_scale_and_the_accelerometer_feels_it():
-    v = vehicle("force_scale")
-    layout, p, f = models(v)
-    x = np.zeros(layout.size)
-    x[VX], x[layout.force_scale] = 20.0, 0.2
-    block, readings = block_of(layout, x[None]), np.zeros((READINGS, WIDTH))
-    push(block.ravel(), LANES, 20.0, (0.5, -0.3), 0.01, p)
-    np.testing.assert_allclose(block[[VY, YAW_RATE], 0], [0.5 * 1.2 * 0.01, -0.3 * 1.2 * 0.01])
-    read(block_of(layout, x[None]).ravel(), 1, 0.0, FRICTION, 0.5, layout, p, f, readings.ravel())
-    assert readings[Z_AY, 0] == pytest.approx((1.0 + G * f.roll_gradient) * 0.5 * 1.2)
-    assert planar_ay(x, 0.0, FRICTION, 0.5, layout, p) == pytest.approx(0.5 * 1.2)
 
 
 def test_long_steps_are_divided_for_the_roll_mode():

@@ -17,7 +17,6 @@ from reference_car import (
     drive,
     forces,
     keep,
-    make_signals,
     rolling_drive,
     runge_kutta,
     slalom,
@@ -236,14 +235,6 @@ def test_linked_steps_are_the_steps_and_their_links_end_where_the_filter_starts(
     assert links.predicted_P[opened, 2, 2] > 5.0 * links.predicted_P[opened - 1, 2, 2]
 
 
-def test_noise_of_the_sensors_is_that_of_the_vehicle_file(irregular):
-    sensors = VEHICLE.sensors.model_copy(update={"ay_std_m_s2": 0.3})
-    by_file = nominal_filter(VEHICLE.model_copy(update={"sensors": sensors}))
-    given = replace(UKF, r_std=(0.3, *UKF.measurement_std[1:]))
-    np.testing.assert_array_equal(posteriors(irregular, by_file).x, posteriors(irregular, given).x)
-    assert not np.array_equal(posteriors(irregular).x, posteriors(irregular, given).x)
-
-
 @pytest.fixture(scope="module")
 def good() -> Drive:
     made = drive(slalom(0.03, 0.5), 8.0)
@@ -452,17 +443,6 @@ def test_with_axle_forces_a_lost_steering_angle_is_a_state(good):
     assert not blind[(good.time_s > 4.5) & (good.time_s < 6.0)].any() and blind[good.time_s > 6.05].all()
 
 
-def test_without_longitudinal_acceleration_the_speed_follows_its_sensor():
-    made = drive(slalom(0.02, 0.5), 10.0, acceleration=lambda t: 3.0 * np.sin(t))
-    signals = replace(with_noise(made.signals, 3), ax_m_s2=np.full(len(made.signals), np.nan))
-    steps = posteriors(signals)
-    settled = made.time_s > 1.0
-    assert steps.valid.all()
-    assert np.abs(steps.x[settled, 0] - made.vx[settled]).max() < 0.6
-    error = np.arctan2(steps.x[:, 1], steps.x[:, 0]) - made.sideslip
-    assert np.abs(error[settled]).max() < 0.3 * DEGREE
-
-
 def test_the_random_walk_covers_exactly_the_steps_without_acceleration(good):
     """An interval is driven by the samples at its ends: it is a random walk where neither is there."""
     at = 301
@@ -557,25 +537,6 @@ def test_one_spike_is_no_divergence(good):
     assert not run_window(UKF, spike)[0].diverged.any()
 
 
-def simulate_from_the_filters_own_model(q_std, r_std, seconds, seed):
-    """Draw a drive with the process noise that the filter assumes: exactly its own statistical model."""
-    rng = np.random.default_rng(seed)
-    n, dt = round(seconds * 100), 0.01
-    state, bias = np.array([22.0, 0.0, 0.0]), 0.0
-    rows = np.empty((n, 5))
-    for k in range(n):
-        steer = 0.02 * math.sin(0.02 * k)
-        ax = -state[1] * state[2] + 0.2 * (22.0 - state[0])
-        ay, _ = forces(*state, steer, FRICTION)
-        z = np.array([ay, state[2], state[0]]) + r_std * rng.standard_normal(3)
-        rows[k] = steer, ax + bias, *z
-        noise = np.array(q_std) * math.sqrt(dt) * rng.standard_normal(4)
-        state = runge_kutta(state, steer, ax, FRICTION, dt) + noise[:3]
-        bias += noise[3]
-    names = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
-    return make_signals(np.full(n - 1, dt), **dict(zip(names, rows.T, strict=True)))
-
-
 def innovation_log_likelihood(estimator: VehicleUkf, signals: Signals) -> tuple[float, int]:
     """Return the Gaussian log-likelihood of all innovations of a drive and how many scalar innovations it sums.
 
@@ -584,29 +545,6 @@ def innovation_log_likelihood(estimator: VehicleUkf, signals: Signals) -> tuple[
     """
     steps, _ = estimator.run(signals, None)
     return float(steps.log_likelihood.sum()), int(np.isfinite(steps.innovation).sum())
-
-
-def test_innovation_likelihood_peaks_at_the_true_process_noise():
-    q, r = np.array([0.1, 0.2, 0.1, 0.05]), np.array([0.12, 0.004, 0.08])
-    signals = simulate_from_the_filters_own_model(q, r, 25.0, seed=1)
-    scales = 2.0 ** np.arange(-4, 5)
-    for only in (slice(0, 4), slice(1, 2), slice(2, 3)):
-
-        def likelihood(scale, part=only):
-            tried = q.copy()
-            tried[part] *= scale
-            return innovation_log_likelihood(replace(UKF, q_std=tuple(tried), r_std=tuple(r)), signals)[0]
-
-        best = scales[np.argmax([likelihood(s) for s in scales])]
-        assert 0.5 <= best <= 2.0
-    # Of the matched filter NIS is chi-square: its mean is its degrees of freedom.
-    matched = replace(UKF, q_std=tuple(q), r_std=tuple(r))
-    steps = posteriors(signals, matched)
-    assert (steps.nis[100:] / steps.nis_dof[100:]).mean() == pytest.approx(1.0, abs=0.06)
-    assert not rejected(steps).any()
-    total, count = innovation_log_likelihood(matched, signals)
-    assert count == 3 * (len(signals) - 1)
-    assert math.isfinite(total)
 
 
 def test_rejecting_a_sample_gains_nothing(good):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,8 @@ import pytest
 
 from pdhef_logtool.car.parts import LearntOn
 from pdhef_logtool.learning.drives import DriveRecord, LearnSettings, choose_drives, exit_code, set_manifest, tell_drive
-from pdhef_logtool.learning.network import extract_command
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
 
@@ -24,13 +21,6 @@ SALOON = RunConfig(car=Path("saloon"))
 
 def record(name: str, **changes: Any) -> DriveRecord:
     return replace(DriveRecord(name, f"{name}.mcap", sha256=name * 64, seconds=6.0, span_s=(1.5, 7.5)), **changes)
-
-
-def logs(folder: Path, names: str) -> list[str]:
-    folder.mkdir(exist_ok=True)
-    for name in names:
-        (folder / f"{name}.mcap").write_bytes(b"")
-    return [str(folder / f"{name}.mcap") for name in names]
 
 
 def test_a_record_in_json_and_as_a_car_remembers_it() -> None:
@@ -92,26 +82,3 @@ def test_three_refused_drives_are_named_and_the_rest_counted(tmp_path: Path) -> 
 def test_wrong_settings_are_usage_errors(wrong: dict[str, Any], place: str) -> None:
     with pytest.raises(UsageError, match=place):
         LearnSettings(config=SALOON, **wrong)
-
-
-def test_extract_tells_its_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[tuple[str, float]] = []
-
-    def one(job: Any, progress: Callable[[float], None]) -> Any:
-        progress(0.5)
-        return extract_command._failure(job, "it is no log")
-
-    monkeypatch.setattr(extract_command, "_extract", one)
-    arguments = logs(tmp_path / "set", "ab")
-    warned: list[str] = []
-    result = extract_command.extract(
-        arguments,
-        tmp_path / "out",
-        extract_command.ExtractSettings(SALOON),
-        reporter=Reporter(lambda *x: told.append(x), warned.append),
-    )
-    assert told == [("a", 0.25), ("a", 0.5), ("b", 0.75), ("b", 1.0)]
-    assert warned == ["a is left out: it is no log", "b is left out: it is no log"]
-    assert result.exit_code == 1
-    assert result.manifest["failed"] == [{"log": n, "file": f"{n}.mcap", "reason": "it is no log"} for n in "ab"]
-    assert result.manifest["vehicles"] == [] and result.manifest["period_s"] is None

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -444,14 +440,6 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
         assert np.corrcoef(found.targets[both, i], other.targets[both, i])[0, 1] > 0.95
 
 
-@pytest.mark.slow
-def test_errors_are_one_line(tmp_path: Path) -> None:
-    result = called("extract", str(tmp_path / "none.mcap"), "-o", str(tmp_path / "out"))
-    assert result.returncode != 0
-    assert result.stderr.splitlines()[-1].startswith("pdhef: ")
-    assert "Traceback" not in result.stderr
-
-
 def test_a_dataset_never_replaces_what_it_is_made_from(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = tmp_path / "dlc.mcap"
     shutil.copy(sample_logs_dir / "dlc.mcap", log)
@@ -467,36 +455,3 @@ def test_a_dataset_is_written_by_one_command_at_a_time(sample_logs_dir: Path, tm
     with OutputFolder(tmp_path), pytest.raises(OutputError, match="another command is writing to"):
         extract([str(sample_logs_dir / "dlc.mcap")], tmp_path, ExtractSettings(RunConfig()))
     assert list(tmp_path.iterdir()) == []
-
-
-def _children(pid: int) -> list[int]:
-    return [int(c) for c in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="looks for processes in /proc")
-@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.fleet)])
-def test_a_command_that_is_ended_takes_its_processes_with_it(
-    dataset: ExtractResult, sample_logs_dir: Path, tmp_path: Path, number: int
-) -> None:
-    out = tmp_path / "out"
-    logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "sweep.mcap")]
-    command = [sys.executable, "-m", "pdhef_logtool", "extract", *logs, "-o", str(out), "--seed", "4", "--jobs", "2"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        children: list[int] = []
-        # The server and two workers.
-        while len(children) < 3 or not list(out.glob("split=*/car=*/.*.partial")):
-            assert process.poll() is None
-            time.sleep(0.01)
-            children = [c for server in _children(process.pid) for c in (server, *_children(server))]
-        process.send_signal(number)
-        said = process.communicate(timeout=300)[1]
-    assert process.returncode == (143 if number == signal.SIGTERM else -number)
-    assert said.endswith("final name\n") or number == signal.SIGKILL
-    ends = time.monotonic() + 300.0
-    while any(Path(f"/proc/{child}/stat").exists() for child in children) and time.monotonic() < ends:
-        time.sleep(0.05)
-    assert not any(Path(f"/proc/{child}/stat").exists() for child in children)
-    assert extract(logs, out, ExtractSettings(RunConfig(), seed=4)).manifest == dataset.manifest
-    files = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
-    assert files == {"manifest.json", *(d["file"] for d in dataset.manifest["drives"])}

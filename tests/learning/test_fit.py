@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,33 +75,6 @@ def test_training_that_stopped_half_way_ends_as_if_it_had_not(tmp_path: Path) ->
     resumed, again = train(training, validation, SMALL, tmp_path / "cut")
     assert resumed.sha256 == whole.sha256
     assert [e.validation_loss for e in again] == [e.validation_loss for e in history]
-
-
-def test_a_killed_training_resumes(tmp_path: Path) -> None:
-    code = (
-        "import sys; sys.path.insert(0, sys.argv[1])\n"
-        "from test_fit import *\n"
-        "long = replace(SMALL, epochs=400, patience=400)\n"
-        "train(make_sequences(0, 8), make_sequences(1, 2), long, Path(sys.argv[2]))\n"
-    )
-    arguments = [sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path)]
-    process = subprocess.Popen(arguments, env=os.environ)
-    deadline = time.monotonic() + 300.0
-    while not (tmp_path / CHECKPOINT).exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    time.sleep(0.1)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    seen: list[int] = []
-
-    def stop(epoch: object, _of: int) -> None:
-        seen.append(getattr(epoch, "epoch", 0))
-        raise Stop
-
-    recipe = replace(SMALL, epochs=400, patience=400)
-    with pytest.raises(Stop):
-        train(make_sequences(0, 8), make_sequences(1, 2), recipe, tmp_path, progress=stop)
-    assert seen[0] > 1
 
 
 def test_fine_tuning_starts_where_the_other_model_ended(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,6 @@ from pdhef_logtool.runs.fleet import run_logs
 from tests.learning.stage_run import run_stage
 
 pytestmark = pytest.mark.slow
-
-REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 
 
 def _losses_by_command(log: Path, out: Path, config: RunConfig) -> dict[str, tuple[list[dict[str, Any]], list[str]]]:
@@ -47,27 +44,16 @@ def _losses_by_command(log: Path, out: Path, config: RunConfig) -> dict[str, tup
     return found
 
 
-def _check(found: dict[str, tuple[list[dict[str, Any]], list[str]]], name: str) -> None:
-    expected, _ = found["run"]
-    lost = [f"{name}: {x['what']} ({x['where']})" for x in expected if x["severity"] == "lost"]
-    assert lost
-    for command, (losses, told) in found.items():
-        assert losses == expected, command
-        if command != "run":
-            assert [text for text in told if text in lost] == lost, command
-
-
 def test_a_truncated_simulated_log(sample_logs_dir: Path, tmp_path: Path) -> None:
     data = (sample_logs_dir / "road.mcap").read_bytes()
     log = tmp_path / "cut.mcap"
     log.write_bytes(data[: len(data) * 6 // 10])
     config = RunConfig(car=sample_logs_dir / "vehicle.toml", end="34")
-    _check(_losses_by_command(log, tmp_path / "out", config), "cut")
-
-
-def test_the_truncated_drive_of_the_250_lm(shared_dir: Path, tmp_path: Path) -> None:
-    source = shared_dir / "data/drives/faulty/revs_250lm_a_truncated60.mcap"
-    log = Path(shutil.copyfile(source, tmp_path / "cut.mcap"))
-    vehicle, mapping = REFERENCE / "vehicles/revs_250lm.toml", REFERENCE / "mappings/revs_250lm.toml"
-    config = RunConfig(car=vehicle, mapping=mapping, end="40")
-    _check(_losses_by_command(log, tmp_path / "out", config), "cut")
+    found = _losses_by_command(log, tmp_path / "out", config)
+    expected, _ = found["run"]
+    lost = [f"cut: {x['what']} ({x['where']})" for x in expected if x["severity"] == "lost"]
+    assert lost
+    for command, (losses, told) in found.items():
+        assert losses == expected, command
+        if command != "run":
+            assert [text for text in told if text in lost] == lost, command

@@ -54,15 +54,6 @@ def rates(rows: ResidualRows) -> np.ndarray:
     return rows.targets / rows.step_s[:, None]
 
 
-def test_known_residual_comes_out(motion: Motion) -> None:
-    rows = rows_of(window(motion))
-    assert rows.weight[:-1].all()
-    assert rows.weight[-1] == 0.0
-    # 0.01 s trapezoids of a motion below 1 Hz.
-    np.testing.assert_allclose(rows.targets[:-1] / 0.01, motion.residual / 0.01, atol=2e-3)
-    assert np.std(motion.residual[:, 0] / 0.01) > 100 * 2e-3
-
-
 def test_residual_is_taken_at_the_true_state_not_at_the_estimate(motion: Motion) -> None:
     whole = window(motion)
     signals = whole.signals
@@ -74,45 +65,11 @@ def test_residual_is_taken_at_the_true_state_not_at_the_estimate(motion: Motion)
     np.testing.assert_array_equal(bad.targets, good.targets)
 
 
-def test_car_of_the_nominal_model_has_no_residual() -> None:
-    rows = rows_of(window(drive(10.0)))
-    assert np.abs(rates(rows)[:-1]).max() < 2e-3
-
-
-def test_wrong_friction_is_a_residual_of_force(motion: Motion) -> None:
-    """The truth has FRICTION; a nominal model with 10 % less lacks 10 % of the peak force, and its sign follows a_y."""
-    rows = rows_of(window(drive(10.0)), friction=0.9 * FRICTION)
-    ay = drive(10.0).ay[:-1]
-    slope = float(ay @ rates(rows)[:-1, 0] / (ay @ ay))
-    assert 0.05 < slope < 0.15
-
-
 def test_signal_friction_wins_over_the_vehicle_file() -> None:
     whole = window(drive(10.0))
     told = replace(whole, signals=replace(whole.signals, friction=np.full(len(whole.signals), FRICTION)))
     assert np.abs(rates(rows_of(told, friction=0.5))[:-1]).max() < 2e-3
     assert np.abs(rates(rows_of(whole, friction=0.5))[:-1]).max() > 0.5
-
-
-def test_smoothed_targets_of_a_noisy_truth_are_unbiased(motion: Motion) -> None:
-    exact = motion.residual / 0.01
-    errors = []
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        measured = motion.state + rng.normal(0.0, [0.01, 0.01, 0.002], motion.state.shape)
-        whole = replace(window(motion), truth=truth_of(motion.stamps_ns, measured))
-        rows = rows_of(whole, half_window=15)
-        use = rows.weight > 0
-        assert 0.97 < use.mean() < 1.0  # the ends have no window
-        found, true = rates(rows)[use], exact[use[:-1]]
-        errors.append(found - true)
-        gain = (found * true).sum(axis=0) / (true * true).sum(axis=0)
-        np.testing.assert_allclose(gain, 1.0, atol=0.05)
-    spread = np.sqrt(np.mean(np.square(errors), axis=(0, 1)))
-    # One-step differences have sqrt(2) sigma / dt = 1.4 m/s2 and 0.28 rad/s2.
-    assert spread[0] < 0.12 and spread[1] < 0.04
-    mean = np.abs(np.mean(errors, axis=(0, 1)))
-    assert mean[0] < 0.01 and mean[1] < 0.004
 
 
 def test_no_target_across_gaps_or_without_truth_or_steering(noisy: Measured) -> None:
@@ -197,15 +154,6 @@ def test_smoothing_keeps_cubics_on_uneven_stamps(coefficients: list[float], seed
     inner = slice(half_window, len(increments) - half_window)
     np.testing.assert_allclose(out[inner], increments[inner], atol=1e-9)
     assert np.isnan(out[:half_window]).all() and np.isnan(out[len(increments) - half_window :]).all()
-
-
-@pytest.mark.parametrize("sigma", [1e-3, 0.02])
-def test_noise_of_differences_is_measured_under_motion(motion: Motion, sigma: float) -> None:
-    rng = np.random.default_rng(5)
-    vy = motion.state[:, 1] + rng.normal(0.0, sigma, len(motion.t))
-    found = difference_noise(motion.stamps_ns, vy)
-    assert found == pytest.approx(np.sqrt(2) * sigma / 0.01, rel=0.1)
-    assert difference_noise(motion.stamps_ns, motion.state[:, 1]) < 0.01
 
 
 def test_staircase_truth_is_noise() -> None:

@@ -18,11 +18,10 @@ from pdhef_logtool.cli.learning_tables import render_learning
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.calibration.joint import FRONT_STIFFNESS, PEAK, parameters_of
-from pdhef_logtool.evaluation.bootstrap import Interval
 from pdhef_logtool.learning.car.taught_prior import TYRES, taught_parameters
 from pdhef_logtool.learning.drives import TEACH, LearnSettings
 from pdhef_logtool.learning.engine import LearnResult, learn
-from pdhef_logtool.learning.stages.teach import OpenedDrive, _folds, _support, learn_from, open_drive
+from pdhef_logtool.learning.stages.teach import OpenedDrive, _folds, learn_from, open_drive
 from pdhef_logtool.records.errors import EstimatorError, VehicleError
 from pdhef_logtool.runs.config import RunConfig
 
@@ -126,8 +125,6 @@ def test_the_prior_of_several_drives_is_tested_with_each_left_out(sample_logs_di
     (prior,) = taught.priors
     assert prior.test is not None and prior.test.blocks >= 4
     assert (prior.support > 0.5) == (prior.test.value < 0.0)
-    assert _support(None) == _support(Interval(0.0, 0.0, 0.0, 9)) == 0.0
-    assert _support(Interval(-1.0, -2.96, 0.96, 9)) == pytest.approx(0.841, abs=1e-3)
     file, weak, full = (
         {p.name: p for p in taught_parameters([d.taught for d in drives], car, support)} for support in (0.0, 0.5, 1.0)
     )

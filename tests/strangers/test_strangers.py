@@ -91,14 +91,10 @@ def test_containers_give_back_what_was_written(container: str, tmp_path: Path) -
     assert np.allclose(read["/speed"].fields["data"], force.values[:, 0], atol=1e-5)
 
 
-def test_the_sign_of_a_weak_signal_counts() -> None:
-    weak = 0.01 * _WAVE
-    assert agrees(_channel(weak), Series(_NS, _NS, weak), 0.03)
-    assert not agrees(_channel(-weak), Series(_NS, _NS, weak), 0.03)
-
-
-def test_an_accelerometer_may_have_a_bias_and_no_tilt() -> None:
-    right = Series(_NS, _NS, _WAVE)
+def test_the_sign_of_a_weak_signal_counts_and_an_accelerometer_may_have_a_bias() -> None:
+    weak, right = 0.01 * _WAVE, Series(_NS, _NS, _WAVE)
+    assert agrees(_channel(weak), replace(right, values=weak), 0.03)
+    assert not agrees(_channel(-weak), replace(right, values=weak), 0.03)
     assert agrees(_channel(_WAVE + 0.25), right, 0.1, bias_of("ay_m_s2"))
     assert not agrees(_channel(_WAVE + 0.85), right, 0.1, bias_of("ay_m_s2"))
     assert bias_of("yaw_rate_rad_s") == 0.0

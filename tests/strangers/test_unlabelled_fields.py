@@ -7,7 +7,6 @@ import pytest
 from fake_drive_log import FakeLog, FakeTopic
 
 from pdhef_logtool.mapping import auto_map
-from pdhef_logtool.mapping.naming import is_unlabelled
 from pdhef_logtool.records.signals import FloatArray
 from studies.strangers.cars import drive
 
@@ -78,11 +77,3 @@ def test_what_does_not_turn_is_not_guessed() -> None:
     for name in ("yaw rate", "lateral", "steering wheel"):
         values[name] = 0.001 * values["noise"]
     assert taken(numbered(values)) == {}
-
-
-@pytest.mark.parametrize(
-    ("name", "nothing"),
-    [("data[3]", True), ("ch07", True), ("k", True), ("signal_12", True), ("", True), ("pedal", False), ("vx", False)],
-)
-def test_names_that_say_nothing(name: str, nothing: bool) -> None:
-    assert is_unlabelled(name) is nothing
