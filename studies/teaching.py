@@ -94,8 +94,8 @@ These are development figures: the settings were chosen on these pairs.
 ## Taught by the reference
 With `--set reference=on`, `learn` takes the [sideslip reference](reference.md) of drives without ground truth, weighted
 by its standard deviation, where GNSS makes it independent of the other sensors. Of the pairs above only those of the
-V40 have a recorded GNSS receiver; a dash there states that a drive has less than 20 s with such a reference. The default
-is off: teaching by the reference is not validated.
+V40 have a recorded GNSS receiver; a dash there states that a drive has less than 20 s with such a reference.
+The default is off: teaching by the reference is not validated.
 """
 
 

@@ -294,12 +294,10 @@ def _weighable(
         its = meaning if name == path else meaning_of(topic.name, topic.type_name, name, info.unit)
         if its is None and meaning.quantity == "speed":
             its = replace(meaning, strength=0.5)  # one of several elements: only its values can identify it
-        if seen is None or its is None or not np.isfinite(seen.values).any():
+        if seen is None or its is None or not _is_measured(name, seen):
             continue
         if role == "sensor" and set(words_of(name)) & _NAVIGATION:
             role = "navigation"
-        if words_of(name)[-1:] in _STATES and is_enumeration(seen.values):
-            continue
         factors = _factors(its, seen)
         if its.quantity == "wheel speed" and not factors:  # too large for a speed: rotational
             its = replace(its, quantity="wheel rate")
@@ -320,6 +318,12 @@ def _weighable(
             item.sign = -1.0
             item.reasons.append("positive downward by its name")
         yield item
+
+
+def _is_measured(name: str, seen: Seen) -> bool:
+    """Return whether there are values, and not those of an enumeration."""
+    is_state = words_of(name)[-1:] in _STATES and is_enumeration(seen.values)
+    return bool(np.isfinite(seen.values).any()) and not is_state
 
 
 def _may_be_share(item: Field) -> bool:

@@ -80,18 +80,23 @@ def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
     )
     seen = {path: values for (_, path), values in samples.items()}
     places = {n: SignalSource(n, topic.name, first[q], stamp) for n, q in _PLACES.items()}
-    if not all(_is_place(seen.get(first[q]), most) for q, most in (("latitude", 90.0), ("longitude", 180.0))):
+    if not (_is_place(seen.get(first["latitude"]), 90.0) and _is_place(seen.get(first["longitude"]), 180.0)):
         return {}
-    found = [replace(places[n], name=f"gnss_{q}_deg") for n, q in _PLACES.items()]
-    course = _course(places, samples, topic.name, pieces)
+    sources = [replace(places[n], name=f"gnss_{q}_deg") for n, q in _PLACES.items()]
+    if (course := _course(places, samples, topic.name, pieces)) is None:
+        return {source.name: source for source in sources}
     sides = {side: seen[velocity[side]].cells for side in "ne" if velocity.get(side, "") in seen}
-    if course is not None and len(sides) > 1 and _median_off(np.arctan2(sides["n"], sides["e"]) - course) < NEAR_RAD:
-        unit = unit_of(velocity["n"].rpartition(".")[2], "speed")[1] or 1.0
-        named = (("gnss_velocity_east_m_s", "e"), ("gnss_velocity_north_m_s", "n"))
-        found += [SignalSource(name, topic.name, velocity[side], stamp, unit) for name, side in named]
-    elif course is not None:
-        found += _speed_and_course(topic.name, stamp, meanings, {p: seen[p] for p in angles if p in seen}, course)
-    return {source.name: source for source in found}
+    if len(sides) > 1 and _median_off(np.arctan2(sides["n"], sides["e"]) - course) < NEAR_RAD:
+        sources += _velocity_over_ground(topic.name, stamp, velocity)
+    else:
+        sources += _speed_and_course(topic.name, stamp, meanings, {p: seen[p] for p in angles if p in seen}, course)
+    return {source.name: source for source in sources}
+
+
+def _velocity_over_ground(topic: str, stamp: str, velocity: Mapping[str, str]) -> Iterator[SignalSource]:
+    unit = unit_of(velocity["n"].rpartition(".")[2], "speed")[1] or 1.0
+    for name, side in (("gnss_velocity_east_m_s", "e"), ("gnss_velocity_north_m_s", "n")):
+        yield SignalSource(name, topic, velocity[side], stamp, unit)
 
 
 def _speed_and_course(

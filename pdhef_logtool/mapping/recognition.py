@@ -703,24 +703,7 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
     axes, is_body = _axes(draft, chosen, candidates), _type(chosen) in BODY_TWIST_TYPES
     receives = not is_body and bool(_words(chosen.name) & NAVIGATION_WORDS)
     if axes in ("east, north", "north, east") or (receives and axes != "body"):
-        # Receivers and some simulators publish their velocity in axes of the earth with the same type.
-        is_down = axes == "north, east"
-        earth = "north, east, down" if is_down else "east, north, up"
-        readings = (f"{chosen.name} as body velocity", f"{chosen.name} as {earth}")
-        up = draft.values(chosen.name, _twist(chosen, "linear", "z"))
-        if not axes or (not is_body and not np.isfinite(up).any()):
-            draft.doubt("ground-truth velocity frame", readings, None, "too little motion to identify the frame")
-            return None
-        why = "x is not the direction of travel" if axes == "not ahead" else "it has the direction of its path"
-        draft.doubt("ground-truth velocity frame", readings, readings[1], why)
-        paths = tuple(_twist(chosen, "linear", a) for a in ("yxz" if is_down else "xyz"))
-        draft.take(draft.truth, "enu_velocity_m_s", chosen.name, paths)
-        if is_down:
-            draft.truth["enu_velocity_m_s"] = replace(draft.truth["enu_velocity_m_s"], scale=(1.0, 1.0, -1.0))
-        rates = draft.values(chosen.name, _twist(chosen, "angular", "z"))
-        if is_body and _span(rates) > 0.0:
-            draft.take(draft.truth, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
-        return chosen
+        return _take_earth_velocity(draft, chosen, axes, is_body=is_body)
     if axes == "not ahead":
         draft.doubt(
             "ground-truth velocity frame",
@@ -734,6 +717,28 @@ def _map_truth_velocity(draft: _Draft, candidates: list[TopicInfo]) -> TopicInfo
         filler = name == "yaw_rate_rad_s" and values.shape[0] > 0 and bool((values == 0.0).all())
         if draft.is_given(chosen.name, full) and not filler:
             draft.take(draft.truth, name, chosen.name, full)
+    return chosen
+
+
+def _take_earth_velocity(draft: _Draft, chosen: TopicInfo, axes: str, *, is_body: bool) -> TopicInfo | None:
+    """Take a ground-truth velocity in axes of the earth; return None if too little motion identifies them."""
+    # Receivers and some simulators publish their velocity in axes of the earth with the same type.
+    is_down = axes == "north, east"
+    earth = "north, east, down" if is_down else "east, north, up"
+    readings = (f"{chosen.name} as body velocity", f"{chosen.name} as {earth}")
+    up = draft.values(chosen.name, _twist(chosen, "linear", "z"))
+    if not axes or (not is_body and not np.isfinite(up).any()):
+        draft.doubt("ground-truth velocity frame", readings, None, "too little motion to identify the frame")
+        return None
+    why = "x is not the direction of travel" if axes == "not ahead" else "it has the direction of its path"
+    draft.doubt("ground-truth velocity frame", readings, readings[1], why)
+    paths = tuple(_twist(chosen, "linear", a) for a in ("yxz" if is_down else "xyz"))
+    draft.take(draft.truth, "enu_velocity_m_s", chosen.name, paths)
+    if is_down:
+        draft.truth["enu_velocity_m_s"] = replace(draft.truth["enu_velocity_m_s"], scale=(1.0, 1.0, -1.0))
+    rates = draft.values(chosen.name, _twist(chosen, "angular", "z"))
+    if is_body and _span(rates) > 0.0:
+        draft.take(draft.truth, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
     return chosen
 
 

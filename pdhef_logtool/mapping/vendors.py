@@ -204,7 +204,11 @@ def _read(path: Path) -> Vendors:
     ]
     receivers = tuple(
         VendorType(
-            {f.field: _field(f, f.scale, m.page) for f in m.fields if isinstance(f.field, str)},
+            {
+                f.field: _field(f, f.scale, m.page)
+                for f in m.fields
+                if isinstance(f.field, str) and isinstance(f.scale, float)
+            },
             has=frozenset(m.has),
             without=frozenset(m.without),
         )

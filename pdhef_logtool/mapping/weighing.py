@@ -7,7 +7,7 @@ or a sign; an open point becomes an undecided check with a remedy.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -201,11 +201,7 @@ class _Weighing:
     def _drop_vectors_over_ground(self) -> None:
         """Take velocities x, y over ground as those of a receiver; they are no velocities of the body."""
         steps, rates = path_velocity(self.fields), self.fields.open("rate", "z")
-        for y in [f for f in self.fields.candidates if f.meaning.quantity == "velocity" and f.is_axis and not f.fixed]:
-            beside = (f for f in self.fields.candidates if f.meaning.quantity == "speed" and triad_of(f) == triad_of(y))
-            x = next((f for f in beside if f.meaning.part == "x" and f.seen.changes), None)
-            if x is None or not y.seen.changes:
-                continue
+        for x, y in list(self._vectors()):
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
             length, speeds = np.hypot(x.si, y.si), [f.si for f in self.fields.open("speed") if f is not x]
             if axes in ("", "body") and not any(agree(v, length) and not agree(v, x.si) for v in speeds):
@@ -217,6 +213,13 @@ class _Weighing:
                     self.taken[f"gnss_velocity_{name}_m_s"] = item
                 note += f"; x and y are {axes.replace(', ', ' and ')}"
             self.notes.append(note)
+
+    def _vectors(self) -> Iterator[tuple[Field, Field]]:
+        """Yield the x and y of velocities that change."""
+        for y in self.fields.candidates:
+            if y.meaning.quantity == "velocity" and y.is_axis and not y.fixed and y.seen.changes:
+                beside = (f for f in self.fields.candidates if f.meaning.part == "x" and triad_of(f) == triad_of(y))
+                yield from ((x, y) for x in [f for f in beside if f.meaning.quantity == "speed" and f.seen.changes][:1])
 
     def note_unlabelled(self, topic: str, evidence: str) -> None:
         """Add a note that the fields of a topic were identified by their values only."""
