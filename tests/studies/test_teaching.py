@@ -31,18 +31,15 @@ def test_a_pair_is_worse_beyond_the_larger_of_both_limits() -> None:
     assert "0.63 (2 pairs)" in text and "worse" in teaching.pair_table([pair(0.2, 0.3)])
 
 
-def test_the_stored_results_have_every_pair_and_only_one_of_a_small_car_is_worse_than_untaught() -> None:
+def test_the_stored_results_have_every_pair_and_none_is_worse_than_untaught() -> None:
     stored = json.loads(teaching.RESULTS_FILE.read_text(encoding="utf-8"))
     counts = {car.name: len(car.parts) for car in CARS}
     for car in CARS:
         wanted = len(car.parts) - car.taught_on if car.taught_on > 1 else counts[car.name] * (counts[car.name] - 1)
         assert sum(r["car"] == car.name for r in stored) == wanted
-    worse = []
     for r in stored:
         before, after = r["untaught"]["rmse_deg"], r["hybrid"]["rmse_deg"]
-        if after > max(1.05 * before, before + 0.03):
-            worse.append((r["taught"], r["scored"]))
-    assert worse == [("5 runs", "f1tenth_xray_0")]
+        assert after <= max(1.05 * before, before + 0.03), (r["taught"], r["scored"])
 
 
 @pytest.mark.fleet
