@@ -429,7 +429,8 @@ _HEAD = ("drive", "GNSS", "true RMS", "RMSE", "±", "coverage", "valid", "RMSE t
 
 def _row(case: Case, got: Figures) -> list[str]:
     gnss = case.gnss if got.used_gnss or case.gnss == NONE else f"{case.gnss}, not used"
-    cells = (number(got.truth, 2), number(got.rmse, 2), number(got.std, 2), f"{100 * got.coverage:.0f} %")
+    coverage = f"{100 * got.coverage:.0f} %" if math.isfinite(got.coverage) else "–"
+    cells = (number(got.truth, 2), number(got.rmse, 2), number(got.std, 2), coverage)
     valid = f"{100 * got.valid_share:.0f} %"
     return [case.title, gnss, *cells, valid, number(got.valid_rmse, 2), got.refused.partition(" (")[0] or "–"]
 
