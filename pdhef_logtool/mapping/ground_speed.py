@@ -62,9 +62,14 @@ def axes_of(
     with np.errstate(invalid="ignore", divide="ignore"):
         turning = np.where(moving, (x * pieces.rate_of(y) - y * pieces.rate_of(x)) / length**2, np.nan)
     relation = None if rate is None else fit(pieces.smooth(rate), turning)
-    if relation is not None and abs(relation.correlation) > CLEAR:
-        return "east, north" if relation.correlation > 0.0 else "north, east"
-    if np.count_nonzero(moving) >= FEWEST_CELLS and np.mean((x > np.abs(y))[moving]) < AHEAD_SHARE:
+    sense = 0.0 if relation is None or abs(relation.correlation) <= CLEAR else relation.correlation
+    if sense > 0.0:
+        return "east, north"
+    known = np.count_nonzero(moving) >= FEWEST_CELLS
+    is_ahead = not known or bool(np.mean((x > np.abs(y))[moving]) >= AHEAD_SHARE)
+    if sense < 0.0 and steps is None:  # in a slide the direction in the body's axes turns against the car, too
+        return "" if is_ahead else "north, east"
+    if not is_ahead:
         return "not ahead"
     return "" if relation is None else "body"
 

@@ -100,7 +100,7 @@ def test_without_truth_the_consistency_is_put_in_words(d2: float, proof: str) ->
 def test_what_was_assumed_of_car_friction_and_network() -> None:
     assert texts()["assumed"] == (
         "car golf, validated on drives with ground truth; friction given (option, 0.9); "
-        "residual gain of the network 0.5, from the car's validation data"
+        "residual gain 0.5 within the region of validity"
     )
     unknown = texts(vehicle=UNKNOWN)
     assert unknown["assumed"].startswith("default sedan (no car given)")
