@@ -65,8 +65,8 @@ def axes_of(
     sense = 0.0 if relation is None or abs(relation.correlation) <= CLEAR else relation.correlation
     if sense > 0.0:
         return "east, north"
-    known = np.count_nonzero(moving) >= FEWEST_CELLS
-    is_ahead = not known or bool(np.mean((x > np.abs(y))[moving]) >= AHEAD_SHARE)
+    enough = np.count_nonzero(moving) >= FEWEST_CELLS
+    is_ahead = not enough or bool(np.mean((x > np.abs(y))[moving]) >= AHEAD_SHARE)
     if sense < 0.0 and steps is None:  # in a slide the direction in the body's axes turns against the car, too
         return "" if is_ahead else "north, east"
     if not is_ahead:
