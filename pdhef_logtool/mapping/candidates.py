@@ -21,7 +21,7 @@ from pdhef_logtool.mapping.channels import signed
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen, is_enumeration
 from pdhef_logtool.mapping.joints import is_joints, joint_meanings
-from pdhef_logtool.mapping.naming import UNIT_TEXTS, UNITS, Meaning, is_command, meaning_of, words_of
+from pdhef_logtool.mapping.naming import STATES, UNIT_TEXTS, UNITS, Meaning, is_command, meaning_of, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
 from pdhef_logtool.records.signals import FloatArray
@@ -35,8 +35,6 @@ Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 _NAVIGATION = frozenset({"gps", "gnss", "ins", "rtk"})
 #: Words for the axes of a car, for which only the sign is unknown.
 _CAR_AXES = frozenset({"lat", "lateral", "long", "longitudinal", "lng", "trans", "transverse", "transversal", "down"})
-#: Last words of names of enumerations, and of what is measured.
-_STATES = (("status",), ("state",), ("states",))
 #: Controls; a steering signal in the same struct may be a control, too.
 _PEDALS = frozenset({"throttle", "brake", "gas"})
 #: Affix that distinguishes the name of a sign from the name of its magnitude.
@@ -322,7 +320,7 @@ def _weighable(
 
 def _is_measured(name: str, seen: Seen) -> bool:
     """Return whether there are values, and not those of an enumeration."""
-    is_state = words_of(name)[-1:] in _STATES and is_enumeration(seen.values)
+    is_state = not STATES.isdisjoint(words_of(name)[-1:]) and is_enumeration(seen.values)
     return bool(np.isfinite(seen.values).any()) and not is_state
 
 

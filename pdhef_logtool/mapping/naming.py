@@ -55,6 +55,8 @@ def words_of(name: str) -> tuple[str, ...]:
     return tuple(words)
 
 
+#: Last words of names of enumerations, and of what is measured.
+STATES = frozenset({"state", "states", "status"})
 #: A wheel as ``FrL`` after letters of a speed.
 _SIDES = re.compile(r"(?<=[a-z_])(Fr|Re)([LR])(?![a-z])")
 #: A wheel before or after a word without a capital between: ``LFspeed``, ``WHEELSPEEDFL``.
@@ -160,9 +162,8 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
     if not leaf_words or _WORDS["other_devices"] & set(outer):
         return None
     # "current" before other words is an adjective; "state" beside them is the topic of an export, or what is measured.
-    states = ("state", "states", "status")
-    kept = {w for w in leaf_words[:-1] if w not in ("current", *states)}
-    kept |= {w for w in leaf_words[-1:] if w not in states or len(leaf_words) == 1}
+    kept = {w for w in leaf_words[:-1] if w not in {"current", *STATES}}
+    kept |= {w for w in leaf_words[-1:] if w not in STATES or len(leaf_words) == 1}
     if _WORDS["not_values"] & kept or _WORDS["not_values"] & set(inner) - {"state", "status", "orientation"}:
         return None
     index = re.search(r"\[(\d+)\]$", leaf)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -83,6 +83,9 @@ class _ReceiverTable(BaseModel):
     has: list[str]
     without: list[str] = []
     fields: list[_FieldTable]
+
+
+_Table = TypeVar("_Table", _TypeTable, _ReceiverTable)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,34 +189,14 @@ def _read(path: Path) -> Vendors:
         f"{key}: not known, expected [[types]] or [[receivers]]" for key in raw if key not in ("types", "receivers")
     ]
     types: dict[str, VendorType] = {}
-    entries = raw.get("types", [])
-    for number, table in enumerate(entries if isinstance(entries, list) else [], 1):
-        model = checked(_TypeTable, table, f"types[{number}]", problems)
-        if model is None:
-            continue
-        page = f"{model.page}, read {model.read}"
-        single = [(f.field, f.scale, f) for f in model.fields]
-        fields = {p: _field(f, x, page) for p, x, f in single if isinstance(p, str) and isinstance(x, float)}
+    for model in _tables(raw, "types", _TypeTable, problems):
+        fields = _single_fields(model.fields, f"{model.page}, read {model.read}")
         several = tuple(_vector(f) for f in model.fields if isinstance(f.field, list))
         kind = VendorType(fields, several, model.leave_out, frozenset(model.has))
         types |= {_plain(name): kind for name in model.type}
-    tables = raw.get("receivers", [])
-    made = [
-        checked(_ReceiverTable, t, f"receivers[{i}]", problems)
-        for i, t in enumerate(tables if isinstance(tables, list) else [], 1)
-    ]
     receivers = tuple(
-        VendorType(
-            {
-                f.field: _field(f, f.scale, m.page)
-                for f in m.fields
-                if isinstance(f.field, str) and isinstance(f.scale, float)
-            },
-            has=frozenset(m.has),
-            without=frozenset(m.without),
-        )
-        for m in made
-        if m is not None
+        VendorType(_single_fields(m.fields, m.page), has=frozenset(m.has), without=frozenset(m.without))
+        for m in _tables(raw, "receivers", _ReceiverTable, problems)
     )
     if problems:
         raise MappingFileError(
@@ -223,6 +206,20 @@ def _read(path: Path) -> Vendors:
             remedy="see docs/formats.md for every entry",
         )
     return Vendors(types, receivers)
+
+
+def _tables(raw: Mapping[str, Any], key: str, kind: type[_Table], problems: list[str]) -> Iterator[_Table]:
+    """Yield the sound tables of a key; what is wrong with the others is added to ``problems``."""
+    entries = raw.get(key, [])
+    for number, table in enumerate(entries if isinstance(entries, list) else [], 1):
+        if (model := checked(kind, table, f"{key}[{number}]", problems)) is not None:
+            yield model
+
+
+def _single_fields(tables: Iterable[_FieldTable], page: str) -> dict[str, VendorField]:
+    """Return the fields of one column by path."""
+    single = ((f.field, f.scale, f) for f in tables)
+    return {p: _field(f, x, page) for p, x, f in single if isinstance(p, str) and isinstance(x, float)}
 
 
 def _field(table: _FieldTable, scale: float, page: str) -> VendorField:

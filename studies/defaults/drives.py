@@ -9,6 +9,14 @@ from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import DriveRecord, no_true_sideslip, record_of
 from pdhef_logtool.learning.stages.task import Task
 from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.records.signals import BoolArray
+from pdhef_logtool.records.tracks import StateTrack
+
+
+def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
+    """Return a mask [N]: sideslip of the ground truth available, speed above the low-speed limit."""
+    finite: BoolArray = np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))
+    return finite
 
 
 def load_drive(
@@ -31,7 +39,7 @@ def load_drive(
         whole = drive.whole(fill_friction=fill_friction, max_bytes=MAX_BYTES)
         slow = task.car.vehicle.low_speed_blend_m_s
         assert whole.truth is not None
-        scored = int(np.count_nonzero(np.isfinite(signal_error(whole.truth, whole.truth, "sideslip_rad", slow))))
+        scored = int(np.count_nonzero(scorable_stamps(whole.truth, slow)))
         if scored < least_scored:
             return record_of(drive, left_out=f"{scored} stamps with a true sideslip above {slow:g} m/s"), None
         return record_of(drive, whole=whole), whole

@@ -33,7 +33,7 @@ from pdhef_logtool.learning.stages.task import Task
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
-from studies.defaults.drives import load_drive
+from studies.defaults.drives import load_drive, scorable_stamps
 
 #: Filters with a searched noise; the noise of ``physics`` is identified together with its values.
 TUNED = ("phy-ukf:tuned",)
@@ -142,7 +142,7 @@ def error_rad(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -> 
     """
     error = signal_error(estimate, truth, "sideslip_rad", low_speed_m_s)
     error = error[np.isfinite(error)]
-    scorable = truth.sideslip_rad[np.isfinite(signal_error(truth, truth, "sideslip_rad", low_speed_m_s))]
+    scorable = truth.sideslip_rad[scorable_stamps(truth, low_speed_m_s)]
     rms, zero = (float(np.sqrt(np.mean(x**2))) if x.size else math.nan for x in (error, scorable))
     if error.size == 0:
         return zero
