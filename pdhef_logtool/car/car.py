@@ -68,8 +68,7 @@ class WithoutTruth:
     ``told_friction`` : whether the calibration used the signals' friction; an estimated friction does not count.
     ``noise`` : of ``physics``. ``note`` : a warning for the reader of the report. ``varied`` : the vehicle one
     posterior 1-sigma away, in independent directions. ``driven_d2_m_s`` : part of the v̇_y residual of ``physics`` on
-    the log that correlates with the driving, NaN if unknown. ``earlier`` : earlier calibrations of the same log in time
-    order; each applies from its ``since_ns``. ``causal`` : whether it depends only on data before ``since_ns``.
+    the log that correlates with the driving, NaN if unknown. ``causal`` : whether it depends on no sample of the log.
     ``cg_std_m`` : as :attr:`Car.cg_std_m`. ``error_scale`` : residual of the sensors after the fit, relative to the
     assumption of the calibration.
     """
@@ -80,8 +79,6 @@ class WithoutTruth:
     note: str
     varied: tuple[VehicleParameters, ...] = ()
     driven_d2_m_s: float = math.nan
-    since_ns: int = 0
-    earlier: tuple[WithoutTruth, ...] = ()
     causal: bool = False
     cg_std_m: float = 0.0
     error_scale: float = 1.0

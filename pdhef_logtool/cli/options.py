@@ -99,7 +99,7 @@ _OPTIONS: dict[str, Any] = {
     "calibrate": _option(
         _Text,
         ESTIMATION,
-        "Calibration without ground truth of a car without validation data: log, online, pool or off.",
+        "Calibration without ground truth of a car without validation data: log or off.",
     ),
     "reference": _option(
         _Text, ESTIMATION, "Sideslip reference without tyre data: auto (without ground truth), on or off."

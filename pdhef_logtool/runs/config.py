@@ -50,7 +50,7 @@ Names = Annotated[
 #: A file or folder, as a path or a text.
 File = Annotated[Path, BeforeValidator(lambda v: Path(v) if isinstance(v, str) else v)]
 Keep = Literal["metrics", "estimates", "full"]
-Calibrate = Literal["off", "online", "log", "pool"]
+Calibrate = Literal["off", "log"]
 Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
 
 
@@ -85,8 +85,7 @@ class RunConfig:
     network : network folder, ``default``, ``none`` or the name of an installed residual model; None = the car's.
     intervals : intervals file, ``none``, or ``unsure`` (wide intervals, for a car that may have changed); None = the
         car's.
-    calibrate : calibration of a car without validation data, without ground truth: per ``log``, ``online`` on what the
-        log has shown so far (causal), on the ``pool`` of all logs, or ``off``.
+    calibrate : calibration of a car without validation data, without ground truth: per ``log``, or ``off``.
     reference : sideslip reference (not causal, without tyre data): ``auto`` (where the log has no ground truth of
         sideslip), ``on`` (beside ground truth as well; in ``learn`` and ``extract`` in its place) or ``off``.
     gnss : ``auto`` (``physics``, ``pd-hef`` and the reference use GNSS velocity where the log has it) or ``off``.

@@ -135,7 +135,7 @@ class DriveOutputs:
             report = brief_report(report)
             write_json(self._change.file(REPORT_FILE), report, brief=True)
         else:
-            write_tables(self._change, report, rows, self.tracks, self._main.spans, self._causal_from_ns())
+            write_tables(self._change, report, rows, self.tracks, self._main.name, self._causal_from_ns())
         return report
 
     def _causal_from_ns(self) -> dict[str, int]:
@@ -188,7 +188,7 @@ def write_tables(
     report: dict[str, Any],
     rows: Sequence[MetricRow],
     tracks: Sequence[StateTrack],
-    selected: Sequence[tuple[int, str]] = (),
+    selected: str | None = None,
     causal_from_ns: Mapping[str, int] | None = None,
 ) -> None:
     """Write estimates.parquet, metrics.parquet and report.json of a drive."""

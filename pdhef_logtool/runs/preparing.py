@@ -55,12 +55,12 @@ class PreparedDrive:
         return log_sensors(self.drive.car.vehicle, calibration, told_friction=self.drive.friction.bank is None)
 
 
-def prepare(drive: Drive, config: RunConfig, pool: SelfCalibration | None) -> PreparedDrive:
-    """Calibrate the car on the drive unless ``pool`` is its calibration, make the reference, choose the estimators.
+def prepare(drive: Drive, config: RunConfig) -> PreparedDrive:
+    """Calibrate the car on the drive, make the reference, choose the estimators.
 
     Raises EstimatorError if no requested estimator can run.
     """
-    calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
+    calibration = checked(drive, calibrate_drive(drive, config))
     car = self_calibrated(drive, calibration)
     estimators, skipped, requested = _choose_estimators(drive, config, car)
     reference = reference_of(drive, calibration, config)

@@ -5,19 +5,15 @@ See docs/method.md#self-calibration.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.drive.reading import Drive, read_drive
+from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.logs.discovery import LogInput
-from pdhef_logtool.mapping import Mapping
-from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
@@ -32,32 +28,11 @@ def calibrate_drive(drive: Drive, config: RunConfig) -> SelfCalibration | None:
     """Return the calibration of a car by a drive, its prior if a sensor is missing; None if not requested."""
     if config.calibrate == "off" or not _asked(config, drive.car):
         return None
-    from pdhef_logtool.estimators.calibration.calibration import calibrate_online, prior_calibration, self_calibrate
+    from pdhef_logtool.estimators.calibration.calibration import prior_calibration, self_calibrate
 
     if lacking(drive):
         return prior_calibration(drive.car.vehicle, drive.car.taught_prior)
-    if config.calibrate == "online":
-        return calibrate_online(read_driving(drive), drive.car.vehicle, taught=drive.car.taught_prior)
     return self_calibrate([read_driving(drive)], drive.car.vehicle, taught=drive.car.taught_prior)
-
-
-def calibrate_pool(
-    inputs: Sequence[LogInput], car: Car, mapping: Mapping | None, config: RunConfig
-) -> SelfCalibration | None:
-    """Return the calibration of a car by all logs of a run; None if not requested. A log that fails is left out."""
-    if not _asked(config, car):
-        return None
-    from pdhef_logtool.estimators.calibration.calibration import self_calibrate
-
-    drivings = []
-    for log_input in inputs:
-        try:
-            with read_drive(log_input, car, mapping, config.read_options) as drive:
-                if not lacking(drive):
-                    drivings.append(read_driving(drive))
-        except PdhefError:
-            continue  # the run itself reports the error
-    return self_calibrate(drivings, car.vehicle, taught=car.taught_prior)
 
 
 def lacking(drive: Drive) -> list[str]:
@@ -77,7 +52,7 @@ def read_driving(drive: Drive) -> Driving:
 
 def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibration | None:
     """Return a calibration with the part of ``d2`` of ``physics`` on it that correlates with the driving."""
-    if calibration is None or calibration.refused or calibration.earlier:
+    if calibration is None or calibration.refused:
         return calibration
     from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency, driving_products
 
@@ -92,28 +67,19 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
     """Return the car of a drive with the calibration, unless it was refused."""
     if calibration is None or calibration.refused:
         return drive.car
-    causal, note = bool(calibration.earlier), "not causal: car calibrated on the whole log, without ground truth"
-    if causal:
-        note = "its car is calibrated on the log up to each time, without ground truth"
-    elif not calibration.parameters:
-        causal, note = True, calibration.text
-
-    def applied(stage: SelfCalibration) -> WithoutTruth:
-        return WithoutTruth(
-            stage.vehicle,
-            stage.noise,
-            told_friction=drive.friction.bank is None,
-            note=note,
-            varied=stage.varied,
-            driven_d2_m_s=stage.driven_d2_m_s,
-            since_ns=stage.since_ns,
-            earlier=tuple(map(applied, stage.earlier)),
-            cg_std_m=drive.car.cg_std_m,
-            causal=causal,
-            error_scale=max(stage.error_scale, 2.0 if causal else 0.0),  # later driving may fit less
-        )
-
-    return replace(drive.car, self_calibrated=applied(calibration))
+    causal = not calibration.parameters
+    applied = WithoutTruth(
+        calibration.vehicle,
+        calibration.noise,
+        told_friction=drive.friction.bank is None,
+        note=calibration.text if causal else "not causal: car calibrated on the whole log, without ground truth",
+        varied=calibration.varied,
+        driven_d2_m_s=calibration.driven_d2_m_s,
+        cg_std_m=drive.car.cg_std_m,
+        causal=causal,
+        error_scale=max(calibration.error_scale, 2.0 if causal else 0.0),  # later driving may fit less
+    )
+    return replace(drive.car, self_calibrated=applied)
 
 
 def log_sensors(

@@ -22,7 +22,6 @@ OURS = {
     "phy-ukf": ("log", "file", "phy-ukf"),
     "physics": ("log", "file", "physics"),
     "pd-hef": ("log", "file", "pd-hef"),
-    "pd-hef, online": ("online", "file", "pd-hef"),
     "pd-hef, causal": ("off", "file", "pd-hef"),
     "pd-hef, no file": ("log", "none", "pd-hef"),
 }

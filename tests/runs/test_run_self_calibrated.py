@@ -14,14 +14,13 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell, read_drive
-from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.results.parquet_sink import list_estimators, read_track
 from pdhef_logtool.runs import selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, read_driving
+from pdhef_logtool.runs.self_calibrating import calibrate_drive, read_driving
 from tests.run_report import follows
 
 pytestmark = pytest.mark.slow
@@ -118,16 +117,6 @@ def test_a_car_with_evidence_is_not_calibrated(sample_logs_dir: Path) -> None:
         assert calibrate_drive(drive, RunConfig()) is None
 
 
-def test_a_pool_takes_what_its_logs_say_together(sample_logs_dir: Path, wrong_car: Path) -> None:
-    logs = find_logs([str(sample_logs_dir / f"{name}.mcap") for name in ("sweep", "dlc")])
-    config = RunConfig(calibrate="pool")
-    pool = calibrate_pool(logs, Car.load(wrong_car), None, config)
-    assert pool is not None
-    assert pool.logs == 2
-    assert pool.seconds > 15.0
-    assert not pool.refused
-
-
 def test_an_estimate_that_contradicts_the_sensors_is_not_selected_and_keeps_its_name(
     sample_logs_dir: Path, wrong_car: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -158,14 +147,3 @@ def test_a_car_with_evidence_keeps_its_estimate_and_is_warned_of(
     report = run(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("phy-ukf", "pd-hef"), end=None)
     assert all(e["causal"] for e in report["estimators"])
     assert any("WARNING" in w for w in report["warnings"])
-
-
-def test_a_calibration_on_line_stays_causal_and_says_so(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
-    report = run(sample_logs_dir / "road.mcap", wrong_car, tmp_path, calibrate="online", estimators=NAMES)
-    follows(report)
-    told = {e["name"]: e for e in report["estimators"]}
-    assert told["physics"]["causal"]
-    assert told["physics"]["outcome"] == "ran"  # the causality check of the run passed
-    assert any("calibrated on the log up to each time" in note for note in told["physics"]["notes"])
-    assert report["self_calibration"]["online"]
-    assert told["physics"]["intervals"] == ["intervals: own and parameters"]
