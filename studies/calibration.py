@@ -205,9 +205,9 @@ def runs_of(
 ) -> dict[str, Run]:
     """Run the estimators on the drives of a car; return the results by log."""
     file = write_toml(tool.work / "cars" / f"{name}.toml", vehicle)
-    mode = "log" if is_calibrated else "off"
+    mode = "auto" if is_calibrated else "off"
     names = "zero,open-loop,phy-ukf,physics"
-    given = ("--car", file, "--calibrate", mode, "--keep", "estimates", "--estimators", names)
+    given = ("--car", file, "--model", mode, "--keep", "estimates", "--estimators", names)
     folder = tool.run(f"{name}-{mode}", *logs, *given)
     metrics = pl.read_parquet(folder / "metrics.parquet").filter(segment="all")
     runs = {}

@@ -294,7 +294,7 @@ def figures(case: Case, tool: Tool, *, with_filters: bool = True) -> Figures:
     scored = scored_run(run(case, tool, name, log, mapping, vehicle), case, vehicle)
     if case.gnss == NONE or not scored.used_gnss or not with_filters:
         return scored
-    bare = ("--calibrate", "off", "--estimators", ",".join(RANKED))
+    bare = ("--model", "off", "--estimators", ",".join(RANKED))
     without, aided = (
         run(case, tool, f"{name}-{gnss}", log, mapping, vehicle, *bare, "--gnss", gnss) for gnss in ("off", "auto")
     )

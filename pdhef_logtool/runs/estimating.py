@@ -47,7 +47,7 @@ class Estimated:
 
 def estimate_drive(
     drive: WholeDrive,
-    car: Car,
+    corrected: DriveSignals,
     estimators: Sequence[Estimator],
     *,
     watched: bool = True,
@@ -76,7 +76,7 @@ def estimate_drive(
         if not drive.plan.has_truth_pose:
             drawn_truth = dead_reckoned(drawn_truth, start)
         drawn_truth = valid_as_a_whole(drawn_truth, drive.plan.derivation, vehicle.standstill_m_s)
-    corrected, tracks = DriveSignals.of(signals, car), {}
+    tracks: dict[str, StateTrack] = {}
     for number, estimator in enumerate(estimators):
         progress(number / len(estimators))
         try:

@@ -11,6 +11,7 @@ from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.table import Options, Skipped, runnable
+from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH
@@ -77,7 +78,9 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     intervals = calibrator(drive.car, estimators)
     if intervals.warning and intervals.warning not in drive.notes:
         drive.tell(intervals.warning)
-    estimated = estimate_drive(drive.whole(), drive.car, estimators, intervals=intervals)
+    whole = drive.whole()
+    corrected = DriveModel.of(drive).apply(whole.signals)
+    estimated = estimate_drive(whole, corrected, estimators, intervals=intervals)
     truth = {} if estimated.drawn_truth is None else {TRUTH: estimated.drawn_truth}
     algorithms = {e.name: resolve(e) for e in estimators}
     return Estimates(drive, truth | estimated.tracks, estimated.signals, algorithms, tuple(skipped))

@@ -36,7 +36,7 @@ _NO_SETTING = frozenset(
         "intervals",
     }
 )
-_FILES = ("mapping", "msgs", "plan", "cars", "setup", "sensor_profile")
+_FILES = ("mapping", "msgs", "plan", "cars", "model", "sensor_profile")
 _READERS = 16
 _REPEATED = "they are tried again"
 _DAMAGED = "their outputs are damaged"

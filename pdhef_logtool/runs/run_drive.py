@@ -102,9 +102,10 @@ def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter)
     drive, plug_ins = run.drive, ", ".join(filter(None, map(package_of, run.estimators)))
     label = f"{drive.name} (plug-ins: {plug_ins})" if plug_ins else drive.name
     causality.failed |= run.failed
+    whole = drive.whole()
     estimated = estimate_drive(
-        drive.whole(),
-        run.car,
+        whole,
+        run.model.apply(whole.signals),
         run.estimators,
         intervals=run.intervals,
         causality=causality,
@@ -125,7 +126,7 @@ def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter)
 def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     """Score the tracks; add the events of an estimated friction, and contradictions as notes of the drive."""
     drive, signals = run.drive, estimated.signals
-    scored = evaluate(drive, run.names, estimated.read, signals, run.sensors(run.calibration))
+    scored = evaluate(drive, run.names, estimated.read, signals, run.model.errors)
     if drive.friction.bank is not None:
         observable = find_intervals(signals, {"friction observable": drive.friction.observable})
         events = [Event(s.name, s.start_ns, s.end_ns, "the estimate of friction can be relied on") for s in observable]

@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.drive.reading import Drive
+from pdhef_logtool.model.drive_model import file_errors
 from pdhef_logtool.records.signals import BoolArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH, Event, ManoeuvreEvent
-from pdhef_logtool.runs.self_calibrating import log_sensors
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
@@ -61,7 +61,7 @@ def evaluate(
     manoeuvres = find_manoeuvres(signals, vehicle)
     masks = segment_masks(signals, truth, vehicle, manoeuvres)
     moving = moving_mask(signals, truth, vehicle)
-    sensors = log_sensors(vehicle, None) if sensors is None else sensors
+    sensors = file_errors(vehicle) if sensors is None else sensors
     tracks = {name: track for name in names if (track := read(name)) is not None}
     slow, dependent = vehicle.low_speed_blend_m_s, drive.plan.dependent
     rows = evaluate_drive(EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, sensors, dependent))
