@@ -6,13 +6,12 @@ so that estimates depend on later samples. With a model file they do not. Every 
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import numpy as np
-from pydantic import Field
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import physics_sha256
@@ -22,7 +21,7 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, Mapping, check_mapping, fit_clocks
 from pdhef_logtool.mapping.records import CanSettings, SignalSource
 from pdhef_logtool.records.errors import MappingError
-from pdhef_logtool.storage.documents import jsonable, read_toml
+from pdhef_logtool.storage.documents import read_toml, validated
 from pdhef_logtool.storage.toml_text import toml_text
 
 #: The offset of a device clock changes between logs: it is estimated from the messages of this duration.
@@ -30,7 +29,7 @@ CLOCK_START_S = 1.0
 _REMEDY = "give the model.toml of a run of the same car and recorder"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid", defer_build=True))
 class Sensors:
     """How the sensors of a recorder are read.
 
@@ -53,7 +52,7 @@ class Sensors:
         return replace(mapping, signals=self.signals, can=self.can, origin="file")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid", defer_build=True))
 class ModelFile:
     """Content of a model.toml.
 
@@ -77,23 +76,15 @@ class ModelFile:
 
     def toml(self, head: str) -> str:
         """Return the file, without loss; ``head`` : comment."""
-        return toml_text(_plain(self), head)
+        from pydantic import RootModel
+
+        return toml_text(RootModel[ModelFile](self).model_dump(mode="json", exclude_none=True), head)
 
 
 def load_model(path: Path, car: Car) -> ModelFile:
     """Read a model.toml for a car; raises MappingError if it is missing, wrong, or of another vehicle file."""
-    from pydantic import TypeAdapter, ValidationError
-
     raw = read_toml(path, "auto, off or a model.toml", MappingError, _REMEDY)
-    try:
-        model = TypeAdapter(ModelFile).validate_python(raw)
-    except ValidationError as error:
-        raise MappingError(
-            expected="the entries of a model.toml",
-            got="; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:3]),
-            where=str(path),
-            remedy=_REMEDY,
-        ) from error
+    model = validated(ModelFile, raw, str(path), MappingError, expected="the entries of a model.toml", remedy=_REMEDY)
     if model.parameters and model.physics_sha256 != physics_sha256(car.datasheet):
         raise MappingError(
             expected=f"a model of the car {car.datasheet.name}",
@@ -129,19 +120,3 @@ def clocks_of(sensors: Sensors, log: DriveLog, mapping: Mapping, start_ns: int) 
 def is_device_clock(clock: ClockModel) -> bool:
     """Return whether stamps of the clock are shifted to log time."""
     return (clock.reference_stamp_ns, clock.reference_log_ns, clock.drift) != (0, 0, 0.0)
-
-
-def _plain(record: Any) -> Any:
-    """Return a record as TOML values: without entries that are None, NaN as nan."""
-    if hasattr(record, "__dataclass_fields__"):
-        entries = {f.name: getattr(record, f.name) for f in fields(record)}
-        return {k: _plain(v) for k, v in entries.items() if v is not None}
-    if isinstance(record, TaughtParameter):
-        return record.model_dump()
-    if isinstance(record, dict):
-        return {k: _plain(v) for k, v in record.items()}
-    if isinstance(record, list | tuple):
-        return [_plain(v) for v in record]
-    if isinstance(record, float | np.floating):
-        return float(record) if math.isfinite(record) else float("nan")
-    return jsonable(record)
