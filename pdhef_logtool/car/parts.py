@@ -187,11 +187,10 @@ class FittedPhysics(Record):
 
 
 class Fit(Record):
-    """``fit.toml``, written by ``pdhef learn --stages calibrate``: identified physics of the car.
+    """``fit.toml``: identified physics of the car.
 
     The noise in ``filter`` was identified together with the values (docs/method.md#identification). ``physics``
     contains the values and noise of the filter ``physics``, which has other model parts and is identified separately.
-    ``without_truth``: the car was calibrated on sensors alone (docs/method.md#self-calibration).
     """
 
     format: Literal["pdhef-fit"] = "pdhef-fit"
@@ -200,7 +199,6 @@ class Fit(Record):
     values: FittedValues = FittedValues()
     filter: FilterTables = Field(default_factory=dict)
     physics: FittedPhysics | None = None
-    without_truth: bool = False
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
     scores: dict[str, dict[str, float]] = Field(default_factory=dict)
     notes: Annotated[tuple[str, ...], Field(strict=False)] = ()

@@ -27,7 +27,7 @@ def render_learning(result: LearnResult, console: Console) -> None:
     head = three_lines(
         result.text,
         f"{len(result.drives)} drive{'s' * (len(result.drives) != 1)}{left}; decisions by held-out driving",
-        f"pdhef run LOG --car {result.car} -o OUT",
+        f"pdhef run LOG --car {result.car}{result.model} -o OUT",
     )
     console.print(head)
     console.print()

@@ -102,10 +102,10 @@ def taught_of(posterior: SelfCalibration) -> tuple[TaughtParameter, ...]:
 
 
 def of_earlier_drives(model: ModelFile | None) -> tuple[TaughtParameter, ...]:
-    """Return the parameters of a model file that are valid on other roads: all but the peak force."""
-    from pdhef_logtool.estimators.calibration.joint import PEAK
+    """Return the parameters of a model file for another drive: the peak force and the steering channel differ."""
+    from pdhef_logtool.estimators.calibration.joint import PEAK, STEER_RATIO
 
-    return () if model is None else tuple(p for p in model.parameters if p.name != PEAK)
+    return () if model is None else tuple(p for p in model.parameters if p.name not in (PEAK, STEER_RATIO))
 
 
 def _text(posterior: SelfCalibration, prior: ModelFile | None) -> str:

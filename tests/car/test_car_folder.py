@@ -248,7 +248,7 @@ def test_other_physics_leave_fit_and_noise_out_and_say_so(folder: Path, old: str
     assert dict(car.noise) == {}
     assert car.learnt_on == ()
     assert car.notes == (
-        "fit.toml is not used: vehicle.toml has changed since; pdhef learn --stages calibrate creates it again",
+        "fit.toml is not used: vehicle.toml has changed since",
         "noise of physics is not used: it belongs to other physics",
     )
 
@@ -292,13 +292,6 @@ def test_another_fit_leaves_the_noise_of_the_first_out(folder: Path) -> None:
     assert car.vehicle.friction == 0.7
     assert dict(car.noise) == fit.filter
     assert [note.split(":")[0] for note in car.notes] == ["noise of physics is not used"]
-
-
-def test_the_gain_limit_of_an_earlier_version_is_named_and_not_used(folder: Path) -> None:
-    (folder / "network.toml").write_text('format = "pdhef-network"\ntrust_cap = 1.0\n')
-    car = load(folder, "default")
-    assert car.notes == ("network.toml is no longer read: the residual gain follows from network and drive",)
-    assert car.residual_gain == 0.0
 
 
 def test_intervals_are_of_the_physics_of_a_car(folder: Path) -> None:

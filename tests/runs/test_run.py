@@ -286,10 +286,7 @@ def test_a_part_that_is_not_used_is_told(sample_logs_dir: Path, tmp_path: Path) 
         said: list[str] = []
         config = _config(sample_logs_dir, car=car, estimators=("open-loop",), end="3")
         run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config, reporter=Reporter(warn=said.append))
-        assert (
-            "fit.toml is not used: vehicle.toml has changed since; pdhef learn --stages calibrate creates it again"
-            in said
-        ) == (name == "other")
+        assert ("fit.toml is not used: vehicle.toml has changed since" in said) == (name == "other")
         estimates = pl.read_parquet(tmp_path / name / "logs/dlc/estimates.parquet")
         offset[name] = float(estimates.filter(pl.col("estimator") == "open-loop")["sideslip_rad"].abs().mean())
     assert offset["same"] > 1.5 * offset["other"]

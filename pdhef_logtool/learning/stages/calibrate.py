@@ -1,21 +1,18 @@
-"""Stage ``calibrate``: calibrate a car on several logs by the sensors alone (``fit.toml``).
+"""Stage ``calibrate``: calibrate a car on several logs by the sensors alone (``model.toml``).
 
-See docs/method.md#self-calibration. ``model.toml`` has the same result for ``pdhef run --model``. The calibration of a
-single log may be wrong on other logs, so that only a calibration on several logs is written.
+See docs/method.md#self-calibration. The calibration of a single log may be wrong on other logs, so that only a
+calibration on several logs is written. Its sensors are those of the first log.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
-from pdhef_logtool.car.car import FIT_FILE, Car
-from pdhef_logtool.car.parts import Fit, FittedPhysics, FittedValues, LearntOn, physics_sha256
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.store import Change
-from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.model_file import ModelFile, Sensors
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
+from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.calibration.driving import Driving
 from pdhef_logtool.learning.drives import CALIBRATE, DriveRecord, record_of
 from pdhef_logtool.learning.stages.task import StageOutput, Task
@@ -61,30 +58,11 @@ def calibrate(task: Task) -> StageOutput:
     )
     if calibration.refused:
         raise _refused(calibration.refused, "logs with bends and lane changes that calibrate the car")
-    part = fit_part(calibration, [r.learnt_on for r in records if not r.left_out])
+    learnt_on = [r.learnt_on for r in records if not r.left_out]
     head = f"Written by pdhef learn --stages calibrate: no ground truth was used.\n{calibration.text}."
-    model = ModelFile.of(drives[0][1], car, taught_of(calibration))
-    files = {FIT_FILE: part_toml(part, head).encode(), MODEL_FILE: model.toml(head).encode()}
-    settings = task.settings.to_dict()
-    change = Change(f"learn --stages {CALIBRATE}", FIT_FILE, files, settings=settings, drives=part.drives)
+    files = {MODEL_FILE: ModelFile.of(drives[0][1], car, taught_of(calibration)).toml(head).encode()}
+    change = Change(f"learn --stages {CALIBRATE}", MODEL_FILE, files, task.settings.to_dict(), learnt_on)
     return StageOutput(change, records, calibration.text, {"self_calibration": calibration.to_dict()})
-
-
-def fit_part(calibration: SelfCalibration, drives: Sequence[LearntOn]) -> Fit:
-    """Return the calibration as a part of a car; ``physics`` has the same values, and its own noise."""
-    datasheet, vehicle = calibration.vehicle_file, calibration.vehicle
-    return Fit(
-        physics_sha256=physics_sha256(datasheet),
-        values=FittedValues.between(datasheet, vehicle),
-        physics=FittedPhysics(
-            values=FittedValues.of(vehicle),
-            noise=calibration.noise,
-            varied=tuple(FittedValues.between(vehicle, v) for v in calibration.varied),
-        ),
-        without_truth=True,
-        drives=tuple(drives),
-        notes=(calibration.text, "no ground truth was used: a drive with ground truth gives better values"),
-    )
 
 
 def _refused(got: str, expected: str) -> EstimatorError:
