@@ -105,6 +105,6 @@ def score(estimates: Estimates) -> pl.DataFrame:
         return replace(track, valid=track.something_known) if track is not None and name == TRUTH else track
 
     names = [name for name in estimates.tracks if name != TRUTH]
-    rows = evaluate(estimates.drive, names, read, estimates.signals).rows
+    rows = evaluate(estimates.drive, names, read, estimates.signals, DriveModel.of(estimates.drive).errors).rows
     columns = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
     return pl.DataFrame([[getattr(r, c) for c in columns] for r in rows], schema=columns, orient="row")
