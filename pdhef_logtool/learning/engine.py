@@ -27,7 +27,6 @@ from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from pdhef_logtool.results.opened_run import MODEL_FILE
 from pdhef_logtool.storage.outputs import check_no_input, local_path
 
 RUN: dict[str, Callable[[Task], StageOutput]] = {TEACH: teach, CALIBRATE: calibrate}
@@ -47,11 +46,6 @@ class LearnResult:
     def exit_code(self) -> int:
         """0 if all drives were used completely, 3 otherwise."""
         return exit_code(self.records)
-
-    @property
-    def model(self) -> str:
-        """Option of ``pdhef run`` that uses the result, after ``--car``."""
-        return f" --model {self.car / MODEL_FILE}" if self.stage == CALIBRATE else ""
 
     @property
     def drives(self) -> tuple[DriveRecord, ...]:

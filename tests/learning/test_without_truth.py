@@ -54,12 +54,6 @@ def test_a_pool_of_logs_mends_the_file_without_ground_truth(pool: LearnResult, s
     )
 
 
-def test_one_log_is_no_pool(sample_logs_dir: Path, config: RunConfig, tmp_path: Path) -> None:
-    with pytest.raises(EstimatorError, match="need not apply to another"):
-        run_stage("calibrate", [str(sample_logs_dir / "dlc.mcap")], tmp_path / "car", config)
-    assert not (tmp_path / "car").exists()
-
-
 def test_logs_that_do_not_know_the_stiffness_are_refused(
     sample_logs_dir: Path, config: RunConfig, tmp_path: Path
 ) -> None:

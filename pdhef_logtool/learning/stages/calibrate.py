@@ -1,7 +1,6 @@
 """Stage ``calibrate``: calibrate a car on several logs by the sensors alone (``model.toml``).
 
-See docs/method.md#self-calibration. The calibration of a single log may be wrong on other logs, so that only a
-calibration on several logs is written. Its sensors are those of the first log.
+See docs/method.md#self-calibration. The sensors are those of the first log.
 """
 
 from __future__ import annotations
@@ -21,9 +20,6 @@ from pdhef_logtool.model.drive_model import lacking, read_driving, taught_of
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.results.opened_run import MODEL_FILE
 
-#: Minimum number of logs.
-LEAST_LOGS = 2
-
 
 def calibrate(task: Task) -> StageOutput:
     """Calibrate a car on its logs without ground truth.
@@ -31,7 +27,7 @@ def calibrate(task: Task) -> StageOutput:
     Raises
     ------
     EstimatorError
-        Too few logs, too little driving, a stiffness that remains uncertain, or a car that drifts.
+        Too little driving, a stiffness that remains uncertain, or a car that drifts.
     """
     start = task.car.datasheet
     car = Car.of(start)
@@ -48,8 +44,6 @@ def calibrate(task: Task) -> StageOutput:
             return record, (driving, drive.plan.sensors) if usable else None
 
     records, drives = task.read(read, 0.8)
-    if len(drives) < LEAST_LOGS:
-        raise _refused(f"{len(drives)} of them", "logs of one car, for the result of one log need not apply to another")
     calibration = self_calibrate(
         [driving for driving, _ in drives],
         start,
@@ -57,18 +51,14 @@ def calibrate(task: Task) -> StageOutput:
         progress=lambda share: task.reporter.progress("fitting to the sensors", 0.8 + 0.2 * share),
     )
     if calibration.refused:
-        raise _refused(calibration.refused, "logs with bends and lane changes that calibrate the car")
+        raise EstimatorError(
+            expected="logs with bends and lane changes that calibrate the car",
+            got=calibration.refused,
+            where="learn --stages calibrate",
+            remedy="give more logs of this car, or one with ground truth without this option",
+        )
     learnt_on = [r.learnt_on for r in records if not r.left_out]
     head = f"Written by pdhef learn --stages calibrate: no ground truth was used.\n{calibration.text}."
     files = {MODEL_FILE: ModelFile.of(drives[0][1], car, taught_of(calibration)).toml(head).encode()}
     change = Change(f"learn --stages {CALIBRATE}", MODEL_FILE, files, task.settings.to_dict(), learnt_on)
     return StageOutput(change, records, calibration.text, {"self_calibration": calibration.to_dict()})
-
-
-def _refused(got: str, expected: str) -> EstimatorError:
-    return EstimatorError(
-        expected=expected,
-        got=got,
-        where="learn --stages calibrate",
-        remedy="give more logs of this car, or one with ground truth without this option",
-    )
