@@ -180,16 +180,6 @@ def test_where_nothing_states_the_accelerometer_the_interval_contains_its_lever(
     assert unknown.valid.sum() <= stated.valid.sum()
 
 
-def test_a_stretch_without_imu_is_not_valid_and_the_rest_is():
-    signals = SLALOM.signals
-    ay = signals.ay_m_s2.copy()
-    ay[1200:1400] = np.nan
-    found = refer(replace(signals, ay_m_s2=ay), PRIOR)
-    seconds = (found.stamps_ns - START_NS) * 1e-9
-    assert not found.valid[(seconds > 12.1) & (seconds < 13.9)].any()
-    assert found.valid[(seconds > 16.0) & (seconds < 29.0)].all()
-
-
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10_000), east=st.booleans(), length=st.booleans())
 def test_jacobians_of_the_measurements_equal_differences(seed, east, length):

@@ -185,5 +185,5 @@ def share_on_roads(seeds, duration_s):
     return found_s / total_s
 
 
-def test_ten_minutes_of_roads_have_few_manoeuvres():
-    assert share_on_roads(range(100, 102), 300.0) <= 0.02
+def test_five_minutes_of_roads_have_few_manoeuvres():
+    assert share_on_roads(range(100, 102), 150.0) <= 0.02

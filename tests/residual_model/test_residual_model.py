@@ -21,7 +21,7 @@ from pdhef_logtool.residual_model.bundle import (
     Normalisation,
     load_bundle,
 )
-from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES, make_features
+from pdhef_logtool.residual_model.features import FEATURES, make_features
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import LIMITS, NetworkService
 
@@ -39,10 +39,6 @@ def make_bundle(seed: int = 0, names: tuple[str, ...] = FEATURES, hidden: int = 
         weights={k: v.numpy().copy() for k, v in network.state_dict().items()},
         provenance={"seed": seed},
     )
-
-
-def test_paper_features_are_the_first_six() -> None:
-    assert FEATURES[:6] == PAPER_FEATURES
 
 
 def test_features_by_hand() -> None:

@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import UsageError
@@ -208,14 +206,3 @@ def test_a_condition_reads_no_file(where: str, tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(pl, "sql_expr", lambda _: pytest.fail("Polars executes subqueries"))
     with pytest.raises(UsageError, match="--where"):
         event_condition(where.format(file=tmp_path / "file.csv"))
-
-
-WORDS = ["speed_m_s", "truth.vx_km_h", "abs(", "(", ")", "and", "or", "not", "in", "0.5", "case", "<", "-", "*"]
-
-
-@given(st.one_of(st.text(max_size=60), st.lists(st.sampled_from(WORDS), max_size=12).map(" ".join)))
-def test_any_text_is_a_condition_or_one_line(text: str) -> None:
-    try:
-        event_condition(text)
-    except UsageError as error:
-        assert "\n" not in str(error)

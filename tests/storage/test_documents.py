@@ -164,7 +164,7 @@ def changed(data: st.DataObject, document: Any, anything: st.SearchStrategy[Any]
 
 
 @every_loader
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=25, deadline=None, derandomize=True)
 @given(data=st.data())
 @pytest.mark.slow
 def test_any_document_is_a_record_or_one_line(

@@ -62,7 +62,7 @@ def test_a_larger_suite_begins_with_the_smaller_one() -> None:
 
 
 def test_draws_fill_the_range_and_the_splits() -> None:
-    jobs = plan_suite(3000, 1)
+    jobs = plan_suite(1500, 1)
     specs = [job.candidates[0] for job in jobs]
     speeds, frictions = np.array([s.speed_km_h for s in specs]), np.array([s.friction for s in specs])
     assert 40.0 <= speeds.min() < 42.0 and 118.0 < speeds.max() <= 120.0
@@ -70,12 +70,12 @@ def test_draws_fill_the_range_and_the_splits() -> None:
     drawn = Counter(s.manoeuvre for s in specs)
     total = sum(SHARES.values())
     for name, share in SHARES.items():
-        assert drawn[name] / 3000 == pytest.approx(share / total, abs=0.025), name
+        assert drawn[name] / 1500 == pytest.approx(share / total, abs=0.025), name
     assert "fishhook" not in drawn
-    assert len({s.seed for s in specs}) == 3000
+    assert len({s.seed for s in specs}) == 1500
     splits = Counter(dict(job.facts)["split"] for job in jobs)
     held_out = splits.pop("extrapolation")
-    assert 0.05 < held_out / 3000 < 0.25
+    assert 0.05 < held_out / 1500 < 0.25
     inside = sum(splits.values())
     for name, share in (("train", 0.70), ("validation", 0.15), ("test", 0.15)):
         assert splits[name] / inside == pytest.approx(share, abs=0.025)

@@ -151,17 +151,6 @@ def test_metadata_says_how_it_was_made(read_back) -> None:
     assert set(json.loads(metadata["versions"])) >= {"pdhef-logtool", "numpy"}
 
 
-def test_a_long_drive_is_written_in_pieces_without_a_seam(tmp_path: Path) -> None:
-    drive = simulate_drive("road", duration_s=130.0)
-    write_drive(drive, tmp_path / "road.mcap")
-    with (tmp_path / "road.mcap").open("rb") as stream:
-        log_times: dict[str, list[int]] = {}
-        for _, channel, message in make_reader(stream).iter_messages():
-            log_times.setdefault(channel.topic, []).append(message.log_time)
-    assert set(np.diff(log_times["/imu/data"])) == {10_000_000} and len(log_times["/imu/data"]) == 13_001
-    assert set(np.diff(log_times["/rtk/odometry"])) == {20_000_000}
-
-
 @pytest.fixture(scope="module")
 def manifest() -> list[dict]:
     return tomllib.loads((ROOT / "sample_logs" / "manifest.toml").read_text(encoding="utf-8"))["log"]
