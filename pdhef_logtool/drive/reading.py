@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
@@ -40,8 +40,6 @@ Tell = Callable[[str], None]
 #: Returns the mapping to read with, from the log and the mapping in effect; may print a message.
 Adjust = Callable[[DriveLog, Mapping, Tell], Mapping]
 
-#: Memory limit of signals, ground truth and derived columns of all drives of a command together.
-MAX_BYTES = 2 << 30
 _AS_IT_IS = ReadOptions()
 
 
@@ -50,7 +48,6 @@ class WholeDrive:
     """A drive in memory: signals [N], and the ground truth [N] at their stamps (None for a log without it)."""
 
     name: str
-    path: LogPlace
     plan: DrivePlan
     signals: Signals
     truth: StateTrack | None
@@ -66,11 +63,6 @@ class WholeDrive:
         """First and last stamp in seconds from the log's start."""
         stamps = self.signals.stamps_ns
         return float(stamps[0] - self.log_start_ns) * 1e-9, float(stamps[-1] - self.log_start_ns) * 1e-9
-
-    @property
-    def nbytes(self) -> int:
-        """Memory that its columns take."""
-        return _nbytes(self.signals) + (0 if self.truth is None else _nbytes(self.truth))
 
 
 @dataclass(slots=True, eq=False)
@@ -192,17 +184,16 @@ class Drive:
         self.notes.append(text)
         self._tell(f"{self.name}: {text}")
 
-    def whole(self, *, fill_friction: bool = True, max_bytes: int | None = None) -> WholeDrive:
+    def whole(self, *, fill_friction: bool = True) -> WholeDrive:
         """Return the whole drive; it is read once per plan.
 
         Parameters
         ----------
         fill_friction : False keeps the friction of the log.
-        max_bytes : memory limit of signals and ground truth; None = no limit.
 
         Raises
         ------
-        EstimatorError : The slice contains no stamp, or the drive exceeds the memory limit.
+        EstimatorError : The slice contains no stamp.
         """
         recorded = self.recorded()
         signals, truth = recorded.signals, recorded.truth
@@ -210,10 +201,7 @@ class Drive:
             raise no_samples(self.path)
         if fill_friction:
             signals = self.friction.fill(signals, truth)
-        whole = WholeDrive(self.name, self.path, self.plan, signals, truth, self.log.start_ns)
-        if max_bytes is not None and whole.nbytes > max_bytes:
-            raise too_big(self.name)
-        return whole
+        return WholeDrive(self.name, self.plan, signals, truth, self.log.start_ns)
 
     def recorded(self) -> Recorded:
         """Return the drive as recorded, which may be empty."""
@@ -361,16 +349,6 @@ def no_samples(path: LogPlace) -> EstimatorError:
     )
 
 
-def too_big(where: str) -> EstimatorError:
-    """Return the error for drives that do not fit into memory."""
-    return EstimatorError(
-        expected=f"drives with at most {MAX_BYTES >> 20} MiB of signals and ground truth together",
-        got="more",
-        where=where,
-        remedy="give fewer drives, or a slice of each with --start and --end",
-    )
-
-
 def _checks_of(plan: DrivePlan, options: ReadOptions) -> tuple[Check, ...]:
     return tuple(replace(c, waived=True) if c.name in options.waived else c for c in plan.checks)
 
@@ -414,7 +392,3 @@ def friction_of(
         return FrictionSource(f"topic {topic}" if topic else "none")
     available, use_speed = plan.alignment.available, options.use_speed
     return friction_source(options.friction, vehicle, available, topic, use_speed=use_speed, validated=validated)
-
-
-def _nbytes(record: Signals | StateTrack) -> int:
-    return sum(getattr(getattr(record, f.name), "nbytes", 0) for f in fields(record))
