@@ -88,12 +88,6 @@ class FittedValues(Record):
     physics: PhysicsParts | None = None
 
     @classmethod
-    def between(cls, datasheet: VehicleParameters, fitted: VehicleParameters) -> FittedValues:
-        """Return the entries of ``fitted`` that differ from ``datasheet``."""
-        same = {k: None for k in cls.model_fields if getattr(fitted, k) == getattr(datasheet, k)}
-        return cls.of(fitted).model_copy(update=same)
-
-    @classmethod
     def of(cls, fitted: VehicleParameters) -> FittedValues:
         """Return all entries of a vehicle."""
         values = {k: getattr(fitted, k) for k in cls.model_fields}
