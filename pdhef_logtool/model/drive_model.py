@@ -1,4 +1,4 @@
-"""The model of a drive: what its log contains, its sensors and its car, without ground truth.
+"""The model of a drive: reading of its log, sensors and car, without ground truth.
 
 See docs/method.md#self-calibration.
 """
