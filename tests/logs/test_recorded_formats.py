@@ -119,4 +119,5 @@ def test_scores_are_those_of_the_same_drive_in_mcap(
     got = _scores(shared_dir / "data" / "formats" / file, table, car, end)
     assert set(got) >= {"phy-ukf", "physics"}
     for estimator, value in got.items():
-        assert value == pytest.approx(expected[estimator], rel=0.02), estimator
+        # Only the MCAP file has arrival times, and with them latencies.
+        assert value == pytest.approx(expected[estimator], rel=0.05), estimator
