@@ -25,7 +25,7 @@ import polars as pl
 from pdhef_logtool import Car, PdhefError
 from studies.drawn_cars import KINDS, DrawnCar, draw_car
 from studies.gates.tool import Tool, reports
-from studies.pages import DOCS, ROOT, SAMPLE_VEHICLE, number, options, table, write, write_toml
+from studies.pages import DOCS, ROOT, SAMPLE_VEHICLE, number, options, table, write, write_toml, write_validated_car
 from truthsim.batch import sensor_noise
 from truthsim.drive import simulate_drive, write_drive
 from truthsim.vehicle import GRAVITY_M_S2
@@ -204,11 +204,11 @@ def runs_of(
     tool: Tool, name: str, vehicle: Mapping[str, Any], logs: Sequence[Path], is_calibrated: bool
 ) -> dict[str, Run]:
     """Run the estimators on the drives of a car; return the results by log."""
-    file = write_toml(tool.work / "cars" / f"{name}.toml", vehicle)
-    mode = "log" if is_calibrated else "off"
+    place = tool.work / "cars" / name
+    file = write_toml(place.parent / f"{name}.toml", vehicle) if is_calibrated else write_validated_car(place, vehicle)
     names = "zero,open-loop,phy-ukf,physics"
-    given = ("--car", file, "--calibrate", mode, "--keep", "estimates", "--estimators", names)
-    folder = tool.run(f"{name}-{mode}", *logs, *given)
+    given = ("--car", file, "--keep", "estimates", "--estimators", names)
+    folder = tool.run(f"{name}-{is_calibrated}", *logs, *given)
     metrics = pl.read_parquet(folder / "metrics.parquet").filter(segment="all")
     runs = {}
     for log, report in reports(folder).items():

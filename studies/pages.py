@@ -10,6 +10,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import Fit, LearntOn
+from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.storage.files import write_bytes
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -65,6 +68,14 @@ def write_toml(path: Path, document: Mapping[str, Any]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(toml_text(document) + "\n", encoding="utf-8")
     return path
+
+
+def write_validated_car(folder: Path, vehicle: Mapping[str, Any]) -> Path:
+    """Write a car that counts as validated, so that runs use its vehicle file unchanged; return the folder."""
+    digest = Car.load(write_toml(folder / "vehicle.toml", vehicle)).physics_sha256
+    fit = Fit(physics_sha256=digest, drives=(LearntOn(name="of the study"),))
+    write(folder / "fit.toml", part_toml(fit, "No parameter is fitted."))
+    return folder
 
 
 def options(name: str, text: str | None) -> argparse.ArgumentParser:

@@ -30,7 +30,19 @@ from numpy.typing import NDArray
 from pdhef_logtool import Car
 from studies.drawn_cars import FIT_FRICTION, fit_vehicle
 from studies.gates.tool import Tool, reports, sideslip_rmse_deg
-from studies.pages import DOCS, DRIVES, RESULTS, ROOT, SAMPLE_VEHICLE, number, options, table, write, write_toml
+from studies.pages import (
+    DOCS,
+    DRIVES,
+    RESULTS,
+    ROOT,
+    SAMPLE_VEHICLE,
+    number,
+    options,
+    table,
+    write,
+    write_toml,
+    write_validated_car,
+)
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 from studies.recalibrate import input_digest
 from truthsim.batch import DriveSpec
@@ -294,7 +306,7 @@ def figures(case: Case, tool: Tool, *, with_filters: bool = True) -> Figures:
     scored = scored_run(run(case, tool, name, log, mapping, vehicle), case, vehicle)
     if case.gnss == NONE or not scored.used_gnss or not with_filters:
         return scored
-    bare = ("--calibrate", "off", "--estimators", ",".join(RANKED))
+    bare = ("--estimators", ",".join(RANKED))
     without, aided = (
         run(case, tool, f"{name}-{gnss}", log, mapping, vehicle, *bare, "--gnss", gnss) for gnss in ("off", "auto")
     )
@@ -327,7 +339,9 @@ def run(
 ) -> Path:
     """Run the reference on a drive; return the output folder."""
     file = write_toml(tool.work / "mappings" / f"{name}.toml", mapping)
-    files = ("--mapping", file, "--car", write_toml(tool.work / "cars" / f"{name}.toml", vehicle))
+    place = tool.work / "cars" / name
+    car = write_validated_car(place, vehicle) if more else write_toml(place.parent / f"{name}.toml", vehicle)
+    files = ("--mapping", file, "--car", car)
     waived = [word for check in SPIN_CHECKS for word in ("--waive", check)] if "spin" in case.title else []
     given = more or ("--estimators", "zero,physics")
     return tool.run(name, log, *files, "--keep", "estimates", "--reference", "on", *waived, *given)

@@ -90,7 +90,7 @@ def report(
             ran("pd-hef", intervals=["intervals calibrated on x"]),
         ],
         "truth": TRUTH,
-        "setup": None,
+        "model": None,
         "friction": friction("option, 0.9"),
         "self_calibration": None,
         "reference": None,

@@ -51,8 +51,6 @@ VEHICLE_FILE, FIT_FILE, NOISE_FILE = "vehicle.toml", "fit.toml", "noise.toml"
 INTERVALS_FILE, UNSURE_FILE, HISTORY_FILE = "intervals.json", "intervals-unsure.json", "history.jsonl"
 NETWORK_FOLDER = "network"
 TAUGHT_FILE = "taught.json"
-#: Gain limit of a network in cars of version 0.2.
-OLD_GAIN_FILE = "network.toml"
 #: Number of digits of a hash in messages.
 SHOWN_DIGITS = 12
 
@@ -68,8 +66,7 @@ class WithoutTruth:
     ``told_friction`` : whether the calibration used the signals' friction; an estimated friction does not count.
     ``noise`` : of ``physics``. ``note`` : a warning for the reader of the report. ``varied`` : the vehicle one
     posterior 1-sigma away, in independent directions. ``driven_d2_m_s`` : part of the v̇_y residual of ``physics`` on
-    the log that correlates with the driving, NaN if unknown. ``earlier`` : earlier calibrations of the same log in time
-    order; each applies from its ``since_ns``. ``causal`` : whether it depends only on data before ``since_ns``.
+    the log that correlates with the driving, NaN if unknown. ``causal`` : whether it depends on no sample of the log.
     ``cg_std_m`` : as :attr:`Car.cg_std_m`. ``error_scale`` : residual of the sensors after the fit, relative to the
     assumption of the calibration.
     """
@@ -80,8 +77,6 @@ class WithoutTruth:
     note: str
     varied: tuple[VehicleParameters, ...] = ()
     driven_d2_m_s: float = math.nan
-    since_ns: int = 0
-    earlier: tuple[WithoutTruth, ...] = ()
     causal: bool = False
     cg_std_m: float = 0.0
     error_scale: float = 1.0
@@ -246,9 +241,8 @@ class Car:
         """Return the car with identified parameters; a residual gain of other parameters is dropped."""
         vehicle = fit.values.applied_to(self.datasheet)
         fitted_car = replace(self, vehicle=vehicle, fitted_physics=fit.physics)
-        how = "(calibrated without ground truth)" if fit.without_truth else "(identified)"
-        if vehicle != self.datasheet and not vehicle.name.endswith(how):
-            vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} {how}"})
+        if vehicle != self.datasheet and not vehicle.name.endswith("(identified)"):
+            vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} (identified)"})
         noise = {n: noise for n, noise in self.noise.items() if fitted_car.owns_noise(n, noise)} | fit.filter
         if fit.physics is not None:
             noise[PHYSICS] = fit.physics.noise
@@ -288,8 +282,6 @@ def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:
 def _with_parts(car: Car, folder: Path) -> Car:
     """Return the car with the valid parts of its folder: ``taught.json``, or fit and noise."""
     notes: list[str] = []
-    if (folder / OLD_GAIN_FILE).is_file():
-        notes.append(f"{OLD_GAIN_FILE} is no longer read: the residual gain follows from network and drive")
     taught = _part(folder / TAUGHT_FILE, Taught)
     if taught is not None and taught.physics_sha256 == physics_sha256(car.datasheet):
         others = [name for name in (FIT_FILE, NOISE_FILE) if (folder / name).is_file()]
@@ -299,22 +291,18 @@ def _with_parts(car: Car, folder: Path) -> Car:
             notes.append(f"{TAUGHT_FILE}: taught by {taught.truth}")
         return replace(car, taught=taught, notes=tuple(notes))
     if taught is not None:
-        notes.append(_stale(TAUGHT_FILE, f"{VEHICLE_FILE} has changed since", "teach"))
+        notes.append(f"{TAUGHT_FILE} is not used: {VEHICLE_FILE} has changed since; pdhef learn creates it again")
     fit = _part(folder / FIT_FILE, Fit)
     if fit is not None and fit.physics_sha256 == physics_sha256(car.datasheet):
         car = car.with_fit(fit)
     elif fit is not None:
-        notes.append(_stale(FIT_FILE, f"{VEHICLE_FILE} has changed since", "calibrate"))
+        notes.append(f"{FIT_FILE} is not used: {VEHICLE_FILE} has changed since")
     tuned = _part(folder / NOISE_FILE, Noise)
     noise: Mapping[str, FilterNoise] = {} if tuned is None else tuned.filter
     if stale := [n for n, of_filter in noise.items() if not car.owns_noise(n, of_filter)]:
         notes.append(f"noise of {', '.join(stale)} is not used: it belongs to other physics")
     noise = {**car.noise, **{n: of_filter for n, of_filter in noise.items() if n not in stale}}
     return replace(car, noise=noise, notes=tuple(notes))
-
-
-def _stale(what: str, why: str, stage: str) -> str:
-    return f"{what} is not used: {why}; pdhef learn --stages {stage} creates it again"
 
 
 def _part(path: Path, kind: type[PartT]) -> PartT | None:

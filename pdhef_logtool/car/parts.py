@@ -88,12 +88,6 @@ class FittedValues(Record):
     physics: PhysicsParts | None = None
 
     @classmethod
-    def between(cls, datasheet: VehicleParameters, fitted: VehicleParameters) -> FittedValues:
-        """Return the entries of ``fitted`` that differ from ``datasheet``."""
-        same = {k: None for k in cls.model_fields if getattr(fitted, k) == getattr(datasheet, k)}
-        return cls.of(fitted).model_copy(update=same)
-
-    @classmethod
     def of(cls, fitted: VehicleParameters) -> FittedValues:
         """Return all entries of a vehicle."""
         values = {k: getattr(fitted, k) for k in cls.model_fields}
@@ -187,11 +181,10 @@ class FittedPhysics(Record):
 
 
 class Fit(Record):
-    """``fit.toml``, written by ``pdhef learn --stages calibrate``: identified physics of the car.
+    """``fit.toml``: identified physics of the car.
 
     The noise in ``filter`` was identified together with the values (docs/method.md#identification). ``physics``
     contains the values and noise of the filter ``physics``, which has other model parts and is identified separately.
-    ``without_truth``: the car was calibrated on sensors alone (docs/method.md#self-calibration).
     """
 
     format: Literal["pdhef-fit"] = "pdhef-fit"
@@ -200,7 +193,6 @@ class Fit(Record):
     values: FittedValues = FittedValues()
     filter: FilterTables = Field(default_factory=dict)
     physics: FittedPhysics | None = None
-    without_truth: bool = False
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
     scores: dict[str, dict[str, float]] = Field(default_factory=dict)
     notes: Annotated[tuple[str, ...], Field(strict=False)] = ()

@@ -24,25 +24,16 @@ MOST_DRIVES = 40
 def render_learning(result: LearnResult, console: Console) -> None:
     """Print result, assumptions and next step, and the tables of the stage."""
     left = f", {len(result.left_out)} left out" if result.left_out else ""
+    calibrated = result.stage == "calibrate"
     head = three_lines(
         result.text,
         f"{len(result.drives)} drive{'s' * (len(result.drives) != 1)}{left}; decisions by held-out driving",
-        f"pdhef run LOG --car {result.car} -o OUT",
+        f"pdhef run LOG --car {result.car}{' --model ' + str(result.car / 'model.toml') if calibrated else ''} -o OUT",
     )
     console.print(head)
-    console.print()
-    _RENDER[result.stage](result.figures, console)
-
-
-def _calibration(figures: Mapping[str, Any], console: Console) -> None:
-    """Print the calibrated parameters with their uncertainty."""
-    calibration = figures["self_calibration"]
-    parameters = table("parameter", ">value", ">± 1 sd", ">prior", ">± 1 sd", "unit")
-    for p in calibration["parameters"]:
-        spread = [f"{100.0 * s:.0f} %" if p["log"] else f"{s:.2g}" for s in (p["sd"], p["prior_sd"])]
-        parameters.add_row(p["name"], f"{p['value']:.5g}", spread[0], f"{p['prior']:.4g}", spread[1], p["unit"])
-    console.print(parameters)
-    console.print(f"  {calibration['text']}")
+    if not calibrated:
+        console.print()
+        _teaching(result.figures, console)
 
 
 def _teaching(figures: Mapping[str, Any], console: Console) -> None:
@@ -66,9 +57,6 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         )
     for text in figures["more"]:
         console.print(f"  {text}")
-
-
-_RENDER = {"teach": _teaching, "calibrate": _calibration}
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:

@@ -74,21 +74,6 @@ _OPTIONS: dict[str, Any] = {
     ),
     "start": _option(_Text, INPUT, "Start of the time slice: 12.5, +10s, end-5s, ns or RFC 3339."),
     "end": _option(_Text, INPUT, "End of the time slice, same formats as --start."),
-    "clock": _option(
-        _Text,
-        ESTIMATION,
-        "arrival: use a sample from its arrival on, as in a car. stamp: from its stamp on (not causal).",
-    ),
-    "setup": _option(
-        _File, ESTIMATION, "setup.toml of another run of this car and recorder, for mounting, delays and clocks."
-    ),
-    "setup_from_s": _option(
-        float | None,
-        ESTIMATION,
-        "Decide mounting, delays and clocks on the first SECONDS only, as in a car.",
-        "--setup-from",
-        metavar="SECONDS",
-    ),
     "estimators": _option(
         _Text, ESTIMATION, "Comma-separated names, all or peers. Default: pd-hef, physics, zero.", "--estimators", "-e"
     ),
@@ -96,10 +81,11 @@ _OPTIONS: dict[str, Any] = {
         _Text, ESTIMATION, "auto (from the log, else the car, else estimated), file, estimate, or a number."
     ),
     "network": _option(_File, ESTIMATION, "Network folder, default or none. Default: the car's."),
-    "calibrate": _option(
-        _Text,
+    "model": _option(
+        _File,
         ESTIMATION,
-        "Calibration without ground truth of a car without validation data: log, online, pool or off.",
+        "auto: fit sensors and car to the log (not causal). off: do not fit the car. FILE: model.toml of a run.",
+        metavar="auto|off|FILE",
     ),
     "reference": _option(
         _Text, ESTIMATION, "Sideslip reference without tyre data: auto (without ground truth), on or off."

@@ -53,8 +53,7 @@ def _list_estimators(show: bool) -> None:
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
     'cars.toml, with paths relative to it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
     '"mini.toml"; [metadata.vehicle_id] "WVW-1" = "cars/golf"; default = "saloon" above them.',
-    shared="cars estimators annotate keep clock setup setup_from_s friction plan network calibrate "
-    "reference gnss no_position waived",
+    shared="cars estimators annotate keep friction plan network model reference gnss no_position waived",
     car="Car of the logs (default: a sedan)",
 )
 def run(  # positional: one an option of the command line

@@ -13,7 +13,7 @@ Rules
   sample, because a filter would otherwise count one reading several times.
 * No value is interpolated or held across a gap of more than ``max_gap_s``, and no value is extrapolated.
 * A sample that arrives much later than its neighbours counts as missing.
-* A channel is read by its stamps if all of its samples arrive too late to wait for, or with ``clock="stamp"``.
+* A channel is read by its stamps if all of its samples arrive too late to wait for.
 """
 
 from __future__ import annotations
@@ -160,9 +160,7 @@ class AlignmentPlan:
         return {**jsonable(self), "unused": dict(self.unused)}
 
 
-def plan_alignment(
-    channels: Mapping[str, Channel], *, steering_ratio: float, wheel_radius_m: float, clock: Clock = "arrival"
-) -> AlignmentPlan:
+def plan_alignment(channels: Mapping[str, Channel], *, steering_ratio: float, wheel_radius_m: float) -> AlignmentPlan:
     """Decide clock, method, gaps and lateness of every channel from the first ``SURVEY_S`` seconds.
 
     The grid channel is the first of yaw rate, a_y, a_x with a rate within a factor 2 of the fastest of them.
@@ -171,8 +169,6 @@ def plan_alignment(
     ----------
     channels : every mapped signal by name, even if it has no sample in the survey.
     steering_ratio : steering-wheel angle over road-wheel angle. wheel_radius_m : m.
-    clock : ``stamp`` reads all channels by their stamps; ``arrival`` only channels that arrive more than
-        ``MAX_PREDICTION_S`` late.
 
     Raises
     ------
@@ -185,7 +181,7 @@ def plan_alignment(
     assert grid_period is not None
     chosen, unused = _choose_sources(survey, steering_ratio, wheel_radius_m)
     plans = tuple(
-        _plan_channel(survey[name], target, scale, survey[grid], grid_period, clock)
+        _plan_channel(survey[name], target, scale, survey[grid], grid_period)
         for name, (target, scale) in sorted(chosen.items())
     )
     return AlignmentPlan(
@@ -413,7 +409,7 @@ def _speed_source(columns: set[str]) -> str:
 
 
 def _plan_channel(  # positional: one call
-    channel: Channel, target: str, scale: float, grid: Channel, grid_period_s: float, clock: Clock
+    channel: Channel, target: str, scale: float, grid: Channel, grid_period_s: float
 ) -> ChannelPlan:
     period = _median_period_s(channel)
     is_input = channel.name in _INPUTS
@@ -435,7 +431,7 @@ def _plan_channel(  # positional: one call
         delay_s=delay_s,
         late_limit_s=late_limit_s,
         max_gap_s=_max_gap_s(period),
-        clock="stamp" if delay_s > MAX_PREDICTION_S else clock,
+        clock="stamp" if delay_s > MAX_PREDICTION_S else "arrival",
     )
 
 

@@ -13,6 +13,8 @@ from pdhef_logtool.records.errors import UsageError
 
 #: A bare integer from here on is nanoseconds, not seconds from the log's start.
 NANOSECONDS_FROM = 10**15
+#: Models in place of a file: sensors and car fitted to the whole log; sensors of the log, and the prior of the car.
+AUTO, OFF = Path("auto"), Path("off")
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,11 +27,9 @@ class ReadOptions:
     sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
     friction : of :func:`~pdhef_logtool.drive.friction.parse_friction`; None keeps the friction of the log, if any.
     prefer_truth : ground truth to use if a simulated log contains both.
-    clock : ``arrival`` makes samples available at their arrival, as in a car; ``stamp`` at their stamps (not causal).
     budget : factor on the resource limits for reading a log.
     waived : names of checks to ignore.
-    setup : frozen set-up file; None decides the set-up on the log. setup_from_s : duration at the start of the slice
-        that decides the set-up; None = ten minutes, and the whole slice for clocks.
+    model : :data:`AUTO`, :data:`OFF`, or the model.toml of an earlier drive, which decides the sensors.
     msgs : folder with definitions of message types that a log does not define.
     allow_private_redirects : whether a web server may redirect to other hosts of this machine and its network.
     """
@@ -39,17 +39,15 @@ class ReadOptions:
     sensors: Literal["full", "esp"] = "full"
     friction: str | float | None = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
-    clock: Literal["arrival", "stamp"] = "arrival"
     budget: float = 1.0
     waived: tuple[str, ...] = ()
-    setup: Path | None = None
-    setup_from_s: float | None = None
+    model: Path = AUTO
     msgs: Path | None = None
     allow_private_redirects: bool = False
 
     def __post_init__(self) -> None:
         """Convert texts to paths."""
-        object.__setattr__(self, "setup", None if self.setup is None else Path(self.setup))
+        object.__setattr__(self, "model", Path(self.model))
         object.__setattr__(self, "msgs", None if self.msgs is None else Path(self.msgs))
 
     @property

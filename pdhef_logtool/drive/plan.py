@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.alignment import SURVEY_S, AlignmentPlan, Clock, has_imu, no_alignment, plan_alignment
+from pdhef_logtool.drive.alignment import SURVEY_S, AlignmentPlan, has_imu, no_alignment, plan_alignment
+from pdhef_logtool.drive.model_file import Sensors, clocks_of
 from pdhef_logtool.drive.mounting import survey_log
-from pdhef_logtool.drive.setup import Setup, clocks_of
 from pdhef_logtool.drive.truth import LatencyEstimate, TruthPlan, dependent_signals
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, Mapping, clock_key, fit_clocks
@@ -27,7 +27,7 @@ class DrivePlan:
     latency : of the ground truth against the sensors; None without ground truth yaw rate or gyro.
     dependent : ground truth quantities that are an input of the estimators, with the reason.
     derivation : derivation of each ground truth quantity.
-    decided_s : duration that decided the sensors' part, of this log or of the log of the set-up.
+    decided_s : duration that decided the sensors, of this log or of that of the model file.
     checks : of signals, ground truth and vehicle file.
     refused : mapped channels that must not be used, with the reason; names of ground truth begin with ``truth.``.
     """
@@ -58,6 +58,14 @@ class DrivePlan:
         """Whether the ground truth has position and heading."""
         return {"position_m", "yaw_rad"} <= self.derivation.keys()
 
+    @property
+    def sensors(self) -> Sensors:
+        """Mapping, clocks and alignment of the sensors, for later drives."""
+        signals = self.mapping.signals
+        keys = {clock_key(source) for source in signals.values()}
+        clocks = {key: clock for key, clock in self.clocks.items() if key in keys}
+        return Sensors(signals, clocks, self.alignment, self.decided_s, self.mapping.can)
+
 
 def plan_drive(
     log: DriveLog,
@@ -67,8 +75,7 @@ def plan_drive(
     end_ns: int,
     *,
     require_imu: bool = True,
-    clock: Clock = "arrival",
-    setup: Setup | None = None,
+    sensors: Sensors | None = None,
     waived: Sequence[str] = (),
 ) -> DrivePlan:
     """Read at most ten minutes of the slice [start_ns, end_ns) and decide clocks, alignment and ground truth.
@@ -76,7 +83,7 @@ def plan_drive(
     Parameters
     ----------
     require_imu : False gives a plan with no alignment (``alignment.channels`` empty) where there is no IMU.
-    clock : as for :func:`~.alignment.plan_alignment`. setup : the sensors' part of the plan; None decides it here.
+    sensors : of an earlier drive; None decides them here.
     waived : names of checks that may fail without excluding a channel.
 
     Raises
@@ -84,27 +91,26 @@ def plan_drive(
     MappingError : The log lacks a mapped topic or field, or an IMU.
     """
     mapping = with_gyro_delay(mapping, vehicle)
-    if setup is not None:
-        mapping = setup.applied_to(mapping)
+    if sensors is not None:
+        mapping = sensors.applied_to(mapping)
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
-    if setup is not None:
-        clocks |= clocks_of(setup, log, mapping, start_ns)
+    if sensors is not None:
+        clocks |= clocks_of(sensors, log, mapping, start_ns)
     span_ns = (start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
     looked_at = survey_log(log, mapping, clocks, span_ns, vehicle)
     mapping, survey = looked_at.mapping, looked_at.channels
-    if setup is not None:
-        alignment = setup.alignment
+    if sensors is not None:
+        alignment = sensors.alignment
     elif require_imu or has_imu(survey.signals):
         alignment = plan_alignment(
             survey.signals,
             steering_ratio=vehicle.steering_ratio,
             wheel_radius_m=vehicle.wheel_radius_m,
-            clock=clock,
         )
     else:
         alignment = no_alignment(survey.signals)
-    # The signals of a set-up must not depend on later samples.
-    refused = looked_at.refused(waived, is_causal=setup is not None)
+    # The signals of earlier sensors must not depend on later samples.
+    refused = looked_at.refused(waived, is_causal=sensors is not None)
     mapping, sound = without_refused_truth(mapping, refused), looked_at
     if mapping is not looked_at.mapping:
         sound = survey_log(log, mapping, clocks, span_ns, vehicle, rescale=False)
@@ -122,7 +128,7 @@ def plan_drive(
         survey_truth=sound.channels.truth,
         start_ns=start_ns,
         end_ns=end_ns,
-        decided_s=(end_ns - start_ns) * 1e-9 if setup is None else setup.decided_s,
+        decided_s=(end_ns - start_ns) * 1e-9 if sensors is None else sensors.decided_s,
         checks=looked_at.checks,
         refused=refused,
     )
@@ -135,18 +141,6 @@ def without_refused_truth(mapping: Mapping, refused: Mapped[str, str]) -> Mappin
         return mapping
     kept = {n: s for n, s in mapping.truth.items() if n not in names}
     return replace(mapping, truth=kept if names <= mapping.truth.keys() else {})
-
-
-def setup_of(plan: DrivePlan) -> Setup:
-    """Return the frozen set-up of a plan: mapping, clocks and alignment of the sensors."""
-    keys = {clock_key(source) for source in plan.mapping.signals.values()}
-    return Setup(
-        signals=plan.mapping.signals,
-        clocks={key: clock for key, clock in plan.clocks.items() if key in keys},
-        alignment=plan.alignment,
-        decided_s=plan.decided_s,
-        can=plan.mapping.can,
-    )
 
 
 def with_gyro_delay(mapping: Mapping, vehicle: VehicleParameters) -> Mapping:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self, cast
+from typing import Self
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.friction import FrictionSource, friction_source
-from pdhef_logtool.drive.options import ReadOptions, time_slice
-from pdhef_logtool.drive.plan import DrivePlan, plan_drive, setup_of
+from pdhef_logtool.drive.model_file import CLOCK_START_S, ModelFile, is_device_clock, load_model
+from pdhef_logtool.drive.options import AUTO, OFF, ReadOptions, time_slice
+from pdhef_logtool.drive.plan import DrivePlan, plan_drive
 from pdhef_logtool.drive.recorded import Recorded, read_recorded
-from pdhef_logtool.drive.setup import CLOCK_START_S, LogUntil, Setup, is_device_clock, load_setup
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput, check_unchanged, find_logs, identity_of, log_state
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -40,8 +40,6 @@ Tell = Callable[[str], None]
 #: Returns the mapping to read with, from the log and the mapping in effect; may print a message.
 Adjust = Callable[[DriveLog, Mapping, Tell], Mapping]
 
-#: Memory limit of signals, ground truth and derived columns of all drives of a command together.
-MAX_BYTES = 2 << 30
 _AS_IT_IS = ReadOptions()
 
 
@@ -50,7 +48,6 @@ class WholeDrive:
     """A drive in memory: signals [N], and the ground truth [N] at their stamps (None for a log without it)."""
 
     name: str
-    path: LogPlace
     plan: DrivePlan
     signals: Signals
     truth: StateTrack | None
@@ -67,11 +64,6 @@ class WholeDrive:
         stamps = self.signals.stamps_ns
         return float(stamps[0] - self.log_start_ns) * 1e-9, float(stamps[-1] - self.log_start_ns) * 1e-9
 
-    @property
-    def nbytes(self) -> int:
-        """Memory that its columns take."""
-        return _nbytes(self.signals) + (0 if self.truth is None else _nbytes(self.truth))
-
 
 @dataclass(slots=True, eq=False)
 class Drive:
@@ -82,6 +74,7 @@ class Drive:
     name : of the log in tables and folders. chosen : the mapping before the drive changed it.
     plan : decisions from the first minutes; may be replaced before reading.
     friction : friction source for :meth:`whole`; may be replaced before reading.
+    prior : model of an earlier drive, None without.
     notes : warnings to the user about this drive. remarks : other information.
     """
 
@@ -93,6 +86,7 @@ class Drive:
     chosen: ChosenMapping
     notes: list[str]
     friction: FrictionSource
+    prior: ModelFile | None
     _tell: Tell
     remarks: list[str] = field(default_factory=list)
     _recorded: Recorded | None = None
@@ -125,19 +119,11 @@ class Drive:
         return self.plan.alignment.available
 
     @property
-    def setup_source(self) -> str:
-        """Where mounting, units, delays and clocks come from: ``log``, ``first seconds`` or ``file``."""
-        if self.options.setup is not None:
-            return "file"
-        return "log" if self.options.setup_from_s is None else "first seconds"
-
-    @property
     def causal_from_s(self) -> float | None:
-        """Time in the slice, s, from which the set-up depends on past samples only; None: it depends on all of them."""
-        if self.options.setup is not None:
-            device = any(map(is_device_clock, self.plan.clocks.values()))
-            return CLOCK_START_S if device else 0.0
-        return self.options.setup_from_s
+        """Time in the slice, s, from which the sensors depend on past samples only; None: they depend on all."""
+        if self.prior is None:
+            return None
+        return CLOCK_START_S if any(map(is_device_clock, self.plan.clocks.values())) else 0.0
 
     @property
     def not_causal(self) -> str:
@@ -198,17 +184,16 @@ class Drive:
         self.notes.append(text)
         self._tell(f"{self.name}: {text}")
 
-    def whole(self, *, fill_friction: bool = True, max_bytes: int | None = None) -> WholeDrive:
+    def whole(self, *, fill_friction: bool = True) -> WholeDrive:
         """Return the whole drive; it is read once per plan.
 
         Parameters
         ----------
         fill_friction : False keeps the friction of the log.
-        max_bytes : memory limit of signals and ground truth; None = no limit.
 
         Raises
         ------
-        EstimatorError : The slice contains no stamp, or the drive exceeds the memory limit.
+        EstimatorError : The slice contains no stamp.
         """
         recorded = self.recorded()
         signals, truth = recorded.signals, recorded.truth
@@ -216,10 +201,7 @@ class Drive:
             raise no_samples(self.path)
         if fill_friction:
             signals = self.friction.fill(signals, truth)
-        whole = WholeDrive(self.name, self.path, self.plan, signals, truth, self.log.start_ns)
-        if max_bytes is not None and whole.nbytes > max_bytes:
-            raise too_big(self.name)
-        return whole
+        return WholeDrive(self.name, self.plan, signals, truth, self.log.start_ns)
 
     def recorded(self) -> Recorded:
         """Return the drive as recorded, which may be empty."""
@@ -289,8 +271,9 @@ def read_drive(
     state = log_state(log_input.path)
     opened = open_log(log_input.path, options.limits, options.msgs, wanted=Wanted(frozenset()))
     try:
-        undecided, prefer = _as_far_as_decided(opened, options), options.prefer_truth
-        chosen = choose_mapping(undecided, mapping, prefer_truth=prefer, require_signals=require_sensors)
+        prior = None if options.model in (AUTO, OFF) else load_model(options.model, car)
+        prefer = options.prefer_truth
+        chosen = choose_mapping(opened, mapping, prefer_truth=prefer, require_signals=require_sensors)
         for ambiguity in chosen.ambiguities:
             told(str(ambiguity))
         remarks += chosen.remarks
@@ -304,10 +287,9 @@ def read_drive(
         if not isinstance(log_input.path, Path):
             opened = _reopened(opened, used, slice_ns, options)
             slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
-        setup = _setup_of(opened, used, car.vehicle, slice_ns, options)
         plan = plan_drive(
-            opened, used, car.vehicle, *slice_ns, require_imu=require_sensors, clock=options.clock, setup=setup,
-            waived=options.waived,
+            opened, used, car.vehicle, *slice_ns, require_imu=require_sensors,
+            sensors=None if prior is None else prior.sensors, waived=options.waived,
         )  # fmt: skip
         for note in plan.mapping.notes[len(used.notes) :]:
             told(note)
@@ -319,29 +301,9 @@ def read_drive(
         _name_damage(error, opened)
         opened.close()
         raise
-    return Drive(log_input.stem, opened, car, options, plan, chosen, notes, friction, tell, remarks, _state=state)
-
-
-def _setup_of(
-    log: DriveLog, mapping: Mapping, vehicle: VehicleParameters, slice_ns: tuple[int, int], options: ReadOptions
-) -> Setup | None:
-    """Return the frozen set-up from a file or from the first seconds, as the options choose; None without one."""
-    if options.setup is not None:
-        return load_setup(options.setup)
-    if options.setup_from_s is None:
-        return None
-    start_ns, end_ns = slice_ns
-    first = _as_far_as_decided(log, options)
-    until_ns = min(end_ns, first.end_ns)
-    return setup_of(plan_drive(first, mapping, vehicle, start_ns, until_ns, clock=options.clock, waived=options.waived))
-
-
-def _as_far_as_decided(log: DriveLog, options: ReadOptions) -> DriveLog:
-    """Return the log up to the end of the set-up from the first seconds, or all of it without such a set-up."""
-    if options.setup_from_s is None or log.end_ns <= log.start_ns:
-        return log
-    start_ns, _ = time_slice(options, log.start_ns, log.end_ns)
-    return cast(DriveLog, LogUntil(log, start_ns + round(options.setup_from_s * 1e9)))
+    return Drive(
+        log_input.stem, opened, car, options, plan, chosen, notes, friction, prior, tell, remarks, _state=state
+    )
 
 
 def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], options: ReadOptions) -> DriveLog:
@@ -387,16 +349,6 @@ def no_samples(path: LogPlace) -> EstimatorError:
     )
 
 
-def too_big(where: str) -> EstimatorError:
-    """Return the error for drives that do not fit into memory."""
-    return EstimatorError(
-        expected=f"drives with at most {MAX_BYTES >> 20} MiB of signals and ground truth together",
-        got="more",
-        where=where,
-        remedy="give fewer drives, or a slice of each with --start and --end",
-    )
-
-
 def _checks_of(plan: DrivePlan, options: ReadOptions) -> tuple[Check, ...]:
     return tuple(replace(c, waived=True) if c.name in options.waived else c for c in plan.checks)
 
@@ -407,13 +359,12 @@ def _tell_doubts(plan: DrivePlan, options: ReadOptions, tell: Tell) -> None:
             tell(f"check {check.name} failed{' (waived)' if check.waived else ''}: {check.evidence}; {check.remedy}")
     for name in sorted(set(options.waived) - {c.name for c in plan.checks}):
         tell(f"--waive {name}: no check of this log is called that")
-    if options.clock == "arrival":
-        for channel in (c for c in plan.alignment.channels if c.clock == "stamp"):
-            source = plan.mapping.signals[channel.name].label
-            tell(
-                f"{channel.name} ({source}) arrives {channel.delay_s:.2f} s after its stamps, expected at most "
-                f"{MAX_PREDICTION_S:g} s: it is read by its stamps, and no estimate of this log is causal"
-            )
+    for channel in (c for c in plan.alignment.channels if c.clock == "stamp"):
+        source = plan.mapping.signals[channel.name].label
+        tell(
+            f"{channel.name} ({source}) arrives {channel.delay_s:.2f} s after its stamps, expected at most "
+            f"{MAX_PREDICTION_S:g} s: it is read by its stamps, and no estimate of this log is causal"
+        )
     for name, reason in plan.alignment.unused:
         if name not in plan.refused:
             tell(f"{name} is not used: {reason}")
@@ -441,7 +392,3 @@ def friction_of(
         return FrictionSource(f"topic {topic}" if topic else "none")
     available, use_speed = plan.alignment.available, options.use_speed
     return friction_source(options.friction, vehicle, available, topic, use_speed=use_speed, validated=validated)
-
-
-def _nbytes(record: Signals | StateTrack) -> int:
-    return sum(getattr(getattr(record, f.name), "nbytes", 0) for f in fields(record))

@@ -16,7 +16,7 @@ the same sum as a velocity. The estimates are unchanged.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -26,8 +26,8 @@ from pdhef_logtool.car.car import WithoutTruth
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
 from pdhef_logtool.estimators.intervals import MAX_SIDESLIP_STD_RAD, scaled_covariance
 from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
@@ -38,64 +38,40 @@ D2_SHARE, CAR_STD_RAD = 0.7, math.radians(0.15)
 
 @dataclass(slots=True)
 class CalibratedBand:
-    """The interval above over one drive; its signals were read with the vehicle file. All tracks share its runs.
+    """The interval above over one drive; its signals were read with the vehicle file. All tracks share its runs."""
 
-    ``stages`` : calibrations in time order, each for its part of the drive.
-    """
-
-    stages: Sequence[WithoutTruth]
+    calibration: WithoutTruth
     vehicle_file: VehicleParameters
     _signals: Signals | None = None
-    _vy: list[list[FloatArray]] = field(default_factory=list)
+    _vy: list[FloatArray] = field(default_factory=list)
 
     @property
     def note(self) -> str:
         """Components of the intervals; calibrated intervals of another car are not used."""
-        calibration = self.stages[-1]
-        parts = ["own", *(["parameters"] if calibration.varied else [])]
-        parts += ["d2"] if math.isfinite(calibration.driven_d2_m_s) else []
+        parts = ["own", *(["parameters"] if self.calibration.varied else [])]
+        parts += ["d2"] if math.isfinite(self.calibration.driven_d2_m_s) else []
         return f"intervals: {', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else "intervals not calibrated"
 
     def widen(self, track: StateTrack, signals: Signals) -> StateTrack:
         """Return a track [N] with wider 1-sigmas of sideslip and v_y."""
         if not len(signals):
             return track
-        spans = [*runs_of(stages_of(signals.stamps_ns, self.stages))]
         if signals is not self._signals:
-            compared = [self._compared(self.stages[n], signals.rows(first, last)) for n, first, last in spans]
-            self._signals, self._vy = signals, compared
-        parts = [
-            _widened(track.rows(first, last), vy, self.stages[n])
-            for (n, first, last), vy in zip(spans, self._vy, strict=True)
-        ]
-        return replace(concatenate(parts) if len(parts) > 1 else parts[0], name=track.name)
+            self._signals, self._vy = signals, self._compared(signals)
+        calibration = self.calibration
+        d2, scale = calibration.driven_d2_m_s, calibration.error_scale
+        contradicted = np.hypot(scale * CAR_STD_RAD * track.vx_m_s, D2_SHARE * d2 if math.isfinite(d2) else 0.0)
+        contradicted = np.hypot(contradicted, calibration.cg_std_m * track.yaw_rate_rad_s)
+        return widened(track, self._vy, contradicted, calibration.vehicle.low_speed_blend_m_s, own_share=scale)
 
-    def _compared(self, calibration: WithoutTruth, signals: Signals) -> list[FloatArray]:
+    def _compared(self, signals: Signals) -> list[FloatArray]:
         """Return v_y of the physics filter on the calibrated vehicle and its variations; empty without variations."""
         from pdhef_logtool.estimators.vehicle_ukf import physics_filter
 
+        calibration = self.calibration
         vehicles = (calibration.vehicle, *calibration.varied) if calibration.varied else ()
         filters = [physics_filter(vehicle, calibration.noise) for vehicle in vehicles]
         return lateral_velocities(filters, calibration.without_estimated_friction(signals), self.vehicle_file)
-
-
-def stages_of(stamps_ns: IntArray, stages: Sequence[WithoutTruth]) -> IntArray:
-    """Return the stage of each stamp [N]; the first begins with the log."""
-    return np.searchsorted([s.since_ns for s in stages[1:]], stamps_ns, side="right").astype(np.int64)
-
-
-def runs_of(stage: IntArray) -> Iterator[tuple[int, int, int]]:
-    """Yield stage, first and last + 1 of each run of equal stages [N]; N > 0."""
-    edges = np.flatnonzero(np.diff(stage)) + 1
-    for first, last in zip([0, *edges], [*edges, len(stage)], strict=True):
-        yield int(stage[first]), int(first), int(last)
-
-
-def _widened(track: StateTrack, vy: Sequence[FloatArray], calibration: WithoutTruth) -> StateTrack:
-    d2, scale = calibration.driven_d2_m_s, calibration.error_scale
-    contradicted = np.hypot(scale * CAR_STD_RAD * track.vx_m_s, D2_SHARE * d2 if math.isfinite(d2) else 0.0)
-    contradicted = np.hypot(contradicted, calibration.cg_std_m * track.yaw_rate_rad_s)
-    return widened(track, vy, contradicted, calibration.vehicle.low_speed_blend_m_s, own_share=scale)
 
 
 def lateral_velocities(

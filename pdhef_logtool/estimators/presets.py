@@ -25,12 +25,6 @@ def calibration_of(name: str, car: Car) -> WithoutTruth | None:
     return car.self_calibrated if uses_calibration(name) else None
 
 
-def calibration_note(name: str, car: Car) -> str:
-    """Return the note on the calibration that an estimator of a car uses; empty without one."""
-    calibration = calibration_of(name, car)
-    return "" if calibration is None else calibration.note
-
-
 #: Presets that GNSS velocity corrects.
 AIDED = frozenset({"physics", "pd-hef"})
 

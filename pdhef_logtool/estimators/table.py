@@ -115,13 +115,8 @@ class Spec:
         if calibration is None:
             estimator: Estimator = build(self.name, car, options)
             return estimator
-        if not (calibration.earlier and self.causal):
-            calibrated: Any = build(self.name, car.calibrated_car, options)
-            return cast("Estimator", replace(calibrated, causal=self.causal and calibration.causal))
-        from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
-
-        cars = tuple(replace(car, self_calibrated=stage) for stage in (*calibration.earlier, calibration))
-        return OnlineCalibrated(tuple(cast("Any", build(self.name, c.calibrated_car, options)) for c in cars), cars)
+        calibrated: Any = build(self.name, car.calibrated_car, options)
+        return cast("Estimator", replace(calibrated, causal=self.causal and calibration.causal))
 
 
 def _aided(build: Callable[[str, Car, Options], Estimator], name: str, car: Car, options: Options) -> Estimator:

@@ -10,11 +10,11 @@ import numpy as np
 
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.learning.drives import no_true_sideslip
+from pdhef_logtool.model.drive_model import DriveModel, lacking
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.referencing import reference_of
-from pdhef_logtool.runs.self_calibrating import calibrate_drive, lacking
 
 #: Sideslip error of a single track in rad; ground truth with the same uncertainty has the weight 1/2.
 MODEL_STD_RAD = math.radians(0.3)
@@ -33,7 +33,7 @@ def teaching_reference(drive: Drive, config: RunConfig) -> tuple[TruthAt | None,
     lacks = no_true_sideslip(drive.plan)
     if not lacks or config.reference != "on" or lacking(drive):
         return None, lacks
-    reference = reference_of(drive, calibrate_drive(drive, config), config)
+    reference = reference_of(drive, DriveModel.fit(drive), config)
     if reference is None or reference.estimator is None:
         return None, f"{lacks}, and no sideslip reference: {'' if reference is None else reference.document['refused']}"
     reference_at = reference.estimator.at

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 #: Folder of logs in the outputs of a run, the figures of all logs, and the files of a log's folder.
 LOGS = "logs"
 METRICS_FILE = "metrics.parquet"
-REPORT_FILE, SETUP_FILE = "report.json", "setup.toml"
+REPORT_FILE, MODEL_FILE = "report.json", "model.toml"
 #: Journal of a run of several logs, a line per drive; and the folder of their figures, by run and car.
 JOURNAL_FILE = "journal.jsonl"
 PARTS = "metrics"

@@ -78,7 +78,7 @@ def write_estimates(
     path: Path,
     tracks: Sequence[StateTrack],
     *,
-    selected: Sequence[tuple[int, str]] = (),
+    selected: str | None = None,
     causal_from_ns: Mapping[str, int] | None = None,
     rows_a_group: int = ROWS_A_GROUP,
 ) -> None:
@@ -89,8 +89,7 @@ def write_estimates(
     Parameters
     ----------
     path : the finished file.
-    selected : estimators, each from a stamp on; their tracks have the same stamps and are also written as
-        :data:`SELECTED`.
+    selected : estimator, whose track is also written as :data:`SELECTED`.
     causal_from_ns : first stamp from which the rows of an estimator depend on no later sample; an estimator without one
         is causal nowhere. None: unknown, and ``causal`` is null.
     rows_a_group : rows of one row group.
@@ -102,37 +101,18 @@ def write_estimates(
     schema = arrow_schema("estimates.parquet.json")
     split = {f.name: "BYTE_STREAM_SPLIT" for f in schema if pa.types.is_floating(f.type)}
     encodings = {**split, "stamp_ns": "DELTA_BINARY_PACKED"}
-    copied = next((t.name for t in tracks if t.name in {name for _, name in selected}), None)
     with parquet_writer(path, schema, ["estimator"], encodings=encodings, level=_LEVEL) as writer:
         for first in range(0, max(map(len, tracks), default=0), rows_a_group):
             group = [track.rows(first, first + rows_a_group) for track in tracks]
             for track in group:
-                _write_group(writer, [(track, track.name)], causal_from_ns)
-                if track.name == copied:
-                    copies = [(part, SELECTED) for part in _selected_parts(group, selected)]
-                    _write_group(writer, copies, causal_from_ns)
-
-
-def _selected_parts(tracks: Sequence[StateTrack], selected: Sequence[tuple[int, str]]) -> Iterator[StateTrack]:
-    ends_ns = [*(since_ns for since_ns, _ in selected[1:]), np.iinfo(np.int64).max]
-    for (since_ns, name), until_ns in zip(selected, ends_ns, strict=True):
-        yield from (track.between(since_ns, until_ns) for track in tracks if track.name == name)
-
-
-def _write_group(
-    writer: pq.ParquetWriter, parts: Sequence[tuple[StateTrack, str]], causal_from_ns: Mapping[str, int] | None
-) -> None:
-    """Write parts of tracks, each under a name, as one row group."""
-    tables = []
-    for track, name in parts:
-        causal = None
-        if causal_from_ns is not None and track.name != TRUTH:
-            first = causal_from_ns.get(track.name)
-            causal = np.zeros(len(track), np.bool_) if first is None else track.stamps_ns >= first
-        if len(track):
-            tables.append(track_table(replace(track, name=name), as_written=True, causal=causal))
-    if tables:
-        writer.write_table(pa.concat_tables(tables).combine_chunks())
+                if not len(track):
+                    continue
+                causal = None
+                if causal_from_ns is not None and track.name != TRUTH:
+                    first_ns = causal_from_ns.get(track.name)
+                    causal = np.zeros(len(track), np.bool_) if first_ns is None else track.stamps_ns >= first_ns
+                for name in (track.name, SELECTED) if track.name == selected else (track.name,):
+                    writer.write_table(track_table(replace(track, name=name), as_written=True, causal=causal))
 
 
 def track_table(track: StateTrack, *, as_written: bool = False, causal: BoolArray | None = None) -> pa.Table:

@@ -44,7 +44,6 @@ class MainFacts:
     distrusted : whether the lateral consistency contradicts the preferred one.
     naive : the estimator to beat, None if it did not run. shown : displayed tracks; all if the estimators were
         ``named``.
-    over_time : estimators selected on line with the stamp, ns, from which on each is; empty: ``name`` throughout.
     """
 
     name: str
@@ -54,12 +53,6 @@ class MainFacts:
     naive: str | None
     shown: Sequence[str]
     named: bool
-    over_time: Sequence[tuple[int, str]] = ()
-
-    @property
-    def spans(self) -> Sequence[tuple[int, str]]:
-        """The selected estimators, each with the stamp from which on it is selected."""
-        return self.over_time or ((0, self.name),)
 
 
 def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
@@ -75,9 +68,7 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
         "next": "; ".join(_next_steps(report, main, figures)[:_MOST_STEPS]),
     }
     best = _best_in_hindsight(report, main, figures)
-    chosen = {"main" if key == "name" else key: value for key, value in asdict(main).items() if key != "over_time"}
-    if main.over_time:
-        chosen["over_time"] = [{"since_ns": t, "name": name} for t, name in main.over_time]
+    chosen = {"main" if key == "name" else key: value for key, value in asdict(main).items()}
     return {**chosen, "shown": list(main.shown), "best_in_hindsight": best, "texts": texts}
 
 
@@ -249,10 +240,8 @@ def _model(report: Report, causal: bool) -> list[str]:
     vehicle, calibration = report["vehicle"], report["self_calibration"]
     used = calibration is not None and not calibration["refused"]
     taught = f", taught by {vehicle['taught']}" if vehicle.get("taught") else ""
-    if used and (calibration.get("online", False) or not causal):
-        where = "this log" if calibration["logs"] == 1 else f"{calibration['logs']} logs"
-        therefore = "as it goes on" if causal else "therefore not causal"
-        return [_car(vehicle) + taught, f"calibrated on {where} without ground truth, {therefore}"]
+    if used and not causal:
+        return [_car(vehicle) + taught, "calibrated on this log without ground truth, therefore not causal"]
     if vehicle["file"] is None:
         return [_car(vehicle)]
     proven = "validated on drives with ground truth" if vehicle["proven"] else "parameters of its file, not validated"

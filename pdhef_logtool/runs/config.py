@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 from pdhef_logtool.car.names import NO_INTERVALS, SHIPPED_CARS, UNSURE
 from pdhef_logtool.car.vehicle import SENSOR_PROFILES
 from pdhef_logtool.drive.friction import parse_friction
-from pdhef_logtool.drive.options import ReadOptions, parse_time
+from pdhef_logtool.drive.options import AUTO, OFF, ReadOptions, parse_time
 from pdhef_logtool.estimators.table import check_names, split_names
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
@@ -24,7 +24,7 @@ from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
 from pdhef_logtool.residual_model.interface import plug_in_names
 from pdhef_logtool.storage.documents import read_toml, validated
 
-_FILES = ("car", "cars", "mapping", "msgs", "plan", "network", "intervals", "setup", "sensor_profile")
+_FILES = ("car", "cars", "mapping", "msgs", "plan", "network", "intervals", "model", "sensor_profile")
 #: Settings that change no result.
 _NO_RESULT = ("allow_private_redirects", "log_timeout_s", "max_memory_mb", "full_worst")
 #: Values that replace a file.
@@ -33,6 +33,7 @@ _KEYWORDS = {
     "network": (*SHIPPED_FOLDERS, NO_MODEL),
     "intervals": (NO_INTERVALS, UNSURE),
     "sensor_profile": tuple(SENSOR_PROFILES),
+    "model": (str(AUTO), str(OFF)),
 }
 
 
@@ -50,7 +51,6 @@ Names = Annotated[
 #: A file or folder, as a path or a text.
 File = Annotated[Path, BeforeValidator(lambda v: Path(v) if isinstance(v, str) else v)]
 Keep = Literal["metrics", "estimates", "full"]
-Calibrate = Literal["off", "online", "log", "pool"]
 Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
 
 
@@ -77,7 +77,6 @@ class RunConfig:
     friction : ``auto`` (from the log, else the car, else estimated; for ``extract`` first from the ground truth),
         ``file``, ``estimate``, or a number.
     prefer_truth : ground truth of a simulated log that has both: ``perfect`` or ``rtk``.
-    clock : ``arrival`` (a sample is available from its arrival on) or ``stamp`` (from its stamp on; not causal).
     budget : factor on the limits of memory and time for reading a log.
     msgs : folder, zip file or wheel with .msg files of types that a log does not define; or a DBC file, or a folder of
         them, for raw CAN frames in BLF, ASC and MDF files.
@@ -85,8 +84,9 @@ class RunConfig:
     network : network folder, ``default``, ``none`` or the name of an installed residual model; None = the car's.
     intervals : intervals file, ``none``, or ``unsure`` (wide intervals, for a car that may have changed); None = the
         car's.
-    calibrate : calibration of a car without validation data, without ground truth: per ``log``, ``online`` on what the
-        log has shown so far (causal), on the ``pool`` of all logs, or ``off``.
+    model : ``auto`` (sensors, and a car without validation data, are fitted to the whole log without ground truth; not
+        causal), ``off`` (the car is not fitted, only its prior is used), or the model.toml of an earlier run or of
+        ``learn``, for sensors and car of earlier drives (causal).
     reference : sideslip reference (not causal, without tyre data): ``auto`` (where the log has no ground truth of
         sideslip), ``on`` (beside ground truth as well; in ``learn`` and ``extract`` in its place) or ``off``.
     gnss : ``auto`` (``physics``, ``pd-hef`` and the reference use GNSS velocity where the log has it) or ``off``.
@@ -94,10 +94,6 @@ class RunConfig:
         if each of their fields is known not to be a position; attachments, metadata and names of log files are left
         out.
     waived : names of checks whose failure is ignored.
-    setup : setup.toml of another run of the same car and recorder, from which mounting, units, delays and clocks are
-        taken; None = decided on the log.
-    setup_from_s : decide these on the first so many seconds of the slice; None = on its first ten minutes (clocks on
-        all of it).
     allow_private_redirects : follow redirects of web servers to hosts of this machine or its network.
     log_timeout_s : abort a log after this time without progress, in s.
     max_memory_mb : abort a log whose worker process exceeds this much memory, in MB.
@@ -116,19 +112,16 @@ class RunConfig:
     sensor_profile: File | None = None
     friction: Literal["auto", "file", "estimate"] | Friction = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
-    clock: Literal["arrival", "stamp"] = "arrival"
     budget: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     msgs: File | None = None
     plan: File | None = None
     network: File | None = None
     intervals: File | None = None
-    calibrate: Calibrate = "log"
+    model: File = AUTO
     reference: Literal["auto", "on", "off"] = "auto"
     gnss: Literal["auto", "off"] = "auto"
     no_position: bool = False
     waived: Names = ()
-    setup: File | None = None
-    setup_from_s: Annotated[float, Field(ge=1)] | None = None
     allow_private_redirects: bool = False
     log_timeout_s: Annotated[float, Field(ge=1)] | None = None
     max_memory_mb: Annotated[int, Field(ge=1)] | None = None
@@ -190,8 +183,6 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         config = validated(RunConfig, entries, where, UsageError, expected="the entries of pdhef.toml")
     if config.estimators is not None:
         check_names(config.estimators)
-    if config.setup is not None and config.setup_from_s is not None:
-        raise UsageError(expected="--setup or --setup-from", got="both", where="--setup")
     # Times are parsed without a log, so that a typing error is reported before the first log is opened.
     for name, text in (("--start", config.start), ("--end", config.end)):
         if text is not None:

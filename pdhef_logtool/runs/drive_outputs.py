@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.car import SHOWN_DIGITS
 from pdhef_logtool.car.parts import PHYSICS
-from pdhef_logtool.drive.plan import setup_of
-from pdhef_logtool.drive.setup import setup_toml
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, all_specs
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
@@ -21,10 +19,10 @@ from pdhef_logtool.results.opened_run import (
     ESTIMATES_FILE,
     LOGS,
     METRICS_FILE,
+    MODEL_FILE,
     PAGE_FILE,
     RECORDING_FILE,
     REPORT_FILE,
-    SETUP_FILE,
 )
 from pdhef_logtool.results.palette import REFERENCE_COLOUR
 from pdhef_logtool.results.run_report import brief_report, build_run, tool_versions, write_json
@@ -46,10 +44,10 @@ if TYPE_CHECKING:
 
 _ANNOTATED, _FOXGLOVE, _PLOTJUGGLER = "annotated.mcap", "foxglove.json", "plotjuggler.xml"
 #: Files of an earlier run, deleted unless the new run writes them.
-STALE_FILES = (SETUP_FILE, PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
+STALE_FILES = (MODEL_FILE, PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
 #: All files that a run writes into the folder of a log.
 LOG_FILES = (
-    SETUP_FILE,
+    MODEL_FILE,
     _ANNOTATED,
     _FOXGLOVE,
     _PLOTJUGGLER,
@@ -129,13 +127,13 @@ class DriveOutputs:
             self._write_layouts(colours)
         if config.kept == "full":
             self._write_recording(report, events, colours)
-        head = f"Mounting, units, delays and clocks of {drive.name}, for pdhef run --setup."
-        write_bytes(self._change.file(SETUP_FILE), setup_toml(setup_of(drive.plan), head).encode())
+        head = f"Sensors and car of {drive.name}, for pdhef run --model."
+        write_bytes(self._change.file(MODEL_FILE), self._run.model.file.toml(head).encode())
         if config.kept == "metrics":
             report = brief_report(report)
             write_json(self._change.file(REPORT_FILE), report, brief=True)
         else:
-            write_tables(self._change, report, rows, self.tracks, self._main.spans, self._causal_from_ns())
+            write_tables(self._change, report, rows, self.tracks, self._main.name, self._causal_from_ns())
         return report
 
     def _causal_from_ns(self) -> dict[str, int]:
@@ -188,7 +186,7 @@ def write_tables(
     report: dict[str, Any],
     rows: Sequence[MetricRow],
     tracks: Sequence[StateTrack],
-    selected: Sequence[tuple[int, str]] = (),
+    selected: str | None = None,
     causal_from_ns: Mapping[str, int] | None = None,
 ) -> None:
     """Write estimates.parquet, metrics.parquet and report.json of a drive."""

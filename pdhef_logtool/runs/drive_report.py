@@ -15,7 +15,7 @@ from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, lost_texts
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import notes_of
-from pdhef_logtool.estimators.presets import calibration_note
+from pdhef_logtool.estimators.presets import calibration_of
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.evaluation.dependence import day_and_route
 from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
@@ -61,7 +61,7 @@ def report_drive(
         "metrics": scored.rows,
         "segments": scored.events,
         "friction": _friction(drive.friction),
-        "self_calibration": None if run.calibration is None else run.calibration.to_dict(),
+        "self_calibration": run.model.document,
         "reference": None if run.reference is None else run.reference.document,
         "largest_errors": [] if selected is None else largest_errors(selected, truth, others, slow),
         "faults": _faults(run, main.name, estimated.read),
@@ -79,11 +79,11 @@ def _estimator_entries(run: PreparedDrive, scored: Evaluation) -> Iterator[dict[
     """Yield the entries of the estimators that ran, failed or were skipped."""
     not_causal = run.drive.not_causal
     for e in run.estimators:
-        algorithm = resolve(e)
+        algorithm, calibration = resolve(e), calibration_of(e.name, run.car)
         yield estimator_entry(
             e.name,
             causal=e.causal and not not_causal,
-            notes=(*notes_of(e), *filter(None, [calibration_note(e.name, run.car), not_causal])),
+            notes=(*notes_of(e), *filter(None, [calibration and calibration.note, not_causal])),
             intervals=run.intervals.notes(e.name),
             reasons=scored.reasons[e.name],
             algorithm={"sha256": algorithm.sha256, **algorithm.model_dump(mode="json")},
@@ -160,7 +160,11 @@ def drive_entries(
             "low_speed_blend_m_s": car.vehicle.low_speed_blend_m_s,
         },
         "truth": _truth(plan, samples),
-        "setup": {"source": drive.setup_source, "decided_s": plan.decided_s, "causal_from_s": drive.causal_from_s},
+        "model": {
+            "source": "log" if drive.prior is None else "file",
+            "decided_s": plan.decided_s,
+            "causal_from_s": drive.causal_from_s,
+        },
         "friction": None,
         "self_calibration": None,
         "reference": None,

@@ -17,8 +17,7 @@ from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.online_calibrated import OnlineCalibrated
-from pdhef_logtool.estimators.presets import SELF_CALIBRATED, calibration_of, preset_of
+from pdhef_logtool.estimators.presets import SELF_CALIBRATED, preset_of, uses_calibration
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import dead_reckon
 from pdhef_logtool.records.readings import without_impossible_states
@@ -48,7 +47,7 @@ class Estimated:
 
 def estimate_drive(
     drive: WholeDrive,
-    car: Car,
+    corrected: DriveSignals,
     estimators: Sequence[Estimator],
     *,
     watched: bool = True,
@@ -77,14 +76,11 @@ def estimate_drive(
         if not drive.plan.has_truth_pose:
             drawn_truth = dead_reckoned(drawn_truth, start)
         drawn_truth = valid_as_a_whole(drawn_truth, drive.plan.derivation, vehicle.standstill_m_s)
-    corrected, tracks = DriveSignals.of(signals, car), {}
+    tracks: dict[str, StateTrack] = {}
     for number, estimator in enumerate(estimators):
         progress(number / len(estimators))
         try:
-            given = (
-                corrected.file if isinstance(estimator, OnlineCalibrated) else corrected.of_estimator(estimator.name)
-            )
-            track = run_estimator(estimator, given, causality)
+            track = run_estimator(estimator, corrected.of_estimator(estimator.name), causality)
         except EstimatorError as error:
             if causality is None:
                 raise
@@ -109,16 +105,14 @@ def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
 
     algorithms, fixed_notes, posterior = {}, {}, {}
     band = posterior_band(car, use_speed=all(resolve(e).use_speed for e in estimators))
-    of_log, banded = car.self_calibrated, SELF_CALIBRATED | (set() if car.fitted_physics else {NOMINAL_MODEL})
-    stages = () if of_log is None else (*of_log.earlier, of_log)
-    whole, online = CalibratedBand(stages[-1:], car.vehicle), CalibratedBand(stages, car.vehicle)
+    banded = SELF_CALIBRATED | (set() if car.fitted_physics else {NOMINAL_MODEL})
+    of_log = None if car.self_calibrated is None else CalibratedBand(car.self_calibrated, car.vehicle)
     for estimator in estimators:
         if note := getattr(estimator, "intervals_note", ""):
             fixed_notes[estimator.name] = note
             continue
-        if calibration_of(estimator.name, car) is not None:
-            of_drive = online if isinstance(estimator, OnlineCalibrated) else whole
-            fixed_notes[estimator.name], posterior[estimator.name] = of_drive.note, of_drive.widen
+        if of_log is not None and uses_calibration(estimator.name):
+            fixed_notes[estimator.name], posterior[estimator.name] = of_log.note, of_log.widen
             continue
         other = getattr(estimator, "calibrated_as", None)
         algorithms[estimator.name] = [resolve(e) for e in (estimator, other) if e is not None]

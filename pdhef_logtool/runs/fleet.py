@@ -29,11 +29,10 @@ from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.drive_outputs import check_places, write_run
 from pdhef_logtool.runs.journal import Entry, Journal
 from pdhef_logtool.runs.judging import judge, read_validation_plan, write_verdicts
-from pdhef_logtool.runs.planning import Plan, PlannedLog, calibrate_pools, plan_logs, settings_of, sweep_parts
+from pdhef_logtool.runs.planning import Plan, PlannedLog, plan_logs, settings_of, sweep_parts
 from pdhef_logtool.runs.reporting import FleetProgress, collect, write_run_pages
 from pdhef_logtool.runs.run_drive import run_log
 from pdhef_logtool.runs.run_result import FEW_LOGS, LogResult, RunResult
-from pdhef_logtool.runs.self_calibrating import calibrate_pool
 from pdhef_logtool.runs.stored_output import StoredEnd, StoredOutput, stored_drive
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work, failed_outcome, log_identity, run_drive, run_on_node
 from pdhef_logtool.storage.object_store import is_url
@@ -42,7 +41,6 @@ from pdhef_logtool.workers.ray_supervisor import supervise_on_ray
 from pdhef_logtool.workers.supervisor import Ended, Limits, supervise
 
 if TYPE_CHECKING:
-    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
@@ -177,12 +175,11 @@ def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> Ru
     config, car = job.config, job.cars.of_log(log)
     log = replace(log, stem=neutral_stem(log_identity(log))) if config.no_position else log
     _check_names([log], output, job, reporter)
-    pool = calibrate_pool([log], car, job.mapping, config) if config.calibrate == "pool" else None
     with OutputFolder(output, (LOGS,)) as outputs:
         try:
             result = run_log(
                 log, outputs, config, car, job.mapping,
-                pool=pool, validation=job.validation, reporter=reporter,
+                validation=job.validation, reporter=reporter,
             )  # fmt: skip
         except Exception:
             raise
@@ -235,10 +232,9 @@ def _prepare(
         reporter.note(f"{JOURNAL_FILE}: {lines} damaged or of another version: the drives of these are run again")
     planned = plan_logs(inputs, journal, twice=config.cars is not None, neutral=config.no_position, reporter=reporter)
     _check_names([p.log for p in planned], output, job, reporter)
-    pools = calibrate_pools(planned, job.cars, job.mapping, job.config)
-    plan = Plan(output, journal, planned, settings_of(job.config, pools), job.cars, stored is not None)
+    plan = Plan(output, journal, planned, settings_of(job.config), job.cars, stored is not None)
     plan.check_only(schedule.only)
-    return _Fleet(job, plan, pools, schedule, limits, full_worst, work, reporter, stored)
+    return _Fleet(job, plan, schedule, limits, full_worst, work, reporter, stored)
 
 
 @dataclass(slots=True, eq=False)
@@ -247,7 +243,6 @@ class _Fleet:
 
     job: _Job
     plan: Plan
-    pools: dict[str, SelfCalibration | None]
     schedule: Schedule
     limits: Limits
     full_worst: int
@@ -354,7 +349,6 @@ class _Fleet:
             replace(self.job.config, keep=keep),
             self.plan.setting,
             self.job.validation,
-            self.pools.get(label),
             self.job.report and keep == "full",
             self._name,
             () if self.stored is None else self.stored.there(label),

@@ -11,6 +11,7 @@ from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.table import Options, Skipped, runnable
+from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH
@@ -77,7 +78,9 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     intervals = calibrator(drive.car, estimators)
     if intervals.warning and intervals.warning not in drive.notes:
         drive.tell(intervals.warning)
-    estimated = estimate_drive(drive.whole(), drive.car, estimators, intervals=intervals)
+    whole = drive.whole()
+    corrected = DriveModel.of(drive).apply(whole.signals)
+    estimated = estimate_drive(whole, corrected, estimators, intervals=intervals)
     truth = {} if estimated.drawn_truth is None else {TRUTH: estimated.drawn_truth}
     algorithms = {e.name: resolve(e) for e in estimators}
     return Estimates(drive, truth | estimated.tracks, estimated.signals, algorithms, tuple(skipped))
@@ -102,6 +105,6 @@ def score(estimates: Estimates) -> pl.DataFrame:
         return replace(track, valid=track.something_known) if track is not None and name == TRUTH else track
 
     names = [name for name in estimates.tracks if name != TRUTH]
-    rows = evaluate(estimates.drive, names, read, estimates.signals).rows
+    rows = evaluate(estimates.drive, names, read, estimates.signals, DriveModel.of(estimates.drive).errors).rows
     columns = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
     return pl.DataFrame([[getattr(r, c) for c in columns] for r in rows], schema=columns, orient="row")

@@ -9,10 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pdhef_logtool.logs.discovery import LogInput, as_taken, hash_log, with_free_stem
-from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.errors import PdhefError, UsageError
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.no_position import neutral_stem
@@ -21,12 +20,7 @@ from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.config import Keep, RunConfig
 from pdhef_logtool.runs.journal import Entry, Journal, Place, changes, digest_of, is_unchanged
-from pdhef_logtool.runs.self_calibrating import calibrate_pool
 from pdhef_logtool.runs.working import DriveEnd, log_identity
-
-if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
 
 #: Each choice keeps the files of the choices before it, too.
 _KEPT = ("metrics", "estimates", "full")
@@ -42,7 +36,7 @@ _NO_SETTING = frozenset(
         "intervals",
     }
 )
-_FILES = ("mapping", "msgs", "plan", "cars", "setup", "sensor_profile")
+_FILES = ("mapping", "msgs", "plan", "cars", "model", "sensor_profile")
 _READERS = 16
 _REPEATED = "they are tried again"
 _DAMAGED = "their outputs are damaged"
@@ -134,22 +128,7 @@ def _identities(logs: Sequence[LogInput]) -> list[str | None]:
         return list(readers.map(log_identity, logs))
 
 
-def calibrate_pools(
-    planned: Sequence[PlannedLog], cars: RunCars, mapping: Mapping | None, config: RunConfig
-) -> dict[str, SelfCalibration | None]:
-    """Return the calibration of each car from all its logs, by label; empty without ``--calibrate pool``."""
-    if config.calibrate != "pool":
-        return {}
-    logs: dict[int, tuple[Car, list[LogInput]]] = {}
-    for planned_log in planned:
-        with suppress(Exception):  # the run reports the reason
-            car = cars.of_log(planned_log.log)
-            logs.setdefault(id(car), (car, []))[1].append(planned_log.log)
-    pools = {key: calibrate_pool(of, car, mapping, config) for key, (car, of) in logs.items()}
-    return {log.stem: pools[key] for key, (_, of) in logs.items() for log in of}
-
-
-def settings_of(config: RunConfig, pools: dict[str, SelfCalibration | None]) -> dict[str, str]:
+def settings_of(config: RunConfig) -> dict[str, str]:
     """Return, as texts, the settings that a drive's files depend on, besides the log and its car."""
     settings = {
         f"--{key.replace('_', '-')}": ",".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
@@ -162,8 +141,6 @@ def settings_of(config: RunConfig, pools: dict[str, SelfCalibration | None]) -> 
             settings[f"--{key}"] = hash_log(path) if path.exists() else str(path)
     settings["--annotate"] = config.annotate or "none named"
     settings |= {f"version of {name}": version for name, version in tool_versions().items()}
-    if pools:
-        settings["the pool's calibration"] = digest_of([p and p.to_dict() for p in pools.values()])
     return settings
 
 

@@ -4,31 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.table import Options, Skipped, runnable
+from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.runs.referencing import DriveReference, reference_of
 from pdhef_logtool.runs.selection import default_names
-from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
-
-if TYPE_CHECKING:
-    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
-    from pdhef_logtool.evaluation.metrics.metric import SensorErrors
 
 _MAP_THEM = "map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedDrive:
-    """A drive, the car as calibrated on it, and the estimators that run on it.
+    """A drive, its model, and the estimators that run on it.
 
     Estimators that are not ``requested`` are candidates for the selected estimate: of these only the selected one is in
     the outputs. ``failed``: reasons of estimators without a result, by name.
@@ -36,8 +31,7 @@ class PreparedDrive:
 
     drive: Drive
     config: RunConfig
-    car: Car
-    calibration: SelfCalibration | None
+    model: DriveModel
     reference: DriveReference | None
     estimators: Sequence[Estimator]
     skipped: Sequence[Skipped]
@@ -50,24 +44,25 @@ class PreparedDrive:
         """Names of the estimators."""
         return [e.name for e in self.estimators]
 
-    def sensors(self, calibration: SelfCalibration | None) -> SensorErrors:
-        """Return the errors of the log's sensors according to a calibration."""
-        return log_sensors(self.drive.car.vehicle, calibration, told_friction=self.drive.friction.bank is None)
+    @property
+    def car(self) -> Car:
+        """The car of the model."""
+        return self.model.car
 
 
-def prepare(drive: Drive, config: RunConfig, pool: SelfCalibration | None) -> PreparedDrive:
-    """Calibrate the car on the drive unless ``pool`` is its calibration, make the reference, choose the estimators.
+def prepare(drive: Drive, config: RunConfig) -> PreparedDrive:
+    """Fit the model of the drive, make the reference, choose the estimators.
 
     Raises EstimatorError if no requested estimator can run.
     """
-    calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
-    car = self_calibrated(drive, calibration)
+    model = DriveModel.fit(drive)
+    car = model.car
     estimators, skipped, requested = _choose_estimators(drive, config, car)
-    reference = reference_of(drive, calibration, config)
+    reference = reference_of(drive, model, config)
     if reference is not None and reference.estimator is not None:
         estimators, requested = [*estimators, reference.estimator], requested | {REFERENCE}
     intervals, failed = calibrator(car, estimators), {s.name: s.reason for s in skipped if s.is_error}
-    return PreparedDrive(drive, config, car, calibration, reference, estimators, skipped, requested, intervals, failed)
+    return PreparedDrive(drive, config, model, reference, estimators, skipped, requested, intervals, failed)
 
 
 def _choose_estimators(

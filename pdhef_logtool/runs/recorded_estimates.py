@@ -42,6 +42,7 @@ from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import check_mapping, mapping_of, merge_losses, read_signals
 from pdhef_logtool.mapping.choosing import mapping_for_recorder
 from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
+from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.ledger import SampleCount, damage
 from pdhef_logtool.records.reporter import SILENT, Reporter
@@ -279,7 +280,7 @@ def _reference(drive: Drive, config: RunConfig, *, scored: bool) -> ReferenceEst
     """Return the sideslip reference of the sensors: without ground truth, or beside it where asked for."""
     if config.reference == "off" or (scored and config.reference == "auto"):
         return None
-    reference = reference_of(drive, None, config)
+    reference = reference_of(drive, DriveModel.of(drive), config)
     if reference is None or reference.estimator is None:
         why = "the log has no IMU" if reference is None else str(reference.document["refused"])
         if not scored:

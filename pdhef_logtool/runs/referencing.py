@@ -10,11 +10,10 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.reading import Drive
+from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference
     from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
 
@@ -34,7 +33,7 @@ class DriveReference:
     document: dict[str, Any]
 
 
-def reference_of(drive: Drive, calibration: SelfCalibration | None, config: RunConfig) -> DriveReference | None:
+def reference_of(drive: Drive, model: DriveModel, config: RunConfig) -> DriveReference | None:
     """Return the sideslip reference of a drive; None if not requested.
 
     With ``reference = auto`` it is made where the log has no ground truth of sideslip.
@@ -48,7 +47,7 @@ def reference_of(drive: Drive, calibration: SelfCalibration | None, config: RunC
     if missing:
         return DriveReference(None, _document([], f"the log has no {', '.join(missing)}"))
     speed = drive.mapping.signals.get("speed_m_s")
-    prior = replace(prior_of(drive.car, calibration), speed_over_ground=speed is not None and speed.combine == "norm")
+    prior = replace(prior_of(model), speed_over_ground=speed is not None and speed.combine == "norm")
     spans = list(_spans(drive, prior, use_gnss=config.gnss != "off"))
     used = [span for span in spans if not span.refused]
     refused = "" if used else next((span.refused for span in spans), "the log has no samples")
@@ -59,14 +58,15 @@ def reference_of(drive: Drive, calibration: SelfCalibration | None, config: RunC
     return DriveReference(estimator, _document(spans, refused))
 
 
-def prior_of(car: Car, calibration: SelfCalibration | None) -> ReferencePrior:
-    """Return the prior of a car before its drive: the geometry of its file, sensors as the log calibrated them.
+def prior_of(model: DriveModel) -> ReferencePrior:
+    """Return the prior of the reference: the geometry of the car's file, sensors as the log calibrated them.
 
     Without calibration or ground truth, the position of the accelerometer is not verified if no file gives one.
     """
-    from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, IMU_X_REACH, RATE_BIAS
+    from pdhef_logtool.estimators.calibration.joint import AY_GAIN, IMU_X, IMU_X_REACH
     from pdhef_logtool.estimators.reference.drive import ReferencePrior
 
+    car, calibration = model.car, model.posterior
     vehicle = car.vehicle
     prior: dict[str, Any] = {
         "imu_x_m": vehicle.imu_position_m[0],
@@ -81,8 +81,8 @@ def prior_of(car: Car, calibration: SelfCalibration | None) -> ReferencePrior:
         prior |= {
             "ay_gain": fitted[AY_GAIN].value,
             "ay_gain_std": max(_LEAST_GAIN_STD, fitted[AY_GAIN].sd),
-            "ay_bias_m_s2": fitted[AY_BIAS].value - vehicle.sensors.ay_bias_m_s2,
-            "yaw_rate_bias_rad_s": fitted[RATE_BIAS].value - vehicle.sensors.yaw_rate_bias_rad_s,
+            "ay_bias_m_s2": model.errors.ay_bias_m_s2,
+            "yaw_rate_bias_rad_s": model.errors.yaw_rate_bias_rad_s,
         }
         if not calibration.refused:
             prior["friction"] = calibration.vehicle.assumed_friction

@@ -32,11 +32,10 @@ from pdhef_logtool.runs.preparing import PreparedDrive, prepare
 from pdhef_logtool.runs.reference_audit import audit_truth
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
-from pdhef_logtool.runs.selection import choose_main, choose_over_time, contradiction
+from pdhef_logtool.runs.selection import choose_main, contradiction
 from pdhef_logtool.storage.outputs import OutputFolder
 
 if TYPE_CHECKING:
-    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
     from pdhef_logtool.results.selected_estimate import MainFacts
 
@@ -52,7 +51,6 @@ def run_log(
     car: Car,
     mapping: SignalMapping | None,
     *,
-    pool: SelfCalibration | None,
     validation: ValidationPlan,
     is_first: bool = True,
     reporter: Reporter = SILENT,
@@ -61,7 +59,6 @@ def run_log(
 
     Parameters
     ----------
-    pool : calibration of the car from all logs of the run; None: from this log, if the configuration asks for it.
     validation : plan of the verdicts in the report.
     is_first : whether it is the run's first log; its estimators get the full causality check.
 
@@ -72,10 +69,10 @@ def run_log(
     """
     reporter.progress(log_input.stem, 0.0)
     with read_drive(log_input, car, mapping, config.read_options, tell=reporter.warn) as drive:
-        run = prepare(drive, config, pool)
+        run = prepare(drive, config)
         with outputs.begin(log_place(drive.name), stale=STALE_FILES) as change:
             run, estimated = _estimate(run, CausalityCheck(is_first), reporter)
-            run, scored, main = _select(run, estimated, _score(run, estimated))
+            run, scored, main = _select(run, _score(run, estimated))
             judged = _judge(run, estimated, scored, main, validation)
             files = DriveOutputs((change, outputs.path), run, estimated, main)
             with files.annotated() as annotated:
@@ -105,9 +102,10 @@ def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter)
     drive, plug_ins = run.drive, ", ".join(filter(None, map(package_of, run.estimators)))
     label = f"{drive.name} (plug-ins: {plug_ins})" if plug_ins else drive.name
     causality.failed |= run.failed
+    whole = drive.whole()
     estimated = estimate_drive(
-        drive.whole(),
-        run.car,
+        whole,
+        run.model.apply(whole.signals),
         run.estimators,
         intervals=run.intervals,
         causality=causality,
@@ -128,7 +126,7 @@ def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter)
 def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     """Score the tracks; add the events of an estimated friction, and contradictions as notes of the drive."""
     drive, signals = run.drive, estimated.signals
-    scored = evaluate(drive, run.names, estimated.read, signals, run.sensors(run.calibration))
+    scored = evaluate(drive, run.names, estimated.read, signals, run.model.errors)
     if drive.friction.bank is not None:
         observable = find_intervals(signals, {"friction observable": drive.friction.observable})
         events = [Event(s.name, s.start_ns, s.end_ns, "the estimate of friction can be relied on") for s in observable]
@@ -148,17 +146,12 @@ def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     return scored
 
 
-def _select(
-    run: PreparedDrive, estimated: Estimated, scored: Evaluation
-) -> tuple[PreparedDrive, Evaluation, MainFacts]:
+def _select(run: PreparedDrive, scored: Evaluation) -> tuple[PreparedDrive, Evaluation, MainFacts]:
     """Choose the selected estimate; leave out other estimators and figures that were not requested."""
-    validated, online = run.drive.car.has_evidence, run.config.calibrate == "online"
+    validated = run.drive.car.has_evidence
     main = choose_main(run.names, scored.rows, proven=validated, named=run.config.estimators is not None)
-    if online and run.calibration is not None and not validated:
-        over_time = choose_over_time(run.estimators, run.calibration, estimated.read, estimated.signals, run.sensors)
-        main = replace(main, over_time=over_time, name=over_time[-1][1])
     digests = {e.name: resolve(e).sha256[:SHOWN_DIGITS] for e in run.estimators}
-    left_out = frozenset(run.names) - run.requested - {name for _, name in main.spans}
+    left_out = frozenset(run.names) - run.requested - {main.name}
     shown = [name for name in main.shown if name not in left_out]
     return (
         replace(run, estimators=[e for e in run.estimators if e.name not in left_out]),

@@ -10,7 +10,6 @@ from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.records.signals import BoolArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH, Event, ManoeuvreEvent
-from pdhef_logtool.runs.self_calibrating import log_sensors
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
@@ -43,14 +42,14 @@ def evaluate(
     names: Sequence[str],
     read: Callable[[str], StateTrack | None],
     signals: Signals,
-    sensors: SensorErrors | None = None,
+    sensors: SensorErrors,
 ) -> Evaluation:
     """Score the tracks of a drive.
 
     Parameters
     ----------
     names : of the estimators. read : returns the track of a name (also ``truth``), or None.
-    signals : input of the estimators. sensors : as the log calibrated them; None: as in the car's file.
+    signals : input of the estimators. sensors : as the model of the drive has them.
     """
     from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
     from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
@@ -61,7 +60,6 @@ def evaluate(
     manoeuvres = find_manoeuvres(signals, vehicle)
     masks = segment_masks(signals, truth, vehicle, manoeuvres)
     moving = moving_mask(signals, truth, vehicle)
-    sensors = log_sensors(vehicle, None) if sensors is None else sensors
     tracks = {name: track for name in names if (track := read(name)) is not None}
     slow, dependent = vehicle.low_speed_blend_m_s, drive.plan.dependent
     rows = evaluate_drive(EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, sensors, dependent))

@@ -6,25 +6,18 @@ See docs/method.md#selection.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS
-from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.table import all_names, spec_of
 from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.results.selected_estimate import MainFacts
 
 if TYPE_CHECKING:
-    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.evaluation.metrics import MetricRow
-    from pdhef_logtool.evaluation.metrics.metric import SensorErrors
-    from pdhef_logtool.records.signals import Signals
-    from pdhef_logtool.records.tracks import StateTrack
 
 #: The preferred estimator, and those that run beside it where no driving has validated the car.
 PREFERRED = "pd-hef"
@@ -34,8 +27,6 @@ SIMPLE = ("open-loop", "open-loop:calibrated", "phy-ukf", "physics")
 FACTOR, YAW_FACTOR = 1.2, 3.0
 #: Their lateral figures are meaningless, because they integrate the residual that ``d2`` measures.
 _NOT_JUDGED = ("kinematic", "slip-ukf", "washout")
-#: Longest driving before a choice on line that decides it.
-_LOOK_BACK_NS = 3600 * 10**9
 #: The baseline of every score. It needs the fewest signals and cannot drift; ``kinematic`` follows the accelerometer's
 #: bias and has a higher error on half of the recorded drives.
 NAIVE = "zero"
@@ -136,34 +127,3 @@ def choose_main(names: Sequence[str], rows: Iterable[MetricRow], *, proven: bool
         shown=names if named else [n for n in dict.fromkeys((name, PHYSICS, NAIVE)) if n in names],
         named=named,
     )
-
-
-def choose_over_time(
-    ran: Sequence[Estimator],
-    calibration: SelfCalibration,
-    read: Callable[[str], StateTrack | None],
-    signals: Signals,
-    sensors_of: Callable[[SelfCalibration], SensorErrors],
-) -> list[tuple[int, str]]:
-    """Return the selected estimators of a calibration on line, each with the stamp from which on it is selected.
-
-    Each stage of the calibration chooses among the causal estimators by their tests on earlier driving.
-
-    Parameters
-    ----------
-    read : returns the track of an estimator [N]. signals : of the drive [N]. sensors_of : a stage of the calibration.
-    """
-    from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
-
-    causal = [e.name for e in ran if e.causal]
-    chosen = [(0, choose_main(causal, (), proven=False, named=False).name)]
-    for stage in (*calibration.earlier, calibration)[1:]:
-        first, last = np.searchsorted(signals.stamps_ns, [stage.since_ns - _LOOK_BACK_NS, stage.since_ns]).tolist()
-        tracks = {name: track.rows(first, last) for name in causal if (track := read(name)) is not None}
-        slow = stage.vehicle_file.low_speed_blend_m_s
-        drive = EvaluatedDrive("", tracks, None, signals.rows(first, last), {}, slow, sensors_of(stage))
-        rows = evaluate_drive(drive, ("d2", "yaw_consistency"))
-        name = choose_main(causal, rows, proven=False, named=False).name
-        if name != chosen[-1][1]:
-            chosen.append((stage.since_ns, name))
-    return chosen

@@ -32,7 +32,6 @@ from pdhef_logtool.storage.outputs import OutputFolder
 from pdhef_logtool.workers.supervisor import Tell
 
 if TYPE_CHECKING:
-    from pdhef_logtool.estimators.calibration.calibration import SelfCalibration
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 
 
@@ -44,7 +43,7 @@ class DriveTask:
     ----------
     log : the log with its label in the run. output : folder of the run.
     setting : digest of the settings that the drive is run with.
-    pool : calibration of the car from all logs of the run. page : whether the drive's page is written.
+    page : whether the drive's page is written.
     run : name of this run in its process, the key of cars that were read. stored : names of the drive's stored files.
     is_first : whether the log is the first of the run's list, which has the full causality check.
     """
@@ -54,7 +53,6 @@ class DriveTask:
     config: RunConfig
     setting: str
     validation: ValidationPlan
-    pool: SelfCalibration | None
     page: bool
     run: str
     stored: tuple[str, ...] = ()
@@ -160,7 +158,7 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
     outputs = OutputFolder(task.output)  # locked by the run
     result = run_log(
         task.log, outputs, task.config, car, mapping,
-        pool=task.pool, validation=task.validation, is_first=task.is_first,
+        validation=task.validation, is_first=task.is_first,
         reporter=Reporter(progress=tell, warn=warned.append),
     )  # fmt: skip
     record = car_record(car)

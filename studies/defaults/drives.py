@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pdhef_logtool.drive.reading import MAX_BYTES, WholeDrive, read_drive
+from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import DriveRecord, no_true_sideslip, record_of
 from pdhef_logtool.learning.stages.task import Task
@@ -36,7 +36,7 @@ def load_drive(
         missing = ", ".join(sorted(needs - drive.available))
         if left_out := no_true_sideslip(drive.plan) or (f"the log has no {missing}" if missing else ""):
             return record_of(drive, left_out=left_out), None
-        whole = drive.whole(fill_friction=fill_friction, max_bytes=MAX_BYTES)
+        whole = drive.whole(fill_friction=fill_friction)
         slow = task.car.vehicle.low_speed_blend_m_s
         assert whole.truth is not None
         scored = int(np.count_nonzero(scorable_stamps(whole.truth, slow)))

@@ -13,6 +13,7 @@ from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.drive.reading import friction_of
 from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.error_features import error_terms
 from pdhef_logtool.estimators.intervals import yaw_rate_terms
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, runnable
@@ -118,7 +119,8 @@ def _run_drive(log: LogInput, number: int, task: Task, spread: float) -> tuple[D
         presumed = car if assumed is vehicle else car.with_vehicle(assumed)
         available = drive.plan.alignment.available
         estimators, _ = runnable((ALL_ESTIMATORS,), presumed, available, Options(options.use_speed))
-        estimated = estimate_drive(replace(drive, signals=seen), presumed, estimators, watched=False, drawn=False)
+        corrected = DriveSignals.of(seen, presumed)
+        estimated = estimate_drive(replace(drive, signals=seen), corrected, estimators, watched=False, drawn=False)
         for estimator in estimators:
             track = estimated.tracks[estimator.name]
             part = drive_samples(track, seen, signals, drive.truth, vehicle, number, wrong=wrong)

@@ -404,6 +404,12 @@ def choose_parts(
     return parts, tuple(tried)
 
 
+def _changed(values: FittedValues, varied: FittedValues) -> FittedValues:
+    """Return the entries of ``varied`` that differ from ``values``."""
+    same = {k: None for k in FittedValues.model_fields if getattr(varied, k) == getattr(values, k)}
+    return varied.model_copy(update=same)
+
+
 def find_physics(
     drives: Sequence[FitDrive],
     start: VehicleParameters,
@@ -425,6 +431,6 @@ def find_physics(
             parts, tried = choose_parts(folds, start, progress=lambda text, share: progress(text, 0.7 * share))
     progress("fitting the physics filter's sideslip to the ground truth", 0.7)
     result = fit_physics(drives, start, parts)
-    varied = tuple(FittedValues.between(result.vehicle, v) for v in varied_vehicles(drives, start, result))
     values = FittedValues.of(result.vehicle)
+    varied = tuple(_changed(values, FittedValues.of(v)) for v in varied_vehicles(drives, start, result))
     return result, FittedPhysics(values=values, noise=result.noise, varied=varied, tried=tried)

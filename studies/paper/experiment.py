@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.presets import Options
 from pdhef_logtool.estimators.table import runnable
 from pdhef_logtool.evaluation.metrics import MetricRow, score_track
@@ -153,7 +154,8 @@ def read_simulated(scenario: Scenario, noise_seed: int, car: Car) -> ReadDrive:
 
 def track_of(estimator: Estimator, car: Car, drive: ReadDrive) -> StateTrack:
     """Run an estimator of a car over a drive."""
-    window = estimate_drive(drive.whole, car, [estimator], watched=False, drawn=False)
+    corrected = DriveSignals.of(drive.whole.signals, car)
+    window = estimate_drive(drive.whole, corrected, [estimator], watched=False, drawn=False)
     return next(iter(window.tracks.values()))
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -67,15 +68,13 @@ def drive_errors(drive: PeerDrive, tool: Tool) -> tuple[DriveErrors, dict[str, A
     estimates: dict[str, FloatArray] = {}
     stds: dict[str, FloatArray] = {}
     runs: dict[tuple[str, str], dict[str, tuple[FloatArray, FloatArray]]] = {}
-    for name, (calibrate, car, preset) in ESTIMATORS.items():
-        if (calibrate, car) not in runs:
-            presets = [one for *of, one in ESTIMATORS.values() if of == [calibrate, car]]
-            folder = tool_run(tool, drive, calibrate, car, presets)
-            runs[calibrate, car] = {} if folder is None else tracks_of(folder, read.signals.stamps_ns)
-            if folder is not None and (calibrate, car) == ("log", "file"):
-                (report,) = reports(folder).values()
-                calibration = report["self_calibration"]
-        estimates[name], std = runs[calibrate, car].get(preset, (missing, missing))
+    for name, (model, car, preset) in ESTIMATORS.items():
+        if (model, car) not in runs:
+            folder = tool_run(tool, drive, model, car)
+            runs[model, car] = {} if folder is None else tracks_of(folder, read.signals.stamps_ns)
+            if folder is not None and (model, car) == ("auto", "file"):
+                calibration = calibration_of(folder)
+        estimates[name], std = runs[model, car].get(preset, (missing, missing))
         if name in OURS:
             stds[name] = std
     errors = score(drive, estimates, read.truth, stds)
@@ -83,12 +82,14 @@ def drive_errors(drive: PeerDrive, tool: Tool) -> tuple[DriveErrors, dict[str, A
     return errors, calibration
 
 
-def tool_run(tool: Tool, drive: PeerDrive, calibrate: str, car: str, presets: Sequence[str]) -> Path | None:
-    """Run estimators with the published mapping and vehicle file; None if the run refuses."""
-    name = f"{drive.log.partition('.')[0]}-{calibrate}-{car}"
+@cache
+def tool_run(tool: Tool, drive: PeerDrive, model: str, car: str) -> Path | None:
+    """Run the estimators of a model and car with the published mapping and vehicle file; None if the run refuses."""
+    name = f"{drive.log.partition('.')[0]}-{model}-{car}"
     mapping = write_toml(tool.work / "mappings" / f"{name}.toml", mapping_table(drive))
-    given: tuple[str | Path, ...] = ("--mapping", mapping, "--keep", "estimates", "--calibrate", calibrate)
-    given += ("--estimators", ",".join(presets))
+    presets = ",".join(preset for *run, preset in ESTIMATORS.values() if run == [model, car])
+    given: tuple[str | Path, ...] = ("--mapping", mapping, "--keep", "estimates", "--estimators", presets)
+    given += ("--model", earlier_model(tool, drive) if model == "earlier" else model)
     if car == "file":
         given += ("--car", write_toml(tool.work / "cars" / f"{name}.toml", vehicle_table(drive)))
     try:
@@ -96,6 +97,31 @@ def tool_run(tool: Tool, drive: PeerDrive, calibrate: str, car: str, presets: Se
     except RuntimeError as error:
         print(error, file=sys.stderr)
         return None
+
+
+def earlier_model(tool: Tool, drive: PeerDrive) -> str | Path:
+    """Return model.toml of the longest other drive with the same recorder and vehicle file; ``off`` without one."""
+    models: list[tuple[float, Path]] = []
+    for other in PEER_DRIVES:
+        if other.drive == drive.drive or _recorder(other) != _recorder(drive):
+            continue
+        folder = tool_run(tool, other, "auto", "file")
+        calibration = None if folder is None else calibration_of(folder)
+        if folder is not None and calibration and not calibration["refused"]:
+            models.append((calibration["seconds"], next(folder.glob("logs/*/model.toml"))))
+    return max(models)[1] if models else "off"
+
+
+def _recorder(drive: PeerDrive) -> tuple[object, ...]:
+    vehicle = vehicle_of(drive).model_dump(exclude={"name"})
+    return drive.car, mapping_table(drive)["signals"], vehicle
+
+
+def calibration_of(folder: Path) -> dict[str, Any] | None:
+    """Return the calibration of a run."""
+    (report,) = reports(folder).values()
+    calibration: dict[str, Any] | None = report["self_calibration"]
+    return calibration
 
 
 def tracks_of(folder: Path, stamps_ns: IntArray) -> dict[str, tuple[FloatArray, FloatArray]]:

@@ -17,14 +17,13 @@ from studies.peers.scoring import (
     spread,
 )
 
-#: Calibration, car and preset of each run. The peers use the vehicle file as it is.
+#: Model, car and preset of each run. The peers use the vehicle file as it is.
 OURS = {
-    "phy-ukf": ("log", "file", "phy-ukf"),
-    "physics": ("log", "file", "physics"),
-    "pd-hef": ("log", "file", "pd-hef"),
-    "pd-hef, online": ("online", "file", "pd-hef"),
-    "pd-hef, causal": ("off", "file", "pd-hef"),
-    "pd-hef, no file": ("log", "none", "pd-hef"),
+    "phy-ukf": ("auto", "file", "phy-ukf"),
+    "physics": ("auto", "file", "physics"),
+    "pd-hef": ("auto", "file", "pd-hef"),
+    "pd-hef, causal": ("earlier", "file", "pd-hef"),
+    "pd-hef, no file": ("auto", "none", "pd-hef"),
 }
 _PUBLISHED = {"open-loop-linear": "linear-kf:open-loop"} | {
     name: name for name in ("linear-kf", "learned-single-track", "slip-ukf", "washout", "kinematic", "zero")

@@ -226,7 +226,7 @@ def test_other_physics_leave_fit_and_noise_out_and_say_so(folder: Path, old: str
     assert dict(car.noise) == {}
     assert car.learnt_on == ()
     assert car.notes == (
-        "fit.toml is not used: vehicle.toml has changed since; pdhef learn --stages calibrate creates it again",
+        "fit.toml is not used: vehicle.toml has changed since",
         "noise of physics is not used: it belongs to other physics",
     )
 

@@ -63,7 +63,7 @@ def test_a_run_says_the_gain_and_uses_it(sample_logs_dir: Path, tmp_path: Path) 
         ("own", (), 1.0, "residual gain 1 within the region of validity"),
         ("other", ("--network", tmp_path / "foreign"), 0.0, "no network was trained with the physics of this car"),
     ):
-        given = ("--car", car, *network, "-e", "pd-hef", "--calibrate", "off", "-o", tmp_path / out)
+        given = ("--car", car, *network, "-e", "pd-hef", "--model", "off", "-o", tmp_path / out)
         shown = called("run", sample_logs_dir / "dlc.mcap", *given, env={"COLUMNS": "400"})
         assert text in shown.stdout, shown.stdout + shown.stderr
         rows = pl.read_parquet(tmp_path / out / "logs" / "dlc" / "estimates.parquet")

@@ -125,7 +125,7 @@ def test_what_is_no_log_is_one_line_and_exit_code_1(tmp_path: Path, content: byt
     [
         "run NONE.mcap -o OUT", "inspect NONE.mcap", "metrics NONE.mcap --estimate /x --car saloon", "report NONE",
         "compare NONE NONE", "events NONE --where valid", "view NONE", "learn NONE.mcap --car saloon -o OUT",
-        "train NONE -o OUT", "run LOG -o OUT --plan NONE", "run LOG -o OUT --setup NONE",
+        "train NONE -o OUT", "run LOG -o OUT --plan NONE", "run LOG -o OUT --model NONE",
     ],
 )  # fmt: skip
 def test_a_missing_file_is_one_line_and_exit_code_2(sample_logs_dir: Path, tmp_path: Path, arguments: str) -> None:

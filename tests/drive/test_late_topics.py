@@ -91,32 +91,3 @@ def test_a_run_of_it_scores_and_calls_nothing_causal(
     sound = pl.read_parquet(tmp_path / "sound/logs/dlc/estimates.parquet").filter(estimator="phy-ukf")
     both = rows.join(sound, on="stamp_ns").filter("valid", "valid_right")
     assert (both["vy_m_s"] - both["vy_m_s_right"]).abs().max() < 1e-9  # type: ignore[operator]
-
-
-@pytest.mark.slow
-def test_by_stamp_there_is_no_latency_and_nothing_is_causal(
-    sample_logs_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = sample_logs_dir / "dlc.mcap"
-    code, report, err = run(capsys, tmp_path / "stamp", log, "--estimators", "zero:no-lateral", "--clock", "stamp")
-    assert (code, [e["causal"] for e in report["estimators"]]) == (0, [False, False])
-    assert "arrives" not in err, "the user asked for it: no warning"
-    assert "not causal: all signals read by stamp, not by arrival" in report["estimators"][0]["notes"]
-    _, plain, _ = run(capsys, tmp_path / "arrival", log, "--estimators", "zero:no-lateral")
-    assert plain["estimators"][0]["causal"]
-    of = ("yaw_rate_rad_s", "all", "rmse")
-    rmse = [
-        next(m["value"] for m in r["metrics"] if (m["signal"], m["segment"], m["metric"]) == of)
-        for r in (report, plain)
-    ]
-    assert rmse[0] < 0.75 * rmse[1], "the gyro's delay is gone"
-    found, _, _ = signals_of(log, clock="stamp")
-    assert (found.ready_ns - found.stamps_ns).max() <= 0.011 * S
-
-
-def test_a_clock_that_does_not_exist_is_refused() -> None:
-    from pdhef_logtool.records.errors import UsageError
-    from pdhef_logtool.runs.config import load_config
-
-    with pytest.raises(UsageError, match="clock"):
-        load_config(None, {"clock": "receiver"})

@@ -16,10 +16,9 @@ from pdhef_logtool.estimators.calibration.joint import FRONT_STIFFNESS, REAR_STI
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import make_estimator, runnable
+from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.frames import estimate, score
-from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, read_driving, self_calibrated
 
 NAMES = ("open-loop", "phy-ukf", "physics", "pd-hef")
 STEERING = ("steer_rad", "steering_wheel_rad")
@@ -116,12 +115,13 @@ def test_without_steering_a_y_and_yaw_rate_there_is_no_estimate(road: WholeDrive
 def test_a_log_without_steering_keeps_the_prior_of_its_car(sample_logs_dir: Path) -> None:
     car = Car.of(default_vehicle())
     with read_drive(sample_logs_dir / "dlc.mcap", car, adjust=without(*STEERING)) as drive:  # type: ignore[arg-type]
-        calibration = checked(drive, calibrate_drive(drive, RunConfig()))
+        model = DriveModel.fit(drive)
+        calibration = model.posterior
         assert calibration is not None
         assert calibration.text == "not calibrated: all parameters keep their prior"
         assert (calibration.parameters, calibration.refused) == ((), "")
         assert len(calibration.varied) == 6
-        estimator = make_estimator("physics", self_calibrated(drive, calibration))
+        estimator = make_estimator("physics", model.car)
         assert estimator.causal  # it contains no data of the log
 
 

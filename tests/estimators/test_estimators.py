@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_models import full_network, linear_residual
-from reference_car import START_NS, cut, drive, keep, rolling_drive, slalom, tanh_tyre, with_noise
+from reference_car import cut, drive, keep, rolling_drive, slalom, tanh_tyre, with_noise
 
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.parts import FilterNoise
@@ -91,9 +91,9 @@ def rough() -> Signals:
 # --- pieces, causality, symmetry -------------------------------------------------------------------------------------
 
 
-def _calibrated(since_s: float = 0.0, **earlier) -> WithoutTruth:
-    vehicle = VEHICLE.model_copy(update={"yaw_inertia_kg_m2": 1700.0, "steer_offset_rad": 0.003 + 0.001 * since_s})
-    return WithoutTruth(vehicle, NOISE, True, "calibrated", since_ns=START_NS + round(since_s * 1e9), **earlier)
+def _calibrated() -> WithoutTruth:
+    vehicle = VEHICLE.model_copy(update={"yaw_inertia_kg_m2": 1700.0, "steer_offset_rad": 0.003})
+    return WithoutTruth(vehicle, NOISE, True, "calibrated")
 
 
 def _taught() -> Car:
@@ -107,11 +107,6 @@ EVERY = {
     OPEN_LOOP: partial(make_estimator, OPEN_LOOP, replace(car_of(), self_calibrated=_calibrated())),
     "physics without parts": partial(make_estimator, "physics", car_of(default_vehicle())),
     "calibrated": partial(make_estimator, "physics", replace(car_of(), self_calibrated=_calibrated())),
-    "online": partial(
-        make_estimator,
-        "physics",
-        replace(car_of(), self_calibrated=_calibrated(2.0, earlier=(_calibrated(), _calibrated(1.0)))),
-    ),
     "taught": partial(make_estimator, "pd-hef", _taught()),
     "GNSS": partial(make_estimator, "physics", car_of(), Options(gnss=True)),
 }

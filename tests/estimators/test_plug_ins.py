@@ -134,7 +134,7 @@ def test_a_plug_in_that_fails_costs_only_its_own_estimates(
 ) -> None:
     specs = (*table.SPECS, _spec("late", raise_error), _spec("ends", end_process))
     monkeypatch.setattr(table, "all_specs", lambda: specs)
-    config = RunConfig(car=Path("saloon"), estimators=("zero",), keep="estimates", calibrate="off", reference="off")
+    config = RunConfig(car=Path("saloon"), estimators=("zero",), keep="estimates", model="off", reference="off")
     log = [str(sample_logs_dir / "dlc.mcap")]
     run_logs(log, tmp_path / "alone", config, report=False)
     result = run_logs(log, tmp_path / "out", replace(config, estimators=("zero", "late", "ends")), report=False)

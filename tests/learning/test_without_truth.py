@@ -1,14 +1,18 @@
-"""``pdhef learn --stages calibrate``: a car is made from a pool of logs, and insufficient pools are rejected."""
+"""``pdhef learn --stages calibrate``: a model is made from a pool of logs, and insufficient pools are rejected."""
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning.engine import LearnResult
+from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.runs.config import RunConfig
 from tests.learning.stage_run import run_stage
@@ -32,34 +36,22 @@ def pool(sample_logs_dir: Path, config: RunConfig, tmp_path_factory: pytest.Temp
     return run_stage("calibrate", logs, tmp_path_factory.mktemp("out") / "car", config)
 
 
-def test_a_pool_of_logs_mends_the_file(pool: LearnResult, sample_logs_dir: Path) -> None:
-    right = Car.load(sample_logs_dir / "vehicle.toml").vehicle
-    car = Car.load(pool.car)
-    for front in (True, False):
-        found = car.vehicle.cornering_stiffness_n_per_rad(front, 0.85)
-        assert found == pytest.approx(right.cornering_stiffness_n_per_rad(front, 0.85), rel=0.25)
-    assert car.datasheet.cornering_stiffness_n_per_rad(True, 0.85) < 0.6 * right.cornering_stiffness_n_per_rad(
-        True, 0.85
-    )
-
-
-def test_the_car_says_what_it_rests_on_and_that_no_truth_was_looked_at(pool: LearnResult) -> None:
-    text = (pool.car / "fit.toml").read_text()
-    assert "without_truth = true" in text
+def test_a_pool_of_logs_mends_the_file_without_ground_truth(pool: LearnResult, sample_logs_dir: Path) -> None:
+    right, car = Car.load(sample_logs_dir / "vehicle.toml").vehicle, Car.load(pool.car)
+    text = (pool.car / "model.toml").read_text()
     assert "no ground truth was used" in text
-    car = Car.load(pool.car)
-    assert [d.name for d in car.learnt_on] == ["dlc", "step", "fishhook"]
-    assert all(d.end_s >= 5.0 for d in car.learnt_on)
-    assert car.vehicle.name.endswith("(calibrated without ground truth)")
-    assert car.has_evidence  # it is not calibrated once more in a run
-    assert make_estimator("physics", car).causal
+    values = {p["name"]: p["value"] for p in tomllib.loads(text)["parameters"]}
+    for front, axle in ((True, "front"), (False, "rear")):
+        expected = right.cornering_stiffness_n_per_rad(front, 0.85)
+        assert values[f"{axle} cornering stiffness"] == pytest.approx(expected, rel=0.25)
     assert pool.figures["self_calibration"]["logs"] == 3
-
-
-def test_one_log_is_no_pool(sample_logs_dir: Path, config: RunConfig, tmp_path: Path) -> None:
-    with pytest.raises(EstimatorError, match="need not apply to another"):
-        run_stage("calibrate", [str(sample_logs_dir / "dlc.mcap")], tmp_path / "car", config)
-    assert not (tmp_path / "car").exists()
+    options = ReadOptions(model=pool.car / "model.toml")
+    with read_drive(sample_logs_dir / "fishhook.mcap", car, options=options) as drive:
+        model = DriveModel.fit(drive)
+    assert make_estimator("physics", model.car).causal
+    assert model.car.calibrated_car.vehicle.cornering_stiffness_n_per_rad(True, 0.85) == pytest.approx(
+        values["front cornering stiffness"], rel=1e-4
+    )
 
 
 def test_logs_that_do_not_know_the_stiffness_are_refused(

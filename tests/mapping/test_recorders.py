@@ -99,7 +99,7 @@ def test_a_fleet_of_two_recorders_is_run_with_one_folder(tmp_path: Path) -> None
     for log in (first, second):
         shutil.move(log, logs / log.name)
     result = called(
-        "run", logs, "-o", tmp_path / "out", "--mapping", folder, "-e", "kinematic", "--calibrate", "off",
+        "run", logs, "-o", tmp_path / "out", "--mapping", folder, "-e", "kinematic", "--model", "off",
         "--annotate", "none",
     )  # fmt: skip
     assert result.returncode == 0, result.stderr

@@ -151,7 +151,7 @@ def test_no_output_contains_a_place_a_name_of_a_file_or_metadata(tmp_path, jobs)
     _personal_log(log)
     damaged = log.with_name("jane_to_work.mcap")
     damaged.write_bytes(log.read_bytes()[:50])
-    config = RunConfig(estimators=("zero",), annotate="full", keep="full", calibrate="off", no_position=True)
+    config = RunConfig(estimators=("zero",), annotate="full", keep="full", model="off", no_position=True)
     logs = [str(log)] if jobs == 1 else [str(log), str(damaged)]
     result = run_logs(logs, tmp_path / "out", config, schedule=Schedule(resume=jobs == 2))
     assert {name for name, data in _all_bytes(tmp_path / "out") if any(secret in data for secret in SECRETS)} == set()
@@ -163,7 +163,7 @@ def test_no_output_contains_a_place_a_name_of_a_file_or_metadata(tmp_path, jobs)
 
 
 def test_outputs_with_names_are_not_mixed_with_outputs_without(sample_logs_dir, tmp_path):
-    config = RunConfig(estimators=("zero",), keep="metrics", calibrate="off", reference="off", end="2")
+    config = RunConfig(estimators=("zero",), keep="metrics", model="off", reference="off", end="2")
     log = str(sample_logs_dir / "dlc.mcap")
     run_logs([log], tmp_path, config, report=False)
     with pytest.raises(UsageError, match="outputs of a run without --no-position"):

@@ -75,7 +75,7 @@ def test_every_file_of_a_drive_is_regenerated_and_a_page_alone(
     options = [o for o in OPTIONS if o not in ("--keep", "estimates", "--no-report")]
     assert command("run", *logs, "-o", str(out), *options, *keep).code == 0
     files = {p.name: p.read_bytes() for p in (out / "logs/dlc").iterdir() if p.is_file()}
-    assert {"setup.toml", "recording.rrd", "annotated.mcap", "report.html"} <= set(files)
+    assert {"model.toml", "recording.rrd", "annotated.mcap", "report.html"} <= set(files)
     entries = map(json.loads, (out / "journal.jsonl").read_text().splitlines())
     outputs = [e["outputs"] for e in entries if e.get("label") == "dlc"][-1]
     assert {Path(o).name for o in outputs if "dlc" in o} == files.keys()

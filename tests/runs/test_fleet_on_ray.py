@@ -98,7 +98,7 @@ def test_a_fleet_on_a_cluster_whose_output_is_in_a_store_equals_one_here(
 def test_an_output_that_a_node_does_not_see_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (log,) = find_logs([str(named_logs(tmp_path / "logs", "a"))])
-    task = DriveTask(log, Path("out"), RunConfig(), "", default_plan(), None, page=False, run="")
+    task = DriveTask(log, Path("out"), RunConfig(), "", default_plan(), page=False, run="")
     told = run_on_node(stub_drive, tmp_path, True, task, lambda *_: None)
     assert isinstance(told, OutputError)
     assert "a folder that all nodes of the cluster see" in str(told)

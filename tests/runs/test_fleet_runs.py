@@ -255,7 +255,7 @@ def test_two_jobs_that_are_killed_and_go_on_leave_what_one_job_leaves(
     assert run_logs(logs, two, config, schedule=Schedule(jobs=2, resume=True)).exit_code == 0
     assert contents(one) == contents(two)
     folder = two / "logs/dlc"
-    assert {p.name for p in folder.iterdir()} == {"estimates.parquet", "metrics.parquet", "report.json", "setup.toml"}
+    assert {p.name for p in folder.iterdir()} == {"estimates.parquet", "metrics.parquet", "report.json", "model.toml"}
 
 
 @pytest.mark.slow
@@ -264,7 +264,7 @@ def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir: Path,
     config = RunConfig(car=Path("saloon"), keep="metrics", end="4")
     result = run_logs(logs, tmp_path, replace(config, full_worst=1))
     files = {folder.name: {p.name for p in folder.iterdir()} for folder in (tmp_path / "logs").iterdir()}
-    (other,) = (name for name, kept in files.items() if kept == {"report.json", "setup.toml"})
+    (other,) = (name for name, kept in files.items() if kept == {"report.json", "model.toml"})
     (worst,) = files.keys() - {other}
     report = tmp_path / "logs" / other / "report.json"
     assert report.stat().st_size < 20_000

@@ -85,7 +85,7 @@ def test_a_persons_files_and_what_the_run_does_not_write_stay(sample_logs_dir: P
     run_logs([log], tmp_path, config(sample_logs_dir, estimators=("kinematic",), annotate="none"))
     after = contents(tmp_path)
     assert {p.name for p in folder.iterdir()} == {*LOG_FILES, "notes.txt"}
-    kept = ("annotated.mcap", "foxglove.json", "plotjuggler.xml", "notes.txt", "recording.rrd", "setup.toml")
+    kept = ("annotated.mcap", "foxglove.json", "plotjuggler.xml", "notes.txt", "recording.rrd", "model.toml")
     assert {p for p in after if after[p] == before[p]} == {f"logs/dlc/{name}" for name in kept}
 
 

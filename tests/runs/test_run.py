@@ -21,7 +21,7 @@ from tests.run_report import follows
 
 pytestmark = pytest.mark.slow
 
-TABLES = {"estimates.parquet", "metrics.parquet", "recording.rrd", "report.html", "report.json", "setup.toml"}
+TABLES = {"estimates.parquet", "metrics.parquet", "recording.rrd", "report.html", "report.json", "model.toml"}
 OUTPUTS = TABLES | {"annotated.mcap", "foxglove.json", "plotjuggler.xml"}
 
 NO_TRUTH_MAPPING = "".join(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,14 +15,13 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell, read_drive
-from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.results.parquet_sink import list_estimators, read_track
 from pdhef_logtool.runs import selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, read_driving
 from tests.run_report import follows
 
 pytestmark = pytest.mark.slow
@@ -80,18 +80,32 @@ def test_a_wrong_file_is_mended(calibrated: Path) -> None:
     assert rmse(calibrated, "physics") < 0.65 * rmse(calibrated, "phy-ukf")
 
 
-def test_off_is_the_file_as_it_stands_and_causal(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
-    report = run(sample_logs_dir / "road.mcap", wrong_car, tmp_path, calibrate="off", end="30", estimators=NAMES[:2])
-    assert report["self_calibration"] is None
+def test_off_is_the_prior_about_the_file_and_causal(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
+    report = run(sample_logs_dir / "road.mcap", wrong_car, tmp_path, model="off", end="30", estimators=NAMES[:2])
+    assert (report["self_calibration"]["parameters"], report["self_calibration"]["refused"]) == ([], None)
     assert all(e["causal"] for e in report["estimators"])
+
+
+def test_a_model_of_an_earlier_drive_is_causal_and_mends_the_file(
+    sample_logs_dir: Path, wrong_car: Path, calibrated: Path, tmp_path: Path
+) -> None:
+    model = calibrated / "logs/road/model.toml"
+    report = run(sample_logs_dir / "dlc.mcap", wrong_car, tmp_path, model=model, end=None)
+    follows(report)
+    assert all(e["causal"] for e in report["estimators"] if e["name"] != "open-loop:calibrated")
+    assert report["model"]["source"] == "file"
+    assert "from earlier drives" in report["answer"]["texts"]["assumed"]
+    assert rmse(tmp_path, "physics") < 0.65 * rmse(tmp_path, "phy-ukf")
+    passed_on = tomllib.loads((tmp_path / "logs/dlc/model.toml").read_text())
+    assert passed_on["parameters"] == tomllib.loads(model.read_text())["parameters"] != []
 
 
 def test_no_truth_is_read(sample_logs_dir: Path, wrong_car: Path) -> None:
     """The same log with its truth made unreadable gives the same bits."""
-    config, car = RunConfig(), Car.load(wrong_car)
+    car = Car.load(wrong_car)
     with read_drive(sample_logs_dir / "road.mcap", car, options=ReadOptions(end=END)) as drive:
         found = read_driving(drive)
-        with_truth = calibrate_drive(drive, config)
+        with_truth = DriveModel.fit(drive).posterior
 
     def without(_log: DriveLog, mapping: Mapping, _tell: Tell) -> Mapping:
         return replace(mapping, truth={})
@@ -99,7 +113,7 @@ def test_no_truth_is_read(sample_logs_dir: Path, wrong_car: Path) -> None:
     with read_drive(sample_logs_dir / "road.mcap", car, options=ReadOptions(end=END), adjust=without) as drive:
         assert drive.plan.truth is None
         np.testing.assert_array_equal(read_driving(drive).columns, found.columns)
-        alone = calibrate_drive(drive, config)
+        alone = DriveModel.fit(drive).posterior
     assert with_truth is not None and alone is not None
     assert alone.to_dict() == with_truth.to_dict()
 
@@ -115,17 +129,7 @@ def test_a_short_log_is_refused_and_the_file_stays(sample_logs_dir: Path, wrong_
 def test_a_car_with_evidence_is_not_calibrated(sample_logs_dir: Path) -> None:
     with read_drive(sample_logs_dir / "road.mcap", Car.load(sample_logs_dir / "vehicle.toml")) as drive:
         assert drive.car.has_evidence
-        assert calibrate_drive(drive, RunConfig()) is None
-
-
-def test_a_pool_takes_what_its_logs_say_together(sample_logs_dir: Path, wrong_car: Path) -> None:
-    logs = find_logs([str(sample_logs_dir / f"{name}.mcap") for name in ("sweep", "dlc")])
-    config = RunConfig(calibrate="pool")
-    pool = calibrate_pool(logs, Car.load(wrong_car), None, config)
-    assert pool is not None
-    assert pool.logs == 2
-    assert pool.seconds > 15.0
-    assert not pool.refused
+        assert DriveModel.fit(drive).posterior is None
 
 
 def test_an_estimate_that_contradicts_the_sensors_is_not_selected_and_keeps_its_name(
@@ -158,14 +162,3 @@ def test_a_car_with_evidence_keeps_its_estimate_and_is_warned_of(
     report = run(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("phy-ukf", "pd-hef"), end=None)
     assert all(e["causal"] for e in report["estimators"])
     assert any("WARNING" in w for w in report["warnings"])
-
-
-def test_a_calibration_on_line_stays_causal_and_says_so(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
-    report = run(sample_logs_dir / "road.mcap", wrong_car, tmp_path, calibrate="online", estimators=NAMES)
-    follows(report)
-    told = {e["name"]: e for e in report["estimators"]}
-    assert told["physics"]["causal"]
-    assert told["physics"]["outcome"] == "ran"  # the causality check of the run passed
-    assert any("calibrated on the log up to each time" in note for note in told["physics"]["notes"])
-    assert report["self_calibration"]["online"]
-    assert told["physics"]["intervals"] == ["intervals: own and parameters"]

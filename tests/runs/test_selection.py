@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.estimators.calibration.calibration import calibrate_online
-from pdhef_logtool.estimators.calibration.driving import driving_of
-from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
 from pdhef_logtool.results.selected_estimate import MainFacts
 from pdhef_logtool.runs import frames, selection
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.selection import choose_main, choose_over_time, default_names
-from pdhef_logtool.runs.self_calibrating import log_sensors
+from pdhef_logtool.runs.selection import choose_main, default_names
 
 EVERY = frozenset(ALIGNED_SIGNALS)
 #: Truth as it is, and the same shuffled: the sideslip of something else at another speed.
@@ -120,16 +113,16 @@ def test_the_interface_for_scripts_runs_the_same_ones(sample_logs_dir: Path) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("calibrate", ["off", "log"])
+@pytest.mark.parametrize("model", ["off", "auto"])
 def test_the_truth_of_a_log_never_chooses(
-    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calibrate: Any
+    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: Any
 ) -> None:
     """The best estimator by consistency is always selected here, so that a choice by ground truth would show."""
     monkeypatch.setattr(selection, "FACTOR", 0.0)
     answers, best = [], set()
     for name, text in (("right", TRUTH), ("shuffled", SHUFFLED)):
         (tmp_path / f"{name}.toml").write_text(text)
-        config = RunConfig(mapping=tmp_path / f"{name}.toml", annotate="none", calibrate=calibrate, end="+4s")
+        config = RunConfig(mapping=tmp_path / f"{name}.toml", annotate="none", model=model, end="+4s")
         result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config).results[0]
         assert result.report is not None
         answer = result.report["answer"]
@@ -141,35 +134,3 @@ def test_the_truth_of_a_log_never_chooses(
     assert answers[0]["chosen_by"] == "d2"
     a, b = ((tmp_path / n / "logs/dlc/metrics.parquet").read_bytes() for n in ("right", "shuffled"))
     assert a != b
-
-
-def test_a_choice_on_line_depends_on_nothing_that_follows(sample_logs_dir: Path) -> None:
-    """The sensors fail after 40 s; the selection until then is unchanged, and the later selection may change."""
-    car, wild_s = Car.of(default_vehicle()), 40.0
-    with read_drive(sample_logs_dir / "road.mcap", car) as drive:
-        signals = drive.whole().signals.rows(0, 6000)
-    after = signals.stamps_ns - signals.stamps_ns[0] > round(wild_s * 1e9)
-    rng = np.random.default_rng(3)
-    spoilt = replace(
-        signals,
-        ay_m_s2=np.where(after, 20.0 * rng.normal(size=after.size), signals.ay_m_s2),
-        yaw_rate_rad_s=np.where(after, -3.0 * signals.yaw_rate_rad_s, signals.yaw_rate_rad_s),
-        steer_rad=np.where(after, 0.3, signals.steer_rad),
-    )
-    chosen, figures = [], []
-    for sensed in (signals, spoilt):
-        calibration = calibrate_online(driving_of(sensed, car.vehicle), car.vehicle)
-        estimators = [make_estimator(name, car) for name in ("zero", "open-loop", "phy-ukf", "physics")]
-        tracks = {e.name: run_window(e, sensed)[0] for e in estimators}
-        looked: list[tuple[int, ...]] = []
-
-        def sensors_of(stage: Any, looked: list[tuple[int, ...]] = looked) -> Any:
-            looked.append((stage.since_ns,))
-            return log_sensors(car.vehicle, stage)
-
-        spans = choose_over_time(estimators, calibration, tracks.get, sensed, sensors_of)
-        limit = int(signals.stamps_ns[0]) + round(wild_s * 1e9)
-        chosen.append([span for span in spans if span[0] <= limit])
-        figures.append(sum(since <= limit for (since,) in looked))
-    assert chosen[0] == chosen[1]
-    assert figures[0] == figures[1] > 1

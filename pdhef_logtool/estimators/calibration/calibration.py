@@ -18,7 +18,7 @@ import numpy as np
 from pdhef_logtool.car.parts import LIMIT_GAIN, FilterNoise
 from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
+from pdhef_logtool.estimators.calibration.driving import Driving
 from pdhef_logtool.estimators.calibration.joint import (
     DERIVATIVE_STEP,
     ERROR_STD,
@@ -40,9 +40,8 @@ AY_STD = 1.0
 #: Process noise of ``physics`` on a calibrated car: PHYSICS_Q_STD with more for the axle forces, so that kinematics
 #: have more influence beyond the linear range, where the fitted tyres are least certain.
 Q_STD = (0.085, 0.12, 0.012, 0.086, 1.0, 1.0)
-#: Minimum driving above the low-speed limit; for the online calibration, growth of the driving from one calibration to
-#: the next, and the delay of its use, because gaps before its last sample may be interpolated.
-LEAST_S, ONLINE_GROWTH, ONLINE_DELAY_NS = 5.0, 1.5, 1_000_000_000
+#: Minimum driving above the low-speed limit.
+LEAST_S = 5.0
 #: A fit is rejected if its error exceeds this share of the RMS of yaw rate or of a_y, and this multiple of
 #: ``ERROR_STD``: sign or topic of a signal may be wrong, or the car spins.
 LARGEST_SHARE, LARGEST_ERROR = 0.5, 1.0
@@ -108,7 +107,6 @@ class SelfCalibration:
     seconds : used driving. logs : number of logs in the pool.
     varied : vehicles one posterior 1-sigma away, one per direction with a large effect on the sideslip.
     driven_d2_m_s : part of the v̇_y residual of ``physics`` that correlates with the driving, NaN without a run.
-    since_ns, earlier : start of the use of an online calibration, and the earlier calibrations, in time order.
     """
 
     vehicle_file: VehicleParameters
@@ -122,8 +120,6 @@ class SelfCalibration:
     logs: int
     varied: tuple[VehicleParameters, ...] = ()
     driven_d2_m_s: float = math.nan
-    since_ns: int = 0
-    earlier: tuple[SelfCalibration, ...] = ()
 
     @property
     def noise(self) -> FilterNoise:
@@ -175,7 +171,6 @@ class SelfCalibration:
                 "drive_sd_rad_per_m_s2": u.drive_sd,
                 "contradicts": u.contradicts,
             },
-            "online": bool(self.earlier),
             "friction_fixed_at": self.vehicle_file.assumed_friction,
             "yaw_rate_rms_rad_s": self.rms[OF_RATE],
             "ay_rms_m_s2": self.rms[OF_AY],
@@ -250,28 +245,6 @@ def prior_calibration(vehicle_file: VehicleParameters, taught: Sequence[TaughtPa
     """Return the calibration before any driving: prior means, with the prior variations that affect sideslip most."""
     centre, priors = prior_vehicle(vehicle_file, taught), with_taught(parameters_of(vehicle_file), taught)
     return replace(_without_fit(vehicle_file, centre), varied=prior_variations(centre, priors))
-
-
-def calibrate_online(
-    driving: Driving, vehicle_file: VehicleParameters, *, taught: Sequence[TaughtParameter] = ()
-) -> SelfCalibration:
-    """Calibrate a car repeatedly during its log; the first calibration consists of the prior means.
-
-    Each calibration uses 1.5 times the driving of the previous one, so that all together take three times as long as
-    the last one.
-    """
-    inside = np.zeros(driving.columns.shape[1])
-    for first, last in driving.stretches:
-        inside[first:last] = STEP_S
-    driven, needed = np.cumsum(inside), LEAST_S
-    stages = [prior_calibration(vehicle_file, taught)]
-    while driven.size and needed < driven[-1]:
-        count = int(np.searchsorted(driven, needed)) + 1
-        calibration = self_calibrate([driving.until(count)], vehicle_file, taught=taught)
-        if not calibration.refused:
-            stages.append(replace(calibration, since_ns=int(driving.stamps_ns[count - 1]) + ONLINE_DELAY_NS))
-        needed *= ONLINE_GROWTH
-    return replace(stages[-1], earlier=tuple(stages[:-1]))
 
 
 def _understeer(

@@ -50,11 +50,6 @@ class Driving:
         """Return the same grid with the stretches between two cells alone."""
         return replace(self, stretches=_long(np.clip(self.stretches, first, last)))
 
-    def until(self, count: int) -> Driving:
-        """Return the first cells of the grid."""
-        stretches = _long(np.minimum(self.stretches, count))
-        return replace(self, columns=self.columns[:, :count], stamps_ns=self.stamps_ns[:count], stretches=stretches)
-
 
 def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
     """Thin the signals of a drive [N] to a grid of cell means."""

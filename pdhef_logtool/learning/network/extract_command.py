@@ -24,7 +24,6 @@ from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, Tell, friction_of, no_samples, read_drive
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.estimators.calibration.calibration import self_calibrate
-from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.estimators.table import FEATURES, FILTERS
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
@@ -64,6 +63,7 @@ from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, id
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
+from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import Loss
@@ -71,7 +71,6 @@ from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, NOMINAL_MODEL,
 from pdhef_logtool.residual_model.ladder import LadderModel
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.self_calibrating import read_driving, self_calibrated
 from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.files import writing
 from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path
@@ -467,7 +466,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         smoothing = _choose_smoothing(plan, settings)
         truth = _truth_facts(plan, smoothing, estimated=reference is not None)
         service = _in_service(drive, job)
-        physics = filter_of(service.car.calibrated_car, settings.model, use_speed=drive.options.use_speed)
+        physics = filter_of(service.model.car.calibrated_car, settings.model, use_speed=drive.options.use_speed)
         validated = drive.car.has_evidence
         drive.friction = friction_of(plan, physics.vehicle, drive.options, validated=validated, of_truth=True)
         condition = None if settings.where is None else condition_of(settings.where)
@@ -489,7 +488,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             "settings_sha256": fingerprint,
             "mapping_sha256": drive.mapping.sha256,
             "calibration": service.calibration,
-            "taught_sha256": None if service.model is None else service.model.sha256,
+            "taught_sha256": None if service.residual is None else service.residual.sha256,
             "period_s": plan.alignment.grid_period_s,
             **_counts(rows, picked, drive.log.start_ns),
             "truth": truth,
@@ -505,22 +504,22 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Service:
-    """Settings of a run on a drive: car, calibration, active residual model."""
+    """Settings of a run on a drive: its model, calibration, active residual model."""
 
-    car: Car
+    model: DriveModel
     calibration: str
-    model: LadderModel | None
+    residual: LadderModel | None
 
 
 def _in_service(drive: Drive, job: _Job) -> _Service:
     """Return the car settings of a run on this drive; a trained car is calibrated on each drive."""
     car, taught = job.car, job.car.taught
     if taught is None or job.settings.model != PHYSICS_MODEL:
-        return _Service(car, "", None)
+        return _Service(DriveModel.of(drive), "", None)
     calibration = self_calibrate([read_driving(drive)], car.vehicle, taught=car.taught_prior)
     text = f"refused: {calibration.refused}" if calibration.refused else calibration.text
     acts = taught.residual if taught.calibrated != bool(calibration.refused) else None
-    return _Service(self_calibrated(drive, calibration), text, acts)
+    return _Service(DriveModel.of(drive, calibration), text, acts)
 
 
 def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) -> DriveResult | None:
@@ -549,10 +548,10 @@ def _residuals(
     truth = whole.truth if reference is None else reference(whole.signals.stamps_ns)
     period_s = drive.plan.alignment.grid_period_s
     half_window = round(smoothing.half_s / period_s)
-    taught = service.model if physics.equations == "forces" else None
+    taught = service.residual if physics.equations == "forces" else None
     noise = smoothing.noise[0] * period_s / math.sqrt(2.0)  # of v_y itself
     return residual_rows(
-        calibrated_signals(whole.signals, service.car) if physics.equations == "forces" else whole.signals,
+        service.model.apply(whole.signals).calibrated if physics.equations == "forces" else whole.signals,
         truth,
         physics,
         period_s=period_s,

@@ -1,29 +1,24 @@
-"""Stage ``calibrate``: calibrate a car on several logs by the sensors alone (``fit.toml``).
+"""Stage ``calibrate``: calibrate a car on several logs by the sensors alone (``model.toml``).
 
-See docs/method.md#self-calibration. The calibration of a single log may be wrong on other logs, so that only a
-calibration on several logs is written.
+See docs/method.md#self-calibration. The sensors are those of the first log.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
-from pdhef_logtool.car.car import FIT_FILE, Car
-from pdhef_logtool.car.parts import Fit, FittedPhysics, FittedValues, LearntOn, physics_sha256
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.store import Change
-from pdhef_logtool.car.toml_files import part_toml
+from pdhef_logtool.drive.model_file import ModelFile, Sensors
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
+from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.calibration.driving import Driving
 from pdhef_logtool.learning.drives import CALIBRATE, DriveRecord, record_of
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.model.drive_model import lacking, read_driving, taught_of
 from pdhef_logtool.records.errors import EstimatorError
-from pdhef_logtool.runs.self_calibrating import lacking, read_driving
-
-#: Minimum number of logs.
-LEAST_LOGS = 2
+from pdhef_logtool.results.opened_run import MODEL_FILE
 
 
 def calibrate(task: Task) -> StageOutput:
@@ -32,12 +27,12 @@ def calibrate(task: Task) -> StageOutput:
     Raises
     ------
     EstimatorError
-        Too few logs, too little driving, a stiffness that remains uncertain, or a car that drifts.
+        Too little driving, a stiffness that remains uncertain, or a car that drifts.
     """
     start = task.car.datasheet
     car = Car.of(start)
 
-    def read(log: LogInput) -> tuple[DriveRecord, Driving | None]:
+    def read(log: LogInput) -> tuple[DriveRecord, tuple[Driving, Sensors] | None]:
         with read_drive(log, car, task.mapping, task.options) as drive:
             if missing := lacking(drive):
                 return record_of(drive, left_out=f"the log has no {', '.join(missing)}"), None
@@ -45,48 +40,25 @@ def calibrate(task: Task) -> StageOutput:
             usable = len(driving.stretches) > 0
             record = record_of(drive, left_out="" if usable else "no driving that a calibration can use")
             start_s, end_s = ((t - drive.log.start_ns) * 1e-9 for t in (drive.plan.start_ns, drive.plan.end_ns))
-            return replace(record, seconds=end_s - start_s, span_s=(start_s, end_s)), driving if usable else None
+            record = replace(record, seconds=end_s - start_s, span_s=(start_s, end_s))
+            return record, (driving, drive.plan.sensors) if usable else None
 
     records, drives = task.read(read, 0.8)
-    if len(drives) < LEAST_LOGS:
-        raise _refused(f"{len(drives)} of them", "logs of one car, for the result of one log need not apply to another")
     calibration = self_calibrate(
-        drives,
+        [driving for driving, _ in drives],
         start,
         exported=True,
         progress=lambda share: task.reporter.progress("fitting to the sensors", 0.8 + 0.2 * share),
     )
     if calibration.refused:
-        raise _refused(calibration.refused, "logs with bends and lane changes that calibrate the car")
-    part = fit_part(calibration, [r.learnt_on for r in records if not r.left_out])
+        raise EstimatorError(
+            expected="logs with bends and lane changes that calibrate the car",
+            got=calibration.refused,
+            where="learn --stages calibrate",
+            remedy="give more logs of this car, or one with ground truth without this option",
+        )
+    learnt_on = [r.learnt_on for r in records if not r.left_out]
     head = f"Written by pdhef learn --stages calibrate: no ground truth was used.\n{calibration.text}."
-    files = {FIT_FILE: part_toml(part, head).encode()}
-    settings = task.settings.to_dict()
-    change = Change(f"learn --stages {CALIBRATE}", FIT_FILE, files, settings=settings, drives=part.drives)
+    files = {MODEL_FILE: ModelFile.of(drives[0][1], car, taught_of(calibration)).toml(head).encode()}
+    change = Change(f"learn --stages {CALIBRATE}", MODEL_FILE, files, task.settings.to_dict(), learnt_on)
     return StageOutput(change, records, calibration.text, {"self_calibration": calibration.to_dict()})
-
-
-def fit_part(calibration: SelfCalibration, drives: Sequence[LearntOn]) -> Fit:
-    """Return the calibration as a part of a car; ``physics`` has the same values, and its own noise."""
-    datasheet, vehicle = calibration.vehicle_file, calibration.vehicle
-    return Fit(
-        physics_sha256=physics_sha256(datasheet),
-        values=FittedValues.between(datasheet, vehicle),
-        physics=FittedPhysics(
-            values=FittedValues.of(vehicle),
-            noise=calibration.noise,
-            varied=tuple(FittedValues.between(vehicle, v) for v in calibration.varied),
-        ),
-        without_truth=True,
-        drives=tuple(drives),
-        notes=(calibration.text, "no ground truth was used: a drive with ground truth gives better values"),
-    )
-
-
-def _refused(got: str, expected: str) -> EstimatorError:
-    return EstimatorError(
-        expected=expected,
-        got=got,
-        where="learn --stages calibrate",
-        remedy="give more logs of this car, or one with ground truth without this option",
-    )

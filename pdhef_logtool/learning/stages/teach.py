@@ -24,7 +24,6 @@ from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import STEP_S
 from pdhef_logtool.estimators.calibration.joint import level_of, like_drives
-from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import compensate
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.residual_response import residual_response
@@ -37,6 +36,7 @@ from pdhef_logtool.learning.drives import TEACH, DriveRecord, no_drive, record_o
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.learning.truth import teaching_reference, weight_of
 from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.model.drive_model import DriveModel, lacking, read_driving
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import release, step_durations_s
@@ -50,7 +50,6 @@ from pdhef_logtool.residual_model.ladder_fit import (
     fit_ladder,
 )
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.self_calibrating import lacking, read_driving, self_calibrated
 
 #: Minimum driving with ground truth, and length beyond which the gain is small (docs/learn.md).
 LEAST_S, ENOUGH_S = 20.0, 150.0
@@ -220,8 +219,9 @@ def _calibration(drive: OpenedDrive, parameters: Sequence[TaughtParameter]) -> S
 
 def lacking_of(drive: OpenedDrive, calibration: SelfCalibration) -> TaughtDrive:
     """Return the features of a drive, the sideslip error of ``physics`` on its calibrated car, and its response."""
-    car = self_calibrated(drive.drive, calibration)
-    physics, signals = make_estimator(PHYSICS, car), calibrated_signals(drive.whole.signals, car)
+    model = DriveModel.of(drive.drive, calibration)
+    car = model.car
+    physics, signals = make_estimator(PHYSICS, car), model.apply(drive.whole.signals).calibrated
     assert isinstance(physics, AdaptivePhysics)
     steps, _ = physics.run(signals, None)
     track, _ = compensate(physics, signals, steps)

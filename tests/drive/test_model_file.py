@@ -1,4 +1,4 @@
-"""A frozen set-up is determined once, from another log or the first seconds; later data do not change it."""
+"""A model file determines sensors and car before the drive: later data do not change them."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.drive import reading
+from pdhef_logtool.drive.model_file import ModelFile, load_model
 from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.plan import setup_of
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.drive.setup import LogUntil, Setup, load_setup, setup_toml
 from pdhef_logtool.estimators.table import spec_of
+from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.runs.frames import estimate
@@ -48,9 +49,18 @@ class ChangedLater:
         return columns
 
 
-def signals(log: Path, options: ReadOptions) -> tuple[Signals, Setup]:
+def signals(log: Path, options: ReadOptions) -> tuple[Signals, ModelFile]:
     with read_drive(log, Car.load("saloon"), options=options) as drive:
-        return drive.whole().signals, setup_of(drive.plan)
+        return drive.whole().signals, DriveModel.of(drive).file
+
+
+@pytest.fixture
+def file(road: Path, tmp_path: Path) -> Path:
+    """Return the model of the drive before the change."""
+    _, model = signals(road, ReadOptions(end=str(CHANGE_S - 5.0)))
+    path = tmp_path / "model.toml"
+    path.write_text(model.toml("Of a test.\nTwo lines."))
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -69,16 +79,12 @@ def before_the_change(both: Signals) -> list[np.ndarray[Any, Any]]:
     ]
 
 
-@pytest.mark.parametrize("how", ["whole log", "first seconds", "file"])
-def test_with_a_set_up_the_future_changes_nothing_that_came_before(
-    how: str, road: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("is_file", [False, True])
+def test_with_a_model_file_the_future_changes_nothing_that_came_before(
+    is_file: bool, road: Path, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    options = ReadOptions(setup_from_s=None if how == "whole log" else CHANGE_S - 5.0)
-    as_recorded, setup = signals(road, options)
-    if how == "file":
-        (tmp_path / "setup.toml").write_text(setup_toml(setup, "Of a test."))
-        options = ReadOptions(setup=tmp_path / "setup.toml")
-        as_recorded, _ = signals(road, options)
+    options = ReadOptions(model=file) if is_file else ReadOptions()
+    as_recorded, _ = signals(road, options)
     really_open = reading.open_log
 
     def opened(*args: Any, **more: Any) -> Any:
@@ -89,15 +95,15 @@ def test_with_a_set_up_the_future_changes_nothing_that_came_before(
     changed, _ = signals(road, options)
     both = zip(before_the_change(as_recorded), before_the_change(changed), strict=True)
     same = [np.array_equal(a, b, equal_nan=True) for a, b in both]
-    assert all(same) == (how != "whole log")  # mounting and delays of a whole log look at all of it
+    assert all(same) == is_file  # mounting and delays of a whole log look at all of it
     later = np.array_equal(changed.ay_m_s2[-500:], -as_recorded.ay_m_s2[-500:], equal_nan=True)
-    assert later == (how != "whole log")
+    assert later == is_file
 
 
 @pytest.mark.slow
-def test_no_causal_estimate_depends_on_the_future(road: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of every estimator, with the set-up of the first seconds."""
-    options = ReadOptions(setup_from_s=CHANGE_S - 5.0, end="60")
+def test_no_causal_estimate_depends_on_the_future(road: Path, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of every estimator, with a model file."""
+    options = ReadOptions(model=file, end="60")
 
     def estimates() -> dict[str, Any]:
         with read_drive(road, Car.load("saloon"), options=options) as drive:
@@ -120,39 +126,27 @@ def test_no_causal_estimate_depends_on_the_future(road: Path, monkeypatch: pytes
         assert same == spec_of(name).causal, name
 
 
-def test_a_set_up_is_read_back_as_it_was_written(road: Path, tmp_path: Path) -> None:
-    _, setup = signals(road, ReadOptions(setup_from_s=20.0))
-    path = tmp_path / "setup.toml"
-    path.write_text(setup_toml(setup, "Of a test.\nTwo lines."))
-    assert repr(load_setup(path)) == repr(setup)  # NaN is NaN
+def test_a_model_is_read_back_as_it_was_written_and_gives_the_same_signals(road: Path, tmp_path: Path) -> None:
+    whole, model = signals(road, ReadOptions())
+    model = replace(model, parameters=(TaughtParameter(name="steering ratio", value=15.1, std=0.02),))
+    path = tmp_path / "model.toml"
+    path.write_text(model.toml("Of a test.\nTwo lines."))
     assert path.read_text().startswith("# Of a test.\n# Two lines.\n")
-
-
-def test_the_same_set_up_gives_the_same_signals(road: Path, tmp_path: Path) -> None:
-    whole, setup = signals(road, ReadOptions())
-    (tmp_path / "setup.toml").write_text(setup_toml(setup, "Of a test."))
-    again, _ = signals(road, ReadOptions(setup=tmp_path / "setup.toml"))
+    assert repr(load_model(path, Car.load("saloon"))) == repr(model)  # NaN is NaN
+    again, _ = signals(road, ReadOptions(model=path))
     np.testing.assert_array_equal(whole.ay_m_s2, again.ay_m_s2)
     np.testing.assert_array_equal(whole.ready_ns, again.ready_ns)
+    with pytest.raises(MappingError, match=r"expected a model of the car .*, got one of the vehicle file"):
+        load_model(path, Car.load())
 
 
-def test_a_set_up_of_other_topics_is_refused_in_one_line(sample_logs_dir: Path, road: Path, tmp_path: Path) -> None:
-    _, setup = signals(road, ReadOptions(setup_from_s=20.0))
-    text = setup_toml(setup, "Of a test.").replace("/imu/data", "/imu/other")
-    (tmp_path / "setup.toml").write_text(text)
+def test_a_model_that_does_not_fit_is_refused_in_one_line(road: Path, file: Path) -> None:
+    text = file.read_text().replace("/imu/data", "/imu/other")
+    file.write_text(text)
     with pytest.raises(MappingError, match="/imu/other"):
-        signals(road, ReadOptions(setup=tmp_path / "setup.toml"))
-    (tmp_path / "setup.toml").write_text(text.replace("decided_s", "decided"))
+        signals(road, ReadOptions(model=file))
+    file.write_text(text.replace("decided_s", "decided"))
     with pytest.raises(MappingError, match="decided_s"):
-        signals(road, ReadOptions(setup=tmp_path / "setup.toml"))
-
-
-def test_a_log_until_some_time_reads_nothing_after_it(road: Path) -> None:
-    log = reading.open_log(road)
-    until = log.start_ns + 5_000_000_000
-    cut: Any = LogUntil(log, until)
-    request = {"/imu/data": ["linear_acceleration.y"]}
-    assert cut.end_ns == until
-    for columns in (cut.read(request), cut.read(request, None, until + 10**9), cut.read(request, cut.start_ns, None)):
-        assert len(columns["/imu/data"]) > 0 and columns["/imu/data"].log_time_ns.max() < until
-    log.close()
+        signals(road, ReadOptions(model=file))
+    with pytest.raises(MappingError, match=r"auto, off or a model\.toml"):
+        signals(road, ReadOptions(model="of"))  # type: ignore[arg-type]
