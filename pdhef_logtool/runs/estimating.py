@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.latency_compensation import run_estimator
+from pdhef_logtool.estimators.plug_ins import package_of
 from pdhef_logtool.estimators.presets import SELF_CALIBRATED, preset_of, uses_calibration
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import dead_reckon
@@ -77,10 +78,17 @@ def estimate_drive(
             drawn_truth = dead_reckoned(drawn_truth, start)
         drawn_truth = valid_as_a_whole(drawn_truth, drive.plan.derivation, vehicle.standstill_m_s)
     tracks: dict[str, StateTrack] = {}
-    for number, estimator in enumerate(estimators):
+    computations = [_computation(e, corrected.of_estimator(e.name)) for e in estimators]
+    shared: dict[tuple[str, int], StateTrack] = {}
+    for number, (estimator, computation) in enumerate(zip(estimators, computations, strict=True)):
         progress(number / len(estimators))
         try:
-            track = run_estimator(estimator, corrected.of_estimator(estimator.name), causality)
+            track = shared.pop(computation, None)
+            if track is None:
+                track = run_estimator(estimator, corrected.of_estimator(estimator.name), causality)
+            if computation in computations[number + 1 :]:
+                shared[computation] = track
+            track = replace(track, name=estimator.name)
         except EstimatorError as error:
             if causality is None:
                 raise
@@ -94,6 +102,11 @@ def estimate_drive(
         track = track.without_sideslip_below(vehicle.standstill_m_s)
         tracks[track.name] = dead_reckoned(track, start) if drawn else track
     return Estimated(signals, truth, drawn_truth, tracks)
+
+
+def _computation(estimator: Estimator, signals: Signals) -> tuple[str, int]:
+    """Return a key that estimators share which compute the same: without a network ``pd-hef`` is ``physics``."""
+    return (estimator.name if package_of(estimator) else resolve(estimator).sha256), id(signals)
 
 
 def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
