@@ -60,13 +60,12 @@ class _Plot:
     column: str
     factor: float = 1.0
     std: str | None = None
-    is_angle: bool = False
     sparse: bool = False
     from_low_speed: bool = True
 
 
 _STATES = (
-    _Plot("sideslip_deg", "sideslip [deg]", "sideslip_rad", DEGREES, "sideslip_std_rad", True, from_low_speed=False),
+    _Plot("sideslip_deg", "sideslip [deg]", "sideslip_rad", DEGREES, "sideslip_std_rad", from_low_speed=False),
     _Plot("yaw_rate_deg_s", "yaw rate [deg/s]", "yaw_rate_rad_s", DEGREES, "yaw_rate_std_rad_s"),
     _Plot("vx_m_s", "longitudinal velocity [m/s]", "vx_m_s", std="vx_std_m_s"),
     _Plot("vy_m_s", "lateral velocity [m/s]", "vy_m_s", std="vy_std_m_s"),

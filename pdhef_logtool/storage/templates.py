@@ -1,0 +1,24 @@
+"""Texts by jinja templates, of which callers fill the fields."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+
+
+def template(path: Path, **known: Any) -> Template:
+    """Return a template; ``known``: functions and constants that it uses. Fields of XML are escaped."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+
+    made = Environment(
+        loader=FileSystemLoader(path.parent),
+        autoescape=select_autoescape(("xml",)),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return made.get_template(path.name, globals=known)
