@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 from pdhef_logtool.evaluation.requirement_verdicts import RequirementVerdict
 from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
-from pdhef_logtool.results.run_report import TEMPLATES
+from pdhef_logtool.results.selected_estimate import TEMPLATES
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.templates import template
 

@@ -9,24 +9,24 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
-from pathlib import Path, PurePath
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.standing import Standing
-from pdhef_logtool.results.selected_estimate import MainFacts, answer_of
+from pdhef_logtool.results.selected_estimate import TEMPLATES, MainFacts, answer_of
 from pdhef_logtool.results.verdicts import verdicts_of
 from pdhef_logtool.storage.documents import jsonable, seal
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.templates import template
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
-#: Templates of texts and files of results.
-TEMPLATES = Path(__file__).parent / "templates"
 #: Columns of a figure in the report.
 _METRIC_COLUMNS = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
 #: Entries that a brief report keeps of a list.
