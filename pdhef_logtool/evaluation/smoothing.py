@@ -39,8 +39,8 @@ def _gaussian(step_ns: float, cutoff_hz: float) -> FloatArray:
     """Return the weights [2 K + 1] of a Gaussian with gain 1/√2 at ``cutoff_hz``, truncated at 4 σ."""
     sigma_rows = float(np.sqrt(np.log(2.0)) / (2.0 * np.pi * cutoff_hz) / (step_ns * 1e-9))
     reach = int(4.0 * sigma_rows + 0.5)
-    weights: FloatArray = np.exp(-0.5 / (sigma_rows * sigma_rows) * np.arange(-reach, reach + 1) ** 2)
-    return weights / weights.sum()
+    weights = np.exp(-0.5 / (sigma_rows * sigma_rows) * np.arange(-reach, reach + 1) ** 2)
+    return np.asarray(weights / weights.sum(), dtype=np.float64)
 
 
 def runs(stamps_ns: IntArray, mask: BoolArray) -> list[tuple[int, int]]:

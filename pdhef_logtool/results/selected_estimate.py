@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeAlias
 
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.tracks import REFERENCE
-from pdhef_logtool.storage.templates import template
+from pdhef_logtool.storage.templates import one_line, template
 
 #: Templates of texts and files of results.
 TEMPLATES = Path(__file__).parent / "templates"
@@ -86,7 +86,7 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
         "assumed": "; ".join(_assumed(report, main)),
         "next": "; ".join(_next_steps(report, main, figures)[:_MOST_STEPS]),
     }
-    texts = {key: " ".join(str(text).split()) for key, text in texts.items()}
+    texts = {key: one_line(text) for key, text in texts.items()}
     best = _best_in_hindsight(report, main, figures)
     chosen = {"main" if key == "name" else key: value for key, value in asdict(main).items() if key != "over_time"}
     if main.over_time:
@@ -97,7 +97,14 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
 @cache
 def _words() -> Any:
     """Return the sentences of ``selected_estimate.txt`` as functions."""
-    limits = {"HOLDS": HOLDS, "NEARLY_HOLDS": NEARLY_HOLDS, "WIDE": _WIDE, "SAME": SAME, "FEW": _FEW, "LESS": _LESS}
+    limits: dict[str, Any] = {
+        "HOLDS": HOLDS,
+        "NEARLY_HOLDS": NEARLY_HOLDS,
+        "WIDE": _WIDE,
+        "SAME": SAME,
+        "FEW": _FEW,
+        "LESS": _LESS,
+    }
     limits |= {"NO_SIDESLIP_RAD": NO_SIDESLIP_RAD, "NIS_RANGE": _NIS_RANGE, "DEGREES": DEGREES}
     shown = {"degrees": degrees, "percent": lambda share: f"{100.0 * share:.0f}", "truth_of": truth_of}
     return template(TEMPLATES / "selected_estimate.txt", **limits, **shown).module

@@ -22,3 +22,8 @@ def template(path: Path, **known: Any) -> Template:
         keep_trailing_newline=True,
     )
     return made.get_template(path.name, globals=known)
+
+
+def one_line(text: object) -> str:
+    """Return a rendered sentence, which may have several lines in its template, in one line."""
+    return " ".join(str(text).split())
