@@ -19,8 +19,8 @@ from pdhef_logtool.storage.templates import one_line, template
 @cache
 def _words() -> Any:
     """Return the sentences of ``comparison.txt`` as functions."""
-    known = {"change_text": change_text, "percent": percent, "LEAST_CLUSTERS": LEAST_CLUSTERS}
-    return template(TEMPLATES / "comparison.txt", **known).module
+    context = {"change_text": change_text, "percent": percent, "LEAST_CLUSTERS": LEAST_CLUSTERS}
+    return template(TEMPLATES / "comparison.txt", **context).module
 
 
 def paired_text(comparison: Comparison) -> str:

@@ -94,7 +94,9 @@ def write_layouts(
         "on_map": {t.name for t in tracks if has_pose(t).any()},
         "fixes": fixes,
     }
-    known = {"topic_of": topic_of, "TRUTH": TRUTH, "MAP_FRAME": MAP_FRAME, "LOG_TOPIC": LOG_TOPIC}
-    layout, xml = (template(TEMPLATES / name, **known).render(fields) for name in ("foxglove.json", "plotjuggler.xml"))
+    context = {"topic_of": topic_of, "TRUTH": TRUTH, "MAP_FRAME": MAP_FRAME, "LOG_TOPIC": LOG_TOPIC}
+    layout, xml = (
+        template(TEMPLATES / name, **context).render(fields) for name in ("foxglove.json", "plotjuggler.xml")
+    )
     write_bytes(foxglove, json_bytes(json.loads(layout)))
     write_bytes(plotjuggler, xml.encode())

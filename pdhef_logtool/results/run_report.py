@@ -220,8 +220,8 @@ def write_json(path: Path, document: Mapping[str, Any], *, brief: bool = False) 
 
 def report_markdown(report: Mapping[str, Any]) -> str:
     """Return the document of :func:`build_report` in a few words, as Markdown for viewers; the page has the figures."""
-    known = {"diverged_line": diverged_line, "reasons_line": reasons_line}
-    return template(TEMPLATES / "report.md", **known).render(report=report)
+    context = {"diverged_line": diverged_line, "reasons_line": reasons_line}
+    return template(TEMPLATES / "report.md", **context).render(report=report)
 
 
 def diverged_line(report: Mapping[str, Any], name: str) -> str:

@@ -1,4 +1,4 @@
-"""Texts by jinja templates, of which callers fill the fields."""
+"""Jinja templates of texts and files; callers fill their fields."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ if TYPE_CHECKING:
     from jinja2 import Template
 
 
-def template(path: Path, **known: Any) -> Template:
-    """Return a template; ``known``: functions and constants that it uses. Fields of XML are escaped."""
+def template(path: Path, **context: Any) -> Template:
+    """Return a template; ``context``: functions and constants that it uses. Fields of XML are escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
     made = Environment(
@@ -21,7 +21,7 @@ def template(path: Path, **known: Any) -> Template:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    return made.get_template(path.name, globals=known)
+    return made.get_template(path.name, globals=context)
 
 
 def one_line(text: object) -> str:
