@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from pdhef_logtool.cli import console, options, panels
+from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
@@ -22,17 +22,7 @@ commands = typer.Typer()
 _PAD_S, _CLIP_PAD_S = 0.25, 5.0
 
 
-@options.command(
-    commands,
-    "pdhef compare before after",
-    "pdhef compare before after --max-regression 5%",
-    "pdhef compare before after --plan plan.toml --junit plan.xml --strict",
-    "pdhef compare before after --cluster day --html change.html",
-    panel=panels.READ,
-    notes="Exit codes: 0 no significant regression; 1 no common drive; 3 some drives are damaged, or without a "
-    "counterpart and there is no limit; 4 a requirement of the plan or --max-regression failed, or is inconclusive "
-    "with --strict. Without either, a regression does not change the exit code.",
-)
+@options.command(commands)
 def compare(
     a: Annotated[str, Argument(metavar="A", help="Output of the reference run: folder or URL.")],
     b: Annotated[str, Argument(metavar="B", help="Output of the run to compare with it.")],
@@ -121,19 +111,7 @@ def _gate(
     return Gate((figure,), allow_unpaired)
 
 
-@options.command(
-    commands,
-    'pdhef events out --where "abs(sideslip_error_deg) > 2 and slalom" --for 0.5s',
-    'pdhef events out --where "diverged or not valid" --json',
-    'pdhef events out --where "abs(sideslip_deg) > 9" --clip --pad 3s',
-    'pdhef events out --where "abs(ay_m_s2) > 6" --parquet events.parquet',
-    panel=panels.READ,
-    notes="EXPR is an expression in the SQL of Polars. Columns: columns of estimates.parquet, speed_m_s, and errors "
-    "relative to ground truth: sideslip_error_rad, vx_error_m_s, vy_error_m_s, yaw_rate_error_rad_s, ay_error_m_s2; "
-    "_deg and _km_h instead of _rad and _m_s. They refer to the selected estimate, or to the track before a dot: "
-    'truth.vx_m_s, "pd-hef:gain=1".vx_m_s. Segments and manoeuvres are columns: slalom, "cornering-left". Names with '
-    "characters other than letters and digits need double quotes.",
-)
+@options.command(commands)
 def events(
     output: Annotated[str, Argument(metavar="OUTPUT", help="Output of a run: folder or URL.")],
     *,

@@ -4,19 +4,12 @@ from __future__ import annotations
 
 import typer
 
-from pdhef_logtool.cli import console, options, panels
+from pdhef_logtool.cli import console, options
 
 commands = typer.Typer()
 
 
-@options.command(
-    commands,
-    "pdhef compile",
-    "NUMBA_CACHE_DIR=/opt/pdhef pdhef compile",
-    panel=panels.TOOLS,
-    notes="A second call has no effect.",
-    name="compile",
-)
+@options.command(commands, name="compile")
 def compile_() -> None:
     """Compile the filters in advance, so that the first run starts at once."""
     import time

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Option
 
-from pdhef_logtool.cli import console, options, panels
+from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 
 if TYPE_CHECKING:
@@ -17,14 +17,7 @@ if TYPE_CHECKING:
 commands = typer.Typer()
 
 
-@options.command(
-    commands,
-    "pdhef convert drive.vbo -o drive.mcap",
-    "pdhef convert drive.mf4 -o drive.mcap",
-    panel=panels.TOOLS,
-    notes="Columns keep their names, units and times, so that a mapping file applies to both files. Every command also "
-    "reads such logs without a conversion.",
-)
+@options.command(commands)
 def convert(
     log: options.Log,
     config: RunConfig,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
-from pdhef_logtool.cli import console, options, panels
+from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, UsageError
 
 if TYPE_CHECKING:
@@ -21,16 +21,7 @@ if TYPE_CHECKING:
 commands = typer.Typer()
 
 
-@options.command(
-    commands,
-    "pdhef inspect drive.mcap",
-    "pdhef inspect drive.bag --json | jq .signals",
-    "pdhef inspect drive.mcap --write-mapping mapping.toml",
-    "pdhef inspect drive.mcap --report inspection.html",
-    "pdhef inspect drive.mcap --fields /imu/data",
-    "pdhef inspect https://host/drive.mcap --all",
-    panel=panels.LOOK,
-)
+@options.command(commands)
 def inspect(
     log: options.Log,
     config: RunConfig,
@@ -81,13 +72,7 @@ def inspect(
     console.finish(inspection, render_inspection, as_json, exit_code=exit_code)
 
 
-@options.command(
-    commands,
-    "pdhef map drive.mcap -o mapping.toml",
-    "pdhef run drive.mcap --mapping mapping.toml",
-    panel=panels.LOOK,
-    name="map",
-)
+@options.command(commands, name="map")
 def map_(
     log: options.Log,
     config: RunConfig,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from pdhef_logtool.cli import console, learning_tables, options, panels
+from pdhef_logtool.cli import console, learning_tables, options
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
@@ -17,20 +17,7 @@ if TYPE_CHECKING:
 commands = typer.Typer()
 
 
-@options.command(
-    commands,
-    "pdhef learn drives/ --car guess.toml -o mycar",
-    "pdhef learn logs/ --car guess.toml -o mycar --stages calibrate",
-    panel=panels.LEARN,
-    notes="""The default stage, teach, uses all driving with ground truth, at least 20 s: it learns the prior for the
-calibration of later drives, and the residual of physics after the calibration (taught.json in the car's folder). With
---set reference=on, the sideslip reference replaces missing ground truth.
-
-Stage calibrate calibrates the car by the sensors of several logs without ground truth. Drives of the splits test and
-extrapolation of a simulated set are rejected; --split any permits them (docs/learn.md).""",
-    shared="sensors friction",
-    car="Car to start from (mass, geometry, sensor noise, priors)",
-)
+@options.command(commands, shared="sensors friction", car="Car to start from (mass, geometry, sensor noise, priors)")
 def learn(
     *,
     logs: options.TruthLogs,
@@ -56,21 +43,7 @@ def learn(
     console.finish(result, learning_tables.render_learning, as_json)
 
 
-@options.command(
-    commands,
-    "pdhef extract logs/ -o residuals --car mycar --jobs 2",
-    "pdhef extract drive.mcap -o residuals --car mycar --set prefer_truth=rtk \\",
-    "  --truth-smoothing 0.15",
-    "pdhef extract 'held_out/*.mcap' -o residuals_test --split test --resume",
-    'pdhef extract logs/ -o residuals --where "vx_km_h > 30" --per-cell 600',
-    panel=panels.LEARN,
-    notes="Drives are split 70/15/15 by a hash of their content and --seed, unless the manifest of a simulated set or "
-    "--split defines the split. Duplicates (drives with identical signals) are used once. Columns of --where: the "
-    "features, truth_vx_m_s, truth_vy_m_s; _deg and _km_h instead of _rad and _m_s (docs/retrain.md). With --set "
-    "reference=on, the sideslip reference replaces missing ground truth.",
-    shared="sensors friction",
-    car="Nominal car (default: from the manifest of a simulated set)",
-)
+@options.command(commands, shared="sensors friction", car="Nominal car (default: from the manifest of a simulated set)")
 def extract(
     *,
     logs: options.TruthLogs,
@@ -113,14 +86,7 @@ def extract(
     console.finish(result, learning_tables.render_extraction, as_json)
 
 
-@options.command(
-    commands,
-    "pdhef train residuals/ -o model",
-    "pdhef train mycar/ -o mycar_model --init model --epochs 10",
-    "pdhef train residuals/ -o model --baselines",
-    panel=panels.LEARN,
-    notes="An interrupted training continues after its last complete epoch when the command is repeated.",
-)
+@options.command(commands)
 def train(
     *,
     dataset: Annotated[Path, Argument(metavar="DATASET", help="Dataset folder of pdhef extract.")],

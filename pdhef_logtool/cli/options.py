@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable
-from functools import partial, wraps
+from functools import cache, partial, wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -119,23 +120,23 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
+@cache
+def _texts() -> dict[str, dict[str, str]]:
+    """Return panel, examples and notes of the commands."""
+    return tomllib.loads((Path(__file__).parent / "commands.toml").read_text(encoding="utf-8"))
+
+
 def command(
-    group: typer.Typer,
-    *examples: str,
-    panel: str,
-    name: str | None = None,
-    notes: str = "",
-    shared: str = "",
-    car: str = "",
+    group: typer.Typer, *, name: str | None = None, shared: str = "", car: str = ""
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Make a function a command; its parameter ``config`` receives the :class:`RunConfig` from the shared options.
+
+    ``commands.toml`` contains its panel, and the text below its options: command lines, and paragraphs.
 
     Parameters
     ----------
     group : commands to add it to.
-    examples, notes : text below the options: command lines, and paragraphs.
     name : of the command; None = the name of the function.
-    panel : group of commands in the help of ``pdhef``.
     shared : shared options in addition to --mapping, --config and --set, which every ``config`` has.
     car : help text of --car for the command, which then also has --start and --end; empty = no car.
     """
@@ -143,8 +144,6 @@ def command(
     taken = {key: option for key, option in _OPTIONS.items() if key in wanted}
     if car:
         taken["car"] = _option(_File, INPUT, f"{car}: car folder or vehicle.toml.")
-    # \b keeps the lines of a paragraph as they are.
-    epilog = "\n  ".join(("\b\nExamples:", *examples)) + f"\n\n{notes}" if examples else None
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         given = signature(function).parameters
@@ -168,7 +167,10 @@ def command(
             parameters += options if key == "config" else [argument]
         run_command.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
         run_command.__annotations__ = {p.name: p.annotation for p in parameters}
-        return group.command(name, epilog=epilog, cls=PanelCommand, rich_help_panel=panel)(run_command)
+        texts = _texts()[name or function.__name__]
+        # \b keeps the lines of a paragraph as they are.
+        epilog = "\n  ".join(("\b\nExamples:", *texts["examples"].splitlines())) + f"\n\n{texts.get('notes', '')}"
+        return group.command(name, epilog=epilog, cls=PanelCommand, rich_help_panel=texts["panel"])(run_command)
 
     return decorate
 

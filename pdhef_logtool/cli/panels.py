@@ -7,8 +7,8 @@ from typing import Any
 
 from typer.core import TyperCommand, TyperGroup
 
-#: The groups of commands, in the order of the help.
-LOOK, RUN, READ, LEARN, TOOLS = "Look at logs", "Run and score", "Read results", "Learn", "Tools"
+#: The groups of commands, in the order of the help; ``commands.toml`` has the group of each command.
+_PANELS = ("Look at logs", "Run and score", "Read results", "Learn", "Tools")
 
 
 class PanelCommand(TyperCommand):
@@ -33,7 +33,7 @@ class CommandGroup(TyperGroup):
         """Write the commands by panel."""
         commands = [(name, c) for name in self.list_commands(ctx) if (c := self.get_command(ctx, name)) is not None]
         records = [(getattr(c, "rich_help_panel", ""), (name, c.get_short_help_str(200))) for name, c in commands]
-        for panel in (LOOK, RUN, READ, LEARN, TOOLS):
+        for panel in _PANELS:
             _write(formatter, [r for r in records if r[0] == panel], panel)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from pdhef_logtool.cli import console, options, panels
+from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
@@ -20,14 +20,7 @@ if TYPE_CHECKING:
 commands = typer.Typer()
 
 
-@options.command(
-    commands,
-    "pdhef report out",
-    "pdhef report out --open",
-    "pdhef report out --by car --by vehicle_id",
-    "pdhef report out --pdf",
-    panel=panels.READ,
-)
+@options.command(commands)
 def report(
     output: Annotated[Path, Argument(parser=options.local_folder, metavar="OUT", help="Output folder of a run.")],
     show: Annotated[bool, Option("--open", help="Open the page in the browser.")] = False,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 from typer import Argument, Option
 
-from pdhef_logtool.cli import console, options, panels
+from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 
 if TYPE_CHECKING:
@@ -35,24 +35,6 @@ def _list_estimators(show: bool) -> None:
 
 @options.command(
     commands,
-    "pdhef run drive.mcap -o out",
-    "pdhef run drive.bag -o out --car mycar --mapping mapping.toml",
-    "pdhef run logs/ -o out --estimators zero,phy-ukf --annotate sidecar",
-    "pdhef run fleet/ -o out --cars cars.toml",
-    "pdhef run s3://bucket/day/ -o out --annotate sidecar",
-    "pdhef run drive.mcap -o out --start +60s --end end-5s --json",
-    "pdhef run logs/ -o out --plan plan.toml --junit out/plan.xml",
-    "pdhef run fleet/ -o out --jobs 8 --keep metrics",
-    "pdhef run fleet/ new/ -o out --jobs 8 --resume",
-    "pdhef run fleet/ -o out --only drive_0312",
-    "pdhef run @list.txt -o /shared/out --ray auto --keep metrics",
-    "pdhef run @list.txt -o s3://bucket/out --jobs 8 --keep metrics --resume",
-    "pdhef run logs/ -o out --set sensors=esp",
-    panel=panels.RUN,
-    notes="Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of "
-    "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
-    'cars.toml, with paths relative to it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
-    '"mini.toml"; [metadata.vehicle_id] "WVW-1" = "cars/golf"; default = "saloon" above them.',
     shared="cars estimators annotate keep friction plan network model reference gnss no_position waived",
     car="Car of the logs (default: a sedan)",
 )
@@ -101,21 +83,7 @@ def run(  # positional: one an option of the command line
 
 
 @options.command(
-    commands,
-    "pdhef metrics drive.mcap --estimate /localization/odometry",
-    "pdhef metrics drive.mcap --estimate sideslip_rad=/esc/state.beta \\",
-    "  --estimate vx_m_s=/esc/state.speed --name esc",
-    "pdhef metrics drive.mcap --estimate /pdhef/phy_ukf/state \\",
-    "  --truth /ins/odometry --car mycar -o out",
-    "pdhef metrics drive.mcap -m mapping.toml --plan plan.toml --json",
-    panel=panels.RUN,
-    notes="Signals of nav_msgs/Odometry, geometry_msgs/Twist*Stamped and pdhef_msgs/VehicleStateEstimate are "
-    "recognised by type. Other topics need SIGNAL=, one of vx_m_s, vy_m_s, yaw_rate_rad_s, sideslip_rad, ay_m_s2, "
-    "their *_std_*, valid. A mapping file can contain scales, offsets, signs and several estimators, one table "
-    "[estimates.NAME.SIGNAL] per signal. Without ground truth, the estimates are compared with the sideslip reference "
-    "from the log's IMU and GNSS; --reference on does so in addition to ground truth.",
-    shared="plan reference gnss",
-    car="Car of the log (position of the ground truth, friction, lowest speed)",
+    commands, shared="plan reference gnss", car="Car of the log (position of the ground truth, friction, lowest speed)"
 )
 def metrics(  # positional: one an option of the command line
     log: options.Log,
@@ -160,7 +128,7 @@ def metrics(  # positional: one an option of the command line
     _finish(result, as_json)
 
 
-@options.command(commands, "pdhef view out", "pdhef view out --log drive", "pdhef view out --web", panel=panels.READ)
+@options.command(commands)
 def view(
     output: Annotated[
         Path,

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from pdhef_logtool.cli import console, options, panels
+from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
 
 commands = typer.Typer()
@@ -19,24 +19,7 @@ _Many = list[str] | None
 SetOutput = Annotated[Path, Option("--output", "-o", help="Output folder. Existing drives are kept.")]
 
 
-@options.command(
-    commands,
-    "pdhef simulate --list",
-    "pdhef simulate dlc --speed 100 --mu 0.85 --seed 1 -o dlc.mcap",
-    "pdhef simulate road --seed 3 --sensor rtk_outages_per_h=30 -o road.mcap",
-    "pdhef simulate dlc --vehicle suv --fault burst20:yaw_rate:3:5 \\",
-    "  --fault dropout:wheels:6:end -o faulty.mcap",
-    panel=panels.TOOLS,
-    notes="""A training set: pdhef simulate suite.
-
-Faults: KIND:WHAT:START:END in seconds (END may be end). Kinds: burst<FACTOR>, stuck, dead, flip, bias<SI>, dropout,
-delay<MS>, jump<S> (of the stamps), float, lost (the RTK's fix). What: imu, steering, wheels, rtk, all (sensors), or one
-field: ax, ay, az, roll_rate, pitch_rate, yaw_rate, steer, wheel_fl, wheel_fr, wheel_rl, wheel_rr. delay and jump apply
-to whole messages.
-
-Vehicles: sedan, suv, hatchback or a TOML file; NAME~SEED is a random variant of it; changes follow commas: mass=1.2,
-cg=0.1 (m to the rear), height=1.1, stiffness=0.85, tyres=suv.""",
-)
+@options.command(commands)
 def simulate(
     *,
     manoeuvre: Annotated[
@@ -101,14 +84,7 @@ def _incomplete(missing: str) -> UsageError:
     return UsageError(expected="a manoeuvre and -o FILE", got=f"no {missing}", where="pdhef simulate", remedy=remedy)
 
 
-@options.command(
-    commands,
-    "pdhef simulate suite --count 200 --seed 1 --jobs 2 -o logs/",
-    "pdhef simulate suite --count 2000 --vehicles randomised -o fleet/",
-    panel=panels.TOOLS,
-    notes="manifest.json contains, for each drive, its split and the command that reproduces it.",
-    name="simulate suite",
-)
+@options.command(commands, name="simulate suite")
 def suite(
     output: SetOutput,
     count: Annotated[int, Option(help="Number of drives.")] = 200,

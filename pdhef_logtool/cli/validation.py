@@ -8,18 +8,13 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from pdhef_logtool.cli import console, options, panels
+from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
 
 commands = typer.Typer()
 
 
-@options.command(
-    commands,
-    "pdhef plan init -o plan.toml",
-    panel=panels.RUN,
-    notes="docs/formats.md describes the entries, schemas/plan.schema.json is the JSON Schema.",
-)
+@options.command(commands)
 def plan(
     action: Annotated[str, Argument(metavar="init", help="init: write a commented plan.")],
     *,

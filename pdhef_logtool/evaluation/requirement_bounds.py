@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 
@@ -32,13 +33,18 @@ _LOGNORMAL = 300
 
 @dataclass(frozen=True, slots=True)
 class Bounded:
-    """A statistic with its bounds, NaN with too few units; number of units and their dependence (``effect``)."""
+    """A statistic with its bounds, NaN with too few units.
+
+    ``units``: number of drives, or of blocks of time of at most ``block_s``; ``effect``: dependence of the drives.
+    """
 
     value: float
     low: float
     high: float
     units: int
     effect: Dependence = field(default_factory=Dependence)
+    basis: Literal["drives", "blocks"] = "drives"
+    block_s: float | None = None
 
 
 def pooled(
@@ -149,11 +155,13 @@ def quantile(values: FloatArray, share: float, level: float, factors: Factors | 
 
     The bounds are exact for independent drives; otherwise a normal approximation with the design effect is used.
     """
+    from scipy.special import bdtr
+
     n = len(values)
     if not n:
         return Bounded(math.nan, math.nan, math.nan, 0)
     ascending = np.sort(values)
-    below = _binomial_cumulative(n, share)  # P(at most k drives are below the quantile)
+    below = bdtr(np.arange(n + 1), n, share)  # P(at most k drives are below the quantile)
     tail = 0.5 * (1.0 - level)
     upper = next((k for k in range(1, n + 1) if below[k - 1] >= 1.0 - tail), None)
     lower = next((k for k in range(n, 0, -1) if below[k - 1] <= tail), None)
@@ -175,10 +183,3 @@ def quantile(values: FloatArray, share: float, level: float, factors: Factors | 
 def least_drives(share: float, level: float) -> int:
     """Return the least number of drives N for an upper bound of a quantile: 1 − share^N ≥ (1 + level) / 2."""
     return math.ceil(math.log(0.5 * (1.0 - level)) / math.log(share))
-
-
-def _binomial_cumulative(n: int, p: float) -> FloatArray:
-    k = np.arange(n + 1)
-    logs = np.array([math.lgamma(n + 1) - math.lgamma(i + 1) - math.lgamma(n - i + 1) for i in range(n + 1)])
-    mass: FloatArray = np.exp(logs + k * math.log(p) + (n - k) * math.log1p(-p))
-    return np.cumsum(mass)

@@ -148,16 +148,14 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
     """
     exposure = _exposure(drives)
     estimated = bool(drives) and math.isfinite(drives[0].std)
-    statistic = _statistic(requirement, drives)
-    bounded, basis, units, block_s = statistic.bounded, statistic.basis, statistic.units, statistic.block_s
+    bounded = _statistic(requirement, drives)
     sd = _reference_sd(requirement, drives) if estimated else 0.0
     bound, at_least = requirement.bound, requirement.metric in AT_LEAST
-    worst = _worst(requirement, drives)
-    notes = _notes(requirement, drives, basis, block_s, estimated)
-    if basis == "drives" and bounded.effect.levels:
+    notes = _notes(requirement, drives, bounded, estimated)
+    if bounded.basis == "drives" and bounded.effect.levels:
         notes.append(bounded.effect.text(len(drives)))
     lacking = _lacking(requirement, exposure, drives)
-    outcome, reason, to_do = _decide(requirement, bounded, exposure, lacking, sd, basis, missing)
+    outcome, reason, to_do = _decide(requirement, bounded, exposure, lacking, sd, missing)
     value = bounded.value if math.isfinite(bounded.value) else None
     margin = None if value is None else (value - bound if at_least else bound - abs(value))
     return RequirementVerdict(
@@ -169,11 +167,11 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
         margin,
         exposure,
         tuple(dict.fromkeys(d.estimator for d in drives)),
-        basis,
-        units,
-        block_s,
+        bounded.basis,
+        bounded.units,
+        bounded.block_s,
         "estimated reference" if estimated else "ground truth",
-        worst,
+        _worst(requirement, drives),
         reason,
         to_do,
         tuple(notes),
@@ -200,28 +198,18 @@ def _ratios(drives: Sequence[DriveValue]) -> FloatArray:
         return np.where(values == others, 1.0, values / others)
 
 
-@dataclass(frozen=True, slots=True)
-class _Statistic:
-    """A statistic with its bounds, the kind and number of the units, and the length of a block."""
-
-    bounded: Bounded
-    basis: Literal["drives", "blocks"] = "drives"
-    units: int = 0
-    block_s: float | None = None
-
-
-def _statistic(requirement: Requirement, drives: Sequence[DriveValue]) -> _Statistic:
+def _statistic(requirement: Requirement, drives: Sequence[DriveValue]) -> Bounded:
     """Return the statistic of a requirement over drives, with bounds from drives or from blocks within them."""
     count, factors = len(drives), {name: [d.factors.get(name) for d in drives] for name in FACTORS}
     if requirement.statistic != POOLED:
-        return _Statistic(_of_drives(requirement, _ratios(drives), factors), units=count)
+        return _of_drives(requirement, _ratios(drives), factors)
     if count >= LEAST_DRIVES and requirement.other_run is not None:
-        return _Statistic(_typical_ratio(_ratios(drives), requirement.confidence, factors), units=count)
+        return _typical_ratio(_ratios(drives), requirement.confidence, factors)
     weights, values = (np.array([getattr(d, key) for d in drives], dtype=np.float64) for key in ("n", "value"))
     others = np.array([d.baseline for d in drives], dtype=np.float64) if requirement.baseline else None
     total = _pooled(requirement, weights, values, others, factors)
     if count >= LEAST_DRIVES or not count:
-        return _Statistic(total, units=count)
+        return total
     return _from_blocks(requirement, total, [d.blocks for d in drives])
 
 
@@ -236,16 +224,17 @@ def _of_drives(requirement: Requirement, values: FloatArray, factors: Factors) -
     return Bounded(largest, largest, largest, len(values))
 
 
-def _from_blocks(requirement: Requirement, total: Bounded, blocks: Sequence[RequirementBlocks | None]) -> _Statistic:
+def _from_blocks(requirement: Requirement, total: Bounded, blocks: Sequence[RequirementBlocks | None]) -> Bounded:
     """Return the statistic ``total`` of few drives with bounds from the blocks of time within them."""
     nan, present = math.nan, [b for b in blocks if b is not None]
     if len(present) < len(blocks):
-        return _Statistic(Bounded(total.value, nan, nan, 0), "blocks")
+        return Bounded(total.value, nan, nan, 0, basis="blocks")
     columns = [np.concatenate([np.asarray(getattr(b, key)) for b in present]) for key in ("n", "value", "baseline")]
     units = len(columns[0])
     bounded = _pooled(requirement, columns[0], columns[1], columns[2] if requirement.baseline else None)
     low, high = (bounded.low, bounded.high) if units >= LEAST_BLOCKS else (nan, nan)
-    return _Statistic(Bounded(total.value, low, high, units), "blocks", units, max(b.block_s for b in present))
+    longest_s = max(b.block_s for b in present)
+    return Bounded(total.value, low, high, units, basis="blocks", block_s=longest_s)
 
 
 def _pooled(
@@ -306,7 +295,6 @@ def _decide(
     exposure: Exposure,
     lacking: Sequence[tuple[str, str]],
     sd: float,
-    basis: str,
     missing: str,
 ) -> tuple[Outcome, str, str]:
     """Return outcome, reason and next step."""
@@ -318,7 +306,7 @@ def _decide(
         more = f"drive {' and '.join(more for _, more in lacking)} more{where}, with ground truth"
         return "INCONCLUSIVE", f"too little driving: {'; '.join(w for w, _ in lacking)}", more
     if _without_bounds(requirement, bounded):
-        return "INCONCLUSIVE", *_too_few(requirement, bounded, basis, where)
+        return "INCONCLUSIVE", *_too_few(requirement, bounded, where)
     outcome = _outcome(requirement, bounded)
     interval = _interval(requirement, bounded, exposure, outcome)
     if outcome == "INCONCLUSIVE":
@@ -388,14 +376,14 @@ def _what_to_record(requirement: Requirement) -> str:
     return f"record drives with {segment}ground truth"
 
 
-def _too_few(requirement: Requirement, bounded: Bounded, basis: str, where: str) -> tuple[str, str]:
+def _too_few(requirement: Requirement, bounded: Bounded, where: str) -> tuple[str, str]:
     """Return the reason for a missing interval, and the driving that is needed."""
     value = shown(bounded.value, requirement.unit)
     if requirement.quantile is not None:
         least = least_drives(requirement.quantile, requirement.confidence)
         more = f"drive {least - bounded.units} more drives{where}"
         return f"{value}; no confidence interval from {bounded.units} drives", more
-    if basis == "blocks" and not bounded.units:
+    if bounded.basis == "blocks" and not bounded.units:
         return f"{value}; this run stored no blocks for this requirement", "run the logs again with this plan"
     blocks = "1 block" if bounded.units == 1 else f"{bounded.units} blocks"
     reason = f"{value}; no confidence interval from {blocks} of driving{where}, it needs {LEAST_BLOCKS}"
@@ -422,12 +410,10 @@ def _decisive(requirement: Requirement, bounded: Bounded, exposure: Exposure, wh
     return f"about {times:g} times as much driving{where} would decide, if value and spread stay the same{minutes}"
 
 
-def _notes(
-    requirement: Requirement, drives: Sequence[DriveValue], basis: str, block_s: float | None, estimated: bool
-) -> list[str]:
+def _notes(requirement: Requirement, drives: Sequence[DriveValue], bounded: Bounded, estimated: bool) -> list[str]:
     notes = []
-    if drives and basis == "blocks" and requirement.statistic == POOLED:
-        length = "" if block_s is None else f" of {block_s:g} s"
+    if drives and bounded.basis == "blocks" and requirement.statistic == POOLED:
+        length = "" if bounded.block_s is None else f" of {bounded.block_s:g} s"
         notes.append(
             f"interval from blocks{length} within {len(drives)} {'drive' if len(drives) == 1 else 'drives'}: other "
             f"drives may differ more; from {LEAST_DRIVES} drives on it is drawn from drives"

@@ -11,7 +11,7 @@ from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.reports.charts import Charts, Cloud, Interval, IntervalsFigure, PointsFigure
 from pdhef_logtool.reports.colours import FAULT, PLAIN
 from pdhef_logtool.reports.page import render
-from pdhef_logtool.results.comparing import ComparedFigure, Comparison, DriveFigure
+from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.comparison_words import (
     interval_text,
     largest_text,
@@ -42,28 +42,13 @@ def comparison_page(comparison: Comparison) -> bytes:
         kind=_KIND[comparison.verdict],
         notes=notes_of(comparison),
         unpaired=[line for line in comparison.unpaired if line not in comparison.failures],
-        figures=[_row(figure) for figure in comparison.figures],
-        others=[_row(figure) for figure in comparison.others],
         drives=_drives(comparison.figures[0]) if comparison.figures and not comparison.equal else None,
-        signals=[{"of": signal, "largest": largest_text(signal)} for signal in one_signal_a_drive(comparison)]
-        if comparison.signals
-        else [],
+        signals=one_signal_a_drive(comparison) if comparison.signals else [],
+        interval=interval_text,
+        largest=largest_text,
+        percent=percent,
+        expm1=math.expm1,
     )
-
-
-def _row(figure: ComparedFigure) -> dict[str, Any]:
-    p = figure.corrected_p
-    return {
-        "label": figure.figure.label,
-        "drives": figure.change.drives,
-        "clusters": figure.change.clusters,
-        "median": percent(math.expm1(figure.change.median)),
-        "interval": interval_text(figure),
-        "limit": None if figure.figure.limit is None else percent(figure.figure.limit),
-        "verdict": figure.verdict,
-        "p": None if p is None else f"{p:.2g}",
-        "changed": p is not None and p < 0.05,
-    }
 
 
 def _draw(comparison: Comparison, charts: Charts) -> None:
@@ -97,15 +82,4 @@ def _drives(figure: ComparedFigure) -> dict[str, Any]:
     half = _MOST_DRIVES // 2
     shown = figure.drives if len(figure.drives) <= _MOST_DRIVES else (*figure.drives[:half], *figure.drives[-half:])
     rest = len(figure.drives) - len(shown)
-    return {"unit": unit, "label": figure.figure.label, "left_out": rest, "rows": [_drive(d, factor) for d in shown]}
-
-
-def _drive(drive: DriveFigure, factor: float) -> dict[str, Any]:
-    return {
-        "name": drive.drive,
-        "name_b": None if drive.drive_b == drive.drive else drive.drive_b,
-        "a": drive.a * factor,
-        "b": drive.b * factor,
-        "change": None if drive.change is None else percent(drive.change),
-        "other_stamps": drive.n_a != drive.n_b,
-    }
+    return {"unit": unit, "factor": factor, "label": figure.figure.label, "left_out": rest, "rows": shown}

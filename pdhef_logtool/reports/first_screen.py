@@ -24,29 +24,15 @@ _UNIT = re.compile(r"_(rad_s|rad|m_s2|m_s)$")
 
 
 @dataclass(frozen=True, slots=True)
-class RequirementLine:
-    """A requirement in display form; all values are texts with their unit."""
-
-    id: str
-    title: str
-    label: str
-    outcome: str
-    kind: str
-    limit: str
-    value: str
-    margin: str
-    exposure: str
-    reason: str
-    next: str
-
-
-@dataclass(frozen=True, slots=True)
 class PlanHead:
-    """The verdicts of a plan: ``kind`` of the worst, one sentence, requirements, and limitations of the verdicts."""
+    """The verdicts of a plan: ``kind`` of the worst, one sentence, requirements, and limitations of the verdicts.
+
+    ``lines``: the requirements in display form; all values are texts with their unit.
+    """
 
     kind: str
     text: str
-    lines: Sequence[RequirementLine]
+    lines: Sequence[Mapping[str, str]]
     notes: Sequence[str]
 
 
@@ -64,25 +50,21 @@ def plan_head(plan: Mapping[str, Any] | None) -> PlanHead | None:
     return PlanHead(worst, f"{name}: {', '.join(parts)}", [_line(r) for r in order], notes)
 
 
-def _line(requirement: Mapping[str, Any]) -> RequirementLine:
+def _line(requirement: Mapping[str, Any]) -> dict[str, str]:
     unit = str(requirement["unit"])
     value, margin = requirement["value"], requirement["margin"]
     sign = "≥" if requirement.get("at_least") else "≤"
     of = f" × {requirement['baseline']}" if requirement.get("baseline") else ""
     text = "" if value is None else shown(value, unit)
-    return RequirementLine(
-        str(requirement["id"]),
-        str(requirement["title"]),
-        str(requirement["label"]),
-        str(requirement["outcome"]),
-        _KINDS.get(str(requirement["outcome"]), "unknown"),
-        f"{sign} {shown(requirement['bound'], unit)}{of}",
-        f"{text}{of}" if text else "–",
-        "–" if margin is None else f"{'+' if margin >= 0 else '−'}{shown(abs(margin), unit)}",
-        _exposure(requirement["exposure"]),
-        _INTERVAL.sub(r"\1", str(requirement["reason"]).removeprefix(text).lstrip("; ")),
-        str(requirement["next"]),
-    )
+    return {
+        **{key: str(requirement[key]) for key in ("id", "title", "label", "outcome", "next")},
+        "kind": _KINDS.get(str(requirement["outcome"]), "unknown"),
+        "limit": f"{sign} {shown(requirement['bound'], unit)}{of}",
+        "value": f"{text}{of}" if text else "–",
+        "margin": "–" if margin is None else f"{'+' if margin >= 0 else '−'}{shown(abs(margin), unit)}",
+        "exposure": _exposure(requirement["exposure"]),
+        "reason": _INTERVAL.sub(r"\1", str(requirement["reason"]).removeprefix(text).lstrip("; ")),
+    }
 
 
 def _exposure(exposure: Mapping[str, Any]) -> str:

@@ -3,73 +3,48 @@
 from __future__ import annotations
 
 import math
+from functools import cache
+from typing import Any
 
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS, read_unit
 from pdhef_logtool.results.changed_signals import ChangedSignal
 from pdhef_logtool.results.comparing import INDEPENDENT, ComparedFigure, Comparison
 from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
+from pdhef_logtool.results.selected_estimate import TEMPLATES
 from pdhef_logtool.results.sink import TRUTH
+from pdhef_logtool.storage.templates import one_line, template
 
-_BY = {"signals": "the content of their signals", "content": "the hashes of their files", "name": "their names alone"}
+
+@cache
+def _words() -> Any:
+    """Return the sentences of ``comparison.txt`` as functions."""
+    context = {"change_text": change_text, "percent": percent, "LEAST_CLUSTERS": LEAST_CLUSTERS}
+    return template(TEMPLATES / "comparison.txt", **context).module
 
 
 def paired_text(comparison: Comparison) -> str:
     """Return the number of drives in both runs, and how they were paired."""
-    pairs = sum(comparison.pairs.values())
-    by = ", ".join(f"{count} by {_BY[key]}" for key, count in comparison.pairs.items())
-    if len(comparison.pairs) == 1:
-        by = by.partition(" ")[2]
-    return f"{pairs} drive{'s' * (pairs != 1)} in both, paired {by}"
+    return one_line(_words().paired(comparison))
 
 
 def verdict_text(comparison: Comparison) -> str:
     """Return the verdict in a sentence."""
-    if comparison.equal and comparison.verdict == "equal":
-        return "equal: all figures of all pairs are the same bit for bit"
-    text = {
-        "worse": "B is worse",
-        "better": "B is better",
-        "not worse": "B is not worse",
-        "equal": "no figure that was asked for changed",
-        "inconclusive": "inconclusive with these drives",
-        "no figure": "no drive has the figure on both sides (is there ground truth?)",
-    }[comparison.verdict]
-    decisive = [f for f in comparison.figures if f.verdict == comparison.verdict]
-    if comparison.verdict == "no figure":
-        return f"{text}: {', '.join(f.figure.label for f in decisive)}"
-    changes = [f"{f.figure.short} {change_text(f)} of {f.change.drives} drives" for f in decisive]
-    return f"{text}: {', '.join(changes)}" if changes and comparison.verdict != "equal" else text
+    return one_line(_words().verdict(comparison))
 
 
 def assumed_text(comparison: Comparison) -> str:
     """Return the assumptions of the verdict."""
     dependence = next((dependence_text(f, comparison.cluster) for f in comparison.figures if f.drives), "")
-    differences = "the other differences (below) count as part of B"
-    return "; ".join(
-        filter(None, [dependence.rstrip("."), paired_text(comparison), differences if comparison.differences else ""])
-    )
+    return one_line(_words().assumed(comparison, dependence))
 
 
 def next_text(comparison: Comparison) -> str:
     """Return the next step."""
-    plan, verdict = comparison.requirements, comparison.verdict
+    plan = comparison.requirements
     steps = next_steps(None if plan is None else plan.to_dict())
-    if comparison.unpaired and not comparison.allow_unpaired:
-        steps = ["run both on the same drives, or accept the difference: --allow-unpaired", *steps]
-    if verdict == "worse":
-        worst = next(f for f in comparison.figures if f.verdict == "worse").drives[0]
-        steps.append(f"look at {worst.drive} first: its error increased most")
-    elif verdict == "inconclusive":
-        detectable = [f.detectable for f in comparison.figures if f.verdict == verdict and math.isfinite(f.detectable)]
-        steps.append(
-            f"compare more drives; these detect an increase of {percent(max(detectable))} with 80 % power"
-            if detectable
-            else f"compare at least {LEAST_CLUSTERS} independent drives or clusters (design effect)"
-        )
-    elif verdict == "no figure":
-        steps.append("compare drives with ground truth, or another --metric")
-    return steps[0] if steps else "nothing is needed"
+    undecided = [f.detectable for f in comparison.figures if f.verdict == comparison.verdict]
+    return one_line(_words().next(comparison, steps, [*filter(math.isfinite, undecided)]))
 
 
 def notes_of(comparison: Comparison) -> list[str]:

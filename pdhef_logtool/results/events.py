@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdhef_logtool.evaluation.segments import SEGMENTS
-from pdhef_logtool.evaluation.smoothing import RUN_GAP_S
+from pdhef_logtool.evaluation.smoothing import runs
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
@@ -240,18 +240,14 @@ def _events_of(log: OpenedLog, condition: Condition, main: str, least_s: float, 
 
 def _spans(stamps_ns: IntArray, mask: BoolArray, least_s: float, pad_s: float) -> list[tuple[int, int]]:
     """Return the rows [first, last) of the runs in a mask [N] that last long enough, joined where their pads touch."""
-    where = np.flatnonzero(mask)
-    if not where.size:
-        return []
-    apart = np.flatnonzero((np.diff(where) > 1) | (np.diff(stamps_ns[where]) > RUN_GAP_S * 1e9)) + 1
     joined: list[tuple[int, int]] = []
-    for run in np.split(where, apart):
-        first, last = int(run[0]), int(run[-1]) + 1
+    for first, last in runs(stamps_ns, mask):
         if (stamps_ns[last - 1] - stamps_ns[first]) * 1e-9 < least_s - 1e-9:
             continue
         if joined and (stamps_ns[first] - stamps_ns[joined[-1][1] - 1]) * 1e-9 <= 2.0 * pad_s:
-            first = joined.pop()[0]
-        joined.append((first, last))
+            joined[-1] = (joined[-1][0], last)
+        else:
+            joined.append((first, last))
     return joined
 
 

@@ -6,7 +6,6 @@ An INCONCLUSIVE requirement is a skipped test. Checks that did not pass are prop
 from __future__ import annotations
 
 import re
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,9 @@ from typing import Any, TypeAlias
 from pdhef_logtool.evaluation.requirement_verdicts import RequirementVerdict
 from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
+from pdhef_logtool.results.selected_estimate import TEMPLATES
 from pdhef_logtool.storage.files import write_bytes
+from pdhef_logtool.storage.templates import template
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +35,8 @@ class Case:
     output: str | None = None
 
 
+#: Characters that XML 1.0 cannot contain.
+_NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 #: By log the checks of its report.
 _Checks: TypeAlias = Mapping[str, Sequence[Mapping[str, Any]]]
 
@@ -74,19 +77,8 @@ def cases_bytes(
     suites: Mapping[str, Sequence[Case]], properties: Mapping[str, Mapping[str, str]] | None = None
 ) -> bytes:
     """Return JUnit XML of testcases, and of properties, by suite, as :func:`junit_bytes`."""
-    everything = [case for of_suite in suites.values() for case in of_suite]
-    root = ET.Element("testsuites", {"name": "pdhef", **_counts(everything)})
-    for name, of_suite in suites.items():
-        suite = ET.SubElement(root, "testsuite", {"name": _text(name), **_counts(of_suite)})
-        if entries := (properties or {}).get(name):
-            element = ET.SubElement(suite, "properties")
-            for key, value in entries.items():
-                ET.SubElement(element, "property", {"name": _text(key), "value": _text(value)})
-        for case in of_suite:
-            _add_case(suite, case)
-    ET.indent(root)
-    document: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
-    return document + b"\n"
+    text = template(TEMPLATES / "junit.xml").render(suites=suites, properties=properties or {})
+    return _NOT_IN_XML.sub("?", text).encode()
 
 
 def _case(verdict: RequirementVerdict, suite: str, *, strict: bool) -> Case:
@@ -105,38 +97,3 @@ def _case(verdict: RequirementVerdict, suite: str, *, strict: bool) -> Case:
         f"{requirement.label}: {verdict.outcome}, {verdict.reason}; margin {margin}; "
         f"{exposure.drives} drives, {minutes} minutes scored",
     )
-
-
-def _counts(cases: Sequence[Case]) -> dict[str, str]:
-    return {
-        "tests": str(len(cases)),
-        "failures": str(sum(c.failed for c in cases)),
-        "errors": "0",
-        "skipped": str(sum(c.outcome == "skipped" for c in cases)),
-        "time": "0",
-    }
-
-
-def _add_case(suite: ET.Element, case: Case) -> None:
-    element = ET.SubElement(
-        suite,
-        "testcase",
-        # Dots would be read as a hierarchy of packages.
-        {
-            "classname": _text(f"pdhef.{case.suite.replace('.', '_')}.{case.subject.replace('.', '_')}"),
-            "name": _text(case.name),
-            "time": "0",
-        },
-    )
-    if case.failed:
-        failure = ET.SubElement(element, "failure", {"message": _text(case.reason), "type": case.outcome})
-        failure.text = _text(f"{case.suite}: {case.subject}: {case.name}: {case.reason}")
-    elif case.outcome == "skipped":
-        ET.SubElement(element, "skipped", {"message": _text(case.reason)})
-    if case.output is not None:
-        ET.SubElement(element, "system-out").text = _text(case.output)
-
-
-def _text(text: str) -> str:
-    """Replace characters that XML 1.0 cannot contain."""
-    return re.sub("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]", "?", text)

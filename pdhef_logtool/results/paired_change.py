@@ -137,14 +137,9 @@ def sign_p(ratios: FloatArray, effect: Dependence | None = None) -> float:
     n = up + down
     if n == 0:
         return 1.0
-    if effect is not None and effect.design_effect > 1.0:
-        from scipy.special import stdtr
+    from scipy.special import bdtr, stdtr
 
+    if effect is not None and effect.design_effect > 1.0:
         excess = max(abs(up - down) - 1.0, 0.0) / math.sqrt(n * effect.design_effect)
         return min(1.0, 2.0 * float(stdtr(effect.freedom, -excess)))
-    log_half = n * math.log(2.0)
-    tail = sum(
-        math.exp(math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) - log_half)
-        for k in range(min(up, down) + 1)
-    )
-    return min(1.0, 2.0 * tail)
+    return min(1.0, 2.0 * float(bdtr(min(up, down), n, 0.5)))

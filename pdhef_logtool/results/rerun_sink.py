@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import errno
-import os
-import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -33,9 +29,8 @@ from pdhef_logtool.results.sink import (
     TRUTH,
     Event,
     first_of_slots,
-    is_finished_recording,
 )
-from pdhef_logtool.storage.files import cannot_write, open_new, writing
+from pdhef_logtool.storage.files import open_new, writing
 
 #: Estimators beside the selected estimate and the baseline that the blueprint has places for, hidden until asked for.
 MOST_OTHERS = 12
@@ -55,9 +50,6 @@ LONG_STEP_NS, OTHERS_STEP_NS = 100_000_000, 200_000_000
 #: Rows of a chunk.
 _CHUNK_ROWS = 6000
 
-#: Longest wait for one call of Rerun before the recording is abandoned.
-LONGEST_WAIT_S = 60.0
-
 
 @dataclass(frozen=True, slots=True)
 class _Plot:
@@ -68,13 +60,12 @@ class _Plot:
     column: str
     factor: float = 1.0
     std: str | None = None
-    is_angle: bool = False
     sparse: bool = False
     from_low_speed: bool = True
 
 
 _STATES = (
-    _Plot("sideslip_deg", "sideslip [deg]", "sideslip_rad", DEGREES, "sideslip_std_rad", True, from_low_speed=False),
+    _Plot("sideslip_deg", "sideslip [deg]", "sideslip_rad", DEGREES, "sideslip_std_rad", from_low_speed=False),
     _Plot("yaw_rate_deg_s", "yaw rate [deg/s]", "yaw_rate_rad_s", DEGREES, "yaw_rate_std_rad_s"),
     _Plot("vx_m_s", "longitudinal velocity [m/s]", "vx_m_s", std="vx_std_m_s"),
     _Plot("vy_m_s", "lateral velocity [m/s]", "vy_m_s", std="vy_std_m_s"),
@@ -147,28 +138,26 @@ def write_recording(
     is_long = end_ns is not None and end_ns - start_ns > LONGEST_WHOLE_NS
     places = _places([t.name for t in tracks], shown)
     truth = next((t for t in tracks if t.name == TRUTH), None)
-    with _stream(path, recording, start_ns) as stream:
-        with stream.calling():
-            recording.send_recording_name(log_name)
-            recording.send_recording_start_time_nanos(start_ns)
-        drawing = _Drawing(stream, is_long, min_speed_m_s)
+    # In memory, because Rerun's writer thread ends on an error of the disk, and other threads then wait for it forever.
+    memory = recording.memory_recording()
+    try:
+        recording.send_blueprint(_blueprint(), make_active=False, make_default=True)
+        recording.send_recording_name(log_name)
+        recording.send_recording_start_time_nanos(start_ns)
+        drawing = _Drawing(recording, start_ns, is_long, min_speed_m_s)
         if signals is not None:
-            with stream.calling():
-                drawing.draw_signals(signals)
+            drawing.draw_signals(signals)
         for track in tracks:
-            with stream.calling():
-                drawing.draw_track(track, truth, places[track.name], colour_rgb(track.name, colours or {}))
-        with stream.calling():
-            for track in tracks:
-                drawing.draw_reasons(track)
-            drawing.draw_texts(report, events, tracks)
-    if not is_finished_recording(path):
+            drawing.draw_track(track, truth, places[track.name], colour_rgb(track.name, colours or {}))
+            drawing.draw_reasons(track)
+        drawing.draw_texts(report, events, tracks)
+        data = memory.drain_as_bytes()
+    except RuntimeError as error:
         raise OutputError(
-            expected="a recording that Rerun has finished",
-            got="one without its end",
-            where=str(path),
-            remedy="run the log again",
-        )
+            expected="a recording by Rerun", got=str(error), where=str(path), remedy="run the log again"
+        ) from error
+    with writing(path), open_new(path) as file:
+        file.write(data)
 
 
 def _places(names: Sequence[str], shown: Sequence[str]) -> dict[str, str]:
@@ -178,56 +167,16 @@ def _places(names: Sequence[str], shown: Sequence[str]) -> dict[str, str]:
     return places | {name: f"other/{number}" for number, name in enumerate(others, start=1)}
 
 
-@contextmanager
-def _stream(path: Path, recording: rr.RecordingStream, start_ns: int) -> Iterator[_Stream]:
-    """Yield a recording that Rerun writes to a file; wait at the end until all is written."""
-    with writing(path):
-        outlet = _Outlet(open_new(path))
-    stream = _Stream(path, recording, outlet, start_ns)
-    try:
-        with stream.calling():
-            recording.save(outlet.name, default_blueprint=_blueprint())
-            outlet.opened()
-        yield stream
-        with stream.calling():
-            recording.disconnect()
-            outlet.close()
-    except BaseException:
-        with suppress(OutputError), stream.calling():
-            outlet.drop()
-            recording.disconnect()
-            outlet.close()
-        raise
-
-
 @dataclass(frozen=True, slots=True)
-class _Stream:
-    """A recording that Rerun writes to a file through an outlet."""
+class _Drawing:
+    """Draws signals, tracks and texts into a recording."""
 
-    path: Path
     recording: rr.RecordingStream
-    outlet: _Outlet
     start_ns: int
+    is_long: bool
+    min_speed_m_s: float
 
-    @contextmanager
-    def calling(self) -> Iterator[None]:
-        """Call Rerun, for a limited time; raises OutputError for a failed write since the last call."""
-        limit = threading.Timer(LONGEST_WAIT_S, self.outlet.give_up)
-        limit.daemon = True
-        limit.start()
-        try:
-            yield
-        except RuntimeError as error:
-            if self.outlet.error is None:
-                raise OutputError(
-                    expected="a recording by Rerun", got=str(error), where=str(self.path), remedy="run the log again"
-                ) from error
-        finally:
-            limit.cancel()
-        if self.outlet.error is not None:
-            raise cannot_write(self.path, self.outlet.error) from self.outlet.error
-
-    def send(self, entity: str, stamps_ns: IntArray, columns: Iterable[Any]) -> None:
+    def _send(self, entity: str, stamps_ns: IntArray, columns: Iterable[Any]) -> None:
         """Send rows of an entity."""
         times = [
             rr.TimeColumn("time", timestamp=stamps_ns.astype("datetime64[ns]")),
@@ -235,22 +184,9 @@ class _Stream:
         ]
         rr.send_columns(entity, indexes=times, columns=columns, recording=self.recording, strict=True)
 
-    def log_static(self, entity: str, what: rr.AsComponents) -> None:
+    def _log_static(self, entity: str, what: rr.AsComponents) -> None:
         """Send something without a time."""
         self.recording.log(entity, what, static=True, strict=True)
-
-    def flush(self) -> None:
-        """Wait until all is written; otherwise it accumulates in memory."""
-        self.recording.flush(timeout_sec=LONGEST_WAIT_S)
-
-
-@dataclass(frozen=True, slots=True)
-class _Drawing:
-    """Draws signals, tracks and texts."""
-
-    stream: _Stream
-    is_long: bool
-    min_speed_m_s: float
 
     def draw_signals(self, signals: Signals) -> None:
         """Draw the inputs of the estimators."""
@@ -263,7 +199,7 @@ class _Drawing:
         widths = [2.0 if track.name == TRUTH else 1.5, 0.75, 0.75]
         colours = [rgb, *[(*rgb, 110)] * len(band)]
         style = rr.SeriesLines(names=[track.name, *band], colors=colours, widths=widths[: len(colours)])
-        self.stream.log_static(f"/{place}", style)
+        self._log_static(f"/{place}", style)
         columns = self._columns(track, _STATES + _HEALTH if place in ("main", "baseline") else _STATES)
         if track.name != TRUTH:
             by_name = errors(track, truth, self.min_speed_m_s)
@@ -271,7 +207,6 @@ class _Drawing:
         sparse = frozenset(p.name for p in _HEALTH if p.sparse)
         self._send_rows(f"/{place}", _TRACK, track.stamps_ns, columns, sparse)
         self._draw_path(track, place, rgb)
-        self.stream.flush()
 
     def _columns(self, track: StateTrack, plots: Sequence[_Plot]) -> dict[str, FloatArray]:
         """Return the drawn values of a track by component, [N, 1] or, with a 95 % interval, [N, 3]; NaN if unknown.
@@ -328,7 +263,7 @@ class _Drawing:
                 _Column(f"{archetype}:{name}", archetype, values[rows], absent[name][rows] if name in absent else None)
                 for name, values in columns.items()
             ]
-            self.stream.send(entity, times_ns[rows], sent)
+            self._send(entity, times_ns[rows], sent)
 
     def _draw_path(self, track: StateTrack, place: str, rgb: tuple[int, int, int]) -> None:
         # North is drawn up: the y axis of Rerun's 2D views points down.
@@ -337,13 +272,13 @@ class _Drawing:
         if not has_plan.any():
             return
         style = rr.Points2D.from_fields(colors=[rgb], radii=[rr.Radius.ui_points(5.0)], labels=[track.name])
-        self.stream.log_static(f"/plan/{place}/now", style)
+        self._log_static(f"/plan/{place}/now", style)
         opens = first_of_slots(track.stamps_ns, LONG_DOT_STEP_NS if self.is_long else DOT_STEP_NS)
         shown = opens[has_plan[opens]]
         if len(shown):
-            self.stream.send(f"/plan/{place}/now", track.stamps_ns[shown], rr.Points2D.columns(positions=plan[shown]))
+            self._send(f"/plan/{place}/now", track.stamps_ns[shown], rr.Points2D.columns(positions=plan[shown]))
         lines = _strips(np.where(has_plan[:, None], plan, np.nan))
-        self.stream.log_static(f"/plan/{place}", rr.LineStrips2D(lines, colors=[rgb], radii=[rr.Radius.ui_points(1.5)]))
+        self._log_static(f"/plan/{place}", rr.LineStrips2D(lines, colors=[rgb], radii=[rr.Radius.ui_points(1.5)]))
 
     def draw_reasons(self, track: StateTrack) -> None:
         """Draw each reason as a state that is active in its intervals."""
@@ -351,90 +286,15 @@ class _Drawing:
             stamps = np.array([t for s in spans for t in (s.start_ns, s.end_ns)], dtype=np.int64)
             # The empty state ends the one before.
             states = rr.StateChange.columns(state=[_REASON_TEXTS[reason], ""] * len(spans))
-            self.stream.send(f"/reasons/{track.name}/{reason}", stamps, states)
+            self._send(f"/reasons/{track.name}/{reason}", stamps, states)
 
     def draw_texts(self, report: Mapping[str, Any], events: Sequence[Event], tracks: Sequence[StateTrack]) -> None:
         """Write the log and the report."""
         if lines := log_lines(report, events, tracks):
             text = rr.TextLog.columns(text=[x.text for x in lines], level=[LEVEL_NAMES[x.level] for x in lines])
-            self.stream.send("/events", np.array([x.stamp_ns for x in lines], dtype=np.int64), text)
+            self._send("/events", np.array([x.stamp_ns for x in lines], dtype=np.int64), text)
         document = rr.TextDocument(report_markdown(report), media_type=rr.MediaType.MARKDOWN)
-        self.stream.log_static("/report", document)
-
-
-class _Outlet:
-    """Copies Rerun's output from a pipe to a file, so that Rerun itself never meets a full or hanging disk.
-
-    Rerun's writer thread ends on an error, and other threads may then wait for it forever. Here
-    bytes that cannot be written are read and dropped, and the error is kept.
-
-    Attributes
-    ----------
-    name : where Rerun is to write. error : the first one of writing, None so far.
-    """
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self.error: OSError | None = None
-        self._file, self._dropped = file, False
-        self._thread: threading.Thread | None = None
-        if Path("/dev/fd").exists():
-            self._from, self._to = os.pipe()
-            self.name = f"/dev/fd/{self._to}"
-            self._start_thread()
-        else:  # pipes have no names on Windows: Rerun writes the file itself
-            file.close()
-            self.name, self._to = file.name, -1
-
-    def _start_thread(self) -> None:
-        self._thread = threading.Thread(target=self._carry, daemon=True)
-        self._thread.start()
-
-    def opened(self) -> None:
-        """Close our own writing end: Rerun has its own now."""
-        if self._to >= 0:
-            os.close(self._to)
-            self._to = -1
-
-    def drop(self) -> None:
-        """Write no further bytes."""
-        self._dropped = True
-
-    def give_up(self) -> None:
-        """Stop waiting for the disk: abandon the waiting thread; another one drops further bytes."""
-        if self.error is None:
-            self.error = TimeoutError(errno.ETIMEDOUT, f"nothing could be written for {LONGEST_WAIT_S:g} s")
-            self._dropped = True
-            if self._thread is not None:
-                self._start_thread()
-
-    def close(self) -> None:
-        """Wait until all of Rerun's output is written; its end of the pipe must be closed."""
-        self.opened()
-        if self._thread is not None:
-            self._thread.join(LONGEST_WAIT_S)
-            if self._thread.is_alive():
-                self.give_up()
-                self._thread.join(LONGEST_WAIT_S)
-
-    def _carry(self) -> None:
-        while data := os.read(self._from, 1 << 20):
-            if not self._dropped:
-                self._write(data)
-            if self._thread is not threading.current_thread():
-                return  # given up while it was writing: another one reads on
-        self._write(None)
-        if self._thread is threading.current_thread():
-            os.close(self._from)
-
-    def _write(self, data: bytes | None) -> None:
-        """Write, or at the end (None) close the file; after an error all bytes are dropped."""
-        try:
-            if data is not None:
-                self._file.write(data)
-            elif not isinstance(self.error, TimeoutError):  # else it would hang as well
-                self._file.close()
-        except OSError as error:
-            self.error, self._dropped = self.error or error, True
+        self._log_static("/report", document)
 
 
 class _Column:

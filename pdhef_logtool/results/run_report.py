@@ -16,10 +16,11 @@ from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.standing import Standing
-from pdhef_logtool.results.selected_estimate import MainFacts, answer_of
+from pdhef_logtool.results.selected_estimate import TEMPLATES, MainFacts, answer_of
 from pdhef_logtool.results.verdicts import verdicts_of
 from pdhef_logtool.storage.documents import jsonable, seal
 from pdhef_logtool.storage.files import write_bytes
+from pdhef_logtool.storage.templates import template
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -219,22 +220,8 @@ def write_json(path: Path, document: Mapping[str, Any], *, brief: bool = False) 
 
 def report_markdown(report: Mapping[str, Any]) -> str:
     """Return the document of :func:`build_report` in a few words, as Markdown for viewers; the page has the figures."""
-    log, requirements = report["log"], (report.get("plan") or {}).get("requirements") or ()
-    lines = [f"# {log['name']}", "", f"{log['file']} ({log['kind']}), {log['duration_s']:.1f} s", ""]
-    lines += _bullets("Requirements", [f"**{r['outcome']}** {r['label']}: {r['reason']}" for r in requirements])
-    if answer := report.get("answer"):
-        lines += _bullets("Selected estimate", [text for text in answer["texts"].values() if text])
-    lines += _bullets("Warnings", report["warnings"])
-    lines += _bullets("Remarks", report.get("remarks", ()))
-    lines += _bullets("Losses", [f"{x['what']} ({x['where']})" for x in report["losses"]])
-    estimators = []
-    for e in report["estimators"]:
-        happened = [diverged_line(report, e["name"]), reasons_line(e, log["start_ns"])]
-        skipped = [f"skipped: {e['reason']}"] if e["reason"] else []
-        notes = "; ".join([*skipped, *e["notes"], *e.get("intervals", ()), *filter(None, happened)])
-        kind = "causal" if e["causal"] else "not causal"
-        estimators.append(f"**{e['name']}** ({kind})" + (f": {notes}" if notes else ""))
-    return "\n".join([*lines, *_bullets("Estimators", estimators)])
+    context = {"diverged_line": diverged_line, "reasons_line": reasons_line}
+    return template(TEMPLATES / "report.md", **context).render(report=report)
 
 
 def diverged_line(report: Mapping[str, Any], name: str) -> str:
@@ -273,7 +260,3 @@ def _reason_text(reason: Mapping[str, Any], start_ns: int) -> str:
     # A sensor at a lower rate than the stamps, or single spikes, do not contain throughout.
     within = reason["share_within"]
     return text if within > _THROUGHOUT else f"{text} ({within:.0%} of it)"
-
-
-def _bullets(title: str, items: Sequence[str]) -> list[str]:
-    return [f"## {title}", "", *(f"- {item}" for item in items), ""] if items else []

@@ -7,10 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.tracks import REFERENCE
+from pdhef_logtool.storage.templates import one_line, template
+
+#: Templates of texts and files of results.
+TEMPLATES = Path(__file__).parent / "templates"
 
 Report: TypeAlias = Mapping[str, Any]
 #: Figures of the whole drive by estimator, signal and metric; None if absent.
@@ -60,16 +66,39 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
     figures = {
         (m["estimator"], m["signal"], m["metric"]): m["value"] for m in report["metrics"] if m["segment"] == "all"
     }
+
+    def value(name: str | None, metric: str, signal: str = "sideslip_rad") -> float | None:
+        return None if name is None else figures.get((name, signal, metric))
+
+    words = _words()
+    intervals = next((e["intervals"] for e in report["estimators"] if e["name"] == main.name), ())
     texts = {
-        "result": _result(report, main, figures),
-        "consistency": "" if report["truth"]["available"] else _consistency(main, figures),
-        "band": _band(report, main, figures),
+        "result": words.result(report, main, value),
+        "consistency": "" if report["truth"]["available"] else words.consistency(main, value),
+        "band": words.band(main, intervals, value(main.name, "coverage95")),
         "assumed": "; ".join(_assumed(report, main)),
         "next": "; ".join(_next_steps(report, main, figures)[:_MOST_STEPS]),
     }
+    texts = {key: one_line(text) for key, text in texts.items()}
     best = _best_in_hindsight(report, main, figures)
     chosen = {"main" if key == "name" else key: value for key, value in asdict(main).items()}
     return {**chosen, "shown": list(main.shown), "best_in_hindsight": best, "texts": texts}
+
+
+@cache
+def _words() -> Any:
+    """Return the sentences of ``selected_estimate.txt`` as functions."""
+    limits: dict[str, Any] = {
+        "HOLDS": HOLDS,
+        "NEARLY_HOLDS": NEARLY_HOLDS,
+        "WIDE": _WIDE,
+        "SAME": SAME,
+        "FEW": _FEW,
+        "LESS": _LESS,
+    }
+    limits |= {"NO_SIDESLIP_RAD": NO_SIDESLIP_RAD, "NIS_RANGE": _NIS_RANGE, "DEGREES": DEGREES}
+    shown = {"degrees": degrees, "percent": lambda share: f"{100.0 * share:.0f}", "truth_of": truth_of}
+    return template(TEMPLATES / "selected_estimate.txt", **limits, **shown).module
 
 
 def degrees(value_rad: float) -> str:
@@ -82,60 +111,6 @@ def _error(figures: _Figures, name: str | None) -> float | None:
     return None if name is None else figures.get((name, "sideslip_rad", "rmse"))
 
 
-def _result(report: Report, main: MainFacts, figures: _Figures) -> str:
-    truth, rmse = report["truth"], _error(figures, main.name)
-    if not truth["available"]:
-        return f"Sideslip estimate: {main.name}; {_from_reference(report, main, figures)}"
-    if rmse is None:
-        return f"Sideslip of {main.name} is not scored: {_why_not_scored(report, main)}{_scored_instead(main, figures)}"
-    said = [f"Sideslip RMSE of {main.name}: {degrees(rmse)} ({truth_of(report, 'sideslip_rad')})"]
-    rivals = [(name, text) for name, text in (("physics", "physics"), ("zero", "zero sideslip")) if name != main.name]
-    others = [(text, other) for name, text in rivals if (other := _error(figures, name)) is not None]
-    others = [(text, other) for text, other in others if (text, other) != ("physics", rmse)]  # residual gain 0
-    said += [_against(rmse, other, text) for text, other in others]
-    if "sideslip_rad" in truth["not_independent"]:
-        said.append("the ground truth is an input of the estimator or the estimate itself: not an independent check")
-    if (measured := figures.get(("zero", "sideslip_rad", "rmse"))) is not None and measured < NO_SIDESLIP_RAD:
-        said.append("the sideslip of the ground truth is 0 throughout: it is probably not measured")
-    naive = None if main.name == main.naive else _error(figures, main.naive)
-    useless = (
-        ". On this drive the estimate is worse than a constant"
-        if naive is not None and rmse > (1.0 + SAME) * naive
-        else ""
-    )
-    return ", ".join(said) + useless
-
-
-def _from_reference(report: Report, main: MainFacts, figures: _Figures) -> str:
-    """Return how far the selected estimate is from the sideslip reference, or why its error is unknown."""
-    rms, std = (figures.get((main.name, "sideslip_rad", metric)) for metric in ("reference_rms", "reference_std"))
-    if rms is not None and std is not None:
-        within = " (within its uncertainty)" if rms <= std else ""
-        share = report["reference"]["valid_share"]
-        return (
-            f"RMS difference from the estimated reference {degrees(rms)}, reference ± {degrees(std)}{within}, "
-            f"on {100.0 * share:.0f} % of the log; the log contains no ground truth"
-        )
-    reference = report.get("reference") or {}
-    why = f"; no reference: {reference['refused']}" if reference.get("refused") else ""
-    return f"its error is unknown, because the log contains no ground truth{why}"
-
-
-def _against(rmse: float, other: float, text: str) -> str:
-    beside = f"{text} ({degrees(other)})"
-    if other == rmse:
-        return f"equal to {beside}"
-    if abs(rmse - other) <= SAME * other:
-        return f"equal within {100.0 * SAME:.0f} % to {beside}"
-    if rmse == 0.0 or other == 0.0:
-        return f"{'lower' if rmse < other else 'higher'} than {beside}"
-    times = max(rmse, other) / min(rmse, other)
-    shown = f"{times:.1f}" if times < _FEW else f"{times:.0f}"
-    if rmse > other:
-        return f"{shown} times {beside}" if times > 2.0 else f"{100.0 * (times - 1.0):.0f} % higher than {beside}"
-    return f"1/{shown} of {beside}" if times > 2.0 else f"{100.0 * (1.0 - rmse / other):.0f} % lower than {beside}"
-
-
 def truth_of(report: Report, name: str) -> str:
     """Return the topics that a ground truth quantity comes from, as far as its derivation names them."""
     by_name = {q["name"]: q for q in report["truth"]["quantities"]}
@@ -143,72 +118,6 @@ def truth_of(report: Report, name: str) -> str:
     words = " ".join(f"{q['source']} {q['derivation']}" for q in parts).replace(",", " ").split()
     topics = dict.fromkeys(w.partition(".")[0] for w in words if w.startswith("/"))
     return f"ground truth: {' and '.join(topics)}" if topics else "ground truth"
-
-
-def _why_not_scored(report: Report, main: MainFacts) -> str:
-    quantities = {q["name"]: q for q in report["truth"]["quantities"]}
-    if "sideslip_rad" in quantities:
-        return f"there is no ground truth at times where {main.name} is valid and the car is fast enough"
-    if "no heading known" in quantities.get("vx_m_s", {}).get("derivation", ""):
-        return (
-            "the ground truth (GNSS) has the course but not the heading; sideslip is their difference and needs two "
-            "antennas or an INS"
-        )
-    return f"the ground truth contains only {', '.join(quantities) or 'no quantity'}"
-
-
-def _scored_instead(main: MainFacts, figures: _Figures) -> str:
-    shown = (("yaw_rate_rad_s", "yaw rate", DEGREES, "°/s"), ("vx_m_s", "v_x", 1.0, " m/s"))
-    others = [
-        f"{text} {value * factor:.2f}{unit}"
-        for signal, text, factor, unit in shown
-        if (value := figures.get((main.name, signal, "rmse"))) is not None
-    ]
-    return f". RMSE of the other signals: {', '.join(others)}" if others else ""
-
-
-def _consistency(main: MainFacts, figures: _Figures) -> str:
-    """Return the results that need no ground truth, in sentences."""
-    said = []
-    d2, naive = (figures.get((n, "vy_m_s", "d2")) for n in (main.name, main.naive or ""))
-    if main.name == "kinematic":
-        said.append("it integrates the sensors that could check it: no independent check")
-    elif d2 is not None:
-        follows = f"lateral kinematic consistency with accelerometer and gyro: {d2:.2f} m/s over 2 s"
-        if naive is None or main.name == main.naive:
-            said.append(follows)
-        elif d2 < _LESS * naive:
-            said.append(f"{follows} (zero sideslip: {naive:.2f}): no contradiction, which is not a proof")
-        else:
-            said.append(
-                f"{follows}, no better than zero sideslip ({naive:.2f}): little sideslip, a biased accelerometer, a "
-                "banked road or a wrong model; inconclusive"
-            )
-    nis, dof = (figures.get((main.name, "state", metric)) for metric in ("nis", "nis_dof"))
-    if nis is not None and dof:
-        low, high = _NIS_RANGE
-        hence = ""
-        if nis < low * dof:
-            hence = ": the standard deviation of the filter is rather too large"
-        elif nis > high * dof:
-            hence = ": model or noise are wrong, the standard deviation of the filter is too small"
-        said.append(f"NIS per degree of freedom {nis / dof:.2f} (expected value 1){hence}")
-    return "; ".join(said)
-
-
-def _band(report: Report, main: MainFacts, figures: _Figures) -> str:
-    notes: Sequence[str] = next((e["intervals"] for e in report["estimators"] if e["name"] == main.name), [])
-    if not notes:
-        return f"none: {main.name} states no interval"
-    made = f" ({'; '.join(notes)})"
-    share = figures.get((main.name, "sideslip_rad", "coverage95"))
-    if share is None:
-        return f"coverage unknown without ground truth of sideslip{made}"
-    if share >= HOLDS:
-        wide = ", wider than necessary" if share > _WIDE else ""
-        return f"coverage {100.0 * share:.0f} % (nominal 95 %){wide}{made}"
-    verdict = "slightly too narrow" if share >= NEARLY_HOLDS else "too narrow"
-    return f"coverage {100.0 * share:.0f} % (nominal 95 %), {verdict}{made}"
 
 
 def _assumed(report: Report, main: MainFacts) -> list[str]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, Literal, TypeAlias
 
 from pdhef_logtool.evaluation.bootstrap import Interval
@@ -15,7 +16,8 @@ from pdhef_logtool.evaluation.requirement_bounds import LEAST_BLOCKS
 from pdhef_logtool.evaluation.standing import JUDGED_SIGNALS, Standing
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.evaluation.validation_plan import shown
-from pdhef_logtool.results.selected_estimate import NO_SIDESLIP_RAD, SAME
+from pdhef_logtool.results.selected_estimate import NO_SIDESLIP_RAD, SAME, TEMPLATES
+from pdhef_logtool.storage.templates import one_line, template
 
 #: ``same``: the interval of the difference lies within
 #: :data:`~pdhef_logtool.results.selected_estimate.SAME` of the rival's error.
@@ -37,7 +39,7 @@ def _verdict(report: Mapping[str, Any], main: str, signal: str, standing: Standi
     else:
         assert standing is not None and standing.rmse is not None
         outcome = _outcome(standing)
-        text = "; ".join([_error(standing), _against(standing, outcome)])
+        text = _text(standing, outcome)
     return {
         "signal": signal,
         "estimator": main,
@@ -96,29 +98,17 @@ def _outcome(standing: Standing) -> Outcome:
     return "better" if difference.high < 0.0 else "undecided"
 
 
-def _error(standing: Standing) -> str:
-    unit, rmse = SCORED_SIGNALS[standing.signal], standing.rmse
-    assert rmse is not None
-    if math.isfinite(rmse.low):
-        between = f" (95 % CI {shown(rmse.low, unit)} to {shown(rmse.high, unit)})"
-    else:
-        between = f" (no CI: it needs {LEAST_BLOCKS} blocks of {standing.block_s:g} s)"
-    return f"RMSE of {standing.estimator}: {shown(rmse.value, unit)}{between}"
+@cache
+def _words() -> Any:
+    """Return the sentences of ``verdict.txt`` as functions."""
+    context = {"shown": shown, "isfinite": math.isfinite, "LEAST_BLOCKS": LEAST_BLOCKS}
+    return template(TEMPLATES / "verdict.txt", **context).module
 
 
-def _against(standing: Standing, outcome: Outcome) -> str:
-    if outcome == "alone":
-        return "no other filter without a network ran for comparison"
-    unit, difference = SCORED_SIGNALS[standing.signal], standing.difference
-    assert standing.rival_rmse is not None and difference is not None
-    beside = f"{standing.rival} ({shown(standing.rival_rmse, unit)})"
-    if outcome == "same":
-        return f"{'equal to' if difference.value == 0.0 else 'no relevant difference to'} {beside}"
-    share = abs(difference.value) / standing.rival_rmse if standing.rival_rmse else math.inf
-    by = "" if share >= 10.0 else "less than 1 % " if share < 0.005 else f"{100.0 * share:.0f} % "
-    how = f"{by}{'lower' if difference.value < 0.0 else 'higher'} than {beside}"
-    if not math.isfinite(difference.low):
-        return f"{how}, difference not tested"
-    low, high = (f"{'+' if x > 0.0 else ''}{shown(x, unit)}" for x in (difference.low, difference.high))
-    between = f"95 % CI of the difference {low} to {high}"
-    return f"{how}, difference not significant: {between}" if outcome == "undecided" else f"{how}: {between}"
+def _text(standing: Standing, outcome: Outcome) -> str:
+    """Return the error of the selected estimate and the comparison with its rival in a sentence."""
+    unit, share = SCORED_SIGNALS[standing.signal], math.inf
+    if standing.rival_rmse and standing.difference is not None:
+        share = abs(standing.difference.value) / standing.rival_rmse
+    error, against = _words().error(standing, unit), _words().against(standing, outcome, unit, share)
+    return f"{one_line(error)}; {one_line(against)}"

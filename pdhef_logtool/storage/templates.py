@@ -1,0 +1,29 @@
+"""Jinja templates of texts and files; callers fill their fields."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+
+
+def template(path: Path, **context: Any) -> Template:
+    """Return a template; ``context``: functions and constants that it uses. Fields of XML are escaped."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+
+    made = Environment(
+        loader=FileSystemLoader(path.parent),
+        autoescape=select_autoescape(("xml",)),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return made.get_template(path.name, globals=context)
+
+
+def one_line(text: object) -> str:
+    """Return a rendered sentence, which may have several lines in its template, in one line."""
+    return " ".join(str(text).split())
