@@ -245,7 +245,7 @@ def test_writing_starts_no_analytics_and_a_switched_off_rerun_is_said(tmp_path):
     assert "unset RERUN" in run_script(tmp_path, RERUN="off")
 
 
-@pytest.mark.parametrize("call", [0, 1, 3, "close"])
+@pytest.mark.parametrize("call", [0, "close"])
 def test_a_disk_that_is_full_is_told(tmp_path, circle, circle_signals, monkeypatch, call):
     class Full(io.BytesIO):
         calls = 0
@@ -305,10 +305,9 @@ except OutputError as error:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("writes", [0, 1000])
-def test_a_disk_that_hangs_is_given_up_and_the_process_ends(tmp_path, writes):
+def test_a_disk_that_hangs_is_given_up_and_the_process_ends(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-c", HANGING, str(tmp_path / "recording.rrd"), str(writes)],
+        [sys.executable, "-c", HANGING, str(tmp_path / "recording.rrd"), "1000"],
         capture_output=True, text=True, check=True, timeout=300,
     )  # fmt: skip
     assert "recording.rrd: expected a place to write to, got nothing could be written for 1 s" in done.stdout
