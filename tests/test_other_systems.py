@@ -26,13 +26,10 @@ def without_posix(*arguments: object, folder: Path) -> subprocess.CompletedProce
 
 
 @pytest.mark.slow
-def test_inspect_and_run_need_no_posix(tmp_path: Path) -> None:
+def test_a_run_needs_no_posix(tmp_path: Path) -> None:
     logs = [ROOT / "sample_logs" / name for name in ("dlc.mcap", "step_rosbag2")]
-    inspected = without_posix("inspect", logs[0], folder=tmp_path)
-    assert inspected.returncode == 0, inspected.stderr
-    assert "steer_rad" in inspected.stdout
     for _ in range(2):  # the second run replaces the folders of the first
-        ran = without_posix("run", *logs, "--car", "saloon", "--jobs", "2", "-o", "out", folder=tmp_path)
+        ran = without_posix("run", *logs, "--car", "saloon", "--jobs", "2", "--end", "2", "-o", "out", folder=tmp_path)
         assert ran.returncode == 0, ran.stderr
         assert ran.stderr.count("worker processes need Linux: one process does all the work") == 1
     names = {path.name for path in (tmp_path / "out/logs/dlc").iterdir()}

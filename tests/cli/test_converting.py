@@ -101,14 +101,3 @@ def test_a_conversion_is_complete_or_absent(table: Path, tmp_path: Path) -> None
     assert done.returncode == 3
     assert "incomplete" in done.stderr
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.csv", "cut.csv", "cut.mcap", "drive.mcap"]
-
-
-@pytest.mark.slow
-def test_a_run_on_a_table_writes_all_outputs(table: Path, tmp_path: Path) -> None:
-    done = called("run", table, "-o", tmp_path / "out", "--car", "saloon", "-e", "zero,phy-ukf")
-    assert done.returncode in (0, 3), done.stderr
-    folder = tmp_path / "out" / "logs" / "drive"
-    names = {p.name for p in folder.iterdir()}
-    assert names >= {"annotated.mcap", "recording.rrd", "estimates.parquet", "report.html", "metrics.parquet"}
-    with closing(open_log(folder / "annotated.mcap")) as log:
-        assert all(t.name.startswith("/pdhef/") for t in log.topics)

@@ -10,7 +10,7 @@ from made_models import random_network
 from reference_car import drive, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.adaptive_physics import CURES, AdaptivePhysics, mix
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, mix
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.signals import Signals
@@ -121,16 +121,6 @@ def test_forces_that_are_wrong_in_proportion_are_scaled(weak):
     assert np.nan_to_num(run_estimator(adaptive(), signals).mixture_weight)[150:].mean() > 0.8
     late = slice(150, None)
     assert rmse(adaptive(), signals, weak, late) < 0.7 * rmse(fixed(), signals, weak, late)
-
-
-def test_each_filter_has_one_cure_and_only_those_that_the_car_has():
-    for own in ((), ("force_scale",), ("bank",), tuple(CURES)):
-        parts = VEHICLE.physics.model_copy(update=dict.fromkeys(own, True))
-        physics = replace(PHYSICS, vehicle=VEHICLE.model_copy(update={"physics": parts}))
-        filters = AdaptivePhysics(physics).filters
-        cures = [tuple(c for c in CURES if getattr(f.vehicle.physics, c)) for f in filters]
-        assert cures == [(), *((c,) for c in own)]
-        assert AdaptivePhysics(physics, adaptive=False).filters == (physics,)
 
 
 def test_the_mixture_has_the_moments_of_its_samples():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import test_estimators as properties
 from made_models import random_network
-from reference_car import REAR_M, cut, drive, forces, keep, rolling_drive, runge_kutta, slalom, with_noise
+from reference_car import REAR_M, cut, drive, forces, keep, runge_kutta, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
@@ -142,13 +142,6 @@ def rough() -> Signals:
     return keep(replace(s, ready_ns=ready), (t < 3.0) | (t > 3.8))
 
 
-@pytest.fixture(scope="module")
-def stopping() -> Signals:
-    """Rolls, stands for three seconds, rolls on."""
-    made = rolling_drive(lambda t: 4.0 * np.clip(np.abs(t - 5.5) - 1.5, 0.0, 1.0), lambda t: 0.05 * np.sin(t), 11.0)
-    return with_noise(made.signals, seed=2, scale=0.1)
-
-
 def test_it_sees_one_to_two_blocks_ahead_and_no_further(rough):
     estimator, j = smoother(0.5), 150
     ay = rough.ay_m_s2.copy()
@@ -169,32 +162,6 @@ def test_blocks_are_as_good_as_the_whole_drive(block_s, parts, tolerance_m_s):
 
 def test_an_empty_drive_has_an_empty_track(rough):
     assert len(smoother().smooth(rough.rows(0, 0))) == 0
-
-
-@pytest.mark.parametrize("parts", [(), tuple(PhysicsParts.model_fields)])
-@pytest.mark.parametrize("which", ["rough", "stopping"])
-def test_the_covariance_is_never_larger_than_the_filters(which, parts, request):
-    steps, links, x, P = smoothed(smoother(parts=parts).filtered.physics, request.getfixturevalue(which))
-    done = steps.valid
-    scale = np.sqrt(np.einsum("kii->ki", steps.P))[done]
-    known = (scale == 0.0).all(axis=0)  # a steering bias that the car does not have
-    scale[:, known] = 1.0
-    unit = scale[:, :, None] * scale[:, None, :]
-    assert not P[done][:, known].any()
-    assert np.linalg.eigvalsh((steps.P[done] - P[done]) / unit).min() > -1e-9
-    assert np.linalg.eigvalsh((P[done] / unit)[:, ~known][:, :, ~known]).min() > 0.0
-    assert np.median(P[done][:, 1, 1] / steps.P[done][:, 1, 1]) < 0.95
-    assert np.isfinite(x[done]).all()
-    opened = (links.predicted_P[:, 2, 2] > 5 * np.roll(steps.P[:, 2, 2], 1)) & links.linked
-    assert opened[done].any() == (which == "rough"), "the gate opens on the jump"
-    assert (~links.linked[1:]).sum() > 100 or which != "stopping", "a standstill links nothing"
-
-
-def test_a_standstill_stands_and_does_not_pull_what_was_before(stopping):
-    track, t = smoother().smooth(stopping), times(stopping)
-    assert np.abs(track.vx_m_s[(t > 4.6) & (t < 6.9)]).max() < 0.02
-    v = 4.0 * np.clip(np.abs(t - 5.5) - 1.5, 0.0, 1.0)
-    assert np.abs(track.vx_m_s - v)[(t < 3.9) | (t > 7.5)].max() < 0.15
 
 
 def test_nothing_behind_a_gap_tells_of_before(rough):

@@ -52,11 +52,6 @@ def test_the_epoch_with_most_messages_is_kept_and_a_pause_is_no_epoch() -> None:
     assert epochs(np.concatenate([boot, drive[:300]]))[0] == [(0, int(boot[-1]) + 1)]
 
 
-def test_a_handful_of_messages_is_a_log() -> None:
-    assert epochs(np.array([T0]))[0] == [(T0, T0 + 1)]
-    assert epochs(np.empty(0, dtype=np.int64))[0] == []
-
-
 @pytest.mark.slow
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(

@@ -233,3 +233,15 @@ def test_truth_that_the_gate_rejects_is_counted() -> None:
     np.testing.assert_array_equal(truth["vx_m_s"].stamps_ns, np.delete(stamps, np.arange(40, 60)))
     assert losses["truth-quality vx_m_s"].count == 20
     assert losses["truth-quality vx_m_s"].severity == "note"
+
+
+def test_a_gate_that_falls_silent_holds_for_two_of_its_periods() -> None:
+    log = imu_log(100)
+    stamps = log.contents["/imu"].fields["header.stamp"]
+    status = stamps[:41:5]  # Every 50 ms until 0.4 s.
+    log.contents["/status"] = FakeTopic("x/S", status + MS, {"stamp": status, "mode": np.full(len(status), 4.0)})
+    base = imu_mapping()
+    vx = replace(base.signals["ay_m_s2"], name="vx_m_s")
+    mapping = replace(base, truth={"vx_m_s": vx}, quality=QualityGate("/status", "mode", values=(4.0,)))
+    _, truth, _ = read_all(log, mapping)
+    np.testing.assert_array_equal(truth["vx_m_s"].stamps_ns, stamps[:51])

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pdhef_logtool.logs.discovery import LogInput, find_logs
+from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.open_log import log_metadata
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.reporter import Reporter
@@ -46,15 +46,6 @@ def test_the_deepest_folder_names_the_car(fleet: Path) -> None:
     assert cars_of(fleet, text) == EACH
 
 
-def test_a_link_lies_where_it_was_put(fleet: Path) -> None:
-    (fleet / "fleet/mini/day/mini_1.mcap").unlink()
-    (fleet / "fleet/mini/day/mini_1.mcap").symlink_to(fleet / "fleet/golf/day/golf_1.mcap")
-    cars_of(fleet, '[folders]\n"fleet/golf" = "golf.toml"\n"fleet/mini" = "mini.toml"\n')
-    cars = RunCars.of(RunConfig(cars=fleet / "cars.toml"), pytest.fail)
-    link = LogInput(fleet / "fleet/mini/day/mini_1.mcap", "mini_1")
-    assert cars.of_log(link).vehicle.name == "mini"
-
-
 def test_a_name_or_pattern_wins_and_the_rest_takes_the_default(fleet: Path) -> None:
     text = 'default = "mini.toml"\n[logs]\n"golf_*.mcap" = "golf.toml"\n[folders]\n"fleet/golf" = "mini.toml"\n'
     assert cars_of(fleet, text) == EACH
@@ -68,14 +59,6 @@ def test_the_metadata_of_a_log_names_its_car(fleet: Path, sample_logs_dir: Path)
         f'[metadata."truthsim.manoeuvre"]\n"{golf["manoeuvre"]}" = "golf.toml"\n"{mini["manoeuvre"]}" = "mini.toml"\n'
     )
     assert cars_of(fleet, text) == EACH
-
-
-def test_the_custom_data_of_a_rosbag2_folder_are_metadata(sample_logs_dir: Path, tmp_path: Path) -> None:
-    bag = tmp_path / "bag"
-    shutil.copytree(sample_logs_dir / "step_rosbag2", bag)
-    text = (bag / "metadata.yaml").read_text()
-    (bag / "metadata.yaml").write_text(text.replace("custom_data: null", "custom_data: {vin: WVW}"))
-    assert log_metadata(bag)["vin"] == "WVW"
 
 
 def test_folder_and_metadata_that_contradict_each_other_are_refused(fleet: Path) -> None:

@@ -108,15 +108,6 @@ def test_a_page_shows_fields_reasons_and_a_mapping_to_paste(tmp_path: Path) -> N
     assert "named by the mapping file" in _text(file.read_text())
 
 
-def test_a_vector_is_drawn_by_its_length_and_has_figures(sample_logs_dir: Path) -> None:
-    inspection = inspect_log(sample_logs_dir / "road.mcap", prefer_truth="rtk")
-    quaternion = inspection.truth["quat_wxyz"]
-    assert quaternion.minimum == pytest.approx(1.0, abs=1e-4)
-    assert quaternion.std < 1e-4
-    text = _text(_page(sample_logs_dir / "road.mcap"))
-    assert "length of the vector" in text
-
-
 def test_a_log_of_many_fields_stays_below_the_limit(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     topics = {f"/ecu{k}": {f"signal_{i}_{'x' * 200}": rng.normal(size=120) for i in range(60)} for k in range(8)}

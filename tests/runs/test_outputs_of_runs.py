@@ -192,8 +192,8 @@ def test_a_file_in_the_place_of_a_folder_is_one_line(sample_logs_dir: Path, tmp_
 
 @pytest.mark.slow
 def test_kills_leave_whole_logs_and_the_next_run_the_same_results(sample_logs_dir: Path, tmp_path: Path) -> None:
-    logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "sweep.mcap")]
-    arguments = [*logs, "--car", str(sample_logs_dir / "vehicle.toml"), "-e", "zero", "--no-report", *SLICE]
+    logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "step.mcap")]
+    arguments = [*logs, "--car", "saloon", "-e", "zero", "--no-report", *SLICE]
     undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
     started = time.monotonic()
     assert kill_run(arguments, undisturbed, after_s=600.0).exit_code is None
