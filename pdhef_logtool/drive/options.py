@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
+from pdhef_logtool.logs.table_file import TableSettings
 from pdhef_logtool.records.errors import UsageError
 
 #: A bare integer from here on is nanoseconds, not seconds from the log's start.
@@ -31,6 +32,7 @@ class ReadOptions:
     setup : frozen set-up file; None decides the set-up on the log. setup_from_s : duration at the start of the slice
         that decides the set-up; None = ten minutes, and the whole slice for clocks.
     msgs : folder with definitions of message types that a log does not define.
+    rate_hz, group, folder : of logs of tables (:class:`~pdhef_logtool.logs.table_file.TableSettings`).
     allow_private_redirects : whether a web server may redirect to other hosts of this machine and its network.
     """
 
@@ -45,6 +47,9 @@ class ReadOptions:
     setup: Path | None = None
     setup_from_s: float | None = None
     msgs: Path | None = None
+    rate_hz: float | None = None
+    group: str = ""
+    folder: Literal["auto", "recording", "drives"] = "auto"
     allow_private_redirects: bool = False
 
     def __post_init__(self) -> None:
@@ -56,6 +61,11 @@ class ReadOptions:
     def use_speed(self) -> bool:
         """Whether the filters use the speed sensor after their start."""
         return self.sensors == "full"
+
+    @property
+    def tables(self) -> TableSettings:
+        """Settings of logs of tables."""
+        return TableSettings(self.rate_hz, self.group, self.folder)
 
     @property
     def limits(self) -> ResourceLimits:

@@ -28,6 +28,7 @@ from pdhef_logtool.mapping import (
     clock_key,
     mapping_of,
     merge_losses,
+    tables_for,
 )
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
@@ -287,7 +288,8 @@ def read_drive(
         tell(f"{log_input.stem}: {text}")
 
     state = log_state(log_input.path)
-    opened = open_log(log_input.path, options.limits, options.msgs, wanted=Wanted(frozenset()))
+    tables = tables_for(mapping, options.tables)
+    opened = open_log(log_input.path, options.limits, options.msgs, Wanted(frozenset()), tables)
     try:
         undecided, prefer = _as_far_as_decided(opened, options), options.prefer_truth
         chosen = choose_mapping(undecided, mapping, prefer_truth=prefer, require_signals=require_sensors)
@@ -355,7 +357,7 @@ def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], option
 
 def one_log(argument: LogPlace | str, options: ReadOptions = _AS_IT_IS) -> LogInput:
     """Return the log that a file, folder or pattern represents; raises UsageError unless there is exactly one."""
-    inputs = find_logs(argument, private_redirects=options.allow_private_redirects)
+    inputs = find_logs(argument, private_redirects=options.allow_private_redirects, settings=options.tables)
     if len(inputs) != 1:
         raise UsageError(expected="one log", got=f"{len(inputs)} of them", where=str(argument))
     return inputs[0]

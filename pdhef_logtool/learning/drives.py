@@ -74,7 +74,11 @@ def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInp
     UsageError
         A drive belongs to a rejected split, or no drive is left.
     """
-    inputs = find_logs(arguments, private_redirects=settings.config.allow_private_redirects)
+    inputs = find_logs(
+        arguments,
+        private_redirects=settings.config.allow_private_redirects,
+        settings=settings.config.read_options.tables,
+    )
     manifests = cache(set_manifest)
     splits = {i.stem: str(manifests(i.folder).get(i.path.name, {}).get("split") or "") for i in inputs}
     if settings.split not in (None, ANY_SPLIT):

@@ -1,6 +1,6 @@
-"""Logs of raw CAN frames, BLF and ASC: a topic ``can`` that a DBC decodes.
+"""Logs of raw CAN frames, BLF, ASC and candump: a topic ``can`` that a DBC decodes.
 
-Both formats state the local time of the recorder without its zone; it is read as UTC.
+BLF and ASC state the local time of the recorder without its zone; it is read as UTC.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import re
 import struct
 import zlib
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from mmap import ACCESS_READ, mmap
 
 import numpy as np
@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.can_decoding import ID_BITS, Frames
 from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import describe_damage
-from pdhef_logtool.logs.table_clocks import placed
+from pdhef_logtool.logs.table_clocks import ascending_rows, placed
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import IntArray, Loss
+from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
 _PARTS = ("id", "length", "is_extended", "bus", "is_error", "is_remote")
 #: Bytes of the numbers of a frame: its time and parts.
@@ -37,7 +37,8 @@ def _tables(
     """Build the topic ``can`` from times [N], numbers [N, 6] and the concatenated data of the frames."""
     if not len(stamps):
         got = f"none that can be read{''.join(f'; {loss.what}' for loss in lost[:1])}"
-        raise LogError(expected="CAN frames", got=got, where=file.name)
+        remedy = "candump -l and candump -t a record times" * (kind == "candump")
+        raise LogError(expected="CAN frames with times", got=got, where=file.name, remedy=remedy)
     widest = max(1, int(numbers[:, 1].max()))
     file.limits.check_table(len(stamps) * (_ROW_BYTES + widest), file.size, f"{len(stamps)} frames")
     rows = np.zeros((len(stamps), widest), np.uint8)
@@ -243,41 +244,83 @@ _FRAME_SHAPE = re.compile(rb"\d+\s+(?:\S+\s+[rt]x\s|errorframe)|canfd\s", re.I)
 _STEP_NS = 10**9
 
 
+class _TextLog:
+    """Reader of a log of text with a frame a line."""
+
+    kind = ""
+
+    def __init__(self, file: TableFile) -> None:
+        self._file = file
+        self._stamps, self._numbers, self._data = array("q"), array("i"), bytearray()
+        self._losses: list[Loss] = []
+
+    def _read(self, line: bytes) -> bool:
+        """Read a line; return False for a frame that cannot be read."""
+        raise NotImplementedError
+
+    def _add(self, stamp_ns: int, number: int, data: bytes, others: Sequence[int]) -> bool:
+        """Add a frame with its identifier, data and the parts behind the length; return False if it is none."""
+        if number > ID_BITS:
+            return False
+        row = array("i", (number, len(data), *others))
+        self._stamps.append(stamp_ns)
+        self._numbers.extend(row)
+        self._data.extend(data)
+        return True
+
+    def _ordered(self, stamps: IntArray, numbers: NDArray[np.int32]) -> tuple[IntArray, BoolArray]:
+        """Return final times [N], and which frames are used [N]; may change the numbers [N, 6]."""
+        del numbers
+        return stamps, np.ones(len(stamps), np.bool_)
+
+    def tables(self) -> Tables:
+        """Read the file."""
+        unreadable, first = 0, ""
+        for number, line in enumerate(self._file.stream, 1):
+            try:
+                is_read = self._read(line)
+            except (ValueError, OverflowError):
+                is_read = False
+            if not is_read:
+                first = first or f"line {number}, {line[:60].decode('ascii', 'replace').strip()!r}"
+                unreadable += 1
+        if unreadable:
+            what = f"{unreadable} lines of frames cannot be read, the first: {first}"
+            self._losses.append(Loss("bad-row", what, self._file.name, count=unreadable))
+        numbers = np.frombuffer(self._numbers, np.int32).reshape(-1, len(_PARTS))
+        stamps, used = self._ordered(np.frombuffer(self._stamps, np.int64), numbers)
+        data = np.frombuffer(self._data, np.uint8)[np.repeat(used, numbers[:, 1])]
+        return _tables(self.kind, self._file, stamps[used], numbers[used], data, self._losses)
+
+
 def open_asc(file: TableFile) -> Tables:
     """Read an ASC file; raises LogError if it has no frames."""
     return _Asc(file).tables()
 
 
-class _Asc:
+class _Asc(_TextLog):
     """Reader of an ASC file."""
 
+    kind = "asc"
+
     def __init__(self, file: TableFile) -> None:
-        self._file = file
-        self._stamps, self._numbers, self._data = array("q"), array("i"), bytearray()
+        super().__init__(file)
         self._base, self._is_relative = 16, False
         self._begins_ns: int | None = None
         self._start_ns = self._now_ns = self._overlapping = 0
         self._is_overlapping = False
 
-    def tables(self) -> Tables:
-        """Read the file."""
-        unreadable, first, losses = 0, "", []
-        for number, line in enumerate(self._file.stream, 1):
-            event = _EVENT.match(line)
-            if event is None:
-                self._read_head(line.decode("ascii", "ignore"))
-            elif not self._read_event(round(float(event[1]) * 1e9), event[2].rstrip()):
-                first = first or f"line {number}, {line[:60].decode('ascii', 'replace').strip()!r}"
-                unreadable += 1
-        if unreadable:
-            what = f"{unreadable} lines of frames cannot be read, the first: {first}"
-            losses.append(Loss("bad-row", what, self._file.name, count=unreadable))
+    def _ordered(self, stamps: IntArray, numbers: NDArray[np.int32]) -> tuple[IntArray, BoolArray]:
         if self._overlapping:
             what = "frames of a measurement that begins before the end of the one above it"
-            losses.append(Loss("out-of-order", what, self._file.name, count=self._overlapping))
-        numbers = np.frombuffer(self._numbers, np.int32).reshape(-1, len(_PARTS))
-        stamps, data = np.frombuffer(self._stamps, np.int64), np.frombuffer(self._data, np.uint8)
-        return _tables("asc", self._file, stamps, numbers, data, losses)
+            self._losses.append(Loss("out-of-order", what, self._file.name, count=self._overlapping))
+        return super()._ordered(stamps, numbers)
+
+    def _read(self, line: bytes) -> bool:
+        event = _EVENT.match(line)
+        if event is None:
+            self._read_head(line.decode("ascii", "ignore"))
+        return event is None or self._read_event(round(float(event[1]) * 1e9), event[2].rstrip())
 
     def _read_head(self, line: str) -> None:
         """Read a line without a time. A date begins a measurement."""
@@ -303,21 +346,15 @@ class _Asc:
         if match is None:
             return _FRAME_SHAPE.match(text) is None
         bus, is_error, identifier, extended, remote, length, content = match.groups()
-        try:
-            base, most = (self._base, 8) if match.re is _CLASSIC else (10, _MOST_BYTES)
-            count = min(int(length or b"0", base), most)
-            data = bytes([int(byte, self._base) for byte in (content or b"").split(None, count)[:count]])
-            number = int(identifier or b"0", self._base)
-            row = array("i", (number, count, bool(extended), int(bus) - 1, bool(is_error), bool(remote)))
-        except (ValueError, OverflowError):
-            return False
+        base, most = (self._base, 8) if match.re is _CLASSIC else (10, _MOST_BYTES)
+        count = min(int(length or b"0", base), most)
+        data = bytes([int(byte, self._base) for byte in (content or b"").split(None, count)[:count]])
         if self._is_overlapping:
             self._overlapping += 1
-        elif len(data) == count and number <= ID_BITS:
-            self._stamps.append(self._start_ns + self._now_ns)
-            self._numbers.extend(row)
-            self._data.extend(data)
-        return len(data) == count and number <= ID_BITS
+            return True
+        others = (bool(extended), int(bus) - 1, bool(is_error), bool(remote))
+        number = int(identifier or b"0", self._base)
+        return len(data) == count and self._add(self._start_ns + self._now_ns, number, data, others)
 
     def _begin(self, begins_ns: int, time_ns: int) -> None:
         """Begin a measurement with its first event. If the times continue, they have the same origin as before."""
@@ -326,3 +363,59 @@ class _Asc:
         if not self._stamps or self._is_overlapping or not goes_on:
             self._is_overlapping = bool(self._stamps) and begins_ns + time_ns < self._stamps[-1]
             self._start_ns, self._now_ns = begins_ns, 0
+
+
+# candump: ``(1609459200.123456) can0 123#DEADBEEF`` of -l, ``(...)  can0  123   [4]  DE AD BE EF`` of -t.
+_CANDUMP = re.compile(
+    rb"\s*\((\d{1,10}\.\d{1,9}|\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{1,9})\)\s+(\S+)\s+(?:[rt]x\s+\S+\s+\S+\s+)?"
+    rb"([\da-f]{3}|[\da-f]{8})(?:#(?:#[\da-f])?(r)?([\da-f.]*)|\s+\[(\d+)\]\s*(r)?((?:\s*[\da-f]{2}\b)*))(?![^\s_'e])",
+    re.I,
+)
+_ERROR_FLAG = 1 << 29
+#: Share of steps back in times that are differences between frames (``candump -t d``).
+_DIFFERENCES = 0.25
+
+
+def open_candump(file: TableFile) -> Tables:
+    """Read a log of ``candump`` (can-utils); raises LogError if it has no frames with times."""
+    return _Candump(file).tables()
+
+
+class _Candump(_TextLog):
+    """Reader of a log of ``candump``."""
+
+    kind = "candump"
+
+    def __init__(self, file: TableFile) -> None:
+        super().__init__(file)
+        self._interfaces: dict[bytes, int] = {}
+
+    def _read(self, line: bytes) -> bool:
+        match = _CANDUMP.match(line)
+        if match is None:
+            return not line.strip()
+        time, interface, identifier, remote, data, count, remote_too, listed = match.groups()
+        whole, _, fraction = time.partition(b".")
+        stamp_ns = int(whole) * 10**9 if whole.isdigit() else int(np.datetime64(whole.decode(), "ns").astype(np.int64))
+        is_remote = bool(remote or remote_too)
+        content = b"" if is_remote else bytes.fromhex((listed if data is None else data.replace(b".", b"")).decode())
+        number, bus = int(identifier, 16), self._interfaces.setdefault(interface, len(self._interfaces))
+        if len(content) > _MOST_BYTES or (count and not is_remote and len(content) != int(count)):
+            return False
+        others = (len(identifier) > 3, bus, bool(number & _ERROR_FLAG), is_remote)
+        return self._add(stamp_ns + int(fraction.ljust(9, b"0")), number & ~_ERROR_FLAG, content, others)
+
+    def _ordered(self, stamps: IntArray, numbers: NDArray[np.int32]) -> tuple[IntArray, BoolArray]:
+        """Number the buses as the interfaces; where the clock steps back, leave out what was recorded again."""
+        ends = [int(end[0]) if (end := re.findall(rb"\d{1,4}$", name)) else -1 for name in self._interfaces]
+        if len(set(ends)) < len(ends):
+            ends = [sorted(self._interfaces).index(name) for name in self._interfaces]
+        numbers[:, _PARTS.index("bus")] = np.array(ends, np.int32)[numbers[:, _PARTS.index("bus")]]
+        if len(stamps) > 1 and np.mean(np.diff(stamps) < 0) > _DIFFERENCES:
+            what = "times are differences between frames, and are summed"
+            self._losses.append(Loss("clock", what, self._file.name, severity="note"))
+            stamps = np.cumsum(stamps)
+        latest = np.maximum.accumulate(stamps)
+        rows, lost = ascending_rows(np.where(latest - stamps < _STEP_NS, latest, stamps), self._file.name)
+        self._losses += lost
+        return stamps, np.isin(np.arange(len(stamps)), rows)

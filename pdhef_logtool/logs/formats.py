@@ -40,8 +40,8 @@ class LogFormat:
     suffixes : by which a search through folders takes files for logs. named : also, if it is named outright.
     magic : first bytes of every file, or several possible ones; empty: a file is recognised by its suffix.
     needs_suffix : whether files of other formats begin with the same bytes, so that the suffix must match too.
-    is_general : whether such files often contain something else: a search through folders ignores them where logs of
-        other formats are beside them.
+    generality : how often such files contain something else: a search through folders ignores them where logs of a
+        lower generality are beside them.
     """
 
     title: str
@@ -49,7 +49,7 @@ class LogFormat:
     suffixes: tuple[str, ...]
     magic: bytes | tuple[bytes, ...] = b""
     needs_suffix: bool = False
-    is_general: bool = False
+    generality: int = 0
     named: tuple[str, ...] = ()
     libraries: tuple[str, ...] | None = None
 
@@ -76,15 +76,15 @@ FORMATS = (
     LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",), libraries=("polars",)),
     LogFormat(
         "a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"),
-        is_general=True, named=(".txt",), libraries=("polars",),
+        generality=1, named=(".txt",), libraries=("polars",),
     ),
     LogFormat(
         "a Parquet file", f"{__package__}.parquet_log:open_parquet", (".parquet",), b"PAR1",
-        is_general=True, libraries=("polars", "pyarrow.parquet"),
+        generality=1, libraries=("polars", "pyarrow.parquet"),
     ),
     LogFormat(
         "a MAT file", f"{__package__}.mat_log:open_mat", (".mat",), b"MATLAB ",
-        is_general=True, libraries=("h5py",),
+        generality=1, libraries=("h5py",),
     ),
     LogFormat(
         "an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF "),
@@ -92,6 +92,11 @@ FORMATS = (
     ),
     LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG", libraries=()),
     LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",), libraries=()),
+    LogFormat("a candump log", f"{__package__}.can_logs:open_candump", (".log",), generality=2, libraries=()),
+    LogFormat(
+        "a file of JSON lines", f"{__package__}.json_lines:open_json_lines", (".jsonl", ".ndjson"),
+        generality=2, named=(".json",), libraries=("polars",),
+    ),
 )  # fmt: skip
 
 
@@ -120,10 +125,14 @@ def log_suffixes() -> tuple[str, ...]:
 
 
 def without_general(names: set[str]) -> set[str]:
-    """Return the names of the logs in one folder, without files of general formats if others are beside them."""
-    general = tuple(suffix for f in _every_format() if f.is_general for suffix in (*f.suffixes, *f.named))
-    general += tuple(suffix + compressed for suffix in general for compressed in COMPRESSED_SUFFIXES)
-    return {name for name in names if not name.endswith(general)} or names
+    """Return the names of the logs in one folder that have the lowest generality."""
+    ranks: dict[int, set[str]] = {}
+    for name in names:
+        bare = next((name.removesuffix(end) for end in COMPRESSED_SUFFIXES if name.endswith(end)), name).lower()
+        ranks.setdefault(
+            max((f.generality for f in _every_format() if bare.endswith((*f.suffixes, *f.named))), default=0), set()
+        ).add(name)
+    return ranks[min(ranks)] if ranks else set()
 
 
 def what_is_a_log() -> str:

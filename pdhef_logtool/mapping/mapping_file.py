@@ -111,6 +111,13 @@ class _CanTable(BaseModel):
         return self
 
 
+class _TablesEntries(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
+
+    rate_hz: Annotated[float, Field(gt=0, le=1e6)] | None = None
+    group: str = ""
+
+
 def mapping_of(given: Mapping | Path | str | None) -> Mapping | None:
     """Return the mapping, read from its file if a path is given; None stays None. Raises MappingFileError."""
     return load_mapping(given) if isinstance(given, Path | str) else given
@@ -141,7 +148,17 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
     ------
     MappingFileError : Entries are wrong, unknown, missing or contradict one another.
     """
-    sections = ("signals", "truth", "truth_quality", "estimates", "can", "fill_recognised", "recorder")
+    sections = (
+        "signals",
+        "truth",
+        "truth_quality",
+        "estimates",
+        "can",
+        "fill_recognised",
+        "recorder",
+        "rate_hz",
+        "group",
+    )
     problems = [unknown(key, sections) for key in raw if key not in sections]
     signals = _read_section(raw.get("signals", {}), "signals", tuple(SIGNAL_UNITS), tuple(TRUTH_UNITS), problems)
     truth = _read_section(raw.get("truth", {}), "truth", tuple(TRUTH_UNITS), tuple(SIGNAL_UNITS), problems)
@@ -153,7 +170,12 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
         problems.append("fill_recognised: should be true or false")
         fill = False
     recorder = _read_recorder(raw.get("recorder", {}), problems)
-    mapping = Mapping(signals, truth, quality, can=can, estimates=estimates, fill_recognised=fill, recorder=recorder)
+    tables = checked(_TablesEntries, {k: raw[k] for k in ("rate_hz", "group") if k in raw}, "", problems)
+    rate_hz, group = (None, "") if tables is None else (tables.rate_hz, tables.group)
+    mapping = Mapping(
+        signals, truth, quality, can=can, estimates=estimates, fill_recognised=fill, recorder=recorder,
+        rate_hz=rate_hz, group=group,
+    )  # fmt: skip
     if "can" not in raw:
         # Other programs read the estimates: their sources are checked as well.
         every = (*mapping.sources(), *(s for e in estimates.values() for s in e.values()))
@@ -324,6 +346,8 @@ def mapping_to_toml(
         "# ISO 8855: x forward, y left, z up; angles and rates are positive to the left. See docs/formats.md.",
     ]
     lines += _comment("\n".join([notes.get("", ""), *mapping.notes]))
+    if mapping.rate_hz or mapping.group:
+        lines += ["", *(f"{n} = {_toml(v)}" for n in ("rate_hz", "group") if (v := getattr(mapping, n)))]
     if mapping.recorder:
         lines += ["", "[recorder]", *(f"{_toml(topic)} = {_toml(kind)}" for topic, kind in mapping.recorder)]
     if mapping.can is not None:

@@ -132,7 +132,7 @@ def run_logs(
     OutputError
         The output cannot be written, or another command is writing to it.
     """
-    inputs = find_logs(arguments, private_redirects=config.allow_private_redirects)
+    inputs = find_logs(arguments, private_redirects=config.allow_private_redirects, settings=config.read_options.tables)
     junit = None if junit is None else Path(junit)
     validation = read_validation_plan(config.plan, junit)
     job = _Job(config, RunCars.of(config, reporter.warn), mapping_of(config.mapping), validation, junit, report, strict)

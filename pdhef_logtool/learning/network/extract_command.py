@@ -248,7 +248,11 @@ def extract(
     output = local_path(output)
     settings.smoothing_half_s()
     _check_counts(jobs, settings)
-    inputs = find_logs(arguments, private_redirects=settings.config.allow_private_redirects)
+    inputs = find_logs(
+        arguments,
+        private_redirects=settings.config.allow_private_redirects,
+        settings=settings.config.read_options.tables,
+    )
     mapping = mapping_of(settings.config.mapping)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, reporter.warn))
     before = _earlier(output, settings)

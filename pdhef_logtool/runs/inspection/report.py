@@ -22,6 +22,7 @@ from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
+from pdhef_logtool.logs.table_file import NO_SETTINGS, TableSettings
 from pdhef_logtool.mapping import (
     Ambiguity,
     ClockModel,
@@ -37,6 +38,7 @@ from pdhef_logtool.mapping import (
     merge_losses,
     read_signals,
     resolve_mapping,
+    tables_for,
 )
 from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.mapping.choosing import choose_mapping
@@ -228,6 +230,7 @@ def inspect_log(
     prefer_truth: Literal["perfect", "rtk"] = "perfect",
     budget: ResourceLimits = DEFAULT_LIMITS,
     msgs: Path | str | None = None,
+    tables: TableSettings = NO_SETTINGS,
     whole: bool = False,
     then: Callable[[Inspection, DriveLog], None] = lambda *_: None,
 ) -> Inspection:
@@ -239,7 +242,7 @@ def inspect_log(
     Parameters
     ----------
     prefer_truth : as for :func:`pdhef_logtool.mapping.auto_map`. budget : resource limits of reading.
-    msgs : folder with definitions of types that the log does not define.
+    msgs : folder with definitions of types that the log does not define. tables : settings for logs of tables.
     then : called with the inspection before the log is closed.
 
     Raises
@@ -248,8 +251,9 @@ def inspect_log(
     MappingError : The mapping names a topic or field that the log does not contain.
     """
     mapping = mapping_of(mapping)
+    tables = tables_for(mapping, tables)
     if not whole:
-        with closing(open_log(path, budget, msgs, Wanted(frozenset(), above_bytes=WHOLE_BYTES))) as log:
+        with closing(open_log(path, budget, msgs, Wanted(frozenset(), above_bytes=WHOLE_BYTES), tables)) as log:
             index = log.index
             # Most of a shorter one is read anyway.
             long = index is not None and (index.is_remote or log.end_ns - log.start_ns > 2 * WINDOW_NS)
@@ -261,7 +265,7 @@ def inspect_log(
             if sample is None or not (damaged or sample.chunks > MOST_SAMPLED * sample.of_chunks):
                 then(partial, log)
                 return partial
-    with closing(open_log(path, budget, msgs)) as log:
+    with closing(open_log(path, budget, msgs, settings=tables)) as log:
         inspection = inspect_drive_log(log, mapping, prefer_truth=prefer_truth)
         then(inspection, log)
         return inspection
