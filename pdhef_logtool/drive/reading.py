@@ -15,7 +15,7 @@ from pdhef_logtool.drive.plan import DrivePlan, plan_drive, setup_of
 from pdhef_logtool.drive.recorded import Recorded, read_recorded
 from pdhef_logtool.drive.setup import CLOCK_START_S, LogUntil, Setup, is_device_clock, load_setup
 from pdhef_logtool.logs.container import Wanted
-from pdhef_logtool.logs.discovery import LogInput, check_unchanged, find_logs, identity_of, log_state
+from pdhef_logtool.logs.discovery import LogInput, Logs, check_unchanged, find_logs, identity_of, log_state
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -355,9 +355,14 @@ def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], option
     return opened
 
 
+def logs_of(arguments: Logs, options: ReadOptions) -> list[LogInput]:
+    """Return the logs that files, folders and patterns represent (:func:`find_logs`)."""
+    return find_logs(arguments, private_redirects=options.allow_private_redirects, settings=options.tables)
+
+
 def one_log(argument: LogPlace | str, options: ReadOptions = _AS_IT_IS) -> LogInput:
     """Return the log that a file, folder or pattern represents; raises UsageError unless there is exactly one."""
-    inputs = find_logs(argument, private_redirects=options.allow_private_redirects, settings=options.tables)
+    inputs = logs_of(argument, options)
     if len(inputs) != 1:
         raise UsageError(expected="one log", got=f"{len(inputs)} of them", where=str(argument))
     return inputs[0]

@@ -10,7 +10,7 @@ import re
 import struct
 import zlib
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from mmap import ACCESS_READ, mmap
 
 import numpy as np
@@ -25,6 +25,7 @@ from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
 _PARTS = ("id", "length", "is_extended", "bus", "is_error", "is_remote")
+_ROW = struct.Struct(f"{len(_PARTS)}i")
 #: Bytes of the numbers of a frame: its time and parts.
 _ROW_BYTES = np.dtype([("stamp", np.int64), ("parts", np.int32, len(_PARTS))]).itemsize
 #: Maximum data length of CAN FD.
@@ -251,21 +252,21 @@ class _TextLog:
 
     def __init__(self, file: TableFile) -> None:
         self._file = file
-        self._stamps, self._numbers, self._data = array("q"), array("i"), bytearray()
+        self._stamps, self._numbers, self._data = array("q"), bytearray(), bytearray()
         self._losses: list[Loss] = []
 
     def _read(self, line: bytes) -> bool:
         """Read a line; return False for a frame that cannot be read."""
         raise NotImplementedError
 
-    def _add(self, stamp_ns: int, number: int, data: bytes, others: Sequence[int]) -> bool:
-        """Add a frame with its identifier, data and the parts behind the length; return False if it is none."""
-        if number > ID_BITS:
+    def _add(self, stamp_ns: int, data: bytes, *parts: int) -> bool:
+        """Add a frame with its parts in their order; return False if it is none."""
+        if parts[0] > ID_BITS:
             return False
-        row = array("i", (number, len(data), *others))
+        row = _ROW.pack(*parts)
         self._stamps.append(stamp_ns)
-        self._numbers.extend(row)
-        self._data.extend(data)
+        self._numbers += row
+        self._data += data
         return True
 
     def _ordered(self, stamps: IntArray, numbers: NDArray[np.int32]) -> tuple[IntArray, BoolArray]:
@@ -279,7 +280,7 @@ class _TextLog:
         for number, line in enumerate(self._file.stream, 1):
             try:
                 is_read = self._read(line)
-            except (ValueError, OverflowError):
+            except (ValueError, OverflowError, struct.error):
                 is_read = False
             if not is_read:
                 first = first or f"line {number}, {line[:60].decode('ascii', 'replace').strip()!r}"
@@ -320,7 +321,8 @@ class _Asc(_TextLog):
         event = _EVENT.match(line)
         if event is None:
             self._read_head(line.decode("ascii", "ignore"))
-        return event is None or self._read_event(round(float(event[1]) * 1e9), event[2].rstrip())
+            return True
+        return self._read_event(round(float(event[1]) * 1e9), event[2].rstrip())
 
     def _read_head(self, line: str) -> None:
         """Read a line without a time. A date begins a measurement."""
@@ -352,9 +354,10 @@ class _Asc(_TextLog):
         if self._is_overlapping:
             self._overlapping += 1
             return True
-        others = (bool(extended), int(bus) - 1, bool(is_error), bool(remote))
-        number = int(identifier or b"0", self._base)
-        return len(data) == count and self._add(self._start_ns + self._now_ns, number, data, others)
+        if len(data) < count:
+            return False
+        number, flags = int(identifier or b"0", self._base), (bool(is_error), bool(remote))
+        return self._add(self._start_ns + self._now_ns, data, number, count, bool(extended), int(bus) - 1, *flags)
 
     def _begin(self, begins_ns: int, time_ns: int) -> None:
         """Begin a measurement with its first event. If the times continue, they have the same origin as before."""
@@ -402,8 +405,9 @@ class _Candump(_TextLog):
         number, bus = int(identifier, 16), self._interfaces.setdefault(interface, len(self._interfaces))
         if len(content) > _MOST_BYTES or (count and not is_remote and len(content) != int(count)):
             return False
-        others = (len(identifier) > 3, bus, bool(number & _ERROR_FLAG), is_remote)
-        return self._add(stamp_ns + int(fraction.ljust(9, b"0")), number & ~_ERROR_FLAG, content, others)
+        flags = len(identifier) > 3, bus, bool(number & _ERROR_FLAG), is_remote
+        stamp_ns += int(fraction.ljust(9, b"0"))
+        return self._add(stamp_ns, content, number & ~_ERROR_FLAG, len(content), *flags)
 
     def _ordered(self, stamps: IntArray, numbers: NDArray[np.int32]) -> tuple[IntArray, BoolArray]:
         """Number the buses as the interfaces; where the clock steps back, leave out what was recorded again."""
