@@ -22,7 +22,7 @@ from pdhef_logtool.logs.container import describe_damage
 from pdhef_logtool.logs.table_clocks import ascending_rows, placed
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
+from pdhef_logtool.records.signals import IntArray, Loss
 
 _PARTS = ("id", "length", "is_extended", "bus", "is_error", "is_remote")
 _ROW = struct.Struct(f"{len(_PARTS)}i")
@@ -269,11 +269,6 @@ class _TextLog:
         self._data += data
         return True
 
-    def _ordered(self, stamps: IntArray, numbers: NDArray[np.int32]) -> tuple[IntArray, BoolArray]:
-        """Return final times [N], and which frames are used [N]; may change the numbers [N, 6]."""
-        del numbers
-        return stamps, np.ones(len(stamps), np.bool_)
-
     def tables(self) -> Tables:
         """Read the file."""
         unreadable, first = 0, ""
@@ -289,9 +284,23 @@ class _TextLog:
             what = f"{unreadable} lines of frames cannot be read, the first: {first}"
             self._losses.append(Loss("bad-row", what, self._file.name, count=unreadable))
         numbers = np.frombuffer(self._numbers, np.int32).reshape(-1, len(_PARTS))
-        stamps, used = self._ordered(np.frombuffer(self._stamps, np.int64), numbers)
+        stamps = self._times(np.frombuffer(self._stamps, np.int64))
+        # Buses are written with small delays; after a larger step back, times that were recorded before are left out.
+        latest = np.maximum.accumulate(stamps)
+        rows, lost = ascending_rows(np.where(latest - stamps < _STEP_NS, latest, stamps), self._file.name)
+        used = np.isin(np.arange(len(stamps)), rows)
         data = np.frombuffer(self._data, np.uint8)[np.repeat(used, numbers[:, 1])]
-        return _tables(self.kind, self._file, stamps[used], numbers[used], data, self._losses)
+        return _tables(
+            self.kind, self._file, stamps[used], self._bus_numbers(numbers[used]), data, [*self._losses, *lost]
+        )
+
+    def _times(self, stamps: IntArray) -> IntArray:
+        """Return the times [N] of frames."""
+        return stamps
+
+    def _bus_numbers(self, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return the numbers [N, 6] of frames with those of buses."""
+        return numbers
 
 
 def open_asc(file: TableFile) -> Tables:
@@ -308,14 +317,7 @@ class _Asc(_TextLog):
         super().__init__(file)
         self._base, self._is_relative = 16, False
         self._begins_ns: int | None = None
-        self._start_ns = self._now_ns = self._overlapping = 0
-        self._is_overlapping = False
-
-    def _ordered(self, stamps: IntArray, numbers: NDArray[np.int32]) -> tuple[IntArray, BoolArray]:
-        if self._overlapping:
-            what = "frames of a measurement that begins before the end of the one above it"
-            self._losses.append(Loss("out-of-order", what, self._file.name, count=self._overlapping))
-        return super()._ordered(stamps, numbers)
+        self._start_ns = self._now_ns = 0
 
     def _read(self, line: bytes) -> bool:
         event = _EVENT.match(line)
@@ -351,9 +353,6 @@ class _Asc(_TextLog):
         base, most = (self._base, 8) if match.re is _CLASSIC else (10, _MOST_BYTES)
         count = min(int(length or b"0", base), most)
         data = bytes([int(byte, self._base) for byte in (content or b"").split(None, count)[:count]])
-        if self._is_overlapping:
-            self._overlapping += 1
-            return True
         if len(data) < count:
             return False
         number, flags = int(identifier or b"0", self._base), (bool(is_error), bool(remote))
@@ -363,8 +362,7 @@ class _Asc(_TextLog):
         """Begin a measurement with its first event. If the times continue, they have the same origin as before."""
         self._begins_ns = None
         goes_on = not begins_ns if self._is_relative else time_ns >= self._now_ns
-        if not self._stamps or self._is_overlapping or not goes_on:
-            self._is_overlapping = bool(self._stamps) and begins_ns + time_ns < self._stamps[-1]
+        if not self._stamps or not goes_on:
             self._start_ns, self._now_ns = begins_ns, 0
 
 
@@ -374,9 +372,7 @@ _CANDUMP = re.compile(
     rb"([\da-f]{3}|[\da-f]{8})(?:#(?:#[\da-f])?(r)?([\da-f.]*)|\s+\[(\d+)\]\s*(r)?((?:\s*[\da-f]{2}\b)*))(?![^\s_'e])",
     re.I,
 )
-_ERROR_FLAG = 1 << 29
-#: Share of steps back in times that are differences between frames (``candump -t d``).
-_DIFFERENCES = 0.25
+_ERROR_FLAG, _DIFFERENCES = CONSTANTS["candump"]["error_flag"], CONSTANTS["candump"]["differences"]
 
 
 def open_candump(file: TableFile) -> Tables:
@@ -409,17 +405,17 @@ class _Candump(_TextLog):
         stamp_ns += int(fraction.ljust(9, b"0"))
         return self._add(stamp_ns, content, number & ~_ERROR_FLAG, len(content), *flags)
 
-    def _ordered(self, stamps: IntArray, numbers: NDArray[np.int32]) -> tuple[IntArray, BoolArray]:
-        """Number the buses as the interfaces; where the clock steps back, leave out what was recorded again."""
+    def _times(self, stamps: IntArray) -> IntArray:
+        if not len(stamps) or np.mean(np.diff(stamps, prepend=stamps[0]) < 0) < _DIFFERENCES:
+            return stamps
+        what = "times are differences between frames, and are summed"
+        self._losses.append(Loss("clock", what, self._file.name, severity="note"))
+        return np.cumsum(stamps)
+
+    def _bus_numbers(self, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return numbers with the number at the end of each interface, or its place among all if two have the same."""
         ends = [int(end[0]) if (end := re.findall(rb"\d{1,4}$", name)) else -1 for name in self._interfaces]
         if len(set(ends)) < len(ends):
             ends = [sorted(self._interfaces).index(name) for name in self._interfaces]
         numbers[:, _PARTS.index("bus")] = np.array(ends, np.int32)[numbers[:, _PARTS.index("bus")]]
-        if len(stamps) > 1 and np.mean(np.diff(stamps) < 0) > _DIFFERENCES:
-            what = "times are differences between frames, and are summed"
-            self._losses.append(Loss("clock", what, self._file.name, severity="note"))
-            stamps = np.cumsum(stamps)
-        latest = np.maximum.accumulate(stamps)
-        rows, lost = ascending_rows(np.where(latest - stamps < _STEP_NS, latest, stamps), self._file.name)
-        self._losses += lost
-        return stamps, np.isin(np.arange(len(stamps)), rows)
+        return numbers

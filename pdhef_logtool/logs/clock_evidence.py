@@ -4,48 +4,39 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.records.signals import BoolArray, IntArray
+from pdhef_logtool.logs.constants import CONSTANTS
+from pdhef_logtool.records.signals import IntArray
 
-_LATITUDE, _LONGITUDE = (
-    re.compile(r"(?:.*_)?lat(?:itude)?(?:_deg)?"),
-    re.compile(r"(?:.*_)?(?:lon|lng|longitude)(?:_deg)?"),
-)
-_SPEED = re.compile(r"(?:.*_)?(?:speed|velocity|geschwindigkeit|v)(?:_(?:mps|m_s|kmh|km_h|kph|mph|kn|knots))?")
-_METRES_PER_DEGREE = 111_195.0
-#: Steps of the path: longer ones average the noise of the positions.
-_STEPS = 400
-_SHORTEST_PATH_M = 100.0
-#: Decades by which noise may lengthen the path. Units of speed (m/s to km/h) shorten its ratio by up to 0.56 decades.
-_NOISE = 0.2
+_MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]
 
 
-def decades_too_short(columns: Mapping[str, Any], stamps: IntArray, has_time: BoolArray) -> int:
-    """Return n if times [N] in ns have to be multiplied by 10**n so that speed and path agree; 0 without evidence.
+def decades_too_short(columns: Mapping[str, Any], rows: IntArray, stamps: IntArray) -> int:
+    """Return n if times have to be multiplied by 10**n so that speed and path agree; 0 without evidence.
+
+    Units of speed, from m/s to km/h, shorten the ratio of the path to the integral by up to 0.56 decades.
 
     Parameters
     ----------
     columns : numbers [N] by name in lower case; positions in degrees, speed in any usual unit.
+    rows, stamps : rows with a time [K], and their times [K] in ns.
     """
-    names = {n: c for n, c in columns.items() if isinstance(c, np.ndarray) and c.dtype.kind in "iuf" and c.ndim == 1}
-    latitude, longitude = (next((names[n] for n in names if p.fullmatch(n)), None) for p in (_LATITUDE, _LONGITUDE))
-    if latitude is None or longitude is None:
+    latitude, longitude, speed = (
+        next((c for n, c in columns.items() if re.fullmatch(_MOTION[name], n) and isinstance(c, np.ndarray)), None)
+        for name in ("latitude", "longitude", "speed")
+    )
+    if latitude is None or longitude is None or speed is None:
         return 0
-    rows = np.flatnonzero(has_time & np.isfinite(latitude) & np.isfinite(longitude) & (latitude != 0.0))
-    if len(rows) < 2 or np.abs(latitude[rows]).max() > 90.0:
-        return 0
-    at = rows[:: max(1, len(rows) // _STEPS)]
-    north, east = np.diff(latitude[at]), np.diff(longitude[at]) * np.cos(np.radians(latitude[at[1:]]))
-    path_m = _METRES_PER_DEGREE * float(np.hypot(north, east).sum())
-    if path_m < _SHORTEST_PATH_M:
-        return 0
-    steps_s = np.diff(stamps[rows]) * 1e-9
-    ways = [float(np.nansum(np.abs(c[rows[1:]]) * steps_s)) for n, c in names.items() if _SPEED.fullmatch(n)]
-    votes = Counter(math.ceil(math.log10(path_m / way) - _NOISE) for way in ways if way > 0.0)
-    (decades, count), *_ = votes.most_common(1) or [(0, 1)]
-    return decades if 2 * count > len(ways) else 0
+    used = np.isfinite(latitude[rows]) & np.isfinite(longitude[rows]) & (latitude[rows] != 0.0)
+    rows, stamps = rows[used], stamps[used]
+    # Long steps average the noise of the positions.
+    corners = rows[:: max(1, len(rows) // _MOTION["steps"])]
+    north, east = np.diff(latitude[corners]), np.diff(longitude[corners]) * np.cos(np.radians(latitude[corners[1:]]))
+    path_m = _MOTION["metres_per_degree"] * float(np.hypot(north, east).sum())
+    length = float(np.nansum(np.abs(speed[rows[1:]]) * np.diff(stamps) * 1e-9))
+    is_moving = _MOTION["shortest_path_m"] < path_m < _MOTION["longest_path_m"] and length > 0.0
+    return math.ceil(math.log10(path_m / length) - _MOTION["noise_decades"]) if is_moving else 0

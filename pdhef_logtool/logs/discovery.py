@@ -27,8 +27,6 @@ _NOT_IN_NAMES = frozenset('<>:"/\\|?*')
 _DEVICE = re.compile(r"CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9¹²³]", re.IGNORECASE)
 #: A folder with this file is an output of ours, and its recordings are no input.
 RUN_FILE = "run.json"
-#: Our files that look like logs.
-_OF_CARS = {"history.jsonl", "journal.jsonl"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,7 +253,7 @@ def _search(folder: Path, visited: set[str], settings: TableSettings) -> Iterato
         return
     entries = [e for e in sorted(folder.iterdir()) if not e.name.startswith(".")]
     named = {e.name for e in entries if not e.is_dir() and _bare_name(e.name) != e.name}
-    logs = without_general(named - _OF_CARS)
+    logs = without_general(named - {"history.jsonl", "journal.jsonl"})  # of cars and runs
     if is_recording(folder, logs, settings):
         yield folder
         logs = set()

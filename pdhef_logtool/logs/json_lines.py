@@ -12,16 +12,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.table_cells import read_cells
 from pdhef_logtool.logs.table_columns import Sheet, read_head, tables_of
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 
-#: Elements of an array that become columns; longer arrays are ignored.
-_MOST_ELEMENTS = 16
-#: Magnitude of a number that fits into a column.
-_LARGEST = 1e300
+_MOST_ELEMENTS, _LARGEST = CONSTANTS["json"]["elements"], CONSTANTS["json"]["largest"]
 #: Values of a column and their rows.
 _Cells: TypeAlias = "tuple[array[int], list[Any]]"
 

@@ -25,7 +25,7 @@ from pdhef_logtool.logs.formats import (
     without_general,
 )
 from pdhef_logtool.logs.log_file import LogFile
-from pdhef_logtool.logs.recording_folder import may_be_recording, open_recording
+from pdhef_logtool.logs.recording_folder import open_recording
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter, ResourceLimits
 from pdhef_logtool.logs.table_file import NO_SETTINGS, TableSettings
@@ -214,9 +214,8 @@ def _open_folder(file: LogFile) -> DriveLog:
         return _open_rosbag2_folder(file)
     logs = [p for p in sorted(path.iterdir()) if p.is_file() and looks_like_log(p)]
     logs = [p for p in logs if p.name in without_general({log.name for log in logs})]
-    is_candidate = may_be_recording(path, [p.name for p in logs], file.settings)
-    if is_candidate and (log := open_recording(file, logs)) is not None:
-        return log
+    if (recording := open_recording(file, logs)) is not None:
+        return recording
     if len(logs) != 1:
         got = "a folder without a log" if not logs else f"a folder of {len(logs)} logs without metadata.yaml"
         raise LogError(expected=what_is_a_log(), got=got, where=str(path), remedy=_ONE_RECORDING if logs else _REMEDY)

@@ -100,11 +100,9 @@ def rate_clock(rows: int, rate_hz: float) -> Clock:
 
 def rescaled(clock: Clock, decades: int, note: str) -> Clock:
     """Return a clock of times since a start that last 10**decades as long."""
-    since = np.where(clock.stamps_ns == NO_TIME, 0, clock.stamps_ns - RELATIVE_NS)
-    stamps = np.where(
-        clock.stamps_ns == NO_TIME, NO_TIME, np.round(since * 10.0**decades).astype(np.int64) + RELATIVE_NS
-    )
-    return replace(clock, stamps_ns=stamps, notes=(*clock.notes, note))
+    has_time = clock.stamps_ns != NO_TIME
+    since = _scaled((clock.stamps_ns - RELATIVE_NS) * 10.0**decades, 1, 0, has_time)
+    return replace(clock, stamps_ns=placed(since), notes=(*clock.notes, note))
 
 
 def number_clock(
@@ -144,8 +142,8 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock], rate_hz
         if length_s <= 0.0:
             return 0.0
         apart = min((abs(math.log10(length_s / length)) for length in lengths), default=0.0)
-        # Short recordings are usual, slow ones are not.
-        return 1.3 * _outside(step_s, _CLOCKS["usual_step_s"]) + _outside(length_s, _CLOCKS["usual_length_s"]) + apart
+        slow = _CLOCKS["weight_of_steps"] * _outside(step_s, _CLOCKS["usual_step_s"])
+        return slow + _outside(length_s, _CLOCKS["usual_length_s"]) + apart
 
     dates = [(factor, 0) for factor in _SUBUNITS if _is_date(middle * factor / _SECONDS)]
     days = [(_DAY_NS, epoch) for epoch in _DAYS_TO_1970 if _is_date((middle - epoch) * _DAY_S)]
@@ -156,13 +154,24 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock], rate_hz
         changed = better[0] != stated
         return *better, f"the unit makes no plausible times, read as {_named(*better)}" if changed else ""
     dates = [reading for reading in dates if fits(reading[0])]
-    if rate_hz and step and not dates:
-        factor = int(10 ** max(0, round(math.log10(_SECONDS / (rate_hz * step)))))
-        return factor, 0, f"no unit, read as {factor / _SECONDS:g} s, as rate_hz states"
-    factor, epoch = dates[0] if dates else min((*((f, 0) for f in _SUBUNITS), *days), key=decades_off)
-    is_shown = dates or (factor == _SECONDS and bool((values != np.round(values)).any()))  # only seconds have fractions
-    assumed = "" if is_shown else f"no unit, read as {_named(factor, epoch)}; rate_hz states another one"
-    return factor, epoch, assumed
+    if dates:
+        return *dates[0], ""
+    if rate_hz and step:
+        return _as_rate_states(rate_hz, step)
+    factor, epoch = min((*((f, 0) for f in _SUBUNITS), *days), key=decades_off)
+    return factor, epoch, _assumption(values, factor, epoch)
+
+
+def _assumption(values: NDArray[Any], factor: int, epoch: int) -> str:
+    """Return the note on a unit that is not stated; empty for fractions of seconds, as other units have none."""
+    are_seconds = factor == _SECONDS and (values != np.round(values)).any()
+    return "" if are_seconds else f"no unit, read as {_named(factor, epoch)}; rate_hz states another one"
+
+
+def _as_rate_states(rate_hz: float, step: float) -> tuple[int, int, str]:
+    """Return the power of ten of ns that gives steps their rate, as :func:`_reading`."""
+    factor = int(10 ** max(0, round(math.log10(_SECONDS / (rate_hz * step)))))
+    return factor, 0, f"no unit, read as {factor / _SECONDS:g} s, as rate_hz states"
 
 
 def _of_gps(clock: Clock, name: str, others: Sequence[Clock]) -> Clock:

@@ -137,9 +137,9 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
     grades = {name: grade for name in sheet.columns if (grade := _grade(sheet, name)) is not None}
     clocks = {name: _read_clock(sheet, name, others, rate_hz) for name in grades}
     chosen, *rivals = _best_clocks(clocks, grades)
-    if not chosen and rate_hz:
-        return rate_clock(max(map(len, sheet.columns.values()), default=0), rate_hz)
     if not chosen:
+        if rate_hz:
+            return rate_clock(max(map(len, sheet.columns.values()), default=0), rate_hz)
         raise LogError(
             expected="a column of times (time, t, timestamp; s, ms, ISO 8601, or GPS week and seconds)",
             got=", ".join([*sheet.columns][:8]) or "no columns",
@@ -150,13 +150,19 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
     certain = [clock for name, clock in clocks.items() if name != chosen and clock.is_certain]
     clock = _read_clock(sheet, chosen, (*others, *certain), rate_hz) if certain else clocks[chosen]
     if not (clock.is_certain or certain or others):
-        named = {snake(name): column for name, column in sheet.columns.items()}
-        if decades := decades_too_short(named, clock.stamps_ns, clock.stamps_ns != NO_TIME):
-            note = f"{chosen}: speed and positions show times that are 10^{decades} as long: corrected"
-            clock = rescaled(clock, decades, note)
+        clock = _as_motion_shows(clock, sheet, chosen)
     apart = [n for n in rivals if abs(clocks[n].length_s - clock.length_s) > _ALIKE * clock.length_s]
     note = f"{chosen} is the clock; the times of {', '.join(apart)} have another length"
     return replace(clock, notes=(*clock.notes, note)) if apart else clock
+
+
+def _as_motion_shows(clock: Clock, sheet: Sheet, name: str) -> Clock:
+    """Return a clock with the power of ten that speed and positions show."""
+    rows = np.flatnonzero(clock.stamps_ns != NO_TIME)
+    columns = {snake(name): column for name, column in sheet.columns.items()}
+    decades = decades_too_short(columns, rows, clock.stamps_ns[rows])
+    note = f"{name}: speed and positions show times that are 10^{decades} as long: corrected"
+    return rescaled(clock, decades, note) if decades else clock
 
 
 def _best_clocks(clocks: Mapping[str, Clock], grades: Mapping[str, int]) -> list[str]:
