@@ -50,18 +50,16 @@ def convert_log(
         if log.start_ns < 0:
             raise LogError(expected="log times from 1970 on", got=f"{log.start_ns} ns", where=str(place))
         with McapLogWriter(output, profile="ros2" if source is None else source_profile(source)) as writer:
-            lost: tuple[Loss, ...] = ()
             if source is None:
                 _write_tables(writer, log)
             else:
                 channels = register_channels(writer, source)
-                lost = channels.lost
                 writer.write([], raws=iterate_copy(source, channels))
                 for attachment in source.attachments():
                     writer.attachment(attachment)
                 for record in source.metadata_records():
                     writer.metadata(record.name, record.metadata)
-        return (*lost, *log.lost), sum(topic.messages for topic in log.topics)
+        return log.lost, sum(topic.messages for topic in log.topics)
 
 
 def _write_tables(writer: McapLogWriter, log: DriveLog) -> None:

@@ -6,7 +6,7 @@ A package adds formats by entry points of the group ``pdhef.log_formats``; each 
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -40,8 +40,8 @@ class LogFormat:
     suffixes : by which a search through folders takes files for logs. named : also, if it is named outright.
     magic : first bytes of every file, or several possible ones; empty: a file is recognised by its suffix.
     needs_suffix : whether files of other formats begin with the same bytes, so that the suffix must match too.
-    generality : how often such files contain something else: a search through folders ignores them where logs of a
-        lower generality are beside them.
+    is_general : whether such files often contain something else: a search through folders ignores them where logs of
+        other formats are beside them. is_text : whether most of them do: it ignores them beside other general files.
     """
 
     title: str
@@ -49,7 +49,8 @@ class LogFormat:
     suffixes: tuple[str, ...]
     magic: bytes | tuple[bytes, ...] = b""
     needs_suffix: bool = False
-    generality: int = 0
+    is_general: bool = False
+    is_text: bool = False
     named: tuple[str, ...] = ()
     libraries: tuple[str, ...] | None = None
 
@@ -76,15 +77,15 @@ FORMATS = (
     LogFormat("a VBO file", f"{__package__}.text_logs:open_vbo", (".vbo",), libraries=("polars",)),
     LogFormat(
         "a CSV file", f"{__package__}.text_logs:open_csv", (".csv", ".tsv"),
-        generality=1, named=(".txt",), libraries=("polars",),
+        is_general=True, named=(".txt",), libraries=("polars",),
     ),
     LogFormat(
         "a Parquet file", f"{__package__}.parquet_log:open_parquet", (".parquet",), b"PAR1",
-        generality=1, libraries=("polars", "pyarrow.parquet"),
+        is_general=True, libraries=("polars", "pyarrow.parquet"),
     ),
     LogFormat(
         "a MAT file", f"{__package__}.mat_log:open_mat", (".mat",), b"MATLAB ",
-        generality=1, libraries=("h5py",),
+        is_general=True, libraries=("h5py",),
     ),
     LogFormat(
         "an MDF file", f"{__package__}.mdf_log:open_mdf", (".mf4", ".mdf"), (b"MDF     ", b"UnFinMF "),
@@ -92,10 +93,10 @@ FORMATS = (
     ),
     LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG", libraries=()),
     LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",), libraries=()),
-    LogFormat("a candump log", f"{__package__}.can_logs:open_candump", (".log",), generality=2, libraries=()),
+    LogFormat("a candump log", f"{__package__}.can_logs:open_candump", (".log",), is_general=True, is_text=True, libraries=()),
     LogFormat(
         "a file of JSON lines", f"{__package__}.json_lines:open_json_lines", (".jsonl", ".ndjson"),
-        generality=2, named=(".json",), libraries=("polars",),
+        is_general=True, is_text=True, named=(".json",), libraries=("polars",),
     ),
 )  # fmt: skip
 
@@ -125,14 +126,17 @@ def log_suffixes() -> tuple[str, ...]:
 
 
 def without_general(names: set[str]) -> set[str]:
-    """Return the names of the logs in one folder that have the lowest generality."""
-    ranks: dict[int, set[str]] = {}
-    for name in names:
-        bare = next((name.removesuffix(end) for end in COMPRESSED_SUFFIXES if name.endswith(end)), name).lower()
-        ranks.setdefault(
-            max((f.generality for f in _every_format() if bare.endswith((*f.suffixes, *f.named))), default=0), set()
-        ).add(name)
-    return ranks[min(ranks)] if ranks else set()
+    """Return the names of the logs in one folder, without those of general formats beside others."""
+    for only_texts in (False, True):
+        ends = _ends(f for f in _every_format() if f.is_general and f.is_text >= only_texts)
+        if kept := {name for name in names if not name.endswith(ends)}:
+            return kept
+    return names
+
+
+def _ends(formats: Iterable[LogFormat]) -> tuple[str, ...]:
+    ends = [suffix for f in formats for suffix in (*f.suffixes, *f.named)]
+    return tuple(suffix + compressed for suffix in ends for compressed in ("", *COMPRESSED_SUFFIXES))
 
 
 def what_is_a_log() -> str:

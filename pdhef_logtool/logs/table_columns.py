@@ -222,10 +222,11 @@ def tables_of(
     """
     used: frozenset[str] = frozenset()
     if stamps is None:
-        clock = find_clock(sheet, where, rate_hz=None if _named_values(sheet) else rate_hz)
+        named_values = _named_values(sheet)
+        clock = find_clock(sheet, where, rate_hz=None if named_values else rate_hz)
         stamps, used = clock.stamps_ns, clock.columns
         losses.extend(clock_notes(clock, where))
-        if long := list(_of_long_form(sheet, stamps)):
+        if named_values and (long := list(_of_long_form(sheet, stamps, *named_values))):
             for name, (part, its) in zip(unique(part.name for part, _ in long), long, strict=True):
                 yield from tables_of(Sheet(name, part.columns, part.units), where, losses, its)
             return
@@ -275,24 +276,22 @@ def _own_rows(there: BoolArray, stamps: IntArray) -> BoolArray:
     return there if has_clock else np.ones(len(there), np.bool_)
 
 
-def _named_values(sheet: Sheet) -> tuple[Any, Any] | None:
-    """Return names and values of a table in long form, None for another table."""
+def _named_values(sheet: Sheet) -> tuple[Any, Any, Any] | None:
+    """Return names, values and units of a table in long form, None for another table."""
     named = {snake(name): column for name, column in sheet.columns.items()}
     signal, value = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in (_SIGNAL, _VALUE))
     is_long = signal is not None and not isinstance(signal, np.ndarray) and isinstance(value, np.ndarray)
-    return (signal, value) if is_long else None
+    return (signal, value, named.get("unit", named.get("units"))) if is_long else None
 
 
-def _of_long_form(sheet: Sheet, stamps: IntArray) -> Iterator[tuple[Sheet, IntArray]]:
+def _of_long_form(
+    sheet: Sheet, stamps: IntArray, signal: Series, value: NDArray[Any], units: Any
+) -> Iterator[tuple[Sheet, IntArray]]:
     """Yield the signals of a table with a row for each value; signals with equal times are one sheet."""
-    named = {snake(name): column for name, column in sheet.columns.items()}
-    if (long := _named_values(sheet)) is None:
-        return
-    signal, value = long
     import polars as pl
 
     rows_of = pl.DataFrame({"signal": signal}).with_row_index().drop_nulls().group_by("signal", maintain_order=True)
-    grouped, units = rows_of.agg("index"), named.get("unit", named.get("units"))
+    grouped = rows_of.agg("index")
     if grouped.height**2 > 100 * len(signal):  # texts of another kind
         return
     clocks: dict[bytes, tuple[Sheet, IntArray]] = {}

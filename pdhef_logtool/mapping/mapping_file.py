@@ -111,13 +111,6 @@ class _CanTable(BaseModel):
         return self
 
 
-class _TablesEntries(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, defer_build=True)
-
-    rate_hz: Annotated[float, Field(gt=0, le=1e6)] | None = None
-    group: str = ""
-
-
 def mapping_of(given: Mapping | Path | str | None) -> Mapping | None:
     """Return the mapping, read from its file if a path is given; None stays None. Raises MappingFileError."""
     return load_mapping(given) if isinstance(given, Path | str) else given
@@ -170,8 +163,9 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
         problems.append("fill_recognised: should be true or false")
         fill = False
     recorder = _read_recorder(raw.get("recorder", {}), problems)
-    tables = checked(_TablesEntries, {k: raw[k] for k in ("rate_hz", "group") if k in raw}, "", problems)
-    rate_hz, group = (None, "") if tables is None else (tables.rate_hz, tables.group)
+    rate_hz, group = raw.get("rate_hz"), raw.get("group", "")
+    if not isinstance(group, str) or not (rate_hz is None or (isinstance(rate_hz, int | float) and rate_hz > 0)):
+        problems.append("rate_hz: should be rows per second, group: a name")
     mapping = Mapping(
         signals, truth, quality, can=can, estimates=estimates, fill_recognised=fill, recorder=recorder,
         rate_hz=rate_hz, group=group,

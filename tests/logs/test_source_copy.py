@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,6 @@ def _copy(source: Path, target: Path) -> None:
     log = open_log(source)
     with McapLogWriter(target, profile=source_profile(log)) as writer:
         channels = register_channels(writer, log)
-        assert channels.lost == ()
         writer.write([], iterate_copy(log, channels))
         for a in log.attachments():
             writer.attachment(a)
@@ -145,37 +145,18 @@ def test_an_old_database_copy_gets_the_definitions_of_common_types(shared_dir: P
 @pytest.mark.parametrize(
     "name", ["reader_corpus/plotjuggler/tilt_laser.bag", "reader_corpus/foxglove_rosbag1/example-bz2.bag"]
 )
-def test_a_ros1_bag_becomes_ros2_cdr_of_the_same_content(shared_dir: Path, tmp_path: Path, name: str) -> None:
+def test_a_copy_of_a_bag_keeps_its_messages(shared_dir: Path, tmp_path: Path, name: str) -> None:
     _copy(shared_dir / name, tmp_path / "copy.mcap")
-    original, copied = decoded_by_rosbags([shared_dir / name]), decoded_by_rosbags([tmp_path / "copy.mcap"])
-    assert set(copied) == set(original)
-    for topic, messages in original.items():
-        theirs = sorted((stamp, _without_sequence_number(m)) for stamp, m in messages)
-        ours = sorted((stamp, _without_sequence_number(m)) for stamp, m in copied[topic])
-        assert ours == theirs, topic
-    log = open_log(tmp_path / "copy.mcap")
-    assert {t.encoding for t in log.topics} == {"cdr"}
-    log.close()
-
-
-def _without_sequence_number(message: object) -> str:
-    """Text of a message; ROS 2 headers have no sequence number."""
-    if hasattr(message, "__dict__"):
-        members = {k: v for k, v in vars(message).items() if k not in ("seq", "__msgtype__")}
-        return "{" + ", ".join(f"{k}: {_without_sequence_number(v)}" for k, v in members.items()) + "}"
-    if isinstance(message, list):
-        return "[" + ", ".join(_without_sequence_number(m) for m in message) + "]"
-    if isinstance(message, np.ndarray):
-        return f"{message.dtype} {message.tolist()}"
-    return repr(message)
-
-
-def test_header_sequence_numbers_of_ros1_become_message_sequences(shared_dir: Path, tmp_path: Path) -> None:
-    source = shared_dir / "reader_corpus/plotjuggler/tilt_laser.bag"
-    _copy(source, tmp_path / "copy.mcap")
-    expected = [m.header.seq for _, m in decoded_by_rosbags([source])["/imu_data"]]
-    assert len(set(expected)) > 100
-    assert [m[6] for m in _content(tmp_path / "copy.mcap") if m[1] == "/imu_data"] == expected
+    with closing(open_log(shared_dir / name)) as bag, closing(open_log(tmp_path / "copy.mcap")) as copy:
+        assert [(t.name, t.type_name, t.encoding, t.messages) for t in copy.topics] == [
+            (t.name, t.type_name, "ros1", t.messages) for t in bag.topics
+        ]
+        paths = {t.name: [f.path for f in bag.fields(t.name) if f.kind != "string"][:50] for t in bag.topics}
+        expected, found = bag.read(paths), copy.read(paths)
+        for topic, columns in expected.items():
+            np.testing.assert_array_equal(found[topic].log_time_ns, columns.log_time_ns)
+            for path, values in columns.fields.items():
+                np.testing.assert_array_equal(found[topic].fields[path], values)
 
 
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
