@@ -93,7 +93,10 @@ FORMATS = (
     ),
     LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG", libraries=()),
     LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",), libraries=()),
-    LogFormat("a candump log", f"{__package__}.can_logs:open_candump", (".log",), is_general=True, is_text=True, libraries=()),
+    LogFormat(
+        "a candump log", f"{__package__}.can_logs:open_candump", (".log",),
+        is_general=True, is_text=True, libraries=(),
+    ),
     LogFormat(
         "a file of JSON lines", f"{__package__}.json_lines:open_json_lines", (".jsonl", ".ndjson"),
         is_general=True, is_text=True, named=(".json",), libraries=("polars",),
