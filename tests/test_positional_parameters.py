@@ -35,18 +35,3 @@ def test_no_function_takes_many_positional_parameters(package: str) -> None:
     found = {str(p.relative_to(_ROOT)): overlong(p.read_text()) for p in sorted((_ROOT / package).rglob("*.py"))}
     assert found, "nothing was looked at"
     assert {path: names for path, names in found.items() if names} == {}
-
-
-@pytest.mark.parametrize(
-    ("source", "names"),
-    [
-        ("def f(a, b, c, d, e, f, g, h, *, i): ...", []),
-        ("def f(a, /, b, c, d, e, f, g, h, i): ...", ["f (9)"]),
-        ("class C:\n    def f(self, a, b, c, d, e, f, g, h, i): ...", ["f (9)"]),
-        ("# positional: why\n@njit\ndef f(a, b, c, d, e, f, g, h, i): ...", []),
-        ("def f(a, b, c, d, e, f, g, h, i): ...  # positional: why", []),
-        ("# positional: too far\n\ndef f(a, b, c, d, e, f, g, h, i): ...", ["f (9)"]),
-    ],
-)
-def test_it_is_seen(source: str, names: list[str]) -> None:
-    assert overlong(source) == names

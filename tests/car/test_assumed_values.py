@@ -5,13 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from pdhef_logtool.car.assumed_values import RULES, completed
-from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.assumed_values import RULES
 from pdhef_logtool.car.toml_files import read_vehicle_file
-from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.records.errors import VehicleError
 from studies.documentation_tables import on_page_markdown
 
@@ -45,13 +41,6 @@ def test_mass_wheelbase_and_weight_split_suffice(tmp_path: Path, vehicle: tuple[
     assert {a.entry for a in file.assumed} >= {"yaw_inertia_kg_m2", "tyres.rear.cornering_stiffness_n_per_rad"}
     assert all(a.spread > 0 and a.rule for a in file.assumed)
     assert file.vehicle.understeer_gradient_rad_per_m_s2() > 0  # the default vehicle understeers
-
-
-@given(st.floats(1.0, 6e4), st.floats(0.3, 1.0), st.floats(0.3, 0.7))
-def test_whatever_the_size_the_assumed_values_agree_with_one_another(mass: float, size: float, share: float) -> None:
-    wheelbase = size * 0.22 * mass ** (1 / 3) + 0.05  # longer for heavier, over a factor of three
-    entries, _ = completed(rough(mass, wheelbase, share))
-    VehicleParameters(**entries)
 
 
 def test_what_is_given_is_kept_and_what_builds_on_it_follows(tmp_path: Path) -> None:
@@ -89,12 +78,6 @@ def test_without_a_weight_split_that_of_a_passenger_car_is_assumed_and_named(tmp
 def test_wrong_entries_are_named(tmp_path: Path, entries: dict[str, float], named: str) -> None:
     with pytest.raises(VehicleError, match=named):
         read_vehicle_file(write(tmp_path, entries))
-
-
-def test_the_car_names_what_was_assumed(tmp_path: Path) -> None:
-    car = Car.load(write(tmp_path, rough(1440.0, 2.87, 0.6)), network="none")
-    assert {a.entry for a in car.assumed} == {a.entry for a in completed(rough(1440.0, 2.87, 0.6))[1]}
-    assert Car.load(network="none").assumed == ()
 
 
 def test_the_documentation_has_every_rule() -> None:

@@ -40,12 +40,6 @@ def test_a_network_acts_on_the_physics_that_it_was_trained_with() -> None:
     assert _gain(own.with_noise("physics", FilterNoise(q_std=(1.0, 1.0, 1.0))))[0] == 1.0
 
 
-def test_a_car_made_wrong_on_purpose_keeps_its_gain() -> None:
-    heavier = SEDAN.vehicle.model_copy(update={"mass_kg": 1500.0})
-    for network, gain in ((OWN, 1.0), (FOREIGN, 0.0)):
-        assert replace(SEDAN, network=network).with_vehicle(heavier).residual_gain == gain
-
-
 def test_the_file_decides_before_the_network_and_the_name_before_both(tmp_path: Path) -> None:
     for gain in (0.0, 0.25):
         (tmp_path / "car.toml").write_text(f"{vehicle_toml(SEDAN.vehicle)}\n[network]\ngain = {gain}\n")

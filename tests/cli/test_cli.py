@@ -136,13 +136,6 @@ def test_a_missing_file_is_one_line_and_exit_code_2(sample_logs_dir: Path, tmp_p
     assert "none" in _one_line_error(result)
 
 
-def test_a_plan_is_written_once(tmp_path: Path) -> None:
-    file = str(tmp_path / "plan.toml")
-    assert called("plan", "init", "-o", file).returncode == 0
-    assert "got one that exists" in called("plan", "init", "-o", file).stderr
-    assert called("plan", "start", "-o", file).returncode == 2
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
@@ -249,16 +242,6 @@ def test_inspect_writes_a_mapping_that_run_takes(sample_logs_dir: Path, tmp_path
     assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
-@pytest.mark.slow
-def test_inspect_never_overwrites_a_mapping(sample_logs_dir: Path, tmp_path: Path) -> None:
-    mapping = tmp_path / "mapping.toml"
-    mapping.write_text("# mine\n")
-    result = called("inspect", str(sample_logs_dir / "dlc.mcap"), "--write-mapping", str(mapping))
-    assert result.returncode == 1
-    assert "mapping.toml" in _one_line_error(result)
-    assert mapping.read_text() == "# mine\n"
-
-
 def _run_of(folder: Path, *names: str) -> Path:
     """Write a run; every log except the last, which failed, has a recording with only a footer."""
     for name in names[:-1]:
@@ -293,14 +276,6 @@ def test_view_takes_all_recordings_of_a_run_or_the_named_ones(tmp_path: Path, mo
     assert called[0][1:] == ["-m", "rerun", "--bind", "127.0.0.1", "--new", "--web-viewer", str(of["b"]), str(of["a"])]
 
 
-def test_view_without_a_display_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    result = called("view", str(_run_of(tmp_path, "a", "failed")))
-    assert result.returncode == 2
-    assert "add --web" in _one_line_error(result)
-
-
 def test_a_bug_of_ours_is_one_line_too(sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("on purpose")
@@ -321,10 +296,3 @@ def test_map_without_a_terminal_writes_what_was_found(sample_logs_dir: Path, tmp
     assert "[signals.steer" in (tmp_path / "m.toml").read_text()
     again = called("map", str(sample_logs_dir / "dlc.mcap"), "-o", "m.toml", cwd=tmp_path)
     assert "one that exists" in _one_line_error(again)
-
-
-@pytest.mark.slow
-def test_a_topic_goes_with_fields(sample_logs_dir: Path) -> None:
-    log = str(sample_logs_dir / "dlc.mcap")
-    assert "angular_velocity.z" in called("inspect", log, "--fields", "/imu/data").stdout
-    assert "--fields" in _one_line_error(called("inspect", log, "/imu/data"))

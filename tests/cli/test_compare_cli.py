@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 from pdhef_logtool.cli.app import app
 from pdhef_logtool.records.errors import UsageError
 from tests.results.made_run import write_estimates, write_run
-from truthsim.samples import convert_to_rosbag2
 
 TEN = {f"drive_{i}": 0.001 * (1 + i) for i in range(10)}
 
@@ -46,14 +45,6 @@ def test_a_regression_is_told_with_its_drives_and_where_they_part(runs: tuple[st
     first = " ".join(text[: text.index("\nA ")].split())
     assert first.startswith("Result B is worse: sideslip RMSE +14.5 % (+11.4 % to +17.6 %) of 10 drives; gate closed: ")
     assert first.endswith("Next look at drive_9 first: its error increased most")
-
-
-def test_the_same_run_is_equal(runs: tuple[str, str]) -> None:
-    code, text = _pdhef("compare", runs[0], runs[0], "--max-regression", "0.05", "--strict")
-    assert code == 0
-    assert (
-        text.splitlines()[0].split(maxsplit=1)[1].rstrip() == "equal: all figures of all pairs are the same bit for bit"
-    )
 
 
 def test_json_and_junit_say_the_same(runs: tuple[str, str], tmp_path: Path) -> None:
@@ -109,20 +100,6 @@ def test_a_plan_and_a_figure_of_the_command_line_do_not_go_together(runs: tuple[
         _pdhef("compare", *runs, "--metric", "bias")
     with pytest.raises(UsageError, match=r"a share such as 5% or 0\.05, got five"):
         _pdhef("compare", *runs, "--max-regression", "five")
-
-
-@pytest.mark.slow
-def test_two_containers_of_one_drive_are_one_drive_and_give_the_same_figures(
-    sample_logs_dir: Path, tmp_path: Path
-) -> None:
-    convert_to_rosbag2(sample_logs_dir / "dlc.mcap", tmp_path / "bag")
-    common = ("--car", "saloon", "--annotate", "none", "-e", "zero")
-    for log, out in ((sample_logs_dir / "dlc.mcap", "a"), (tmp_path / "bag", "b")):
-        assert _pdhef("run", str(log), "-o", str(tmp_path / out), *common)[0] == 0
-    code, text = _pdhef("compare", str(tmp_path / "a"), str(tmp_path / "b"), "--json", "--max-regression", "0")
-    document = json.loads(text)
-    assert (code, document["verdict"], document["pairs"]) == (0, "equal", {"signals": 1})
-    assert document["differences"] == []
 
 
 def test_events_are_told_in_a_table_with_what_was_not_searched(runs: tuple[str, str], tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -63,16 +62,6 @@ def test_table_and_assumptions_go_to_stdout(annotated: str) -> None:
     assert all(len(line) <= 100 for line in result.stdout.splitlines())
 
 
-def test_json_is_one_document(annotated: str, tmp_path: Path) -> None:
-    result = called("metrics", annotated, *ESTIMATE, "--plan", _plan(tmp_path, 10.0), "--json")
-    document = json.loads(result.stdout)
-    assert document["exit_code"] == result.returncode == 0
-    assert document["output"] is None
-    assert [v["outcome"] for v in document["plan"]["requirements"]] == ["PASS", "INCONCLUSIVE"]
-    assert document["plan"]["requirements"][1]["next"] == "add it to the estimators of pdhef run"
-    assert document["logs"][0]["report"]["estimators"][0]["name"] == "phy-ukf"
-
-
 def test_passed_gate_is_0_and_failed_gate_is_4(annotated: str, tmp_path: Path) -> None:
     junit = tmp_path / "gate.xml"
     passed = called("metrics", annotated, *ESTIMATE, "--plan", _plan(tmp_path, 10.0), "--junit", str(junit))
@@ -84,18 +73,6 @@ def test_passed_gate_is_0_and_failed_gate_is_4(annotated: str, tmp_path: Path) -
     assert "FAIL: SR-1 (sideslip p95 ≤ 0.01° (worst drive)): worst of 1 drives" in failed.stderr
     (suite,) = ET.parse(junit).getroot()
     assert (suite.attrib["tests"], suite.attrib["failures"], suite.attrib["skipped"]) == ("2", "1", "1")
-
-
-def test_run_has_the_same_gate(sample_logs_dir: Path, tmp_path: Path) -> None:
-    logs = [str(sample_logs_dir / "dlc.mcap"), str(sample_logs_dir / "sweep.mcap")]
-    junit = tmp_path / "gate.xml"
-    result = called(
-        "run", *logs, "-o", str(tmp_path / "out"), "-e", "zero", "--annotate", "none",
-        "--plan", _plan(tmp_path, 0.01), "--junit", str(junit),
-    )  # fmt: skip
-    assert result.returncode == 4
-    assert [(s.attrib["name"], s.attrib["tests"]) for s in ET.parse(junit).getroot()] == [("plan.toml", "2")]
-    assert (tmp_path / "out/run.json").is_file()
 
 
 def test_failed_gate_wins_over_lost_input_and_both_are_said(sample_logs_dir: Path, tmp_path: Path) -> None:

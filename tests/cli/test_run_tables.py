@@ -78,11 +78,6 @@ def test_the_answer_stands_first_then_three_rows() -> None:
     assert "In hindsight" not in text  # no other estimator was better
 
 
-def test_hashes_and_notes_stay_in_the_report() -> None:
-    estimators = [ran("pd-hef", notes=[f"network {SHA}"])]
-    assert SHA[:12] not in shown(report(replace(MAIN, shown=["pd-hef"]), estimators=estimators))
-
-
 def test_without_truth_there_is_no_column_of_errors() -> None:
     metrics = figures(
         ("pd-hef", "vy_m_s", "d2", 0.1),
@@ -129,12 +124,6 @@ def test_estimators_that_were_skipped_are_named_with_the_reason_once() -> None:
     drive["estimators"] += [{**drive["estimators"][0], "name": name, **skipped} for name in ("one", "two")]
     (line,) = (line for line in shown(drive).splitlines() if "skipped" in line)
     assert line.strip() == "one, two skipped: needs a gyro"
-
-
-def test_long_names_of_logs_stay_whole() -> None:
-    name = "recording_of_a_long_day_" * 4
-    text = shown(named(name), named("b"))
-    assert name in "".join(line.split()[0] for line in text.splitlines() if line.strip())
 
 
 def test_a_fleet_is_told_in_a_few_lines_within_80_columns() -> None:

@@ -10,18 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.cli import stopping
-
 PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 FULL = Path("/dev/full")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arguments", [["inspect", "LOG"], ["simulate", "--list"]])
-def test_a_reader_that_has_had_enough_hears_nothing(sample_logs_dir: Path, arguments: list[str]) -> None:
+def test_a_reader_that_has_had_enough_hears_nothing(sample_logs_dir: Path) -> None:
     read, write = os.pipe()
     os.close(read)
-    command = [a.replace("LOG", str(sample_logs_dir / "dlc.mcap")) for a in arguments]
+    command = ["inspect", str(sample_logs_dir / "dlc.mcap")]
     done = subprocess.run([*PDHEF, *command], stdout=write, stderr=subprocess.PIPE, text=True, check=False)
     os.close(write)
     assert (done.returncode, done.stderr) == (141, "")
@@ -29,10 +26,9 @@ def test_a_reader_that_has_had_enough_hears_nothing(sample_logs_dir: Path, argum
 
 @pytest.mark.slow
 @pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
-@pytest.mark.parametrize("arguments", [["simulate", "--list"], ["--version"]])
-def test_an_output_that_takes_nothing_is_one_line(arguments: list[str]) -> None:
+def test_an_output_that_takes_nothing_is_one_line() -> None:
     with FULL.open("w") as full:
-        done = subprocess.run([*PDHEF, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        done = subprocess.run([*PDHEF, "--version"], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 1
     assert done.stderr == (
         "pdhef: standard output: expected a place to write to, got No space left on device; "
@@ -41,10 +37,9 @@ def test_an_output_that_takes_nothing_is_one_line(arguments: list[str]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("closed", [(1,), (0, 1, 2)])
-def test_closed_streams_are_no_error_and_no_output_gets_their_numbers(tmp_path: Path, closed: tuple[int, ...]) -> None:
+def test_closed_streams_are_no_error_and_no_output_gets_their_numbers(tmp_path: Path) -> None:
     log = tmp_path / "x.mcap"
-    shell = " ".join([*PDHEF, "simulate", "dlc", "--duration", "5", "-o", str(log), *(f"{n}>&-" for n in closed)])
+    shell = " ".join([*PDHEF, "simulate", "dlc", "--duration", "5", "-o", str(log), "0>&- 1>&- 2>&-"])
     done = subprocess.run(["sh", "-c", shell], capture_output=True, check=False)
     assert done.returncode == 0
     assert log.read_bytes().endswith(b"\x89MCAP0\r\n")
@@ -73,9 +68,7 @@ main()
 @pytest.mark.parametrize(
     ("name", "way", "code", "said"),
     [
-        ("SIGINT", "raised", 130, "interrupted"),
         ("SIGINT", "changed", 130, "interrupted"),
-        ("SIGTERM", "raised", 143, "terminated"),
         ("SIGTERM", "swallowed", 143, "terminated"),
     ],
 )
@@ -94,11 +87,6 @@ def test_the_second_request_ends_at_once_and_what_is_ignored_stays_so() -> None:
     script += "signal.raise_signal(signal.SIGINT)\nprint('still here')"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (-signal.SIGINT, "")
-
-
-def test_nothing_came_here() -> None:
-    assert stopping.came() is None
-    stopping.check()
 
 
 def test_without_a_terminal_progress_is_a_line_every_half_minute(

@@ -45,14 +45,6 @@ def test_same_stem_gets_hash_digits_that_depend_on_the_path_only(tmp_path: Path)
     assert {f.path.name: f.stem for f in find_logs([str(tmp_path / "x" / "*")])} == stems
 
 
-def test_stems_are_relative_to_the_common_root(tmp_path: Path) -> None:
-    _touch(tmp_path, "car1/d.mcap", "car2/d.mcap")
-    assert [f.stem for f in find_logs([str(tmp_path / "car1" / "d.mcap"), str(tmp_path / "car2")])] == [
-        "car1__d",
-        "car2__d",
-    ]
-
-
 def test_each_log_once_whatever_names_it(tmp_path: Path) -> None:
     _touch(tmp_path, "a.mcap")
     (tmp_path / "link.mcap").symlink_to(tmp_path / "a.mcap")

@@ -12,7 +12,6 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
-from pdhef_logtool.drive.correlation import parabolic_peak
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.truth import (
     channel_of,
@@ -306,17 +305,6 @@ def test_derivative_agrees_with_scipy_on_even_stamps():
     assert np.isnan(ours[-10:]).all()
 
 
-@settings(derandomize=True, max_examples=30, deadline=None)
-@given(seed=st.integers(0, 10**6), coefficients=st.lists(st.floats(-5, 5), min_size=4, max_size=4))
-def test_derivative_of_a_cubic_is_exact_on_uneven_stamps(seed, coefficients):
-    rng = np.random.default_rng(seed)
-    stamps = T0 + np.cumsum(rng.integers(2_000_000, 25_000_000, 200))
-    t = (stamps - T0) * 1e-9
-    p = np.polynomial.Polynomial(coefficients)
-    ours = differentiate(stamps, p(t), 6, 30_000_000)
-    np.testing.assert_allclose(ours[6:-6], p.deriv()(t)[6:-6], atol=1e-6)
-
-
 def test_no_derivative_across_a_gap_or_a_missing_value():
     stamps = T0 + np.arange(300) * 10_000_000
     stamps[150:] += 1_000_000_000
@@ -395,14 +383,6 @@ def test_a_known_latency_is_found_to_a_millisecond(latency, seed, truth_rate):
     assert abs(estimate.latency_s - latency) < 1e-3
 
 
-def test_latency_survives_a_dropout():
-    gyro, truth = yaw_rates(0.12)
-    keep = np.ones(len(truth), dtype=bool)
-    keep[1000:2500] = False
-    truth = channel("yaw_rate_rad_s", truth.stamps_ns[keep], truth.values[keep])
-    assert abs(estimate_truth_latency(gyro, truth).latency_s - 0.12) < 1e-3
-
-
 def test_without_yaw_motion_no_latency_is_claimed():
     gyro, truth = yaw_rates(0.1, scale=0.002)
     estimate = estimate_truth_latency(gyro, truth)
@@ -427,12 +407,6 @@ def test_the_gyros_own_channel_as_truth_is_flagged():
     estimate = estimate_truth_latency(gyro, truth)
     assert estimate.identical
     assert estimate.latency_s == 0.0
-
-
-def test_parabola_vertex():
-    f = lambda x: 3.0 - 2.0 * (x - 0.3) ** 2  # noqa: E731
-    assert parabolic_peak(f(-1), f(0), f(1)) == pytest.approx(0.3)
-    assert parabolic_peak(1.0, 1.0, 1.0) == 0.0
 
 
 def test_latency_of_a_truth_whose_yaw_rate_is_derived():
@@ -473,13 +447,6 @@ def test_a_few_equal_samples_or_a_constant_do_not_make_a_copy():
     assert (
         dependent_signals({"speed_m_s": standing}, {"vx_m_s": channel("vx_m_s", stamps, np.zeros(stamps.size))}) == {}
     )
-
-
-def test_a_copy_with_another_latency_is_still_a_copy():
-    stamps, d = drive(10.0)
-    truth = {"vx_m_s": channel("vx_m_s", stamps, d.vx)}
-    signals = {"speed_m_s": channel("speed_m_s", stamps + 7_000_000, d.vx, SIGNAL_UNITS)}
-    assert list(dependent_signals(signals, truth)) == ["vx_m_s"]
 
 
 def test_valid_means_that_everything_claimed_is_known():

@@ -19,13 +19,11 @@ import pytest
 from half_slip_package import example_code, install
 from reference_car import cut, drive, slalom, with_noise
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators import table
 from pdhef_logtool.estimators.base import Steps, make_steps
 from pdhef_logtool.estimators.causality_check import SHORT_CUT, CausalityCheck
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.table import Spec, make_estimator
+from pdhef_logtool.estimators.table import Spec
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.runs.config import RunConfig
@@ -148,13 +146,6 @@ def test_the_check_leaves_the_estimates_and_a_state_that_is_changed_in_place_alo
     np.testing.assert_array_equal(np.concatenate(checked), np.concatenate(plain))
 
 
-def test_every_shipped_estimator_is_what_it_declares(signals: Signals) -> None:
-    car = Car.of(default_vehicle())
-    for name in table.all_names(car):
-        if (estimator := make_estimator(name, car)).causal:
-            assert reason(estimator, signals, (0, 150), (150, len(signals))) == "", name
-
-
 # --- in a run --------------------------------------------------------------------------------------------------------
 
 
@@ -211,16 +202,6 @@ def _python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, *arguments], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
     )
-
-
-@pytest.mark.slow
-def test_the_example_of_architecture_passes_all_tests_of_estimators(tmp_path: Path) -> None:
-    code = example_code()
-    assert len(code.splitlines()) <= 40
-    done = _python(install(tmp_path, code), "-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", "half-slip",
-                   "tests/estimators/test_estimators.py", "tests/estimators/test_table.py")  # fmt: skip
-    assert done.returncode == 0, done.stdout[-3000:]
-    assert int(re.search(r"(\d+) passed", done.stdout)[1]) >= 50  # type: ignore[index]
 
 
 @pytest.mark.slow

@@ -103,59 +103,10 @@ def test_an_error_is_flagged_while_it_grows_and_taken_back_with_it(degrees: floa
     assert left > 2.9 or not found[t > 7.0 + rise_s + 0.1].any()
 
 
-def test_the_lever_arm_and_the_roll_count() -> None:
-    """The truth at the CG against the IMU's reading: without its position or the roll it looks like divergence."""
-    signals, truth = motion(share=1.0, hz=1.0)
-    assert not flags(truth, signals).any()
-    wrong = VEHICLE.model_copy(update={"imu_position_m": (-10.0, 0.0, 0.0)})
-    assert flags(truth, signals, wrong).any()
-    signals, truth = motion(share=1.0, hz=0.1)
-    assert not flags(truth, signals).any()
-    assert flags(truth, signals, VEHICLE.model_copy(update={"roll_gradient_rad_per_m_s2": 0.06})).any()
-
-
 def test_in_the_linear_range_bank_and_bias_are_no_divergence() -> None:
     signals, truth = motion(share=0.3)
     banked = replace(signals, ay_m_s2=signals.ay_m_s2 + 1.0)  # 10 % of bank
     assert not flags(truth, banked).any()
-
-
-def test_stuck_and_missing_sensors_are_not_judged() -> None:
-    signals, truth = motion()
-    t = seconds(signals)
-    for column in ("yaw_rate_rad_s", "ay_m_s2"):
-        at = int(np.searchsorted(t, 5.0))
-        stuck = np.where(t >= 5.0, getattr(signals, column)[at], getattr(signals, column))
-        assert not flags(truth, replace(signals, **{column: stuck})).any()
-        missing = np.where(t >= 5.0, np.nan, getattr(signals, column))
-        assert not flags(truth, replace(signals, **{column: missing})).any()
-    moving = np.where(t >= 5.0, 1e-5 * np.arange(len(t)), signals.yaw_rate_rad_s)
-    assert flags(truth, replace(signals, yaw_rate_rad_s=moving)).any()  # only the repetition excuses it
-
-
-def test_sensors_at_half_the_rate_are_held() -> None:
-    signals, truth = motion()
-    even = np.arange(len(signals)) % 2 == 0
-    half = replace(signals, yaw_rate_rad_s=np.where(even, signals.yaw_rate_rad_s, np.nan))
-    assert not flags(truth, half).any()
-    assert flags(off_by(truth, 12.0, 5.0, 7.0), half).any()
-
-
-def test_sensors_too_noisy_to_judge_do_not_judge() -> None:
-    signals, truth = motion()
-    wrong = off_by(truth, 12.0, 5.0, 7.0)
-    rough = VEHICLE.sensors.model_copy(update={"ay_std_m_s2": 40.0})
-    assert flags(wrong, signals).any()
-    assert not flags(wrong, signals, VEHICLE.model_copy(update={"sensors": rough})).any()
-
-
-def test_the_flag_waits_for_the_samples_to_arrive() -> None:
-    late_ns = 200_000_000
-    signals, truth = motion(delay_ns=0)
-    wrong = off_by(truth, 20.0, 5.0, 7.0)
-    late = replace(signals, ready_ns=signals.stamps_ns + late_ns)
-    at, at_late = (int(np.flatnonzero(flags(wrong, s))[0]) for s in (signals, late))
-    assert 0.185 <= seconds(signals)[at_late] - seconds(signals)[at] <= 0.215
 
 
 def test_what_comes_later_changes_no_flag() -> None:

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, drive, keep, slalom, tanh_tyre, with_noise
+from reference_car import drive, keep, slalom, tanh_tyre, with_noise
 
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, default_vehicle
 from pdhef_logtool.drive.friction import friction_source, parse_friction
-from pdhef_logtool.estimators.friction_bank import BOUND_SHARE, FORGETTING_S, FrictionBank, FrictionEstimate
+from pdhef_logtool.estimators.friction_bank import FrictionBank, FrictionEstimate
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.signals import SIGNAL_COLUMNS, Signals
+from pdhef_logtool.records.signals import Signals
 
 pytestmark = pytest.mark.slow
 
@@ -51,50 +51,11 @@ def test_friction_is_found_after_three_seconds_of_excitation(mu):
     assert found.observable[after].mean() > 0.8
 
 
-@pytest.mark.parametrize("mu", [0.3, 0.6])
-def test_tyres_that_keep_their_stiffness_show_friction_near_the_limit(mu):
-    """There friction shows in the curve's bend alone."""
-    steer = slalom(0.15 * mu, 0.5)
-    signals = with_noise(drive(steer, 8.0, speed=20.0, mu=mu, tyre=tanh_tyre).signals, seed=2)
-    found = estimate(signals, STIFFNESS_VEHICLE)
-    after = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9 > 3.0
-    assert abs(np.median(found.friction[after]) - mu) < 0.15
-
-
 @pytest.mark.parametrize("mu", [0.3, 0.9])
 def test_a_straight_shows_nothing(mu):
     found = estimate(with_noise(drive(lambda _t: 0.0, 20.0, mu=mu).signals, seed=1))
     assert not found.observable.any()
     assert found.friction.min() > 0.75
-
-
-def test_what_was_seen_is_forgotten_on_a_straight():
-    there = drive(lambda t: slalom(0.05, 0.6)(t) if t < 6.0 else 0.0, 30.0, speed=20.0, mu=0.3)
-    signals = with_noise(there.signals, seed=3)
-    found = estimate(signals)
-    at = np.searchsorted(there.time_s, [6.0, 6.0 + 8.0 * FORGETTING_S])
-    assert found.friction[at[0]] < 0.5
-    assert found.friction[at[1]] > 0.75
-    assert not found.observable[at[1]]
-
-
-def test_friction_is_never_below_what_the_acceleration_needs():
-    signals = excited(0.9, 6.0)
-    found = estimate(signals)
-    capacity = (FRONT_TYRE[2] + REAR_TYRE[2]) / MASS_KG
-    smooth = np.convolve(np.abs(signals.ay_m_s2), np.ones(5) / 5, mode="same")
-    # The bound covers the last 0.1 s. The tolerance allows for the decrease of a_y in this time.
-    behind = np.minimum.reduce([np.roll(smooth, k) for k in range(30)])[40:]
-    assert np.all(found.friction[40:] >= BOUND_SHARE * (behind - 0.3) / capacity)
-
-
-def test_the_bound_holds_beyond_the_bank():
-    """A steady turn that needs more friction than any filter of the bank has."""
-    signals = drive(lambda _t: 0.09, 4.0, speed=25.0, mu=1.8).signals
-    ay = np.abs(signals.ay_m_s2[-1])
-    capacity = (FRONT_TYRE[2] + REAR_TYRE[2]) / MASS_KG
-    assert ay / capacity > 1.25
-    assert estimate(signals).friction[-1] == pytest.approx(BOUND_SHARE * ay / capacity, rel=0.02)
 
 
 def test_spinning_wheels_are_not_a_slippery_road():
@@ -115,21 +76,6 @@ def test_a_file_with_wrong_stiffness_is_no_slippery_road(front, rear):
     found = FrictionBank(vehicle, validated=False).run(signals)
     assert found.friction.min() > 0.8
     assert not found.observable.any()
-
-
-def test_saturation_shows_with_a_file_that_may_be_wrong():
-    found = FrictionBank(VEHICLE, validated=False).run(excited(0.3, 10.0))
-    assert abs(np.median(found.friction[-400:]) - 0.3) < 0.1
-
-
-def test_the_acceleration_that_was_reached_is_forgotten_where_saturation_shows():
-    """A turn on a dry road, then the excitation of a slippery one."""
-    dry, slippery = excited(0.9), excited(0.3)
-    later = replace(slippery, stamps_ns=slippery.stamps_ns + dry.stamps_ns[-1] + 10_000_000 - slippery.stamps_ns[0])
-    joined = {c: np.concatenate([getattr(dry, c), getattr(later, c)]) for c in SIGNAL_COLUMNS}
-    friction = FrictionBank(VEHICLE).run(replace(dry, **joined)).friction
-    assert friction[len(dry)] > 0.7
-    assert abs(np.median(friction[-200:]) - 0.3) < 0.1
 
 
 def rough() -> Signals:
@@ -161,11 +107,6 @@ def test_the_friction_that_is_told_plays_no_part():
     np.testing.assert_array_equal(estimate(ROUGH).friction, estimate(ROUGH, NO_FRICTION).friction)
 
 
-def test_left_and_right_are_the_same():
-    mirrored = replace(ROUGH, steer_rad=-ROUGH.steer_rad, ay_m_s2=-ROUGH.ay_m_s2, yaw_rate_rad_s=-ROUGH.yaw_rate_rad_s)
-    np.testing.assert_allclose(estimate(ROUGH).friction, estimate(mirrored).friction, atol=2e-3)
-
-
 # --- where a run gets its friction from ------------------------------------------------------------------------------
 
 
@@ -187,18 +128,6 @@ def test_the_source_is_named(choice, vehicle, available, label):
     assert source.from_log == label.startswith("topic")
 
 
-def test_the_source_tells_what_it_says():
-    told = replace(ROUGH, friction=np.full(len(ROUGH), 0.2))
-    with_topic = ALL | {"friction"}
-    assert friction_source("auto", VEHICLE, with_topic).fill(told) is told
-    assert np.all(friction_source("file", VEHICLE, with_topic).fill(told).friction == 0.85)
-    assert np.all(friction_source(0.4, VEHICLE, with_topic).fill(told).friction == 0.4)
-    source = friction_source("estimate", VEHICLE, with_topic)
-    np.testing.assert_array_equal(source.fill(told).friction, estimate(ROUGH).friction)
-    assert len(source.observable) == len(ROUGH)
-    assert f"{100 * source.observable.mean():.0f} % of the time" in source.summary
-
-
 def test_what_is_not_there_is_refused():
     with pytest.raises(UsageError, match="friction"):
         friction_source("file", NO_FRICTION, ALL)
@@ -210,8 +139,3 @@ def test_what_is_not_there_is_refused():
 def test_what_is_no_friction_is_refused(text):
     with pytest.raises(UsageError, match="--friction"):
         parse_friction(text)
-
-
-@pytest.mark.parametrize(("text", "want"), [("auto", "auto"), ("0.3", 0.3), (0.85, 0.85), ("estimate", "estimate")])
-def test_choices_and_numbers_are_understood(text, want):
-    assert parse_friction(text) == want

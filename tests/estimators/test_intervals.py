@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +17,8 @@ from pdhef_logtool.car.toml_files import vehicle_toml
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.error_features import FLOOR_RAD, TERMS, error_terms
 from pdhef_logtool.estimators.intervals import (
-    SIDESLIP_TERMS,
     TrackCalibrator,
     calibrated,
-    inflated,
 )
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.reasons import STUCK_AY, STUCK_YAW_RATE
@@ -116,19 +113,6 @@ def test_the_estimate_stays_and_the_covariance_is_scaled_as_one() -> None:
     assert np.all(np.linalg.eigvalsh(after) > 0.0)
 
 
-def test_the_interval_widens_with_every_term() -> None:
-    _, track = _drive(50)
-    track = replace(track, sideslip_std_rad=np.full(50, 0.001))
-    terms = np.full((50, len(TERMS)), 0.001)
-    plain = make_inflation(SIDESLIP_FACTORS, (0.5, 1.2, 0.7))
-    base = inflated(track, terms, plain).sideslip_std_rad
-    np.testing.assert_allclose(base, 0.001 * np.sqrt(np.sum(np.square(SIDESLIP_FACTORS))))
-    for i in range(len(TERMS)):
-        more = terms.copy()
-        more[:, i] = 0.002
-        assert np.all(inflated(track, more, plain).sideslip_std_rad > base)
-
-
 def test_terms_see_a_wrong_sideslip_and_a_wrong_yaw_rate() -> None:
     signals, track = _drive()
     right = replace(track, vy_m_s=track.vy_m_s / 0.8, yaw_rate_rad_s=signals.yaw_rate_rad_s)
@@ -144,49 +128,6 @@ def test_terms_see_a_wrong_sideslip_and_a_wrong_yaw_rate() -> None:
     off = error_terms(replace(right, yaw_rate_rad_s=right.yaw_rate_rad_s - 0.01), signals, 0.0)
     assert off[400, rate] == pytest.approx(0.01, rel=0.05)
     assert np.all(untilted[:, 0] == FLOOR_RAD)
-
-
-def test_grip_follows_the_friction_that_is_told() -> None:
-    signals, track = _drive()
-    grip = TERMS.index("grip")
-    high = error_terms(track, signals, 0.0)[:, grip]
-    low = error_terms(track, replace(signals, friction=signals.friction / 2.0), 0.0)[:, grip]
-    np.testing.assert_allclose(low, 2.0 * high)
-
-
-def test_terms_tell_that_an_estimator_cures_its_car_and_sees_a_bank() -> None:
-    signals, track = _drive()
-    weight = np.linspace(0.0, 1.0, 900)
-    weight[5] = np.nan
-    curing = replace(track, mixture_weight=weight, bank_rad=np.full(900, -0.03))
-    plain, told = (error_terms(t, signals, 0.0) for t in (track, curing))
-    cure, bank = TERMS.index("cure"), TERMS.index("bank")
-    np.testing.assert_allclose(told[:, cure], np.nan_to_num(weight) * np.abs(track.sideslip_rad))
-    np.testing.assert_array_equal(told[:, bank], 0.03)
-    np.testing.assert_array_equal(plain[:, [cure, bank]], 0.0)
-    np.testing.assert_array_equal(np.delete(told, [cure, bank], axis=1), np.delete(plain, [cure, bank], axis=1))
-
-
-def test_a_factor_holds_where_its_share_of_the_grip_is_used() -> None:
-    _, track = _drive(5)
-    track = replace(track, sideslip_std_rad=np.full(5, 0.001))
-    terms = np.full((5, len(TERMS)), 0.001)
-    terms[:, TERMS.index("grip")] = 0.003 * np.array([0.0, 0.2, 0.45, 0.575, 1.2])
-    free = [k * (t != "grip") for t, k in zip(SIDESLIP_TERMS, SIDESLIP_FACTORS, strict=True)]
-    std = [
-        inflated(track, terms, make_inflation(free, (1.0, 1.0, 1.0), 1.0, factors)).sideslip_std_rad
-        for factors in ((1.0, 1.0, 1.0), (0.5, 1.0, 2.0))
-    ]
-    np.testing.assert_allclose(std[1] / std[0], [0.5, 0.5, 1.0, 1.5, 2.0])
-
-
-def test_nothing_is_made_of_missing_samples() -> None:
-    signals, track = _drive(60)
-    nothing = np.full(60, np.nan)
-    blind = replace(signals, ay_m_s2=nothing, yaw_rate_rad_s=nothing, friction=nothing)
-    terms = error_terms(track, blind, 0.009)
-    assert np.all(np.isfinite(terms))
-    assert np.all(terms[:, 3:] == 0.0)
 
 
 def test_a_sensor_that_the_estimator_has_found_faulty_widens_nothing() -> None:
@@ -280,23 +221,3 @@ def test_which_intervals_a_run_takes(tmp_path: Path) -> None:
     assert taken(None, network="none") == "mine"
     with pytest.raises(PdhefError, match="elsewhere"):
         taken(tmp_path / "elsewhere")
-
-
-def test_an_estimator_that_is_another_one_has_its_intervals() -> None:
-    signals, track = _drive()
-    renamed = replace(track, name="hybrid")
-    cautious = ALGORITHM.model_copy(update={"algorithm": "cautious-physics"})
-
-    def with_intervals(algorithms: Sequence[Algorithm], intervals: Intervals | None = None) -> StateTrack:
-        return _calibrator(intervals or _intervals(), *algorithms, name="hybrid").apply(renamed, signals)
-
-    np.testing.assert_array_equal(with_intervals([cautious]).sideslip_std_rad, track.sideslip_std_rad)
-    own = _calibrator(_intervals(), ALGORITHM).apply(track, signals)
-    as_another = with_intervals([cautious, ALGORITHM])
-    np.testing.assert_array_equal(as_another.sideslip_std_rad, own.sideslip_std_rad)
-    assert as_another.name == "hybrid"
-    # Its own come first, wherever they stand in the file.
-    wide = make_inflation([3.0 * k for k in SIDESLIP_FACTORS], (0.5, 1.2, 0.7), 1.0, INFLATION.grip_factors)
-    both = _intervals(entries=(*_intervals().entries, *_intervals(cautious, wide).entries))
-    ratio = with_intervals([cautious, ALGORITHM], both).sideslip_std_rad[3:] / own.sideslip_std_rad[3:]
-    np.testing.assert_allclose(ratio, 3.0)

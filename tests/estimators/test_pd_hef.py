@@ -17,7 +17,7 @@ from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.latency_compensation import compensate, run_window
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
-from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.runs.config import RunConfig
@@ -107,15 +107,6 @@ def test_the_filter_of_another_vehicle_has_half_of_the_residual_and_that_of_a_ba
     assert not banked.any()
 
 
-def test_below_the_dynamic_range_the_residual_counts_for_nothing() -> None:
-    slow = replace(_signals(speed=1.0), ay_m_s2=np.zeros(800))
-    a, _ = run_window(hybrid(network=random_network(constant=(2.0, 1.0))), slow)
-    b, _ = run_window(hybrid(trust=0.0), slow)
-    # At the start, the speed's 1-sigma reaches the dynamic range.
-    np.testing.assert_allclose(a.vy_m_s, b.vy_m_s, atol=1e-5)
-    np.testing.assert_allclose(a.vy_m_s[200:], b.vy_m_s[200:], atol=1e-8)
-
-
 def test_run_with_a_model_writes_its_hash_and_its_estimates(sample_logs_dir: Path, tmp_path: Path) -> None:
     bundle = random_network(constant=(0.0, 0.0))
     bundle.save(tmp_path / "model")
@@ -149,13 +140,3 @@ def test_a_residual_in_the_model_is_what_the_car_does_with_it() -> None:
         errors.append(np.sqrt(np.mean((track.vy_m_s - made.vy)[200:] ** 2)))
     assert errors[1] < 0.05 * errors[0]
     assert errors[1] < errors[2] < errors[0]
-
-
-def test_what_is_estimated_stands_in_the_track_and_only_that() -> None:
-    signals = _signals()
-    track, _ = run_window(hybrid("roll", "bank", "biases", "force_scale"), signals)
-    for name in ESTIMATED_COLUMNS:  # a filter without such a state takes it to be 0
-        assert np.isfinite(getattr(track, name)[track.valid]).all(), name
-    static, _ = run_window(replace(hybrid(), adaptive=False), signals)
-    assert [n for n in ESTIMATED_COLUMNS if len(getattr(static, n))] == []
-    assert not {"roll_rad", "force_scale"} & static.columns().keys()

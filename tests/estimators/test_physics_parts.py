@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
-from physics_oracle import ALL_PARTS, Oracle, parts, vehicle
+from physics_oracle import Oracle, parts, vehicle
 from reference_car import Drive, drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
@@ -16,8 +15,8 @@ from pdhef_logtool.car.vehicle import PhysicsParts, Tyres, VehicleParameters, co
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.table import Options, all_names, make_estimator
-from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD, VehicleUkf, nominal_filter, of_car, physics_filter
+from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, nominal_filter, physics_filter
 from pdhef_logtool.records.signals import Signals
 
 pytestmark = pytest.mark.slow
@@ -64,40 +63,6 @@ def test_beyond_the_linear_range_kinematics_count_more():
     np.testing.assert_array_equal(plain, yields)
 
 
-def test_each_axle_keeps_its_own_noise_beyond_the_linear_range():
-    """A vanishing gain changes nothing."""
-    signals = with_noise(drive(slalom(0.09, 0.5), 3.0).signals, 1)
-    physics = VehicleUkf(vehicle(), q_std=(*PHYSICS_Q_STD[:4], 0.2, 2.0))
-    plain, yields = (f.run(signals, None)[0].P for f in (physics, replace(physics, limit_gain=1e-12)))
-    np.testing.assert_allclose(plain, yields, rtol=1e-6, atol=1e-12)
-
-
-def test_a_file_that_nothing_has_validated_yields_at_the_limit():
-    """Its tyres are half as stiff as the car's. In the linear range it is the filter of a car without lag."""
-    oracle = Oracle(parts("lag", "roll"))
-    soft = with_soft_tyres(oracle.as_vehicle(physics=PhysicsParts(roll=True)))
-    made = oracle.drive(slalom(0.09, 0.5), 8.0)
-    noisy = with_noise(made.signals, 1)
-    bare = of_car(Car.of(soft))
-    assert sideslip_rmse(bare, made, noisy) < 0.6 * sideslip_rmse(VehicleUkf(soft), made, noisy)
-    linear = with_noise(oracle.drive(slalom(0.003, 0.5), 8.0).signals, 1)
-    plain, yields = (run_window(f, linear)[0].vy_m_s for f in (VehicleUkf(soft), bare))
-    np.testing.assert_array_equal(plain, yields)
-
-
-def test_forces_of_the_axles_are_found():
-    """Also a third of them that no tyre model knows of."""
-    oracle = Oracle(parts("lag"))
-    made = oracle.drive(slalom(0.03, 0.5), 8.0)
-    v = oracle.as_vehicle()
-    weak = v.tyres.front.model_copy(update={"D_n": 7600.0 / 1.5})
-    v = v.model_copy(update={"tyres": Tyres(front=weak, rear=v.tyres.rear)})
-    steps, _ = VehicleUkf(v, q_std=(*PHYSICS_Q_STD[:4], 10.0, 10.0)).run(made.signals, None)
-    total = steps.x[:, 4] * np.cos(made.signals.steer_rad) + steps.x[:, 5]
-    error = (total - made.ay)[made.time_s > 1.0]
-    assert np.sqrt(np.mean(error**2)) < 0.1 * np.sqrt(np.mean(made.ay**2))
-
-
 @pytest.mark.parametrize("bias", [{"ay_m_s2": 0.15}, {"steer_rad": 0.0016}])
 def test_a_bias_is_found_and_its_removal_helps(bias):
     """Each bias alone. Two biases, or a bias and the gyro's, are not distinguishable while the car moves."""
@@ -113,37 +78,7 @@ def test_a_bias_is_found_and_its_removal_helps(bias):
     assert sideslip_rmse(physics_filter(v), made, biased) < 0.75 * sideslip_rmse(without, made, biased)
 
 
-@pytest.mark.parametrize(("part", "entry", "value"), [("bank", "bank", 0.05), ("force_scale", "s", 0.1)])
-def test_what_comes_and_goes_is_found(part, entry, value):
-    """It fades as the filter thinks it does, and the estimate is better for it."""
-    oracle = Oracle(parts("lag", part))
-    made = oracle.drive(slalom(0.035, 0.6), 4.0, **{entry: value})
-    noisy = with_noise(made.signals, 5)
-    v, without = oracle.as_vehicle(), oracle.as_vehicle(physics=parts("lag"))
-    steps, _ = physics_filter(v).run(noisy, None)
-    fading = value * np.exp(-made.time_s / {"bank": 5.0, "force_scale": 2.0}[part])
-    middle = (made.time_s > 0.5) & (made.time_s < 2.5)
-    found = steps.x[:, getattr(physics_filter(v).layout, part)]
-    assert 0.3 < found[middle].mean() / fading[middle].mean() < 1.3
-    assert sideslip_rmse(physics_filter(v), made, noisy) < 0.95 * sideslip_rmse(physics_filter(without), made, noisy)
-
-
 # --- the car ---------------------------------------------------------------------------------------------------------
-
-
-def test_its_noise_comes_from_the_car_where_it_has_some():
-    v = vehicle()
-    bare = physics_filter(v)
-    assert "physics" in all_names(Car.of(v))
-    assert bare.q_std == PHYSICS_Q_STD
-    assert bare.measurement_std.tolist() == [0.12, 0.004, 0.08]
-    noise = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
-    car = Car.of(v, noise={"physics": noise})
-    assert "physics" in all_names(car)
-    tuned = make_estimator("physics", car).physics
-    assert tuned.q_std == (0.05, 0.02, 0.02, *PHYSICS_Q_STD[3:])
-    assert tuned.measurement_std.tolist() == [0.8, 0.004, 0.08]
-    assert not make_estimator("physics", car, Options(use_speed=False)).physics.use_speed
 
 
 def test_a_fitted_car_runs_on_its_values_and_on_signals_that_were_read_with_others():
@@ -169,8 +104,3 @@ def test_a_fitted_car_runs_on_its_values_and_on_signals_that_were_read_with_othe
     raw = replace(noisy, steer_rad=noisy.steer_rad * own.steering_ratio / 15.0)
     want, _ = run_window(physics_filter(fitted, FilterNoise()), correct_signals(raw, fitted), None)
     np.testing.assert_allclose(ours.sideslip_rad, want.sideslip_rad, rtol=1e-9, atol=1e-12)
-
-
-def test_every_set_of_parts_has_its_own_digest():
-    digests = {physics_sha256(vehicle(*c)) for k in range(3) for c in combinations(ALL_PARTS, k)}
-    assert len(digests) == 1 + 7 + 21

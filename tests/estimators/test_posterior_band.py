@@ -26,7 +26,6 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.calibration.joint import prior_variations
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.error_features import TERMS, error_terms
-from pdhef_logtool.estimators.intervals import POSTERIOR_NOTE
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.posterior_band import OWN_SHARE, posterior_band
 from pdhef_logtool.estimators.table import make_estimator
@@ -65,13 +64,6 @@ def banded(car: Car, signals: Signals, name: str = "physics") -> tuple[StateTrac
     return track, calibrator(car, [estimator]).apply(track, signals)
 
 
-def test_no_estimate_changes(signals: Signals) -> None:
-    plain, whole = banded(identified(), signals)
-    for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "nis", "yaw_rate_std_rad_s"):
-        np.testing.assert_array_equal(getattr(whole, column), getattr(plain, column))
-    assert (np.linalg.eigvalsh(whole.covariance[10:]) > 0.0).all()
-
-
 def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
     """The filter runs on the varied vehicles without the states that would compensate the variation."""
     car = identified()
@@ -106,16 +98,6 @@ def test_a_file_that_no_drive_has_shown_to_be_right_has_the_interval_of_its_prio
     found = FittedPhysics(values=VALUES, noise=NOISE)
     assert posterior_band(Car.of(OWN, fitted_physics=found).with_noise(PHYSICS, NOISE)) is None
     assert len({vehicle.model_dump_json() for vehicle in (OWN, *prior_variations(OWN))}) == 7
-
-
-def test_only_what_runs_on_physics_has_it_and_it_is_told(signals: Signals) -> None:
-    car = identified()
-    for name, note in (("physics", POSTERIOR_NOTE), ("phy-ukf", "intervals not calibrated")):
-        estimator = make_estimator(name, car)
-        applied = calibrator(car, [estimator])
-        track = run_estimator(estimator, signals)
-        assert (applied.apply(track, signals) is track) == (name == "phy-ukf")
-        assert applied.notes(name) == (note,)
 
 
 def test_calibrated_intervals_come_first(signals: Signals) -> None:

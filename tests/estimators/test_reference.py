@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.estimators import kinematic_filter as kinematics
 from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference, refer, sideslip_std
-from pdhef_logtool.estimators.reference.estimator import steps_at
 from pdhef_logtool.records.signals import FloatArray, Signals
 
 RATE_HZ = 100
@@ -151,32 +150,6 @@ def test_long_driving_at_the_limit_needs_gnss_and_the_interval_shows_it():
     assert alone.gnss_share.max() == 0.0
 
 
-def test_a_paired_jump_of_gnss_velocity_is_rejected():
-    signals = with_gnss(LONG)
-    jumped = signals.gnss_velocity_m_s.copy()
-    jumped[1500:2000, 1] += 1.0
-    clean, wrong = refer(signals, PRIOR), refer(replace(signals, gnss_velocity_m_s=jumped), PRIOR)
-    error, std = LONG.error_deg(wrong)
-    inside = (wrong.stamps_ns - START_NS > 14.5e9) & (wrong.stamps_ns - START_NS < 20.5e9)
-    assert np.abs(error[inside]).max() < 3.0 * std[inside].max()
-    assert np.abs(wrong.vy_m_s - clean.vy_m_s).max() < 0.3
-
-
-def test_gnss_off_is_the_reference_without_gnss():
-    alone, off = refer(SLIDE.signals, PRIOR), refer(with_gnss(SLIDE), PRIOR, use_gnss=False)
-    np.testing.assert_array_equal(alone.vy_m_s, off.vy_m_s)
-    assert not off.with_gnss
-
-
-def test_the_mirrored_drive_has_the_mirrored_reference():
-    signals = SLALOM.signals
-    mirrored = replace(signals, ay_m_s2=-signals.ay_m_s2, yaw_rate_rad_s=-signals.yaw_rate_rad_s)
-    prior = replace(PRIOR, yaw_rate_bias_rad_s=0.0)
-    a, b = refer(signals, prior), refer(mirrored, prior)
-    np.testing.assert_allclose(a.vy_m_s, -b.vy_m_s, atol=1e-8)
-    np.testing.assert_allclose(a.covariance[:, 2], b.covariance[:, 2], rtol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("change", "named"),
     [
@@ -205,42 +178,6 @@ def test_where_nothing_states_the_accelerometer_the_interval_contains_its_lever(
     assert np.mean(np.abs(error) < 1.96 * std) > 0.95
     assert (std >= driven.error_deg(stated)[1]).all()
     assert unknown.valid.sum() <= stated.valid.sum()
-
-
-def test_a_stretch_without_imu_is_not_valid_and_the_rest_is():
-    signals = SLALOM.signals
-    ay = signals.ay_m_s2.copy()
-    ay[1200:1400] = np.nan
-    found = refer(replace(signals, ay_m_s2=ay), PRIOR)
-    seconds = (found.stamps_ns - START_NS) * 1e-9
-    assert not found.valid[(seconds > 12.1) & (seconds < 13.9)].any()
-    assert found.valid[(seconds > 16.0) & (seconds < 29.0)].all()
-
-
-def test_without_longitudinal_accelerometer_the_speed_stands_in():
-    found = refer(replace(SLALOM.signals, ax_m_s2=np.full(len(SLALOM.signals), np.nan)), PRIOR)
-    error, _ = SLALOM.error_deg(found)
-    assert not found.refused
-    assert np.sqrt(np.mean(error[found.valid] ** 2)) < 0.3
-
-
-def test_between_the_knots_the_reference_follows_the_kinematics():
-    found = refer(SLIDE.signals, PRIOR)
-    steps = steps_at([found], SLIDE.signals.stamps_ns)
-    error = np.degrees(np.arctan2(steps.values[:, 1], steps.values[:, 0]) - np.arctan2(SLIDE.vy, SLIDE.vx))
-    assert np.sqrt(np.mean(error[steps.valid] ** 2)) < 0.25
-    np.testing.assert_allclose(steps.shares[steps.valid].sum(axis=1), 1.0)
-    outside = steps_at([found], SLIDE.signals.stamps_ns[-1:] + 10**9)
-    assert not outside.valid[0]
-    assert np.isnan(outside.values).all()
-
-
-def test_spans_cover_a_drive_once():
-    found = refer(SLALOM.signals, PRIOR)
-    middle = int(found.stamps_ns[300])
-    parts = [found.between(None, middle), found.between(middle, None)]
-    whole, joined = steps_at([found], SLALOM.signals.stamps_ns), steps_at(parts, SLALOM.signals.stamps_ns)
-    np.testing.assert_array_equal(whole.values, joined.values)
 
 
 @settings(max_examples=40, deadline=None)
@@ -311,12 +248,3 @@ _OVER_THE_OFFSET = {
 }
 #: The transition neglects errors of the gyro in the centripetal term and in the tilt.
 _SECOND_ORDER = {kinematics.YAW_RATE_BIAS, kinematics.YAW_RATE_GAIN}
-
-
-def test_gnss_that_does_not_change_as_the_imu_is_not_used():
-    signals = with_gnss(LONG)
-    swapped = replace(signals, gnss_velocity_m_s=signals.gnss_velocity_m_s[:, ::-1].copy())
-    assert refer(signals, PRIOR).with_gnss
-    assert not refer(swapped, PRIOR).with_gnss
-    body = np.stack([LONG.vx, LONG.vy], axis=1)
-    assert not refer(replace(signals, gnss_velocity_m_s=body), PRIOR).with_gnss

@@ -2,35 +2,25 @@
 
 from __future__ import annotations
 
-import io
-import json
 import math
-import tracemalloc
-from dataclasses import fields, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import test_estimators as properties
 from made_models import random_network
 from reference_car import REAR_M, cut, drive, forces, keep, rolling_drive, runge_kutta, slalom, with_noise
-from rich.console import Console
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
-from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Smoother
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.smoothed import BLOCK_S, ForwardSteps, SmoothedPhysics, smooth_steps
 from pdhef_logtool.estimators.table import SPECS, make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
-from pdhef_logtool.records.reasons import BURST_YAW_RATE, DEAD_YAW_RATE, STUCK_YAW_RATE
 from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import run_logs
 
 pytestmark = pytest.mark.slow
 
@@ -159,11 +149,6 @@ def stopping() -> Signals:
     return with_noise(made.signals, seed=2, scale=0.1)
 
 
-@pytest.fixture(scope="module")
-def slalom_drive():
-    return drive(slalom(0.035, 0.5), 12.0, speed=22.0)
-
-
 def test_it_sees_one_to_two_blocks_ahead_and_no_further(rough):
     estimator, j = smoother(0.5), 150
     ay = rough.ay_m_s2.copy()
@@ -182,29 +167,8 @@ def test_blocks_are_as_good_as_the_whole_drive(block_s, parts, tolerance_m_s):
     np.testing.assert_allclose(a.vy_m_s, b.vy_m_s, atol=tolerance_m_s)
 
 
-def test_memory_does_not_grow_with_the_covariances_of_a_drive():
-    """Beside its inputs and results, a longer drive takes no memory: the steps of two blocks at a time do."""
-    signals = with_noise(drive(slalom(0.02, 0.3), 60.0, step_s=0.02).signals, seed=1)
-    estimator, peaks = smoother(2.0), []
-    for part in (signals.rows(0, 400), signals.rows(0, 1500), signals):
-        tracemalloc.start()
-        track = estimator.smooth(part)
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    n = estimator.filtered.physics.layout.size
-    assert (peaks[2] - peaks[1]) / (len(track) - 1500) < 8 * 2 * n * n
-
-
 def test_an_empty_drive_has_an_empty_track(rough):
     assert len(smoother().smooth(rough.rows(0, 0))) == 0
-
-
-def test_left_and_right_are_mirrored(rough):
-    estimator = smoother(trust=0.0)  # a network with random weights knows no left and right
-    mirrored = replace(rough, **{c: sign * getattr(rough, c) for c, sign in properties.SIGNS.items()})
-    a, b = estimator.smooth(rough), estimator.smooth(mirrored)
-    for c in properties.MIRRORED:
-        np.testing.assert_allclose(getattr(a, c), -getattr(b, c), atol=1e-9, err_msg=c)
 
 
 @pytest.mark.parametrize("parts", [(), tuple(PhysicsParts.model_fields)])
@@ -261,68 +225,6 @@ def test_it_is_nearer_to_the_truth_than_its_filter(parts):
 # --- the detector ----------------------------------------------------------------------------------------------------
 
 
-class Unchecked(AdaptivePhysics):
-    """Without the detector: signals as they are, no extra noise."""
-
-    def inputs(self, signals, carry):
-        return AdaptivePhysics.inputs(replace(self, adaptive=False), signals, carry)
-
-
-def unchecked(estimator: SmoothedPhysics, signals: Signals) -> StateTrack:
-    """The estimate without the detector."""
-    filtered = Unchecked(**{f.name: getattr(estimator.filtered, f.name) for f in fields(AdaptivePhysics)})
-    return replace(estimator, filtered=filtered).smooth(signals)
-
-
-def test_without_a_fault_it_is_what_it_is_without_the_detector(slalom_drive):
-    estimator = smoother()  # with network
-    track = estimator.smooth(slalom_drive.signals)
-    assert not track.reason.any()
-    assert (track.r_scale == 1.0).all()
-    properties.same_bits(track, unchecked(estimator, slalom_drive.signals))
-    for seed in range(2):  # false alarms hardly change the estimate
-        signals = with_noise(slalom_drive.signals, seed)
-        away = estimator.smooth(signals).sideslip_rad - unchecked(estimator, signals).sideslip_rad
-        assert np.sqrt(np.mean(away**2)) < np.radians(0.01)
-
-
-@pytest.mark.parametrize("kind", ["stuck", "dead", "burst"])
-def test_a_faulty_gyro_costs_little_and_is_told(slalom_drive, kind):
-    t = slalom_drive.time_s
-    during = (t > 4.0) & (t < 7.0)
-    clean = with_noise(slalom_drive.signals, seed=1)
-    noise = np.random.default_rng(2).standard_normal(len(t))
-    held = clean.yaw_rate_rad_s[np.searchsorted(t, 4.0)]
-    bad, bit = {
-        "stuck": (np.full(len(t), held), STUCK_YAW_RATE),
-        "dead": (0.002 * noise, DEAD_YAW_RATE),
-        "burst": (clean.yaw_rate_rad_s + 0.08 * noise, BURST_YAW_RATE),
-    }[kind]
-    signals = on_time(replace(clean, yaw_rate_rad_s=np.where(during, bad, clean.yaw_rate_rad_s)))
-    estimator = flat_smoother()
-    track, before = estimator.smooth(signals), unchecked(estimator, signals)
-    told = track.reason & bit > 0
-    assert told[during & (t > 5.5)].mean() > 0.9
-    assert not told[(t < 3.9) | (t > 8.0)].any()
-    assert (np.median(track.r_scale[told]) > 20.0) == (kind == "burst")
-    rmse, without = (np.sqrt(np.mean((x.sideslip_rad - slalom_drive.sideslip) ** 2)) for x in (track, before))
-    assert rmse < (1.0 if kind == "burst" else 0.6) * without
-    filtered = run_estimator(estimator.filtered, signals)
-    np.testing.assert_array_equal(track.reason, filtered.reason)
-    np.testing.assert_array_equal(track.r_scale, filtered.r_scale)
-
-
-def test_its_weights_know_what_comes_later():
-    """The true grip is 25 % lower than the input. The filter adapts over time, the smoother from the start."""
-    made = drive(slalom(0.035, 0.5), 12.0, speed=22.0, mu=0.75 * 0.85)
-    signals = with_noise(made.signals, 0)
-    signals.friction[:] = 0.85
-    estimator = flat_smoother("force_scale")
-    later, now = (run_estimator(e, signals).mixture_weight for e in (estimator, estimator.filtered))
-    assert now[:10].max() < 0.6
-    assert later.min() > 0.99
-
-
 def test_what_it_says_of_itself(rough):
     trusted = Car.of(VEHICLE, network=BUNDLE, network_gain=0.6)
     estimator = make_estimator("pd-hef-smoothed", trusted)
@@ -337,23 +239,3 @@ def test_what_it_says_of_itself(rough):
     assert not track.nis_dof.any()
     assert set(track.network_trust[track.valid]) == {0.6}
     assert np.array_equal(track.stamps_ns, rough.stamps_ns)
-
-
-def test_a_run_marks_it_as_not_causal(sample_logs_dir: Path, tmp_path: Path):
-    BUNDLE.save(tmp_path / "model")
-    config = RunConfig(
-        car=sample_logs_dir / "vehicle.toml",
-        network=tmp_path / "model",
-        annotate="none",
-        estimators=("pd-hef-smoothed", "zero"),
-    )
-    result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
-    report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())
-    assert {e["name"]: e["causal"] for e in report["estimators"]} == {
-        "pd-hef-smoothed": False, "zero": True, "pd-hef": True,
-    }  # fmt: skip
-    console = Console(file=io.StringIO(), width=200)
-    render_run(result, console)
-    printed = console.file.getvalue()
-    assert printed.rindex("\n zero") < printed.rindex("\n pd-hef-smoothed")
-    assert "not causal" in printed

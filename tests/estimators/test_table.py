@@ -14,18 +14,14 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import (
     Algorithm,
     FilterNoise,
-    FittedPhysics,
-    FittedValues,
 )
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
-from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Smoother
 from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.presets import OPEN_LOOP, options_of, preset_of
+from pdhef_logtool.estimators.presets import OPEN_LOOP
 from pdhef_logtool.estimators.table import (
     ALL_ESTIMATORS,
-    OPTIONS,
     PEERS,
     SPECS,
     Options,
@@ -37,7 +33,6 @@ from pdhef_logtool.estimators.table import (
     spec_of,
     split_names,
 )
-from pdhef_logtool.estimators.vehicle_ukf import FILE_LAG, PHYSICS_Q_STD
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -124,29 +119,6 @@ def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec: Any) -> None:
     assert (spec.name in all_names(Car.of(VEHICLE))) == (spec.group == ALL_ESTIMATORS and not lacks)
 
 
-def test_physics_runs_on_any_car_and_without_a_fit_it_has_no_part() -> None:
-    bare = Car.of(VEHICLE)
-    assert "physics" in all_names(bare)
-    adaptive = make_estimator("physics", bare)
-    assert isinstance(adaptive, AdaptivePhysics)
-    estimator = adaptive.physics
-    assert (estimator.q_std, estimator.r_std) == (PHYSICS_Q_STD, None)
-    assert estimator.limit_lag_m == FILE_LAG * VEHICLE.wheelbase_m
-    assert estimator.vehicle.physics.names == ("lag", "roll")
-    assert estimator.vehicle == VEHICLE.model_copy(update={"physics": estimator.vehicle.physics})
-
-
-def test_tuned_noise_keeps_the_axle_forces_noise_of_the_fit() -> None:
-    fitted = FittedPhysics(
-        values=FittedValues(roll_damping=0.5), noise=FilterNoise(q_std=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6))
-    )
-    adaptive = make_estimator("physics", replace(CAR, fitted_physics=fitted))
-    assert isinstance(adaptive, AdaptivePhysics)
-    estimator = adaptive.physics
-    assert estimator.q_std == (*NOISE.q_std, 0.4, 0.5, 0.6)
-    assert estimator.vehicle.roll_damping == 0.5
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -163,13 +135,6 @@ def test_tuned_noise_keeps_the_axle_forces_noise_of_the_fit() -> None:
 def test_an_unknown_name_or_option_is_answered_with_those_that_exist(name: str, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         check_names(("zero", name))
-
-
-def test_the_options_of_the_presets_are_those_of_the_entries() -> None:
-    variants = {
-        preset: {o for s in SPECS if preset_of(s.name) == preset for o in options_of(s.name)} for preset in OPTIONS
-    }
-    assert variants == {preset: set(options) for preset, options in OPTIONS.items()}
 
 
 def test_a_group_names_its_estimators_and_each_runs_once() -> None:
@@ -245,13 +210,6 @@ def test_other_noise_is_another_basis_of_the_same_identity(name: str) -> None:
         assert is_now.identity == was.identity
     told = ran(name, CAR.with_noise(of, NOISE.model_copy(update={"score_deg": 0.1, "trial": 3})))
     assert told == was
-
-
-def test_gain_and_speed_sensor_are_told() -> None:
-    assert len({ran(f"pd-hef:gain={gain}").identity for gain in (0.0, 0.5, 1.0)}) == 3
-    full, esp = resolve(make_estimator("phy-ukf", CAR)), ran("phy-ukf", use_speed=False)
-    assert (full.use_speed, esp.use_speed) == (True, False)
-    assert full.sha256 != esp.sha256
 
 
 # --- pd-hef without residual is physics ------------------------------------------------------------------------------

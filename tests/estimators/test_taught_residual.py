@@ -18,7 +18,6 @@ from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.joint import parameters_of, prior_vehicle, with_taught
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.latency_compensation import run_window
-from pdhef_logtool.estimators.pd_hef import FILTER_ALONE
 from pdhef_logtool.estimators.residual_response import residual_response
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
@@ -60,18 +59,6 @@ def test_a_residual_of_zero_is_physics_bit_for_bit(signals: Signals) -> None:
     assert np.array_equal(hybrid.sideslip_rad, physics.sideslip_rad, equal_nan=True)
     assert np.allclose(hybrid.vy_m_s, physics.vy_m_s, atol=1e-12, equal_nan=True)
     assert np.nanmax(hybrid.network_trust) == 1.0
-
-
-def test_a_smoother_takes_the_prior_and_says_why_not_the_residual() -> None:
-    assert FILTER_ALONE in make_estimator("pd-hef-smoothed", taught_car(linear_residual())).notes
-    assert FILTER_ALONE not in make_estimator("pd-hef-smoothed", taught_car(None)).notes
-
-
-def test_the_residual_acts_in_the_filter(signals: Signals) -> None:
-    (physics,), (hybrid,) = (track_of(name, taught_car(linear_residual()), signals) for name in ("physics", "pd-hef"))
-    added, late = hybrid.sideslip_rad - physics.sideslip_rad, slice(200, None)
-    assert np.nanmax(np.abs(added[late])) > 1e-4
-    assert np.corrcoef(added[late], physics.yaw_rate_rad_s[late])[0, 1] > 0.5
 
 
 def test_its_response_is_the_one_that_teaching_uses(signals: Signals) -> None:

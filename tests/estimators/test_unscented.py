@@ -56,13 +56,6 @@ def test_repair_gives_the_nearest_positive_definite_matrix(seed: int, n: int, lo
     np.testing.assert_allclose(P, nearest, rtol=0, atol=1e-11 * np.abs(broken).max() + 1e-11)
 
 
-def test_the_root_of_an_indefinite_matrix_is_that_of_its_repair() -> None:
-    P = np.array([[1.0, 1.5, 0.0], [1.5, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    L = root_of(P)
-    np.testing.assert_allclose(L @ L.T, P, atol=1e-12)
-    assert P[0, 0] == pytest.approx(1.25)  # eigenvalues 2.5 and -0.5 -> 2.5 and 0
-
-
 @pytest.mark.parametrize("size", [np.inf, np.nan])
 def test_repair_keeps_non_finite_values_for_the_filter(size: float) -> None:
     P = np.diag([size, 1.0])

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physics_oracle import ALL_PARTS, CG_HEIGHT_M, TRACK_M, G, Oracle, names_of, parts, vehicle
-from reference_car import FRICTION, FRONT_M, MASS_KG, REAR_M, WHEELBASE_M
+from reference_car import FRICTION, FRONT_M, REAR_M, WHEELBASE_M
 
 from pdhef_logtool.car import nominal_model
 from pdhef_logtool.car.nominal_model import model_parameters
@@ -30,7 +30,6 @@ from pdhef_logtool.estimators.vehicle_model import (
     Z_YAW_RATE,
     Layout,
     advance,
-    grip_under_braking,
     layout_of,
     physics_parameters,
     push,
@@ -214,30 +213,6 @@ def test_load_transfer_takes_a_share_of_its_square(ay, sensitivity):
     np.testing.assert_allclose(held, np.array([ff, fr]) * two_wheels / own, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("ax", "mu"), [(1.0, 0.8), (0.0, 0.8), (-3.0, 0.8), (-6.0, 0.7), (-50.0, 0.8)])
-def test_braking_moves_load_and_takes_grip(ax, mu):
-    f = physics_parameters(vehicle("braking"))
-    factors = [grip_under_braking(ax, mu, load) for load in (f.front_load_per_ax, f.rear_load_per_ax)]
-    if ax >= 0.0:
-        assert factors == [1.0, 1.0]
-        return
-    left = math.sqrt(max(0.04, 1.0 - (ax / (mu * G)) ** 2))
-    moment = -ax * CG_HEIGHT_M * MASS_KG / WHEELBASE_M
-    loads = [MASS_KG * G * arm / WHEELBASE_M for arm in (REAR_M, FRONT_M)]
-    np.testing.assert_allclose(factors, [left * (1 + moment / loads[0]), left * max(0.2, 1 - moment / loads[1])])
-    none = physics_parameters(vehicle())
-    assert grip_under_braking(ax, mu, none.front_load_per_ax) == 1.0
-
-
-def test_a_car_that_does_not_lean_has_the_load_transfer_of_its_acceleration():
-    """With a roll gradient of 0, the load transfer follows from a_y, without a division by zero."""
-    v = vehicle("roll", "load_transfer", roll_gradient_rad_per_m_s2=0.0)
-    flat = vehicle("load_transfer", roll_gradient_rad_per_m_s2=0.0)
-    x = np.array([25.0, 0.3, -0.1, 0.0, 3.0, 2.0])
-    over = HeldInputs(0.05, 0.0, True, FRICTION)
-    np.testing.assert_allclose(moved(v, x, over, 0.01)[:6], moved(flat, x, over, 0.01)[:6])
-
-
 @pytest.mark.parametrize("speed", [25.0, 2.2])
 @every_set
 def test_the_sensors_read_what_the_equations_say(names, speed):
@@ -245,14 +220,3 @@ def test_the_sensors_read_what_the_equations_say(names, speed):
     x, v = state_of(oracle, steer, 0.0, FRICTION, vx=speed), oracle.as_vehicle()
     gyro = x[YAW_RATE] + (ENTRIES["b_r"] if "biases" in names else 0.0)
     np.testing.assert_allclose(readings_of(v, x, steer), [oracle.sensed_ay(x, steer), gyro, speed], rtol=1e-12)
-
-
-def test_long_steps_are_divided_for_the_roll_mode():
-    v, flat = vehicle("roll", roll_frequency_rad_s=60.0), vehicle("lag")
-    for car, most in ((v, 0.5), (flat, 60.0)):
-        n = step_count(25.0, 0.1, FRICTION, *models(car))
-        assert 1 <= n <= 32
-        assert 0.1 / n * 60.0 <= most
-    x = np.zeros(8)
-    x[0], x[6] = 25.0, 0.1
-    assert abs(moved(v, x, HeldInputs(0.0, 0.0, True, FRICTION), 0.1)[6]) < 0.1

@@ -69,19 +69,6 @@ def test_below_the_blend_a_y_says_nothing():
     assert {k[0] for k in residuals(replace(s, speed_m_s=s.speed_m_s * 0.05))} == {"vx_m_s"}
 
 
-def test_disagreement_is_pairwise_above_the_blend_and_wraps():
-    fast = np.where(T < 30, 10.0, 1.0)
-
-    def track(name, beta):
-        return make_track(name, STAMPS, vx_m_s=fast, sideslip_rad=np.where(T < 30, beta, 3.0))
-
-    tracks = [track("a", 0.0), track("b", 0.02), track("c", 2 * np.pi - 0.01)]
-    rows = rows_of(tracks, names=("disagreement_rms",))
-    values = {r.estimator: r.value for r in rows}
-    assert values == pytest.approx({"a~b": 0.02, "a~c": 0.01, "b~c": 0.03})
-    assert all(r.n == 3000 for r in rows)
-
-
 def test_figures_of_a_segment_are_formulas_over_its_stamps_and_steps() -> None:
     n = T.size
     rng = np.random.default_rng(1)

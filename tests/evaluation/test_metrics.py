@@ -270,57 +270,6 @@ def test_lateral_seconds_agree_with_a_plain_restart_every_second():
     np.testing.assert_allclose(lateral_errors(estimate, truth), expected, atol=1e-9)
 
 
-def test_seconds_with_holes_do_not_count():
-    truth = circle(n=1001)
-    valid = np.ones(1001, bool)
-    valid[250] = False
-    x = truth.x_m.copy()
-    x[500] = np.nan  # end of the fifth second and start of the sixth
-    holed = make_track("truth", truth.stamps_ns, vx_m_s=truth.vx_m_s, x_m=x, y_m=truth.y_m, yaw_rad=truth.yaw_rad)
-    estimate = make_track(
-        "e", truth.stamps_ns, vx_m_s=truth.vx_m_s, vy_m_s=truth.vy_m_s, yaw_rate_rad_s=truth.yaw_rate_rad_s, valid=valid
-    )
-    assert lateral_errors(estimate, holed).size == 10 - 1 - 2
-    keep = np.ones(1001, bool)
-    keep[720:760] = False  # a gap of 0.41 s in the stamps
-
-    def thin(t):
-        return make_track(
-            t.name,
-            t.stamps_ns[keep],
-            **{
-                c: getattr(t, c)[keep] for c in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m", "yaw_rad", "valid")
-            },
-        )
-
-    assert lateral_errors(thin(estimate), thin(holed)).size == 10 - 1 - 2 - 1
-
-
-@settings(derandomize=True, max_examples=20, deadline=None)
-@given(turn=st.floats(-3, 3), dx=st.floats(-1e4, 1e4), dy=st.floats(-1e4, 1e4), shift=st.integers(-(10**15), 10**15))
-def test_position_figures_do_not_depend_on_place_heading_or_time(turn, dx, dy, shift):
-    truth = circle(n=801)
-    c, s = np.cos(turn), np.sin(turn)
-    moved = make_track(
-        "truth",
-        truth.stamps_ns + shift,
-        vx_m_s=truth.vx_m_s,
-        vy_m_s=truth.vy_m_s,
-        yaw_rate_rad_s=truth.yaw_rate_rad_s,
-        x_m=c * truth.x_m - s * truth.y_m + dx,
-        y_m=s * truth.x_m + c * truth.y_m + dy,
-        yaw_rad=truth.yaw_rad + turn,
-    )
-
-    def wrong(t):
-        return make_track(
-            "e", t.stamps_ns, vx_m_s=t.vx_m_s + 0.1, vy_m_s=t.vy_m_s + 0.2, yaw_rate_rad_s=t.yaw_rate_rad_s
-        )
-
-    np.testing.assert_allclose(position_error(wrong(moved), moved), position_error(wrong(truth), truth), atol=1e-7)
-    np.testing.assert_allclose(lateral_errors(wrong(moved), moved), lateral_errors(wrong(truth), truth), atol=1e-7)
-
-
 # ---- bootstrap ----
 
 
@@ -341,14 +290,6 @@ def test_bootstrap_value_and_determinism():
     assert a.low < a.value < a.high
     # White noise: the standard error of an RMSE is σ/√(2N).
     assert (a.high - a.low) / (2 * 1.96) == pytest.approx(2.0 / np.sqrt(60000), rel=0.35)
-
-
-def test_blocks_see_the_correlation_that_samples_hide():
-    rng = np.random.default_rng(1)
-    e = np.repeat(rng.normal(0, 1.0, 60), 500)  # the error is constant for 5 s
-    wide = interval_of(e, stamps_of(30000))
-    narrow = interval_of(rng.permutation(e), stamps_of(30000))
-    assert wide.high - wide.low > 5 * (narrow.high - narrow.low)
 
 
 def test_too_short_for_an_interval():

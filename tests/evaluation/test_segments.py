@@ -113,27 +113,3 @@ def test_a_gap_in_the_stamps_ends_an_interval_and_is_not_smoothed_across():
     np.testing.assert_allclose(found, [(25, 27), (28, 30)], atol=0.1)
     step = np.where(t[keep] < 27.5, 0.0, 5.0)
     np.testing.assert_allclose(smooth(s.stamps_ns, step, 1.0), step, atol=1e-12)
-
-
-def test_smoothing_has_the_stated_gain_and_no_phase():
-    t = np.arange(0, 20, 0.01)
-    stamps = T0 + np.round(t * 1e9).astype(np.int64)
-    wave = np.sin(2 * np.pi * 2.0 * t)
-    inner = slice(200, -200)
-    np.testing.assert_allclose(smooth(stamps, wave, 2.0)[inner], wave[inner] / np.sqrt(2), atol=2e-3)
-    holed = np.where(np.arange(t.size) % 7 == 0, np.nan, 3.0)
-    out = smooth(stamps, holed, 2.0)
-    np.testing.assert_array_equal(np.isnan(out), np.isnan(holed))
-    np.testing.assert_allclose(out[np.isfinite(out)], 3.0)
-
-
-def test_intervals_give_the_masks_back():
-    s = signals(*staged(), noise=0.3)
-    masks = segment_masks(s, None, VEHICLE)
-    rebuilt = {name: np.zeros(len(s), bool) for name in masks}
-    found = find_intervals(s, masks)
-    for i in found:
-        rebuilt[i.name] |= (s.stamps_ns >= i.start_ns) & (s.stamps_ns < i.end_ns)
-    for name in masks:
-        np.testing.assert_array_equal(rebuilt[name], masks[name])
-    assert [i.start_ns for i in found] == sorted(i.start_ns for i in found)

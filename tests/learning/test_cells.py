@@ -73,14 +73,6 @@ def test_a_choice_holds_at_most_so_much_depends_on_no_order_and_shrinks_as_the_s
     assert [x for i, x in enumerate(limits) if i not in (3, 7)] == [1.0] * (COUNT - 2)
 
 
-def test_a_second_draws_by_its_log_the_seed_and_itself() -> None:
-    stamps = np.array([0, 999_999_999, 1_000_000_000, 5_000_000_000])
-    drawn = draw_of(stamps, "0:a")
-    assert drawn[0] == drawn[1] and len(set(drawn.tolist())) == 3
-    np.testing.assert_array_equal(draw_of(stamps[2:], "0:a"), drawn[2:])
-    assert draw_of(stamps, "1:a")[0] != drawn[0] != draw_of(stamps, "0:b")[0]
-
-
 def test_conditions_are_on_the_columns_of_a_row() -> None:
     made, none = arrays(50), np.full(50, np.nan)
     columns = [made.stamps_ns, made.features, made.targets, made.step_s, made.weight, made.segment, made.truth_velocity]
@@ -140,34 +132,3 @@ def test_extract_chooses_leaves_copies_out_and_older_sets_still_open(sample_logs
     (out / MANIFEST).write_text(json.dumps(seal({**document, "version": 2})))
     with pytest.raises(OutputError, match="creates it again"):
         read_dataset(out)
-
-
-def test_a_fleet_is_told_by_what_gave_nothing_and_by_its_cells(capsys: pytest.CaptureFixture[str]) -> None:
-    from rich.console import Console
-
-    from pdhef_logtool.cli.learning_tables import MOST_DRIVES, render_extraction
-    from pdhef_logtool.learning.drives import DriveRecord
-    from pdhef_logtool.learning.network.cells import table_of
-    from pdhef_logtool.learning.network.dataset import SPLITS
-    from pdhef_logtool.learning.network.extract_command import DriveResult, ExtractResult
-
-    truth = {"kind": "perfect", "smoothing_half_s": 0.0}
-    rms = {"vy_dot_m_s2": 0.1, "yaw_acceleration_rad_s2": 0.1}
-    entry = {"duration_s": 9.0, "usable_rows": 90, "rows": 100, "truth": truth, "residual_rms": rms, "split": "train"}
-    seconds = [0.0] * COUNT
-    seconds[3], seconds[-1] = 0.2, 1234.0
-    manifest = {
-        "splits": {s: {"drives": 1, "usable_rows": 90} for s in SPLITS},
-        "cells": table_of(dict.fromkeys(SPLITS, seconds)),
-        "choice": {"per_cell_s": 600.0},
-    }
-    good = [DriveResult(DriveRecord(f"d{i}", ""), entry) for i in range(MOST_DRIVES)]
-    copy = DriveResult(DriveRecord("twin", ""), None, copy_of="d3")
-    for results in (good, [*good, copy]):
-        render_extraction(ExtractResult(Path("out"), manifest, tuple(results)), Console(width=80))
-    few, many = capsys.readouterr().out.split("dataset in out")[:2]
-    assert " d39 " in few and " d39 " not in many and "as d3" in many
-    assert f"{MOST_DRIVES + 1} drives, listed in manifest.json" in many
-    assert "38 of the 40 cells below the friction limit are empty" in few
-    assert " 600 " in few and " <1 " in few and "as chosen" in few
-    assert max(map(len, (few + many).splitlines())) <= 80

@@ -120,23 +120,6 @@ def test_clean_truth_is_differenced_as_it_is(motion: Motion, tmp_path: Path, mon
     assert rms["yaw_acceleration_rad_s2"] == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
 
 
-def test_truth_away_from_the_cg_is_moved(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = _log(motion, arm=(1.3, -0.4))
-    moved = CAR.model_copy(update={"truth_position_m": (1.3, -0.4, 0.5)})
-    error, _ = _errors(_extract(tmp_path, monkeypatch, log, moved), motion)
-    assert np.abs(error).max() < 1e-2
-    forgotten, _ = _errors(_extract(tmp_path, monkeypatch, log, CAR), motion)
-    assert np.abs(forgotten).max() > 0.3
-
-
-def test_late_truth_is_put_back(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    result = _extract(tmp_path, monkeypatch, _log(motion, latency_s=0.08))
-    (entry,) = result.manifest["drives"]
-    assert entry["truth"]["latency_s"] == pytest.approx(0.08, abs=1e-3)
-    error, _ = _errors(result, motion)
-    assert np.sqrt(np.mean(error**2, axis=0)).max() < 0.02
-
-
 @pytest.mark.slow
 def test_noisy_truth_is_smoothed_and_unbiased(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = _log(motion, sigma=0.01)
@@ -219,23 +202,6 @@ def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
     assert dict(sums.iter_rows()) == {
         name: s["rows"] for name, s in dataset.manifest["splits"].items() if s["drives"]
     }  # fmt: skip
-
-
-def test_reading_back_gives_arrays_for_training(dataset: ExtractResult) -> None:
-    data = read_dataset(dataset.output)
-    assert tuple(data.manifest["features"]) == FEATURES
-    for one in data.drives:
-        assert one.period_s == pytest.approx(0.01)
-        found = one.load()
-        frame = pl.read_parquet(one.path, hive_partitioning=False).filter(pl.col(FEATURES[0]).is_not_null())
-        np.testing.assert_array_equal(found.features, frame.select(FEATURES).to_numpy())
-        assert found.features.dtype == found.targets.dtype == found.weight.dtype == np.float32
-        assert np.isfinite(found.features).all() and np.isfinite(found.targets).all()
-        np.testing.assert_allclose(found.step_s, 0.01, atol=1e-9)
-        assert not found.targets[found.weight == 0].any()
-        assert data.vehicle(one).name == next(
-            v["name"] for v in data.manifest["vehicles"] if v["sha256"] == one.entry["vehicle_sha256"]
-        )
 
 
 def test_a_taught_car_is_calibrated_and_each_row_has_the_gain_of_its_region(

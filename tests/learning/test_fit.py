@@ -13,7 +13,6 @@ from pdhef_logtool.learning.network.fit import (
     PAPER_RECIPE,
     FeatureSequence,
     Recipe,
-    normalisation_of,
     train,
 )
 from pdhef_logtool.learning.network.train_command import mean_square
@@ -77,16 +76,6 @@ def test_training_that_stopped_half_way_ends_as_if_it_had_not(tmp_path: Path) ->
     assert [e.validation_loss for e in again] == [e.validation_loss for e in history]
 
 
-def test_fine_tuning_starts_where_the_other_model_ended(tmp_path: Path) -> None:
-    training, validation = make_sequences(0, 12), make_sequences(1, 3)
-    first, history = train(training, validation, replace(SMALL, epochs=10), tmp_path / "first")
-    tuned, after = train(
-        training, validation, replace(SMALL, epochs=1, learning_rate=1e-6), tmp_path / "tuned", init=first
-    )
-    assert after[0].validation_loss == pytest.approx(min(e.validation_loss for e in history), rel=0.05)
-    assert tuned.normalisation == first.normalisation
-
-
 def test_training_stops_when_patience_ends_and_keeps_the_best_epoch(tmp_path: Path) -> None:
     """Validation targets have the other sign, so that their error grows while the network learns."""
     training = make_sequences(0, 6)
@@ -97,22 +86,6 @@ def test_training_stops_when_patience_ends_and_keeps_the_best_epoch(tmp_path: Pa
     assert len(losses) == best + 3 < 20
     assert (bundle.provenance["best_epoch"], bundle.provenance["validation_loss"]) == (best + 1, losses[best])
     assert mean_square(bundle, validation) == pytest.approx(losses[best], rel=0.5)
-
-
-def test_samples_without_weight_teach_nothing(tmp_path: Path) -> None:
-    training, validation = make_sequences(0, 4), make_sequences(1, 2)
-    spoiled = []
-    for s in training:
-        target, weight = s.target.copy(), s.weight.copy()
-        target[100:150] = 1e3
-        weight[100:150] = 0.0
-        spoiled.append(replace(s, target=target, weight=weight))
-    clean = [replace(s, weight=t.weight) for s, t in zip(training, spoiled, strict=True)]
-    few = replace(SMALL, epochs=2)
-    a, _ = train(spoiled, validation, few, tmp_path / "a")
-    b, _ = train(clean, validation, few, tmp_path / "b")
-    assert a.sha256 == b.sha256
-    assert normalisation_of(spoiled, FEATURES) == normalisation_of(clean, FEATURES)
 
 
 def test_checkpoint_of_other_data_and_empty_splits_are_refused(tmp_path: Path) -> None:

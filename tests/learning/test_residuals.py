@@ -7,19 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import reference_car
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from physics_oracle import Oracle, parts
 from reference_car import Drive
-from residual_car import CAR, FRICTION, START_NS, Measured, Motion, Wave, drive, pick, truth_of, window
+from residual_car import CAR, START_NS, Measured, Motion, Wave, drive, pick, truth_of, window
 
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, nominal_filter
 from pdhef_logtool.learning.network.dataset import DriveArrays
 from pdhef_logtool.learning.network.residuals import (
     ResidualRows,
-    difference_noise,
     residual_rows,
-    smooth_increments,
 )
 from pdhef_logtool.learning.network.train_command import steering_offset
 
@@ -65,13 +61,6 @@ def test_residual_is_taken_at_the_true_state_not_at_the_estimate(motion: Motion)
     np.testing.assert_array_equal(bad.targets, good.targets)
 
 
-def test_signal_friction_wins_over_the_vehicle_file() -> None:
-    whole = window(drive(10.0))
-    told = replace(whole, signals=replace(whole.signals, friction=np.full(len(whole.signals), FRICTION)))
-    assert np.abs(rates(rows_of(told, friction=0.5))[:-1]).max() < 2e-3
-    assert np.abs(rates(rows_of(whole, friction=0.5))[:-1]).max() > 0.5
-
-
 def test_no_target_across_gaps_or_without_truth_or_steering(noisy: Measured) -> None:
     rows = rows_of(noisy)
     index = np.round((rows.stamps_ns - START_NS) / 1e7).astype(int)
@@ -79,52 +68,6 @@ def test_no_target_across_gaps_or_without_truth_or_steering(noisy: Measured) -> 
     expected = {299, 499, 1202, *range(699, 720), *range(899, 905), int(index[-1])}
     assert gone == expected
     assert not rows.weight[np.isin(index, list(expected))].any()
-
-
-def test_smoothing_reaches_over_no_gap(noisy: Measured) -> None:
-    h = 15
-    plain, smooth = rows_of(noisy), rows_of(noisy, half_window=h)
-    missing = np.flatnonzero(np.isnan(plain.targets[:-1]).any(axis=1))
-    near = np.zeros(len(plain), dtype=bool)
-    near[:h] = near[-h - 1 :] = True
-    for i in missing:
-        near[max(0, i - h) : i + h + 1] = True
-    np.testing.assert_array_equal(np.isnan(smooth.targets).any(axis=1), near)
-
-
-def test_segments_begin_where_the_filter_does(noisy: Measured) -> None:
-    rows = rows_of(noisy)
-    index = np.round((rows.stamps_ns - START_NS) / 1e7).astype(int)
-    assert rows.segment[0] == 0
-    # The lost 0.8 s restart the filter (at the next speed sample); a lost stamp and held steering do not.
-    changes = np.flatnonzero(np.diff(rows.segment)) + 1
-    assert index[changes].tolist() == [380]
-    assert (np.diff(rows.segment) >= 0).all()
-    # In operation, the state before a restart is not carried over either.
-    assert rows.weight[changes - 1].tolist() == [0.0]
-
-
-def test_rows_before_the_filter_starts_weigh_nothing(motion: Motion) -> None:
-    whole = window(motion)
-    speed = whole.signals.speed_m_s.copy()
-    speed[:200] = np.nan
-    rows = rows_of(replace(whole, signals=replace(whole.signals, speed_m_s=speed)))
-    assert np.isnan(rows.features[:200]).all()
-    assert not rows.weight[:200].any()
-    assert np.isfinite(rows.targets[:200]).all()
-    assert rows.weight[200:-1].all()
-    assert not rows.segment.any()
-
-
-def test_slow_and_spinning_cars_weigh_nothing() -> None:
-    motion = drive(5.0)
-    state = motion.state.copy()
-    state[100:200, 0] = 0.99 * CAR.low_speed_blend_m_s
-    state[300:350, 1] = 1.01 * state[300:350, 0]
-    rows = rows_of(replace(window(motion), truth=truth_of(motion.stamps_ns, state)))
-    expected = np.ones(len(rows), dtype=bool)
-    expected[99:200] = expected[299:350] = expected[-1] = False
-    np.testing.assert_array_equal(rows.weight > 0, expected)
 
 
 def test_features_do_not_see_the_truth(noisy: Measured) -> None:
@@ -137,30 +80,6 @@ def test_features_do_not_see_the_truth(noisy: Measured) -> None:
     np.testing.assert_array_equal(a.features, b.features)
     np.testing.assert_array_equal(a.segment, b.segment)
     assert not np.array_equal(a.targets, b.targets, equal_nan=True)
-
-
-@settings(max_examples=30, deadline=None, derandomize=True)
-@given(
-    coefficients=st.lists(st.floats(-3, 3), min_size=4, max_size=4),
-    seed=st.integers(0, 1000),
-    half_window=st.integers(2, 20),
-)
-def test_smoothing_keeps_cubics_on_uneven_stamps(coefficients: list[float], seed: int, half_window: int) -> None:
-    rng = np.random.default_rng(seed)
-    stamps = START_NS + np.cumsum(rng.integers(5_000_000, 15_000_000, 80))
-    curve = np.polynomial.Polynomial(coefficients)((stamps - START_NS) * 1e-9)
-    increments = np.diff(curve)[:, None]
-    out = smooth_increments(stamps, increments, half_window)
-    inner = slice(half_window, len(increments) - half_window)
-    np.testing.assert_allclose(out[inner], increments[inner], atol=1e-9)
-    assert np.isnan(out[:half_window]).all() and np.isnan(out[len(increments) - half_window :]).all()
-
-
-def test_staircase_truth_is_noise() -> None:
-    """A 20 Hz truth that is repeated at 100 Hz has no usable one-step differences, though most of them are 0."""
-    t = np.arange(2000) * 0.01
-    held = np.sin(2 * np.pi * 0.5 * t)[np.arange(2000) // 5 * 5]
-    assert difference_noise(START_NS + np.arange(2000) * 10_000_000, held) > 1.0
 
 
 # --- missing residual of physics -------------------------------------------------------------------------------------

@@ -17,11 +17,11 @@ from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.cli.learning_tables import render_learning
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.calibration.calibration import self_calibrate
-from pdhef_logtool.estimators.calibration.joint import FRONT_STIFFNESS, PEAK, parameters_of
+from pdhef_logtool.estimators.calibration.joint import FRONT_STIFFNESS, parameters_of
 from pdhef_logtool.learning.car.taught_prior import TYRES, taught_parameters
 from pdhef_logtool.learning.drives import TEACH, LearnSettings
 from pdhef_logtool.learning.engine import LearnResult, learn
-from pdhef_logtool.learning.stages.teach import OpenedDrive, _folds, learn_from, open_drive
+from pdhef_logtool.learning.stages.teach import OpenedDrive, learn_from, open_drive
 from pdhef_logtool.records.errors import EstimatorError, VehicleError
 from pdhef_logtool.runs.config import RunConfig
 
@@ -75,25 +75,6 @@ def test_a_drive_teaches_a_prior_that_later_drives_start_from(
     assert [prior[name] for name in TYRES] == pytest.approx([by_name[name].value for name in TYRES])
 
 
-def test_a_manoeuvre_at_the_limit_does_not_spoil_what_roads_teach(sample_logs_dir: Path, bare: Path) -> None:
-    roads = [opened(sample_logs_dir / "road.mcap", bare, start=a, end=b) for a, b in (("60", "90"), ("95", "125"))]
-    change = opened(sample_logs_dir / "dlc.mcap", bare)
-    alone, mixed = learn_from(roads), learn_from([change, *roads])
-    low, high = mixed.priors
-    assert high.level_m_s2 > 2.0 * low.level_m_s2
-    assert low.support == alone.priors[0].support > 0.0 and mixed.parameters == alone.parameters
-
-
-def test_what_a_drive_does_not_excite_keeps_its_prior(drive: OpenedDrive) -> None:
-    vehicle = drive.drive.car.vehicle
-    first = drive.taught.driving.stretches[0][0]
-    short = replace(drive.taught, driving=drive.taught.driving.between(first, first + 100))
-    taught = {p.name: p for p in taught_parameters([short], vehicle)}
-    parameters = {p.name: p for p in parameters_of(vehicle)}
-    assert taught[PEAK].std > 0.97 * parameters[PEAK].std
-    assert taught[PEAK].value == pytest.approx(parameters[PEAK].mean, rel=0.02)
-
-
 def test_the_figures_say_which_rung_and_what_to_drive_next(result: LearnResult) -> None:
     figures = result.figures
     assert [t["rung"] for t in figures["rungs"]][:2] == ["none", "linear"]
@@ -132,15 +113,6 @@ def test_the_prior_of_several_drives_is_tested_with_each_left_out(sample_logs_di
         if p.name in TYRES:
             assert file[p.name].value == pytest.approx(p.mean) and file[p.name].std == pytest.approx(p.std)
             assert full[p.name].std <= weak[p.name].std <= file[p.name].std
-
-
-def test_a_drive_that_begins_with_a_long_stop_is_halved_by_its_driving(drive: OpenedDrive) -> None:
-    cells = len(drive.taught.slopes)
-    moving = replace(drive.taught.driving, stretches=np.array([[cells // 2, cells]]))
-    slopes = np.where(np.arange(cells) < cells // 2, np.nan, drive.taught.slopes)
-    late = replace(drive, taught=replace(drive.taught, driving=moving, slopes=slopes))
-    first, second = (fold.taught[0].driving.seconds for fold in _folds([late]))
-    assert first == pytest.approx(second, abs=2.0) and first > 8.0
 
 
 def test_a_changed_vehicle_file_makes_it_stale(result: LearnResult, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -131,29 +130,6 @@ def test_every_message_is_found_through_the_copied_indexes(tmp_path: Path) -> No
     log.close()
 
 
-def test_other_readers_agree(tmp_path: Path) -> None:
-    from rerun.chunk import McapReader
-    from rosbags.highlevel import AnyReader
-
-    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
-    with McapLogWriter(source) as writer:
-        writer.add_topic("/x", "std_msgs/msg/Float64")
-        stamps = T0 + np.arange(200_000) * 1000
-        writer.write([TopicBatch("/x", stamps, stamps, {"data": np.arange(200_000.0)})])
-    items, _ = _annotate(source, target)
-    assert len(items) > 5
-    with AnyReader([target]) as reader:
-        x = [c for c in reader.connections if c.topic == "/x"]
-        got = [(t, reader.deserialize(raw, c.msgtype).data) for c, t, raw in reader.messages(x)]
-    assert got == list(zip(stamps.tolist(), np.arange(200_000.0).tolist(), strict=True))
-    rows = {}
-    for chunk in McapReader(target).stream():
-        if not chunk.is_static:
-            rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
-    assert rows["/x"] == 200_000
-    assert rows["/ours"] == 7000
-
-
 def _damage_chunk(path: Path, number: int) -> tuple[int, int]:
     """Flip a byte inside the compressed records of a chunk; returns the log times it held as [start, end)."""
     with path.open("rb") as stream:
@@ -177,20 +153,6 @@ def test_a_damaged_chunk_is_dropped_and_said(tmp_path: Path, compression: Compre
     assert _messages(target) != intact
 
 
-def test_a_chunk_without_crc_gets_one(tmp_path: Path) -> None:
-    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
-    _write(source, enable_crcs=False)
-    assert {c.uncompressed_crc for c in _chunks(source)} == {0}
-    _annotate(source, target, batches=False)
-    copied = _chunks(target)
-    assert [c.data for c in copied] == [c.data for c in _chunks(source)]
-    import zstandard
-
-    for chunk in copied:
-        content = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=chunk.uncompressed_size)
-        assert chunk.uncompressed_crc == zlib.crc32(content) != 0
-
-
 def test_chunks_that_hold_what_is_left_out_are_taken_apart(tmp_path: Path) -> None:
     source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
     _write(source, extra=("/old",))
@@ -198,27 +160,6 @@ def test_chunks_that_hold_what_is_left_out_are_taken_apart(tmp_path: Path) -> No
     assert lost == ()
     assert all(isinstance(item, RawMessage) for item in items)
     assert _messages(target) == [m for m in _messages(source) if m[0] != "/old"]
-
-
-def test_chunks_of_what_is_left_out_alone_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source, first, second = (tmp_path / f"{name}.mcap" for name in ("source", "first", "second"))
-    _write(source)
-    _annotate(source, first)
-    loads: list[int] = []
-    load = McapContainer.load
-    monkeypatch.setattr(McapContainer, "load", lambda self, span, want=None: (loads.append(1), load(self, span))[1])
-    items, _ = _annotate(first, second, leave_out=lambda topic: topic == "/ours")
-    assert [c for c in _chunks(second) if c in _chunks(source)] == _chunks(source)
-    assert len(loads) == len(items) == len(_chunks(source)) < len(_chunks(first))
-    assert first.read_bytes() == second.read_bytes()
-
-
-def test_unchunked_messages_are_copied_one_by_one(tmp_path: Path) -> None:
-    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
-    _write(source, use_chunking=False)
-    items, _ = _annotate(source, target)
-    assert all(isinstance(item, RawMessage) for item in items)
-    assert sorted(_messages(target), key=repr) == sorted(_messages(source), key=repr)
 
 
 def test_a_window_takes_apart_only_the_chunks_at_its_ends(tmp_path: Path) -> None:
@@ -289,23 +230,6 @@ def test_overlapping_chunks_keep_the_order_of_the_file(tmp_path: Path) -> None:
     assert _messages(target) == _messages(source)
     items, _ = _annotate(source, target, leave_out=lambda topic: topic == "/b", batches=False)
     assert [item.log_time_ns - T0 for item in items] == [2, 5, 6, 9, 12, 13, 20, 21], "message by message, merged"
-
-
-def test_ids_at_the_end_of_their_range_leave_room_for_more(tmp_path: Path) -> None:
-    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
-    with McapLogWriter(source) as writer:
-        id_ = writer.add_raw_channel(
-            "/a", schema_name="A", schema_encoding="ros2msg", schema_data=TEXT, message_encoding="cdr", metadata={},
-            channel_id=0xFFFF, schema_id=0xFFFF,
-        )  # fmt: skip
-        writer.write([], [RawMessage(id_, T0, T0, 0, b"1")])
-    items, _ = _annotate(source, target)
-    assert isinstance(items[0], RawChunk)
-    assert _messages(target) == _messages(source)
-    with target.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert {c.topic: c.id for c in summary.channels.values()} == {"/a": 0xFFFF, "/ours": 1}
-    assert set(summary.schemas) == {0xFFFF, 1}
 
 
 def test_ids_that_are_taken_are_replaced(tmp_path: Path) -> None:

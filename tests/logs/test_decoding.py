@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pdhef_logtool.logs.decoding import NO_TIME_NS
 from pdhef_logtool.logs.open_log import open_log
@@ -97,53 +95,6 @@ def test_a_json_message_that_is_no_json_is_counted(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read, [1, np.nan, 3] if start is None else [np.nan, 3])
         (loss,) = log.lost
         assert (loss.kind, loss.count, loss.severity) == ("undecodable", 1, "lost")
-    log.close()
-
-
-@pytest.mark.slow
-@settings(max_examples=30, deadline=None, derandomize=True)
-@given(
-    rows=st.lists(
-        st.tuples(
-            st.lists(st.text("abc", max_size=4), max_size=3), st.lists(st.floats(width=64), max_size=3), st.booleans()
-        ),
-        min_size=1,
-        max_size=25,
-    )
-)
-def test_changing_layouts_and_byte_orders_read_like_the_independent_deserialiser(
-    tmp_path_factory: pytest.TempPathFactory, rows: list[tuple[list[str], list[float], bool]]
-) -> None:
-    store = _rosbags_store()
-    types, name = store.types, "sensor_msgs/msg/JointState"
-    header = types["std_msgs/msg/Header"](stamp=types["builtin_interfaces/msg/Time"](sec=3, nanosec=4), frame_id="f")
-    payloads = [
-        bytes(
-            store.serialize_cdr(
-                types[name](
-                    header=header,
-                    name=names,
-                    position=np.array(position),
-                    velocity=np.array(position[:1]),
-                    effort=np.zeros(0),
-                ),
-                name,
-                little_endian=little,
-            )
-        )
-        for names, position, little in rows
-    ]
-    path = tmp_path_factory.mktemp("layouts") / "x.mcap"
-    _write_raw(path, payloads, "cdr", name, "ros2msg", store.generate_msgdef(name, ros_version=2)[0])
-    log = open_log(path)
-    read = log.read({"/t": ["header.stamp", "position", "position[1]", "velocity[0]"]})["/t"].fields
-    assert log.lost == ()
-    assert read["header.stamp"].tolist() == [3_000_000_004] * len(rows)
-    width = max(len(p) for _, p, _ in rows)
-    padded = np.array([p + [np.nan] * (width - len(p)) for _, p, _ in rows]).reshape(len(rows), width)
-    np.testing.assert_array_equal(read["position"].reshape(len(rows), -1), padded)
-    np.testing.assert_array_equal(read["position[1]"], [p[1] if len(p) > 1 else np.nan for _, p, _ in rows])
-    np.testing.assert_array_equal(read["velocity[0]"], [p[0] if p else np.nan for _, p, _ in rows])
     log.close()
 
 

@@ -24,7 +24,7 @@ from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import Meter
 from pdhef_logtool.logs.table_log import Table, TableLog
-from pdhef_logtool.records.errors import LogError, MappingError, PdhefError
+from pdhef_logtool.records.errors import LogError, PdhefError
 
 G_M_S2 = 9.80665
 TOPICS = {
@@ -112,15 +112,6 @@ def test_a_drive_of_tables_is_estimated(npz: Path) -> None:
 
 
 @pytest.mark.usefixtures("_installed")
-def test_a_missing_topic_or_field_names_the_nearest(npz: Path) -> None:
-    log = open_log(npz)
-    for topic, path in (("imo", "yaw_rate"), ("imu", "yaw_rates")):
-        with pytest.raises(MappingError, match=r"nearest: (imu|yaw_rate)"):
-            log.read({topic: [path]})
-    log.close()
-
-
-@pytest.mark.usefixtures("_installed")
 def test_a_compressed_file_and_a_folder_of_one_file_are_read_too(npz: Path, tmp_path: Path) -> None:
     import zstandard
 
@@ -131,18 +122,6 @@ def test_a_compressed_file_and_a_folder_of_one_file_are_read_too(npz: Path, tmp_
         found = log.read({"imu": ["yaw_rate"]})["imu"]
         np.testing.assert_array_equal(found.fields["yaw_rate"], expected.fields["yaw_rate"])
         log.close()
-
-
-@pytest.mark.usefixtures("_installed")
-def test_times_far_from_all_others_are_left_out(npz: Path, tmp_path: Path) -> None:
-    with np.load(npz) as archive:
-        columns = dict(archive)
-    columns["imu/t [s]"][0] = 5.0
-    np.savez(tmp_path / "stray.npz", **columns)
-    log, sound = open_log(tmp_path / "stray.npz"), open_log(npz)
-    assert (log.start_ns, log.end_ns) == (sound.start_ns, sound.end_ns)
-    assert [(loss.kind, loss.count, loss.severity) for loss in log.lost] == [("outlier", 1, "note")]
-    assert len(log.read({}, stamps=["imu"])["imu"]) == len(columns["imu/t [s]"]) - 1
 
 
 @pytest.mark.usefixtures("_installed")

@@ -25,7 +25,6 @@ from pdhef_logtool.logs.mdf_conversions import conversion_rule, formula_rule
 from pdhef_logtool.logs.mdf_log import open_mdf
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
-from pdhef_logtool.logs.table_clocks import RELATIVE_NS
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError, PdhefError
 from tests.command_line import called
@@ -269,13 +268,6 @@ def test_a_conversion_is_that_of_the_standard(version: int, kind: int, raw: list
     np.testing.assert_allclose(rule(np.asarray(raw)), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_the_end_of_a_range_belongs_to_a_range_of_integers() -> None:
-    parameters, _ = ORACLES[4, 6]
-    rule = conversion_rule(block_of(4, 6, **parameters), 4)
-    assert rule(np.asarray([1, 2, 4, 5])).tolist() == [-9.0, 0.5, 0.5, -9.0]
-    assert rule(np.asarray([4.0])).tolist() == [-9.0]
-
-
 def test_numbers_with_texts_stay_numbers_and_texts_among_scaled_numbers_are_missing() -> None:
     texts = {"ref_param_nr": 3, "val_0": 0, "text_0": b"off", "val_1": 1, "text_1": b"on"}
     raw = np.asarray([0, 1, 200])
@@ -411,12 +403,6 @@ def test_offsets_of_a_utc_start_are_not_applied_twice(tmp_path: Path) -> None:
     assert read.read.losses == []
 
 
-def test_a_damaged_date_is_no_date(tmp_path: Path) -> None:
-    data = imu()
-    (tmp_path / "a.mf4").write_bytes(patched(data, block(data, b"HD") + 72, 2**63 + 5))
-    assert contents(tmp_path / "a.mf4").stamps_ns["IMU"][0] == RELATIVE_NS
-
-
 @pytest.mark.parametrize(("sync", "what"), [(2, "an angle"), (3, "a distance"), (4, "an index")])
 def test_a_master_that_is_no_time_is_no_clock(sync: int, what: str, tmp_path: Path) -> None:
     samples = np.column_stack([TIME_S, AY]).tobytes()
@@ -426,40 +412,6 @@ def test_a_master_that_is_no_time_is_no_clock(sync: int, what: str, tmp_path: Pa
         contents(tmp_path / "a.mf4")
     (tmp_path / "b.mf4").write_bytes(mdf4([distance, Ch("AccY", 8), TIME], samples, N, 16))
     np.testing.assert_array_equal(contents(tmp_path / "b.mf4").columns["IMU.AccY"], AY)
-
-
-def test_a_virtual_master_counts_the_rows(tmp_path: Path) -> None:
-    master = Ch("time", kind=3, sync=1, bits=0, linear=(0.5, 0.02))
-    (tmp_path / "a.mf4").write_bytes(mdf4([master, Ch("AccY", 0)], AY.tobytes(), N, 8))
-    read = contents(tmp_path / "a.mf4")
-    expected = START_NS + np.round((0.5 + np.arange(N) * 0.02) * 1e9)
-    np.testing.assert_array_equal(read.stamps_ns["IMU"], expected.astype(np.int64))
-
-
-def test_a_group_may_have_the_times_of_another_group(tmp_path: Path) -> None:
-    def channel(name: str, kind: int) -> tuple[list[str], bytes]:
-        numbers = struct.pack("<BBBBIIIIBxHdddddd", kind, kind // 2, 4, 0, 0, 64, 0, 0, 0, 0, *[0.0] * 6)
-        return ["", "", name, "", "", "", "", ""], numbers
-
-    def group(flags: int) -> bytes:
-        return struct.pack("<QQHHIII", 0, N, flags, 0, 0, 8, 0)
-
-    date = struct.pack("<QhhB", START_NS, 0, 0, 0)
-    blocks = {
-        "HD": (["DG", "FH", "", "", "", ""], date + bytes(19)),
-        "FH": (["", "MD"], date + bytes(3)),
-        "MD": ([], b"<FHcomment><TX>x</TX></FHcomment>\0"),
-        "DG": (["DG2", "CG", "DT", ""], bytes(8)),
-        "CG": (["", "CN", "", "", "", ""], group(0)),
-        "DG2": (["", "CG2", "DT2", ""], bytes(8)),
-        "CG2": (["", "CN2", "TX3", "", "", "", "CG"], group(8)),
-        "CN": channel("TX1", 2), "CN2": channel("TX2", 0), "TX1": ([], b"time\0"), "TX2": ([], b"AccY\0"),
-        "TX3": ([], b"IMU\0"), "DT": ([], TIME_S.tobytes()), "DT2": ([], AY.tobytes()),
-    }  # fmt: skip
-    (tmp_path / "a.mf4").write_bytes(assembled(blocks, 420))
-    read = contents(tmp_path / "a.mf4")
-    np.testing.assert_array_equal(read.columns["IMU.AccY"], AY)
-    np.testing.assert_array_equal(read.stamps_ns["IMU"], START_NS + np.round(TIME_S * 1e9).astype(np.int64))
 
 
 # ---- bus logging of newer loggers ----
@@ -587,11 +539,6 @@ def test_an_unfinished_file_with_several_lists_of_data_is_one_line(tmp_path: Pat
     (tmp_path / "a.mf4").write_bytes(patched(bytes(data), group + 24 + 16, lists[0]))
     with pytest.raises(LogError, match="several lists of data"):
         contents(tmp_path / "a.mf4")
-
-
-def test_packed_data_are_read(tmp_path: Path) -> None:
-    (tmp_path / "a.mf4").write_bytes(imu(packed=(16 * N,)))
-    np.testing.assert_array_equal(contents(tmp_path / "a.mf4").columns["IMU.AccY"], AY)
 
 
 def test_a_file_that_a_recorder_has_not_finished_leaves_no_copy(

@@ -13,7 +13,7 @@ import zstandard
 from mcap.writer import Writer
 
 from pdhef_logtool.logs.container import Block
-from pdhef_logtool.logs.open_log import is_log_folder, looks_like_log, open_log
+from pdhef_logtool.logs.open_log import is_log_folder, open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError
 
@@ -106,19 +106,6 @@ def test_missing_paths_and_folders_without_one_log_are_refused(tmp_path: Path) -
     _mcap(tmp_path / "b.mcap")
     with pytest.raises(LogError, match="2 logs"):
         open_log(tmp_path)
-
-
-def test_the_suffix_does_not_matter(tmp_path: Path) -> None:
-    path = _mcap(tmp_path / "drive.bag")
-    np.testing.assert_array_equal(_values(path, "/imu", "angular_velocity.z"), VALUES)
-    assert looks_like_log(path)
-
-
-def test_a_folder_with_one_bare_file_is_that_log(tmp_path: Path) -> None:
-    _mcap(tmp_path / "drive.mcap")
-    (tmp_path / "notes.txt").write_text("windy")
-    np.testing.assert_array_equal(_values(tmp_path, "/imu", "angular_velocity.z"), VALUES)
-    assert not is_log_folder(tmp_path)
 
 
 @pytest.mark.parametrize(

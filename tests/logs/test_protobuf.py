@@ -182,14 +182,6 @@ def test_fields_are_listed_without_maps_and_recursion(tmp_path: Path) -> None:
     assert not [p for p in kinds if p.startswith(("labels", "parent"))]
 
 
-def test_google_files_may_be_missing_from_the_descriptors(tmp_path: Path) -> None:
-    message = STATE(a_double=1.5, stamp={"seconds": 3, "nanos": 7})
-    _write(tmp_path / "a.mcap", [message.SerializeToString()], schema=_files(with_timestamp=False).SerializeToString())
-    got = _read(tmp_path / "a.mcap", "a_double", "stamp")
-    assert got["a_double"].tolist() == [1.5]
-    assert got["stamp"].tolist() == [3_000_000_007]
-
-
 def test_a_payload_that_is_no_message_is_counted_and_nan(tmp_path: Path) -> None:
     good = STATE(a_double=2.0).SerializeToString()
     _write(tmp_path / "a.mcap", [good, b"\xff\xff\xff", good, good[:-1]])

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from recorded import attribute, decoded_by_rosbags
 
-from pdhef_logtool.logs.drive_log import windows
 from pdhef_logtool.logs.open_log import open_log
 
 pytestmark = pytest.mark.slow
@@ -82,38 +81,6 @@ def test_stamps_arrays_and_elements_equal_those_of_an_independent_reader(shared_
     log.close()
 
 
-def test_json_messages_read_as_columns(shared_dir: Path) -> None:
-    from mcap.reader import make_reader
-
-    path = shared_dir / "data/drives/comma2k19_segment.mcap"
-    with path.open("rb") as file:
-        messages = [json.loads(m.data) for _, _, m in make_reader(file).iter_messages(topics=["/gnss/pose"])]
-    log = open_log(path)
-    pose = log.read({"/gnss/pose": ["position_ecef_m", "position_ecef_m[1]", "t"]})["/gnss/pose"]
-    np.testing.assert_array_equal(pose.fields["position_ecef_m"], [m["position_ecef_m"] for m in messages])
-    np.testing.assert_array_equal(pose.fields["position_ecef_m[1]"], [m["position_ecef_m"][1] for m in messages])
-    np.testing.assert_array_equal(pose.fields["t"], [m["t"] for m in messages])
-    log.close()
-
-
-def test_windows_together_give_what_one_read_gives(shared_dir: Path) -> None:
-    for name in (REVS, f"{FAULTY}/revs_250lm_a_disorder.mcap", "data/drives/lunda_v40"):
-        log = open_log(shared_dir / name)
-        topic = log.topics[0].name
-        field = next(f.path for f in log.fields(topic) if f.kind == "number")
-        whole = log.read({topic: [field]})[topic]
-        parts = [
-            log.read({topic: [field]}, a, b)[topic]
-            for a, b in windows(log.start_ns, log.end_ns, 7_000_000_000, log.recording_span)
-        ]
-        np.testing.assert_array_equal(np.concatenate([p.log_time_ns for p in parts]), whole.log_time_ns)
-        np.testing.assert_array_equal(np.concatenate([p.fields[field] for p in parts]), whole.fields[field])
-        assert np.all(np.diff(whole.log_time_ns) >= 0)
-        assert whole.log_time_ns[0] >= log.start_ns
-        assert whole.log_time_ns[-1] < log.end_ns
-        log.close()
-
-
 @pytest.mark.parametrize("name", ["revs_250lm_a_flipped_byte.mcap", "revs_250lm_a_flipped_byte_crc_only.mcap"])
 def test_a_flipped_byte_costs_its_chunk_and_says_which_interval(shared_dir: Path, name: str) -> None:
     facts = json.loads((shared_dir / FAULTY / "faults.json").read_text())[name]
@@ -135,24 +102,6 @@ def test_a_flipped_byte_costs_its_chunk_and_says_which_interval(shared_dir: Path
     good.close()
 
 
-def test_a_truncated_log_gives_its_complete_chunks(shared_dir: Path) -> None:
-    facts = json.loads((shared_dir / FAULTY / "faults.json").read_text())["revs_250lm_a_truncated60.mcap"]
-    log = open_log(shared_dir / FAULTY / "revs_250lm_a_truncated60.mcap")
-    good = open_log(shared_dir / REVS)
-    counts = {topic: len(columns) for topic, columns in log.read({}, stamps=[t.name for t in log.topics]).items()}
-    assert counts == facts["messages_in_complete_chunks"]
-    (loss,) = log.lost
-    assert (loss.kind, loss.severity) == ("truncated", "lost")
-    assert loss.start_ns == facts["last_log_time_ns"] + 1
-    fields = {"/ins/odometry": ["twist.twist.linear.y"]}
-    read, whole = log.read(fields)["/ins/odometry"], good.read(fields)["/ins/odometry"]
-    np.testing.assert_array_equal(
-        read.fields["twist.twist.linear.y"], whole.fields["twist.twist.linear.y"][: len(read)]
-    )
-    log.close()
-    good.close()
-
-
 def test_a_split_folder_is_one_log(shared_dir: Path) -> None:
     split, whole = open_log(shared_dir / FAULTY / "revs_250lm_a_split"), open_log(shared_dir / REVS)
     assert split.kind == "rosbag2-mcap"
@@ -165,12 +114,3 @@ def test_a_split_folder_is_one_log(shared_dir: Path) -> None:
     assert (split.start_ns, split.end_ns, split.lost) == (whole.start_ns, whole.end_ns, ())
     split.close()
     whole.close()
-
-
-def test_bursts_out_of_order_come_in_log_time_order(shared_dir: Path) -> None:
-    log = open_log(shared_dir / FAULTY / "revs_250lm_a_disorder.mcap")
-    columns = log.read({}, stamps=[t.name for t in log.topics])
-    assert sum(len(c) for c in columns.values()) == 117_010
-    assert all(np.all(np.diff(c.log_time_ns) >= 0) for c in columns.values())
-    assert log.lost == ()
-    log.close()

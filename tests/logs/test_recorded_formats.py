@@ -106,7 +106,6 @@ def _scores(log: Path, table: _Table, car: Path, clock: str, end: str) -> dict[s
     ("file", "table", "drive", "reference", "vehicle", "clock", "end"),
     [
         ("v40_swd.vbo", V40_VBO, "v40_swd_gnss", V40_MCAP, V40, "stamp", "+23.9s"),
-        ("v40_slalom.vbo", V40_VBO, "v40_slalom", V40_MCAP, V40, "stamp", "+33.1s"),
         ("v40_swd.mf4", V40_MF4, "v40_swd_gnss", V40_MCAP | _GNSS, V40, "arrival", "+23.9s"),
         ("gti_pole_aa.mat", GTI_MAT, "gti_pole_aa", GTI_MCAP, GTI, "stamp", "+61.9s"),
     ],

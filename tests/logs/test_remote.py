@@ -133,31 +133,6 @@ def _write_groups(path: Path, seconds: int, groups: dict[str, tuple[list[str], i
 _APART = {"imu": (["/imu", "/wheels"], 20), "camera": (["/camera"], 500), "lidar": (["/lidar"], 300)}
 
 
-def test_topics_apart_cost_three_requests_and_the_wanted_chunks(tmp_path: Path) -> None:
-    file = tmp_path / "apart.mcap"
-    _write_groups(file, 80, _APART)
-    with serving(**{file.name: file.read_bytes()}) as server:
-        place = _place(server, file.name)
-        whole = open_log(file)
-        first = open_log(place, wanted=NOTHING_YET)
-        assert len(server.requests) <= 3
-        assert first.topics == whole.topics
-        assert (first.start_ns, first.end_ns) == (whole.start_ns, whole.end_ns)
-        log = open_log(place, wanted=Wanted(frozenset({"/imu"})))
-        first.close()
-        asked = {"/imu": ["data"]}
-        here, there = whole.read(asked)["/imu"], log.read(asked)["/imu"]
-        assert here.fields["data"].tobytes() == there.fields["data"].tobytes()
-        assert here.log_time_ns.tobytes() == there.log_time_ns.tobytes()
-        assert log.lost == ()
-        log.close()
-        whole.close()
-        chunks = 8
-        assert len(server.requests) <= 3 + chunks
-        assert server.twice() == 0
-        assert server.bytes_sent < 0.2 * file.stat().st_size + 2 * remote_source.BLOCK_BYTES * chunks + (256 << 10)
-
-
 def test_a_drive_apart_from_its_camera_costs_its_chunks_alone(
     tmp_path: Path, sample_logs_dir: Path, saloon: Car
 ) -> None:
@@ -222,15 +197,6 @@ def test_a_server_without_ranges_gives_all_at_once(sample_logs_dir: Path) -> Non
         server.ranges = False
         assert _read(_place(server, file.name)) == _read(file)
         assert len(server.requests) == 1
-
-
-def test_copies_of_closed_logs_are_kept_up_to_a_size(served: CountingServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    for kept_bytes, fetched in ((1 << 30, 1), (0, 2)):
-        monkeypatch.setattr(remote_source, "KEPT_BYTES", kept_bytes)
-        _read(_place(served, "dlc.mcap"))
-        _read(_place(served, "dlc.mcap"))
-        size = len(served.files["dlc.mcap"])
-        assert fetched * size <= served.bytes_sent <= fetched * size + 100, kept_bytes
 
 
 def test_metadata_is_read_from_head_and_tail(sample_logs_dir: Path) -> None:
@@ -386,16 +352,3 @@ def test_urls_lists_and_files_together(tmp_path: Path, monkeypatch: pytest.Monke
         find_logs(["gs://bucket/one.mcap"])
     with pytest.raises(UsageError, match="s3://, http://, https://"):
         find_logs(["https://"])
-
-
-def test_a_hint_of_time_leaves_the_others_chunks_alone(tmp_path: Path) -> None:
-    file = tmp_path / "apart.mcap"
-    _write_groups(file, 40, {"imu": (["/imu"], 200), "camera": (["/camera"], 500)})
-    with serving(**{file.name: file.read_bytes()}) as server:
-        start = 1_700_000_000_000_000_000
-        wanted = Wanted(frozenset({"/imu"}), start, start + 5_000_000_000)
-        log = open_log(_place(server, file.name), wanted=wanted)
-        later = log.read({"/imu": ["data"]}, start + 35_000_000_000)["/imu"]  # a hint, and no bound
-        assert len(later) == 500
-        log.close()
-        assert server.bytes_sent < 0.5 * file.stat().st_size + (256 << 10)

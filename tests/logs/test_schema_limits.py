@@ -116,15 +116,6 @@ def test_a_schema_that_refers_to_itself_is_open_there() -> None:
     np.testing.assert_array_equal(values, [2.0])
 
 
-def test_the_texts_of_ros_parse_as_before_and_quickly() -> None:
-    constants = "".join(f"const long C{i} = (({i})) + 1;" for i in range(200))
-    struct = 'struct A { @default(value=3) long x; @verbatim(language="c", text="a (b") sequence<double, 4> y; };'
-    text = f"module p {{ module msg {{ module A_Constants {{ {constants} }}; {struct} }}; }};"
-    started = time.process_time()
-    assert [leaf.path for leaf in leaves(_schema("ros2idl", text).root)] == ["x", "y[]"]
-    assert time.process_time() - started < 2.0
-
-
 def test_an_array_without_end_does_not_take_its_neighbours_along() -> None:
     schema = _schema("ros2msg", "int8 y\nfloat64[4294967295] x\n")
     with pytest.raises(MappingError, match="4294967295 elements, too many"):
@@ -195,24 +186,6 @@ def test_a_schema_that_does_not_parse_is_a_loss_of_its_channel_and_no_other(tmp_
     assert [len(log.fields(topic)) for topic in ("/bomb", "/bomb", "/sound", "/other")] == [0, 0, 1, 0]
     (loss,) = log.lost
     assert (loss.kind, loss.where, loss.severity) == ("bad-schema", "/bomb", "lost")
-    log.close()
-
-
-@pytest.mark.slow
-def test_many_schemas_that_cost_too_much_are_no_more_than_a_few(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="", library="test")
-        for number in range(600):
-            schema = writer.register_schema(str(number), "jsonschema", _nested(13, 10).encode() + b" " * number)
-            writer.add_message(writer.register_channel(f"/{number}", "json", schema), 5, b"{}", 5)
-        writer.finish()
-    log = open_log(path)
-    started = time.process_time()
-    assert not any(log.fields(f"/{number}") for number in range(600))
-    assert time.process_time() - started < 15.0
-    assert len(log.lost) == 600
     log.close()
 
 

@@ -70,31 +70,6 @@ def _serialised(message: Any, type_name: str) -> bytes:
 
 
 @_settings
-@given(stamp=_stamps, frame=_texts, values=hnp.arrays(np.float64, 10, elements=_floats), first=_floats)
-def test_imu_bytes_equal_an_independent_serialiser(stamp: int, frame: str, values: np.ndarray, first: float) -> None:
-    covariance = [first] + [0.0] * 8
-    name = "sensor_msgs/msg/Imu"
-    message = _message(
-        name,
-        header=_header(stamp, frame),
-        orientation=_quaternion(values[:4]),
-        orientation_covariance=np.array(covariance),
-        angular_velocity=_vector(values[4:7]),
-        angular_velocity_covariance=np.zeros(9),
-        linear_acceleration=_vector(values[7:10]),
-        linear_acceleration_covariance=np.zeros(9),
-    )
-    fields = {
-        "header.stamp": np.array([stamp]),
-        "orientation": values[None, :4],
-        "angular_velocity": values[None, 4:7],
-        "linear_acceleration": values[None, 7:10],
-    }
-    constants = {"header.frame_id": frame, "orientation_covariance": covariance}
-    assert _encoded(name, fields, constants) == _serialised(message, name)
-
-
-@_settings
 @given(
     stamp=_stamps,
     frame=_texts,
@@ -167,16 +142,6 @@ def test_own_message_bytes_equal_an_independent_serialiser(
         "reason": np.array([reason], dtype=np.uint32),
     }
     assert _encoded(ESTIMATE, fields, {"header.frame_id": frame}) == _serialised(message, ESTIMATE)
-
-
-@_settings
-@given(data=hnp.arrays(np.float64, st.integers(0, 5), elements=_floats))
-def test_sequences_take_the_width_of_their_column(data: np.ndarray) -> None:
-    name = "std_msgs/msg/Float64MultiArray"
-    layout = _message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=7)
-    message = _message(name, layout=layout, data=data)
-    encoded = _encoded(name, {"data": data[None, :], "layout.data_offset": np.array([7])}, {})
-    assert encoded == _serialised(message, name)
 
 
 @st.composite

@@ -20,7 +20,7 @@ from mcap.writer import Writer
 
 from pdhef_logtool.logs.can_decoding import signal_values
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import Mapping, check_mapping, fit_clocks, load_mapping, mapping_to_toml, read_signals
+from pdhef_logtool.mapping import Mapping, check_mapping, fit_clocks, load_mapping, read_signals
 from pdhef_logtool.mapping.evidence import LARGEST
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.runs.inspection.report import inspect_log
@@ -251,18 +251,6 @@ def test_error_and_remote_frames_carry_no_data(tmp_path: Path) -> None:
     assert channel.stamps_ns.tolist() == [S, S + 3_000_000]
 
 
-def test_socketcan_flags_in_a_signed_identifier(tmp_path: Path) -> None:
-    raw = {"extended": (_EXTENDED_ID | 1 << 31) - 2**32, "remote": 256 | 1 << 30, "error": 256 | 1 << 29}
-    rows = [{"id": value, "data": [0, 0, 128, 63, 1, 1, 1, 1]} for value in raw.values()]
-    schema = {"type": "object", "properties": {"id": {"type": "integer"},
-                                               "data": {"type": "array", "items": {"type": "integer"}}}}  # fmt: skip
-    _write(tmp_path / "a.mcap", "json", ("Can", "jsonschema", json.dumps(schema).encode()),
-           [json.dumps(r).encode() for r in rows])  # fmt: skip
-    channels = _read(tmp_path / "a.mcap", _mapping(tmp_path, {k: _FIELDS[k] for k in ("ax_m_s2", "speed_m_s")}))
-    assert channels.signals["ax_m_s2"].values.tolist() == [1.0]
-    assert len(channels.signals["speed_m_s"]) == 0
-
-
 def test_another_bus_and_masked_bits_are_told_apart(tmp_path: Path) -> None:
     rows = [{"msg": {"no": 256 | priority << 11, "raw": [value, 0, 0, 0, 0, 0, 0, 0]}, "port": bus, "ide": 0}
             for priority, value, bus in ((0, 1, 0), (0, 2, 1), (0, 3, 0))]  # fmt: skip
@@ -288,16 +276,6 @@ def test_inspect_shows_the_signals_and_counts_short_frames(tmp_path: Path) -> No
     assert report.maximum == pytest.approx(0.49)
     assert [(x.kind, x.count, x.severity) for x in found.lost] == [("undecodable", 1, "lost")]
     assert [t.name for t in found.topics] == ["/can/raw"]
-
-
-def test_the_mapping_is_written_as_it_was_read(tmp_path: Path) -> None:
-    more = 'id_field = "a"\ndata_field = "b"\ndata_encoding = "hex"\nlength_field = "c"\nextended_field = "d"\n'
-    more += 'bus_field = "e"\nbus = 2\nid_mask = 0x1FFFFF00'
-    mapping = _mapping(tmp_path, _FIELDS, more)
-    assert mapping.can is not None
-    assert mapping.can.dbc == (tmp_path / "car.dbc",)
-    (tmp_path / "again.toml").write_text(mapping_to_toml(mapping))
-    assert load_mapping(tmp_path / "again.toml") == mapping
 
 
 # --------------------------------------------------------------------------------------------------- errors

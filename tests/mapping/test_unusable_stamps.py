@@ -77,17 +77,6 @@ def test_sound_stamps_stay() -> None:
         assert why_unusable(stamps, log_time) == ""
 
 
-def test_single_wild_stamps_are_bad_stamps() -> None:
-    stamps = TRUE.copy()
-    stamps[[100, 101]] = [T0 + 10**18, T0 - 500 * S]
-    log = FakeLog({"/imu": FakeTopic("a/b", LOG, {"header.stamp": stamps, "v": np.arange(float(N))})})
-    mapping = Mapping(signals={"ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp")})
-    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-    found = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
-    assert +found.counts["signal", "ay_m_s2"] == {"read": N, "bad-stamp": 2}
-    assert [(x.kind, x.count, x.severity) for x in found.losses] == [("bad-stamp", 2, "lost")]
-
-
 @pytest.mark.parametrize(("behind_ns", "serves"), [(3600 * S, True), (-3 * S, True), (20 * MS, False)])
 def test_one_topic_of_another_clock(behind_ns: int, serves: bool) -> None:
     """A clock offset shared by all topics is accepted; a topic with a different offset has unusable stamps."""
@@ -210,10 +199,3 @@ def test_a_delay_of_another_clock_is_named_and_not_shown_as_a_delay() -> None:
     assert "other clock" in text["boot"]
     assert "clock" not in text["arrival"].split("Mapping")[0]
     assert "e+" not in "".join(text.values()).split("Values")[0]
-
-
-def test_rates_of_bursts_are_those_of_their_messages() -> None:
-    bursts = T0 + np.repeat(np.arange(0, 60 * S, 100 * MS), 4) + np.tile(np.arange(4) * 40_000, 600)
-    assert Steps.of([bursts]).rate_hz == pytest.approx(40.0, rel=0.01)
-    regular = np.delete(TRUE, [100, 200, 201, *range(500, 700)])
-    assert Steps.of([regular]).rate_hz == pytest.approx(100.0)

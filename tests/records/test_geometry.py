@@ -142,18 +142,6 @@ def test_dead_reckoning_of_a_circle_converges_with_the_square_of_the_step():
         assert math.log2(coarse / fine) == pytest.approx(2.0, abs=0.1)
 
 
-def test_dead_reckoning_skips_what_is_not_known():
-    stamps = np.arange(6, dtype=np.int64) * 1_000_000_000
-    vx = np.array([1.0, 1.0, np.nan, 1.0, 1.0, 1.0])
-    x, y, yaw = dead_reckon(stamps, vx, np.zeros(6), np.zeros(6), (0.0, 0.0, math.pi / 2))
-    np.testing.assert_allclose(y, [0, 1, 1, 1, 2, 3], atol=1e-12)
-    np.testing.assert_allclose(x, 0.0, atol=1e-12)
-    np.testing.assert_allclose(yaw, math.pi / 2)
-    assert all(len(a) == 0 for a in dead_reckon(stamps[:0], vx[:0], vx[:0], vx[:0], (1.0, 2.0, 3.0)))
-    one = dead_reckon(stamps[:1], vx[:1], vx[:1], vx[:1], (1.0, 2.0, 3.0))
-    assert [a.tolist() for a in one] == [[1.0], [2.0], [3.0]]
-
-
 def test_angles_beyond_a_turn_change_none_beside_them() -> None:
     within = np.array([-np.pi, -1e-300, -0.0, 0.0, 3.0, np.nextafter(np.pi, 0.0), np.nan])
     alone, beside = wrap_angle(within), wrap_angle(np.append(within, [7.0, -9.0]))

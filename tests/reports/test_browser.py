@@ -137,49 +137,6 @@ def test_an_error_of_one_sample_is_seen_unzoomed_and_named(browser, tmp_path):
     assert "1000.000 s" in browser.value("document.querySelector('button.jump').textContent")
 
 
-@pytest.mark.fleet
-def test_an_hour_of_fourteen_tracks_is_small_and_quick(browser, tmp_path):
-    file = page_of(write_run(tmp_path, drive_tracks(3600.0, NAMES)))
-    assert file.stat().st_size < 8_000_000
-    before = browser.busy_s()
-    opened(browser, file)
-    after = browser.busy_s()
-    # The clock of a page restarts if the browser moves the page to another process.
-    assert (after - before if after > before else after) < FIRST_PICTURE_S
-    browser.value(_DRAWN)
-    times = []
-    for start, end in ((0.3, 0.6), (0.4, 0.5), (0.45, 0.55)):
-        before = browser.busy_s()
-        browser.drag(".u-over", start, end)
-        browser.value(_DRAWN)
-        times.append(browser.busy_s() - before)
-    assert np.median(times) < ZOOM_S
-
-
-def test_print_is_a4_with_figures(browser, tmp_path):
-    opened(browser, page_of(write_run(tmp_path, drive_tracks())))
-    browser.pdf(tmp_path / "page.pdf")
-    made = (tmp_path / "page.pdf").read_bytes()
-    assert made.startswith(b"%PDF")
-    assert len(made) > 50_000
-    browser.value(_DRAWN)
-    widths = browser.value("[...document.querySelectorAll('.canvas .uplot')].map(n => n.clientWidth)")
-    assert max(widths) > 1000  # back on the screen
-
-
-def test_figures_are_drawn_when_the_page_has_loaded_and_in_browsers_without_streams(browser, tmp_path):
-    file = page_of(write_run(tmp_path, drive_tracks(3.0)))
-    at_load = "addEventListener('load', () => { window.drawnAtLoad = document.documentElement.dataset.drawn; });"
-    source = f"delete window.DecompressionStream; {at_load}"
-    script = browser.call("Page.addScriptToEvaluateOnNewDocument", source=source)
-    opened(browser, file)
-    assert browser.value("document.querySelectorAll('.canvas:not([role=img]), .canvas:not([aria-label])').length") == 0
-    assert int(browser.value("window.drawnAtLoad")) == browser.value(
-        "document.querySelectorAll('[data-figure]').length"
-    )
-    browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script["identifier"])
-
-
 def test_the_keyboard_zooms(browser, tmp_path):
     opened(browser, page_of(write_run(tmp_path, drive_tracks(60.0))))
     press = (

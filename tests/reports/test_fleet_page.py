@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -73,13 +72,6 @@ def test_a_run_with_everything_says_everything(tmp_path: Path) -> None:
         assert f'data-figure="{key}"' in page
 
 
-def test_one_log_has_a_short_page(tmp_path: Path) -> None:
-    page = words(run_of(tmp_path, {"only": {"errors": (0.001, 0.0015)}}))
-    assert "RMSE of the selected estimate: 0.057°." in page
-    assert "Ranking" not in page and "Breakdown" not in page and "data-figure" not in page.split("<script")[0]
-    assert 'href="logs/only/report.html"' in page
-
-
 @pytest.mark.parametrize("drives", [{}, {"a": {"truth": {"available": False, "not_independent": []}}}])
 def test_without_a_score_there_is_no_verdict_and_no_empty_figure(tmp_path: Path, drives: dict[str, Any]) -> None:
     page = words(run_of(tmp_path, drives, {"bad": "empty"}))
@@ -91,13 +83,6 @@ def test_what_logs_say_is_text(tmp_path: Path) -> None:
     page = words(run_of(tmp_path, drives, {"bad": HOSTILE}))
     assert "<script>alert" not in page and "<img" not in page and "\u202e" not in page
     assert "&lt;/script&gt;" in page
-
-
-def test_a_key_can_be_asked_for(tmp_path: Path) -> None:
-    drives = {f"d{i}": {"errors": (0.001, 0.002), "metadata": {"who": f"x{i}"}} for i in range(3)}
-    folder = run_of(tmp_path, drives)
-    assert "<h3>who" not in words(folder)
-    assert re.search(r"<h3>who.*<td>x2</td>", words(folder, by=["who"]), re.DOTALL)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from pdhef_logtool.residual_model.features import FEATURES, ODD_COUNT, SlowFeatures, slow_features
-from pdhef_logtool.residual_model.ladder import LARGEST, LadderModel
+from pdhef_logtool.residual_model.ladder import LadderModel
 from pdhef_logtool.residual_model.ladder_fit import (
     LadderFit,
     TaughtDrive,
@@ -82,24 +82,12 @@ def test_a_linear_error_is_found_on_a_drive_that_was_not_taught() -> None:
     assert np.mean(fit.model.evaluate(other.features).gain > 0.0) > 0.8
 
 
-def test_noise_alone_teaches_nothing() -> None:
-    fits = [fit_ladder([taught(60.0, seed)]) for seed in range(8)]
-    assert sum(fit.model is not None for fit in fits) <= 1
-    assert all(fit.trials[0].rung == "none" for fit in fits)
-
-
 def test_a_product_of_odd_and_even_takes_the_random_rung() -> None:
     def product(found: SlowFeatures) -> np.ndarray:
         return 0.3 * found.odd[:, 4] * np.tanh(found.even[:, 3])
 
     fit = fit_ladder([taught(900.0, 2, product, noise_rad=0.0003)])
     assert fit.rung == "random"
-
-
-def test_too_little_driving_gives_no_model() -> None:
-    fit = fit_ladder([taught(5.0, 1, linear)])
-    assert fit.model is None and fit.trials == ()
-    assert fit_ladder([]).model is None
 
 
 @pytest.mark.parametrize("offset_rad", [0.02, -0.5])
@@ -111,15 +99,6 @@ def test_a_constant_of_the_ground_truth_is_not_learned(offset_rad: float) -> Non
     expected, got = linear_model().evaluate(found), moved.evaluate(found)
     assert np.allclose(got.rate_m_s2, expected.rate_m_s2, atol=1e-9)
     assert np.array_equal(got.gain, expected.gain)
-
-
-def test_each_drive_may_have_its_own_constant() -> None:
-    drives = [taught(200.0, seed, linear) for seed in (1, 2, 3)]
-    moved = [replace(d, lacking_rad=d.lacking_rad + 0.01 * k) for k, d in enumerate(drives)]
-    fits = [fit_ladder(each).model for each in (drives, moved)]
-    assert all(f is not None for f in fits)
-    a, b = (f.evaluate(drives[0].features).rate_m_s2 for f in fits if f is not None)
-    assert np.allclose(a, b, atol=1e-9)
 
 
 @settings(max_examples=20, deadline=None)
@@ -149,13 +128,6 @@ def random_model() -> LadderModel:
     )
 
 
-def test_straight_driving_has_no_residual() -> None:
-    signals = np.zeros((200, 6))
-    signals[:, 4] = 20.0
-    for model in (linear_model(), random_model()):
-        assert np.all(model.evaluate(features(signals)).rate_m_s2 == 0.0)
-
-
 def test_outside_of_the_taught_driving_the_residual_is_zero_within_two_seconds() -> None:
     inside = driving(20.0, 3)
     for outside in (driving(10.0, 3, speed=60.0), inside[:500] * np.array([8.0] * 4 + [1.0, 1.0])):
@@ -165,11 +137,6 @@ def test_outside_of_the_taught_driving_the_residual_is_zero_within_two_seconds()
         assert np.mean(found.gain[first + 100 :] == 0.0) > 0.9
     fast = linear_model().evaluate(features(driving(10.0, 3, speed=60.0)))
     assert np.all(fast.gain == 0.0)
-
-
-def test_a_residual_is_limited() -> None:
-    found = linear_model().evaluate(features(driving(5.0, 1) * np.array([100.0] * 4 + [1.0, 1.0])))
-    assert np.max(np.abs(found.rate_m_s2)) <= LARGEST * linear_model().largest_m_s2
 
 
 def test_unknown_features_have_gain_zero_and_the_next_ones_go_on() -> None:
@@ -195,15 +162,6 @@ def test_the_sums_of_blocks_give_the_weighted_ridge_regression_of_the_samples() 
     squares = np.sum((table[seen:, 6] - table[seen:, :6] @ expected) ** 2)
     assert problem.block_error(5, (5,), ridge) == pytest.approx(squares)
     assert problem.only(5).block_error(5, (5,), ridge) == pytest.approx(squares)
-
-
-def test_a_sideslip_without_weight_teaches_nothing() -> None:
-    drive = taught(300.0, 1, linear)
-    weight = np.where(np.arange(len(drive.stamps_ns)) % 500 < 100, 0.0, 0.5)
-    wrong = replace(drive, weight=weight, lacking_rad=np.where(weight > 0.0, drive.lacking_rad, 1.0))
-    first, second = (fit_ladder([d], rungs=("linear",)).model for d in (replace(drive, weight=weight), wrong))
-    assert first is not None and second is not None
-    assert np.allclose(first.weights, second.weights, rtol=1e-6, atol=1e-9)
 
 
 def test_a_model_survives_its_document_and_damage_is_refused() -> None:

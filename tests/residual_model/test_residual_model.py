@@ -21,7 +21,7 @@ from pdhef_logtool.residual_model.bundle import (
     Normalisation,
     load_bundle,
 )
-from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES, make_features
+from pdhef_logtool.residual_model.features import FEATURES, make_features
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import LIMITS, NetworkService
 
@@ -39,10 +39,6 @@ def make_bundle(seed: int = 0, names: tuple[str, ...] = FEATURES, hidden: int = 
         weights={k: v.numpy().copy() for k, v in network.state_dict().items()},
         provenance={"seed": seed},
     )
-
-
-def test_paper_features_are_the_first_six() -> None:
-    assert FEATURES[:6] == PAPER_FEATURES
 
 
 def test_features_by_hand() -> None:
@@ -84,24 +80,6 @@ def test_a_bundle_of_an_older_version_says_how_to_make_it_anew(tmp_path: Path) -
     with pytest.raises(ModelError, match=r"pdhef extract .* pdhef train") as refused:
         load_bundle(tmp_path)
     assert "\n" not in str(refused.value)
-
-
-def test_missing_measurements_look_like_agreement_with_physics() -> None:
-    posterior = np.array([[20.0, 0.4, 0.1, 0.0]])
-    prior = np.full((1, 4), np.nan)
-    nan = np.array([np.nan])
-    features = make_features(
-        np.array([0.02]),
-        nan,
-        nan,
-        posterior,
-        prior,
-        np.array([1.4]),
-        np.array([0.8]),
-        nan,
-        np.zeros((1, 4)),
-    )
-    np.testing.assert_array_equal(features[:, :10], [[20.0, 1.4, 0.02, 0.1, 0.0, 0.0, 0.4, 0.1, 0.8, 0.0]])
 
 
 def test_bundle_round_trip_and_hash(tmp_path: Path) -> None:
@@ -205,9 +183,3 @@ def test_causality_and_limits() -> None:
     np.testing.assert_array_equal(before[:250], after[:250])
     assert np.all(np.abs(after) <= LIMITS)
     assert np.isfinite(after).all()
-
-
-def test_thread_setting_is_put_back() -> None:
-    threads = torch.get_num_threads()
-    NetworkService(make_bundle()).run(np.zeros((10, len(FEATURES))), np.zeros(10, dtype=np.bool_), None)
-    assert torch.get_num_threads() == threads

@@ -41,16 +41,6 @@ def test_of_fleets_without_effects_few_show_any() -> None:
     assert wrong <= 5 and naive >= 16
 
 
-def test_weather_of_a_single_day_cannot_be_separated_from_it() -> None:
-    rng = np.random.default_rng(2)
-    drives = [drive(x, day=i // 10, weather="wet" if i < 10 else "dry") for i, x in enumerate(rng.lognormal(size=40))]
-    (found,) = breakdowns(drives)
-    assert {g.why_not for g in found.groups} == {
-        "its drives are all of one day: the two cannot be separated",
-        "the other drives are all of one day: the two cannot be separated",
-    }
-
-
 def test_days_that_differ_are_no_effect_of_the_weather() -> None:
     rng = np.random.default_rng(3)
     wrong = 0

@@ -62,23 +62,6 @@ def test_drives_pair_by_signals_then_content_then_name(tmp_path: Path) -> None:
     assert any(line.startswith("drives: only their names") for line in found.differences)
 
 
-def test_a_removed_drive_closes_the_gate_unless_it_is_allowed(tmp_path: Path) -> None:
-    a, b = write_run(tmp_path / "a", TEN), write_run(tmp_path / "b", {k: v for k, v in TEN.items() if k != "d3"})
-    assert _compare(a, b).exit_code == 3
-    found = _compare(a, b, GATE)
-    assert (found.exit_code, found.failures) == (4, ("drives in A only: d3",))
-    assert _compare(b, a, GATE).failures == ("drives in B only: d3",)
-    assert _compare(a, b, Gate(GATE.figures, allow_unpaired=True)).exit_code == 0
-
-
-def test_a_figure_that_vanished_closes_the_gate_too(tmp_path: Path) -> None:
-    a, b = write_run(tmp_path / "a", TEN), write_run(tmp_path / "b", {**TEN, "d3": float("nan")})
-    found = _compare(a, b, GATE)
-    assert found.failures == ("figures in A only: sideslip_rad rmse (all): d3",)
-    assert found.exit_code == 4
-    assert _compare(a, b).exit_code == 3
-
-
 @pytest.mark.slow
 def test_the_gate_closes_on_a_regression_and_not_on_an_improvement(tmp_path: Path) -> None:
     a = write_run(tmp_path / "a", TEN)
@@ -102,15 +85,6 @@ def test_cannot_tell_is_an_answer_and_strict_refuses_it(tmp_path: Path) -> None:
         assert replace(found, strict=True).exit_code == 4
 
 
-def test_clusters_that_the_user_names_are_too_few_or_unknown(tmp_path: Path) -> None:
-    entries = [entry(label, car={"name": f"car{i // 5}", "sha256": "a"}) for i, label in enumerate(TEN)]
-    a, b = write_run(tmp_path / "a", TEN, entries=entries), write_run(tmp_path / "b", _scaled(1.2), entries=entries)
-    found = _compare(a, b, GATE, cluster="car")
-    assert (found.figures[0].change.clusters, found.verdict) == (2, "inconclusive")
-    with pytest.raises(UsageError, match="--cluster: expected a key of the drives: day, car, route, none, got colour"):
-        _compare(a, b, cluster="colour")
-
-
 def test_drives_of_six_days_that_change_together_are_no_evidence_unless_the_user_says_so(tmp_path: Path) -> None:
     rmse = {f"d{i}": 0.01 for i in range(60)}
     changed = {label: 0.01 * (1.1 if i // 10 < 4 else 0.95) * (1 + 1e-4 * i) for i, label in enumerate(rmse)}
@@ -130,17 +104,6 @@ def test_drives_of_six_days_that_change_together_are_no_evidence_unless_the_user
     alone = _compare(a, b, GATE, cluster="none")
     assert (alone.verdict, alone.figures[0].change.dependence.design_effect) == ("worse", 1.0)
     assert "--cluster none" in "".join(notes_of(alone))
-
-
-def test_each_figure_of_a_gate_has_its_limit(tmp_path: Path) -> None:
-    others = [row(label, 0.5, signal="vy_m_s", unit="m/s") for label in TEN]
-    worse = [row(label, 0.6, signal="vy_m_s", unit="m/s") for label in TEN]
-    a, b = write_run(tmp_path / "a", TEN, rows=others), write_run(tmp_path / "b", _scaled(1.2), rows=worse)
-    figures = (Figure(limit=0.25), Figure("vy_m_s", limit=0.1), Figure(metric="max_abs", limit=0.0))
-    found = _compare(a, b, Gate(figures))
-    assert [f.verdict for f in found.figures] == ["not worse", "worse", "no figure"]
-    assert found.failures == ("vy_m_s rmse (all): worse", "sideslip_rad max_abs (all): no figure")
-    assert "lateral_1s_m" not in {f.figure.signal for f in found.others}  # there is no such figure
 
 
 def test_the_others_are_corrected_for_being_several(tmp_path: Path) -> None:

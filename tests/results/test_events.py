@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import UsageError
@@ -71,20 +69,6 @@ def test_rows_have_drive_start_end_and_peak(run: Path) -> None:
     assert found.exit_code == 3
 
 
-def test_room_around_events_joins_them(run: Path) -> None:
-    where = "abs(sideslip_error_deg) > 1.5 and speed_m_s > 10"
-    assert len(_find(run, where, pad_s=0.09).events) == 2
-    (one,) = _find(run, where, pad_s=0.1).events
-    assert (one.start_ns, one.end_ns) == (START_NS + 1_030_000_000, START_NS + 1_400_000_001)
-    assert one.peak == pytest.approx(4.0, abs=1e-4)
-
-
-def test_what_holds_too_short_is_none(run: Path) -> None:
-    where = "abs(sideslip_error_deg) > 1.5 and speed_m_s > 10"
-    assert len(_find(run, where, least_s=0.1).events) == 1
-    assert not _find(run, where, least_s=0.2).events
-
-
 def test_an_error_is_known_only_where_it_is_scored(run: Path) -> None:
     assert [e.drive for e in _find(run, "abs(sideslip_error_deg) > 170").events] == ["b"]
     _report(run, "b", low_speed_blend_m_s=3.0)
@@ -107,11 +91,6 @@ def test_other_tracks_are_read_at_the_same_stamps(run: Path, tmp_path: Path) -> 
     with pytest.raises(UsageError, match="an estimator of this run: esc, got none named"):
         _find(scored, "vx_m_s > 0")
     assert len(_find(scored, "vx_m_s > 0", estimator="esc").events) == 1
-
-
-def test_a_peak_of_what_falls_is_its_smallest(run: Path) -> None:
-    assert {e.peak for e in _find(run, "speed_m_s < 3").events} == {2.0}
-    assert _find(run, "not valid").events[0].peak is None
 
 
 def test_a_damaged_file_leaves_a_drive_out(run: Path) -> None:
@@ -227,14 +206,3 @@ def test_a_condition_reads_no_file(where: str, tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(pl, "sql_expr", lambda _: pytest.fail("Polars executes subqueries"))
     with pytest.raises(UsageError, match="--where"):
         event_condition(where.format(file=tmp_path / "file.csv"))
-
-
-WORDS = ["speed_m_s", "truth.vx_km_h", "abs(", "(", ")", "and", "or", "not", "in", "0.5", "case", "<", "-", "*"]
-
-
-@given(st.one_of(st.text(max_size=60), st.lists(st.sampled_from(WORDS), max_size=12).map(" ".join)))
-def test_any_text_is_a_condition_or_one_line(text: str) -> None:
-    try:
-        event_condition(text)
-    except UsageError as error:
-        assert "\n" not in str(error)

@@ -83,31 +83,6 @@ def test_six_drives_rank_nobody_and_seven_can(run: Run) -> None:
     assert [(r.place, r.estimator) for r in run.read().ranking] == [(1, "pd-hef"), (2, "physics"), (3, "zero")]
 
 
-def test_drives_of_one_day_each_are_worth_less_than_independent_ones(run: Run) -> None:
-    rng = np.random.default_rng(5)
-    better = rng.normal(size=8) + 0.8
-    for i in range(80):
-        start_ns = 1_700_000_000_000_000_000 + i // 10 * 86_400_000_000_000
-        log = {"name": f"d{i}", "duration_s": 12.0, "kind": "mcap", "start_ns": start_ns}
-        run.add(f"d{i}", {"pd-hef": 0.01, "physics": 0.01 * float(np.exp(better[i // 10]))}, log=log)
-    found = run.read()
-    assert found.scored[0].factors["day"] == "2023-11-14"
-    assert [r.place for r in found.ranking] == [None, None]  # 70 of 80 drives agree, and 7 of 8 days
-
-
-def test_ranking_follows_the_drives_and_one_wild_drive_decides_nothing(run: Run) -> None:
-    rng = np.random.default_rng(0)
-    for i in range(30):
-        level = float(rng.lognormal())
-        wild = 100.0 if i == 0 else 1.0
-        run.add(f"d{i}", {"pd-hef": 0.8 * level * wild, "physics": level, "zero": 5.0 * level})
-    found = run.read()
-    assert [(r.place, r.estimator) for r in found.ranking] == [(1, "pd-hef"), (2, "physics"), (3, "zero")]
-    assert found.ranking[0].better_than == ("physics", "zero") and found.ranking[0].against_answer is None
-    against = found.ranking[1].against_answer
-    assert against is not None and against.value == pytest.approx(0.25) and against.low == pytest.approx(0.25)
-
-
 def test_drives_without_independent_truth_stand_apart_and_score_nothing(run: Run) -> None:
     run.add("good", {"pd-hef": 0.01})
     run.add("none", truth=NO_TRUTH)
@@ -172,16 +147,6 @@ def test_effects_have_intervals_and_keys_without_one_are_not_significant(run: Ru
     assert [g.value for g in nothing.groups] == ["not given"]
 
 
-def test_four_drives_against_one_show_nothing(run: Run) -> None:
-    for i in range(5):
-        run.add(f"d{i}", {"pd-hef": 9.0 if i == 4 else 1.0}, metadata={"versions": "old" if i < 4 else "new"})
-    (versions,) = [b for b in run.read().breakdowns if b.key == "versions"]
-    assert [(g.effect, g.why_not) for g in versions.groups] == [
-        (None, "1 scored drives, at least 5 are needed"),
-        (None, "4 scored drives, at least 5 are needed"),
-    ]
-
-
 def test_the_operating_space_adds_up_and_empty_cells_are_empty(run: Run) -> None:
     cells = [{"speed": 0, "ay": 2, "seconds": 1.0, "scored": 300, "sideslip_mse_rad2": 9e-4}]
     space = {"speed_edges_m_s": [0, 5, 10, 15, 20], "ay_edges_m_s2": [0, 1, 2], "cells": cells}
@@ -194,14 +159,6 @@ def test_the_operating_space_adds_up_and_empty_cells_are_empty(run: Run) -> None
     assert found.seconds[4, 1] == 10.0 and found.seconds.sum() == 11.0
     assert found.rmse_rad[4, 1] == pytest.approx(0.01) and found.rmse_rad[0, 2] == pytest.approx(0.03)
     assert np.isnan(found.rmse_rad[1, 1])
-
-
-def test_folders_part_drives(run: Run) -> None:
-    for i in range(6):
-        run.add(f"d{i}", {"pd-hef": 0.1 * (1 + i)}, folder=("golf/monday", "golf/friday", "mini")[i // 2])
-    found = {b.key: [(g.value, g.drives) for g in b.groups] for b in run.read(by=["folder", "folder 2"]).breakdowns}
-    assert found["folder"] == [("golf", 4), ("mini", 2)]
-    assert found["folder 2"] == [("golf/friday", 2), ("golf/monday", 2), ("not given", 2)]
 
 
 @pytest.mark.fleet

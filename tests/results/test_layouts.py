@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
-import numpy as np
 import pytest
 from foxglove import layouts as fl
 from mcap.reader import make_reader
 from rosbags.typesys import get_types_from_msg
 
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.layouts import foxglove_layout, plotjuggler_layout, write_layouts
+from pdhef_logtool.results.layouts import write_layouts
 from pdhef_logtool.results.mcap_sink import AnnotatedMcap
 from pdhef_logtool.results.sink import Event
 
@@ -141,15 +140,6 @@ def test_panels_have_the_settings_that_foxglove_publishes(written: Path) -> None
     assert not conforms({"paths": [{"value": "/a.b", "lineSize": "1"}]}, fl.PlotConfig)
 
 
-def test_without_poses_there_is_no_path(tmp_path: Path, circle: Any) -> None:
-    none = np.full(100, np.nan)
-    write(tmp_path, [circle("pd-hef", 0, 100).with_pose(none, none, none)])
-    layout = json.loads((tmp_path / "foxglove.json").read_text())
-    assert "3D!path" not in layout["configById"]
-    assert sorted(panels_of(layout["layout"])) == sorted(layout["configById"])
-    assert "/pdhef/pd_hef/path" not in fields_by_topic(tmp_path / "annotated.mcap")
-
-
 #: Elements that PlotJuggler reads: attributes and children of each (MainWindow, TabbedPlotWidget, PlotDocker and
 #: PlotWidget, xmlLoadState; it asks for each attribute by name).
 PLOTJUGGLER = {
@@ -187,11 +177,3 @@ def test_every_curve_of_plotjuggler_is_in_the_log(written: Path) -> None:
     assert [tab.attrib["tab_name"] for tab in root.iter("Tab")] == ["Estimates", "Errors", "Filter"]
     for splitter in root.iter("DockSplitter"):
         assert int(splitter.attrib["count"]) == len(splitter) == len(splitter.attrib["sizes"].split(";"))
-
-
-def test_without_ground_truth_there_are_no_plots_of_errors() -> None:
-    tracks = {"pd-hef": "#123456"}
-    layout = foxglove_layout(tracks, tracks)
-    assert not [name for name in layout["configById"] if "error" in name or name.startswith("map!")]
-    tabs = [tab.attrib["tab_name"] for tab in ET.fromstring(plotjuggler_layout(tracks, tracks)).iter("Tab")]
-    assert tabs == ["Estimates", "Filter"]

@@ -15,10 +15,8 @@ from written import as_written
 
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results import mcap_sink
-from pdhef_logtool.results.mcap_sink import AnnotatedMcap, metrics_record, thinned_step_ns, topic_of
+from pdhef_logtool.results.mcap_sink import AnnotatedMcap, thinned_step_ns
 from pdhef_logtool.results.sink import Event
 
 STATE = "pdhef_msgs/msg/VehicleStateEstimate"
@@ -227,16 +225,6 @@ def ros_only(tmp_path, source, tracks) -> Path:
     return path
 
 
-def test_weights_reasons_and_their_names_are_in_the_message(tmp_path, circle):
-    path = tmp_path / "sidecar.mcap"
-    track = circle("pd-hef", 0, 600, adaptive=True)
-    annotate(path, None, [track])
-    rows = [m for _, m in decoded(path, "/pdhef/pd_hef/state")]
-    np.testing.assert_array_equal([m.mixture_weight for m in rows], as_written(track.mixture_weight))
-    np.testing.assert_array_equal([m.reason for m in rows], track.reason)
-    assert {r.name: getattr(rows[0], f"REASON_{r.name.upper()}") for r in REASONS} == {r.name: r.bit for r in REASONS}
-
-
 @pytest.mark.parametrize("token", NAMES)
 def test_rosbags_reads_every_state(ros_only, circle, token):
     track = circle(NAMES[token], 0, 600)
@@ -283,30 +271,6 @@ def test_rosbags_reads_every_odometry(ros_only, circle, token):
     np.testing.assert_array_equal(covariance, as_written(expected))
 
 
-def test_rerun_shows_every_topic(annotated):
-    reader = McapReader(annotated)
-    rows: dict[str, int] = {}
-    for chunk in reader.stream():
-        if not chunk.is_static:
-            rows[chunk.entity_path] = max(rows.get(chunk.entity_path, 0), chunk.num_rows)
-    for topic in TOPICS:
-        assert rows.get(topic, 0) > 0, topic
-    info = reader.info()
-    assert info.statistics_present
-    assert info.summary_source == "embedded"
-    assert info.message_count == sum(n for _, _, n in TOPICS.values())
-
-
-def test_our_own_reader_takes_the_estimates_as_signals(annotated, circle):
-    log = open_log(annotated)
-    columns = log.read({"/pdhef/phy_ukf/state": ["header.stamp", "sideslip_rad"]})["/pdhef/phy_ukf/state"]
-    track = circle("phy-ukf", 0, 600)
-    np.testing.assert_array_equal(columns.fields["header.stamp"], track.stamps_ns)
-    np.testing.assert_array_equal(columns.fields["sideslip_rad"], as_written(track.sideslip_rad, "sideslip_rad"))
-    assert log.lost == ()
-    log.close()
-
-
 def test_annotating_twice_is_annotating_once(tmp_path, annotated, tracks):
     again = tmp_path / "again.mcap"
     annotate(again, annotated, tracks)
@@ -316,23 +280,6 @@ def test_annotating_twice_is_annotating_once(tmp_path, annotated, tracks):
         assert list(first.iter_attachments()) == list(second.iter_attachments())
         assert list(first.iter_metadata()) == list(second.iter_metadata())
         assert len(first.get_summary().channels) == len(TOPICS)
-
-
-def test_topics_of_an_earlier_run_go(tmp_path, annotated, circle):
-    path = tmp_path / "other.mcap"
-    annotate(path, annotated, [circle("zero:no-lateral", 0, 600)], {**REPORT, "metrics": []})
-    assert {topic for topic, *_ in messages(path)} == {
-        *SOURCE_TOPICS,
-        *(f"/pdhef/zero_no_lateral/{what}" for what in ("state", "odometry", "plot", "path")),
-    }
-
-
-def test_pieces_change_neither_messages_nor_bytes(tmp_path, source, tracks, monkeypatch):
-    for name, piece_ns in (("a", 60 * 10**9), ("b", 60 * 10**9), ("c", 700_000_000)):
-        monkeypatch.setattr(mcap_sink, "_PIECE_NS", piece_ns)
-        annotate(tmp_path / name, source, tracks)
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
-    assert messages(tmp_path / "a") == messages(tmp_path / "c")
 
 
 def test_sidecar_holds_our_topics_alone(tmp_path, tracks):
@@ -346,35 +293,6 @@ def test_sidecar_holds_our_topics_alone(tmp_path, tracks):
         assert [m.name for m in reader.iter_metadata()] == ["pdhef.metrics"]
     rows = {c.entity_path for c in McapReader(path).stream() if c.num_rows and not c.is_static}
     assert set(OUR_TOPICS) <= rows
-
-
-def test_odometry_holds_no_pose_that_is_not_known(tmp_path, circle):
-    path = tmp_path / "sidecar.mcap"
-    track = circle("zero", 0, 10)
-    x = track.x_m.copy()
-    x[3:5] = np.nan
-    annotate(path, None, [track.with_pose(x, track.y_m, track.yaw_rad)])
-    stamps = [t for t, _ in decoded(path, "/pdhef/zero/odometry")]
-    assert stamps == np.delete(track.stamps_ns, [3, 4]).tolist()
-    assert len(decoded(path, "/pdhef/zero/state")) == 10
-
-
-def test_a_log_without_truth_says_so_in_its_record():
-    report = {**REPORT, "truth": {"available": False}, "metrics": [], "estimators": []}
-    assert metrics_record(report) == {"log": "drive", "truth": "no ground truth"}
-
-
-def test_positions_far_from_the_origin_keep_their_millimetres(tmp_path, circle):
-    path = tmp_path / "sidecar.mcap"
-    track = circle("zero", 0, 10)
-    annotate(path, None, [track.with_pose(track.x_m + 4_500_000.0, track.y_m, track.yaw_rad)])
-    x = [m.pose.pose.position.x for _, m in decoded(path, "/pdhef/zero/odometry")]
-    np.testing.assert_allclose(x, track.x_m + 4_500_000.0, rtol=0, atol=5e-4)
-
-
-def test_topic_names_are_legal():
-    assert topic_of("pd-hef", "state") == "/pdhef/pd_hef/state"
-    assert topic_of("2nd try", "odometry") == "/pdhef/_2nd_try/odometry"
 
 
 def test_two_estimators_never_share_a_topic_and_a_failure_leaves_no_file(tmp_path, circle):

@@ -77,14 +77,6 @@ def test_polars_reads_every_column_with_its_type(circle, path):
         assert all(rows[column].null_count() == rows.height for column in OPTIONAL)
 
 
-def test_unknown_is_null_for_polars(circle, path):
-    frame = pl.read_parquet(path)
-    assert frame.filter(pl.col("estimator") == "truth")["nis"].null_count() == 600
-    nis = circle("phy-ukf", 0, 600).nis
-    mean = frame.filter(pl.col("estimator") == "phy-ukf")["nis"].mean()
-    assert mean == pytest.approx(nis[np.isfinite(nis)].mean())
-
-
 def test_units_stand_in_the_file(path):
     metadata = pl.read_parquet_metadata(path)
     assert metadata["format"] == "pdhef.estimates"
@@ -143,14 +135,6 @@ def test_a_file_without_a_column_is_one_line(path):
         read_track(path, "phy-ukf", ["sideslip_rad"])
 
 
-def test_mixed_row_groups_of_other_writers_are_read(tmp_path, circle, path):
-    shuffled = tmp_path / "by_stamp.parquet"
-    pl.read_parquet(path).sort("stamp_ns", "estimator").write_parquet(shuffled)
-    track = read_track(shuffled, "phy-ukf")
-    assert_array_equal(track.sideslip_rad, as_written(circle("phy-ukf", 0, 600).sideslip_rad, "sideslip_rad"))
-    assert set(list_estimators(shuffled)) == set(NAMES)
-
-
 def test_a_second_copy_joins_the_selected_estimators_and_causal_rows_are_marked(tmp_path, circle):
     path = tmp_path / "estimates.parquet"
     a, b = circle("phy-ukf", 0, 600, covariance=False), circle("zero", 0, 600, bias=0.1)
@@ -183,12 +167,6 @@ def test_what_is_not_there_is_said(tmp_path, path):
     pl.DataFrame({"stamp_ns": [1]}).write_parquet(tmp_path / "other.parquet")
     with pytest.raises(OutputError, match=r"estimates\.parquet"):
         read_track(tmp_path / "other.parquet", "zero")
-
-
-def test_empty_log_gives_an_empty_table(tmp_path):
-    path = tmp_path / "estimates.parquet"
-    write_estimates(path, [])
-    assert pl.read_parquet(path).schema.names() == list(ESTIMATE_COLUMNS)
 
 
 ROWS = [

@@ -38,12 +38,6 @@ def test_a_failure_while_writing_goes_through_and_leaves_the_folder_as_it_was(
     assert folder(tmp_path) == {"out.bin": b"old"}
 
 
-def test_a_failure_before_anything_was_written_is_not_hidden(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="mine"), PendingFile(tmp_path / "out.bin"):
-        raise ValueError("mine")
-    assert folder(tmp_path) == {}
-
-
 def test_what_a_killed_run_left_is_gone_from_the_start(tmp_path: Path) -> None:
     script = "import sys, pathlib; from pdhef_logtool.storage.files import PendingFile as P\n"
     script += "P(pathlib.Path(sys.argv[1])).path.write_bytes(b'half of an old one')"
@@ -93,23 +87,6 @@ def test_a_commit_that_fails_says_where_and_removes_what_was_written(
     with pytest.raises(OutputError, match=r"out\.bin.*No space left on device"):
         pending.commit()
     assert folder(tmp_path) == {"out.bin": b"old"}
-
-
-def test_a_commit_of_nothing_is_an_output_error(tmp_path: Path) -> None:
-    with pytest.raises(OutputError):
-        PendingFile(tmp_path / "out.bin").commit()
-    assert folder(tmp_path) == {}
-
-
-def test_a_temporary_file_that_cannot_be_removed_does_not_hide_the_failure(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="mine"), PendingFile(tmp_path / "out.bin") as pending:
-        pending.path.mkdir()  # no file: unlink refuses
-        raise ValueError("mine")
-
-
-def test_the_longest_name_is_written(tmp_path: Path) -> None:
-    write_bytes(tmp_path / ("n" * 255), b"new")
-    assert folder(tmp_path) == {"n" * 255: b"new"}
 
 
 def test_a_file_in_the_way_of_the_folder_is_an_output_error_at_once(tmp_path: Path) -> None:

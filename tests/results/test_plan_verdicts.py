@@ -62,13 +62,6 @@ def test_a_file_gives_the_same_verdict_as_the_rows() -> None:
     assert of_file == plan_verdicts(plan, figures_of_rows(rows), drives)
 
 
-def test_dependent_ground_truth_does_not_count() -> None:
-    dependent = [row(log, "not_independent", 1.0, unit="1") for log in SIX]
-    verdict = judged(scored() + dependent)
-    assert verdict.outcome == "INCONCLUSIVE" and "not an independent check" in verdict.reason
-    assert judged(scored() + dependent[:1]).exposure.drives == 5
-
-
 def test_the_estimated_reference_counts_only_without_ground_truth() -> None:
     reference = [r for log in SIX for r in (row(log, "reference_rms", 0.001), row(log, "reference_std", 0.0005))]
     alone = judged(reference)
@@ -91,14 +84,6 @@ def test_the_reason_for_no_value_is_given(requirement: Requirement, reason: str)
     verdict = judged(scored(), requirement)
     assert (verdict.outcome, verdict.exposure.drives) == ("INCONCLUSIVE", 0)
     assert reason in verdict.reason and verdict.next
-
-
-def test_a_recorded_estimate_is_judged_where_it_is_the_only_one() -> None:
-    recorded = scored(estimator="esc")
-    drives = [JudgedDrive(log, None) for log in SIX]
-    assert judged(recorded, drives=drives).estimators == ("esc",)
-    several = judged(recorded + scored(estimator="other"), drives=drives)
-    assert several.reason == "there are several recorded estimates: name one with estimator"
 
 
 def test_run_a_is_the_baseline_of_a_comparison_with_its_own_selected_estimate() -> None:

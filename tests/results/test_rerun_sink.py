@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from collections import defaultdict
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +15,8 @@ from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.tracks import concatenate, make_track
+from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.results import rerun_sink as rerun
-from pdhef_logtool.results.palette import colour_rgb
 from pdhef_logtool.results.rerun_sink import LONGEST_BRIDGE_NS, MOST_OTHERS, write_recording
 from pdhef_logtool.results.sink import Event
 
@@ -182,31 +180,6 @@ def test_values_stamps_bands_and_errors(recording, circle):
     assert speed_stamps.tolist() == track.stamps_ns[::2].tolist() and {v[0] for v in speed} == {10.0}
 
 
-def test_lines_carry_names_and_colours_of_estimators(recording):
-    _, static = tables(recording)
-    for place, name in (("main", "phy-ukf"), ("other/1", "zero"), ("truth", "truth")):
-        r, g, b = colour_rgb(name, COLOURS)
-        assert name not in COLOURS or (r << 16) | (g << 8) | b == COLOURS[name]
-        packed = (r << 24) | (g << 16) | (b << 8)
-        (batch,) = static[f"/{place}"]
-        band = [] if name == "truth" else [packed | 110] * 2
-        assert batch["SeriesLines:colors"].to_pylist() == [[packed | 0xFF, *band]]
-        assert batch["SeriesLines:names"].to_pylist() == [[name, *[f"{name} 95 %"] * len(band)]]
-        assert batch["SeriesLines:widths"].to_pylist() == [[2.0] if name == "truth" else [1.5, 0.75, 0.75]]
-        (strips,) = static[f"/plan/{place}"]
-        assert strips["LineStrips2D:colors"].to_pylist() == [[packed | 0xFF]]
-
-
-def test_the_plan_has_north_up_and_parts_where_the_track_is_not_valid(recording, circle):
-    _, static = tables(recording)
-    (batch,) = static["/plan/truth"]
-    strips = batch["LineStrips2D:strips"].to_pylist()[0]
-    assert len(strips) == 12
-    truth = circle("truth", 0, 600)
-    expected = np.stack([truth.x_m, -truth.y_m], axis=1)[:49]
-    np.testing.assert_allclose(np.array(strips[0]), expected, rtol=1e-5, atol=1e-5)
-
-
 def test_events_and_report_are_text(recording):
     timed, static = tables(recording)
     order = np.argsort(timed["/events"]["time"].to_numpy())
@@ -235,45 +208,6 @@ def test_weights_and_reasons_are_drawn(tmp_path, circle):
     assert spikes["time"][::2] == [int(track.stamps_ns[30]), int(track.stamps_ns[400])]
     texts = [t[0] for t in timed["/events"]["TextLog:text"].to_pylist()]
     assert texts == ["pd-hef: a_y spike, 0.00 s", "pd-hef: gyro stuck, 0.49 s", "pd-hef: a_y spike, 0.00 s"]
-
-
-@pytest.mark.slow
-def test_same_input_gives_the_same_content(tmp_path, circle, circle_signals):
-    contents = []
-    for name in ("a.rrd", "b.rrd"):
-        write(tmp_path / name, circle, circle_signals)
-        timed, static = tables(tmp_path / name)
-        contents.append(({e: plain(t) for e, t in timed.items()}, {e: [*map(plain, bs)] for e, bs in static.items()}))
-    assert repr(contents[0]) == repr(contents[1])  # NaN equals itself in words
-
-
-def test_slow_sideslip_is_not_drawn(tmp_path, circle):
-    path = tmp_path / "recording.rrd"
-    tracks = [circle("zero"), circle("truth")]
-    record(path, tracks, shown=["phy-ukf", "zero"], min_speed_m_s=11.0)
-    timed, _ = tables(path)
-    assert np.isfinite(series(timed["/baseline"], "vx_m_s")[1]).any()
-    for component in ("sideslip_deg", "error_sideslip_deg"):
-        assert np.isnan(series(timed["/baseline"], component)[1]).all()
-    assert "/events" not in timed
-
-
-def test_errors_stand_where_both_are_valid_and_share_a_stamp(tmp_path, circle):
-    path = tmp_path / "recording.rrd"
-    track, truth = circle("phy-ukf", 0, 40), circle("truth", 5, 40)
-    track.valid[20] = False
-    truth.valid[25] = False  # stamp 30 of the track
-    record(path, [track, truth])
-    timed, _ = tables(path)
-    stamps, values = series(timed["/main"], "error_sideslip_deg")
-    shown = [int(t) for t, v in zip(stamps, values, strict=True) if np.isfinite(v[0])]
-    assert shown == track.stamps_ns[[i for i in range(5, 40) if i not in (20, 30)]].tolist()
-
-
-def test_an_error_of_the_report_is_raised_and_ends_the_recording(tmp_path, circle):
-    with pytest.raises(KeyError):
-        record(tmp_path / "recording.rrd", [circle("zero")], report={})
-    record(tmp_path / "recording.rrd", [circle("zero")])
 
 
 SCRIPT = """
@@ -380,14 +314,6 @@ def test_a_disk_that_hangs_is_given_up_and_the_process_ends(tmp_path, writes):
     assert "recording.rrd: expected a place to write to, got nothing could be written for 1 s" in done.stdout
 
 
-def test_a_line_breaks_where_nothing_was_recorded(tmp_path, circle):
-    path = tmp_path / "recording.rrd"
-    track = concatenate([circle("phy-ukf", 0, 40), circle("phy-ukf", 400, 40)])
-    record(path, [track])
-    stamps, values = series(tables(path)[0]["/main"], "vx_m_s")
-    assert stamps[40] == track.stamps_ns[39] + 1 and np.isnan(values[40]).all() and len(stamps) == 81
-
-
 @settings(max_examples=30, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 1500)), min_size=1, max_size=40))
 def test_a_sparse_line_goes_on_over_a_second_of_unknown_values(tmp_path, samples):
@@ -403,17 +329,6 @@ def test_a_sparse_line_goes_on_over_a_second_of_unknown_values(tmp_path, samples
         is_bridged = not known[i] and (len(before) == 0 or stamp - before[-1] <= LONGEST_BRIDGE_NS)
         assert (stamp in drawn) is not is_bridged
         assert is_bridged or np.isfinite(drawn[stamp][0]) == known[i]
-
-
-def test_a_trajectory_is_thinned_evenly(tmp_path, monkeypatch):
-    monkeypatch.setattr(rerun, "MOST_TRAJECTORY_POINTS", 50)
-    for total, left in ((50, 50), (51, 26), (400, 50), (401, 26)):
-        path, x = tmp_path / f"{total}.rrd", np.arange(total) * 1.0
-        track = make_track("phy-ukf", START_NS + np.arange(total) * 10_000_000, vx_m_s=x, vy_m_s=x)
-        record(path, [track.with_pose(x, 0 * x, 0 * x)])
-        (batch,) = tables(path)[1]["/plan/main"]
-        (strip,) = batch["LineStrips2D:strips"].to_pylist()[0]
-        assert len(strip) == left and strip[0][0] == 0.0 and len({b[0] - a[0] for a, b in pairwise(strip)}) == 1
 
 
 def test_of_a_long_drive_ten_rows_a_second_are_drawn_with_the_largest_nis_and_five_of_the_others(tmp_path):

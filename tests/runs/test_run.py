@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.presets import OPEN_LOOP
 from pdhef_logtool.estimators.table import SPECS, all_names
-from pdhef_logtool.records.errors import EstimatorError, LogError, MappingError, UsageError, VehicleError
+from pdhef_logtool.records.errors import LogError, MappingError, UsageError, VehicleError
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
@@ -69,20 +68,6 @@ def test_everything_that_a_run_promises_is_there_and_nothing_else(dlc_run: Path)
     assert {p.name for p in dlc_run.iterdir()} == {"logs", "metrics.parquet", "report.html", "report.json", "run.json"}
 
 
-def test_the_largest_error_of_the_page_is_that_of_the_figures(dlc_run: Path) -> None:
-    from pdhef_logtool.reports.drive import drive_page
-    from pdhef_logtool.results.opened_run import open_run
-
-    (log,) = open_run(dlc_run).logs
-    report = log.report()
-    assert report is not None
-    errors = drive_page(log).charts.figures["error"]
-    figures = {m["estimator"]: m["value"] for m in report["metrics"]
-               if (m["signal"], m["segment"], m["metric"]) == ("sideslip_rad", "all", "max_abs")}  # fmt: skip
-    assert len(figures) > 5
-    assert {s.label: np.radians(np.nanmax(s.values)) for s in errors.series} == pytest.approx(figures, abs=1e-6)  # type: ignore[union-attr]
-
-
 def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) -> None:
 
     report = json.loads((dlc_run / "logs/dlc/report.json").read_text())
@@ -113,12 +98,12 @@ def test_metrics_agree_with_the_estimates_that_were_written(dlc_run: Path) -> No
         assert _value(metrics, name, "sideslip_rad", "rmse") == pytest.approx(rmse, rel=1e-4)  # the file is rounded
 
 
-def test_same_input_gives_the_same_bytes(sample_logs_dir: Path, tmp_path: Path, dlc_run: Path) -> None:
-    run_logs(
-        [str(sample_logs_dir / "dlc.mcap")], tmp_path, _config(sample_logs_dir, annotate="full", estimators=("all",))
-    )
+def test_same_input_gives_the_same_bytes(sample_logs_dir: Path, tmp_path: Path) -> None:
+    config = _config(sample_logs_dir, annotate="full", estimators=("zero", "physics"), end="4")
+    for folder in ("a", "b"):
+        run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / folder, config)
     for name in ("run.json", "report.html", "metrics.parquet", *(f"logs/dlc/{n}" for n in OUTPUTS - {"recording.rrd"})):
-        assert (tmp_path / name).read_bytes() == (dlc_run / name).read_bytes(), name
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
 def test_slice_scores_the_slice_alone(sample_logs_dir: Path, tmp_path: Path) -> None:
@@ -158,24 +143,6 @@ def test_estimates_do_not_depend_on_whether_truth_is_mapped(
     pose = ["x_m", "y_m", "yaw_rad"]
     assert without.drop(pose).equals(with_truth.drop(pose), null_equal=True)
     assert not without.drop(pose).equals(full_wheels.drop(pose), null_equal=True)  # four wheels are not two
-
-
-def test_missing_signal_skips_the_estimators_that_need_it(sample_logs_dir: Path, tmp_path: Path) -> None:
-    no_steering = NO_TRUTH_MAPPING[NO_TRUTH_MAPPING.index("[signals.ax_m_s2]") :]
-    (tmp_path / "m.toml").write_text(no_steering)
-    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("zero", "phy-ukf"))
-    result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
-    assert result.exit_code == 0
-    assert result.results[0].report is not None
-    outcomes = {e["name"]: (e["outcome"], e["reason"]) for e in result.results[0].report["estimators"]}
-    assert outcomes["zero"] == ("ran", None)
-    assert outcomes["phy-ukf"] == ("skipped", "the log has no steer_rad")
-    with pytest.raises(EstimatorError, match="steer_rad"):
-        run_logs(
-            [str(sample_logs_dir / "dlc.mcap")],
-            tmp_path / "none",
-            _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("phy-ukf",)),
-        )
 
 
 def test_one_bad_log_does_not_stop_the_others(sample_logs_dir: Path, tmp_path: Path) -> None:
@@ -231,29 +198,6 @@ def test_an_error_half_way_keeps_the_outputs_of_the_run_before(
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
 
 
-def test_esp_suite_is_not_the_full_suite(sample_logs_dir: Path, tmp_path: Path) -> None:
-    rmse = {}
-    for suite in ("full", "esp"):
-        config = _config(sample_logs_dir, sensors=suite, estimators=("phy-ukf",))
-        run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / suite, config)
-        rmse[suite] = _value(pl.read_parquet(tmp_path / suite / "metrics.parquet"), "phy-ukf", "vx_m_s", "rmse")
-    assert rmse["esp"] > 1.5 * rmse["full"]
-
-
-def test_impossible_readings_are_told(sample_logs_dir: Path, tmp_path: Path) -> None:
-    in_g = NO_TRUTH_MAPPING.replace(
-        'field = "linear_acceleration.y"', 'field = "linear_acceleration.y"\nscale = 96.2361'
-    )
-    (tmp_path / "m.toml").write_text(in_g)
-    checks = ("ay_m_s2.unit", "ay_m_s2.axis")
-    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("phy-ukf",), waived=checks)
-    run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
-    report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())
-    told = [x for x in report["losses"] if x["kind"] == "impossible"]
-    assert [x["where"] for x in told] == ["ay_m_s2"]
-    assert told[0]["count"] > 10
-
-
 def test_what_ran_under_a_name_stands_in_every_record(dlc_run: Path) -> None:
     from mcap.reader import make_reader
 
@@ -269,56 +213,3 @@ def test_what_ran_under_a_name_stands_in_every_record(dlc_run: Path) -> None:
     with (folder / "annotated.mcap").open("rb") as stream:
         (record,) = [m.metadata for m in make_reader(stream).iter_metadata() if m.name == "pdhef.metrics"]
     assert {n: json.loads(record[f"{n}/algorithm"]) for n in told} == told
-
-
-def test_a_part_that_is_not_used_is_told(sample_logs_dir: Path, tmp_path: Path) -> None:
-    car = tmp_path / "car"
-    car.mkdir()
-    text = (sample_logs_dir / "vehicle.toml").read_text()
-    (car / "vehicle.toml").write_text(text)
-    (car / "fit.toml").write_text(
-        'format = "pdhef-fit"\nversion = 1\n'
-        f'physics_sha256 = "{Car.load(car).physics_sha256}"\n[values]\nsteer_offset_rad = 0.02\n'
-    )
-    offset = {}
-    for name, changed in (("same", text), ("other", text.replace("1440.0", "1450.0"))):
-        (car / "vehicle.toml").write_text(changed)
-        said: list[str] = []
-        config = _config(sample_logs_dir, car=car, estimators=("open-loop",), end="3")
-        run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config, reporter=Reporter(warn=said.append))
-        assert (
-            "fit.toml is not used: vehicle.toml has changed since; pdhef learn --stages calibrate creates it again"
-            in said
-        ) == (name == "other")
-        estimates = pl.read_parquet(tmp_path / name / "logs/dlc/estimates.parquet")
-        offset[name] = float(estimates.filter(pl.col("estimator") == "open-loop")["sideslip_rad"].abs().mean())
-    assert offset["same"] > 1.5 * offset["other"]
-
-
-@pytest.mark.slow
-def test_an_annotated_log_holds_the_answer_and_the_recordings_of_a_run_are_one_dataset(
-    sample_logs_dir: Path, tmp_path: Path
-) -> None:
-    from mcap.reader import make_reader
-    from rerun.chunk import RrdReader
-
-    run_logs(
-        [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")],
-        tmp_path,
-        _config(sample_logs_dir, annotate="sidecar"),
-    )
-    entries = []
-    for name in ("dlc", "step"):
-        folder = tmp_path / "logs" / name
-        report = json.loads((folder / "report.json").read_text())
-        tracks = {re.sub(r"\W", "_", e["name"]) for e in report["estimators"] if e["outcome"] == "ran"} | {"truth"}
-        with (folder / "annotated.mcap").open("rb") as stream:
-            topics = {c.topic for c in make_reader(stream).get_summary().channels.values()}
-        kinds = ("state", "odometry", "plot", "path")
-        assert topics == {f"/pdhef/{track}/{kind}" for track in tracks for kind in kinds} | {"/pdhef/log"}
-        assert (folder / "annotated.mcap").stat().st_size <= (sample_logs_dir / f"{name}.mcap").stat().st_size
-        plotted = json.loads((folder / "foxglove.json").read_text())["configById"]["3D!path"]["topics"]
-        assert set(plotted) == {topic for topic in topics if topic.endswith(("odometry", "path"))}
-        entries += RrdReader(folder / "recording.rrd").recordings()
-    assert len({entry.application_id for entry in entries}) == 1
-    assert len({entry.recording_id for entry in entries}) == 2

@@ -14,10 +14,7 @@ from rich.console import Console
 from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_toml
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.estimators.friction_bank import USUAL_FRICTION
-from pdhef_logtool.learning.network.dataset import read_dataset
-from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
@@ -130,22 +127,3 @@ def test_a_vehicle_file_without_friction_cannot_be_asked_for_it(
 ) -> None:
     with pytest.raises(UsageError, match="--friction"):
         run(sample_logs_dir / "sweep.mcap", tmp_path, car=files / "car.toml", friction="file")
-
-
-def test_the_network_is_trained_with_what_a_run_tells(
-    slippery: Any, files: Path, sample_logs_dir: Path, tmp_path: Path
-) -> None:
-    config = RunConfig(car=files / "car.toml", friction="estimate")
-    result = extract([str(sample_logs_dir / "sweep.mcap")], tmp_path, ExtractSettings(config, split="train"))
-    (entry,) = result.manifest["drives"]
-    assert entry["friction_from"].startswith("estimate, observable")
-    assert result.manifest["settings"]["friction"] == "estimate"
-    (found,) = (d.load() for d in read_dataset(tmp_path).drives)
-    track = slippery[2].filter(estimator="phy-ukf").drop_nulls("friction")
-    of_run = dict(zip(track["stamp_ns"].to_list(), track["friction"].to_list(), strict=True))
-    told = found.features[:, FEATURES.index("friction")].tolist()
-    both = np.array([(of_run.get(s, np.nan), v) for s, v in zip(found.stamps_ns.tolist(), told, strict=True)])
-    both = both[np.isfinite(both).all(axis=1)]
-    assert len(both) > 1000
-    # The track shows the friction of the newest step that had arrived, a sample or two earlier.
-    assert np.quantile(np.abs(both[:, 0] - both[:, 1]), 0.9) < 0.03

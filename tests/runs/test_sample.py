@@ -133,30 +133,3 @@ def test_of_a_far_log_only_the_sample_is_fetched(sample_logs_dir: Path) -> None:
         server.requests.clear()
         fields_of_log(RemotePlace(server.place("fields.mcap")), "/imu/data")
         assert server.bytes_sent < 0.6 * len(data)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("_small_windows")
-def test_a_log_of_which_little_would_be_left_is_read_whole(
-    sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("pdhef_logtool.runs.inspection.report.WINDOW_NS", 270 * S)
-    file = sample_logs_dir / "road.mcap"
-    whole = inspect_log(file)
-    assert whole.sample is None
-    pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
-    with serving(**{file.name: file.read_bytes()}) as server:
-        far = inspect_log(RemotePlace(server.place(file.name)))
-        assert server.twice() <= 1, "one byte, to ask whether it is still the same"
-    assert far.to_dict() | {"path": ""} == whole.to_dict() | {"path": ""}
-
-
-@pytest.mark.usefixtures("_small_windows")
-def test_a_far_log_without_an_index_is_read_whole(sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
-    monkeypatch.setattr("pdhef_logtool.runs.inspection.report.WHOLE_BYTES", 1 << 16)
-    data = (sample_logs_dir / "dlc.mcap").read_bytes()[:-40]
-    with serving(**{"cut.mcap": data}) as server:
-        found = inspect_log(RemotePlace(server.place("cut.mcap")))
-    assert found.sample is None
-    assert found.is_partial

@@ -79,24 +79,6 @@ def test_state_topic_gives_the_figures_of_the_run_that_wrote_it(annotated: Path,
         assert again[key][0] == (value if value is None else pytest.approx(value, rel=1e-3, abs=1e-6)), key
 
 
-def test_odometry_gives_the_same_but_for_the_rows_that_it_lacks(annotated: Path, config: RunConfig) -> None:
-    state = _figures(_scored(annotated, config, "/pdhef/pd_hef/state", name="x")["metrics"], "x")
-    odometry = _figures(_scored(annotated, config, "/pdhef/pd_hef/odometry", name="x")["metrics"], "x")
-    assert ("ay_m_s2", "all", "rmse") not in odometry  # the message has no acceleration
-    assert ("state", "all", "diverged") not in odometry  # nor does it say whether its author diverged
-    compared = 0
-    for signal in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad"):
-        for metric in ("rmse", "mae", "bias", "p95_abs", "max_abs", "coverage95"):
-            (value, n), (other, m) = state[signal, "all", metric], odometry[signal, "all", metric]
-            assert n == m
-            # Without a sideslip in the message, v_y gives it, with a different factor on the calibrated interval.
-            loose = signal == "sideslip_rad" and metric == "coverage95"
-            assert other == pytest.approx(value, rel=0.02 if loose else 1e-3)
-            compared += 1
-    assert compared == 24
-    assert state["state", "all", "nees"][0] == pytest.approx(odometry["state", "all", "nees"][0], rel=1e-4)
-
-
 @pytest.mark.slow
 def test_named_fields_and_a_table_with_scale_give_the_same(
     annotated: Path, sample_logs_dir: Path, tmp_path: Path, config: RunConfig
@@ -145,14 +127,6 @@ def test_outputs_are_those_of_a_run(annotated: Path, config: RunConfig, tmp_path
                 assert a[column].to_numpy() == close, (name, column)
 
 
-def test_nothing_is_written_without_a_folder(
-    annotated: Path, config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    _scored(annotated, config, "/pdhef/zero/state")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_slice_scores_its_stamps_alone(annotated: Path, sample_logs_dir: Path, tmp_path: Path) -> None:
     config = RunConfig(car=sample_logs_dir / "vehicle.toml", start="3", end="6")
     report = _scored(annotated, config, "/pdhef/zero/state", output=tmp_path)
@@ -194,18 +168,6 @@ def test_no_truth_is_an_error_that_says_what_to_do(annotated: Path, sample_logs_
     config = RunConfig(car=sample_logs_dir / "vehicle.toml", mapping=tmp_path / "m.toml")
     with pytest.raises(MappingError, match="--truth"):
         _scored(annotated, config, "/pdhef/zero/state")
-
-
-def test_named_truth_replaces_the_recognised_one(annotated: Path, config: RunConfig) -> None:
-    truth = ["/pdhef/zero/state.vx_m_s", "/pdhef/zero/state.vy_m_s"]
-    report = _scored(annotated, config, "/pdhef/phy_ukf/state", truth=truth)
-    sources = {q["name"]: q["source"] for q in report["truth"]["quantities"]}
-    assert sources["vy_m_s"] == "/pdhef/zero/state.vy_m_s"
-    stamps = pl.read_parquet(annotated / "estimates.parquet")
-    a, b = (stamps.filter(pl.col("estimator") == n)["vy_m_s"].to_numpy() for n in ("phy-ukf", "zero"))
-    difference = (a - b)[np.isfinite(a - b)]
-    # The latency of ground truth without a yaw rate cannot be measured, so that the two are compared stamp by stamp.
-    assert _value(report, "vy_m_s", "rmse") == pytest.approx(math.sqrt(float(np.mean(difference**2))), rel=1e-6)
 
 
 def test_an_estimate_that_is_the_truth_is_marked(annotated: Path, config: RunConfig) -> None:
@@ -277,3 +239,15 @@ def test_other_stamps_than_the_truths_without_any_imu(tmp_path: Path) -> None:
     assert report["truth"]["latency_s"] is None
     assert any("latency" in note and "0" in note for note in report["truth"]["notes"])
     assert any("no IMU" in text for text in said)
+
+
+def test_named_truth_replaces_the_recognised_one(annotated: Path, config: RunConfig) -> None:
+    truth = ["/pdhef/zero/state.vx_m_s", "/pdhef/zero/state.vy_m_s"]
+    report = _scored(annotated, config, "/pdhef/phy_ukf/state", truth=truth)
+    sources = {q["name"]: q["source"] for q in report["truth"]["quantities"]}
+    assert sources["vy_m_s"] == "/pdhef/zero/state.vy_m_s"
+    stamps = pl.read_parquet(annotated / "estimates.parquet")
+    a, b = (stamps.filter(pl.col("estimator") == n)["vy_m_s"].to_numpy() for n in ("phy-ukf", "zero"))
+    difference = (a - b)[np.isfinite(a - b)]
+    # The latency of ground truth without a yaw rate cannot be measured, so that the two are compared stamp by stamp.
+    assert _value(report, "vy_m_s", "rmse") == pytest.approx(math.sqrt(float(np.mean(difference**2))), rel=1e-6)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -106,38 +105,6 @@ def test_what_was_fetched_in_part_is_fetched_again(
     assert opened.logs[0].report() == {"format": "pdhef.report", "log": {"name": "a"}}
 
 
-def test_figures_of_an_earlier_run_go_and_what_is_gone_is_made_anew(tmp_path: Path, memory: Any) -> None:
-    logs, work = named_logs(tmp_path / "logs", "a", "b"), Counted()
-    run(logs, URL, work=work, config=RunConfig(keep="metrics"))
-    run(logs, URL, work=work, config=RunConfig(keep="metrics", start="1"))
-    run(logs, tmp_path / "out", RunConfig(keep="metrics", start="1"))
-    assert stored(memory) == local(tmp_path / "out"), "the figures of the first run are gone"
-    memory.rm("/fleet/out/logs/b/report.json")
-    run(logs, URL, work=work, resume=True, config=RunConfig(keep="metrics", start="1"))
-    assert work.asked == ["a", "b"] * 2 + ["b"]
-    run(logs, URL, work=work, only=["a"], config=RunConfig(keep="metrics", start="1"))
-    assert work.asked[5:] == ["a"]
-    assert stored(memory) == local(tmp_path / "out")
-
-
-def test_a_run_that_ends_has_put_what_is_done(tmp_path: Path, memory: Any) -> None:
-    logs, work = named_logs(tmp_path / "logs", "a", "b", "c"), Counted()
-
-    def stopped(task: DriveTask, tell: Tell) -> DriveEnd:
-        if task.log.stem == "b":
-            raise KeyboardInterrupt
-        return stub_drive(task, tell)
-
-    with pytest.raises(KeyboardInterrupt) as raised:
-        run(logs, URL, work=stopped)
-    assert raised.value.__notes__ == ["--resume goes on", "1 of 3 logs are done"]
-    document = json.loads(memory.cat_file("/fleet/out/run.json"))
-    assert (document["remaining"], [log["log"] for log in document["logs"]]) == (2, ["a"])
-    run(logs, URL, work=work, resume=True)
-    run(logs, tmp_path / "out")
-    assert (work.asked, stored(memory)) == (["b", "c"], local(tmp_path / "out"))
-
-
 def test_a_store_that_fails_ends_the_run_and_what_is_put_counts(
     tmp_path: Path, memory: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -158,20 +125,6 @@ def test_a_store_that_fails_ends_the_run_and_what_is_put_counts(
     run(logs, URL, work=work, resume=True)
     run(logs, tmp_path / "out")
     assert (work.asked[2:], stored(memory)) == (["b", "c"], local(tmp_path / "out"))
-
-
-def test_a_drive_that_is_replaced_halfway_does_not_count_as_done(
-    tmp_path: Path, memory: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A command that dies leaves the journal of the run before; its figures must not stand beside new files."""
-    logs, work = named_logs(tmp_path / "logs", "a", "b"), Counted()
-    first = RunConfig(keep="metrics")
-    run(logs, URL, work=work, config=first)
-    journal = memory.cat_file(f"/fleet/out/{JOURNAL_FILE}")
-    run(logs, URL, work=work, resume=True, config=RunConfig(keep="metrics", start="1"))
-    memory.pipe_file(f"/fleet/out/{JOURNAL_FILE}", journal)
-    run(logs, URL, work=work, resume=True, config=first)
-    assert work.asked == ["a", "b"] * 3
 
 
 def test_one_command_at_a_time_holds_the_place(tmp_path: Path, memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -18,9 +17,8 @@ from pdhef_logtool.car.car import SHIPPED_CARS, Car, load_intervals
 from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.evaluation.validation_plan import load_plan
 from pdhef_logtool.logs.can_decoding import load_dbc
-from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
-from pdhef_logtool.records.errors import EXIT_USAGE, LogError, PdhefError, UsageError, VehicleError
+from pdhef_logtool.records.errors import EXIT_USAGE, PdhefError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, SHIPPED_FOLDERS, WEIGHTS_FILE, load_network
 from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
 from pdhef_logtool.runs.config import load_config
@@ -100,7 +98,6 @@ LOADERS = [
     ),
 ]
 every_loader = pytest.mark.parametrize("loader", LOADERS, ids=lambda loader: loader.name)
-every_toml = pytest.mark.parametrize("loader", LOADERS[:6], ids=lambda loader: loader.name)
 
 
 def to_toml(value: Any, top: bool = False) -> str:
@@ -167,7 +164,7 @@ def changed(data: st.DataObject, document: Any, anything: st.SearchStrategy[Any]
 
 
 @every_loader
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=25, deadline=None, derandomize=True)
 @given(data=st.data())
 @pytest.mark.slow
 def test_any_document_is_a_record_or_one_line(
@@ -208,13 +205,6 @@ def test_deep_nesting_is_one_line(loader: Loader, tmp_path: Path, depth: int) ->
     path = tmp_path / loader.name
     nested = "[" * depth + "]" * depth
     path.write_text(f'{{"a": {nested}}}' if path.suffix == ".json" else f"a = {nested}")
-    assert "too deeply" in outcome(loader, path)
-
-
-@every_toml
-def test_deep_tables_that_the_parser_takes_are_one_line(loader: Loader, tmp_path: Path) -> None:
-    path = tmp_path / loader.name
-    path.write_text(".".join("a" * 1000) + " = 1\n")
     assert "too deeply" in outcome(loader, path)
 
 
@@ -299,23 +289,6 @@ def test_hashes_that_stand_in_files_stay_what_they_were() -> None:
     assert mapping.sha256 == "95bc15effd8048a668853de7ce24f1e84c771acd8e1692d120c193d57d689937"
     linear = LinearModel(("ay_m_s2",), (0.5,), 0.25, 2.0)
     assert linear.sha256 == "47076088d4172941685a059bf407bb89750dff940ccc307b7ca6278cb1868aed"
-
-
-def test_what_an_editor_puts_before_the_text_is_no_part_of_it(tmp_path: Path) -> None:
-    (tmp_path / "a.toml").write_bytes(b"\xef\xbb\xbfa = 1\r\nb = 2\r\n")
-    assert read_toml(tmp_path / "a.toml", "a file", UsageError) == {"a": 1, "b": 2}
-
-
-@pytest.mark.parametrize("key", ["x", "relative_file_paths", "ros_distro", "compression_mode"])
-def test_anchors_of_anchors_are_not_written_out(tmp_path: Path, key: str) -> None:
-    anchors = "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 9))
-    files = "" if key in ("x", "relative_file_paths") else "relative_file_paths: [x], "
-    text = f"a0: &a0 [x, x]\n{anchors}rosbag2_bagfile_information: {{{files}{key}: *a8}}\n"
-    (tmp_path / "metadata.yaml").write_text(text)
-    started = time.process_time()
-    with pytest.raises(LogError):
-        open_log(tmp_path)
-    assert time.process_time() - started < 3.0
 
 
 def test_a_dbc_that_is_none_is_a_wrong_mapping(tmp_path: Path) -> None:

@@ -12,8 +12,7 @@ from reference_car import drive, slalom
 
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, default_vehicle
 from pdhef_logtool.records.tracks import make_track
-from studies.defaults.axle_forces import AxleCurve, FitDrive, axle_samples, fit_axle, usable_stamps
-from studies.defaults.prior import Prior
+from studies.defaults.axle_forces import AxleCurve, FitDrive, axle_samples, fit_axle
 
 CAR = default_vehicle().model_copy(
     update={
@@ -34,24 +33,7 @@ def fit_drive(seconds: float = 6.0, period_s: float = 0.01, **changes: Any) -> F
     return replace(FitDrive("made", made.signals, truth), **changes)
 
 
-DRIVE = fit_drive()
-
-
 # ---- axle forces ----
-
-
-def test_only_known_tame_and_fast_enough_driving_is_used() -> None:
-    n = len(DRIVE.truth)
-    vx, vy, valid = DRIVE.truth.vx_m_s.copy(), np.zeros(n), np.ones(n, dtype=bool)
-    vx[:2] = 5.9, 6.1  # twice the low-speed limit of 3 m/s
-    vy[10:12] = vx[10] * math.tan(math.radians(8.1)), -vx[10] * math.tan(math.radians(7.9))
-    valid[20] = False
-    yaw_rate, steer = DRIVE.truth.yaw_rate_rad_s.copy(), DRIVE.signals.steer_rad.copy()
-    yaw_rate[30], steer[40] = np.nan, np.nan
-    beta = np.arctan2(vy, vx)
-    truth = replace(DRIVE.truth, vx_m_s=vx, vy_m_s=vy, sideslip_rad=beta, yaw_rate_rad_s=yaw_rate, valid=valid)
-    use = usable_stamps(replace(DRIVE.signals, steer_rad=steer), truth, CAR)
-    assert np.flatnonzero(~use).tolist() == [0, 10, 20, 30, 40]
 
 
 def test_axle_forces_follow_from_newton_and_euler() -> None:
@@ -104,14 +86,3 @@ def test_the_fit_minimises_the_cost_of_method_14(count: int) -> None:
         aside = at.copy()
         aside[i] += sign * 2e-3
         assert cost(aside) > cost(at)
-
-
-# ---- priors ----
-
-
-def test_a_prior_counts_in_standard_deviations_of_its_own_scale() -> None:
-    linear, log = Prior("a", "1", 3.0, 0.5), Prior("b", "1", 3.0, 0.5, log=True)
-    assert linear.value(2.0) == 4.0
-    assert log.value(2.0) == pytest.approx(3.0 * math.e)
-    for prior in (linear, log):
-        assert prior.theta(prior.value(-1.7)) == pytest.approx(-1.7)

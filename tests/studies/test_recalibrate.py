@@ -79,22 +79,6 @@ def test_a_changed_input_runs_the_dependents_again_and_deletes_their_work(projec
     assert calls(project) == "c"
 
 
-def test_another_command_runs_again_and_an_equal_output_ends_the_chain(project: Recalibration) -> None:
-    project.run()
-    calls(project)
-    first = Stage("first", "python join.py a source.py other", ("source.py",), ("a",))
-    Recalibration(project.root, (first, *project.stages[1:])).run(["first"])
-    assert calls(project) == "a"
-    (project.root / "source.py").write_text("x = 1 \n")
-    project.run()
-    assert calls(project) == "a"
-
-
-def test_a_command_without_its_output_fails(project: Recalibration) -> None:
-    stage = Stage("none", "python join.py d other", ("other",), ("absent",))
-    assert Recalibration(project.root, (stage,)).run() == 1
-
-
 def test_no_stage_of_the_project_needs_the_output_of_a_later_one() -> None:
     stages = load_stages()
     for i, stage in enumerate(stages):

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.records.errors import SimulationError
-from truthsim.drive import Drive, judge, reference_steer_rad, simulate_drive
-from truthsim.faults import parse_fault
+from truthsim.drive import Drive, reference_steer_rad, simulate_drive
 from truthsim.manoeuvres import (
     ISO_3888_1_M,
     MANOEUVRES,
@@ -20,10 +19,7 @@ from truthsim.manoeuvres import (
     iso_3888_2_start_m,
     sine_with_dwell,
 )
-from truthsim.motion import Motion
-from truthsim.road_course import TOUR, draw_course
-from truthsim.sensors import SensorNoise
-from truthsim.vehicle import OBSERVED, OBSERVED_SIZE, Vehicle
+from truthsim.vehicle import Vehicle
 
 G = 9.80665
 
@@ -63,28 +59,6 @@ def test_lane_change_is_the_standard_s_course_and_peaks_near_0_7_g(lane_change: 
     assert lane_change.truth["y_m"].max() == pytest.approx(3.5 * lane_change.scale, rel=0.25)
     assert abs(lane_change.truth["y_m"][-1]) < 0.3
     assert abs(lane_change.truth["vx_m_s"] * 3.6 - 100.0).max() < 5.0
-
-
-@pytest.mark.slow
-def test_sweep_reaches_nine_tenths_of_the_friction_limit() -> None:
-    drive = simulate_drive("sine-sweep", seed=1)
-    assert drive.friction == 0.3 and drive.speed_km_h == 60.0 and drive.duration_s == 12.0
-    a_y = np.abs(drive.truth["ay_m_s2"])
-    assert 0.90 * 0.3 * G <= a_y.max() <= 0.3 * G
-    # Growing, and turning round faster at the end: 0.6 Hz at first, 1 Hz at last.
-    assert a_y[:300].max() < 0.55 * a_y.max() and a_y[-200:].max() > 0.95 * a_y.max()
-    crossings = drive.times_s[1:][np.diff(np.sign(drive.truth["steer_rad"])) != 0]
-    assert np.diff(crossings)[1] == pytest.approx(0.5 / 0.63, rel=0.06)
-    assert np.diff(crossings)[-1] == pytest.approx(0.5 / 0.98, rel=0.06)
-
-
-def test_step_steer_is_iso_7401_s() -> None:
-    drive = simulate_drive("step-steer")
-    assert np.abs(drive.truth["ay_m_s2"][-100:]).mean() == pytest.approx(4.0, rel=0.005)
-    assert drive.speed_km_h == 100.0 and drive.peak_ay_m_s2 > 4.0  # it overshoots
-    steer = drive.truth["steer_rad"]
-    assert np.all(steer[:101] == 0.0) and np.ptp(steer[115:]) == 0.0
-    assert steer[107] == pytest.approx(steer[-1] * 0.07 / 0.15)
 
 
 def test_sine_with_dwell_is_fmvss_126_s() -> None:
@@ -172,27 +146,6 @@ def test_a_road_is_ordinary_and_has_a_standstill(road: Drive) -> None:
             assert np.abs(truth[name][still]).max() < 1e-3, name
 
 
-def test_roads_are_those_of_town_country_and_motorway() -> None:
-    course = draw_course(
-        np.random.default_rng(5), length_m=40_000.0, step_m=0.5, top_speed_m_s=130.0 / 3.6, friction=0.85, first=0
-    )
-    kinds = {s.name: course.kind == i for i, s in enumerate(TOUR)}
-    limit = course.limit_m_s * 3.6
-    assert limit[kinds["town"]].max() <= 55.0 and limit[kinds["motorway"]].min() > 80.0
-    sharpest = {name: 1.0 / np.abs(course.curvature_1_m[rows]).max() for name, rows in kinds.items()}
-    assert 7.0 < sharpest["town"] < 17.0 and 55.0 < sharpest["rural"] < 120.0 and sharpest["motorway"] > 300.0
-    # The lateral acceleration at the speed limit is comfortable everywhere.
-    assert (np.abs(course.curvature_1_m) * course.limit_m_s**2).max() < 3.7
-    assert np.abs(course.grade_rad).max() <= 0.06 and np.abs(course.bank_rad).max() <= 0.0701
-    assert np.std(course.grade_rad) > 0.01
-    # Bends outside towns lean inward, straights to the right edge.
-    bends = kinds["rural"] & (np.abs(course.curvature_1_m) > 1.0 / 200.0)
-    inward = -np.sign(course.curvature_1_m[bends]) * course.bank_rad[bends]
-    assert np.median(inward) > 0.05
-    assert np.median(course.bank_rad[kinds["town"]]) == pytest.approx(0.02, abs=1e-3)
-    assert course.stops.shape[0] > 10 and course.stops[:, 1].min() >= 3.0
-
-
 @pytest.mark.slow
 def test_seeds_make_other_roads_and_other_noise_and_repeat(road: Drive) -> None:
     again = simulate_drive("road", seed=3, duration_s=120.0)
@@ -216,20 +169,6 @@ def test_a_spin_is_dropped_unless_asked_for() -> None:
     assert drive.command.endswith("--keep-spins")
 
 
-def test_a_wheel_that_leaves_the_road_is_no_drive_to_learn_from() -> None:
-    rows, step = 200, 0.01
-    observed = np.zeros((rows, 1, OBSERVED_SIZE))
-    observed[:, 0, OBSERVED.index("vx_m_s")] = 20.0
-    for wheel in ("fl", "fr", "rl", "rr"):
-        observed[:, 0, OBSERVED.index(f"fz_{wheel}_n")] = 3000.0
-    motion = Motion(np.arange(rows) * step, np.zeros(1), observed)
-    assert not judge(motion).lifted
-    observed[50:54, 0, OBSERVED.index("fz_rl_n")] = 0.0  # 40 ms: it bounced
-    assert not judge(motion).lifted
-    observed[54, 0, OBSERVED.index("fz_rl_n")] = 0.0
-    assert judge(motion).lifted and judge(motion).lost and "wheel" in judge(motion).describe()
-
-
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
@@ -247,34 +186,6 @@ def test_bad_requests_are_one_clear_line(name: str, options: dict[str, float], w
         simulate_drive(name, **options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     assert all(word in str(caught.value) for word in words)
-
-
-@pytest.mark.slow
-def test_command_makes_the_drive_again(lane_change: Drive) -> None:
-    assert lane_change.command == "pdhef simulate dlc --speed 100 --mu 0.85 --seed 1"
-    assert simulate_drive("road", duration_s=20.0).command.endswith("--seed 0 --duration 20")
-    drive = simulate_drive(
-        "dlc",
-        speed_km_h=1.0 / 3.0 * 200.0,
-        amplitude=0.7,
-        noise=SensorNoise(jitter_s=0.005),
-        faults=(parse_fault("burst20:yaw_rate:5:8"), parse_fault("dropout:imu:1:end")),
-        rtk_rate_hz=50,
-    )
-    assert drive.command == (
-        "pdhef simulate dlc --speed 66.66666666666666 --mu 0.85 --seed 0 --amplitude 0.7 --rtk-rate 50 "
-        "--fault burst20:yaw_rate:5:8 --fault dropout:imu:1:end --sensor jitter_s=0.005"
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["dlc", "step-steer", "fishhook", "banked-road"])
-def test_amplitude_multiplies_what_the_manoeuvre_is_scaled_to(name: str) -> None:
-    half, whole = simulate_drive(name, amplitude=0.3), simulate_drive(name, amplitude=0.6)
-    if MANOEUVRES[name].uses_reference:
-        assert half.truth["steer_rad"].max() / whole.truth["steer_rad"].max() == pytest.approx(0.5)
-    else:
-        assert half.peak_ay_m_s2 / whole.peak_ay_m_s2 == pytest.approx(0.5, abs=0.12)
 
 
 def test_listing_the_manoeuvres_compiles_nothing() -> None:

@@ -14,10 +14,7 @@ from scipy import stats
 from pdhef_logtool.records.errors import UsageError
 from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
 from truthsim.faults import FIELDS, KINDS, TARGETS, apply_faults, parse_fault
-from truthsim.manoeuvres import Plan
-from truthsim.motion import simulate_motion
-from truthsim.sensors import STEER_PHASE_S, WHEEL_PHASE_S, SensorChannel, SensorNoise, sense
-from truthsim.vehicle import Vehicle
+from truthsim.sensors import SensorChannel
 
 pytestmark = pytest.mark.slow
 
@@ -129,17 +126,6 @@ def test_rtk_outages_open_the_gate_and_close_it() -> None:
     for name in ("imu", "steering", "wheels"):
         for key, column in drive.channels[name].fields.items():
             assert np.array_equal(column, usual.channels[name].fields[key])
-
-
-def test_outages_are_drawn_at_their_rate() -> None:
-    noise = SensorNoise(rtk_outages_per_h=360.0, rtk_outage_s=2.0)
-    straight = Plan(20.0, 300.0, steer_rad=np.zeros(300_001))
-    motion = simulate_motion(straight, 0.85, phases_s=(0.0, STEER_PHASE_S, WHEEL_PHASE_S))
-    qualities = [sense(motion, Vehicle(), noise, seed, 10)["rtk"].fields["quality"] for seed in range(30)]
-    # 360 an hour of 2 s each, counted from the end of the one before: 2 s of every 12, half of them float.
-    assert np.mean(np.concatenate(qualities) != 4) == pytest.approx(1.0 / 6.0, abs=0.02)
-    assert np.mean(np.concatenate(qualities) == 5) == pytest.approx(1.0 / 12.0, abs=0.02)
-    assert all(np.all(sense(motion, Vehicle(), SensorNoise(), s, 10)["rtk"].fields["quality"] == 4) for s in range(3))
 
 
 def test_every_fault_reads_back_from_its_text() -> None:

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import os
-import resource
 import signal
 import subprocess
 import sys
 import textwrap
-import time
-import tracemalloc
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
-import psutil
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -95,13 +91,6 @@ def test_workers_have_one_thread_and_live_as_long_as_the_run() -> None:
     assert not called
 
 
-def test_what_workers_took_counts_as_the_commands() -> None:
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    outcomes([("burn", "")] * 2, 2, Limits())
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime > 0.35
-
-
 def test_one_job_without_limits_runs_here() -> None:
     told: list[tuple[int, str, float]] = []
     items = [("where", ""), ("raise", ""), ("well", "x")]
@@ -110,12 +99,6 @@ def test_one_job_without_limits_runs_here() -> None:
     assert ended[1].failure == Failure(REASONS["raise"], "at raise", 1)
     assert ended[2].result == "x"
     assert told == [(0, "at where", 0.5), (1, "at raise", 0.5), (2, "at well", 0.5)]
-
-
-def test_progress_of_workers_is_heard() -> None:
-    told: list[tuple[int, str, float]] = []
-    list(supervise(planted, [("well", ""), ("raise", "")], jobs=2, progress=lambda *what: told.append(what)))
-    assert sorted(told) == [(0, "at well", 0.5), (1, "at raise", 0.5)]
 
 
 def test_items_that_do_not_travel_are_told() -> None:
@@ -148,42 +131,12 @@ def deaths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 DYING = ["tests.workers.planted_work:die_at_start"]
 
 
-def test_a_fork_server_that_dies_while_it_loads_is_restarted_and_that_is_said(deaths: Path) -> None:
-    warned: list[str] = []
-    items = [("well", str(i)) for i in range(4)]
-    ended = list(supervise(planted, items, jobs=2, preload=DYING, warn=warned.append))
-    assert sorted((e.result, e.failure) for e in ended) == [(str(i), None) for i in range(4)]
-    assert warned == [f"the fork server died (signal 9): restart {n} of 3, no item is lost" for n in (1, 2)]
-    assert deaths.read_text() == "xx"
-
-
 def test_a_fork_server_that_dies_again_and_again_is_one_error(deaths: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(MOST_DEATHS, "99")
     with pytest.raises(WorkerError, match="4 that died, the last one by signal 9") as caught:
         list(supervise(planted, [("well", "")] * 4, jobs=2, preload=DYING))
     assert caught.value.exit_code == EXIT_FAILURE
     assert deaths.read_text() == "xxxx"
-
-
-def test_workers_finish_without_their_fork_server(tmp_path: Path) -> None:
-    files = [tmp_path / name for name in "ab"]
-    warned: list[str] = []
-    pids: set[int] = set()
-
-    def heard(*_: object) -> None:
-        begun = [f.with_suffix(".begun") for f in files]
-        if not pids and all(f.is_file() and f.read_text().endswith("\n") for f in begun):
-            pids.update(int(f.read_text()) for f in begun)
-            os.kill(psutil.Process(min(pids)).ppid(), signal.SIGKILL)
-            (tmp_path / "go").touch()
-
-    items = [("wait", str(f)) for f in files] + [("where", "")]
-    ended = list(supervise(planted, items, jobs=2, preload=PRELOAD, progress=heard, warn=warned.append))
-    assert [e.failure for e in ended] == [None] * 3
-    assert {e.result[0] for e in ended if e.number == 2} <= pids  # type: ignore[index]
-    assert warned == []
-    for pid in pids:
-        assert not Path(f"/proc/{pid}/exe").exists()
 
 
 def test_no_jobs_are_refused_before_anything_is_pulled() -> None:
@@ -203,27 +156,6 @@ def test_items_are_pulled_as_workers_become_free() -> None:
     with closing(supervise(planted, items(), jobs=2, preload=PRELOAD)) as ended:
         for count, _ in zip(range(10), ended, strict=False):
             assert pulled <= count + 1 + 2
-
-
-@pytest.mark.slow
-def test_a_busy_caller_is_no_silence_of_the_workers() -> None:
-    items = [("well", ""), ("slowly", "")]
-    for ended in supervise(planted, items, jobs=2, limits=Limits(silence_s=3.0), preload=PRELOAD):
-        time.sleep(4.0 if ended.item[0] == "well" else 0.0)
-        assert ended.failure is None
-
-
-@pytest.mark.slow
-def test_3000_items_leave_nothing_in_the_parent() -> None:
-    sizes = []
-    tracemalloc.start()
-    items = (("well", "x" * 10_000 + str(i)) for i in range(3000))
-    for count, ended in enumerate(supervise(planted, items, jobs=2, preload=PRELOAD)):
-        assert ended.failure is None
-        if count in (300, 2900):
-            sizes.append(tracemalloc.get_traced_memory()[0])
-    tracemalloc.stop()
-    assert sizes[1] - sizes[0] < 100_000
 
 
 SCRIPT = """
