@@ -143,7 +143,7 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock], rate_hz
             return 0.0
         apart = min((abs(math.log10(length_s / length)) for length in lengths), default=0.0)
         slow = _CLOCKS["weight_of_steps"] * _outside(step_s, _CLOCKS["usual_step_s"])
-        return slow + _outside(length_s, _CLOCKS["usual_length_s"]) + apart
+        return float(slow + _outside(length_s, _CLOCKS["usual_length_s"]) + apart)
 
     dates = [(factor, 0) for factor in _SUBUNITS if _is_date(middle * factor / _SECONDS)]
     days = [(_DAY_NS, epoch) for epoch in _DAYS_TO_1970 if _is_date((middle - epoch) * _DAY_S)]
