@@ -73,6 +73,9 @@ class ReadOptions:
         return DEFAULT_LIMITS.times(self.budget)
 
 
+AS_IT_IS = ReadOptions()
+
+
 def parse_time(text: str, start_ns: int, end_ns: int, *, option: str) -> int:
     """Convert a time from user input to int64 nanoseconds of the log's clock.
 

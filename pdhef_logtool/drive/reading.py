@@ -10,7 +10,7 @@ from typing import Self, cast
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.friction import FrictionSource, friction_source
-from pdhef_logtool.drive.options import ReadOptions, time_slice
+from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions, time_slice
 from pdhef_logtool.drive.plan import DrivePlan, plan_drive, setup_of
 from pdhef_logtool.drive.recorded import Recorded, read_recorded
 from pdhef_logtool.drive.setup import CLOCK_START_S, LogUntil, Setup, is_device_clock, load_setup
@@ -43,7 +43,6 @@ Adjust = Callable[[DriveLog, Mapping, Tell], Mapping]
 
 #: Memory limit of signals, ground truth and derived columns of all drives of a command together.
 MAX_BYTES = 2 << 30
-_AS_IT_IS = ReadOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -245,7 +244,7 @@ def read_drive(
     log: LogInput | LogPlace | str,
     car: Car | Path | str,
     mapping: Mapping | Path | str | None = None,
-    options: ReadOptions = _AS_IT_IS,
+    options: ReadOptions = AS_IT_IS,
     *,
     tell: Tell = lambda _text: None,
     adjust: Adjust | None = None,
@@ -360,7 +359,7 @@ def logs_of(arguments: Logs, options: ReadOptions) -> list[LogInput]:
     return find_logs(arguments, private_redirects=options.allow_private_redirects, settings=options.tables)
 
 
-def one_log(argument: LogPlace | str, options: ReadOptions = _AS_IT_IS) -> LogInput:
+def one_log(argument: LogPlace | str, options: ReadOptions = AS_IT_IS) -> LogInput:
     """Return the log that a file, folder or pattern represents; raises UsageError unless there is exactly one."""
     inputs = logs_of(argument, options)
     if len(inputs) != 1:

@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool import inspect_log
+from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.logs.can_decoding import Decoder, Frames
 from pdhef_logtool.logs.can_logs import open_asc, open_blf, open_candump
 from pdhef_logtool.logs.open_log import open_log
@@ -738,7 +739,7 @@ def test_a_mapping_of_frames_names_the_bus_where_several_send_a_message(tmp_path
 def test_a_dbc_that_matches_nothing_is_named(tmp_path: Path) -> None:
     path = write(tmp_path / "a.blf", [sent(i / 100, 300, bytes(8)) for i in range(100)])
     (tmp_path / "car.dbc").write_text(HEAD + MOTION)
-    notes = " ".join(map(str, inspect_log(path, msgs=tmp_path / "car.dbc").to_dict()["notes"]))
+    notes = " ".join(map(str, inspect_log(path, options=ReadOptions(msgs=tmp_path / "car.dbc")).to_dict()["notes"]))
     assert "car.dbc contains none of their identifiers" in notes
     assert "--set msgs" not in notes
 

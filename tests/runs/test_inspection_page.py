@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
+from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.runs.inspection import inspect_log
 from pdhef_logtool.runs.inspection.page import inspection_page, sparkline
@@ -109,7 +110,7 @@ def test_a_page_shows_fields_reasons_and_a_mapping_to_paste(tmp_path: Path) -> N
 
 
 def test_a_vector_is_drawn_by_its_length_and_has_figures(sample_logs_dir: Path) -> None:
-    inspection = inspect_log(sample_logs_dir / "road.mcap", prefer_truth="rtk")
+    inspection = inspect_log(sample_logs_dir / "road.mcap", options=ReadOptions(prefer_truth="rtk"))
     quaternion = inspection.truth["quat_wxyz"]
     assert quaternion.minimum == pytest.approx(1.0, abs=1e-4)
     assert quaternion.std < 1e-4

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.text import Text
 
-from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.open_log import open_log
@@ -26,7 +26,6 @@ from pdhef_logtool.storage.documents import jsonable
 if TYPE_CHECKING:
     from rich.console import Console
 
-_AS_IT_IS = ReadOptions()
 #: Arrays inside of arrays, or of structs.
 INNER_ARRAY = re.compile(r"\[\].")
 #: Fields of one topic that are read.
@@ -73,7 +72,7 @@ class FieldsOfLog:
 def fields_of_log(
     path: LogPlace | str,
     topic: str | None = None,
-    options: ReadOptions = _AS_IT_IS,
+    options: ReadOptions = AS_IT_IS,
 ) -> FieldsOfLog:
     """Return the numeric fields of a topic, or of all, over a few pieces of the log.
 
