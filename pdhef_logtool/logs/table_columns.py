@@ -149,7 +149,7 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
         )
     certain = [clock for name, clock in clocks.items() if name != chosen and clock.is_certain]
     clock = _read_clock(sheet, chosen, (*others, *certain), rate_hz) if certain else clocks[chosen]
-    if not (clock.is_certain or certain or others):
+    if clock.notes and not (clock.is_certain or certain or others):
         clock = _as_motion_shows(clock, sheet, chosen)
     apart = [n for n in rivals if abs(clocks[n].length_s - clock.length_s) > _ALIKE * clock.length_s]
     note = f"{chosen} is the clock; the times of {', '.join(apart)} have another length"
