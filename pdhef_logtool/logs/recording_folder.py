@@ -100,4 +100,4 @@ def _overlap(logs: Sequence[TableLog]) -> bool:
     dated = {start >= CONSTANTS["clocks"]["first_date_ns"] for start in starts}
     if len(long) < 2 or len(dated) > 1:
         return len(long) < 2
-    return min(ends) - max(starts) >= _FOLDER["common"][all(dated)] * (max(ends) - min(starts))
+    return bool(min(ends) - max(starts) >= _FOLDER["common"][all(dated)] * (max(ends) - min(starts)))
