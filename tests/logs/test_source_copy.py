@@ -138,14 +138,13 @@ def test_a_database_copy_keeps_bytes_and_definitions(shared_dir: Path, tmp_path:
     "name", ["reader_corpus/plotjuggler/tilt_laser.bag", "reader_corpus/foxglove_rosbag1/example-bz2.bag"]
 )
 def test_a_copy_of_a_bag_keeps_its_messages(shared_dir: Path, tmp_path: Path, name: str) -> None:
+    from rosbags.highlevel import AnyReader
+
     _copy(shared_dir / name, tmp_path / "copy.mcap")
+    with AnyReader([shared_dir / name]) as reader:
+        expected = [(stamp, c.topic, bytes(data)) for c, stamp, data in reader.messages()]
+    assert sorted((m[0], m[1], m[7]) for m in _content(tmp_path / "copy.mcap")) == sorted(expected)
     with closing(open_log(shared_dir / name)) as bag, closing(open_log(tmp_path / "copy.mcap")) as copy:
-        assert [(t.name, t.type_name, t.encoding, t.messages) for t in copy.topics] == [
-            (t.name, t.type_name, "ros1", t.messages) for t in bag.topics
-        ]
-        paths = {t.name: [f.path for f in bag.fields(t.name) if f.kind != "string"][:50] for t in bag.topics}
-        expected, found = bag.read(paths), copy.read(paths)
-        for topic, columns in expected.items():
-            np.testing.assert_array_equal(found[topic].log_time_ns, columns.log_time_ns)
-            for path, values in columns.fields.items():
-                np.testing.assert_array_equal(found[topic].fields[path], values)
+        assert copy.topics == bag.topics
+        assert {t.encoding for t in copy.topics} == {"ros1"}
+        assert [copy.fields(t.name) for t in copy.topics] == [bag.fields(t.name) for t in bag.topics]
