@@ -319,13 +319,6 @@ class _Asc(_TextLog):
         self._begins_ns: int | None = None
         self._start_ns = self._now_ns = 0
 
-    def _read(self, line: bytes) -> bool:
-        event = _EVENT.match(line)
-        if event is None:
-            self._read_head(line.decode("ascii", "ignore"))
-            return True
-        return self._read_event(round(float(event[1]) * 1e9), event[2].rstrip())
-
     def _read_head(self, line: str) -> None:
         """Read a line without a time. A date begins a measurement."""
         if match := _BASE.match(line):
@@ -339,8 +332,12 @@ class _Asc(_TextLog):
                 self._begins_ns = _start_ns(int(year), _MONTHS.get(month.lower()[:3], 0), int(day), *time)
             self._begins_ns = self._begins_ns or 0
 
-    def _read_event(self, time_ns: int, text: bytes) -> bool:
-        """Read a line with a time; return False for a frame that cannot be read."""
+    def _read(self, line: bytes) -> bool:
+        event = _EVENT.match(line)
+        if event is None:
+            self._read_head(line.decode("ascii", "ignore"))
+            return True
+        time_ns, text = round(float(event[1]) * 1e9), event[2].rstrip()
         if self._begins_ns is None and not self._is_relative and time_ns < self._now_ns - _STEP_NS:
             self._begins_ns = 0
         if self._begins_ns is not None:
