@@ -159,12 +159,12 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock], rate_hz
     if rate_hz and step:
         return _as_rate_states(rate_hz, step)
     factor, epoch = min((*((f, 0) for f in _SUBUNITS), *days), key=decades_off)
-    return factor, epoch, _assumption(values, factor, epoch)
+    return factor, epoch, _assumption(values, factor, epoch, others)
 
 
-def _assumption(values: NDArray[Any], factor: int, epoch: int) -> str:
-    """Return the note on a unit that is not stated; empty for fractions of seconds, as other units have none."""
-    are_seconds = factor == _SECONDS and (values != np.round(values)).any()
+def _assumption(values: NDArray[Any], factor: int, epoch: int, others: Sequence[Clock]) -> str:
+    """Return the note on a unit that is not stated; empty for seconds with fractions, or beside other clocks."""
+    are_seconds = factor == _SECONDS and (others or (values != np.round(values)).any())
     return "" if are_seconds else f"no unit, read as {_named(factor, epoch)}; rate_hz states another one"
 
 
