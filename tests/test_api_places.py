@@ -39,7 +39,7 @@ def test_read_drive(dlc: Path, sample_logs_dir: Path, mapping: Path, tmp_path: P
 @pytest.mark.parametrize("kind", KINDS)
 def test_inspect_log(dlc: Path, mapping: Path, tmp_path: Path, kind: Any) -> None:
     (tmp_path / "Any.msg").write_text("float64 a\n")
-    found = pdhef.inspect_log(kind(dlc), kind(mapping), msgs=kind(tmp_path))
+    found = pdhef.inspect_log(kind(dlc), kind(mapping), pdhef.ReadOptions(msgs=kind(tmp_path)))
     assert set(found.signals) > {"yaw_rate_rad_s", "ay_m_s2"}
     assert set(pdhef.load_mapping(kind(mapping)).signals) < set(found.mapping.signals)
     assert read_definitions(kind(tmp_path)).files == read_definitions(tmp_path).files

@@ -31,7 +31,7 @@ def convert(
 
     reading = config.read_options
     place = one_place(log, private_redirects=config.allow_private_redirects)
-    lost, messages = convert_log(place, output, reading.limits, reading.msgs)
+    lost, messages = convert_log(place, output, reading.limits, reading.msgs, reading.tables)
     for loss in lost:
         console.warn(f"{loss.where}: {loss.what}" + ("" if loss.count is None else f" ({loss.count} times)"))
     console.say(f"{messages} messages written to {output}")

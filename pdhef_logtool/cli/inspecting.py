@@ -53,8 +53,7 @@ def inspect(
     if fields and (report or write_mapping) is not None:
         raise UsageError(expected="--fields alone", got="--report or --write-mapping as well", where="--fields")
     if fields:
-        reading = config.read_options
-        topic_fields = fields_of_log(_place(log, config), topic, budget=reading.limits, msgs=reading.msgs)
+        topic_fields = fields_of_log(_place(log, config), topic, config.read_options)
         console.finish(topic_fields, render_fields, as_json, exit_code=EXIT_OK)
 
     def write_files(inspection: Inspection, open_log: DriveLog) -> None:
@@ -107,9 +106,7 @@ def _inspect(log: str, config: RunConfig, **given: Any) -> Inspection:
     """Inspect the log of an argument as configured."""
     from pdhef_logtool.runs.inspection import inspect_log
 
-    reading = config.read_options
-    given |= {"prefer_truth": reading.prefer_truth, "budget": reading.limits, "msgs": reading.msgs}
-    return inspect_log(_place(log, config), config.mapping, **given)
+    return inspect_log(_place(log, config), config.mapping, config.read_options, **given)
 
 
 def _ask(question: str) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
+from pdhef_logtool.logs.table_file import TableSettings
 from pdhef_logtool.records.errors import UsageError
 
 #: A bare integer from here on is nanoseconds, not seconds from the log's start.
@@ -31,6 +32,7 @@ class ReadOptions:
     waived : names of checks to ignore.
     model : :data:`AUTO`, :data:`OFF`, or the model.toml of an earlier drive, which decides the sensors.
     msgs : folder with definitions of message types that a log does not define.
+    rate_hz, group, folder : of logs of tables (:class:`~pdhef_logtool.logs.table_file.TableSettings`).
     allow_private_redirects : whether a web server may redirect to other hosts of this machine and its network.
     """
 
@@ -43,6 +45,9 @@ class ReadOptions:
     waived: tuple[str, ...] = ()
     model: Path = AUTO
     msgs: Path | None = None
+    rate_hz: float | None = None
+    group: str = ""
+    folder: Literal["auto", "recording", "drives"] = "auto"
     allow_private_redirects: bool = False
 
     def __post_init__(self) -> None:
@@ -56,9 +61,17 @@ class ReadOptions:
         return self.sensors == "full"
 
     @property
+    def tables(self) -> TableSettings:
+        """Settings of logs of tables."""
+        return TableSettings(self.rate_hz, self.group, self.folder)
+
+    @property
     def limits(self) -> ResourceLimits:
         """Resource limits for reading a log."""
         return DEFAULT_LIMITS.times(self.budget)
+
+
+AS_IT_IS = ReadOptions()
 
 
 def parse_time(text: str, start_ns: int, end_ns: int, *, option: str) -> int:

@@ -11,11 +11,11 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.friction import FrictionSource, friction_source
 from pdhef_logtool.drive.model_file import CLOCK_START_S, ModelFile, is_device_clock, load_model
-from pdhef_logtool.drive.options import AUTO, OFF, ReadOptions, time_slice
+from pdhef_logtool.drive.options import AS_IT_IS, AUTO, OFF, ReadOptions, time_slice
 from pdhef_logtool.drive.plan import DrivePlan, plan_drive
 from pdhef_logtool.drive.recorded import Recorded, read_recorded
 from pdhef_logtool.logs.container import Wanted
-from pdhef_logtool.logs.discovery import LogInput, check_unchanged, find_logs, identity_of, log_state
+from pdhef_logtool.logs.discovery import LogInput, Logs, check_unchanged, find_logs, identity_of, log_state
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -28,6 +28,7 @@ from pdhef_logtool.mapping import (
     clock_key,
     mapping_of,
     merge_losses,
+    tables_for,
 )
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
@@ -39,8 +40,6 @@ from pdhef_logtool.records.tracks import StateTrack
 Tell = Callable[[str], None]
 #: Returns the mapping to read with, from the log and the mapping in effect; may print a message.
 Adjust = Callable[[DriveLog, Mapping, Tell], Mapping]
-
-_AS_IT_IS = ReadOptions()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +225,7 @@ def read_drive(
     log: LogInput | LogPlace | str,
     car: Car | Path | str,
     mapping: Mapping | Path | str | None = None,
-    options: ReadOptions = _AS_IT_IS,
+    options: ReadOptions = AS_IT_IS,
     *,
     tell: Tell = lambda _text: None,
     adjust: Adjust | None = None,
@@ -269,7 +268,8 @@ def read_drive(
         tell(f"{log_input.stem}: {text}")
 
     state = log_state(log_input.path)
-    opened = open_log(log_input.path, options.limits, options.msgs, wanted=Wanted(frozenset()))
+    tables = tables_for(mapping, options.tables)
+    opened = open_log(log_input.path, options.limits, options.msgs, Wanted(frozenset()), tables)
     try:
         prior = None if options.model in (AUTO, OFF) else load_model(options.model, car)
         prefer = options.prefer_truth
@@ -315,9 +315,14 @@ def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], option
     return opened
 
 
-def one_log(argument: LogPlace | str, options: ReadOptions = _AS_IT_IS) -> LogInput:
+def logs_of(arguments: Logs, options: ReadOptions) -> list[LogInput]:
+    """Return the logs that files, folders and patterns represent (:func:`find_logs`)."""
+    return find_logs(arguments, private_redirects=options.allow_private_redirects, settings=options.tables)
+
+
+def one_log(argument: LogPlace | str, options: ReadOptions = AS_IT_IS) -> LogInput:
     """Return the log that a file, folder or pattern represents; raises UsageError unless there is exactly one."""
-    inputs = find_logs(argument, private_redirects=options.allow_private_redirects)
+    inputs = logs_of(argument, options)
     if len(inputs) != 1:
         raise UsageError(expected="one log", got=f"{len(inputs)} of them", where=str(argument))
     return inputs[0]

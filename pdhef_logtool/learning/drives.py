@@ -13,8 +13,8 @@ from typing import Any
 
 from pdhef_logtool.car.parts import LearntOn
 from pdhef_logtool.drive.plan import DrivePlan
-from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, lost_texts
-from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
+from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, logs_of, lost_texts
+from pdhef_logtool.logs.discovery import LogInput, Logs
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
@@ -74,7 +74,7 @@ def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInp
     UsageError
         A drive belongs to a rejected split, or no drive is left.
     """
-    inputs = find_logs(arguments, private_redirects=settings.config.allow_private_redirects)
+    inputs = logs_of(arguments, settings.config.read_options)
     manifests = cache(set_manifest)
     splits = {i.stem: str(manifests(i.folder).get(i.path.name, {}).get("split") or "") for i in inputs}
     if settings.split not in (None, ANY_SPLIT):

@@ -1,6 +1,6 @@
-"""Logs of raw CAN frames, BLF and ASC: a topic ``can`` that a DBC decodes.
+"""Logs of raw CAN frames, BLF, ASC and candump: a topic ``can`` that a DBC decodes.
 
-Both formats state the local time of the recorder without its zone; it is read as UTC.
+BLF and ASC state the local time of the recorder without its zone; it is read as UTC.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.can_decoding import ID_BITS, Frames
 from pdhef_logtool.logs.constants import CONSTANTS, numbered
 from pdhef_logtool.logs.container import describe_damage
-from pdhef_logtool.logs.table_clocks import placed
+from pdhef_logtool.logs.table_clocks import ascending_rows, placed
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray, Loss
 
 _PARTS = ("id", "length", "is_extended", "bus", "is_error", "is_remote")
+_ROW = struct.Struct(f"{len(_PARTS)}i")
 #: Bytes of the numbers of a frame: its time and parts.
 _ROW_BYTES = np.dtype([("stamp", np.int64), ("parts", np.int32, len(_PARTS))]).itemsize
 #: Maximum data length of CAN FD.
@@ -37,7 +38,8 @@ def _tables(
     """Build the topic ``can`` from times [N], numbers [N, 6] and the concatenated data of the frames."""
     if not len(stamps):
         got = f"none that can be read{''.join(f'; {loss.what}' for loss in lost[:1])}"
-        raise LogError(expected="CAN frames", got=got, where=file.name)
+        remedy = "candump -l and candump -t a record times" * (kind == "candump")
+        raise LogError(expected="CAN frames with times", got=got, where=file.name, remedy=remedy)
     widest = max(1, int(numbers[:, 1].max()))
     file.limits.check_table(len(stamps) * (_ROW_BYTES + widest), file.size, f"{len(stamps)} frames")
     rows = np.zeros((len(stamps), widest), np.uint8)
@@ -243,41 +245,79 @@ _FRAME_SHAPE = re.compile(rb"\d+\s+(?:\S+\s+[rt]x\s|errorframe)|canfd\s", re.I)
 _STEP_NS = 10**9
 
 
+class _TextLog:
+    """Reader of a log of text with a frame a line."""
+
+    kind = ""
+
+    def __init__(self, file: TableFile) -> None:
+        self._file = file
+        self._stamps, self._numbers, self._data = array("q"), bytearray(), bytearray()
+        self._losses: list[Loss] = []
+
+    def _read(self, line: bytes) -> bool:
+        """Read a line; return False for a frame that cannot be read."""
+        raise NotImplementedError
+
+    def _add(self, stamp_ns: int, data: bytes, *parts: int) -> bool:
+        """Add a frame with its parts in their order; return False if it is none."""
+        if parts[0] > ID_BITS:
+            return False
+        row = _ROW.pack(*parts)
+        self._stamps.append(stamp_ns)
+        self._numbers += row
+        self._data += data
+        return True
+
+    def tables(self) -> Tables:
+        """Read the file."""
+        unreadable, first = 0, ""
+        for number, line in enumerate(self._file.stream, 1):
+            try:
+                is_read = self._read(line)
+            except (ValueError, OverflowError, struct.error):
+                is_read = False
+            if not is_read:
+                first = first or f"line {number}, {line[:60].decode('ascii', 'replace').strip()!r}"
+                unreadable += 1
+        if unreadable:
+            what = f"{unreadable} lines of frames cannot be read, the first: {first}"
+            self._losses.append(Loss("bad-row", what, self._file.name, count=unreadable))
+        numbers = np.frombuffer(self._numbers, np.int32).reshape(-1, len(_PARTS))
+        stamps = self._times(np.frombuffer(self._stamps, np.int64))
+        # Buses are written with small delays; after a larger step back, times that were recorded before are left out.
+        latest = np.maximum.accumulate(stamps)
+        rows, lost = ascending_rows(np.where(latest - stamps < _STEP_NS, latest, stamps), self._file.name)
+        used = np.isin(np.arange(len(stamps)), rows)
+        data = np.frombuffer(self._data, np.uint8)[np.repeat(used, numbers[:, 1])]
+        return _tables(
+            self.kind, self._file, stamps[used], self._bus_numbers(numbers[used]), data, [*self._losses, *lost]
+        )
+
+    def _times(self, stamps: IntArray) -> IntArray:
+        """Return the times [N] of frames."""
+        return stamps
+
+    def _bus_numbers(self, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return the numbers [N, 6] of frames with those of buses."""
+        return numbers
+
+
 def open_asc(file: TableFile) -> Tables:
     """Read an ASC file; raises LogError if it has no frames."""
     return _Asc(file).tables()
 
 
-class _Asc:
+class _Asc(_TextLog):
     """Reader of an ASC file."""
 
+    kind = "asc"
+
     def __init__(self, file: TableFile) -> None:
-        self._file = file
-        self._stamps, self._numbers, self._data = array("q"), array("i"), bytearray()
+        super().__init__(file)
         self._base, self._is_relative = 16, False
         self._begins_ns: int | None = None
-        self._start_ns = self._now_ns = self._overlapping = 0
-        self._is_overlapping = False
-
-    def tables(self) -> Tables:
-        """Read the file."""
-        unreadable, first, losses = 0, "", []
-        for number, line in enumerate(self._file.stream, 1):
-            event = _EVENT.match(line)
-            if event is None:
-                self._read_head(line.decode("ascii", "ignore"))
-            elif not self._read_event(round(float(event[1]) * 1e9), event[2].rstrip()):
-                first = first or f"line {number}, {line[:60].decode('ascii', 'replace').strip()!r}"
-                unreadable += 1
-        if unreadable:
-            what = f"{unreadable} lines of frames cannot be read, the first: {first}"
-            losses.append(Loss("bad-row", what, self._file.name, count=unreadable))
-        if self._overlapping:
-            what = "frames of a measurement that begins before the end of the one above it"
-            losses.append(Loss("out-of-order", what, self._file.name, count=self._overlapping))
-        numbers = np.frombuffer(self._numbers, np.int32).reshape(-1, len(_PARTS))
-        stamps, data = np.frombuffer(self._stamps, np.int64), np.frombuffer(self._data, np.uint8)
-        return _tables("asc", self._file, stamps, numbers, data, losses)
+        self._start_ns = self._now_ns = 0
 
     def _read_head(self, line: str) -> None:
         """Read a line without a time. A date begins a measurement."""
@@ -292,8 +332,12 @@ class _Asc:
                 self._begins_ns = _start_ns(int(year), _MONTHS.get(month.lower()[:3], 0), int(day), *time)
             self._begins_ns = self._begins_ns or 0
 
-    def _read_event(self, time_ns: int, text: bytes) -> bool:
-        """Read a line with a time; return False for a frame that cannot be read."""
+    def _read(self, line: bytes) -> bool:
+        event = _EVENT.match(line)
+        if event is None:
+            self._read_head(line.decode("ascii", "ignore"))
+            return True
+        time_ns, text = round(float(event[1]) * 1e9), event[2].rstrip()
         if self._begins_ns is None and not self._is_relative and time_ns < self._now_ns - _STEP_NS:
             self._begins_ns = 0
         if self._begins_ns is not None:
@@ -303,26 +347,72 @@ class _Asc:
         if match is None:
             return _FRAME_SHAPE.match(text) is None
         bus, is_error, identifier, extended, remote, length, content = match.groups()
-        try:
-            base, most = (self._base, 8) if match.re is _CLASSIC else (10, _MOST_BYTES)
-            count = min(int(length or b"0", base), most)
-            data = bytes([int(byte, self._base) for byte in (content or b"").split(None, count)[:count]])
-            number = int(identifier or b"0", self._base)
-            row = array("i", (number, count, bool(extended), int(bus) - 1, bool(is_error), bool(remote)))
-        except (ValueError, OverflowError):
+        base, most = (self._base, 8) if match.re is _CLASSIC else (10, _MOST_BYTES)
+        count = min(int(length or b"0", base), most)
+        data = bytes([int(byte, self._base) for byte in (content or b"").split(None, count)[:count]])
+        if len(data) < count:
             return False
-        if self._is_overlapping:
-            self._overlapping += 1
-        elif len(data) == count and number <= ID_BITS:
-            self._stamps.append(self._start_ns + self._now_ns)
-            self._numbers.extend(row)
-            self._data.extend(data)
-        return len(data) == count and number <= ID_BITS
+        number, flags = int(identifier or b"0", self._base), (bool(is_error), bool(remote))
+        return self._add(self._start_ns + self._now_ns, data, number, count, bool(extended), int(bus) - 1, *flags)
 
     def _begin(self, begins_ns: int, time_ns: int) -> None:
         """Begin a measurement with its first event. If the times continue, they have the same origin as before."""
         self._begins_ns = None
         goes_on = not begins_ns if self._is_relative else time_ns >= self._now_ns
-        if not self._stamps or self._is_overlapping or not goes_on:
-            self._is_overlapping = bool(self._stamps) and begins_ns + time_ns < self._stamps[-1]
+        if not self._stamps or not goes_on:
             self._start_ns, self._now_ns = begins_ns, 0
+
+
+# candump: ``(1609459200.123456) can0 123#DEADBEEF`` of -l, ``(...)  can0  123   [4]  DE AD BE EF`` of -t.
+_CANDUMP = re.compile(
+    rb"\s*\((\d{1,10}\.\d{1,9}|\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{1,9})\)\s+(\S+)\s+(?:[rt]x\s+\S+\s+\S+\s+)?"
+    rb"([\da-f]{3}|[\da-f]{8})(?:#(?:#[\da-f])?(r)?([\da-f.]*)|\s+\[(\d+)\]\s*(r)?((?:\s*[\da-f]{2}\b)*))(?![^\s_'e])",
+    re.I,
+)
+_ERROR_FLAG, _DIFFERENCES = CONSTANTS["candump"]["error_flag"], CONSTANTS["candump"]["differences"]
+
+
+def open_candump(file: TableFile) -> Tables:
+    """Read a log of ``candump`` (can-utils); raises LogError if it has no frames with times."""
+    return _Candump(file).tables()
+
+
+class _Candump(_TextLog):
+    """Reader of a log of ``candump``."""
+
+    kind = "candump"
+
+    def __init__(self, file: TableFile) -> None:
+        super().__init__(file)
+        self._interfaces: dict[bytes, int] = {}
+
+    def _read(self, line: bytes) -> bool:
+        match = _CANDUMP.match(line)
+        if match is None:
+            return not line.strip()
+        time, interface, identifier, remote, data, count, remote_too, listed = match.groups()
+        whole, _, fraction = time.partition(b".")
+        stamp_ns = int(whole) * 10**9 if whole.isdigit() else int(np.datetime64(whole.decode(), "ns").astype(np.int64))
+        is_remote = bool(remote or remote_too)
+        content = b"" if is_remote else bytes.fromhex((listed if data is None else data.replace(b".", b"")).decode())
+        number, bus = int(identifier, 16), self._interfaces.setdefault(interface, len(self._interfaces))
+        if len(content) > _MOST_BYTES or (count and not is_remote and len(content) != int(count)):
+            return False
+        flags = len(identifier) > 3, bus, bool(number & _ERROR_FLAG), is_remote
+        stamp_ns += int(fraction.ljust(9, b"0"))
+        return self._add(stamp_ns, content, number & ~_ERROR_FLAG, len(content), *flags)
+
+    def _times(self, stamps: IntArray) -> IntArray:
+        if not len(stamps) or np.mean(np.diff(stamps, prepend=stamps[0]) < 0) < _DIFFERENCES:
+            return stamps
+        what = "times are differences between frames, and are summed"
+        self._losses.append(Loss("clock", what, self._file.name, severity="note"))
+        return np.cumsum(stamps)
+
+    def _bus_numbers(self, numbers: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return numbers with the number at the end of each interface, or its place among all if two have the same."""
+        ends = [int(end[0]) if (end := re.findall(rb"\d{1,4}$", name)) else -1 for name in self._interfaces]
+        if len(set(ends)) < len(ends):
+            ends = [sorted(self._interfaces).index(name) for name in self._interfaces]
+        numbers[:, _PARTS.index("bus")] = np.array(ends, np.int32)[numbers[:, _PARTS.index("bus")]]
+        return numbers

@@ -19,6 +19,7 @@ from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
 from pdhef_logtool.logs.table_columns import field_name, unique
+from pdhef_logtool.logs.table_file import NO_SETTINGS, TableSettings
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import LogError, OutputError
 from pdhef_logtool.records.signals import Loss
@@ -29,7 +30,11 @@ _DATA = re.compile(r"data\[(\d+)\]")
 
 
 def convert_log(
-    place: LogPlace, output: Path, limits: ResourceLimits = DEFAULT_LIMITS, msgs: Path | None = None
+    place: LogPlace,
+    output: Path,
+    limits: ResourceLimits = DEFAULT_LIMITS,
+    msgs: Path | None = None,
+    settings: TableSettings = NO_SETTINGS,
 ) -> tuple[tuple[Loss, ...], int]:
     """Write a log as an MCAP, complete or not at all; return its losses and the number of messages.
 
@@ -40,23 +45,21 @@ def convert_log(
     if output.exists():
         remedy = "remove it or name another"
         raise OutputError(expected="a new file", got="one that exists", where=str(output), remedy=remedy)
-    with closing(open_log(place, limits, msgs)) as log:
+    with closing(open_log(place, limits, msgs, settings=settings)) as log:
         source = log.messages
         if log.start_ns < 0:
             raise LogError(expected="log times from 1970 on", got=f"{log.start_ns} ns", where=str(place))
         with McapLogWriter(output, profile="ros2" if source is None else source_profile(source)) as writer:
-            lost: tuple[Loss, ...] = ()
             if source is None:
                 _write_tables(writer, log)
             else:
                 channels = register_channels(writer, source)
-                lost = channels.lost
                 writer.write([], raws=iterate_copy(source, channels))
                 for attachment in source.attachments():
                     writer.attachment(attachment)
                 for record in source.metadata_records():
                     writer.metadata(record.name, record.metadata)
-        return (*lost, *log.lost), sum(topic.messages for topic in log.topics)
+        return log.lost, sum(topic.messages for topic in log.topics)
 
 
 def _write_tables(writer: McapLogWriter, log: DriveLog) -> None:

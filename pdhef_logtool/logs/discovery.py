@@ -16,7 +16,9 @@ from typing import TypeAlias
 
 from pdhef_logtool.logs.byte_source import ChangedError, require_regular
 from pdhef_logtool.logs.formats import COMPRESSED_SUFFIXES, ROSBAG2_METADATA, log_suffixes, without_general
+from pdhef_logtool.logs.recording_folder import is_recording
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
+from pdhef_logtool.logs.table_file import NO_SETTINGS, TableSettings
 from pdhef_logtool.records.errors import LogError, UsageError
 
 #: Stems are folder names on any system.
@@ -54,13 +56,15 @@ class LogInput:
 Logs: TypeAlias = "str | LogPlace | Sequence[str | LogPlace] | Sequence[LogInput]"
 
 
-def find_logs(arguments: Logs, *, private_redirects: bool = False) -> list[LogInput]:
+def find_logs(
+    arguments: Logs, *, private_redirects: bool = False, settings: TableSettings = NO_SETTINGS
+) -> list[LogInput]:
     """Expand paths, patterns and URLs to logs in a stable order; each log once. Logs that were found already are kept.
 
     A file or rosbag2 folder that is named itself is a log, readable or not. Folders, and
-    ``s3://bucket/prefix/``, are searched for logs by suffix; a rosbag2 folder of this machine counts as one log. Any
-    other URL is one log. ``@list.txt`` means the lines of a file. ``private_redirects`` as for
-    :class:`~pdhef_logtool.logs.remote_place.RemotePlace`.
+    ``s3://bucket/prefix/``, are searched for logs by suffix; a rosbag2 folder of this machine, or a folder of CSV files
+    of one recording, counts as one log. Any other URL is one log. ``@list.txt`` means the lines of a file.
+    ``private_redirects`` as for :class:`~pdhef_logtool.logs.remote_place.RemotePlace`.
 
     Raises
     ------
@@ -72,7 +76,7 @@ def find_logs(arguments: Logs, *, private_redirects: bool = False) -> list[LogIn
         return already
     named = (a.url if isinstance(a, RemotePlace) else str(a) for a in several)
     for argument in chain.from_iterable(map(_lines, named)):
-        places = list(_expand(argument, private_redirects))
+        places = list(_expand(argument, private_redirects, settings))
         if not places:
             raise UsageError(
                 expected=f"at least one log ({', '.join(log_suffixes())} or a rosbag2 folder)",
@@ -190,21 +194,21 @@ def check_unchanged(path: LogPlace, state: tuple[tuple[int, int, int], ...]) -> 
         )
 
 
-def _expand(argument: str, private_redirects: bool) -> Iterator[LogPlace]:
+def _expand(argument: str, private_redirects: bool, settings: TableSettings) -> Iterator[LogPlace]:
     place = place_of(argument, private_redirects=private_redirects)
     if isinstance(place, RemotePlace):
         yield from (
             _search_store(place) if place.scheme == "s3" and (not place.key or argument.endswith("/")) else (place,)
         )
     elif place.is_dir():
-        yield from _search(place, set())
+        yield from _search(place, set(), settings)
     elif place.exists() or not glob.has_magic(argument):
         yield place
     else:
         visited: set[str] = set()
         for match in _matches(argument):
             if match.is_dir():
-                yield from _search(match, visited)
+                yield from _search(match, visited, settings)
             else:
                 yield match
 
@@ -236,7 +240,7 @@ def _matches(pattern: str) -> list[Path]:
     return sorted(paths, key=str)
 
 
-def _search(folder: Path, visited: set[str]) -> Iterator[Path]:
+def _search(folder: Path, visited: set[str], settings: TableSettings) -> Iterator[Path]:
     """Yield the logs below a folder, each folder once: links can lead back to where they lie."""
     place = os.path.realpath(folder)
     if place in visited:
@@ -248,10 +252,14 @@ def _search(folder: Path, visited: set[str]) -> Iterator[Path]:
     if (folder / RUN_FILE).is_file():
         return
     entries = [e for e in sorted(folder.iterdir()) if not e.name.startswith(".")]
-    logs = without_general({e.name for e in entries if not e.is_dir() and _bare_name(e.name) != e.name})
+    named = {e.name for e in entries if not e.is_dir() and _bare_name(e.name) != e.name}
+    logs = without_general(named - {"history.jsonl", "journal.jsonl"})  # of cars and runs
+    if is_recording(folder, logs, settings):
+        yield folder
+        logs = set()
     for entry in entries:
         if entry.is_dir():
-            yield from _search(entry, visited)
+            yield from _search(entry, visited, settings)
         elif entry.name in logs:
             yield entry
 

@@ -6,7 +6,7 @@ A package adds formats by entry points of the group ``pdhef.log_formats``; each 
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -41,7 +41,7 @@ class LogFormat:
     magic : first bytes of every file, or several possible ones; empty: a file is recognised by its suffix.
     needs_suffix : whether files of other formats begin with the same bytes, so that the suffix must match too.
     is_general : whether such files often contain something else: a search through folders ignores them where logs of
-        other formats are beside them.
+        other formats are beside them. is_text : whether most of them do: it ignores them beside other general files.
     """
 
     title: str
@@ -50,6 +50,7 @@ class LogFormat:
     magic: bytes | tuple[bytes, ...] = b""
     needs_suffix: bool = False
     is_general: bool = False
+    is_text: bool = False
     named: tuple[str, ...] = ()
     libraries: tuple[str, ...] | None = None
 
@@ -92,6 +93,14 @@ FORMATS = (
     ),
     LogFormat("a BLF file", f"{__package__}.can_logs:open_blf", (".blf",), b"LOGG", libraries=()),
     LogFormat("an ASC file", f"{__package__}.can_logs:open_asc", (".asc",), libraries=()),
+    LogFormat(
+        "a candump log", f"{__package__}.can_logs:open_candump", (".log",),
+        is_general=True, is_text=True, libraries=(),
+    ),
+    LogFormat(
+        "a file of JSON lines", f"{__package__}.json_lines:open_json_lines", (".jsonl", ".ndjson"),
+        is_general=True, is_text=True, named=(".json",), libraries=("polars",),
+    ),
 )  # fmt: skip
 
 
@@ -120,10 +129,17 @@ def log_suffixes() -> tuple[str, ...]:
 
 
 def without_general(names: set[str]) -> set[str]:
-    """Return the names of the logs in one folder, without files of general formats if others are beside them."""
-    general = tuple(suffix for f in _every_format() if f.is_general for suffix in (*f.suffixes, *f.named))
-    general += tuple(suffix + compressed for suffix in general for compressed in COMPRESSED_SUFFIXES)
-    return {name for name in names if not name.endswith(general)} or names
+    """Return the names of the logs in one folder, without those of general formats beside others."""
+    for only_texts in (False, True):
+        ends = _ends(f for f in _every_format() if f.is_general and f.is_text >= only_texts)
+        if kept := {name for name in names if not name.endswith(ends)}:
+            return kept
+    return names
+
+
+def _ends(formats: Iterable[LogFormat]) -> tuple[str, ...]:
+    ends = [suffix for f in formats for suffix in (*f.suffixes, *f.named)]
+    return tuple(suffix + compressed for suffix in ends for compressed in ("", *COMPRESSED_SUFFIXES))
 
 
 def what_is_a_log() -> str:

@@ -6,6 +6,7 @@ is their clock.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.mat_arrays import DEEPEST, HDF5_MAT, hdf5_variables, mat5_variables
-from pdhef_logtool.logs.table_clocks import Clock
+from pdhef_logtool.logs.table_clocks import Clock, rate_clock
 from pdhef_logtool.logs.table_columns import Sheet, clock_notes, field_name, find_clock, tables_of, unique
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.logs.table_log import Table
@@ -46,13 +47,14 @@ def open_mat(file: TableFile) -> Tables:
     if unusable:
         what = f"arrays that are no vectors are left out: {', '.join(unusable)}"
         losses.append(Loss("no-numbers", what, file.name, count=len(unusable), severity="note"))
-    tables = list(_mat_tables(arrays, units, file.name, losses))
+    tables = list(_mat_tables(arrays, units, file, losses))
     if not tables:
         raise LogError(
             expected="a vector of times (t, time, ...) as long as the signals beside it",
             got=", ".join(name for columns in arrays.values() for name in columns) or "no numeric variables",
             where=file.name,
-            remedy="name the vector of times so",
+            remedy="name the vector of times so; without one, state the samples per second: --set rate_hz=100, "
+            "or rate_hz in the mapping file",
         )
     return Tables("mat-7.3" if hdf5 else "mat", tables, losses)
 
@@ -60,10 +62,11 @@ def open_mat(file: TableFile) -> Tables:
 def _mat_tables(
     arrays: Mapping[str, Mapping[str, NDArray[Any]]],
     units: Mapping[str, Mapping[str, str]],
-    where: str,
+    file: TableFile,
     losses: list[Loss],
 ) -> Iterator[Table]:
     """Yield the tables of the structs; vectors without a clock of their length are noted."""
+    where = file.name
     sheets = []
     for struct_, variables in arrays.items():
         lengths = dict.fromkeys(len(v) for v in variables.values() if len(v) > 1)
@@ -71,7 +74,7 @@ def _mat_tables(
             columns = {n: v for n, v in variables.items() if len(v) == length}
             name = field_name(struct_) if struct_ else "mat"
             sheets.append((struct_, length, Sheet(name, columns, units[struct_])))
-    clocks = _clocks(sheets, where)
+    clocks = _clocks(sheets, where, file.settings.rate_hz)
     rows: list[tuple[Sheet, IntArray]] = []
     for struct_, length, sheet in sheets:
         clock = _clock_of(struct_, length, clocks)
@@ -88,18 +91,26 @@ def _mat_tables(
         yield from tables_of(Sheet(name, sheet.columns, sheet.units), where, losses, stamps)
 
 
-def _clocks(sheets: Sequence[tuple[str, int, Sheet]], where: str) -> dict[tuple[str, int], Clock]:
-    """Return the clocks of sheets; those without a unit are read beside certain ones, or the longest one."""
+def _clocks(
+    sheets: Sequence[tuple[str, int, Sheet]], where: str, rate_hz: float | None
+) -> dict[tuple[str, int], Clock]:
+    """Return the clocks of sheets; those without a unit are read beside certain ones, or the longest one.
+
+    Without any clock, ``rate_hz`` applies to the length that most vectors have.
+    """
     clocks: dict[tuple[str, int], Clock] = {}
     for struct_, length, sheet in sheets:
         with suppress(LogError):
             clocks[struct_, length] = find_clock(sheet, where)
+    if not clocks and rate_hz:
+        counts = Counter(length for _, length, sheet in sheets for _ in sheet.columns)
+        return {(s, n): rate_clock(n, rate_hz) for s, n, _ in sheets if n == counts.most_common(1)[0][0]}
     certain = {key for key, clock in clocks.items() if clock.is_certain}
     certain = certain or set(sorted(clocks, key=lambda key: -key[1])[:1])
     others = [clocks[key] for key in clocks if key in certain]
     for struct_, length, sheet in sheets:
         if (struct_, length) in clocks and (struct_, length) not in certain:
-            clocks[struct_, length] = find_clock(sheet, where, others)
+            clocks[struct_, length] = find_clock(sheet, where, others, rate_hz)
     return clocks
 
 

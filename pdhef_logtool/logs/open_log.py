@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
@@ -25,8 +25,10 @@ from pdhef_logtool.logs.formats import (
     without_general,
 )
 from pdhef_logtool.logs.log_file import LogFile
+from pdhef_logtool.logs.recording_folder import open_recording
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter, ResourceLimits
+from pdhef_logtool.logs.table_file import NO_SETTINGS, TableSettings
 from pdhef_logtool.logs.table_log import TableLog
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import Loss
@@ -34,6 +36,7 @@ from pdhef_logtool.storage.documents import read_text
 from pdhef_logtool.storage.files import scratch_folder
 
 _REMEDY = "give the recording itself"
+_ONE_RECORDING = "name one recording; if the files are parts of one, --set folder=recording"
 #: First bytes of a Git LFS pointer, which is in a repository in place of a large file that was not fetched.
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 #: Kinds of logs by container format, as a file and as a folder.
@@ -46,11 +49,13 @@ def open_log(
     limits: ResourceLimits = DEFAULT_LIMITS,
     msgs: Path | str | None = None,
     wanted: Wanted = EVERYTHING,
+    settings: TableSettings = NO_SETTINGS,
 ) -> DriveLog:
     """Open a log, recognised by its content.
 
     A file of one of the :mod:`~pdhef_logtool.logs.formats`, each also zstd-compressed; a rosbag2 folder with its
-    ``metadata.yaml`` (split files are one log), or a folder with exactly one such file. Each file also by its URL
+    ``metadata.yaml`` (split files are one log), a folder of CSV files of one recording
+    (:mod:`~pdhef_logtool.logs.recording_folder`), or a folder with exactly one such file. Each file also by its URL
     (``https://``, ``s3://``).
 
     Parameters
@@ -58,7 +63,7 @@ def open_log(
     limits : resource limits of reading; data beyond them are a loss.
     msgs : folder, zip file or wheel with definitions of types that the log does not define (:func:`read_definitions`);
         or a DBC file, or a folder of them, that defines the CAN frames of a log of tables.
-    wanted : the parts of a remote log that will be read.
+    wanted : the parts of a remote log that will be read. settings : for logs of tables.
 
     Raises
     ------
@@ -67,7 +72,9 @@ def open_log(
     """
     databases = dbc_files(msgs)
     definitions = read_definitions(None if databases else msgs)
-    log = _opened(place_of(path) if isinstance(path, str) else path, Meter(limits), wanted)
+    place = place_of(path) if isinstance(path, str) else path
+    local = place if isinstance(place, Path) else Path()
+    log = _opened(LogFile(local, place, Meter(limits), settings=settings), wanted)
     if log.messages is not None:
         log.messages.definitions = definitions
     log.given_databases = databases
@@ -78,18 +85,19 @@ def open_log(
     return log
 
 
-def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> DriveLog:
+def _opened(file: LogFile, wanted: Wanted) -> DriveLog:
+    path = file.place
     try:
         if isinstance(path, RemotePlace):
-            opened = _open_remote(path, meter, wanted)
+            opened = _open_remote(file, path, wanted)
         elif path.is_dir():
-            return _open_folder(path, meter)
+            return _open_folder(file)
         elif not path.exists():
             raise LogError(
                 expected=what_is_a_log(), got="no such file", where=str(path), remedy="check the path", missing=True
             )
         else:
-            opened = _open_file(path, meter)
+            opened = _open_file(file)
     except OSError as error:
         raise_source_error(error, str(path))
         raise LogError(
@@ -136,14 +144,13 @@ def looks_like_log(path: Path) -> bool:
     return recognised_format(head, path.name) is not None
 
 
-def _open_file(path: Path, meter: Meter) -> Container | DriveLog:
+def _open_file(file: LogFile) -> Container | DriveLog:
     """Open one file."""
-    if _head_of(path).startswith(ZSTD_MAGIC):
-        return _open_compressed(path, path, meter)
-    return _open_plain(LogFile(path, path, meter))
+    is_compressed = _head_of(file.path).startswith(ZSTD_MAGIC)
+    return _open_compressed(file) if is_compressed else _open_plain(file)
 
 
-def _open_remote(place: RemotePlace, meter: Meter, wanted: Wanted) -> Container | DriveLog:
+def _open_remote(file: LogFile, place: RemotePlace, wanted: Wanted) -> Container | DriveLog:
     """Open an object; a log without an index, or of a format that needs the whole file, is copied once."""
     from pdhef_logtool.logs.remote_source import RemoteSource
 
@@ -153,13 +160,12 @@ def _open_remote(place: RemotePlace, meter: Meter, wanted: Wanted) -> Container 
         if head.startswith(MCAP_MAGIC):
             from pdhef_logtool.logs.mcap_log import McapContainer
 
-            return McapContainer(source, place, meter, wanted)
-        if head.startswith(ZSTD_MAGIC):
+            return McapContainer(source, place, file.meter, wanted)
+        file = replace(file, path=source.path, release=source.close)
+        is_compressed = head.startswith(ZSTD_MAGIC)
+        if is_compressed or recognised_format(head, source.path.name) is not None:
             source.fetch_whole()
-            return _open_compressed(source.path, place, meter, source.close)
-        if recognised_format(head, source.path.name) is not None:
-            source.fetch_whole()
-        return _open_plain(LogFile(source.path, place, meter, source.close))
+        return _open_compressed(file) if is_compressed else _open_plain(file)
     except BaseException:
         source.close()
         raise
@@ -188,33 +194,32 @@ def _open_plain(file: LogFile) -> Container | DriveLog:
     return opened
 
 
-def _open_compressed(
-    path: Path, place: LogPlace, meter: Meter, release: Callable[[], None] = lambda: None
-) -> Container | DriveLog:
-    """Decompress a file to a temporary one and open that; ``release`` is called when the log is closed."""
+def _open_compressed(file: LogFile) -> Container | DriveLog:
+    """Decompress a file to a temporary one and open that."""
     stack = ExitStack()
-    stack.callback(release)
+    stack.callback(file.release)
     try:
-        copy = Path(stack.enter_context(scratch_folder())) / path.stem
-        with meter.running(path.stat().st_size):
-            cut = decompress_file(path, copy, meter)
-        return _open_plain(LogFile(copy, place, meter, stack.close, cut))
+        copy = Path(stack.enter_context(scratch_folder())) / file.path.stem
+        with file.meter.running(file.path.stat().st_size):
+            cut = decompress_file(file.path, copy, file.meter)
+        return _open_plain(replace(file, path=copy, release=stack.close, cut=cut))
     except BaseException:
         stack.close()
         raise
 
 
-def _open_folder(path: Path, meter: Meter) -> DriveLog:
+def _open_folder(file: LogFile) -> DriveLog:
+    path = file.path
     if is_log_folder(path):
-        return _open_rosbag2_folder(path, meter)
+        return _open_rosbag2_folder(file)
     logs = [p for p in sorted(path.iterdir()) if p.is_file() and looks_like_log(p)]
     logs = [p for p in logs if p.name in without_general({log.name for log in logs})]
+    if (recording := open_recording(file, logs)) is not None:
+        return recording
     if len(logs) != 1:
         got = "a folder without a log" if not logs else f"a folder of {len(logs)} logs without metadata.yaml"
-        raise LogError(
-            expected=what_is_a_log(), got=got, where=str(path), remedy="name one recording" if logs else _REMEDY
-        )
-    opened = _open_file(logs[0], meter)
+        raise LogError(expected=what_is_a_log(), got=got, where=str(path), remedy=_ONE_RECORDING if logs else _REMEDY)
+    opened = _open_file(replace(file, path=logs[0], place=logs[0]))
     if isinstance(opened, DriveLog):
         return opened
     return ColumnarLog(path, _FOLDER_KINDS[opened.form], [opened], distro=opened.distro)
@@ -244,8 +249,9 @@ def _read_metadata(path: Path, limits: ResourceLimits) -> Mapping[str, Any]:
     return information
 
 
-def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
-    information = _read_metadata(path, meter.limits)
+def _open_rosbag2_folder(folder: LogFile) -> ColumnarLog:
+    path = folder.path
+    information = _read_metadata(path, folder.meter.limits)
     per_message = _text(information.get("compression_mode")).lower() == "message"
     encodings = _declared_encodings(information)
     containers: list[Container] = []
@@ -258,7 +264,7 @@ def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
                 lost.append(Loss("missing-file", f"{name} is named in metadata.yaml and absent", str(path)))
                 continue
             try:
-                container = _open_file(file, meter)
+                container = _open_file(replace(folder, path=file, place=file))
                 if not isinstance(container, Container):
                     container.close()
                     raise LogError(

@@ -50,7 +50,8 @@ def open_parquet(file: TableFile) -> Tables:
             columns[name] = _column(pa.chunked_array(chunks), kinds[path], name, file, losses)
         except Exception as error:  # noqa: BLE001  any error of a conversion
             losses.append(Loss("bad-column", f"{path} cannot be read: {describe_damage(error)[1]}", file.name))
-    return Tables("parquet", list(tables_of(Sheet("parquet", columns, units), file.name, losses)), losses)
+    sheet = Sheet("parquet", columns, units)
+    return Tables("parquet", list(tables_of(sheet, file.name, losses, rate_hz=file.settings.rate_hz)), losses)
 
 
 def _leaves(fields: Any, prefix: str) -> Iterator[tuple[str, Any]]:

@@ -17,7 +17,7 @@ import signal
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -32,7 +32,7 @@ from pdhef_logtool.logs.container import SpanDamageError, describe_damage
 from pdhef_logtool.logs.log_file import LogFile
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.resource_limits import RAISE_LIMIT, LimitError, ResourceLimits
-from pdhef_logtool.logs.table_file import TableFile, Tables
+from pdhef_logtool.logs.table_file import TableFile, Tables, TableSettings
 from pdhef_logtool.logs.table_log import Table, TableLog
 from pdhef_logtool.records.errors import LogError, PdhefError, UsageError, WorkerError
 from pdhef_logtool.records.signals import Loss
@@ -65,23 +65,25 @@ def open_tables(file: LogFile, reader: str, libraries: Sequence[str] = ()) -> Ta
     with file.meter.running(size):
         if not can_fork():
             stream = file.path.open("rb")
-            tables = pkgutil.resolve_name(reader)(TableFile(stream, size, str(file.place), file.meter.limits))
-            return TableLog(_closing(file, stream.close), tables.kind, tables.tables, tables.losses)
+            opened = TableFile(stream, size, str(file.place), file.meter.limits, file.settings)
+            return log_of_tables(file, pkgutil.resolve_name(reader)(opened), stream.close)
         session = _Session(file, size, reader, libraries)
         try:
-            tables = session.open()
-            return TableLog(_closing(file, session.close), tables.kind, tables.tables, tables.losses)
+            return log_of_tables(file, session.open(), session.close)
         except BaseException:
             session.close()
             raise
 
 
-def _closing(file: LogFile, close: Callable[[], object]) -> LogFile:
+def log_of_tables(file: LogFile, tables: Tables, close: Callable[[], object]) -> TableLog:
+    """Return the tables of a file, of the group in its settings, as a log; ``close`` is called with the log's."""
+
     def release() -> None:
         close()
         file.release()
 
-    return LogFile(file.path, file.place, file.meter, release, file.cut)
+    tables = tables.of_group(file.settings.group, str(file.place)) if file.settings.group else tables
+    return TableLog(replace(file, release=release), tables.kind, tables.tables, tables.losses)
 
 
 class _Session:
@@ -129,7 +131,8 @@ class _Session:
         limits, timeout_s = self._file.meter.limits, _PATIENCE_S + _PATIENCE * self._seconds
         with self._file.path.open("rb") as stream:
             self._child = _fork(self._reader, self._libraries, stream.fileno(), timeout_s)
-        order = _Order(self._reader, self._where, self._size, limits, folder, self._bytes, self._seconds)
+        settings = self._file.settings
+        order = _Order(self._reader, self._where, self._size, limits, settings, folder, self._bytes, self._seconds)
         with suppress(OSError):  # the next request notices the end of the reader
             self._child.connection.send(order)
 
@@ -161,6 +164,7 @@ class _Order:
     name: str
     size: int
     limits: ResourceLimits
+    settings: TableSettings
     folder: str
     more_bytes: int
     seconds: float
@@ -205,7 +209,7 @@ def serve_tables(connection: Connection, descriptor: int) -> None:
             allow_processor_time(order.seconds)
             try:
                 if name == "open":
-                    file = TableFile(stream, order.size, order.name, order.limits)
+                    file = TableFile(stream, order.size, order.name, order.limits, order.settings)
                     tables = pkgutil.resolve_name(order.reader)(file)
                     head, arrays = _contents(tables), [t.stamps_ns for t in tables.tables]
                 else:

@@ -57,6 +57,7 @@ class Rosbag1Container(FileContainer):
     """One ROS 1 bag of format 2.0, its connections as channels."""
 
     form = "rosbag1"
+    profile = ""  # of ROS 1 messages beside ours of ROS 2
     magic = ROSBAG1_MAGIC
     magic_text = "'#ROSBAG V2.0' at its start"
     remedy = "is it a ROS 1 bag?"

@@ -3,8 +3,7 @@
 Chunks of an MCAP are copied unchanged if all their channels are kept: checked, but not compressed again.
 
 Messages of an MCAP keep schema, topic, encoding, channel metadata, both times, sequence and payload; attachments and
-metadata records are copied too. rosbag2 databases keep their CDR bytes and definitions. ROS 1 messages become ROS 2
-CDR.
+metadata records are copied too. Bags and rosbag2 databases keep their bytes and definitions.
 """
 
 from __future__ import annotations
@@ -15,14 +14,11 @@ from dataclasses import dataclass, fields, replace
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
 from pdhef_logtool.logs.container import Block, ChannelRecord, RawChunk, Span
-from pdhef_logtool.logs.message_schema import SchemaError, parsing, ros_schema
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
-from pdhef_logtool.records.signals import Loss
 
 #: Times of MCAP are unsigned; times in this package are signed.
 _UNSIGNED = (1 << 64) - 1
-_HEADER = "std_msgs/msg/Header"
 
 #: Number of a channel in the log: file of the log, and channel id in that file.
 _Key = tuple[int, int]
@@ -37,22 +33,15 @@ class SourceChannels:
     Attributes
     ----------
     ids : channel of the copy by file and channel of the source.
-    converters : functions from payload to payload of the copy; absent where bytes are kept.
-    numbered : ROS 1 channels with a header at the start of each message. ROS 2 headers have no sequence number; it
-        becomes the sequence number of the message.
-    lost : channels and messages that cannot be copied.
     verbatim : channels of MCAP files that keep their id, their schema's id and their definition.
     """
 
     ids: Mapping[_Key, int]
-    converters: Mapping[_Key, Callable[[bytes], bytes | None]]
-    numbered: frozenset[_Key]
-    lost: tuple[Loss, ...]
     verbatim: frozenset[_Key] = frozenset()
 
 
 def source_profile(log: ColumnarLog) -> str:
-    """Return the MCAP profile that a full copy should carry: the source's own, or ``ros2`` for bags."""
+    """Return the MCAP profile that a full copy should carry: the source's own."""
     return log.containers[0].profile if log.containers else "ros2"
 
 
@@ -72,13 +61,9 @@ def register_channels(
     Without ``whole_metadata`` channels keep only the metadata that state how messages are sent.
 
     Equal channels of split files become one channel. Channels keep their ids; if the ids of split files contradict each
-    other, the ids of the first file are kept. A ROS 1 channel with a definition that does not parse is left out with a
-    loss.
+    other, the ids of the first file are kept.
     """
     ids: dict[_Key, int] = {}
-    converters: dict[_Key, Callable[[bytes], bytes | None]] = {}
-    numbered: set[_Key] = set()
-    lost: list[Loss] = []
     ids_by_content: dict[tuple[object, ...], int] = {}
     verbatim: set[_Key] = set()
     for c, container in enumerate(log.containers):
@@ -89,15 +74,7 @@ def register_channels(
             target = channel
             if not whole_metadata and not _TRANSPORT.issuperset(channel.metadata):
                 target = replace(channel, metadata={k: v for k, v in channel.metadata.items() if k in _TRANSPORT})
-            if channel.encoding == "ros1" and log.kind == "rosbag1":
-                try:
-                    target, converters[(c, channel.id)], has_number = _as_ros2(channel)
-                    if has_number:
-                        numbered.add((c, channel.id))
-                except SchemaError as error:
-                    lost.append(Loss("not-converted", f"cannot become ROS 2: {error}", channel.topic))
-                    continue
-            elif channel.encoding == "cdr" and not channel.schema_data:
+            if channel.encoding == "cdr" and not channel.schema_data:
                 target = _with_definition(target)
             identity = (
                 target.topic,
@@ -115,7 +92,7 @@ def register_channels(
             ids[(c, channel.id)] = id_
             if target is channel and container.whole_chunks and writer.has_ids_of(id_, channel):
                 verbatim.add((c, channel.id))
-    return SourceChannels(ids, converters, frozenset(numbered), tuple(lost), frozenset(verbatim))
+    return SourceChannels(ids, frozenset(verbatim))
 
 
 def iterate_copy(
@@ -170,14 +147,8 @@ def _messages(
         id_ = channels.ids.get((c, channel)) if log_time >= 0 else None
         if id_ is None:
             continue
-        data: bytes | None = bytes(block.buffer[offset : offset + length])
-        convert = channels.converters.get((c, channel))
-        if convert is not None and data is not None:
-            if (c, channel) in channels.numbered:
-                sequence = int.from_bytes(data[:4], "little")
-            data = convert(data)
-        if data is not None:
-            yield log_time, *place, row, RawMessage(id_, log_time, publish_time & _UNSIGNED, sequence, data)
+        data = bytes(block.buffer[offset : offset + length])
+        yield log_time, *place, row, RawMessage(id_, log_time, publish_time & _UNSIGNED, sequence, data)
 
 
 def _spans_to_copy(
@@ -221,47 +192,3 @@ def _with_definition(channel: ChannelRecord) -> ChannelRecord:
     except KeyError:
         return channel
     return replace(channel, schema_encoding="ros2msg", schema_data=text.encode())
-
-
-def _as_ros2(channel: ChannelRecord) -> tuple[ChannelRecord, Callable[[bytes], bytes | None], bool]:
-    """Return the ROS 2 form of a ROS 1 channel, the converter of its payloads, and whether a header begins these.
-
-    Raises
-    ------
-    SchemaError : its definition does not parse.
-    """
-    from rosbags.typesys import Stores, get_typestore
-
-    text = channel.schema_data.decode("utf-8", errors="replace")
-    parsed = ros_schema(channel.type_name, "ros1msg", text, "ros1").store
-    if parsed is None:
-        raise SchemaError("no definition")
-    name = channel.type_name
-    # The conversion drops the sequence number of headers, which the ROS 2 header has not; so must the definition.
-    types = dict(parsed.fielddefs)
-    if _HEADER in types:
-        types[_HEADER] = get_typestore(Stores.LATEST).fielddefs[_HEADER]
-    source = get_typestore(Stores.EMPTY)
-    with parsing(f"the definition of {name}"):
-        source.register(types)
-        definition = source.generate_msgdef(name, ros_version=2)[0]
-
-    def convert(data: bytes) -> bytes | None:
-        try:
-            return bytes(source.ros1_to_cdr(data, name))
-        except Exception:  # noqa: BLE001 (third-party data and converter)
-            return None
-
-    members = parsed.fielddefs[name][1]
-    return (
-        replace(
-            channel,
-            encoding="cdr",
-            schema_name=name,
-            schema_encoding="ros2msg",
-            schema_data=definition.encode(),
-            metadata={},
-        ),
-        convert,
-        bool(members) and members[0][1][1] == _HEADER,
-    )

@@ -92,20 +92,42 @@ class Clock:
 # ---- numbers ----
 
 
-def number_clock(values: NDArray[Any], unit: str = "", name: str = "times", others: Sequence[Clock] = ()) -> Clock:
-    """Return the clock of numbers or NumPy dates [N]; ``others`` are certain clocks of the same recording."""
+def rate_clock(rows: int, rate_hz: float) -> Clock:
+    """Return the clock of a table without times."""
+    note = f"the table has no times: its rows are 1/{rate_hz:g} s apart, as rate_hz states"
+    return Clock(placed(np.round(np.arange(rows) * (_SECONDS / rate_hz)).astype(np.int64)), (note,))
+
+
+def rescaled(clock: Clock, decades: int, note: str) -> Clock:
+    """Return a clock of times since a start that last 10**decades as long."""
+    has_time = clock.stamps_ns != NO_TIME
+    since = _scaled((clock.stamps_ns - RELATIVE_NS) * 10.0**decades, 1, 0, has_time)
+    return replace(clock, stamps_ns=placed(since), notes=(*clock.notes, note))
+
+
+def number_clock(
+    values: NDArray[Any],
+    unit: str = "",
+    name: str = "times",
+    others: Sequence[Clock] = (),
+    rate_hz: float | None = None,
+) -> Clock:
+    """Return the clock of numbers or NumPy dates [N]; ``others`` are certain clocks of the same recording.
+
+    ``rate_hz``, rows per second, decides a unit that is not stated.
+    """
     if values.dtype.kind == "M":
         factor = TIME_UNITS_NS[np.datetime_data(values.dtype)[0].lower()]
         return Clock(placed(_scaled(values.astype(np.int64), factor, 0, ~np.isnat(values))))
     finite = np.isfinite(values)
     stated = TIME_UNITS_NS.get(re.sub(r"[\s\[\](){}.]", "", unit).lower(), 0)
-    factor, epoch, note = _reading(values[finite], stated, others)
+    factor, epoch, note = _reading(values[finite], stated, others, rate_hz)
     stamps = placed(_scaled(values, factor, epoch, finite))
-    clock = Clock(stamps, (f"{name}: {note}",) if note else (), bool(stated or epoch) or _is_dated(stamps))
+    clock = Clock(stamps, (f"{name}: {note}",) if note else (), bool(stated or epoch or rate_hz) or _is_dated(stamps))
     return clock if epoch else _of_gps(clock, name, others)
 
 
-def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock]) -> tuple[int, int, str]:
+def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock], rate_hz: float | None) -> tuple[int, int, str]:
     """Return ns of a unit, the units from an epoch to 1970, and the assumption, from finite values and the unit."""
     middle = float(np.median(values)) if len(values) else 0.0
     step, count = _steps(values)
@@ -120,7 +142,8 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock]) -> tupl
         if length_s <= 0.0:
             return 0.0
         apart = min((abs(math.log10(length_s / length)) for length in lengths), default=0.0)
-        return _outside(step_s, _CLOCKS["usual_step_s"]) + _outside(length_s, _CLOCKS["usual_length_s"]) + apart
+        slow = _CLOCKS["weight_of_steps"] * _outside(step_s, _CLOCKS["usual_step_s"])
+        return float(slow + _outside(length_s, _CLOCKS["usual_length_s"]) + apart)
 
     dates = [(factor, 0) for factor in _SUBUNITS if _is_date(middle * factor / _SECONDS)]
     days = [(_DAY_NS, epoch) for epoch in _DAYS_TO_1970 if _is_date((middle - epoch) * _DAY_S)]
@@ -131,9 +154,24 @@ def _reading(values: NDArray[Any], stated: int, others: Sequence[Clock]) -> tupl
         changed = better[0] != stated
         return *better, f"the unit makes no plausible times, read as {_named(*better)}" if changed else ""
     dates = [reading for reading in dates if fits(reading[0])]
-    factor, epoch = dates[0] if dates else min((*((f, 0) for f in _SUBUNITS), *days), key=decades_off)
-    assumed = "" if dates or factor == _SECONDS else f"no unit, read as {_named(factor, epoch)}"
-    return factor, epoch, assumed
+    if dates:
+        return *dates[0], ""
+    if rate_hz and step:
+        return _as_rate_states(rate_hz, step)
+    factor, epoch = min((*((f, 0) for f in _SUBUNITS), *days), key=decades_off)
+    return factor, epoch, _assumption(values, factor, epoch, others)
+
+
+def _assumption(values: NDArray[Any], factor: int, epoch: int, others: Sequence[Clock]) -> str:
+    """Return the note on a unit that is not stated; empty for seconds with fractions, or beside other clocks."""
+    are_seconds = factor == _SECONDS and (others or (values != np.round(values)).any())
+    return "" if are_seconds else f"no unit, read as {_named(factor, epoch)}; rate_hz states another one"
+
+
+def _as_rate_states(rate_hz: float, step: float) -> tuple[int, int, str]:
+    """Return the power of ten of ns that gives steps their rate, as :func:`_reading`."""
+    factor = int(10 ** max(0, round(math.log10(_SECONDS / (rate_hz * step)))))
+    return factor, 0, f"no unit, read as {factor / _SECONDS:g} s, as rate_hz states"
 
 
 def _of_gps(clock: Clock, name: str, others: Sequence[Clock]) -> Clock:

@@ -12,12 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs.clock_evidence import decades_too_short
 from pdhef_logtool.logs.table_clocks import (
     NO_TIME,
     TIME_UNITS_NS,
     Clock,
     ascending_rows,
     number_clock,
+    rate_clock,
+    rescaled,
     text_clock,
     week_clock,
 )
@@ -117,12 +120,14 @@ class Sheet:
     type_name: str = ""
 
 
-def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = ()) -> Clock:
+def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: float | None = None) -> Clock:
     """Return the clock of a sheet; ``others`` are certain clocks of the same recording.
+
+    ``rate_hz`` applies where no column contains times, or their unit is not stated.
 
     Raises
     ------
-    LogError : no column contains times.
+    LogError : no column contains times, and no rate is given.
     """
     names = {snake(name): name for name in reversed([*sheet.columns])}
     week, seconds = (next((names[n] for n in names if p.fullmatch(n)), None) for p in (_WEEK, _WEEK_TIME))
@@ -130,20 +135,34 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = ()) -> Clock:
         clock = week_clock(_numbers(sheet.columns[week]), _numbers(sheet.columns[seconds]))
         return replace(clock, columns=frozenset({week, seconds}))
     grades = {name: grade for name in sheet.columns if (grade := _grade(sheet, name)) is not None}
-    clocks = {name: _read_clock(sheet, name, others) for name in grades}
+    clocks = {name: _read_clock(sheet, name, others, rate_hz) for name in grades}
     chosen, *rivals = _best_clocks(clocks, grades)
     if not chosen:
+        if rate_hz:
+            return rate_clock(max(map(len, sheet.columns.values()), default=0), rate_hz)
         raise LogError(
             expected="a column of times (time, t, timestamp; s, ms, ISO 8601, or GPS week and seconds)",
             got=", ".join([*sheet.columns][:8]) or "no columns",
             where=f"{where}, {sheet.name}",
-            remedy="name the column of times so",
+            remedy="name the column of times so; without one, state the rows per second: --set rate_hz=100, or "
+            "rate_hz in the mapping file",
         )
     certain = [clock for name, clock in clocks.items() if name != chosen and clock.is_certain]
-    clock = _read_clock(sheet, chosen, (*others, *certain)) if certain else clocks[chosen]
+    clock = _read_clock(sheet, chosen, (*others, *certain), rate_hz) if certain else clocks[chosen]
+    if clock.notes and not (clock.is_certain or certain or others):
+        clock = _as_motion_shows(clock, sheet, chosen)
     apart = [n for n in rivals if abs(clocks[n].length_s - clock.length_s) > _ALIKE * clock.length_s]
     note = f"{chosen} is the clock; the times of {', '.join(apart)} have another length"
     return replace(clock, notes=(*clock.notes, note)) if apart else clock
+
+
+def _as_motion_shows(clock: Clock, sheet: Sheet, name: str) -> Clock:
+    """Return a clock with the power of ten that speed and positions show."""
+    rows = np.flatnonzero(clock.stamps_ns != NO_TIME)
+    columns = {snake(name): column for name, column in sheet.columns.items()}
+    decades = decades_too_short(columns, rows, clock.stamps_ns[rows])
+    note = f"{name}: speed and positions show times that are 10^{decades} as long: corrected"
+    return rescaled(clock, decades, note) if decades else clock
 
 
 def _best_clocks(clocks: Mapping[str, Clock], grades: Mapping[str, int]) -> list[str]:
@@ -175,11 +194,11 @@ def _grade(sheet: Sheet, name: str) -> int | None:
     return 1 if _TIME_LIKE.search(text) else 2 if column.dtype.kind == "M" else 3 if is_unit_of_time else None
 
 
-def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock]) -> Clock:
+def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock], rate_hz: float | None) -> Clock:
     column, columns = sheet.columns[name], {name}
     if isinstance(column, np.ndarray):
         unit = sheet.units.get(name, "") or snake(name).rpartition("_")[2]
-        clock = number_clock(column, unit, name, others)
+        clock = number_clock(column, unit, name, others, rate_hz)
     else:
         date = next((n for n in sheet.columns if n != name and _DATE.fullmatch(snake(n))), name)
         dates = sheet.columns[date]
@@ -194,17 +213,20 @@ def _numbers(column: NDArray[Any] | Series) -> FloatArray:
     return np.full(len(column), np.nan)
 
 
-def tables_of(sheet: Sheet, where: str, losses: list[Loss], stamps: IntArray | None = None) -> Iterator[Table]:
+def tables_of(
+    sheet: Sheet, where: str, losses: list[Loss], stamps: IntArray | None = None, rate_hz: float | None = None
+) -> Iterator[Table]:
     """Yield the tables of a sheet: one for all columns, and one for each slower clock that some of them have.
 
     A row without a time, a row that steps back in time and a column without numbers are losses.
     """
     used: frozenset[str] = frozenset()
     if stamps is None:
-        clock = find_clock(sheet, where)
+        named_values = _named_values(sheet)
+        clock = find_clock(sheet, where, rate_hz=None if named_values else rate_hz)
         stamps, used = clock.stamps_ns, clock.columns
         losses.extend(clock_notes(clock, where))
-        if long := list(_of_long_form(sheet, stamps)):
+        if named_values and (long := list(_of_long_form(sheet, stamps, *named_values))):
             for name, (part, its) in zip(unique(part.name for part, _ in long), long, strict=True):
                 yield from tables_of(Sheet(name, part.columns, part.units), where, losses, its)
             return
@@ -254,16 +276,22 @@ def _own_rows(there: BoolArray, stamps: IntArray) -> BoolArray:
     return there if has_clock else np.ones(len(there), np.bool_)
 
 
-def _of_long_form(sheet: Sheet, stamps: IntArray) -> Iterator[tuple[Sheet, IntArray]]:
-    """Yield the signals of a table with a row for each value; signals with equal times are one sheet."""
+def _named_values(sheet: Sheet) -> tuple[Any, Any, Any] | None:
+    """Return names, values and units of a table in long form, None for another table."""
     named = {snake(name): column for name, column in sheet.columns.items()}
     signal, value = (next((c for n, c in named.items() if p.fullmatch(n)), None) for p in (_SIGNAL, _VALUE))
-    if signal is None or isinstance(signal, np.ndarray) or not isinstance(value, np.ndarray):
-        return
+    is_long = signal is not None and not isinstance(signal, np.ndarray) and isinstance(value, np.ndarray)
+    return (signal, value, named.get("unit", named.get("units"))) if is_long else None
+
+
+def _of_long_form(
+    sheet: Sheet, stamps: IntArray, signal: Series, value: NDArray[Any], units: Any
+) -> Iterator[tuple[Sheet, IntArray]]:
+    """Yield the signals of a table with a row for each value; signals with equal times are one sheet."""
     import polars as pl
 
     rows_of = pl.DataFrame({"signal": signal}).with_row_index().drop_nulls().group_by("signal", maintain_order=True)
-    grouped, units = rows_of.agg("index"), named.get("unit", named.get("units"))
+    grouped = rows_of.agg("index")
     if grouped.height**2 > 100 * len(signal):  # texts of another kind
         return
     clocks: dict[bytes, tuple[Sheet, IntArray]] = {}

@@ -6,15 +6,36 @@ separate process (:mod:`~pdhef_logtool.logs.reader_process`), which has an open 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO, Literal
 
 from pdhef_logtool.logs.resource_limits import ResourceLimits
+from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 
 if TYPE_CHECKING:
     from pdhef_logtool.logs.table_log import Table
+
+
+@dataclass(frozen=True, slots=True)
+class TableSettings:
+    """What users state about a log of tables.
+
+    Attributes
+    ----------
+    rate_hz : rows per second of a table without times, or with times without a unit.
+    group : run whose tables are read: the beginning or the end of their names; empty: all tables.
+    folder : whether a folder of CSV files is one ``recording`` or several ``drives``; ``auto``: by their contents.
+    """
+
+    rate_hz: float | None = None
+    group: str = ""
+    folder: Literal["auto", "recording", "drives"] = "auto"
+
+
+NO_SETTINGS = TableSettings()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,13 +46,14 @@ class TableFile:
     ----------
     stream : read-only, seekable, at its start. size : bytes of the file.
     name : as the user named the file, for messages.
-    limits : resource limits of reading.
+    limits : resource limits of reading. settings : of the user.
     """
 
     stream: BinaryIO
     size: int
     name: str
     limits: ResourceLimits
+    settings: TableSettings = NO_SETTINGS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,3 +63,17 @@ class Tables:
     kind: str
     tables: Sequence[Table]
     losses: Sequence[Loss] = field(default=())
+
+    def of_group(self, group: str, where: str) -> Tables:
+        """Return the tables of a group; raises LogError if there are none."""
+        names = [table.name for table in self.tables]
+        its = [
+            t for t in self.tables if t.name == group or t.name.startswith(f"{group}_") or t.name.endswith(f"_{group}")
+        ]
+        if group == "1":  # of repeated names, the first has no number
+            its = its or [t for t in self.tables if not re.search(r"_\d+$", t.name)]
+        if not its:
+            raise LogError(
+                expected=f"tables of the group {group}", got=", ".join(names), where=where, remedy="correct group"
+            )
+        return Tables(self.kind, its, self.losses)

@@ -93,7 +93,8 @@ class TableLog(DriveLog):
         self._lost = [*lost, *cut, *unlike_lengths(inside, str(self.path)), *self.recording_span.losses]
         self._unreadable: set[tuple[str, str]] = set()
         self._column_losses: dict[tuple[str, str], list[Loss]] = {}
-        self.size = file.path.stat().st_size
+        files = file.path.rglob("*") if file.path.is_dir() else (file.path,)
+        self.size = sum(path.stat().st_size for path in files)
 
     def decode_frames(self, databases: Sequence[tuple[str, Database]]) -> None:
         """Add a table for each message of DBC files, given with their names, that raw CAN frames of the log contain."""
@@ -103,6 +104,11 @@ class TableLog(DriveLog):
             decoder = Decoder(frames, databases, self._tables, self._lost, self._column_losses)
             for table in decoder.tables():
                 self._tables[table.name] = table
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """The tables by name."""
+        return tuple(self._tables.values())
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:

@@ -22,6 +22,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.table_cells import EMPTY, Cells, read_cells
 from pdhef_logtool.logs.table_clocks import NO_TIME, placed, unwrapped, whole_days
 from pdhef_logtool.logs.table_columns import Sheet, is_unit, read_head, tables_of
@@ -74,7 +75,8 @@ def open_csv(file: TableFile) -> Tables:
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
         columns = _columns(chain(head[first:], rows), fields, file, losses, decimal)
-    return Tables("csv", list(tables_of(Sheet("csv", columns, given), file.name, losses)), losses)
+    sheet = Sheet("csv", columns, given)
+    return Tables("csv", list(tables_of(sheet, file.name, losses, rate_hz=file.settings.rate_hz)), losses)
 
 
 def open_vbo(file: TableFile) -> Tables:
@@ -94,7 +96,9 @@ def open_vbo(file: TableFile) -> Tables:
         what = "longitude is positive to the east, against the format, as the heading shows: its sign is changed"
         losses.append(Loss("mirrored", what, file.name, severity="note"))
         columns["longitude"] = -columns["longitude"]
-    units = _vbo_units(titles, fields, sections.get("channel units", [])) | given
+    modules = [f for f, title in zip(fields, titles, strict=True) if not _RECEIVER.fullmatch(title)]
+    units = {f: "min" for f in fields if f.startswith(("latitude", "longitude"))}
+    units |= _channel_units(sections.get("channel units", []), modules, fields, file.name, losses) | given
     sheet = Sheet("vbox", {n: c for n, c in columns.items() if n != "time"}, units, VBO_TYPE)
     if not isinstance(columns.get("time"), np.ndarray):
         raise LogError(expected="a channel time in hhmmss.sss", got=", ".join(fields[:8]), where=file.name)
@@ -236,13 +240,29 @@ def _is_mirrored(columns: Mapping[str, Any]) -> bool:
     return bool(east > max(_ALONG_HEADING * length, west + (1.0 - _ALONG_HEADING) * length))
 
 
-def _vbo_units(titles: Sequence[str], fields: Sequence[str], units: Sequence[str]) -> dict[str, str]:
-    """Return the units of the channels of input modules; latitude and longitude are in minutes by definition."""
-    modules = [f for f, title in zip(fields, titles, strict=True) if not _RECEIVER.fullmatch(title)]
-    named = {f: "min" for f in fields if f.startswith(("latitude", "longitude"))}
+def _channel_units(
+    units: Sequence[str], modules: Sequence[str], fields: Sequence[str], where: str, losses: list[Loss]
+) -> dict[str, str]:
+    """Return the units of the channels of input modules, or of all channels, by the lines of ``[channel units]``.
+
+    Of lines that are more or fewer than the channels, a quantity has its unit if each of its channels has the same one.
+    """
+    units = [unit.strip() for unit in units]
     for owners in (modules, fields):
         if len(units) == len(owners):
-            return named | {f: unit.strip() for f, unit in zip(owners, units, strict=True) if unit.strip()}
+            return {f: unit for f, unit in zip(owners, units, strict=True) if unit}
+    named: dict[str, str] = {}
+    for quantity in CONSTANTS["vbo"]["quantities"].values():
+        its = [unit for unit in units if unit.lower() in quantity["units"]]
+        owners = [f for f in modules if re.search(quantity["names"], f.lower())]
+        named |= dict.fromkeys(owners, its[0]) if len(its) == len(owners) and len(set(its)) == 1 else {}
+    if any(units):
+        rest = [f for f in modules if f not in named]
+        what = (
+            f"[channel units] has {len(units)} lines for {len(modules)} channels: used for {', '.join(named) or 'none'}"
+        )
+        what += f", no unit is known of {', '.join(rest)}"
+        losses.append(Loss("units", what, where, count=len(rest), severity="note"))
     return named
 
 

@@ -11,6 +11,7 @@ from pdhef_logtool.mapping.checking import check_mapping as check_mapping
 from pdhef_logtool.mapping.checking import resolve_mapping as resolve_mapping
 from pdhef_logtool.mapping.choosing import ChosenMapping as ChosenMapping
 from pdhef_logtool.mapping.choosing import choose_mapping as choose_mapping
+from pdhef_logtool.mapping.choosing import tables_for as tables_for
 from pdhef_logtool.mapping.clocks import ClockModel as ClockModel
 from pdhef_logtool.mapping.clocks import apply_clock as apply_clock
 from pdhef_logtool.mapping.clocks import clock_key as clock_key

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.table_file import TableSettings
 from pdhef_logtool.mapping.checking import check_mapping
 from pdhef_logtool.mapping.recognition import RUN, Ambiguity, auto_map
 from pdhef_logtool.mapping.records import Mapping
@@ -50,7 +51,7 @@ def choose_mapping(
             expected="signals and ground truth of one run",
             got=f"{len(runs)} runs: {', '.join(runs)}",
             where=str(log.path),
-            remedy="name the topics of one of them in a mapping file; pdhef map LOG helps to write it",
+            remedy=f'choose one: --set group={runs[0]}, or group = "{runs[0]}" in the mapping file',
         )
     if require_signals and not auto.mapping.signals:
         raise MappingError(
@@ -61,6 +62,13 @@ def choose_mapping(
         )
     remarks = (*auto.mapping.notes, *_borrowed(log, auto.mapping))
     return ChosenMapping(auto.mapping, auto.missing, auto.ambiguities, remarks)
+
+
+def tables_for(mapping: Mapping | None, settings: TableSettings) -> TableSettings:
+    """Return settings for logs of tables, completed by a mapping file."""
+    if mapping is None:
+        return settings
+    return replace(settings, rate_hz=settings.rate_hz or mapping.rate_hz, group=settings.group or mapping.group)
 
 
 def mapping_for_recorder(log: DriveLog, mapping: Mapping) -> Mapping:

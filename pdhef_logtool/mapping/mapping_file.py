@@ -141,7 +141,17 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
     ------
     MappingFileError : Entries are wrong, unknown, missing or contradict one another.
     """
-    sections = ("signals", "truth", "truth_quality", "estimates", "can", "fill_recognised", "recorder")
+    sections = (
+        "signals",
+        "truth",
+        "truth_quality",
+        "estimates",
+        "can",
+        "fill_recognised",
+        "recorder",
+        "rate_hz",
+        "group",
+    )
     problems = [unknown(key, sections) for key in raw if key not in sections]
     signals = _read_section(raw.get("signals", {}), "signals", tuple(SIGNAL_UNITS), tuple(TRUTH_UNITS), problems)
     truth = _read_section(raw.get("truth", {}), "truth", tuple(TRUTH_UNITS), tuple(SIGNAL_UNITS), problems)
@@ -153,7 +163,13 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
         problems.append("fill_recognised: should be true or false")
         fill = False
     recorder = _read_recorder(raw.get("recorder", {}), problems)
-    mapping = Mapping(signals, truth, quality, can=can, estimates=estimates, fill_recognised=fill, recorder=recorder)
+    rate_hz, group = raw.get("rate_hz"), raw.get("group", "")
+    if not isinstance(group, str) or not (rate_hz is None or (isinstance(rate_hz, int | float) and rate_hz > 0)):
+        problems.append("rate_hz: should be rows per second, group: a name")
+    mapping = Mapping(
+        signals, truth, quality, can=can, estimates=estimates, fill_recognised=fill, recorder=recorder,
+        rate_hz=rate_hz, group=group,
+    )  # fmt: skip
     if "can" not in raw:
         # Other programs read the estimates: their sources are checked as well.
         every = (*mapping.sources(), *(s for e in estimates.values() for s in e.values()))
@@ -324,6 +340,8 @@ def mapping_to_toml(
         "# ISO 8855: x forward, y left, z up; angles and rates are positive to the left. See docs/formats.md.",
     ]
     lines += _comment("\n".join([notes.get("", ""), *mapping.notes]))
+    if mapping.rate_hz or mapping.group:
+        lines += ["", *(f"{n} = {_toml(v)}" for n in ("rate_hz", "group") if (v := getattr(mapping, n)))]
     if mapping.recorder:
         lines += ["", "[recorder]", *(f"{_toml(topic)} = {_toml(kind)}" for topic, kind in mapping.recorder)]
     if mapping.can is not None:

@@ -215,6 +215,10 @@ def _of_one_run(draft: _Draft, topics: list[TopicInfo]) -> list[TopicInfo]:
 
     Runs are the beginnings of names before the same devices with the same fields.
     """
+    if repeated := _repeated_groups(draft.log, topics):
+        runs = ["1", *sorted({t.name.rpartition("_")[2] for t in repeated}, key=int)]
+        draft.doubt(RUN, tuple(runs), runs[0], "signals and ground truth are of one run, here the first")
+        return [t for t in topics if t not in repeated]
     devices: dict[str, set[tuple[str, frozenset[str]]]] = {}
     for topic in topics if draft.log.kind in RUN_KINDS else ():
         fields = frozenset(f.path for f in draft.log.fields(topic.name, quiet=True))
@@ -226,6 +230,15 @@ def _of_one_run(draft: _Draft, topics: list[TopicInfo]) -> list[TopicInfo]:
         return topics
     draft.doubt(RUN, tuple(runs), runs[0], "signals and ground truth are of one run, here the first")
     return [t for t in topics if t.name.startswith(f"{runs[0]}_")]
+
+
+def _repeated_groups(log: DriveLog, topics: list[TopicInfo]) -> list[TopicInfo]:
+    """Return the channel groups of an MDF that repeat another one, with its name and a number, at later times."""
+    fields = {t.name: [f.path for f in log.fields(t.name, quiet=True)] for t in topics} if "mdf" in log.kind else {}
+    pairs = [(t, base) for t in topics for base, _, n in [t.name.rpartition("_")] if n.isdigit() and base in fields]
+    pairs = [(t, base) for t, base in pairs if fields[t.name] == fields[base]]
+    times = log.read({}, stamps={name for t, base in pairs for name in (t.name, base)}) if pairs else {}
+    return [t for t, base in pairs if times[t.name].log_time_ns[:1] > times[base].log_time_ns[-1:]]
 
 
 def _decode(draft: _Draft, topics: list[TopicInfo]) -> tuple[list[TopicInfo], CanSignalLog | None]:

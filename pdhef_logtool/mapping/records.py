@@ -170,6 +170,7 @@ class Mapping:
     open_signs : groups of signals (ground truth: ``truth.NAME``) with an undocumented common sign.
     file : name of the file. recorder : type by topic of the logs that it is for.
     recorders : the mappings of a folder; each log uses the one that fits its recorder.
+    rate_hz, group : of logs of tables (:class:`~pdhef_logtool.logs.table_file.TableSettings`).
     """
 
     signals: dict[str, SignalSource] = field(default_factory=dict)
@@ -185,6 +186,8 @@ class Mapping:
     file: str = field(default="", compare=False, repr=False)
     recorder: tuple[tuple[str, str], ...] = ()
     recorders: tuple[Mapping, ...] = ()
+    rate_hz: float | None = None
+    group: str = ""
 
     @property
     def dbc(self) -> tuple[Path, ...]:
@@ -195,7 +198,8 @@ class Mapping:
     @property
     def sha256(self) -> str:
         """Hash of all sources with their scales, stamps, latencies and limits, and of the ground-truth gate."""
-        return digest(jsonable({"signals": self.signals, "truth": self.truth, "quality": self.quality}))
+        tables = {name: value for name in ("rate_hz", "group") if (value := getattr(self, name))}
+        return digest(jsonable({"signals": self.signals, "truth": self.truth, "quality": self.quality, **tables}))
 
     def sources(self) -> Iterator[SignalSource]:
         """Yield every source: signals, ground truth, the gate."""

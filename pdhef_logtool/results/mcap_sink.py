@@ -21,7 +21,7 @@ from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, sour
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import quat_from_yaw
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.log_lines import LogLine, log_lines, log_message
 from pdhef_logtool.results.plotted import plotted_fields
@@ -147,13 +147,12 @@ class AnnotatedMcap:
         """Remove an unfinished file."""
         self._writer.abort()
 
-    def write(self, tracks: Sequence[StateTrack]) -> tuple[Loss, ...]:
-        """Write the tracks, merged with the messages of the source; return the losses of the copy.
+    def write(self, tracks: Sequence[StateTrack]) -> None:
+        """Write the tracks, merged with the messages of the source.
 
         Sound chunks that contain only kept messages are copied whole, others message by
         message. The losses of the source itself are complete afterwards.
         """
-        lost: tuple[Loss, ...] = ()
         raws: Iterator[_Raw] = iter(())
         waiting: list[_Raw] = []
         if self._source is not None:
@@ -164,7 +163,7 @@ class AnnotatedMcap:
                 leave_out=lambda topic: topic.startswith(NAMESPACE) or topic in left_out,
                 whole_metadata=self._left_out is None,
             )
-            lost, raws = channels.lost, iterate_copy(self._source, channels, *(self._span_ns or (None, None)))
+            raws = iterate_copy(self._source, channels, *(self._span_ns or (None, None)))
         for track in tracks:
             self._add_topics(track.name)
         rows = [self._rows(track) for track in tracks]
@@ -174,7 +173,6 @@ class AnnotatedMcap:
             if ends := [int(b.log_time_ns[-1]) + 1 for b in batches if len(b.log_time_ns)]:
                 self._writer.write(batches, raws=_until(raws, waiting, max(ends)))
         self._writer.write([], raws=_until(raws, waiting, math.inf))
-        return lost
 
     def _rows(self, track: StateTrack) -> tuple[IntArray, IntArray, IntArray]:
         """Return the rows with a state, an odometry message and plotted values."""

@@ -79,7 +79,11 @@ class RunConfig:
     prefer_truth : ground truth of a simulated log that has both: ``perfect`` or ``rtk``.
     budget : factor on the limits of memory and time for reading a log.
     msgs : folder, zip file or wheel with .msg files of types that a log does not define; or a DBC file, or a folder of
-        them, for raw CAN frames in BLF, ASC and MDF files.
+        them, for raw CAN frames in BLF, ASC, candump and MDF files.
+    rate_hz : rows per second of a table without times, or with times without a unit; None = that of the mapping file.
+    group : of a file with several runs, the one to read: the beginning or end of its names of topics.
+    folder : whether a folder of tables is one ``recording`` or several ``drives``; ``auto``: CSV files with overlapping
+        times and different columns are one recording.
     plan : validation plan (plan.toml); None = the default plan, which decides no exit code.
     network : network folder, ``default``, ``none`` or the name of an installed residual model; None = the car's.
     intervals : intervals file, ``none``, or ``unsure`` (wide intervals, for a car that may have changed); None = the
@@ -114,6 +118,9 @@ class RunConfig:
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
     budget: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     msgs: File | None = None
+    rate_hz: Annotated[float, Field(gt=0, le=1e6)] | None = None
+    group: str = ""
+    folder: Literal["auto", "recording", "drives"] = "auto"
     plan: File | None = None
     network: File | None = None
     intervals: File | None = None

@@ -16,8 +16,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pdhef_logtool.drive.reading import logs_of
 from pdhef_logtool.estimators.table import FILTERS
-from pdhef_logtool.logs.discovery import RUN_FILE, LogInput, Logs, find_logs
+from pdhef_logtool.logs.discovery import RUN_FILE, LogInput, Logs
 from pdhef_logtool.mapping import Mapping, mapping_of
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, WorkerError
 from pdhef_logtool.records.processes import process_name
@@ -130,7 +131,7 @@ def run_logs(
     OutputError
         The output cannot be written, or another command is writing to it.
     """
-    inputs = find_logs(arguments, private_redirects=config.allow_private_redirects)
+    inputs = logs_of(arguments, config.read_options)
     junit = None if junit is None else Path(junit)
     validation = read_validation_plan(config.plan, junit)
     job = _Job(config, RunCars.of(config, reporter.warn), mapping_of(config.mapping), validation, junit, report, strict)

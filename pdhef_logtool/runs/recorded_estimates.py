@@ -114,7 +114,9 @@ def score_log(
     mapping = mapping_of(config.mapping)
     if mapping is not None and mapping.recorders:
         reading = config.read_options
-        with closing(open_log(log_input.path, reading.limits, reading.msgs, Wanted(frozenset()))) as log:
+        with closing(
+            open_log(log_input.path, reading.limits, reading.msgs, Wanted(frozenset()), reading.tables)
+        ) as log:
             mapping = mapping_for_recorder(log, mapping)
     plan = read_validation_plan(config.plan, junit)
     check_places([log_input], output, config, mapping, junit)

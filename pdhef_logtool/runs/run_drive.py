@@ -76,8 +76,9 @@ def run_log(
             judged = _judge(run, estimated, scored, main, validation)
             files = DriveOutputs((change, outputs.path), run, estimated, main)
             with files.annotated() as annotated:
-                lost = () if annotated is None else annotated.write(files.tracks)
-                losses = merge_losses([drive.losses, lost, *_losses(run, scored)])
+                if annotated is not None:
+                    annotated.write(files.tracks)
+                losses = merge_losses([drive.losses, *_losses(run, scored)])
                 report = report_drive(run, estimated, scored, main, judged, losses)
                 if annotated is not None:
                     annotated.finish(report, files.tracks, scored.events)

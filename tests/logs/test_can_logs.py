@@ -17,8 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool import inspect_log
+from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.logs.can_decoding import Decoder, Frames
-from pdhef_logtool.logs.can_logs import open_asc, open_blf
+from pdhef_logtool.logs.can_logs import open_asc, open_blf, open_candump
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
 from pdhef_logtool.logs.table_clocks import RELATIVE_NS
@@ -43,7 +44,7 @@ PARTS = ("id", "is_extended", "bus", "is_error", "is_remote", "length")
 def read(path: Path) -> Tables:
     """Read a file in this process."""
     with path.open("rb") as stream:
-        reader = open_blf if path.suffix == ".blf" else open_asc
+        reader = {".blf": open_blf, ".asc": open_asc, ".log": open_candump}[path.suffix]
         return reader(TableFile(stream, path.stat().st_size, path.name, DEFAULT_LIMITS))
 
 
@@ -129,6 +130,68 @@ def test_asc_is_read_as_python_can_reads_it(written: list[Any], tmp_path_factory
     assert [r for r in rows_of(tables) if not r[3]] == [r for r in expected if not r[3]]
     assert [r[bus] for r in rows_of(tables)] == [m.channel for m in written]
     np.testing.assert_allclose(frames_of(tables).stamps_ns - START_NS, np.arange(len(written)) * 10**6, atol=1000)
+
+
+@settings(max_examples=25, deadline=None)
+@given(written=messages())
+def test_candump_is_read_as_python_can_wrote_it(written: list[Any], tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = tmp_path_factory.mktemp("log") / "a.log"
+    write(path, written)
+    tables = read(path)
+    assert tables.losses == []
+    assert [r[:2] + r[4:] for r in rows_of(tables) if not r[3]] == [
+        r[:2] + r[4:] for r in map(row_of, written) if not r[3]
+    ]
+    assert [(r[2], r[3]) for r in rows_of(tables)] == [(m.channel, m.is_error_frame) for m in written]
+    np.testing.assert_allclose(frames_of(tables).stamps_ns - START_NS, np.arange(len(written)) * 10**6, atol=1000)
+
+
+def candump(path: Path, *lines: str) -> Tables:
+    """Write lines and read them."""
+    path.write_text("\n".join([*lines, ""]))
+    return read(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "row"),
+    [
+        (" (1714564800.5)  can1  123   [2]  DE AD   '..'", (0x123, 0, 1, 0, 0, 2, b"\xde\xad")),
+        (" (2024-05-01 12:00:00.500000)  can0  RX - -  00000123   [0]  remote request", (0x123, 1, 0, 0, 1, 0, b"")),
+        (" (1714564800.5)  vcan0  20000004   [1]  08   ERRORFRAME", (4, 1, 0, 1, 0, 1, b"\x08")),
+        ("(1714564800.500000) can3 7FF##3" + "AB" * 12, (0x7FF, 0, 3, 0, 0, 12, b"\xab" * 12)),
+    ],
+)
+def test_forms_of_candump(line: str, row: tuple[Any, ...], tmp_path: Path) -> None:
+    tables = candump(tmp_path / "a.log", line)
+    assert rows_of(tables) == [row]
+    assert frames_of(tables).stamps_ns.tolist() == [START_NS + 500 * 10**6]
+    assert tables.losses == []
+
+
+def test_lines_of_candump_that_are_no_frames_are_counted(tmp_path: Path) -> None:
+    bad = [
+        "(5.0) can0 12#11",
+        "(5.0) can0 123#1",
+        " (5.0)  can0  123   [2]  11",
+        f"(5.0) can0 123##0{'00' * 65}",
+        "end",
+    ]
+    tables = candump(tmp_path / "a.log", "(5.0) can0 123#11", "", *bad)
+    assert [(loss.kind, loss.count) for loss in tables.losses] == [("bad-row", len(bad))]
+    assert "line 3" in tables.losses[0].what
+    with pytest.raises(LogError, match="candump -l and candump -t a record times"):
+        candump(tmp_path / "b.log", " can0  123   [1]  11")
+
+
+def test_times_of_candump_may_be_differences_and_frames_recorded_again_are_left_out(tmp_path: Path) -> None:
+    lines = [f" (000.0{1 + i % 2}0000)  can0  123   [1]  {i:02X}" for i in range(20)]
+    tables = candump(tmp_path / "a.log", *lines)
+    assert np.ptp(frames_of(tables).stamps_ns) == 29 * 10**7
+    assert [loss.severity for loss in tables.losses] == ["note"]
+    times = [1.0, 2.0, 3.0, 6.5, 6.4, 9.0, 5.5, 6.0, 9.5]
+    tables = candump(tmp_path / "b.log", *(f"({t}) can0 123#{i:02X}" for i, t in enumerate(times)))
+    assert [row[-1][0] for row in rows_of(tables)] == [0, 1, 2, 4, 3, 5, 8]
+    assert [loss.count for loss in tables.losses] == [2]
 
 
 def blf_object(kind: int, payload: bytes, time: int, *, unit: int = 2, version: int = 1) -> bytes:
@@ -303,7 +366,7 @@ def test_a_blf_without_frames_is_one_line(data: bytes, tmp_path: Path) -> None:
         read(tmp_path / "a.blf")
 
 
-@pytest.mark.parametrize("suffix", [".blf", ".asc"])
+@pytest.mark.parametrize("suffix", [".blf", ".asc", ".log"])
 def test_mutants_are_read_or_refused_in_one_line(suffix: str, tmp_path: Path) -> None:
     messages = [sent(i / 100, 0x100 + i % 3, bytes(range(i % 9))) for i in range(60)]
     more = {"max_container_size": 700} if suffix == ".blf" else {}
@@ -625,7 +688,7 @@ def test_multiplexed_signals_have_a_table_for_each_selector() -> None:
     assert [loss.where for loss in lost] == ["Mux"]
 
 
-@pytest.fixture(params=[".blf", ".asc"])
+@pytest.fixture(params=[".blf", ".asc", ".log"])
 def drive(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Path]:
     """A log of Motion frames on bus 1, with others between them."""
     messages = []
@@ -676,7 +739,7 @@ def test_a_mapping_of_frames_names_the_bus_where_several_send_a_message(tmp_path
 def test_a_dbc_that_matches_nothing_is_named(tmp_path: Path) -> None:
     path = write(tmp_path / "a.blf", [sent(i / 100, 300, bytes(8)) for i in range(100)])
     (tmp_path / "car.dbc").write_text(HEAD + MOTION)
-    notes = " ".join(map(str, inspect_log(path, msgs=tmp_path / "car.dbc").to_dict()["notes"]))
+    notes = " ".join(map(str, inspect_log(path, options=ReadOptions(msgs=tmp_path / "car.dbc")).to_dict()["notes"]))
     assert "car.dbc contains none of their identifiers" in notes
     assert "--set msgs" not in notes
 

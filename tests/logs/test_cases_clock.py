@@ -12,7 +12,7 @@ from pdhef_logtool.logs.open_log import open_log
 
 # Topic, rows, duration in s, start in s since 1970, and kinds of the losses with their severity.
 CASES = {
-    "hostile/t_1hz.csv": ("csv", 1500, 1499.0, 86_400, {}),
+    "hostile/t_1hz.csv": ("csv", 1500, 1499.0, 86_400, {"clock": "note"}),
     "hostile/t_min.csv": ("csv", 1500, 29.98, 86_400, {}),
     "hostile/excel.csv": ("csv", 1500, 29.98, 1_765_238_400, {"clock": "note"}),
     "hostile/dropout5s.csv": ("csv", 2000, 39.98, 86_400, {}),

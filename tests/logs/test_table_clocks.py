@@ -103,8 +103,8 @@ def test_dates_of_tables_and_texts_come_back(rate_hz: float, start: dt.datetime,
 @pytest.mark.parametrize(
     ("values", "length_s", "note"),
     [
-        (np.arange(1500.0), 1499.0, ""),
-        (np.arange(900) * 2.0, 1798.0, ""),
+        (np.arange(1500.0), 1499.0, "seconds; rate_hz"),
+        (np.arange(900) * 2.0, 1798.0, "seconds; rate_hz"),
         (np.arange(2000) * 10.0, 19.99, "milliseconds"),
         (np.arange(60_000.0), 59.999, "milliseconds"),
         (np.arange(5000) * 0.004, 19.996, ""),

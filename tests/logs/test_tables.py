@@ -229,7 +229,7 @@ def test_other_columns_decide_what_a_mark_between_digits_is(
     separator: str, other: str, cell: str, value: float, note: bool, tmp_path: Path
 ) -> None:
     rows = [separator.join([str(i), other, cell, str(i)]) for i in range(30)]
-    columns, lost = _read(tmp_path / "a.csv", "\n".join([separator.join(["time", "a", "b", "c"]), *rows, ""]))
+    columns, lost = _read(tmp_path / "a.csv", "\n".join([separator.join(["time [s]", "a", "b", "c"]), *rows, ""]))
     assert set(columns["b"]) == {value}
     assert lost == ([("ambiguous-number", None)] if note else [])
 
@@ -315,9 +315,20 @@ def test_a_vbo_file_keeps_minutes_units_and_the_clock_over_midnight(tmp_path: Pa
     assert read.fields["velocity_kmh"][1] == 72.01
 
 
-def test_units_that_fit_no_columns_are_left_out(tmp_path: Path) -> None:
-    with closing(_log(tmp_path / "a.vbo", vbo(["100000.00", "100000.01"], units="g\n°/s\n"))) as log:
-        assert {f.unit for f in log.fields("vbox") if f.path in ("Y_Accel", "YawRate")} == {""}
+@pytest.mark.parametrize(
+    ("lines", "units"),
+    [
+        ("g\n°/s\n", {"Y_Accel": "g", "YawRate": "°/s", "Temp": ""}),
+        ("g\nm/s2\n°/s\n°C\n", {"Y_Accel": "", "YawRate": "°/s", "Temp": ""}),  # whose is g?
+    ],
+)
+def test_of_too_many_or_too_few_units_those_that_belong_to_one_quantity_are_used(
+    lines: str, units: dict[str, str], tmp_path: Path
+) -> None:
+    with closing(_log(tmp_path / "a.vbo", vbo(["100000.00", "100000.01"], units=lines))) as log:
+        assert {f.path: f.unit for f in log.fields("vbox") if f.path in units} == units
+        (loss,) = log.lost
+        assert (loss.kind, loss.severity, loss.count) == ("units", "note", list(units.values()).count(""))
 
 
 def test_titles_of_a_vbo_file_may_contain_units(tmp_path: Path) -> None:

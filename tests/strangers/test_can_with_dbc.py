@@ -12,6 +12,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from pdhef_logtool import inspect_log
+from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import fit_clocks, read_signals
 from pdhef_logtool.mapping.can_frames import decoded_frames
@@ -55,7 +56,7 @@ def test_signals_of_a_dbc_are_mapped_on_first_contact(tmp_path: Path) -> None:
         for t, number, data in sorted(messages):
             ours = {"arbitration_id": number, "is_extended_id": False, "data": data}
             writer.on_message_received(can.Message(timestamp=t, channel=0, **ours))
-    found = inspect_log(tmp_path / "car.blf", msgs=tmp_path / "car.dbc")
+    found = inspect_log(tmp_path / "car.blf", options=ReadOptions(msgs=tmp_path / "car.dbc"))
     fields = {name: (source.field, source.scale) for name, source in found.mapping.signals.items()}
     degree = pytest.approx(np.radians(1.0))
     assert fields == {
@@ -113,7 +114,7 @@ def test_frames_in_mcap_are_decoded_by_the_files_in_it_or_given_with_it(tmp_path
         mine = tmp_path / "bare.mcap"
         _without_attachments(path, mine, texts if place == "metadata" else {})
         path, msgs = mine, tmp_path if place == "given" else None
-    found = inspect_log(path, msgs=msgs)
+    found = inspect_log(path, options=ReadOptions(msgs=msgs))
     sources = {name: (s.topic, s.field, s.scale) for name, s in found.mapping.signals.items()}
     degree = pytest.approx(np.radians(1.0))
     assert sources == {

@@ -21,7 +21,7 @@ from pdhef_logtool.car.taught import ESTIMATED
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.plan import DrivePlan
-from pdhef_logtool.drive.reading import Drive, Tell, friction_of, no_samples, read_drive
+from pdhef_logtool.drive.reading import Drive, Tell, friction_of, logs_of, no_samples, read_drive
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.parallel_physics import filter_of
@@ -59,7 +59,7 @@ from pdhef_logtool.learning.network.residuals import (
     residual_rows,
 )
 from pdhef_logtool.learning.truth import TruthAt, teaching_reference
-from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, identity_of
+from pdhef_logtool.logs.discovery import LogInput, Logs, hash_log, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
@@ -247,7 +247,7 @@ def extract(
     output = local_path(output)
     settings.smoothing_half_s()
     _check_counts(jobs, settings)
-    inputs = find_logs(arguments, private_redirects=settings.config.allow_private_redirects)
+    inputs = logs_of(arguments, settings.config.read_options)
     mapping = mapping_of(settings.config.mapping)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, reporter.warn))
     before = _earlier(output, settings)

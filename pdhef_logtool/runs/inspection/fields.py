@@ -6,17 +6,16 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.text import Text
 
+from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces, Seen
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import FloatArray
@@ -73,9 +72,7 @@ class FieldsOfLog:
 def fields_of_log(
     path: LogPlace | str,
     topic: str | None = None,
-    *,
-    budget: ResourceLimits = DEFAULT_LIMITS,
-    msgs: Path | str | None = None,
+    options: ReadOptions = AS_IT_IS,
 ) -> FieldsOfLog:
     """Return the numeric fields of a topic, or of all, over a few pieces of the log.
 
@@ -84,7 +81,7 @@ def fields_of_log(
     LogError : The file is no log.
     UsageError : The log has no such topic.
     """
-    with closing(open_log(path, budget, msgs, Wanted(frozenset()))) as log:
+    with closing(open_log(path, options.limits, options.msgs, Wanted(frozenset()), options.tables)) as log:
         topics = [t for t in log.topics if topic in (None, t.name)]
         if topic is not None and not topics:
             names = ", ".join(t.name for t in log.topics) or "none"

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pdhef_logtool.drive.mounting import survey_log
+from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import Wanted
@@ -21,7 +22,6 @@ from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
-from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, ResourceLimits
 from pdhef_logtool.mapping import (
     Ambiguity,
     ClockModel,
@@ -37,6 +37,7 @@ from pdhef_logtool.mapping import (
     merge_losses,
     read_signals,
     resolve_mapping,
+    tables_for,
 )
 from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.mapping.choosing import choose_mapping
@@ -224,10 +225,8 @@ class Inspection:
 def inspect_log(
     path: LogPlace | str,
     mapping: Mapping | Path | str | None = None,
+    options: ReadOptions = AS_IT_IS,
     *,
-    prefer_truth: Literal["perfect", "rtk"] = "perfect",
-    budget: ResourceLimits = DEFAULT_LIMITS,
-    msgs: Path | str | None = None,
     whole: bool = False,
     then: Callable[[Inspection, DriveLog], None] = lambda *_: None,
 ) -> Inspection:
@@ -238,8 +237,7 @@ def inspect_log(
 
     Parameters
     ----------
-    prefer_truth : as for :func:`pdhef_logtool.mapping.auto_map`. budget : resource limits of reading.
-    msgs : folder with definitions of types that the log does not define.
+    options : as for :func:`~pdhef_logtool.drive.reading.read_drive`; the whole log is read.
     then : called with the inspection before the log is closed.
 
     Raises
@@ -248,21 +246,23 @@ def inspect_log(
     MappingError : The mapping names a topic or field that the log does not contain.
     """
     mapping = mapping_of(mapping)
+    tables, prefer = tables_for(mapping, options.tables), options.prefer_truth
+    limits, msgs = options.limits, options.msgs
     if not whole:
-        with closing(open_log(path, budget, msgs, Wanted(frozenset(), above_bytes=WHOLE_BYTES))) as log:
+        with closing(open_log(path, limits, msgs, Wanted(frozenset(), above_bytes=WHOLE_BYTES), tables)) as log:
             index = log.index
             # Most of a shorter one is read anyway.
             long = index is not None and (index.is_remote or log.end_ns - log.start_ns > 2 * WINDOW_NS)
             if index is not None and not (long and index.size > WHOLE_BYTES):
                 index = None
-            partial = inspect_drive_log(log, mapping, prefer_truth=prefer_truth, index=index)
+            partial = inspect_drive_log(log, mapping, prefer_truth=prefer, index=index)
             damaged = any(loss.severity == "lost" for loss in log.lost)
             sample = partial.sample
             if sample is None or not (damaged or sample.chunks > MOST_SAMPLED * sample.of_chunks):
                 then(partial, log)
                 return partial
-    with closing(open_log(path, budget, msgs)) as log:
-        inspection = inspect_drive_log(log, mapping, prefer_truth=prefer_truth)
+    with closing(open_log(path, limits, msgs, settings=tables)) as log:
+        inspection = inspect_drive_log(log, mapping, prefer_truth=prefer)
         then(inspection, log)
         return inspection
 
