@@ -23,14 +23,16 @@ from pdhef_logtool.estimators.calibration.joint import (
     DERIVATIVE_STEP,
     ERROR_STD,
     FRONT_STIFFNESS,
+    RATIO,
     REAR_STIFFNESS,
     JointProblem,
+    Parameter,
     driven,
-    parameters_of,
+    front_stiffness,
+    prior_of,
     prior_variations,
     prior_vehicle,
     varied_parameters,
-    with_taught,
 )
 from pdhef_logtool.estimators.calibration.single_track import AY, OF_AY, OF_RATE, YAW_RATE
 from pdhef_logtool.records.signals import FloatArray
@@ -208,18 +210,15 @@ def self_calibrate(
     problem = JointProblem(drives, vehicle_file)
     theta = problem.solve()
     refused = _refusal(problem, theta, drives)
+    prior = prior_of(vehicle_file)
     if taught and not refused:
         with_prior = problem.taught(taught)
         place = with_prior.solve()
         if not _refusal(with_prior, place, drives):
-            problem, theta = with_prior, place
-    covariance = problem.covariance(theta)
+            problem, theta, prior = with_prior, place, with_prior.parameters
+    theta, covariance = problem.posterior(theta)
     progress(1.0)
-    std = np.sqrt(np.diag(covariance))
-    parameters = tuple(
-        Calibrated(p.name, p.unit, p.value(float(t)), p.mean, float(s) * p.std, of_file.std, p.log)
-        for p, of_file, t, s in zip(problem.parameters, parameters_of(vehicle_file), theta, std, strict=True)
-    )
+    parameters = _calibrated(problem, theta, covariance, prior)
     idle = [p.name for p in parameters if p.name in (FRONT_STIFFNESS, REAR_STIFFNESS) and p.sd > EXPORTED_STD]
     if exported and idle and not refused:
         refused = f"the driving does not determine the {' and the '.join(idle)}"
@@ -239,6 +238,27 @@ def self_calibrate(
     )
 
 
+def _calibrated(
+    problem: JointProblem, theta: FloatArray, covariance: FloatArray, prior: Sequence[Parameter]
+) -> tuple[Calibrated, ...]:
+    """Return the parameters of a posterior; the stiffness of the front axle replaces the ratio of the axles."""
+    file, fitted = prior_of(problem.vehicle_file), problem.parameters
+    sd = np.sqrt(np.diag(covariance))
+    rows = {
+        p.name: Calibrated(p.name, p.unit, p.value(float(t)), before.mean, float(s) * p.std, wide.std, p.log)
+        for p, before, wide, t, s in zip(fitted, prior, file, theta, sd, strict=True)
+    }
+    ratio, rear = rows.pop(RATIO), rows[REAR_STIFFNESS]
+    (i, j) = ([p.name for p in fitted].index(name) for name in (RATIO, REAR_STIFFNESS))
+    common = 2.0 * covariance[i, j] * fitted[i].std * fitted[j].std
+    value, mean = (
+        front_stiffness(problem.vehicle_file, a, b) for a, b in ((ratio.value, rear.value), (ratio.prior, rear.prior))
+    )
+    std = math.sqrt(ratio.sd**2 + rear.sd**2 + common)
+    front = Calibrated(FRONT_STIFFNESS, rear.unit, value, mean, std, math.hypot(ratio.prior_sd, rear.prior_sd), True)
+    return front, *rows.values()
+
+
 def _without_fit(
     vehicle_file: VehicleParameters, vehicle: VehicleParameters, refused: str = "", seconds: float = 0.0, logs: int = 1
 ) -> SelfCalibration:
@@ -248,8 +268,8 @@ def _without_fit(
 
 def prior_calibration(vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()) -> SelfCalibration:
     """Return the calibration before any driving: prior means, with the prior variations that affect sideslip most."""
-    centre, priors = prior_vehicle(vehicle_file, taught), with_taught(parameters_of(vehicle_file), taught)
-    return replace(_without_fit(vehicle_file, centre), varied=prior_variations(centre, priors))
+    centre = prior_vehicle(vehicle_file, taught)
+    return replace(_without_fit(vehicle_file, centre), varied=prior_variations(centre, prior_of(vehicle_file, taught)))
 
 
 def calibrate_online(
