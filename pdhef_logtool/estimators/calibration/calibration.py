@@ -51,6 +51,8 @@ LARGEST_SHARE, LARGEST_ERROR = 0.5, 1.0
 #: A fit is rejected if the rear axle slides for this time and this share of the driving: beyond this slip angle the
 #: lateral force depends on longitudinal slip, which the model lacks.
 SLIDING_RAD, SLIDING_S, SLIDING_SHARE = math.radians(8.0), 10.0, 0.2
+#: Correlation of a parameter between two drives of a car, about the mean of its prior.
+CORRELATION = 0.9
 #: Largest standard deviation of a log stiffness for a car file.
 EXPORTED_STD = 0.16
 #: Maximum number of posterior directions in an interval.
@@ -218,7 +220,7 @@ def self_calibrate(
             problem, theta, prior = with_prior, place, with_prior.parameters
     theta, covariance = problem.posterior(theta)
     progress(1.0)
-    parameters = _calibrated(problem, theta, covariance, prior)
+    parameters = posterior_of(problem, theta, covariance, prior)
     idle = [p.name for p in parameters if p.name in (FRONT_STIFFNESS, REAR_STIFFNESS) and p.sd > EXPORTED_STD]
     if exported and idle and not refused:
         refused = f"the driving does not determine the {' and the '.join(idle)}"
@@ -238,25 +240,47 @@ def self_calibrate(
     )
 
 
-def _calibrated(
+def posterior_of(
     problem: JointProblem, theta: FloatArray, covariance: FloatArray, prior: Sequence[Parameter]
 ) -> tuple[Calibrated, ...]:
-    """Return the parameters of a posterior; the stiffness of the front axle replaces the ratio of the axles."""
+    """Return the parameters of a posterior, with the stiffness of the front axle beside the ratio of the axles."""
     file, fitted = prior_of(problem.vehicle_file), problem.parameters
     sd = np.sqrt(np.diag(covariance))
     rows = {
         p.name: Calibrated(p.name, p.unit, p.value(float(t)), before.mean, float(s) * p.std, wide.std, p.log)
         for p, before, wide, t, s in zip(fitted, prior, file, theta, sd, strict=True)
     }
-    ratio, rear = rows.pop(RATIO), rows[REAR_STIFFNESS]
-    (i, j) = ([p.name for p in fitted].index(name) for name in (RATIO, REAR_STIFFNESS))
-    common = 2.0 * covariance[i, j] * fitted[i].std * fitted[j].std
-    value, mean = (
-        front_stiffness(problem.vehicle_file, a, b) for a, b in ((ratio.value, rear.value), (ratio.prior, rear.prior))
-    )
-    std = math.sqrt(ratio.sd**2 + rear.sd**2 + common)
-    front = Calibrated(FRONT_STIFFNESS, rear.unit, value, mean, std, math.hypot(ratio.prior_sd, rear.prior_sd), True)
-    return front, *rows.values()
+    ratio, rear = rows[RATIO], rows[REAR_STIFFNESS]
+    (i, j) = (list(rows).index(name) for name in (RATIO, REAR_STIFFNESS))
+    std = math.sqrt(ratio.sd**2 + rear.sd**2 + 2.0 * covariance[i, j] * fitted[i].std * fitted[j].std)
+    value = front_stiffness(problem.vehicle_file, ratio.value, rear.value)
+    before = front_stiffness(problem.vehicle_file, ratio.prior, rear.prior)
+    prior_sd = math.hypot(ratio.prior_sd, rear.prior_sd)
+    return Calibrated(FRONT_STIFFNESS, rear.unit, value, before, std, prior_sd, log=True), *rows.values()
+
+
+def as_prior(
+    parameters: Sequence[Calibrated], correlation: float = CORRELATION, level_m_s2: float = 0.0
+) -> tuple[TaughtParameter, ...]:
+    """Return the posterior of earlier drives as the prior for a later drive of the car.
+
+    Its width contains the spread between drives, so that the sensors of the later drive can overrule it.
+
+    Parameters
+    ----------
+    correlation : of a parameter between two drives of a car, about the mean of its prior.
+    level_m_s2 : lateral acceleration of the drives; 0 if unknown.
+    """
+
+    def of(p: Calibrated) -> TaughtParameter:
+        moved = (p.value / p.prior) ** correlation if p.log else correlation * (p.value - p.prior)
+        value = p.prior * moved if p.log else p.prior + moved
+        std = math.sqrt(p.prior_sd**2 - correlation**2 * max(p.prior_sd**2 - p.sd**2, 0.0))
+        return TaughtParameter(
+            name=p.name, value=float(f"{value:.9g}"), std=float(f"{std:.6g}"), ay_m_s2=float(f"{level_m_s2:.4g}")
+        )
+
+    return tuple(map(of, parameters))
 
 
 def _without_fit(

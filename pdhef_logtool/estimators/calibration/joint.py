@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pdhef_logtool.car.assumed_values import stiffness_per_load
 from pdhef_logtool.car.descent import descend
 from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import (
@@ -71,16 +72,14 @@ ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
 REACHED_SHARE, REACHED_QUANTILE = 0.8, 0.98
 #: Parts of ``physics`` on a calibrated car: the set with the lowest sideslip error on simulated cars with wrong files.
 PARTS = ("lag", "roll", "bank")
-#: Cornering coefficient (stiffness over axle load, 1/rad) of the rear axle, and front over rear coefficient (below 1 by
-#: the steering compliance), of cars on tarmac. Yaw rate and a_y determine the ratio well and the level badly.
-USUAL_LEVEL, USUAL_RATIO = 22.0, 0.68
+#: Cornering coefficient (stiffness over axle load) of the rear axle of driven cars over that of usual files, and front
+#: over rear coefficient (below 1 by the steering compliance). Yaw rate and a_y determine the ratio, not the level.
+USUAL_LEVEL, USUAL_RATIO = 1.5, 0.68
 #: Log standard deviations of level and ratio, of cars and of a file that describes the driven tyres; prior probability
 #: of such a file.
 USUAL_STDS, FILE_STDS, FILE_SHARE = (0.5, 0.2), (0.2, 0.15), 1.0 / 3.0
 #: Log standard deviation of a file's peak force (wet or icy roads), and of its stiffness without a calibration.
 FILE_TYRE_STD = 0.5
-#: Correlation of a parameter between two drives of a car, about the mean of its prior (docs/teaching.md).
-CORRELATION = 0.6
 #: Ratio of the a_y levels of two drives: below the first, no information is shared; above the second, all of it.
 LIKE = (0.3, 0.5)
 #: Usual share of gravity in a_y by body roll, rad/(m/s²), for files without one (3 degrees per g), and 1-sigma of the
@@ -159,7 +158,7 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
     gradient = vehicle_file.roll_gradient_rad_per_m_s2 or USUAL_ROLL_GRADIENT
     reach = IMU_X_REACH * vehicle_file.wheelbase_m
     return (
-        *_tyres(vehicle_file, USUAL_LEVEL, USUAL_RATIO, USUAL_STDS),
+        *_tyres(vehicle_file, USUAL_LEVEL * stiffness_per_load(vehicle_file.mass_kg), USUAL_RATIO, USUAL_STDS),
         _factor(PEAK, "1", 1.0, FILE_TYRE_STD, 6.0),
         _factor(INERTIA, "kg m^2", vehicle_file.yaw_inertia_kg_m2, 0.2, 2.0),
         _factor(RELAXATION, "m", vehicle_file.relaxation_length_m or 0.5, 0.4, 4.0),
@@ -314,9 +313,8 @@ class JointProblem:
 
     def rms(self, theta: FloatArray | None) -> tuple[float, float]:
         """Return the RMS error of yaw rate and a_y for θ, or for the vehicle file if θ is None."""
-        rms = self._rms(
-            self._errors(track_of(self.vehicle_file, self.vehicle_file)) if theta is None else self.errors_of(theta)
-        )
+        file = self.vehicle_file
+        rms = self._rms(self._errors(track_of(file, file)) if theta is None else self.errors_of(theta))
         return float(rms[OF_RATE]), float(rms[OF_AY])
 
     def sideslip(self, theta: FloatArray) -> FloatArray:
@@ -331,21 +329,22 @@ class JointProblem:
         turning = np.concatenate([d.columns[YAW_RATE, k] / d.columns[SPEED, k] for d, k in drives])
         return self.vehicle_file.cg_to_rear_axle_m * turning - self.sideslip(theta)
 
-    def values(self, theta: FloatArray, *, digits: int = 17) -> dict[str, float]:
+    def values(self, theta: FloatArray) -> dict[str, float]:
         """Return the parameters by name."""
-        pairs = zip(self.parameters, theta, strict=True)
-        return {p.name: float(f"{p.value(float(t)):.{digits}g}") for p, t in pairs}
+        return {p.name: p.value(t) for p, t in zip(self.parameters, theta.tolist(), strict=True)}
 
     def vehicle(self, theta: FloatArray, *, digits: int = 17) -> VehicleParameters:
         """Return the vehicle file with the parameters; friction is the file's, the peak force includes its error."""
-        return _vehicle_with(self.vehicle_file, self.values(theta, digits=digits), digits)
+        values = {name: float(f"{value:.{digits}g}") for name, value in self.values(theta).items()}
+        return _vehicle_with(self.vehicle_file, values, digits)
 
     def theta_of(self, values: Mapping[str, float]) -> FloatArray:
         """Return the normalised parameters of values by name."""
         return np.array([p.theta(values[p.name]) for p in self.parameters])
 
     def _track(self, theta: FloatArray) -> TrackParameters:
-        return track_of(self.vehicle(theta), self.vehicle_file, self.values(theta)[STEER_DELAY])
+        values = self.values(theta)
+        return track_of(_vehicle_with(self.vehicle_file, values, 17), self.vehicle_file, values[STEER_DELAY])
 
     def _errors(self, p: TrackParameters) -> FloatArray:
         for d, columns, out, differences in zip(self._drives, self._columns, self._out, self._differences, strict=True):
@@ -401,25 +400,6 @@ class JointProblem:
         spread = share * (1.0 - share) * np.outer(away, away)
         mixed = (1.0 - share) * covariance + share * other_covariance * np.outer(scale, scale) + spread
         return theta + share * away, mixed
-
-    def as_prior(self, names: Sequence[str], correlation: float = CORRELATION) -> tuple[TaughtParameter, ...]:
-        """Return the posterior of parameters of these drives as the prior for a later drive of the car.
-
-        ``correlation`` of a parameter between two drives of the car, about the mean of its prior.
-        """
-        theta, covariance = self.posterior(self.solve())
-        level = float(f"{level_of(self._drives):.4g}")
-        std = np.sqrt(1.0 - correlation**2 * (1.0 - np.minimum(np.diag(covariance), 1.0)))
-        return tuple(
-            TaughtParameter(
-                name=p.name,
-                value=float(f"{p.value(correlation * float(t)):.9g}"),
-                std=float(f"{s * p.std:.6g}"),
-                ay_m_s2=level,
-            )
-            for p, t, s in zip(self.parameters, theta, std, strict=True)
-            if p.name in names
-        )
 
     def _laplace(self, theta: FloatArray) -> tuple[float, FloatArray]:
         """Return log evidence and covariance of the parameters at the lowest cost."""

@@ -15,9 +15,9 @@ import numpy as np
 
 from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.estimators.calibration.calibration import CORRELATION, as_prior, posterior_of
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.joint import (
-    CORRELATION,
     ERROR_STD,
     KEPT_STEPS,
     PEAK,
@@ -25,6 +25,8 @@ from pdhef_logtool.estimators.calibration.joint import (
     REAR_STIFFNESS,
     RELAXATION,
     JointProblem,
+    level_of,
+    prior_of,
 )
 from pdhef_logtool.estimators.calibration.single_track import SPEED
 from pdhef_logtool.learning.truth import MODEL_STD_RAD, weight_of
@@ -71,10 +73,12 @@ def taught_parameters(
 ) -> tuple[TaughtParameter, ...]:
     """Return the prior of a car's calibration from drives that were read with ``vehicle_file``.
 
-    ``support`` scales the correlation between drives. The prior is at least as wide as the spread between drives, so
-    that the sensors of a later drive can overrule it.
+    ``support`` scales the correlation between drives.
     """
-    return TaughtProblem(drives, vehicle_file).as_prior(TYRES, support * CORRELATION)
+    problem = TaughtProblem(drives, vehicle_file)
+    posterior = posterior_of(problem, *problem.posterior(problem.solve()), prior_of(vehicle_file))
+    tyres, level = [p for p in posterior if p.name in TYRES], level_of([d.driving for d in drives])
+    return as_prior(tyres, support * CORRELATION, level)
 
 
 def taught_driving(driving: Driving, truth: StateTrack) -> TaughtDriving:
