@@ -44,7 +44,7 @@ class Rule:
     text: str
 
 
-def _stiffness_per_load(mass_kg: float) -> float:
+def stiffness_per_load(mass_kg: float) -> float:
     """Return cornering stiffness over axle load in 1/rad by the class of vehicle.
 
     14.5 for cars, 6 for heavy trucks and for models below 50 kg; between the classes linear in the logarithm of mass.
@@ -79,13 +79,13 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         "tyres.front.cornering_stiffness_n_per_rad",
-        lambda v: 0.97 * _stiffness_per_load(v["mass_kg"]) * v["front_load_n"],
+        lambda v: 0.97 * stiffness_per_load(v["mass_kg"]) * v["front_load_n"],
         0.4,
         "14 per rad times the axle load for cars, 5.8 for heavy trucks and small models",
     ),
     Rule(
         "tyres.rear.cornering_stiffness_n_per_rad",
-        lambda v: 1.03 * _stiffness_per_load(v["mass_kg"]) * v["rear_load_n"],
+        lambda v: 1.03 * stiffness_per_load(v["mass_kg"]) * v["rear_load_n"],
         0.4,
         "15 per rad times the axle load for cars, 6.2 for heavy trucks and small models",
     ),

@@ -141,6 +141,17 @@ def test_what_straight_driving_does_not_excite_keeps_its_prior() -> None:
     assert "not excited: front cornering stiffness" in straight.text
 
 
+def test_a_right_file_decides_what_gentle_driving_cannot_and_a_wrong_one_does_not() -> None:
+    signals = with_noise(drive(sweep(0.001), 20.0).signals, 3)
+
+    def level_error(file: VehicleParameters) -> float:
+        return abs(stiffness_errors(found(signals, file))[1][0])
+
+    right, wrong_level, without_file = (level_error(file) for file in (wrong(1.001, 1.001), wrong(2.0, 0.5), RIGHT))
+    assert right < 0.7 * without_file
+    assert wrong_level < 0.7 * math.log(2.0)
+
+
 def test_a_car_that_slides_all_the_time_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rules, "SLIDING_RAD", 0.001)
     assert "the rear axle slides in" in found(wide().signals, RIGHT).refused

@@ -23,14 +23,16 @@ from pdhef_logtool.estimators.calibration.joint import (
     DERIVATIVE_STEP,
     ERROR_STD,
     FRONT_STIFFNESS,
+    RATIO,
     REAR_STIFFNESS,
     JointProblem,
+    Parameter,
     driven,
-    parameters_of,
+    front_stiffness,
+    prior_of,
     prior_variations,
     prior_vehicle,
     varied_parameters,
-    with_taught,
 )
 from pdhef_logtool.estimators.calibration.single_track import AY, OF_AY, OF_RATE, YAW_RATE
 from pdhef_logtool.records.signals import FloatArray
@@ -48,6 +50,8 @@ LARGEST_SHARE, LARGEST_ERROR = 0.5, 1.0
 #: A fit is rejected if the rear axle slides for this time and this share of the driving: beyond this slip angle the
 #: lateral force depends on longitudinal slip, which the model lacks.
 SLIDING_RAD, SLIDING_S, SLIDING_SHARE = math.radians(8.0), 10.0, 0.2
+#: Correlation of a parameter between two drives of a car, about the mean of its prior.
+CORRELATION = 0.9
 #: Largest standard deviation of a log stiffness for a car file.
 EXPORTED_STD = 0.16
 #: Maximum number of posterior directions in an interval.
@@ -203,18 +207,15 @@ def self_calibrate(
     problem = JointProblem(drives, vehicle_file)
     theta = problem.solve()
     refused = _refusal(problem, theta, drives)
+    prior = prior_of(vehicle_file)
     if taught and not refused:
         with_prior = problem.taught(taught)
         place = with_prior.solve()
         if not _refusal(with_prior, place, drives):
-            problem, theta = with_prior, place
-    covariance = problem.covariance(theta)
+            problem, theta, prior = with_prior, place, with_prior.parameters
+    theta, covariance = problem.posterior(theta)
     progress(1.0)
-    std = np.sqrt(np.diag(covariance))
-    parameters = tuple(
-        Calibrated(p.name, p.unit, p.value(float(t)), p.mean, float(s) * p.std, of_file.std, p.log)
-        for p, of_file, t, s in zip(problem.parameters, parameters_of(vehicle_file), theta, std, strict=True)
-    )
+    parameters = posterior_of(problem, theta, covariance, prior)
     idle = [p.name for p in parameters if p.name in (FRONT_STIFFNESS, REAR_STIFFNESS) and p.sd > EXPORTED_STD]
     if exported and idle and not refused:
         refused = f"the driving does not determine the {' and the '.join(idle)}"
@@ -234,6 +235,49 @@ def self_calibrate(
     )
 
 
+def posterior_of(
+    problem: JointProblem, theta: FloatArray, covariance: FloatArray, prior: Sequence[Parameter]
+) -> tuple[Calibrated, ...]:
+    """Return the parameters of a posterior, with the stiffness of the front axle beside the ratio of the axles."""
+    file, fitted = prior_of(problem.vehicle_file), problem.parameters
+    sd = np.sqrt(np.diag(covariance))
+    rows = {
+        p.name: Calibrated(p.name, p.unit, p.value(float(t)), before.mean, float(s) * p.std, wide.std, p.log)
+        for p, before, wide, t, s in zip(fitted, prior, file, theta, sd, strict=True)
+    }
+    ratio, rear = rows[RATIO], rows[REAR_STIFFNESS]
+    (i, j) = (list(rows).index(name) for name in (RATIO, REAR_STIFFNESS))
+    std = math.sqrt(ratio.sd**2 + rear.sd**2 + 2.0 * covariance[i, j] * fitted[i].std * fitted[j].std)
+    value = front_stiffness(problem.vehicle_file, ratio.value, rear.value)
+    before = front_stiffness(problem.vehicle_file, ratio.prior, rear.prior)
+    prior_sd = math.hypot(ratio.prior_sd, rear.prior_sd)
+    return Calibrated(FRONT_STIFFNESS, rear.unit, value, before, std, prior_sd, log=True), *rows.values()
+
+
+def as_prior(
+    parameters: Sequence[Calibrated], correlation: float = CORRELATION, level_m_s2: float = 0.0
+) -> tuple[TaughtParameter, ...]:
+    """Return the posterior of earlier drives as the prior for a later drive of the car.
+
+    Its width contains the spread between drives, so that the sensors of the later drive can overrule it.
+
+    Parameters
+    ----------
+    correlation : of a parameter between two drives of a car, about the mean of its prior.
+    level_m_s2 : lateral acceleration of the drives; 0 if unknown.
+    """
+
+    def of(p: Calibrated) -> TaughtParameter:
+        moved = (p.value / p.prior) ** correlation if p.log else correlation * (p.value - p.prior)
+        value = p.prior * moved if p.log else p.prior + moved
+        std = math.sqrt(p.prior_sd**2 - correlation**2 * max(p.prior_sd**2 - p.sd**2, 0.0))
+        return TaughtParameter(
+            name=p.name, value=float(f"{value:.9g}"), std=float(f"{std:.6g}"), ay_m_s2=float(f"{level_m_s2:.4g}")
+        )
+
+    return tuple(map(of, parameters))
+
+
 def _without_fit(
     vehicle_file: VehicleParameters, vehicle: VehicleParameters, refused: str = "", seconds: float = 0.0, logs: int = 1
 ) -> SelfCalibration:
@@ -243,8 +287,8 @@ def _without_fit(
 
 def prior_calibration(vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()) -> SelfCalibration:
     """Return the calibration before any driving: prior means, with the prior variations that affect sideslip most."""
-    centre, priors = prior_vehicle(vehicle_file, taught), with_taught(parameters_of(vehicle_file), taught)
-    return replace(_without_fit(vehicle_file, centre), varied=prior_variations(centre, priors))
+    centre = prior_vehicle(vehicle_file, taught)
+    return replace(_without_fit(vehicle_file, centre), varied=prior_variations(centre, prior_of(vehicle_file, taught)))
 
 
 def _understeer(

@@ -9,7 +9,9 @@ from the prior mean in prior standard deviations) the cost is
 
 with errors e after a zero-phase low pass, so that T = 1 s of driving is equivalent to one sample. σ is the RMS of the
 errors of each channel, at least :data:`ERROR_STD`: with a poor model the prior dominates. Only the product of friction
-and peak force is observable: friction keeps the file's value, the peak force is fitted.
+and peak force is observable: friction keeps the file's value, the peak force is fitted. The prior of the tyres is a
+mixture, because a published file describes the driven tyres, or softer ones, and cars on tarmac differ by a factor of
+two.
 
 The covariance of θ has three parts: the curvature of the cost; the spread of the cost's gradient between blocks of the
 drives (sandwich estimator, White 1982), which includes model error that changes within a drive; and the model error
@@ -26,9 +28,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pdhef_logtool.car.assumed_values import stiffness_per_load
 from pdhef_logtool.car.descent import descend
 from pdhef_logtool.car.taught import TaughtParameter
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, STIFFNESS_TYRE_SHAPE, AxleTyre, Tyres, VehicleParameters
+from pdhef_logtool.car.vehicle import (
+    GRAVITY_M_S2,
+    STIFFNESS_TYRE_SHAPE,
+    AxleTyre,
+    Tyres,
+    VehicleParameters,
+    default_vehicle,
+)
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.single_track import (
     AY,
@@ -62,10 +72,14 @@ ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
 REACHED_SHARE, REACHED_QUANTILE = 0.8, 0.98
 #: Parts of ``physics`` on a calibrated car: the set with the lowest sideslip error on simulated cars with wrong files.
 PARTS = ("lag", "roll", "bank")
-#: Usual cornering stiffness over axle load, 1/rad, front (softer by the steering compliance) and rear, its log standard
-#: deviation, and the log standard deviation of the file's value, which also applies to the peak force (wet or icy
-#: roads).
-USUAL_STIFFNESS, USUAL_STIFFNESS_STD, FILE_TYRE_STD = (13.5, 18.0), 0.35, 0.5
+#: Cornering coefficient (stiffness over axle load) of the rear axle of driven cars over that of usual files, and front
+#: over rear coefficient (below 1 by the steering compliance). Yaw rate and a_y determine the ratio, not the level.
+USUAL_LEVEL, USUAL_RATIO = 1.5, 0.68
+#: Log standard deviations of level and ratio, of cars and of a file that describes the driven tyres; prior probability
+#: of such a file.
+USUAL_STDS, FILE_STDS, FILE_SHARE = (0.5, 0.2), (0.2, 0.15), 1.0 / 3.0
+#: Log standard deviation of a file's peak force (wet or icy roads), and of its stiffness without a calibration.
+FILE_TYRE_STD = 0.5
 #: Ratio of the a_y levels of two drives: below the first, no information is shared; above the second, all of it.
 LIKE = (0.3, 0.5)
 #: Usual share of gravity in a_y by body roll, rad/(m/s²), for files without one (3 degrees per g), and 1-sigma of the
@@ -73,6 +87,7 @@ LIKE = (0.3, 0.5)
 USUAL_ROLL_GRADIENT, IMU_X_REACH = 0.005, 0.4
 
 FRONT_STIFFNESS, REAR_STIFFNESS = "front cornering stiffness", "rear cornering stiffness"
+RATIO = "front over rear cornering coefficient"
 PEAK, INERTIA, RELAXATION = "peak force over the file's", "yaw inertia", "relaxation length"
 STEER_OFFSET, STEER_RATIO, STEER_DELAY = "steering offset", "steering ratio", "steering delay"
 AY_GAIN, AY_BIAS, IMU_X, RATE_BIAS = "roll gain", "a_y bias", "lever of a_y", "yaw rate bias"
@@ -113,17 +128,28 @@ def _around(name: str, unit: str, mean: float, std: float, most: float) -> Param
     return Parameter(name, unit, mean, std, mean - most, mean + most)
 
 
-def _stiffness(vehicle_file: VehicleParameters, name: str, *, front: bool) -> Parameter:
-    """Return a cornering stiffness with a prior that combines the file's value with the usual value of cars."""
-    of_file, of_usual = FILE_TYRE_STD**-2, USUAL_STIFFNESS_STD**-2
-    file = vehicle_file.cornering_stiffness_n_per_rad(front, vehicle_file.assumed_friction)
-    usual = USUAL_STIFFNESS[0 if front else 1] * vehicle_file.axle_load_n(front)
-    mean = math.exp((of_file * math.log(file) + of_usual * math.log(usual)) / (of_file + of_usual))
-    return _factor(name, "N/rad", mean, (of_file + of_usual) ** -0.5, 5.0)
+def _tyres(vehicle_file: VehicleParameters, level: float, ratio: float, stds: tuple[float, float]) -> list[Parameter]:
+    """Return the prior of both axles about a rear cornering coefficient and a ratio of the coefficients."""
+    rear = level * vehicle_file.axle_load_n(False)
+    return [_factor(RATIO, "1", ratio, stds[1], 5.0), _factor(REAR_STIFFNESS, "N/rad", rear, stds[0], 5.0)]
+
+
+def front_stiffness(vehicle: VehicleParameters, ratio: float, rear: float) -> float:
+    """Return the cornering stiffness of the front axle from the ratio of the coefficients and that of the rear axle."""
+    return ratio * rear * vehicle.axle_load_n(True) / vehicle.axle_load_n(False)
+
+
+def coefficients(vehicle: VehicleParameters) -> tuple[float, float]:
+    """Return the cornering coefficients of front and rear axle, 1/rad."""
+    mu = vehicle.assumed_friction
+    front, rear = (
+        vehicle.cornering_stiffness_n_per_rad(axle, mu) / vehicle.axle_load_n(axle) for axle in (True, False)
+    )
+    return front, rear
 
 
 def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
-    """Return the parameters of a fit about a vehicle file.
+    """Return the parameters of a fit, with tyres as cars have; :func:`with_file_tyres` is the alternative.
 
     The stiffness in published files differs from the driven car's by up to a factor of two, the steering gain by −15 to
     +18 % (compliance, toe, wrong ratios). An accelerometer may be at either axle.
@@ -132,8 +158,7 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
     gradient = vehicle_file.roll_gradient_rad_per_m_s2 or USUAL_ROLL_GRADIENT
     reach = IMU_X_REACH * vehicle_file.wheelbase_m
     return (
-        _stiffness(vehicle_file, FRONT_STIFFNESS, front=True),
-        _stiffness(vehicle_file, REAR_STIFFNESS, front=False),
+        *_tyres(vehicle_file, USUAL_LEVEL * stiffness_per_load(vehicle_file.mass_kg), USUAL_RATIO, USUAL_STDS),
         _factor(PEAK, "1", 1.0, FILE_TYRE_STD, 6.0),
         _factor(INERTIA, "kg m^2", vehicle_file.yaw_inertia_kg_m2, 0.2, 2.0),
         _factor(RELAXATION, "m", vehicle_file.relaxation_length_m or 0.5, 0.4, 4.0),
@@ -145,6 +170,32 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
         _around(IMU_X, "m", vehicle_file.imu_position_m[0], reach, 3.0 * reach),
         _around(RATE_BIAS, "rad/s", sensors.yaw_rate_bias_rad_s, 0.005, 0.05),
     )
+
+
+def with_file_tyres(parameters: Sequence[Parameter], vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
+    """Return the parameters with a prior for a file that describes the driven tyres.
+
+    The default vehicle describes no tyres: its parameters stay.
+    """
+    if vehicle_file.tyres == default_vehicle().tyres:
+        return tuple(parameters)
+    front, rear = coefficients(vehicle_file)
+    tyres = {p.name: p for p in _tyres(vehicle_file, rear, front / rear, FILE_STDS)}
+    return tuple(tyres.get(p.name, p) for p in parameters)
+
+
+def prior_of(vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()) -> tuple[Parameter, ...]:
+    """Return the prior of a car before any driving: mean and spread of both alternatives, or the taught prior."""
+    parameters = parameters_of(vehicle_file)
+    if taught:
+        return with_taught(parameters, taught)
+
+    def mixed(p: Parameter, of_file: Parameter) -> Parameter:
+        away, scale = p.theta(of_file.mean), of_file.std / p.std
+        variance = 1.0 - FILE_SHARE + FILE_SHARE * (scale**2 + (1.0 - FILE_SHARE) * away**2)
+        return replace(p, mean=p.value(FILE_SHARE * away), std=p.std * math.sqrt(variance))
+
+    return tuple(map(mixed, parameters, with_file_tyres(parameters, vehicle_file)))
 
 
 def with_taught(
@@ -203,7 +254,8 @@ class JointProblem:
             replace(p, low=min(max(p.low, reached), p.mean)) if p.name == PEAK else p
             for p in parameters_of(vehicle_file)
         )
-        self._drives, self._file = drives, vehicle_file
+        self._drives, self.vehicle_file = drives, vehicle_file
+        self._file_tyres = with_file_tyres(self.parameters, vehicle_file)
         self._filter = low_pass(CUTOFF_HZ, STEP_S)
         self._kept = [np.flatnonzero(counted(d))[::KEPT_STEPS] for d in drives]
         self._columns = [np.concatenate([d.columns, np.empty((2, d.columns.shape[1]))]) for d in drives]
@@ -221,6 +273,7 @@ class JointProblem:
         """Return the fit with the prior from drives with ground truth."""
         problem = copy(self)
         problem.parameters = with_taught(self.parameters, taught, level_of(self._drives))
+        problem._file_tyres = problem.parameters
         return problem
 
     def solve(self) -> FloatArray:
@@ -260,7 +313,8 @@ class JointProblem:
 
     def rms(self, theta: FloatArray | None) -> tuple[float, float]:
         """Return the RMS error of yaw rate and a_y for θ, or for the vehicle file if θ is None."""
-        rms = self._rms(self._errors(track_of(self._file, self._file)) if theta is None else self.errors_of(theta))
+        file = self.vehicle_file
+        rms = self._rms(self._errors(track_of(file, file)) if theta is None else self.errors_of(theta))
         return float(rms[OF_RATE]), float(rms[OF_AY])
 
     def sideslip(self, theta: FloatArray) -> FloatArray:
@@ -273,19 +327,24 @@ class JointProblem:
         """Return (l_r r − v_y) / v_x of the model with the gyro's r, of all used samples [K]."""
         drives = zip(self._drives, self._kept, strict=True)
         turning = np.concatenate([d.columns[YAW_RATE, k] / d.columns[SPEED, k] for d, k in drives])
-        return self._file.cg_to_rear_axle_m * turning - self.sideslip(theta)
+        return self.vehicle_file.cg_to_rear_axle_m * turning - self.sideslip(theta)
 
-    def values(self, theta: FloatArray, *, digits: int = 17) -> dict[str, float]:
+    def values(self, theta: FloatArray) -> dict[str, float]:
         """Return the parameters by name."""
-        pairs = zip(self.parameters, theta, strict=True)
-        return {p.name: float(f"{p.value(float(t)):.{digits}g}") for p, t in pairs}
+        return {p.name: p.value(t) for p, t in zip(self.parameters, theta.tolist(), strict=True)}
 
     def vehicle(self, theta: FloatArray, *, digits: int = 17) -> VehicleParameters:
         """Return the vehicle file with the parameters; friction is the file's, the peak force includes its error."""
-        return _vehicle_with(self._file, self.values(theta, digits=digits), digits)
+        values = {name: float(f"{value:.{digits}g}") for name, value in self.values(theta).items()}
+        return _vehicle_with(self.vehicle_file, values, digits)
+
+    def theta_of(self, values: Mapping[str, float]) -> FloatArray:
+        """Return the normalised parameters of values by name."""
+        return np.array([p.theta(values[p.name]) for p in self.parameters])
 
     def _track(self, theta: FloatArray) -> TrackParameters:
-        return track_of(self.vehicle(theta), self._file, self.values(theta)[STEER_DELAY])
+        values = self.values(theta)
+        return track_of(_vehicle_with(self.vehicle_file, values, 17), self.vehicle_file, values[STEER_DELAY])
 
     def _errors(self, p: TrackParameters) -> FloatArray:
         for d, columns, out, differences in zip(self._drives, self._columns, self._out, self._differences, strict=True):
@@ -321,16 +380,38 @@ class JointProblem:
         np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])
         return inverse, gradients
 
-    def covariance(self, theta: FloatArray) -> FloatArray:
-        """Return the covariance of the parameters at the lowest cost."""
+    def posterior(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of the parameters from the lowest cost with tyres as cars have.
+
+        The posterior is a mixture with the tyres of the file. Each part is normal and weighted by its evidence,
+        exp(-J / 2) times the root of the determinant of its inverse curvature (Laplace; MacKay 1992).
+        """
+        evidence, covariance = self._laplace(theta)
+        if self._file_tyres == self.parameters:
+            return theta, covariance
+        other = copy(self)
+        other.parameters = self._file_tyres
+        other_theta = other._descend(other.theta_of(self.values(theta)))
+        other_evidence, other_covariance = other._laplace(other_theta)
+        odds = math.exp(min(evidence - other_evidence, 100.0)) * (1.0 - FILE_SHARE) / FILE_SHARE
+        share = 1.0 / (1.0 + odds)
+        scale = np.array([q.std / p.std for p, q in zip(self.parameters, other.parameters, strict=True)])
+        away = self.theta_of(other.values(other_theta)) - theta
+        spread = share * (1.0 - share) * np.outer(away, away)
+        mixed = (1.0 - share) * covariance + share * other_covariance * np.outer(scale, scale) + spread
+        return theta + share * away, mixed
+
+    def _laplace(self, theta: FloatArray) -> tuple[float, FloatArray]:
+        """Return log evidence and covariance of the parameters at the lowest cost."""
         inverse, gradients = self._curvature(theta)
+        evidence = 0.5 * (float(np.linalg.slogdet(inverse)[1]) - self._cost(self.errors_of(theta), theta))
         of_drives = np.add.reduceat(gradients, self._first_block[:-1])
         spread = _spread(gradients)
         # Add the variation between the drives of a pool beyond block variation: the parameters are for a single drive.
         more, axes = np.linalg.eigh(_spread(of_drives) - spread)
         spread += len(of_drives) * (axes * np.maximum(more, 0.0)) @ axes.T
         shared = np.diag([SHARED_SHARES.get(p.name, SHARED_SHARE) ** 2 for p in self.parameters])
-        return np.asarray(inverse + inverse @ spread @ inverse + shared, dtype=np.float64)
+        return evidence, np.asarray(inverse + inverse @ spread @ inverse + shared, dtype=np.float64)
 
 
 def _spread(gradients: FloatArray) -> FloatArray:
@@ -358,15 +439,17 @@ def _vehicle_with(vehicle_file: VehicleParameters, values: Mapping[str, float], 
 
     mu = vehicle_file.assumed_friction
 
-    def tyre(front: bool, stiffness: str) -> AxleTyre:
+    def tyre(front: bool, stiffness: float) -> AxleTyre:
         peak = values[PEAK] * vehicle_file.magic_formula(front, mu)[2]
-        b = rounded(values[stiffness] / (STIFFNESS_TYRE_SHAPE * peak))
+        b = rounded(stiffness / (STIFFNESS_TYRE_SHAPE * peak))
         return AxleTyre(B=b, C=STIFFNESS_TYRE_SHAPE, D_n=rounded(peak / mu), E=0.0, reference_friction=mu)
 
+    rear = values[REAR_STIFFNESS]
+    front = front_stiffness(vehicle_file, values[RATIO], rear)
     biases = {"ay_bias_m_s2": values[AY_BIAS], "yaw_rate_bias_rad_s": values[RATE_BIAS]}
     return vehicle_file.model_copy(
         update={
-            "tyres": Tyres(front=tyre(True, FRONT_STIFFNESS), rear=tyre(False, REAR_STIFFNESS)),
+            "tyres": Tyres(front=tyre(True, front), rear=tyre(False, rear)),
             "yaw_inertia_kg_m2": values[INERTIA],
             "steer_offset_rad": values[STEER_OFFSET],
             "steering_ratio": values[STEER_RATIO],
@@ -382,8 +465,7 @@ def _vehicle_with(vehicle_file: VehicleParameters, values: Mapping[str, float], 
 
 def prior_vehicle(vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()) -> VehicleParameters:
     """Return the vehicle file with every parameter at its prior mean."""
-    parameters = with_taught(parameters_of(vehicle_file), taught)
-    return _vehicle_with(vehicle_file, {p.name: p.value(0.0) for p in parameters}, 6)
+    return _vehicle_with(vehicle_file, {p.name: p.mean for p in prior_of(vehicle_file, taught)}, 6)
 
 
 def prior_variations(
@@ -391,15 +473,14 @@ def prior_variations(
 ) -> tuple[VehicleParameters, ...]:
     """Return vehicles with a prior 1-sigma error in one parameter each, those with the most effect on the sideslip.
 
-    Stiffness of each axle, friction in place of peak force, steering ratio and offset, position of the accelerometer.
+    Stiffness of the axles, friction in place of peak force, steering ratio and offset, position of the accelerometer.
     Without ``priors``, ``vehicle`` is a vehicle file.
     """
     std, (x, y, z) = {p.name: p.std for p in priors or parameters_of(vehicle)}, vehicle.imu_position_m
-    if priors is None:
-        std |= dict.fromkeys((FRONT_STIFFNESS, REAR_STIFFNESS), FILE_TYRE_STD)
+    front, rear = (std[RATIO], std[REAR_STIFFNESS]) if priors else (FILE_TYRE_STD, FILE_TYRE_STD)
     return (
-        vehicle.with_stiffness(math.exp(std[FRONT_STIFFNESS]), 1.0),
-        vehicle.with_stiffness(1.0, math.exp(std[REAR_STIFFNESS])),
+        vehicle.with_stiffness(math.exp(front), 1.0),
+        vehicle.with_stiffness(math.exp(rear) if priors else 1.0, math.exp(rear)),
         vehicle.model_copy(update={"friction": math.exp(-std[PEAK]) * vehicle.assumed_friction}),
         vehicle.model_copy(update={"steering_ratio": math.exp(std[STEER_RATIO]) * vehicle.steering_ratio}),
         vehicle.model_copy(update={"steer_offset_rad": vehicle.steer_offset_rad + std[STEER_OFFSET]}),

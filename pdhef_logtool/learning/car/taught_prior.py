@@ -15,17 +15,18 @@ import numpy as np
 
 from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.estimators.calibration.calibration import CORRELATION, as_prior, posterior_of
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.joint import (
     ERROR_STD,
-    FRONT_STIFFNESS,
     KEPT_STEPS,
     PEAK,
+    RATIO,
     REAR_STIFFNESS,
     RELAXATION,
     JointProblem,
     level_of,
-    parameters_of,
+    prior_of,
 )
 from pdhef_logtool.estimators.calibration.single_track import SPEED
 from pdhef_logtool.learning.truth import MODEL_STD_RAD, weight_of
@@ -34,9 +35,7 @@ from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Parameters trained with ground truth.
-TYRES = (FRONT_STIFFNESS, REAR_STIFFNESS, PEAK, RELAXATION)
-#: Correlation of a parameter between two drives of a car, about the mean of its prior (docs/teaching.md).
-CORRELATION = 0.6
+TYRES = (RATIO, REAR_STIFFNESS, PEAK, RELAXATION)
 #: Window of the mean to remove, in s. If only a constant is removed, the bank of simulated roads doubles the sideslip
 #: error on other drives.
 SLOW_S = 4.0
@@ -74,24 +73,12 @@ def taught_parameters(
 ) -> tuple[TaughtParameter, ...]:
     """Return the prior of a car's calibration from drives that were read with ``vehicle_file``.
 
-    ``support`` scales the correlation between drives. The prior is at least as wide as the spread between drives, so
-    that the sensors of a later drive can overrule it.
+    ``support`` scales the correlation between drives.
     """
-    correlation = support * CORRELATION
     problem = TaughtProblem(drives, vehicle_file)
-    theta, level = problem.solve(), float(f"{level_of([d.driving for d in drives]):.4g}")
-    variances = np.minimum(np.diag(problem.covariance(theta)), 1.0)
-    stds = np.sqrt(1.0 - correlation**2 * (1.0 - variances))
-    return tuple(
-        TaughtParameter(
-            name=p.name,
-            value=float(f"{p.value(correlation * float(t)):.9g}"),
-            std=float(f"{s * p.std:.6g}"),
-            ay_m_s2=level,
-        )
-        for p, t, s in zip(parameters_of(vehicle_file), theta, stds, strict=True)
-        if p.name in TYRES
-    )
+    posterior = posterior_of(problem, *problem.posterior(problem.solve()), prior_of(vehicle_file))
+    tyres, level = [p for p in posterior if p.name in TYRES], level_of([d.driving for d in drives])
+    return as_prior(tyres, support * CORRELATION, level)
 
 
 def taught_driving(driving: Driving, truth: StateTrack) -> TaughtDriving:
