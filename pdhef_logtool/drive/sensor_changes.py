@@ -43,6 +43,8 @@ LEAST_CELLS, LEAST_SPEED_M_S = 40, 3.0
 #: Alarm level and level of confirmation in standard deviations of a statistic, and the least standard deviations.
 ALARM, SURE = 4.0, 3.0
 LEAST_AY_STD, LEAST_STEER_STD, LEAST_GYRO_STD = 0.06, 0.0005, 0.003
+#: Smallest jumps that are reported. The crossfall of a road changes a_y by 0.5 m/s² from lane to lane.
+LEAST_AY_JUMP_M_S2, LEAST_GYRO_JUMP_RAD_S = 0.6, 0.02
 #: Samples beside a step of the gyro, s; largest relative difference of steps that agree, and of an absent one.
 STEP_S, AGREES, ABSENT = 0.05, 0.5, 0.35
 #: A reading repeats by chance with this probability; shortest time that is reported.
@@ -231,7 +233,8 @@ def _step(relation: _Relation, least_std: float) -> _Step:
     is_sharp = np.abs(earlier) < AGREES * np.abs(size)
     for part in (*map(relation.residual, (*changes, short)), short[:, 0] - short[:, 2]):
         is_sharp &= np.abs(part - size) < AGREES * np.abs(size)
-    return _Step(size, is_sharp, _std_so_far(size, least_std) * relation.leverage(change[:, 1:]))
+    leverage = relation.leverage(change[:, 1:])
+    return _Step(size, is_sharp, _std_so_far(size / leverage, least_std) * leverage)
 
 
 def _std_so_far(column: FloatArray, least: float) -> FloatArray:
@@ -278,9 +281,9 @@ def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> Se
         by_ay, by_steer = ay.scaled(-1.0 / v), of_steer.scaled(-1.0 / (steering.fit[:, 1] / v + steering.fit[:, 2] * v))
         step, at_ns = _sample_steps(signals)
         step_std = _std_so_far(step, LEAST_GYRO_STD)
-        is_gyro = (np.abs(step) > ALARM * step_std) & by_ay.confirms(step)
+        is_gyro = (np.abs(step) > np.maximum(ALARM * step_std, LEAST_GYRO_JUMP_RAD_S)) & by_ay.confirms(step)
         is_gyro &= ~by_steer.contradicts(step)
-        is_ay = (np.abs(ay.size) > ALARM * ay.std) & ay.is_sharp
+        is_ay = (np.abs(ay.size) > np.maximum(ALARM * ay.std, LEAST_AY_JUMP_M_S2)) & ay.is_sharp
         is_ay &= (np.abs(by_steer.size) < ABSENT * np.abs(by_ay.size)) & (np.abs(by_ay.size) > SURE * by_steer.std)
     is_gyro &= "yaw_rate_rad_s" not in ignored
     is_ay &= "ay_m_s2" not in ignored
@@ -289,7 +292,7 @@ def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> Se
     if not len(alarms):
         return None
     k = int(alarms[0])
-    known_ns = start_ns + round((k + WINDOW_CELLS + PEAK_CELLS + 1) * CELL_S * 1e9)
+    known_ns = start_ns + round((k * CELL_S + DECIDED_S) * 1e9)
     if is_gyro[k]:
         size, std = float(step[k]), float(step_std[k])
         return SensorChange("yaw_rate_rad_s", "jump", int(at_ns[k]), known_ns, end_ns, size, std)
@@ -328,7 +331,7 @@ def _without_stuck(signals: Signals, names: Sequence[str]) -> tuple[Signals, lis
             start_ns, end_ns = (int(signals.stamps_ns[i]) for i in (start, end - 1))
             size = float(getattr(signals, name)[start])
             changes.append(SensorChange(name, "stuck", start_ns, known_ns, end_ns + 1, size, float(std)))
-    return replace(signals, **columns), changes
+    return (replace(signals, **columns) if changes else signals), changes
 
 
 def _long_runs(signals: Signals, name: str, cells: _Cells) -> Iterator[tuple[int, int, int]]:
