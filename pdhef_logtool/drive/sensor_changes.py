@@ -105,7 +105,7 @@ class _Relation(NamedTuple):
         return table[:, 0] - (table[:, 1:] * self.fit).sum(axis=1)
 
     def leverage(self, change: FloatArray) -> FloatArray:
-        """Return the factor on the 1-sigma of a residual whose regressors change by [n, m]: the fit is uncertain."""
+        """Return the factor on the 1-sigma of a residual that an uncertain fit has for changed regressors [n, m]."""
         known = np.nan_to_num(change)
         share = (known * np.linalg.solve(self.information, known[..., None])[..., 0]).sum(axis=1)
         return np.sqrt(1.0 + INDEPENDENT_CELLS * share)
@@ -206,7 +206,7 @@ class _Step(NamedTuple):
     std: FloatArray
 
     def confirms(self, other: FloatArray) -> BoolArray:
-        """Return where this step is another one, and excludes that there is none."""
+        """Return where this step equals another one and is significant."""
         return (np.abs(self.size) > SURE * self.std) & (np.abs(self.size - other) < AGREES * np.abs(other))
 
     def contradicts(self, other: FloatArray) -> BoolArray:
@@ -252,7 +252,7 @@ def _std_so_far(column: FloatArray, least: float) -> FloatArray:
 def _sample_steps(signals: Signals) -> tuple[FloatArray, IntArray]:
     """Return the largest step between neighbouring samples of the gyro in each cell, [n], and its stamp.
 
-    The step is that of a straight line with a step, fitted to the samples up to ``STEP_S`` before and after.
+    A straight line with a step is fitted to the samples up to ``STEP_S`` before and after.
     """
     signals = without_impossible(signals)
     finite = np.isfinite(signals.yaw_rate_rad_s)
@@ -280,7 +280,7 @@ def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> Se
         ay, of_steer = _step(kinematics, LEAST_AY_STD), _step(steering, LEAST_STEER_STD)
         by_ay, by_steer = ay.scaled(-1.0 / v), of_steer.scaled(-1.0 / (steering.fit[:, 1] / v + steering.fit[:, 2] * v))
         step, at_ns = _sample_steps(signals)
-        step_std = _std_so_far(step, LEAST_GYRO_STD)
+        step_std = np.fmax(_std_so_far(step, LEAST_GYRO_STD), np.sqrt(_mean(step**2, 3, WINDOW_CELLS)))  # a burst
         is_gyro = (np.abs(step) > np.maximum(ALARM * step_std, LEAST_GYRO_JUMP_RAD_S)) & by_ay.confirms(step)
         is_gyro &= ~by_steer.contradicts(step)
         is_ay = (np.abs(ay.size) > np.maximum(ALARM * ay.std, LEAST_AY_JUMP_M_S2)) & ay.is_sharp
@@ -294,11 +294,21 @@ def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> Se
     k = int(alarms[0])
     known_ns = start_ns + round((k * CELL_S + DECIDED_S) * 1e9)
     if is_gyro[k]:
-        size, std = float(step[k]), float(step_std[k])
-        return SensorChange("yaw_rate_rad_s", "jump", int(at_ns[k]), known_ns, end_ns, size, std)
+        three = (step, step_std), (by_ay.size, by_ay.std), (by_steer.size, by_steer.std)
+        return SensorChange("yaw_rate_rad_s", "jump", int(at_ns[k]), known_ns, end_ns, *_weighted(three, k))
     k += int(np.argmax(np.abs(ay.size[k : k + PEAK_CELLS + 1])))
     at = start_ns + round(k * CELL_S * 1e9)
     return SensorChange("ay_m_s2", "jump", at, known_ns, end_ns, float(ay.size[k]), float(ay.std[k]))
+
+
+def _weighted(measured: Sequence[tuple[FloatArray, FloatArray]], k: int) -> tuple[float, float]:
+    """Return the mean of the known sizes [n] of one step in cell k, weighted by their 1-sigmas [n], and its 1-sigma."""
+    sizes, stds = (np.array([column[k] for column in columns]) for columns in zip(*measured, strict=True))
+    known = np.isfinite(sizes) & np.isfinite(stds)
+    size, weight = sizes[known], stds[known] ** -2.0
+    mean = float(weight @ size / weight.sum())
+    scatter = float(weight @ (size - mean) ** 2) / max(len(size) - 1, 1)
+    return mean, math.sqrt(max(1.0, scatter) / float(weight.sum()))
 
 
 # ------------------------------------------------------------------------------------------------ stuck values

@@ -1,4 +1,4 @@
-"""``SIGNAL.change``: sensors whose bias jumps or whose value freezes in mid-drive."""
+"""``SIGNAL.change``: jumps of a sensor's bias, and frozen values, in mid-drive."""
 
 from __future__ import annotations
 
