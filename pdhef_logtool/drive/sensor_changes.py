@@ -106,8 +106,8 @@ class _Relation(NamedTuple):
 
     def leverage(self, change: FloatArray) -> FloatArray:
         """Return the factor on the 1-sigma of a residual that an uncertain fit has for changed regressors [n, m]."""
-        known = np.nan_to_num(change)
-        share = (known * np.linalg.solve(self.information, known[..., None])[..., 0]).sum(axis=1)
+        finite = np.nan_to_num(change)
+        share = (finite * np.linalg.solve(self.information, finite[..., None])[..., 0]).sum(axis=1)
         return np.sqrt(1.0 + INDEPENDENT_CELLS * share)
 
 
@@ -161,14 +161,14 @@ def _cells(signals: Signals) -> _Cells:
 
 
 def _mean(column: FloatArray, start: int, end: int) -> FloatArray:
-    """Return the mean over cells k + start to k + end of a column [n] or [n, c]; NaN where one is not known."""
+    """Return the mean over cells k + start to k + end of a column [n] or [n, c]; NaN where a cell is not finite."""
     n = len(column)
     sums = np.concatenate([np.zeros_like(column[:1]), np.cumsum(np.nan_to_num(column), axis=0)])
     gaps = np.concatenate([np.zeros_like(column[:1]), np.cumsum(~np.isfinite(column), axis=0)])
     k = np.arange(n)
     first, last = np.clip(k + start, 0, n), np.clip(k + end, 0, n)
-    known = ((k + start >= 0) & (k + end <= n)).reshape((-1, *[1] * (column.ndim - 1))) & (gaps[first] == gaps[last])
-    return np.where(known, (sums[last] - sums[first]) / (end - start), np.nan)
+    finite = ((k + start >= 0) & (k + end <= n)).reshape((-1, *[1] * (column.ndim - 1))) & (gaps[first] == gaps[last])
+    return np.where(finite, (sums[last] - sums[first]) / (end - start), np.nan)
 
 
 def _relations(cells: _Cells) -> tuple[_Relation, _Relation]:
@@ -186,13 +186,13 @@ def _relations(cells: _Cells) -> tuple[_Relation, _Relation]:
 
 def _fitted(table: FloatArray) -> _Relation:
     """Regress the first column of a table [n, 1 + m] on the others, over the rows before each."""
-    known = np.isfinite(table).all(axis=1)
-    rows = np.where(known[:, None], table, 0.0)
+    finite = np.isfinite(table).all(axis=1)
+    rows = np.where(finite[:, None], table, 0.0)
     products = np.cumsum(rows[:, :, None] * rows[:, None, :], axis=0)
     products = np.concatenate([np.zeros_like(products[:1]), products[:-1]])
     square = products[:, 1:, 1:] * (1.0 + RIDGE * np.eye(table.shape[1] - 1)) + 1e-9 * np.eye(table.shape[1] - 1)
     fit = np.linalg.solve(square, products[:, 1:, :1])[..., 0]
-    return _Relation(table, np.where(np.cumsum(known)[:, None] > LEAST_CELLS, fit, np.nan), square)
+    return _Relation(table, np.where(np.cumsum(finite)[:, None] > LEAST_CELLS, fit, np.nan), square)
 
 
 # ------------------------------------------------------------------------------------------------ jumps
@@ -210,7 +210,7 @@ class _Step(NamedTuple):
         return (np.abs(self.size) > SURE * self.std) & (np.abs(self.size - other) < AGREES * np.abs(other))
 
     def contradicts(self, other: FloatArray) -> BoolArray:
-        """Return where another step differs by more than the uncertainty; False where this one is not known."""
+        """Return where another step differs by more than the uncertainty; False where this one is not finite."""
         return np.abs(self.size - other) > AGREES * np.abs(other) + SURE * self.std
 
     def scaled(self, by: FloatArray) -> _Step:
@@ -239,11 +239,11 @@ def _step(relation: _Relation, least_std: float) -> _Step:
 
 def _std_so_far(column: FloatArray, least: float) -> FloatArray:
     """Return the RMS of a column over the cells that were decided before each; inf before ``LEAST_CELLS``."""
-    known = np.isfinite(column)
+    finite = np.isfinite(column)
     late = WINDOW_CELLS + PEAK_CELLS
     count, total = (
         np.concatenate([np.zeros(late), np.cumsum(x)[:-late]])[: len(column)]
-        for x in (known.astype(float), np.where(known, column, 0.0) ** 2)
+        for x in (finite.astype(float), np.where(finite, column, 0.0) ** 2)
     )
     few = 1.0 + LEAST_CELLS / np.maximum(count, 1.0)
     return np.where(count < 0.5 * LEAST_CELLS, np.inf, np.maximum(few * np.sqrt(total / np.maximum(count, 1.0)), least))
@@ -258,17 +258,17 @@ def _sample_steps(signals: Signals) -> tuple[FloatArray, IntArray]:
     finite = np.isfinite(signals.yaw_rate_rad_s)
     values, stamps, cell = signals.yaw_rate_rad_s[finite], signals.stamps_ns[finite], _cell_of(signals)[finite]
     count = int(_cell_of(signals)[-1]) + 1
-    largest, at = np.zeros(count), np.zeros(count, np.int64)
+    largest, stamp_ns = np.zeros(count), np.zeros(count, np.int64)
     if len(values) < 5:
-        return largest, at
+        return largest, stamp_ns
     half = max(2, round(STEP_S * 1e9 / max(float(np.median(np.diff(stamps))), 1.0)))
     place = np.arange(2 * half) - (half - 0.5)
     weights = np.linalg.pinv(np.stack([np.ones(2 * half), place, 0.5 * np.sign(place)], axis=1))[2]
     steps = np.convolve(values, weights[::-1], "valid")
     middle = slice(half, half + len(steps))
     order = np.argsort(np.abs(steps), kind="stable")  # the largest of a cell is written last
-    largest[cell[middle][order]], at[cell[middle][order]] = steps[order], stamps[middle][order]
-    return largest, at
+    largest[cell[middle][order]], stamp_ns[cell[middle][order]] = steps[order], stamps[middle][order]
+    return largest, stamp_ns
 
 
 def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> SensorChange | None:
@@ -297,15 +297,15 @@ def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> Se
         three = (step, step_std), (by_ay.size, by_ay.std), (by_steer.size, by_steer.std)
         return SensorChange("yaw_rate_rad_s", "jump", int(at_ns[k]), known_ns, end_ns, *_weighted(three, k))
     k += int(np.argmax(np.abs(ay.size[k : k + PEAK_CELLS + 1])))
-    at = start_ns + round(k * CELL_S * 1e9)
-    return SensorChange("ay_m_s2", "jump", at, known_ns, end_ns, float(ay.size[k]), float(ay.std[k]))
+    jump_ns = start_ns + round(k * CELL_S * 1e9)
+    return SensorChange("ay_m_s2", "jump", jump_ns, known_ns, end_ns, float(ay.size[k]), float(ay.std[k]))
 
 
 def _weighted(measured: Sequence[tuple[FloatArray, FloatArray]], k: int) -> tuple[float, float]:
-    """Return the mean of the known sizes [n] of one step in cell k, weighted by their 1-sigmas [n], and its 1-sigma."""
+    """Return the mean of the finite sizes [n] in cell k, weighted by their 1-sigmas [n], and its 1-sigma."""
     sizes, stds = (np.array([column[k] for column in columns]) for columns in zip(*measured, strict=True))
-    known = np.isfinite(sizes) & np.isfinite(stds)
-    size, weight = sizes[known], stds[known] ** -2.0
+    finite = np.isfinite(sizes) & np.isfinite(stds)
+    size, weight = sizes[finite], stds[finite] ** -2.0
     mean = float(weight @ size / weight.sum())
     scatter = float(weight @ (size - mean) ** 2) / max(len(size) - 1, 1)
     return mean, math.sqrt(max(1.0, scatter) / float(weight.sum()))

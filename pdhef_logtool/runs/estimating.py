@@ -109,8 +109,8 @@ def estimate_drive(
 
 def _varied(estimator: Estimator, given: Signals, changes: Sequence[SensorChange]) -> list[FloatArray]:
     """Return v_y [N] of an estimator on signals whose corrected sensors are one 1-sigma away, one by one."""
-    known = (c for c in changes if math.isfinite(c.std))
-    away = (shifted(given, c.sensor, c.std, c.known_ns, c.end_ns) for c in known)
+    varied = (c for c in changes if math.isfinite(c.std))
+    away = (shifted(given, c.sensor, c.std, c.known_ns, c.end_ns) for c in varied)
     return [run_estimator(estimator, signals).vy_m_s for signals in away]
 
 

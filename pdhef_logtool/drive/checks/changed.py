@@ -17,17 +17,17 @@ def change_checks(changes: Iterable[SensorChange], start_ns: int) -> list[Check]
     """Return a failed check for each signal with changes; their times are in s from the log's start."""
     texts: dict[str, list[str]] = {}
     for c in changes:
-        start, known, end = ((t - start_ns) * 1e-9 for t in (c.start_ns, c.known_ns, c.end_ns))
+        start, decided, end = ((t - start_ns) * 1e-9 for t in (c.start_ns, c.known_ns, c.end_ns))
         unit = SIGNAL_UNITS[c.sensor]
         if c.kind == "jump":
             text = (
-                f"its bias jumps by {c.size:.3f} +- {c.std:.3f} {unit} at {start:.2f} s, corrected from {known:.2f} s"
+                f"its bias jumps by {c.size:.3f} +- {c.std:.3f} {unit} at {start:.2f} s, corrected from {decided:.2f} s"
             )
         else:
             instead = (
                 "missing" if math.isnan(c.std) else f"replaced by the steering of the yaw rate (+- {c.std:.4f} rad)"
             )
-            text = f"it is stuck at {c.size:.4f} {unit} from {start:.2f} to {end:.2f} s, {instead} from {known:.2f} s"
+            text = f"it is stuck at {c.size:.4f} {unit} from {start:.2f} to {end:.2f} s, {instead} from {decided:.2f} s"
         texts.setdefault(c.sensor, []).append(text)
     return [CHANGE.failed("; ".join(text), name, waive=name) for name, text in texts.items()]
 
