@@ -15,7 +15,7 @@ it, in units of the same statistic in the drive so far:
 * frozen: a value repeats for longer than the share of repetitions so far explains by chance (probability
   ``CHANCE``), while the other sensors show that it changes: the steering relation, or a_x for the speed.
 
-The decision is made ``DECIDED_S`` after the change, from samples up to then, and corrections begin then, so that
+The decision is made ``DECIDED_CELLS`` after the change, from samples up to then, and corrections begin then, so that
 causal estimators stay causal.
 """
 
@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,7 +37,9 @@ CELL_S, MEAN_CELLS, PART_CELLS, PARTS = 0.05, 5, 9, 3
 #: The largest statistic of this many cells is the time of the change.
 PEAK_CELLS = 5
 WINDOW_CELLS = MEAN_CELLS + PARTS * PART_CELLS
-DECIDED_S = (WINDOW_CELLS + PEAK_CELLS + 1) * CELL_S
+DECIDED_CELLS = WINDOW_CELLS + PEAK_CELLS + 1
+#: Longest time between samples that has its cells; longer gaps take as many.
+LONGEST_GAP_S = 1.0
 #: Cells of driving before the first decision, and the speed above which the relations apply.
 LEAST_CELLS, LEAST_SPEED_M_S = 40, 3.0
 #: Alarm level and level of confirmation in standard deviations of a statistic, and the least standard deviations.
@@ -102,13 +104,13 @@ class _Relation(NamedTuple):
 
     def residual(self, table: FloatArray) -> FloatArray:
         """Return the part of the first column of a table [n, 1 + m] that the others do not explain, [n]."""
-        return table[:, 0] - (table[:, 1:] * self.fit).sum(axis=1)
+        return np.asarray(table[:, 0] - (table[:, 1:] * self.fit).sum(axis=1))
 
     def leverage(self, change: FloatArray) -> FloatArray:
         """Return the factor on the 1-sigma of a residual that an uncertain fit has for changed regressors [n, m]."""
-        finite = np.nan_to_num(change)
-        share = (finite * np.linalg.solve(self.information, finite[..., None])[..., 0]).sum(axis=1)
-        return np.sqrt(1.0 + INDEPENDENT_CELLS * share)
+        change = np.nan_to_num(change)
+        share = (change * np.linalg.solve(self.information, change[..., None])[..., 0]).sum(axis=1)
+        return np.asarray(np.sqrt(1.0 + INDEPENDENT_CELLS * share))
 
 
 def find_changes(signals: Signals, ignored: Collection[str] = ()) -> tuple[Signals, tuple[SensorChange, ...]]:
@@ -139,7 +141,15 @@ def shifted(signals: Signals, name: str, by: float, start_ns: int, end_ns: int) 
 
 
 def _cell_of(signals: Signals) -> IntArray:
-    return ((signals.stamps_ns - signals.stamps_ns[0]) // round(CELL_S * 1e9)).astype(np.int64)
+    """Return the cell of each stamp [N]."""
+    steps_ns = np.diff(signals.stamps_ns, prepend=signals.stamps_ns[0])
+    return np.asarray(np.cumsum(np.minimum(steps_ns, round(LONGEST_GAP_S * 1e9))) // round(CELL_S * 1e9))
+
+
+def _time_of(signals: Signals, cell: int) -> int:
+    """Return the first stamp in a cell or behind it."""
+    row = int(np.searchsorted(_cell_of(signals), cell))
+    return int(signals.stamps_ns[row]) if row < len(signals) else int(signals.stamps_ns[-1]) + 1
 
 
 def _cells(signals: Signals) -> _Cells:
@@ -178,7 +188,8 @@ def _relations(cells: _Cells) -> tuple[_Relation, _Relation]:
     one, turning = np.ones_like(v), v * r
 
     def rate(column: FloatArray) -> FloatArray:
-        return (column - np.concatenate([np.full(MEAN_CELLS, np.nan), column[:-MEAN_CELLS]])) / (MEAN_CELLS * CELL_S)
+        before = np.concatenate([np.full(MEAN_CELLS, np.nan), column[:-MEAN_CELLS]])[: len(column)]
+        return np.asarray((column - before) / (MEAN_CELLS * CELL_S))
 
     kinematics = np.stack([ay, one, turning, rate(r), rate(turning), v * rate(turning)], axis=1)
     return _fitted(kinematics), _fitted(np.stack([steer, one, r / v, turning, rate(r)], axis=1))
@@ -186,7 +197,7 @@ def _relations(cells: _Cells) -> tuple[_Relation, _Relation]:
 
 def _fitted(table: FloatArray) -> _Relation:
     """Regress the first column of a table [n, 1 + m] on the others, over the rows before each."""
-    finite = np.isfinite(table).all(axis=1)
+    finite = np.asarray(np.isfinite(table).all(axis=1))
     rows = np.where(finite[:, None], table, 0.0)
     products = np.cumsum(rows[:, :, None] * rows[:, None, :], axis=0)
     products = np.concatenate([np.zeros_like(products[:1]), products[:-1]])
@@ -259,9 +270,9 @@ def _sample_steps(signals: Signals) -> tuple[FloatArray, IntArray]:
     values, stamps, cell = signals.yaw_rate_rad_s[finite], signals.stamps_ns[finite], _cell_of(signals)[finite]
     count = int(_cell_of(signals)[-1]) + 1
     largest, stamp_ns = np.zeros(count), np.zeros(count, np.int64)
-    if len(values) < 5:
+    half = max(2, round(STEP_S * 1e9 / float(np.median(np.diff(stamps))))) if len(stamps) > 1 else 2
+    if len(values) < 2 * half:
         return largest, stamp_ns
-    half = max(2, round(STEP_S * 1e9 / max(float(np.median(np.diff(stamps))), 1.0)))
     place = np.arange(2 * half) - (half - 0.5)
     weights = np.linalg.pinv(np.stack([np.ones(2 * half), place, 0.5 * np.sign(place)], axis=1))[2]
     steps = np.convolve(values, weights[::-1], "valid")
@@ -273,7 +284,7 @@ def _sample_steps(signals: Signals) -> tuple[FloatArray, IntArray]:
 
 def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> SensorChange | None:
     """Return the first jump of gyro or accelerometer behind a time."""
-    cells, start_ns, end_ns = _cells(signals), int(signals.stamps_ns[0]), int(signals.stamps_ns[-1]) + 1
+    cells, end_ns = _cells(signals), int(signals.stamps_ns[-1]) + 1
     kinematics, steering = _relations(cells)
     v = _mean(np.where(cells.speed > LEAST_SPEED_M_S, cells.speed, np.nan), -PART_CELLS, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -287,18 +298,18 @@ def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> Se
         is_ay &= (np.abs(by_steer.size) < ABSENT * np.abs(by_ay.size)) & (np.abs(by_ay.size) > SURE * by_steer.std)
     is_gyro &= "yaw_rate_rad_s" not in ignored
     is_ay &= "ay_m_s2" not in ignored
-    possible = np.arange(len(v)) > (after_ns - start_ns) * 1e-9 / CELL_S + WINDOW_CELLS
+    first = _cell_of(signals)[np.searchsorted(signals.stamps_ns, after_ns)]
+    possible = np.arange(len(v)) > first + WINDOW_CELLS
     alarms = np.flatnonzero((is_gyro | is_ay) & possible)
     if not len(alarms):
         return None
     k = int(alarms[0])
-    known_ns = start_ns + round((k * CELL_S + DECIDED_S) * 1e9)
+    known_ns = _time_of(signals, k + DECIDED_CELLS)
     if is_gyro[k]:
         three = (step, step_std), (by_ay.size, by_ay.std), (by_steer.size, by_steer.std)
         return SensorChange("yaw_rate_rad_s", "jump", int(at_ns[k]), known_ns, end_ns, *_weighted(three, k))
     k += int(np.argmax(np.abs(ay.size[k : k + PEAK_CELLS + 1])))
-    jump_ns = start_ns + round(k * CELL_S * 1e9)
-    return SensorChange("ay_m_s2", "jump", jump_ns, known_ns, end_ns, float(ay.size[k]), float(ay.std[k]))
+    return SensorChange("ay_m_s2", "jump", _time_of(signals, k), known_ns, end_ns, float(ay.size[k]), float(ay.std[k]))
 
 
 def _weighted(measured: Sequence[tuple[FloatArray, FloatArray]], k: int) -> tuple[float, float]:
@@ -320,7 +331,7 @@ def _without_stuck(signals: Signals, names: Sequence[str]) -> tuple[Signals, lis
     _, steering = _relations(cells)
     error = _std_so_far(steering.residual(steering.table), 0.0)
     travelled = np.cumsum(np.nan_to_num(cells.ax)) * CELL_S
-    columns: dict[str, FloatArray] = {name: getattr(signals, name).copy() for name in names}
+    columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in names}
     for name, column in columns.items():
         for start, end, first in _long_runs(signals, name, cells):
             k0, k = cell[start], np.arange(cell[start], cell[end - 1] + 1)
@@ -335,7 +346,7 @@ def _without_stuck(signals: Signals, names: Sequence[str]) -> tuple[Signals, lis
             missed = first + np.flatnonzero(np.abs(change[first:]) > limit)
             if not len(missed):
                 continue
-            known_ns = int(signals.stamps_ns[0]) + round((k[missed[0]] + 1) * CELL_S * 1e9)
+            known_ns = _time_of(signals, k[missed[0]] + 1)
             rows = np.arange(start, end)[signals.stamps_ns[start:end] >= known_ns]
             column[rows] = expected[np.maximum(cell[rows] - 1 - k0, 0)]
             start_ns, end_ns = (int(signals.stamps_ns[i]) for i in (start, end - 1))
