@@ -9,7 +9,7 @@ Two relations that every car on wheels obeys are fitted to the drive so far, by 
 At each cell, a generalised likelihood ratio test compares the residuals in the windows after it with the window before
 it, in units of the same statistic in the drive so far:
 
-* gyro: its own samples have a step, and both residuals have the step that follows from it;
+* gyro: its samples have a step that the kinematic residual confirms and the steering residual does not contradict;
 * a_y: the residual of the kinematics has a flat step, and steering and gyro agree that the car did not change its
   motion. A slide moves the steering residual too; a banked road begins slowly.
 * frozen: a value repeats for longer than the share of repetitions so far explains by chance (probability
