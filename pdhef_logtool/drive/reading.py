@@ -9,11 +9,13 @@ from typing import Self
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.drive.checks.changed import CHANGE_SUFFIX, change_checks
 from pdhef_logtool.drive.friction import FrictionSource, friction_source
 from pdhef_logtool.drive.model_file import CLOCK_START_S, ModelFile, is_device_clock, load_model
 from pdhef_logtool.drive.options import AS_IT_IS, AUTO, OFF, ReadOptions, time_slice
 from pdhef_logtool.drive.plan import DrivePlan, plan_drive
 from pdhef_logtool.drive.recorded import Recorded, read_recorded
+from pdhef_logtool.drive.sensor_changes import SensorChange
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput, Logs, check_unchanged, find_logs, identity_of, log_state
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -44,13 +46,17 @@ Adjust = Callable[[DriveLog, Mapping, Tell], Mapping]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WholeDrive:
-    """A drive in memory: signals [N], and the ground truth [N] at their stamps (None for a log without it)."""
+    """A drive in memory: signals [N], and the ground truth [N] at their stamps (None for a log without it).
+
+    ``changes`` : of the sensors in mid-drive; the signals are corrected for them.
+    """
 
     name: str
     plan: DrivePlan
     signals: Signals
     truth: StateTrack | None
     log_start_ns: int
+    changes: tuple[SensorChange, ...] = ()
 
     @property
     def seconds(self) -> float:
@@ -140,8 +146,9 @@ class Drive:
 
     @property
     def checks(self) -> tuple[Check, ...]:
-        """Checks of signals, ground truth and vehicle file; waived checks are marked."""
-        return _checks_of(self.plan, self.options)
+        """Checks of signals, ground truth and vehicle file, after reading also of changes; waived checks are marked."""
+        changes = () if self._recorded is None else self._recorded.changes
+        return (*_checks_of(self.plan, self.options), *change_checks(changes, self.log.start_ns))
 
     @property
     def sha256(self) -> str:
@@ -200,12 +207,16 @@ class Drive:
             raise no_samples(self.path)
         if fill_friction:
             signals = self.friction.fill(signals, truth)
-        return WholeDrive(self.name, self.plan, signals, truth, self.log.start_ns)
+        return WholeDrive(self.name, self.plan, signals, truth, self.log.start_ns, recorded.changes)
 
     def recorded(self) -> Recorded:
         """Return the drive as recorded, which may be empty."""
         if self._recorded is None or self._recorded.plan is not self.plan:
-            self._recorded = read_recorded(self.log, self.plan)
+            unchanged = [n.removesuffix(CHANGE_SUFFIX) for n in self.options.waived]
+            self._recorded = read_recorded(self.log, self.plan, unchanged)
+            for check in change_checks(self._recorded.changes, self.log.start_ns):
+                if (text := _failed_text(check)) not in self.notes:
+                    self.tell(text)
         return self._recorded
 
     def close(self) -> None:
@@ -358,11 +369,16 @@ def _checks_of(plan: DrivePlan, options: ReadOptions) -> tuple[Check, ...]:
     return tuple(replace(c, waived=True) if c.name in options.waived else c for c in plan.checks)
 
 
+def _failed_text(check: Check) -> str:
+    return f"check {check.name} failed{' (waived)' if check.waived else ''}: {check.evidence}; {check.remedy}"
+
+
 def _tell_doubts(plan: DrivePlan, options: ReadOptions, tell: Tell) -> None:
     for check in _checks_of(plan, options):
         if check.verdict == "failed":
-            tell(f"check {check.name} failed{' (waived)' if check.waived else ''}: {check.evidence}; {check.remedy}")
-    for name in sorted(set(options.waived) - {c.name for c in plan.checks}):
+            tell(_failed_text(check))
+    unknown = {n for n in options.waived if not n.endswith(CHANGE_SUFFIX)} - {c.name for c in plan.checks}
+    for name in sorted(unknown):
         tell(f"--waive {name}: no check of this log is called that")
     for channel in (c for c in plan.alignment.channels if c.clock == "stamp"):
         source = plan.mapping.signals[channel.name].label

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection
 from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, replace
 
@@ -12,6 +13,7 @@ from pdhef_logtool.car.vehicle import correct_signals
 from pdhef_logtool.drive.alignment import align, count_late
 from pdhef_logtool.drive.channel_hash import channels_sha256
 from pdhef_logtool.drive.plan import DrivePlan
+from pdhef_logtool.drive.sensor_changes import SensorChange, find_changes
 from pdhef_logtool.drive.truth import derive_truth, truth_at
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, clock_key, merge_losses, read_signals
@@ -38,6 +40,7 @@ class Recorded:
     ----------
     signals, truth : [N] at the same stamps; N may be 0, and ``truth`` is None without ground truth.
     samples : number of used messages, by source. ledger : used and dropped samples of each mapped signal.
+    changes : of the sensors in mid-drive, corrected in ``signals``.
     signals_sha256, truth_sha256 : hashes of the channels' content; None without samples.
     """
 
@@ -47,12 +50,13 @@ class Recorded:
     losses: tuple[Loss, ...]
     samples: dict[str, int]
     ledger: tuple[SampleCount, ...]
+    changes: tuple[SensorChange, ...]
     signals_sha256: str | None
     truth_sha256: str | None
 
 
-def read_recorded(log: DriveLog, plan: DrivePlan) -> Recorded:
-    """Read the slice of a plan once, align it and derive the ground truth."""
+def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = ()) -> Recorded:
+    """Read the slice of a plan once, align it and derive the ground truth; ``unchanged`` sensors are not corrected."""
     log.keep_no_more()
     part = read_signals(log, plan.mapping, plan.clocks, plan.start_ns, plan.end_ns)
     channels = [*part.signals.values(), *part.truth.values()]
@@ -61,7 +65,8 @@ def read_recorded(log: DriveLog, plan: DrivePlan) -> Recorded:
         samples[channel.source] += len(channel)
     stamps = [c.stamps_ns for c in part.signals.values() if len(c)]
     start_ns, end_ns = (min(int(s[0]) for s in stamps), max(int(s[-1]) for s in stamps) + 1) if stamps else (0, 0)
-    signals = correct_signals(align(part.signals, plan.alignment, start_ns, end_ns), plan.vehicle)
+    aligned = correct_signals(align(part.signals, plan.alignment, start_ns, end_ns), plan.vehicle)
+    signals, changes = find_changes(aligned, unchanged)
     late = []
     for name, count in count_late(part.signals, plan.alignment, start_ns, end_ns).items():
         part.counts["signal", name]["late"] += count
@@ -84,6 +89,7 @@ def read_recorded(log: DriveLog, plan: DrivePlan) -> Recorded:
         losses=losses,
         samples=dict(samples),
         ledger=sample_ledger(log, plan, part.counts),
+        changes=changes,
         signals_sha256=channels_sha256(part.signals, mapping.signals),
         truth_sha256=channels_sha256(part.truth, mapping.truth),
     )

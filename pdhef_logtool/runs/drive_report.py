@@ -18,7 +18,7 @@ from pdhef_logtool.estimators.base import notes_of
 from pdhef_logtool.estimators.presets import calibration_of
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.evaluation.dependence import day_and_route
-from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
+from pdhef_logtool.evaluation.reasons import Interval, SensorFault, sensor_faults
 from pdhef_logtool.evaluation.standing import standings
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.ledger import SampleCount
@@ -96,10 +96,18 @@ def _estimator_entries(run: PreparedDrive, scored: Evaluation) -> Iterator[dict[
 
 
 def _faults(run: PreparedDrive, main: str, read: Callable[[str], StateTrack | None]) -> tuple[SensorFault, ...] | None:
-    """Return the sensor faults that the selected estimate detects, or else physics; None where neither detects any."""
+    """Return the changes of the sensors, and the faults that the selected estimate detects, or else physics.
+
+    None without changes where neither detects any.
+    """
     tracks = [read(name) for name in dict.fromkeys((main, PHYSICS)) if name in run.names]
     detected = (sensor_faults(track) for track in tracks if track is not None)
-    return next((faults for faults in detected if faults is not None), None)
+    faults = next((faults for faults in detected if faults is not None), None)
+    changes = tuple(
+        SensorFault(c.sensor, c.kind, 1, (c.end_ns - c.start_ns) * 1e-9, (Interval(c.start_ns, c.end_ns),))
+        for c in run.drive.recorded().changes
+    )
+    return (*changes, *(faults or ())) if changes or faults is not None else None
 
 
 def _rivals(run: PreparedDrive, name: str, estimated: Estimated) -> list[str]:

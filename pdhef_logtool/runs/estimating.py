@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -9,10 +10,11 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import WholeDrive
+from pdhef_logtool.drive.sensor_changes import SensorChange, shifted
 from pdhef_logtool.drive.truth import valid_as_a_whole
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.calibrated_band import CalibratedBand
+from pdhef_logtool.estimators.calibrated_band import CalibratedBand, widened
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.intervals import TrackCalibrator
@@ -22,7 +24,7 @@ from pdhef_logtool.estimators.presets import SELF_CALIBRATED, preset_of, uses_ca
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import dead_reckon
 from pdhef_logtool.records.readings import without_impossible_states
-from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 from pdhef_logtool.results.sink import TRUTH
@@ -83,12 +85,11 @@ def estimate_drive(
     for number, (estimator, computation) in enumerate(zip(estimators, computations, strict=True)):
         progress(number / len(estimators))
         try:
+            given = corrected.of_estimator(estimator.name)
             track = shared.pop(computation, None)
             if track is None:
-                track = run_estimator(estimator, corrected.of_estimator(estimator.name), causality)
-            if computation in computations[number + 1 :]:
-                shared[computation] = track
-            track = replace(track, name=estimator.name)
+                track = run_estimator(estimator, given, causality)
+            varied = _varied(estimator, given, drive.changes)
         except EstimatorError as error:
             if causality is None:
                 raise
@@ -96,9 +97,15 @@ def estimate_drive(
             continue
         if causality is not None and estimator.name in causality.failed:
             continue
-        track = without_impossible_states(track)
+        if computation in computations[number + 1 :]:
+            shared[computation] = track
+        track = without_impossible_states(replace(track, name=estimator.name))
         track = watched_track(track, signals, vehicle) if watched else track
+        compared = [track.vy_m_s, *varied]
         track = track if intervals is None else intervals.apply(track, signals)
+        if varied:
+            none = np.zeros(len(track))
+            track = widened(track, compared, none, vehicle.low_speed_blend_m_s, own_share=1.0)
         track = track.without_sideslip_below(vehicle.standstill_m_s)
         tracks[track.name] = dead_reckoned(track, start) if drawn else track
     return Estimated(signals, truth, drawn_truth, tracks)
@@ -107,6 +114,13 @@ def estimate_drive(
 def _computation(estimator: Estimator, signals: Signals) -> tuple[str, int]:
     """Return a key that estimators share which compute the same: without a network ``pd-hef`` is ``physics``."""
     return (estimator.name if package_of(estimator) else resolve(estimator).sha256), id(signals)
+
+
+def _varied(estimator: Estimator, given: Signals, changes: Sequence[SensorChange]) -> list[FloatArray]:
+    """Return v_y [N] of an estimator on signals whose corrected sensors are one 1-sigma away, one by one."""
+    varied = (c for c in changes if math.isfinite(c.std))
+    away = (shifted(given, c.sensor, c.std, c.known_ns, c.end_ns) for c in varied)
+    return [run_estimator(estimator, signals).vy_m_s for signals in away]
 
 
 def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:

@@ -10,6 +10,7 @@ from pdhef_logtool.records.entries import load_entries
 #: Modules of this package that export ``CHECKS``. Add the name of a new one here.
 MODULES = (
     "mounting",
+    "changed",
     "by_relations",
     "magnitude",
     "level",

@@ -1,0 +1,130 @@
+"""A sensor that changes in mid-drive is named with time and size, corrected, and costs the interval its certainty."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.drive.sensor_changes import SensorChange, find_changes
+from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.runs.estimating import estimate_drive
+from studies.peers.drives import PEER_DRIVES, mapping_of, read_peer_drive, vehicle_of
+from tests.command_line import called
+from tests.run_report import follows
+
+AT_S = 40.0
+#: Sensor, kind and size of a change; its size is the jump, or NaN for a value that is stuck.
+CHANGES = [
+    ("yaw_rate_rad_s", 0.05), ("yaw_rate_rad_s", -0.05), ("ay_m_s2", 1.0), ("ay_m_s2", -1.0), ("steer_rad", np.nan),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def road(sample_logs_dir: Path) -> Signals:
+    """Return 80 s of a simulated country road [8000]."""
+    with read_drive(sample_logs_dir / "road.mcap", sample_logs_dir / "vehicle.toml") as drive:
+        return drive.whole().signals.rows(8000, 16000)
+
+
+def seconds(signals: Signals) -> Any:
+    return (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
+
+
+def changed(signals: Signals, name: str, jump: float, since_s: float = AT_S) -> Signals:
+    """Return signals with a jump of one sensor, or with its value stuck where the jump is NaN."""
+    column, late = getattr(signals, name), seconds(signals) >= since_s
+    other = column[np.flatnonzero(late)[0]] if np.isnan(jump) else column + jump
+    return replace(signals, **{name: np.where(late & np.isfinite(column), other, column)})
+
+
+def only(signals: Signals) -> tuple[Signals, SensorChange]:
+    sound, (change,) = find_changes(signals)
+    return sound, change
+
+
+@pytest.mark.parametrize(("name", "jump"), CHANGES)
+def test_a_change_is_named_and_corrected(road: Signals, name: str, jump: float) -> None:
+    sound, change = only(changed(road, name, jump))
+    stuck = np.isnan(jump)
+    assert (change.sensor, change.kind) == (name, "stuck" if stuck else "jump")
+    start_s, decided_s = ((t - road.stamps_ns[0]) * 1e-9 for t in (change.start_ns, change.known_ns))
+    assert start_s == pytest.approx(AT_S, abs=0.15)
+    assert decided_s < AT_S + (10.0 if stuck else 2.0)  # a straight road does not show that the steering is stuck
+    if not stuck:
+        assert abs(change.size - jump) < 3.0 * change.std < abs(jump)
+    after = seconds(road) > decided_s
+    error = (getattr(sound, name) - getattr(road, name))[after]
+    assert np.sqrt(np.nanmean(error**2)) < (0.004 if stuck else 0.25 * abs(jump))
+
+
+@pytest.mark.parametrize(("name", "jump"), [(CHANGES[0]), CHANGES[2], CHANGES[4]])
+def test_a_correction_uses_earlier_samples_alone(road: Signals, name: str, jump: float) -> None:
+    signals = changed(road, name, jump)
+    whole, change = only(signals)
+    for after_s in (-1.0, 0.05, 3.0):
+        count = int(np.searchsorted(signals.stamps_ns, change.known_ns + round(after_s * 1e9)))
+        part, _ = find_changes(signals.rows(0, count))
+        np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[:count])
+
+
+def test_a_sound_drive_stays_as_it_is(road: Signals) -> None:
+    assert find_changes(road)[0] is road
+    assert find_changes(road.rows(0, 1))[1] == ()
+
+
+def test_a_waived_sensor_is_not_changed(road: Signals) -> None:
+    signals = changed(road, "ay_m_s2", 1.0)
+    assert find_changes(signals, ["ay_m_s2"])[0] is signals
+
+
+def test_a_bank_that_begins_slowly_is_no_jump(road: Signals) -> None:
+    ramp = np.clip((seconds(road) - AT_S) / 1.5, 0.0, 1.0)
+    assert find_changes(replace(road, ay_m_s2=road.ay_m_s2 + 1.2 * ramp))[1] == ()
+
+
+def test_a_recorded_steering_that_freezes_is_named(shared_dir: Path) -> None:
+    """The steering repeats one value for the last 2 s, while the car comes out of a bend at 17 m/s."""
+    (drive,) = (d for d in PEER_DRIVES if d.log == "stanford_wet_1.mcap")
+    folder = shared_dir / "data" / "drives"
+    read = read_peer_drive(folder / drive.log, vehicle_of(drive, folder), mapping_of(drive, folder))
+    (change,) = read.changes
+    assert (change.sensor, change.kind) == ("steer_rad", "stuck")
+    assert change.end_ns - change.start_ns == pytest.approx(1.98e9, abs=0.1e9)
+
+
+def test_the_interval_is_wider_from_a_correction_on(sample_logs_dir: Path) -> None:
+    car = Car.load(sample_logs_dir / "vehicle.toml")
+    with read_drive(sample_logs_dir / "sweep.mcap", car) as drive:
+        sound = drive.whole()
+    middle_ns = int(sound.signals.stamps_ns[600])
+    change = SensorChange(
+        "yaw_rate_rad_s", "jump", middle_ns, middle_ns, int(sound.signals.stamps_ns[-1]) + 1, 0.05, 0.01
+    )
+    changed = replace(sound, changes=(change,))
+    physics = make_estimator("physics", car)
+    before, after = (estimate_drive(d, car, [physics]).tracks["physics"] for d in (sound, changed))
+    np.testing.assert_array_equal(after.vy_m_s, before.vy_m_s)
+    np.testing.assert_array_equal(after.sideslip_std_rad[:600], before.sideslip_std_rad[:600])
+    assert np.nanmean((after.sideslip_std_rad / before.sideslip_std_rad)[700:]) > 1.02
+
+
+@pytest.mark.slow
+def test_a_run_names_the_change(tmp_path: Path) -> None:
+    log, out = tmp_path / "road.mcap", tmp_path / "out"
+    fault = ("--fault", "bias0.05:yaw_rate:12:end")
+    assert called("simulate", "road", "--duration", 25, "--seed", 3, *fault, "-o", log).returncode == 0
+    ran = called("run", log, "-o", out, "-e", "physics", "--calibrate", "off")
+    assert ran.returncode == 3, ran.stderr
+    assert "yaw_rate_rad_s.change: its bias jumps by 0.05" in ran.stdout
+    report = json.loads((out / "logs" / "road" / "report.json").read_text())
+    follows(report)
+    assert [(f["sensor"], f["kind"]) for f in report["faults"]] == [("yaw_rate_rad_s", "jump")]
+    assert "yaw_rate_rad_s.change" in (out / "logs" / "road" / "report.html").read_text()
