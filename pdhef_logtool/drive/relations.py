@@ -24,12 +24,16 @@ COURSE_RATE = "truth.y_m"
 TURNING = "truth.yaw_rad"
 #: Column of the course rate of a GNSS receiver's velocity.
 GNSS_COURSE_RATE = "gnss_course_rate_rad_s"
+#: Columns of the course rate and the speed of a GNSS receiver's positions; their sign is that of the longitude.
+GNSS_PATH = "gnss_path_rate_rad_s", "gnss_path_speed_m_s"
 #: Columns of the velocity along the axes of the ground-truth positions.
 POSITION = "truth.position_vx_m_s", "truth.position_vy_m_s"
 #: A side that moves by more than this must also move the other side. Crossfall and grade alone move an accelerometer by
 #: less (5 % are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
 MOVES_M_S2 = 1.0
 MOVES_RAD_S = 0.06
+#: 1-sigma of the offset of a gyro, and of an accelerometer on a crossfall.
+BIAS_RAD_S, BIAS_M_S2 = 0.01, 0.5
 #: Gains that tyres, roll, bank, grade and noise explain; outside, a unit is wrong.
 GAIN_RANGE = (0.55, 1.8)
 #: The same quantity measured twice.
@@ -89,13 +93,13 @@ def measured_relations(
         relations += _wheel_differences(columns, speed_name, speed)
         relations += _courses(of_path, speed)
     relations += _poses(of_path)
-    rate = ("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S)
-    twice = (("truth.yaw_rate_rad_s", *rate), (TURNING, *rate), ("truth.ay_m_s2", "ay_m_s2", GAIN_RANGE, MOVES_M_S2))
-    for other, name, expected, moves in twice:
+    rate = ("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S, BIAS_RAD_S)
+    lateral = ("truth.ay_m_s2", "ay_m_s2", GAIN_RANGE, MOVES_M_S2, BIAS_M_S2)
+    for other, name, expected, moves, bias in (("truth.yaw_rate_rad_s", *rate), (TURNING, *rate), lateral):
         if name in columns and other in columns:
             text = f"{other} against {name}"
             sides, everywhere = (columns[name], columns[other]), np.ones(columns[name].shape[0], np.bool_)
-            relations += compare(text, {other: 1, name: -1}, *sides, everywhere, expected, moves=moves)
+            relations += compare(text, {other: 1, name: -1}, *sides, everywhere, expected, moves=moves, bias=bias)
     bends = {"ay_m_s2", "yaw_rate_rad_s"}
     agree = any(r.tells and r.accepts() for r in relations if r.powers.keys() >= bends)
     axle = _axle_sideslips(columns, vehicle, speed_name, agree)
@@ -116,16 +120,19 @@ def compare(
     moves: float | None = None,
     either: bool = True,
     gentle: BoolArray | None = None,
+    bias: float = math.inf,
 ) -> list[Relation]:  # positional: the two sides of a relation and their expected gain
     """Return the relation between two columns where ``use`` and both are finite; an empty list without driving.
 
     ``moves``: both sides have one unit, and a side that moves by more than this, 1-sigma, must move the other; with
     ``either`` False only the reference must move the measured side. ``gentle``: samples of gentle driving. The relation
     of these is returned if only it is plausible: a wrong sign, unit or axis is wrong everywhere, sliding is not.
+    ``bias``: 1-sigma of the offset between the sides. The means count as far as they exceed it: on a circle the mean is
+    the signal.
     """
     if gentle is not None:
-        relations = compare(text, powers, reference, measured, use, expected, moves=moves)
-        at_ease = compare(text, powers, reference, measured, gentle, expected, moves=moves)
+        relations = compare(text, powers, reference, measured, use, expected, moves=moves, bias=bias)
+        at_ease = compare(text, powers, reference, measured, gentle, expected, moves=moves, bias=bias)
         is_right = all(r.accepts() and not r.unrelated for r in relations)
         return at_ease if not is_right and at_ease and all(r.tells and r.accepts() for r in at_ease) else relations
     use = use & np.isfinite(reference) & np.isfinite(measured)
@@ -140,10 +147,17 @@ def compare(
     if min(spread_a, spread_b) <= 1e-12:
         return [Relation(text, powers, 0.0, float("nan"), expected, samples, both)]
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
-    # The ratio of the spreads lies between the two regressions, because either side may be noisy.
-    gain = float(np.copysign(spread_b / spread_a, correlation))
-    # The gain of a block with fewer samples is random.
-    blocks = block_gains(a, b, min(BLOCKS, max(1, int(samples / MIN_SAMPLES))))
+    left, mean_a, mean_b = (1.0 - correlation**2) * spread_b**2, reference[use].mean(), measured[use].mean()
+    # Weight of the means in a regression with a normal prior of the offset.
+    weight = left / (left + samples * bias**2)
+    of_means = math.sqrt(weight) * mean_a, math.sqrt(weight) * mean_b
+    rms_a, rms_b = math.hypot(spread_a, of_means[0]), math.hypot(spread_b, of_means[1])
+    correlation = (correlation * spread_a * spread_b + of_means[0] * of_means[1]) / (rms_a * rms_b)
+    # The ratio of the sizes lies between the two regressions, because either side may be noisy.
+    gain = float(np.copysign(rms_b / rms_a, correlation))
+    # The gain of a block with fewer samples is random, and a block on a circle has none.
+    by_means = abs(of_means[0]) > spread_a
+    blocks = () if by_means else block_gains(a, b, min(BLOCKS, max(1, int(samples / MIN_SAMPLES))))
     return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=blocks)]
 
 
@@ -156,7 +170,9 @@ def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace
         powers = {f"{prefix}ay_m_s2": 1, f"{prefix}yaw_rate_rad_s": -1, pace_name: -1}
         text = f"{prefix}ay_m_s2 against {prefix}yaw_rate_rad_s x speed"
         turns, gentle = yaw * pace, gentle_at(yaw * pace, moving)
-        relations += compare(text, powers, turns, left, moving, GAIN_RANGE, moves=MOVES_M_S2, gentle=gentle)
+        relations += compare(
+            text, powers, turns, left, moving, GAIN_RANGE, moves=MOVES_M_S2, gentle=gentle, bias=BIAS_M_S2
+        )
     if forward is not None:
         powers = {f"{prefix}ax_m_s2": 1, pace_name: -1}
         text = f"{prefix}ax_m_s2 against the derivative of the speed"
@@ -277,6 +293,12 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
             blocks=tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS)),
         )  # fmt: skip
         relations.append(replace(relation, signless=name == "truth.position_speed_m_s"))
+    if (path := columns.get(GNSS_PATH[1])) is not None and (use := moving & np.isfinite(path)).any():
+        ratios = speed[use] / path[use]
+        text, samples = f"{speed_name} over the speed of the GNSS positions", independent_samples(ratios.size)
+        blocks = tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS) if b.size)
+        ratio = float(np.median(ratios))
+        relations.append(Relation(text, {speed_name: 1}, 1.0, ratio, SAME_RANGE, samples, signless=True, blocks=blocks))
     of_wheels = any(n.startswith("wheel") and n.endswith("_rad_s") for n in columns) and speed_name == "wheel_speeds"
     fast = speed[np.abs(speed) > REVERSE_M_S * (3.0 if of_wheels else 1.0)]
     if (samples := independent_samples(fast.size)) >= 2.0 * MIN_SAMPLES:
@@ -287,7 +309,9 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
 
 def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
     """Return other measurements of the yaw rate than the gyro's, up to a factor; steering has no certain sign."""
-    references = [(n, columns[n]) for n in (COURSE_RATE, GNSS_COURSE_RATE, "truth.yaw_rate_rad_s") if n in columns]
+    references = [
+        (n, columns[n]) for n in (COURSE_RATE, GNSS_COURSE_RATE, GNSS_PATH[0], "truth.yaw_rate_rad_s") if n in columns
+    ]
     return references + ([] if speed_name is None else _axle_differences(columns, columns[speed_name]))
 
 
@@ -342,27 +366,28 @@ def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> Float
 
 
 def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relation]:
-    """Relate the yaw rates to the course rate of the ground truth, otherwise of a GNSS receiver."""
-    path = next((n for n in (COURSE_RATE, GNSS_COURSE_RATE) if n in columns), "")
-    if not path:
-        return []
-    course, signs = columns[path], {COURSE_RATE: -1} if path == COURSE_RATE else {}
-    turnings = [course]
-    if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # in a spin, the sideslip changes as well
-        turnings.append(course - direction_rate(columns["truth.vx_m_s"], columns["truth.vy_m_s"]))
-    relations = []
-    moving = _moving(columns, speed)
-    for name in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s"):
-        if name in columns:
-            text = f"{name} against the turning of the path over ground"
+    """Relate the yaw rates to the course rates of the ground truth, and of a GNSS receiver's velocity and positions."""
+    # Positions of a receiver are too noisy to show that something does not turn.
+    paths = ((COURSE_RATE, {COURSE_RATE: -1}, MOVES_RAD_S), (GNSS_COURSE_RATE, {}, MOVES_RAD_S))
+    relations, moving = [], _moving(columns, speed)
+    for path, signs, moves in (*paths, (GNSS_PATH[0], {"gnss_longitude_deg": -1}, None)):
+        if path not in columns:
+            continue
+        course = columns[path]
+        turnings = [course]
+        if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # in a spin, the sideslip changes as well
+            turnings.append(course - direction_rate(columns["truth.vx_m_s"], columns["truth.vy_m_s"]))
+        for name in (n for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns):
+            text = f"{name} against the turning of the {'course' if path == GNSS_COURSE_RATE else 'path'} over ground"
             yaw, gentle = columns[name], gentle_at(columns[name] * speed, moving)
             either = [
                 r
                 for turning in turnings
                 for r in compare(
-                    text, {name: 1, **signs}, turning, yaw, moving, GAIN_RANGE, moves=MOVES_RAD_S, gentle=gentle
+                    text, {name: 1, **signs}, turning, yaw, moving, GAIN_RANGE, moves=moves, gentle=gentle,
+                    bias=BIAS_RAD_S,
                 )
-            ]
+            ]  # fmt: skip
             relations += _best(either)
     return relations
 

@@ -35,6 +35,7 @@ _LACKS = {
     "speed_m_s": "a wheel speed, an accelerometer or ground truth to compare with, and speeding up or bends",
 }
 _BENDS = "bends to both sides at speed"
+_LACKS_FOR_SIGN = "needs a path, a course, wheel speeds or a documented sign"
 
 
 def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int = 2) -> dict[str, tuple[float, str]]:
@@ -94,8 +95,9 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
         if wrong > FAILS:
             return checks
         words = " or ".join(dict.fromkeys(h.words + " is another field" * (h.kind == "field") for h in likely))
-        are_units = not any(h.kind == "sign" for h in likely)
-        weak = f"{_lacks(name, for_unit=are_units)} to rule out that {words}"
+        are_units = not any(h.kind.endswith("sign") for h in likely)
+        lacks = _LACKS_FOR_SIGN if likely[0].kind == "open sign" else _lacks(name, for_unit=are_units)
+        weak = f"{lacks} to rule out that {words}"
         return [replace(c, verdict="undecided", remedy=c.remedy if wrong > 0.5 else weak) for c in checks]
     factors = {r.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
     usable = [r for r in relations if not math.isnan(factors[r.text])]
@@ -161,7 +163,13 @@ def _failed(
     return [kind.failed(evidence, name, remedy=remedy) for kind in wrong]
 
 
-_ASPECTS = {"sign": ("sign",), "unit": ("unit",), "foreign": ("unit",), "sign and unit": ("sign", "unit")}
+_ASPECTS = {
+    "sign": ("sign",),
+    "open sign": ("sign",),
+    "unit": ("unit",),
+    "foreign": ("unit",),
+    "sign and unit": ("sign", "unit"),
+}
 
 
 def _not_excited(name: str, relations: Sequence[Relation]) -> Check:
