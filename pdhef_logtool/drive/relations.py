@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -68,6 +68,24 @@ TRACK_M = (0.12, 3.0)
 #: front tyres slip.
 STEERING_SHARE = 0.6
 
+#: Values that no road car, race car or model car exceeds for more than a second: model cars spin at 5 rad/s and corner
+#: at 15 m/s²; a body that keeps rolling at 4 rad/s overturns; a wheel of 5 cm radius turns with 600 rad/s at 30 m/s;
+#: trucks have five turns of the steering wheel.
+MOST = {
+    **dict.fromkeys(("ax_m_s2", "ay_m_s2", "truth.ay_m_s2"), 30.0),
+    **dict.fromkeys(("yaw_rate_rad_s", "truth.yaw_rate_rad_s"), 10.0),
+    **dict.fromkeys(("roll_rate_rad_s", "pitch_rate_rad_s"), 4.0),
+    "steer_rad": 1.3,
+    "steering_wheel_rad": 20.0,
+    **dict.fromkeys(("speed_m_s", "truth.vx_m_s"), 120.0),
+    **{f"wheel_speed_{w}_m_s": 150.0 for w in WHEELS},
+    **{f"wheel_speed_{w}_rad_s": 700.0 for w in WHEELS},
+    "truth.vy_m_s": 40.0,
+    "truth.sideslip_rad": math.pi,
+}
+#: Least share of the low-passed values below the limit: shocks and spins are short; a wheel spins in the air.
+SHARE, WHEEL_SHARE = 0.95, 0.5
+
 
 def measured_relations(
     columns: Mapping[str, FloatArray], speed_name: str | None, vehicle: VehicleParameters | None = None
@@ -79,7 +97,7 @@ def measured_relations(
     columns : on the grid, SI, by signal name; names of ground truth begin with ``truth.``.
     speed_name : the column used as the speed. vehicle : of a file; None without a file.
     """
-    relations: list[Relation] = []
+    relations = list(_limits(columns))
     speed = None if speed_name is None else columns[speed_name]
     of_path = {} if any(map(is_misscaled, position_factors(columns))) else columns
     for prefix in ("", "truth."):
@@ -159,6 +177,18 @@ def compare(
     by_means = abs(of_means[0]) > spread_a
     blocks = () if by_means else block_gains(a, b, min(BLOCKS, max(1, int(samples / MIN_SAMPLES))))
     return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=blocks)]
+
+
+def _limits(columns: Mapping[str, FloatArray]) -> Iterator[Relation]:
+    """Yield a relation for each signal with values that no vehicle reaches; it needs no second signal."""
+    for name, most in MOST.items():
+        column = columns.get(name, np.empty(0))
+        finite = np.abs(column[np.isfinite(column)])
+        share = WHEEL_SHARE if name.startswith("wheel") else SHARE
+        if finite.size and (large := float(np.quantile(finite, share))) > most:
+            text = f"{1.0 - share:.0%} of {name} are above {large:.3g}, vehicles reach {most:.3g}"
+            samples = independent_samples(finite.size)
+            yield Relation(text, {name: 1}, 1.0, large / most, (0.0, 1.0), samples, signless=True)
 
 
 def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace: FloatArray) -> list[Relation]:

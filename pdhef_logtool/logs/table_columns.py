@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.table_clocks import (
+    NAMED_UNITS,
     NO_TIME,
     TIME_UNITS_NS,
     Clock,
@@ -178,7 +179,8 @@ def _grade(sheet: Sheet, name: str) -> int | None:
 def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock]) -> Clock:
     column, columns = sheet.columns[name], {name}
     if isinstance(column, np.ndarray):
-        unit = sheet.units.get(name, "") or snake(name).rpartition("_")[2]
+        text = snake(name)
+        unit = sheet.units.get(name, "") or NAMED_UNITS.get(text, text.rpartition("_")[2])
         clock = number_clock(column, unit, name, others)
     else:
         date = next((n for n in sheet.columns if n != name and _DATE.fullmatch(snake(n))), name)

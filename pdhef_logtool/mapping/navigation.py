@@ -178,7 +178,11 @@ def side_of(struct: str, leaf: str) -> str:
         return ""
     frame = next((f for f in ("ned", "enu") if f in words and words[-1] in {*"xyz"}), "")
     side = {"x": frame[:1], "y": frame[1:2], "z": frame[2:]}[words[-1]] if frame else side
-    is_speed = {"velocity", "vel", "speed"} & {*words, *words_of(struct)} or re.fullmatch("(v|vel)[neud]", short)
+    is_speed = (
+        {"velocity", "vel", "speed"} & {*words, *words_of(struct)}
+        or re.fullmatch("(v|vel)[neud]", short)
+        or words[:1] == ("v",)
+    )
     return side if is_speed else ""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
@@ -200,6 +200,7 @@ def auto_map(
     _map_navigation(draft, topics, vendors)
     _fall_back(draft, topics)
     _map_gnss(draft, topics, vendors)
+    _speed_of_receiver(draft)
     mapping = Mapping(draft.signals, draft.truth, draft.quality, "auto", tuple(draft.notes))
     mapping = replace(mapping, checks=(*draft.checks, *weighed.checks), open_signs=weighed.open_signs)
     candidates = weighed.candidates
@@ -434,7 +435,7 @@ def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
         if chosen is not None:
             draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
             draft.notes.append(f"yaw_rate_rad_s comes from the odometry {chosen.name}, as no IMU gives it")
-    if not draft.signals or any(n.startswith(("speed_m_s", "wheel_speed_")) for n in draft.signals):
+    if not draft.signals or has_speed(draft.signals):
         return
     _speed_of_navigation(draft, topics)
     if "speed_m_s" not in draft.signals:
@@ -457,6 +458,23 @@ def _speed_over_ground(draft: _Draft, topics: list[TopicInfo], twists: list[Topi
             draft.take(draft.signals, f"gnss_velocity_{name}_m_s", source.topic, path)
     draft.notes.append(f"speed_m_s comes from {source.topic}, {evidence}: it is {NEVER_NEGATIVE}")
     draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
+
+
+def _speed_of_receiver(draft: _Draft) -> None:
+    """Take the speed as the length of a receiver's velocity if no other source gives one."""
+    velocity = [draft.signals.get(f"gnss_velocity_{n}_m_s") for n in ("east", "north")]
+    paths = tuple(s.field for s in velocity if s is not None and isinstance(s.field, str))
+    scales = tuple(s.scale for s in velocity if s is not None and isinstance(s.scale, float))
+    if has_speed(draft.signals) or velocity[0] is None or len(paths) < len(velocity) or len({*scales}) != 1:
+        return
+    source = replace(velocity[0], name="speed_m_s", field=paths, scale=scales, combine="norm")
+    draft.signals["speed_m_s"] = source
+    draft.notes.append(f"speed_m_s comes from {source.topic}: it is {NEVER_NEGATIVE}")
+
+
+def has_speed(signals: Collection[str]) -> bool:
+    """Return whether signals contain a speed or wheel speeds."""
+    return any(n.startswith(("speed_m_s", "wheel_speed_")) for n in signals)
 
 
 def _speed_of_navigation(draft: _Draft, topics: list[TopicInfo]) -> None:

@@ -143,6 +143,7 @@ def _failed(
     if math.isnan(mistakes[0].factors[name]):
         look_at = " and ".join(relations[0].powers)
         remedy = f"{SUSPICIONS[1]}: look at the field, unit and sign of {look_at}"
+        remedy += "; raw counts of a converter need its resolution" if len(relations[0].powers) == 1 else ""
         return [UNIT.failed(relations[0].evidence, name, remedy=remedy)]
     mistakes = [h for h in mistakes if not math.isnan(h.factors[name])]
     wrong = [c for a, c in (("sign", SIGN), ("unit", UNIT)) if any(a in _ASPECTS[h.kind] for h in mistakes)]
@@ -189,7 +190,7 @@ def _lacks(name: str, *, for_unit: bool = False) -> str:
 SIGN = CheckKind(
     "SIGNAL.sign",
     compares="a_y with v r, steering with curvature, v̇ with a_x, wheel speeds, wheel differences and the ground "
-    "ground truth's path with the signals that they correspond to",
+    "ground truth's path with the signals that they correspond to, and values with the limits of all vehicles",
     fails="they contradict the signal by its sign",
     remedy="{remedy}",
     lacks=f"needs {_BENDS}",

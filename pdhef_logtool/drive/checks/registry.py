@@ -11,7 +11,6 @@ from pdhef_logtool.records.entries import load_entries
 MODULES = (
     "mounting",
     "by_relations",
-    "magnitude",
     "level",
     "truth_sideslip",
     "truth_position",

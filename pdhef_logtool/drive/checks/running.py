@@ -18,7 +18,7 @@ from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import Channel
 
 #: If a check of one of these aspects fails, the channel is not the signal that it is mapped to.
-_MISREAD = frozenset({"sign", "unit", "scale", "axis", "mounting", "magnitude"})
+_MISREAD = frozenset({"sign", "unit", "scale", "axis", "mounting"})
 _BADNESS = {"passed": 0, "undecided": 1, "failed": 2}
 
 
