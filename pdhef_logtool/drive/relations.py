@@ -10,7 +10,14 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.columns import derivative, fit, independent_samples, median_known, moving_at
-from pdhef_logtool.drive.hypotheses import BLOCKS, MIN_CORRELATION, MIN_SAMPLES, Relation, block_gains
+from pdhef_logtool.drive.hypotheses import (
+    BLOCKS,
+    MIN_CORRELATION,
+    MIN_SAMPLES,
+    MOST_ENERGY,
+    Relation,
+    block_gains,
+)
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
 #: Least correlation of two residuals of a regression: they are small, and sliding changes their relation.
@@ -165,10 +172,10 @@ def compare(
     if min(spread_a, spread_b) <= 1e-12:
         return [Relation(text, powers, 0.0, float("nan"), expected, samples, both)]
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
-    left, mean_a, mean_b = (1.0 - correlation**2) * spread_b**2, reference[use].mean(), measured[use].mean()
+    left = (1.0 - correlation**2) * spread_b**2
     # Weight of the means in a regression with a normal prior of the offset.
     weight = left / (left + samples * bias**2)
-    of_means = math.sqrt(weight) * mean_a, math.sqrt(weight) * mean_b
+    of_means = [math.sqrt(weight) * float(side[use].mean()) for side in (reference, measured)]
     rms_a, rms_b = math.hypot(spread_a, of_means[0]), math.hypot(spread_b, of_means[1])
     correlation = (correlation * spread_a * spread_b + of_means[0] * of_means[1]) / (rms_a * rms_b)
     # The ratio of the sizes lies between the two regressions, because either side may be noisy.
@@ -188,7 +195,8 @@ def _limits(columns: Mapping[str, FloatArray]) -> Iterator[Relation]:
         if finite.size and (large := float(np.quantile(finite, share))) > most:
             text = f"{1.0 - share:.0%} of {name} are above {large:.3g}, vehicles reach {most:.3g}"
             samples = independent_samples(finite.size)
-            yield Relation(text, {name: 1}, 1.0, large / most, (0.0, 1.0), samples, signless=True)
+            ratio = large / most  # no sliding explains it
+            yield Relation(text, {name: 1}, 1.0, ratio, (0.0, 1.0), samples, signless=True, most_energy=2 * MOST_ENERGY)
 
 
 def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace: FloatArray) -> list[Relation]:

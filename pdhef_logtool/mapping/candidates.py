@@ -37,8 +37,6 @@ _NAVIGATION = frozenset({"gps", "gnss", "ins", "rtk"})
 _CAR_AXES = frozenset({"lat", "lateral", "long", "longitudinal", "lng", "trans", "transverse", "transversal", "down"})
 #: Controls; a steering signal in the same struct may be a control, too.
 _PEDALS = frozenset({"throttle", "brake", "gas"})
-#: Names of one struct beside which r is a yaw rate.
-_BESIDE_R = ({"vx", "vy"}, {"u", "v"}, {"v", "ay"}, {"v", "a_y"}, {"v", "delta"})
 #: Affix that distinguishes the name of a sign from the name of its magnitude.
 _SIGN = re.compile(r"(?<![A-Za-z0-9])(?:VZ|vorzeichen|sign|sgn)_|_(?:VZ|vorzeichen|sign|sgn)$", re.IGNORECASE)
 #: Limit of numeric fields in a topic. Larger topics are no sensors and would take long to examine.
@@ -228,10 +226,10 @@ def _meaning_by_names(topic: TopicInfo, info: FieldInfo, there: set[str]) -> Mea
     path = info.path
     if (gyro := re.fullmatch(r"(.*(?:^|[._]))g([xyz])", path)) and f"{gyro[1]}a{gyro[2]}" in there:
         path = f"{gyro[1]}gyro_{gyro[2]}"
-    if (rate := re.fullmatch(r"((?:.*\.)?)r", path)) and any(
-        {rate[1] + n for n in names} <= there for names in _BESIDE_R
-    ):
-        path = f"{rate[1]}yaw_rate"
+    if rate := re.fullmatch(r"((?:.*\.)?)r", path):
+        beside = {p.removeprefix(rate[1]) for p in there if p.startswith(rate[1])}
+        if {"vx", "vy"} <= beside or ("v" in beside and {"ay", "a_y"} & beside and "u" not in beside):
+            path = f"{rate[1]}yaw_rate"
     paths = dict.fromkeys((path, path.replace("[]", "[2]")))
     meanings = (meaning_of(topic.name, topic.type_name, path, info.unit) for path in paths)
     return next((meaning for meaning in meanings if meaning is not None), None)

@@ -66,7 +66,8 @@ def axes_of(
     if sense > 0.0:
         return "east, north"
     enough = np.count_nonzero(moving) >= FEWEST_CELLS
-    is_ahead = not enough or bool(np.mean((np.abs(x) > np.abs(y))[moving]) >= AHEAD_SHARE)  # a car may reverse
+    # Ahead, or in reverse for most of the drive.
+    is_ahead = not enough or max(float(np.mean((way * x > np.abs(y))[moving])) for way in (1.0, -1.0)) >= AHEAD_SHARE
     if sense < 0.0 and steps is None:  # in a slide the direction in the body's axes turns against the car, too
         return "" if is_ahead else "north, east"
     if not is_ahead:

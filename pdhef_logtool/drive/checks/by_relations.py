@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pdhef_logtool.drive.checks.kind import CheckKind
-from pdhef_logtool.drive.hypotheses import FOREIGN, Hypothesis, Posterior, Relation, units_of
+from pdhef_logtool.drive.hypotheses import FOREIGN, MOST_ENERGY, Hypothesis, Posterior, Relation, units_of
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured
 from pdhef_logtool.drive.relations import COURSE_RATE
 from pdhef_logtool.records.checks import Check
@@ -140,10 +140,10 @@ def _is_cleared(name: str, unrelated: Relation, relations: Sequence[Relation]) -
 def _failed(
     name: str, mistakes: Sequence[Hypothesis], relations: Sequence[Relation], measured: Measured
 ) -> list[Check]:
+    counts = "; raw counts of a converter need its resolution" if relations[0].most_energy > MOST_ENERGY else ""
     if math.isnan(mistakes[0].factors[name]):
         look_at = " and ".join(relations[0].powers)
-        remedy = f"{SUSPICIONS[1]}: look at the field, unit and sign of {look_at}"
-        remedy += "; raw counts of a converter need its resolution" if len(relations[0].powers) == 1 else ""
+        remedy = f"{SUSPICIONS[1]}: look at the field, unit and sign of {look_at}{counts}"
         return [UNIT.failed(relations[0].evidence, name, remedy=remedy)]
     mistakes = [h for h in mistakes if not math.isnan(h.factors[name])]
     wrong = [c for a, c in (("sign", SIGN), ("unit", UNIT)) if any(a in _ASPECTS[h.kind] for h in mistakes)]
@@ -161,7 +161,7 @@ def _failed(
     else:
         shown = [f"{h.words} ({line})" if (line := lines[h.factors[name]]) else h.words for h in mistakes]
         remedy = SUSPICIONS[0] + " or ".join(shown)
-    return [kind.failed(evidence, name, remedy=remedy) for kind in wrong]
+    return [kind.failed(evidence, name, remedy=remedy + counts) for kind in wrong]
 
 
 _ASPECTS = {
