@@ -172,7 +172,7 @@ def compare(
     if min(spread_a, spread_b) <= 1e-12:
         return [Relation(text, powers, 0.0, float("nan"), expected, samples, both)]
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
-    left = (1.0 - correlation**2) * spread_b**2
+    left = max(0.0, 1.0 - correlation**2) * spread_b**2
     # Weight of the means in a regression with a normal prior of the offset.
     weight = left / (left + samples * bias**2)
     of_means = [math.sqrt(weight) * float(side[use].mean()) for side in (reference, measured)]

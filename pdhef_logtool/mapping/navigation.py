@@ -65,15 +65,17 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool 
 def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
     """Return position, velocity or speed and course over ground by the names of a topic's fields.
 
-    A velocity must agree with the path. A heading that is the direction of the path is a course.
+    A velocity must agree with the path, if there is one. A heading that is the direction of the path is a course.
     """
     fields = log.fields(topic.name, quiet=True)
     stamp, meanings = stamp_path_of(fields), _meanings(topic, fields)
     first = {m.quantity: path for path, m in reversed(meanings.items())}
-    if not {"latitude", "longitude"} <= set(first) or is_command(topic.name):
-        return {}
-    angles = [p for q in ("course", "heading") for p, m in meanings.items() if m.quantity == q]
     velocity = next(_horizontal(fields), {})
+    if is_command(topic.name):
+        return {}
+    if not {"latitude", "longitude"} <= set(first):
+        return {s.name: s for s in (_velocity_over_ground(topic.name, stamp, velocity) if velocity else ())}
+    angles = [p for q in ("course", "heading") for p, m in meanings.items() if m.quantity == q]
     pieces = Pieces(log)
     samples = pieces.read(
         {topic.name: [*dict.fromkeys([*velocity.values(), *angles, *(first[q] for q in _PLACES.values())])]}

@@ -226,10 +226,7 @@ class _Weighing:
         best = good[0]
         if best.meaning.strength < 0.6:
             best.doubts.append("its element of the array is identified by values alone")
-        near = [f for f in good[1:] if f.score > best.score - 0.1 and not agree(best.si, f.si)]
-        if near:
-            best = self._better([best, *near])
-        self._choose(name, best, [f for f in (good[0], *near) if f is not best])
+        self._choose(name, best, [f for f in good[1:] if f.score > best.score - 0.1 and not agree(best.si, f.si)])
 
     def _choose(self, name: str, best: Field, rivals: Sequence[Field]) -> None:
         """Select a field for a signal, and record its rivals."""
@@ -248,28 +245,6 @@ class _Weighing:
                 item.reasons.append(f"its rate of change follows a_x (correlation {relation.correlation:.2f})")
                 self.fields.settle(item, relation.slope, "its rate of change against a_x", 0.4)
                 return
-
-    def _better(self, rivals: Sequence[Field]) -> Field:
-        """Return the rival that follows the other signals best; the first one without evidence."""
-        speed = self._speed()
-        if speed is None:
-            return rivals[0]
-        kind = rivals[0].meaning
-        best: tuple[float, Field] = (0.0, rivals[0])
-        for item in rivals:
-            if kind.quantity == "rate":
-                others = self.fields.all("acceleration", "y")
-                relations = [self.fields.turning(a.si, item.si, speed.si) for a in others[:3]]
-            elif kind.quantity == "acceleration" and kind.part == "y":
-                relations = [self.fields.turning(item.si, r.si, speed.si) for r in self.fields.all("rate", "z")[:3]]
-            elif kind.quantity == "acceleration":
-                relations = [fit(self.fields.pieces.rate_of(speed.si), self.fields.pieces.smooth(item.si))]
-            else:
-                continue
-            value = max((abs(r.correlation) for r in relations if r is not None), default=0.0)
-            if value > best[0] + 0.1:
-                best = (value, item)
-        return best[1]
 
     def _turn_about(self) -> None:
         """Select the yaw rate's axis by a_y ≈ v r if a_y names the car's axis and the yaw rate a device's."""
