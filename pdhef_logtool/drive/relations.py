@@ -406,9 +406,13 @@ def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> Float
 def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relation]:
     """Relate the yaw rates to the course rates of the ground truth, and of a GNSS receiver's velocity and positions."""
     # Positions of a receiver are too noisy to show that something does not turn.
-    paths = ((COURSE_RATE, {COURSE_RATE: -1}, MOVES_RAD_S), (GNSS_COURSE_RATE, {}, MOVES_RAD_S))
+    paths: tuple[tuple[str, dict[str, int], float | None], ...] = (
+        (COURSE_RATE, {COURSE_RATE: -1}, MOVES_RAD_S),
+        (GNSS_COURSE_RATE, {}, MOVES_RAD_S),
+        (GNSS_PATH[0], {"gnss_longitude_deg": -1}, None),
+    )
     relations, moving = [], _moving(columns, speed)
-    for path, signs, moves in (*paths, (GNSS_PATH[0], {"gnss_longitude_deg": -1}, None)):
+    for path, signs, moves in paths:
         if path not in columns:
             continue
         course = columns[path]

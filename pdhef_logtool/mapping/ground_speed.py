@@ -61,8 +61,9 @@ def axes_of(
     if sense > 0.0:
         return "east, north"
     enough = np.count_nonzero(moving) >= FEWEST_CELLS
-    # Ahead, or in reverse for most of the drive.
-    is_ahead = not enough or max(float(np.mean((way * x > np.abs(y))[moving])) for way in (1.0, -1.0)) >= AHEAD_SHARE
+    # A car may reverse; without a path, a direction that is often opposite shows axes of the earth.
+    ahead = x if steps is None else np.abs(x)
+    is_ahead = not enough or bool(np.mean((ahead > np.abs(y))[moving]) >= AHEAD_SHARE)
     if sense < 0.0 and steps is None:  # in a slide the direction in the body's axes turns against the car, too
         return "" if is_ahead else "north, east"
     if not is_ahead:
