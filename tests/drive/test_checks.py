@@ -14,6 +14,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import check_drive
 from pdhef_logtool.drive.checks.by_relations import relation_checks
+from pdhef_logtool.drive.checks.truth_sideslip import sideslip_offset
 from pdhef_logtool.drive.columns import columns_on_grid
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.mounting import truth_latency
@@ -490,6 +491,15 @@ def test_on_a_circle_the_mean_is_the_signal() -> None:
         (relation,) = compare("", {}, turning, mirrored, everywhere, GAIN_RANGE, bias=bias)
         assert bool(relation.correlation < -0.9) is is_shown
         assert bool(abs(relation.gain + 1.0) < 0.1) is is_shown
+
+
+def test_driving_in_reverse_is_no_offset_of_the_heading() -> None:
+    seconds = np.arange(0.0, 120.0, 0.05)
+    speed, rate = -8.0 - np.sin(0.2 * seconds), 0.1 * np.sin(0.5 * seconds)
+    columns = {"truth.vx_m_s": speed, "truth.vy_m_s": 0.3 * rate, "yaw_rate_rad_s": rate, "ay_m_s2": speed * rate}
+    wrong, right = (sideslip_offset(c) for c in (columns, {**columns, "speed_m_s": speed}))
+    assert right is not None and right[1] < 0.01
+    assert wrong is None or wrong[1] > 0.1
 
 
 def test_marks_of_invalid_values_are_no_motion() -> None:
