@@ -19,7 +19,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen
-from pdhef_logtool.mapping.naming import Meaning, is_command, meaning_of, unit_of, words_of
+from pdhef_logtool.mapping.naming import Meaning, meaning_of, unit_of, words_of
 from pdhef_logtool.mapping.path import DEGREE_M
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.signals import FloatArray
@@ -71,8 +71,6 @@ def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
     stamp, meanings = stamp_path_of(fields), _meanings(topic, fields)
     first = {m.quantity: path for path, m in reversed(meanings.items())}
     velocity = next(_horizontal(fields), {})
-    if is_command(topic.name):
-        return {}
     if not {"latitude", "longitude"} <= set(first):
         return {s.name: s for s in (_velocity_over_ground(topic.name, stamp, velocity) if velocity else ())}
     angles = [p for q in ("course", "heading") for p, m in meanings.items() if m.quantity == q]

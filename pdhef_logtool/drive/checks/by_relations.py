@@ -95,9 +95,7 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
         if wrong > FAILS:
             return checks
         words = " or ".join(dict.fromkeys(h.words + " is another field" * (h.kind == "field") for h in likely))
-        are_units = not any(h.kind.endswith("sign") for h in likely)
-        lacks = _LACKS_FOR_SIGN if likely[0].kind == "open sign" else _lacks(name, for_unit=are_units)
-        weak = f"{lacks} to rule out that {words}"
+        weak = f"{_lacks_for(name, likely)} to rule out that {words}"
         return [replace(c, verdict="undecided", remedy=c.remedy if wrong > 0.5 else weak) for c in checks]
     factors = {r.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
     usable = [r for r in relations if not math.isnan(factors[r.text])]
@@ -180,6 +178,12 @@ def _not_excited(name: str, relations: Sequence[Relation]) -> Check:
         best = max(relations, key=lambda r: abs(r.correlation))
         evidence = f"{best.text}: correlation {best.correlation:.2f} over {best.samples:.0f} independent samples"
     return SIGN.undecided(evidence, name, _lacks(name))
+
+
+def _lacks_for(name: str, mistakes: Sequence[Hypothesis]) -> str:
+    if mistakes[0].kind == "open sign":
+        return _LACKS_FOR_SIGN
+    return _lacks(name, for_unit=not any(h.kind == "sign" for h in mistakes))
 
 
 def _lacks(name: str, *, for_unit: bool = False) -> str:
