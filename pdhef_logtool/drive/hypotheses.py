@@ -61,7 +61,8 @@ class Relation:
     expected : range of plausible gains. samples : number of independent samples. moves : both sides, or one of two that
         must move together, move by more than disturbances do. signless : one side has no sign.
     least_correlation : below it the gain gives no information.
-    typical : the likeliest gain. blocks : gains of blocks of the drive, each without the block's means.
+    typical : the likeliest gain. blocks : gains of blocks of the drive, each without the block's means. most_energy :
+        largest energy of a gain.
     """
 
     text: str
@@ -75,6 +76,7 @@ class Relation:
     least_correlation: float = MIN_CORRELATION
     typical: float = 1.0
     blocks: tuple[float, ...] = ()
+    most_energy: float = MOST_ENERGY
 
     @property
     def decides_unit(self) -> bool:
@@ -122,8 +124,8 @@ class Relation:
             middle = math.log(self.typical) if low < math.log(self.typical) < high else 0.5 * (low + high)
             off = np.maximum(np.abs(size - middle) - room, 0.0)
             energy += 0.5 * (off / math.hypot(max((high - low) / 6.0, LEAST_WIDTH), apart)) ** 2
-        energy = np.minimum(energy, MOST_ENERGY)
-        mean = (energy if self.signless else np.where(gains > 0.0, energy, MOST_ENERGY)).mean(axis=1)
+        energy = np.minimum(energy, self.most_energy)
+        mean = (energy if self.signless else np.where(gains > 0.0, energy, self.most_energy)).mean(axis=1)
         return np.where(np.isnan(factors), _ANY_GAIN, mean)
 
     @property

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
-from pdhef_logtool.drive.columns import columns_on_grid, derivative, halves, median_known, moving_at
+from pdhef_logtool.drive.columns import columns_on_grid, derivative, median_known, moving_at
 from pdhef_logtool.drive.hypotheses import Posterior, Relation, known_hypotheses, posterior
 from pdhef_logtool.drive.relations import (
     CG_VY,
     COURSE_RATE,
     GNSS_COURSE_RATE,
+    GNSS_PATH,
     POSITION,
     SPIN_SHARE,
     TURNING,
@@ -21,13 +23,16 @@ from pdhef_logtool.drive.relations import (
     measured_relations,
 )
 from pdhef_logtool.drive.truth import TruthTrack, channel_of
+from pdhef_logtool.mapping.path import DEGREE_M
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
-from pdhef_logtool.records.signals import GNSS, WHEELS, Channel, FloatArray
+from pdhef_logtool.records.signals import GNSS, GNSS_POSITION, WHEELS, Channel, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Name of the column that is the mean of the wheel speeds.
 WHEEL_SPEEDS = "wheel_speeds"
 _EAST_NORTH = ("gnss_velocity_east_m_s", "gnss_velocity_north_m_s")
+#: Positions of a receiver east and north, m.
+_PATH = ("gnss_path.east", "gnss_path.north")
 _TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 
 
@@ -38,7 +43,7 @@ class Measured:
     Attributes
     ----------
     speed_name : the column used as the speed. topics : topics of the signals, by name.
-    scales : scales of the mapping, by name.
+    scales : scales of the mapping, by name. open_signs : groups of signals with an undocumented common sign.
     """
 
     columns: Mapping[str, FloatArray]
@@ -46,6 +51,7 @@ class Measured:
     relations: tuple[Relation, ...]
     topics: Mapping[str, str]
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
+    open_signs: tuple[tuple[str, ...], ...] = ()
 
     @property
     def positions(self) -> tuple[str, str]:
@@ -60,31 +66,16 @@ class Measured:
         speed = None if (self.speed_name or "").startswith("truth.") else self.speed_name
         return replace(self, columns=columns, speed_name=speed, relations=kept)
 
-    def parts(self, vehicle: VehicleParameters | None) -> Iterator[Measured]:
-        """Yield the measurements of two independent parts of the drive."""
-        cells = len(next(iter(self.columns.values()), np.empty(0)))
-        for part in halves(cells):
-            columns = {n: np.where(part, c, np.nan) for n, c in self.columns.items()}
-            related = measured_relations(columns, self.speed_name, _known(vehicle))
-            yield replace(self, columns=columns, relations=tuple(related))
-
     def without(self, names: Iterable[str]) -> Measured:
         """Return the measurements without these columns, which have no relations."""
         gone = set(names)
         columns = {n: c for n, c in self.columns.items() if n not in gone}
         return replace(self, columns=columns, topics={n: t for n, t in self.topics.items() if n not in gone})
 
-    def posterior(self, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> Posterior:
+    def posterior(self, *, mounting_is_known: bool) -> Posterior:
         """Return the probabilities of the mistakes that mappings make with these signals."""
         groups = tuple(self.groups(mounting_is_known=mounting_is_known))
-        return posterior(
-            self.relations, known_hypotheses((*self.columns,), groups, tuple(map(tuple, open_signs))), self.scales
-        )
-
-    def agrees(self, name: str, *, mounting_is_known: bool, open_signs: Sequence[tuple[str, ...]] = ()) -> bool:
-        """Return whether these relations confirm that a signal is wrong; True without an informative relation."""
-        mistakes = self.posterior(mounting_is_known=mounting_is_known, open_signs=open_signs).of(name)
-        return sum(p for p, _ in mistakes) > 0.5 or not any(r.tells and name in r.powers for r in self.relations)
+        return posterior(self.relations, known_hypotheses((*self.columns,), groups, self.open_signs), self.scales)
 
     def groups(self, *, mounting_is_known: bool) -> list[tuple[str, ...]]:
         """Return groups of signals with a common error of sign or unit: per topic, and of ground truth."""
@@ -127,7 +118,8 @@ def measure(
     # Two quantities of ground truth from the same field agree trivially.
     read = [[(of_truth[n].topic, of_truth[n].paths) for n in r.powers if n in of_truth] for r in related]
     related = [r for r, fields in zip(related, read, strict=True) if len(set(fields)) == len(fields)]
-    return Measured(columns, speed_name, tuple(related), topics, {n: s.scale for n, s in sources.items()})
+    open_signs = () if mapping is None else tuple(map(tuple, mapping.open_signs))
+    return Measured(columns, speed_name, tuple(related), topics, {n: s.scale for n, s in sources.items()}, open_signs)
 
 
 def drive_columns(
@@ -152,6 +144,9 @@ def drive_columns(
         columns[TURNING] = derivative(columns[TURNING])
     if set(_EAST_NORTH) <= set(columns):
         columns[GNSS_COURSE_RATE] = direction_rate(*(columns[n] for n in _EAST_NORTH))
+    if {*_PATH} <= columns.keys():
+        east, north = (derivative(columns.pop(n)) for n in _PATH)
+        columns |= {GNSS_PATH[0]: direction_rate(east, north), GNSS_PATH[1]: np.hypot(east, north)}
     if "truth.x_m" in columns and "truth.y_m" in columns:
         vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))
         columns |= {POSITION[0]: vx, POSITION[1]: vy, "truth.position_speed_m_s": np.hypot(vx, vy)}
@@ -160,12 +155,19 @@ def drive_columns(
 
 
 def _over_ground(channels: Mapping[str, Channel]) -> dict[str, Channel]:
-    """Return speed and course of a receiver as components, which do not jump at ±π."""
+    """Return positions of a receiver in m, and speed and course as components, which do not jump at ±π."""
+    metres: dict[str, Channel] = {}
+    if set(GNSS_POSITION) <= channels.keys():
+        latitude, longitude = (channels[n] for n in GNSS_POSITION)
+        shrunk = math.cos(math.radians(float(np.nanmedian(latitude.values))))
+        for name, place, factor in zip(_PATH, (longitude, latitude), (DEGREE_M * shrunk, DEGREE_M), strict=True):
+            values = (place.values - np.nanmedian(place.values)) * factor
+            metres[name] = replace(place, name=name, values=values)
     speed, course = (channels.get(n) for n in ("gnss_speed_m_s", "gnss_course_rad"))
     if speed is None or course is None or not np.array_equal(speed.stamps_ns, course.stamps_ns):
-        return {}
+        return metres
     sides = zip(_EAST_NORTH, (np.cos, np.sin), strict=True)
-    return {n: replace(speed, name=n, values=speed.values * side(course.values)) for n, side in sides}
+    return metres | {n: replace(speed, name=n, values=speed.values * side(course.values)) for n, side in sides}
 
 
 def _pose_velocity(truth: Mapping[str, Channel], track: StateTrack) -> dict[str, Channel]:

@@ -36,7 +36,7 @@ from pdhef_logtool.drive.frames import (
 )
 from pdhef_logtool.drive.measured import Measured, measure
 from pdhef_logtool.drive.other_fields import with_other_fields
-from pdhef_logtool.drive.relations import gentle_at, steering_references, yaw_references
+from pdhef_logtool.drive.relations import BIAS_RAD_S, compare, gentle_at, steering_references, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -262,16 +262,11 @@ def _along(measured: FloatArray, driven: FloatArray) -> bool:
 
 def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tuple[float, str]:
     """Return the correlation of the yaw rate with its best other measurement, and a text; 0 and empty without one."""
-    best, said = 0.0, ""
+    everywhere, best, said = np.ones(rate.shape, np.bool_), 0.0, ""
     for text, reference in references:
-        use = np.isfinite(rate) & np.isfinite(reference)
-        if independent_samples(int(np.count_nonzero(use))) < MIN_SAMPLES:
-            continue
-        a, b = rate[use] - rate[use].mean(), reference[use] - reference[use].mean()
-        spread = float(a.std() * b.std())
-        correlation = float(np.mean(a * b)) / spread if spread > 0.0 else 0.0
-        if abs(correlation) > max(SIGN_CORRELATION, abs(best)):
-            best, said = correlation, f", yaw rate against {text} {correlation:.2f}"
+        for relation in compare(text, {}, reference, rate, everywhere, GAIN_RANGE, bias=BIAS_RAD_S):
+            if relation.samples >= MIN_SAMPLES and abs(relation.correlation) > max(SIGN_CORRELATION, abs(best)):
+                best, said = relation.correlation, f", yaw rate against {text} {relation.correlation:.2f}"
     return best, said
 
 
@@ -544,28 +539,25 @@ def _by_frames(
 def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
     """Return the survey with undocumented signs decided, or with one wrong unit or sign corrected.
 
-    A correction must be certain, and no part of the drive may contradict it. Documented units and signs are corrected
+    A correction must be certain. Documented units and signs are corrected
     without ground truth, and each such correction is a failed check.
     """
     mapping, is_mounted, measured = survey.mapping, survey.is_mounted, survey.measured
-    groups, turned = mapping.open_signs, []
-    if groups:
-        probable = measured.posterior(mounting_is_known=is_mounted, open_signs=groups)
-        turned = [n for g in groups if probable.turned(g[0]) >= CERTAIN for n in g]
+    probable = measured.posterior(mounting_is_known=is_mounted)
+    turned = [n for g in measured.open_signs if probable.turned(g[0]) >= CERTAIN for n in g]
     factors = dict.fromkeys(turned, (-1.0, "its sign is not documented, and the drive shows it"))
     if not turned:
-        groups, measured = (), measured.without_truth()
+        measured = replace(measured, open_signs=()).without_truth()
         factors = explained_factors(measured, mounting_is_known=is_mounted, most=1)
         sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle) if factors else ({}, {})
         if shares:
             factors = explained_factors(measure(sound, vehicle=survey.vehicle), mounting_is_known=is_mounted, most=1)
-    parts = list(measured.parts(survey.vehicle)) if factors else []
     sections, notes = {"truth.": dict(mapping.truth), "": dict(mapping.signals)}, list(mapping.notes)
     checks = list(survey.corrected)
     for name, (factor, evidence) in factors.items():
         section = sections[name[:6] if name.startswith("truth.") else ""]
         source = section.get(name.removeprefix("truth."))
-        if source is not None and all(p.agrees(name, mounting_is_known=is_mounted, open_signs=groups) for p in parts):
+        if source is not None:
             section[source.name] = scaled_source(source, factor)
             notes.append(f"{name} is read with {factor:.6g} times its scale: {evidence}")
             checks += [] if turned else [_corrected(name, section[source.name], notes[-1])]

@@ -17,7 +17,7 @@ from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import PdhefError
 
-_MISREAD = (".sign", ".unit", ".axis", ".mounting", ".magnitude", ".frame", ".level")
+_MISREAD = (".sign", ".unit", ".axis", ".mounting", ".frame", ".level")
 
 
 def with_other_fields(

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.columns import derivative, fit, independent_samples, median_known, moving_at
-from pdhef_logtool.drive.hypotheses import BLOCKS, MIN_CORRELATION, MIN_SAMPLES, Relation, block_gains
+from pdhef_logtool.drive.hypotheses import (
+    BLOCKS,
+    MIN_CORRELATION,
+    MIN_SAMPLES,
+    MOST_ENERGY,
+    Relation,
+    block_gains,
+)
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
 #: Least correlation of two residuals of a regression: they are small, and sliding changes their relation.
@@ -24,12 +31,16 @@ COURSE_RATE = "truth.y_m"
 TURNING = "truth.yaw_rad"
 #: Column of the course rate of a GNSS receiver's velocity.
 GNSS_COURSE_RATE = "gnss_course_rate_rad_s"
+#: Columns of the course rate and the speed of a GNSS receiver's positions; their sign is that of the longitude.
+GNSS_PATH = "gnss_path_rate_rad_s", "gnss_path_speed_m_s"
 #: Columns of the velocity along the axes of the ground-truth positions.
 POSITION = "truth.position_vx_m_s", "truth.position_vy_m_s"
 #: A side that moves by more than this must also move the other side. Crossfall and grade alone move an accelerometer by
 #: less (5 % are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
 MOVES_M_S2 = 1.0
 MOVES_RAD_S = 0.06
+#: 1-sigma of the offset of a gyro, and of an accelerometer on a crossfall.
+BIAS_RAD_S, BIAS_M_S2 = 0.01, 0.5
 #: Gains that tyres, roll, bank, grade and noise explain; outside, a unit is wrong.
 GAIN_RANGE = (0.55, 1.8)
 #: The same quantity measured twice.
@@ -64,6 +75,24 @@ TRACK_M = (0.12, 3.0)
 #: front tyres slip.
 STEERING_SHARE = 0.6
 
+#: Values that no road car, race car or model car exceeds for more than a second: model cars spin at 5 rad/s and corner
+#: at 15 m/s²; a body that keeps rolling at 4 rad/s overturns; a wheel of 5 cm radius turns with 600 rad/s at 30 m/s;
+#: trucks have five turns of the steering wheel.
+MOST = {
+    **dict.fromkeys(("ax_m_s2", "ay_m_s2", "truth.ay_m_s2"), 30.0),
+    **dict.fromkeys(("yaw_rate_rad_s", "truth.yaw_rate_rad_s"), 10.0),
+    **dict.fromkeys(("roll_rate_rad_s", "pitch_rate_rad_s"), 4.0),
+    "steer_rad": 1.3,
+    "steering_wheel_rad": 20.0,
+    **dict.fromkeys(("speed_m_s", "truth.vx_m_s"), 120.0),
+    **{f"wheel_speed_{w}_m_s": 150.0 for w in WHEELS},
+    **{f"wheel_speed_{w}_rad_s": 700.0 for w in WHEELS},
+    "truth.vy_m_s": 40.0,
+    "truth.sideslip_rad": math.pi,
+}
+#: Least share of the low-passed values below the limit: shocks and spins are short; a wheel spins in the air.
+SHARE, WHEEL_SHARE = 0.95, 0.5
+
 
 def measured_relations(
     columns: Mapping[str, FloatArray], speed_name: str | None, vehicle: VehicleParameters | None = None
@@ -75,7 +104,7 @@ def measured_relations(
     columns : on the grid, SI, by signal name; names of ground truth begin with ``truth.``.
     speed_name : the column used as the speed. vehicle : of a file; None without a file.
     """
-    relations: list[Relation] = []
+    relations = list(_limits(columns))
     speed = None if speed_name is None else columns[speed_name]
     of_path = {} if any(map(is_misscaled, position_factors(columns))) else columns
     for prefix in ("", "truth."):
@@ -89,13 +118,13 @@ def measured_relations(
         relations += _wheel_differences(columns, speed_name, speed)
         relations += _courses(of_path, speed)
     relations += _poses(of_path)
-    rate = ("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S)
-    twice = (("truth.yaw_rate_rad_s", *rate), (TURNING, *rate), ("truth.ay_m_s2", "ay_m_s2", GAIN_RANGE, MOVES_M_S2))
-    for other, name, expected, moves in twice:
+    rate = ("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S, BIAS_RAD_S)
+    lateral = ("truth.ay_m_s2", "ay_m_s2", GAIN_RANGE, MOVES_M_S2, BIAS_M_S2)
+    for other, name, expected, moves, bias in (("truth.yaw_rate_rad_s", *rate), (TURNING, *rate), lateral):
         if name in columns and other in columns:
             text = f"{other} against {name}"
             sides, everywhere = (columns[name], columns[other]), np.ones(columns[name].shape[0], np.bool_)
-            relations += compare(text, {other: 1, name: -1}, *sides, everywhere, expected, moves=moves)
+            relations += compare(text, {other: 1, name: -1}, *sides, everywhere, expected, moves=moves, bias=bias)
     bends = {"ay_m_s2", "yaw_rate_rad_s"}
     agree = any(r.tells and r.accepts() for r in relations if r.powers.keys() >= bends)
     axle = _axle_sideslips(columns, vehicle, speed_name, agree)
@@ -116,16 +145,19 @@ def compare(
     moves: float | None = None,
     either: bool = True,
     gentle: BoolArray | None = None,
+    bias: float = math.inf,
 ) -> list[Relation]:  # positional: the two sides of a relation and their expected gain
     """Return the relation between two columns where ``use`` and both are finite; an empty list without driving.
 
     ``moves``: both sides have one unit, and a side that moves by more than this, 1-sigma, must move the other; with
     ``either`` False only the reference must move the measured side. ``gentle``: samples of gentle driving. The relation
     of these is returned if only it is plausible: a wrong sign, unit or axis is wrong everywhere, sliding is not.
+    ``bias``: 1-sigma of the offset between the sides. The means count as far as they exceed it: on a circle the mean is
+    the signal.
     """
     if gentle is not None:
-        relations = compare(text, powers, reference, measured, use, expected, moves=moves)
-        at_ease = compare(text, powers, reference, measured, gentle, expected, moves=moves)
+        relations = compare(text, powers, reference, measured, use, expected, moves=moves, bias=bias)
+        at_ease = compare(text, powers, reference, measured, gentle, expected, moves=moves, bias=bias)
         is_right = all(r.accepts() and not r.unrelated for r in relations)
         return at_ease if not is_right and at_ease and all(r.tells and r.accepts() for r in at_ease) else relations
     use = use & np.isfinite(reference) & np.isfinite(measured)
@@ -140,11 +172,31 @@ def compare(
     if min(spread_a, spread_b) <= 1e-12:
         return [Relation(text, powers, 0.0, float("nan"), expected, samples, both)]
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
-    # The ratio of the spreads lies between the two regressions, because either side may be noisy.
-    gain = float(np.copysign(spread_b / spread_a, correlation))
-    # The gain of a block with fewer samples is random.
-    blocks = block_gains(a, b, min(BLOCKS, max(1, int(samples / MIN_SAMPLES))))
+    left = max(0.0, 1.0 - correlation**2) * spread_b**2
+    # Weight of the means in a regression with a normal prior of the offset.
+    weight = left / (left + samples * bias**2)
+    of_means = [math.sqrt(weight) * float(side[use].mean()) for side in (reference, measured)]
+    rms_a, rms_b = math.hypot(spread_a, of_means[0]), math.hypot(spread_b, of_means[1])
+    correlation = (correlation * spread_a * spread_b + of_means[0] * of_means[1]) / (rms_a * rms_b)
+    # The ratio of the sizes lies between the two regressions, because either side may be noisy.
+    gain = float(np.copysign(rms_b / rms_a, correlation))
+    # The gain of a block with fewer samples is random, and a block on a circle has none.
+    by_means = abs(of_means[0]) > spread_a
+    blocks = () if by_means else block_gains(a, b, min(BLOCKS, max(1, int(samples / MIN_SAMPLES))))
     return [Relation(text, powers, correlation, gain, expected, samples, both, blocks=blocks)]
+
+
+def _limits(columns: Mapping[str, FloatArray]) -> Iterator[Relation]:
+    """Yield a relation for each signal with values that no vehicle reaches; it needs no second signal."""
+    for name, most in MOST.items():
+        column = columns.get(name, np.empty(0))
+        finite = np.abs(column[np.isfinite(column)])
+        share = WHEEL_SHARE if name.startswith("wheel") else SHARE
+        if finite.size and (large := float(np.quantile(finite, share))) > most:
+            text = f"{1.0 - share:.0%} of {name} are above {large:.3g}, vehicles reach {most:.3g}"
+            samples = independent_samples(finite.size)
+            ratio = large / most  # no sliding explains it
+            yield Relation(text, {name: 1}, 1.0, ratio, (0.0, 1.0), samples, signless=True, most_energy=2 * MOST_ENERGY)
 
 
 def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace: FloatArray) -> list[Relation]:
@@ -156,7 +208,9 @@ def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace
         powers = {f"{prefix}ay_m_s2": 1, f"{prefix}yaw_rate_rad_s": -1, pace_name: -1}
         text = f"{prefix}ay_m_s2 against {prefix}yaw_rate_rad_s x speed"
         turns, gentle = yaw * pace, gentle_at(yaw * pace, moving)
-        relations += compare(text, powers, turns, left, moving, GAIN_RANGE, moves=MOVES_M_S2, gentle=gentle)
+        relations += compare(
+            text, powers, turns, left, moving, GAIN_RANGE, moves=MOVES_M_S2, gentle=gentle, bias=BIAS_M_S2
+        )
     if forward is not None:
         powers = {f"{prefix}ax_m_s2": 1, pace_name: -1}
         text = f"{prefix}ax_m_s2 against the derivative of the speed"
@@ -277,6 +331,12 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
             blocks=tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS)),
         )  # fmt: skip
         relations.append(replace(relation, signless=name == "truth.position_speed_m_s"))
+    if (path := columns.get(GNSS_PATH[1])) is not None and (use := moving & np.isfinite(path)).any():
+        ratios = speed[use] / path[use]
+        text, samples = f"{speed_name} over the speed of the GNSS positions", independent_samples(ratios.size)
+        blocks = tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS) if b.size)
+        ratio = float(np.median(ratios))
+        relations.append(Relation(text, {speed_name: 1}, 1.0, ratio, SAME_RANGE, samples, signless=True, blocks=blocks))
     of_wheels = any(n.startswith("wheel") and n.endswith("_rad_s") for n in columns) and speed_name == "wheel_speeds"
     fast = speed[np.abs(speed) > REVERSE_M_S * (3.0 if of_wheels else 1.0)]
     if (samples := independent_samples(fast.size)) >= 2.0 * MIN_SAMPLES:
@@ -287,7 +347,9 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
 
 def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
     """Return other measurements of the yaw rate than the gyro's, up to a factor; steering has no certain sign."""
-    references = [(n, columns[n]) for n in (COURSE_RATE, GNSS_COURSE_RATE, "truth.yaw_rate_rad_s") if n in columns]
+    references = [
+        (n, columns[n]) for n in (COURSE_RATE, GNSS_COURSE_RATE, GNSS_PATH[0], "truth.yaw_rate_rad_s") if n in columns
+    ]
     return references + ([] if speed_name is None else _axle_differences(columns, columns[speed_name]))
 
 
@@ -342,27 +404,32 @@ def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> Float
 
 
 def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relation]:
-    """Relate the yaw rates to the course rate of the ground truth, otherwise of a GNSS receiver."""
-    path = next((n for n in (COURSE_RATE, GNSS_COURSE_RATE) if n in columns), "")
-    if not path:
-        return []
-    course, signs = columns[path], {COURSE_RATE: -1} if path == COURSE_RATE else {}
-    turnings = [course]
-    if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # in a spin, the sideslip changes as well
-        turnings.append(course - direction_rate(columns["truth.vx_m_s"], columns["truth.vy_m_s"]))
-    relations = []
-    moving = _moving(columns, speed)
-    for name in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s"):
-        if name in columns:
-            text = f"{name} against the turning of the path over ground"
+    """Relate the yaw rates to the course rates of the ground truth, and of a GNSS receiver's velocity and positions."""
+    # Positions of a receiver are too noisy to show that something does not turn.
+    paths: tuple[tuple[str, dict[str, int], float | None], ...] = (
+        (COURSE_RATE, {COURSE_RATE: -1}, MOVES_RAD_S),
+        (GNSS_COURSE_RATE, {}, MOVES_RAD_S),
+        (GNSS_PATH[0], {"gnss_longitude_deg": -1}, None),
+    )
+    relations, moving = [], _moving(columns, speed)
+    for path, signs, moves in paths:
+        if path not in columns:
+            continue
+        course = columns[path]
+        turnings = [course]
+        if "truth.vx_m_s" in columns and "truth.vy_m_s" in columns:  # in a spin, the sideslip changes as well
+            turnings.append(course - direction_rate(columns["truth.vx_m_s"], columns["truth.vy_m_s"]))
+        for name in (n for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns):
+            text = f"{name} against the turning of the {'course' if path == GNSS_COURSE_RATE else 'path'} over ground"
             yaw, gentle = columns[name], gentle_at(columns[name] * speed, moving)
             either = [
                 r
                 for turning in turnings
                 for r in compare(
-                    text, {name: 1, **signs}, turning, yaw, moving, GAIN_RANGE, moves=MOVES_RAD_S, gentle=gentle
+                    text, {name: 1, **signs}, turning, yaw, moving, GAIN_RANGE, moves=moves, gentle=gentle,
+                    bias=BIAS_RAD_S,
                 )
-            ]
+            ]  # fmt: skip
             relations += _best(either)
     return relations
 

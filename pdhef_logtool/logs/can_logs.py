@@ -328,7 +328,8 @@ class _Asc(_TextLog):
             if date := _DATE.match(begin[1]):
                 month, day, hour, minute, second, fraction, half, year = date.groups()
                 hours = int(hour) % 12 + 12 * (half.lower() == "pm") if half else int(hour)
-                time = hours, int(minute), int(second), int((fraction or "0").ljust(6, "0")[:6])
+                # Milliseconds; python-can does not pad them to three digits.
+                time = hours, int(minute), int(second), int((fraction or "0").zfill(3).ljust(6, "0")[:6])
                 self._begins_ns = _start_ns(int(year), _MONTHS.get(month.lower()[:3], 0), int(day), *time)
             self._begins_ns = self._begins_ns or 0
 

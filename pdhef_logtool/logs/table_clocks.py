@@ -39,7 +39,9 @@ _UNITS: dict[int, list[str]] = {ns: spellings.split() for ns, spellings in numbe
 TIME_UNITS_NS = {spelling: ns for ns, spellings in _UNITS.items() for spelling in spellings}
 _DAY_NS, _HOUR_NS, _MINUTE_NS, _SECONDS = (TIME_UNITS_NS[name] for name in ("days", "hours", "minutes", "seconds"))
 _DAY_S = _DAY_NS / _SECONDS
-_SUBUNITS = tuple(ns for ns in _UNITS if ns <= _SECONDS)
+#: Units of columns with published names; they explain no other column.
+NAMED_UNITS: dict[str, str] = _CLOCKS["columns"]
+_SUBUNITS = tuple(ns for ns in _UNITS if ns <= _SECONDS and not {*NAMED_UNITS.values()} & {*_UNITS[ns]})
 #: Times that count from the start of a recording follow this instant, 1970-01-02, so that none is negative.
 RELATIVE_NS = _DAY_NS
 #: 1970-01-01 in the days of Excel, and of MATLAB's ``datenum``.

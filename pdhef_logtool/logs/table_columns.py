@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.clock_evidence import decades_too_short
 from pdhef_logtool.logs.table_clocks import (
+    NAMED_UNITS,
     NO_TIME,
     TIME_UNITS_NS,
     Clock,
@@ -197,7 +198,8 @@ def _grade(sheet: Sheet, name: str) -> int | None:
 def _read_clock(sheet: Sheet, name: str, others: Sequence[Clock], rate_hz: float | None) -> Clock:
     column, columns = sheet.columns[name], {name}
     if isinstance(column, np.ndarray):
-        unit = sheet.units.get(name, "") or snake(name).rpartition("_")[2]
+        text = snake(name)
+        unit = sheet.units.get(name, "") or NAMED_UNITS.get(text, text.rpartition("_")[2])
         clock = number_clock(column, unit, name, others, rate_hz)
     else:
         date = next((n for n in sheet.columns if n != name and _DATE.fullmatch(snake(n))), name)

@@ -226,8 +226,10 @@ def _meaning_by_names(topic: TopicInfo, info: FieldInfo, there: set[str]) -> Mea
     path = info.path
     if (gyro := re.fullmatch(r"(.*(?:^|[._]))g([xyz])", path)) and f"{gyro[1]}a{gyro[2]}" in there:
         path = f"{gyro[1]}gyro_{gyro[2]}"
-    if (rate := re.fullmatch(r"((?:.*\.)?)r", path)) and {f"{rate[1]}vx", f"{rate[1]}vy"} <= there:
-        path = f"{rate[1]}yaw_rate"
+    if rate := re.fullmatch(r"((?:.*\.)?)r", path):
+        beside = {p.removeprefix(rate[1]) for p in there if p.startswith(rate[1])}
+        if {"vx", "vy"} <= beside or ("v" in beside and {"ay", "a_y"} & beside and "u" not in beside):
+            path = f"{rate[1]}yaw_rate"
     paths = dict.fromkeys((path, path.replace("[]", "[2]")))
     meanings = (meaning_of(topic.name, topic.type_name, path, info.unit) for path in paths)
     return next((meaning for meaning in meanings if meaning is not None), None)

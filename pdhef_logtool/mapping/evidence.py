@@ -163,12 +163,6 @@ def is_enumeration(values: FloatArray) -> bool:
     return single.shape[0] <= MOST_COLUMNS and bool((single == np.rint(single)).all())
 
 
-def is_of_one_sign(values: FloatArray) -> bool:
-    """Return whether no value is negative."""
-    finite = values[np.isfinite(values)]
-    return finite.shape[0] > 0 and bool(finite.min() >= 0.0)
-
-
 def is_of_both_signs(values: FloatArray) -> bool:
     """Return whether a significant share of the values, well beyond noise, is on either side of zero."""
     finite = values[np.isfinite(values)]

@@ -50,13 +50,6 @@ class Fields:
             return None
         return wheels[0].standing_for(mean_of([f.si for f in wheels]))
 
-    def wheel_turns(self) -> Field | None:
-        """Return the mean wheel rotation, which is a speed up to the wheel radius."""
-        wheels = [
-            f for f in (*self.candidates, *self.anchors.values()) if f.meaning.quantity == "wheel rate" and f.unit_known
-        ]
-        return wheels[0].standing_for(mean_of([f.si for f in wheels])) if wheels else None
-
     def turning(self, ay: FloatArray, rate: FloatArray, speed: FloatArray) -> Fit | None:
         """Fit a_y to v r; None if the car does not turn."""
         expected = rate * speed

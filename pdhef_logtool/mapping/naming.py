@@ -184,7 +184,7 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
     return None
 
 
-_TURNING = frozenset({"rate", "velocity", "gyro", "gyroscope"})
+_TURNING = frozenset({"rate", "velocity", "velocities", "gyro", "gyroscope"})
 
 
 def _strength_of_leaf(

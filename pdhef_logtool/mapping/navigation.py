@@ -19,7 +19,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen
-from pdhef_logtool.mapping.naming import Meaning, is_command, meaning_of, unit_of, words_of
+from pdhef_logtool.mapping.naming import Meaning, meaning_of, unit_of, words_of
 from pdhef_logtool.mapping.path import DEGREE_M
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.signals import FloatArray
@@ -65,15 +65,15 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool 
 def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
     """Return position, velocity or speed and course over ground by the names of a topic's fields.
 
-    A velocity must agree with the path. A heading that is the direction of the path is a course.
+    A velocity must agree with the path, if there is one. A heading that is the direction of the path is a course.
     """
     fields = log.fields(topic.name, quiet=True)
     stamp, meanings = stamp_path_of(fields), _meanings(topic, fields)
     first = {m.quantity: path for path, m in reversed(meanings.items())}
-    if not {"latitude", "longitude"} <= set(first) or is_command(topic.name):
-        return {}
-    angles = [p for q in ("course", "heading") for p, m in meanings.items() if m.quantity == q]
     velocity = next(_horizontal(fields), {})
+    if not {"latitude", "longitude"} <= set(first):
+        return {s.name: s for s in (_velocity_over_ground(topic.name, stamp, velocity) if velocity else ())}
+    angles = [p for q in ("course", "heading") for p, m in meanings.items() if m.quantity == q]
     pieces = Pieces(log)
     samples = pieces.read(
         {topic.name: [*dict.fromkeys([*velocity.values(), *angles, *(first[q] for q in _PLACES.values())])]}
@@ -178,7 +178,11 @@ def side_of(struct: str, leaf: str) -> str:
         return ""
     frame = next((f for f in ("ned", "enu") if f in words and words[-1] in {*"xyz"}), "")
     side = {"x": frame[:1], "y": frame[1:2], "z": frame[2:]}[words[-1]] if frame else side
-    is_speed = {"velocity", "vel", "speed"} & {*words, *words_of(struct)} or re.fullmatch("(v|vel)[neud]", short)
+    is_speed = (
+        {"velocity", "vel", "speed"} & {*words, *words_of(struct)}
+        or re.fullmatch("(v|vel)[neud]", short)
+        or words[:1] == ("v",)
+    )
     return side if is_speed else ""
 
 

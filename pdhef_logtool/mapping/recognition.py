@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
@@ -15,11 +15,11 @@ from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.clocks import with_usable_stamps
 from pdhef_logtool.mapping.gnss_signals import RAW_COURSE, gnss_signals, has_heading, receiver_signals
-from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, Axes, length_of, speed_over_ground, twist_axes
+from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, Axes, length_of, twist_axes
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command
-from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth, side_of
+from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.units import mounting_checks
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
@@ -200,6 +200,7 @@ def auto_map(
     _map_navigation(draft, topics, vendors)
     _fall_back(draft, topics)
     _map_gnss(draft, topics, vendors)
+    _speed_of_receiver(draft)
     mapping = Mapping(draft.signals, draft.truth, draft.quality, "auto", tuple(draft.notes))
     mapping = replace(mapping, checks=(*draft.checks, *weighed.checks), open_signs=weighed.open_signs)
     candidates = weighed.candidates
@@ -447,29 +448,27 @@ def _fall_back(draft: _Draft, topics: list[TopicInfo]) -> None:
         if chosen is not None:
             draft.take(draft.signals, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
             draft.notes.append(f"yaw_rate_rad_s comes from the odometry {chosen.name}, as no IMU gives it")
-    if not draft.signals or any(n.startswith(("speed_m_s", "wheel_speed_")) for n in draft.signals):
+    if not draft.signals or has_speed(draft.signals):
         return
     _speed_of_navigation(draft, topics)
-    if "speed_m_s" not in draft.signals:
-        _speed_over_ground(draft, topics, twists)
 
 
-def _speed_over_ground(draft: _Draft, topics: list[TopicInfo], twists: list[TopicInfo]) -> None:
-    """Take the speed as the length of a velocity; one with north and east is also a GNSS signal."""
-    unsaid = (t for t in twists if not _words(t.name) & _TOPICS["vehicle"])
-    other = (t for t in topics if _role(t) in ("sensor", "navigation") and not _is_well_known(t))
-    vectors = [(t, TWIST_FIELDS[_type(t)].format("linear")) for t in unsaid]
-    vectors += ((t, "") for t in other if not _type(t).startswith(NO_SENSORS))
-    speed = speed_over_ground(draft.log, vectors, draft.signals, draft.truth)
-    if speed is None:
+def _speed_of_receiver(draft: _Draft) -> None:
+    """Take the speed as the length of a receiver's velocity if no other source gives one."""
+    velocity = [draft.signals.get(f"gnss_velocity_{n}_m_s") for n in ("east", "north")]
+    paths = tuple(s.field for s in velocity if s is not None and isinstance(s.field, str))
+    scales = tuple(s.scale for s in velocity if s is not None and isinstance(s.scale, float))
+    if has_speed(draft.signals) or velocity[0] is None or len(paths) < len(velocity) or len({*scales}) != 1:
         return
-    source, evidence = speed
+    source = replace(velocity[0], name="speed_m_s", field=paths, scale=scales, combine="norm")
     draft.signals["speed_m_s"] = source
-    if [side_of(*path.rpartition(".")[::2]) for path in source.paths] == ["n", "e"]:
-        for name, path in zip(("north", "east"), source.paths, strict=True):
-            draft.take(draft.signals, f"gnss_velocity_{name}_m_s", source.topic, path)
-    draft.notes.append(f"speed_m_s comes from {source.topic}, {evidence}: it is {NEVER_NEGATIVE}")
+    draft.notes.append(f"speed_m_s comes from {source.topic}: it is {NEVER_NEGATIVE}")
     draft.ambiguities = [a for a in draft.ambiguities if (a.subject, a.chosen) != ("speed", None)]
+
+
+def has_speed(signals: Collection[str]) -> bool:
+    """Return whether signals contain a speed or wheel speeds."""
+    return any(n.startswith(("speed_m_s", "wheel_speed_")) for n in signals)
 
 
 def _speed_of_navigation(draft: _Draft, topics: list[TopicInfo]) -> None:

@@ -25,7 +25,7 @@ from pdhef_logtool.mapping.candidates import (
     triad_of,
 )
 from pdhef_logtool.mapping.checking import has_path
-from pdhef_logtool.mapping.evidence import Fit, fit, is_of_both_signs, is_of_one_sign, ratio, spread
+from pdhef_logtool.mapping.evidence import Fit, fit, ratio, spread
 from pdhef_logtool.mapping.fields import CLEAR, Fields, agree, mean_of
 from pdhef_logtool.mapping.gnss_signals import has_heading
 from pdhef_logtool.mapping.ground_speed import axes_of
@@ -51,8 +51,7 @@ _SENSORS = (
 )  # fmt: skip
 #: Standard deviation of the curvature below which a path counts as straight.
 EXCITED_CURVATURE_1_M = 0.0001
-#: Standard deviation above which a sensor must follow an acceleration, and the required correlation.
-MOVING_M_S2 = 0.6
+#: Least correlation of a yaw rate about the right axis.
 FOLLOWS = 0.5
 #: Relative tolerance between wheel speeds in a unit of speed and the speed; beyond, the wheel speeds are rotational.
 WHEEL_UNIT = 0.04
@@ -174,20 +173,8 @@ class _Weighing:
             self._wheels(usable)
         if not have & {"steer_rad", "steering_wheel_rad"}:
             self._steering([f for f in usable if f.meaning.quantity == "steering"])
-        self._follow()
         for name, item in self.taken.items():
             self._tell(name, item)
-        self._tell_mirrored()
-
-    def _tell_mirrored(self) -> None:
-        """Add checks if left and right depend on the names of steering and yaw rate only: both may be mirrored."""
-        turning = [n for n in _SIGNED if self._chosen(n) is not None]
-        is_open = {*turning} <= {n for group in self._open_signs() for n in group}
-        others = [n for n in (*self.taken, *self.fields.anchors) if n == "ay_m_s2" or n.startswith("wheel_speed")]
-        if len(turning) > 1 and is_open and not others and not self.fields.positions:
-            evidence = f"left and right may be exchanged in {' and '.join(turning)}: no signal shows which is positive"
-            remedy = 'name them in a mapping file, or --waive "mapping.names"'
-            self.checks += [Check("mapping.names", name, "undecided", evidence, remedy) for name in turning]
 
     def _usable(self) -> list[Field]:
         """Return candidates for signals; sensors in the ground-truth topic rank below sensors of other messages."""
@@ -239,10 +226,7 @@ class _Weighing:
         best = good[0]
         if best.meaning.strength < 0.6:
             best.doubts.append("its element of the array is identified by values alone")
-        near = [f for f in good[1:] if f.score > best.score - 0.1 and not agree(best.si, f.si)]
-        if near:
-            best = self._better([best, *near])
-        self._choose(name, best, [f for f in (good[0], *near) if f is not best])
+        self._choose(name, best, [f for f in good[1:] if f.score > best.score - 0.1 and not agree(best.si, f.si)])
 
     def _choose(self, name: str, best: Field, rivals: Sequence[Field]) -> None:
         """Select a field for a signal, and record its rivals."""
@@ -261,28 +245,6 @@ class _Weighing:
                 item.reasons.append(f"its rate of change follows a_x (correlation {relation.correlation:.2f})")
                 self.fields.settle(item, relation.slope, "its rate of change against a_x", 0.4)
                 return
-
-    def _better(self, rivals: Sequence[Field]) -> Field:
-        """Return the rival that follows the other signals best; the first one without evidence."""
-        speed = self._speed()
-        if speed is None:
-            return rivals[0]
-        kind = rivals[0].meaning
-        best: tuple[float, Field] = (0.0, rivals[0])
-        for item in rivals:
-            if kind.quantity == "rate":
-                others = self.fields.all("acceleration", "y")
-                relations = [self.fields.turning(a.si, item.si, speed.si) for a in others[:3]]
-            elif kind.quantity == "acceleration" and kind.part == "y":
-                relations = [self.fields.turning(item.si, r.si, speed.si) for r in self.fields.all("rate", "z")[:3]]
-            elif kind.quantity == "acceleration":
-                relations = [fit(self.fields.pieces.rate_of(speed.si), self.fields.pieces.smooth(item.si))]
-            else:
-                continue
-            value = max((abs(r.correlation) for r in relations if r is not None), default=0.0)
-            if value > best[0] + 0.1:
-                best = (value, item)
-        return best[1]
 
     def _turn_about(self) -> None:
         """Select the yaw rate's axis by a_y ≈ v r if a_y names the car's axis and the yaw rate a device's."""
@@ -409,32 +371,6 @@ class _Weighing:
     def _speed(self) -> Field | None:
         """Return the best speed to compare other signals with, selected or not."""
         return self._chosen("speed_m_s") or self.fields.wheel_mean() or self.fields.best("speed")
-
-    def _follow(self) -> None:
-        """Add a doubt to accelerations that do not follow the car's motion in a drive that excites them."""
-        speed, rate = self._speed() or self.fields.wheel_turns(), self._chosen("yaw_rate_rad_s")
-        self._both_signs()
-        if speed is None:
-            return
-        smooth = self.fields.pieces.smooth
-        expected = {"ax_m_s2": (self.fields.pieces.rate_of(speed.si), "the speed's rate of change")}
-        if rate is not None:
-            expected["ay_m_s2"] = (smooth(rate.si * speed.si), "v r")
-        for name, (motion, words) in expected.items():
-            item = self.taken.get(name)
-            relation = None if item is None or spread(motion) < MOVING_M_S2 else fit(smooth(item.si), motion)
-            if item is not None and relation is not None and abs(relation.correlation) < FOLLOWS:
-                item.doubts.append(f"its correlation with {words} is only {relation.correlation:.2f}")
-
-    def _both_signs(self) -> None:
-        """Add a doubt to fields that are never negative although the car turns both ways."""
-        names = ("yaw_rate_rad_s", "ay_m_s2", "steer_rad", "steering_wheel_rad")
-        there = {n: f for n in names if (f := self._chosen(n)) is not None and f.seen.changes}
-        if not any(is_of_both_signs(f.seen.values) for f in there.values()):
-            return
-        for item in there.values():
-            if is_of_one_sign(item.seen.values) and not item.anchor:
-                item.doubts.append("it is never negative although the car turns: its sign may be in another field")
 
     def _chosen(self, *names: str) -> Field | None:
         """Return the field of the first of these signals that is selected or mapped."""

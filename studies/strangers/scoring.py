@@ -53,6 +53,8 @@ WEAK_SHARE = 0.6
 BIAS_M_S2 = 0.3
 #: A share of right samples from which a channel counts as right: some logs contain invalid samples.
 RIGHT_BINS = 0.95
+#: Times below are those of a clock without a date.
+FEWEST_WEEKS_NS = 10**15
 #: The same of a course: the rest are stops.
 MOVING_BINS = 0.8
 
@@ -261,8 +263,9 @@ def score_log(
     sources = {} if mapping is None else _sources(mapping)
     fitting = {**(allowed or {}), **right}
     first = min((int(c.arrival_ns[0]) for c in channels.values() if len(c)), default=None)
-    if start_ns is not None and first is not None and first < RELATIVE_NS + 10**12:
-        shift = RELATIVE_NS - start_ns
+    if start_ns is not None and first is not None and first < RELATIVE_NS + FEWEST_WEEKS_NS:
+        # A clock without a date counts from its own zero, such as the start of a GPS week.
+        shift = (RELATIVE_NS if first < RELATIVE_NS + 10**12 else first) - start_ns
         fitting = {n: [s.late(shift * 1e-9) for s in series] for n, series in fitting.items()}
     is_right = {
         name: any(agrees(channel, series, floor_of(name), bias_of(name)) for series in fitting.get(name, ()))

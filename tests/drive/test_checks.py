@@ -13,12 +13,15 @@ from hypothesis import strategies as st
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import check_drive
+from pdhef_logtool.drive.checks.by_relations import relation_checks
+from pdhef_logtool.drive.checks.truth_sideslip import sideslip_offset
 from pdhef_logtool.drive.columns import columns_on_grid
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.mounting import truth_latency
+from pdhef_logtool.drive.relations import BIAS_RAD_S, GAIN_RANGE, compare
 from pdhef_logtool.drive.truth import LatencyEstimate, booked_on_the_late, derive_truth
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import MappedChannels, auto_map, fit_clocks, load_mapping, read_signals
+from pdhef_logtool.mapping import MappedChannels, Mapping, auto_map, fit_clocks, load_mapping, read_signals
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import SIGNAL_UNITS, Channel
 from truthsim.drive import simulate_drive, write_drive
@@ -460,6 +463,43 @@ def test_two_spinning_wheels_show_no_speed() -> None:
     assert 0.5 < np.isfinite(measure(spinning).columns["wheel_speeds"]).mean() < 0.8
     km_h = with_front(np.full(len(wheel), 3.6))
     assert np.isfinite(measure(km_h).columns["wheel_speeds"]).mean() > 0.95
+
+
+def test_a_magnitude_without_its_sign_does_not_pass() -> None:
+    channels = drive(3)
+    yaw = channels["yaw_rate_rad_s"]
+    checks = check_drive({**channels, "yaw_rate_rad_s": replace(yaw, values=np.abs(yaw.values))})
+    assert "passed" not in {c.verdict for c in checks if c.subject == "yaw_rate_rad_s"}
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_signs_that_nothing_decides_are_undecided(sign: float) -> None:
+    """Steering, yaw rate and lateral acceleration of a mirrored recorder agree with one another."""
+    names = ("steer_rad", "yaw_rate_rad_s", "ay_m_s2")
+    channels = {n: replace(c, values=sign * c.values) if n in names else c for n, c in drive(3).items()}
+    channels = {n: c for n, c in channels.items() if n in (*names, "speed_m_s")}
+    measured = measure(channels, mapping=Mapping(open_signs=tuple((n,) for n in names)))
+    verdicts = {c.name: c.verdict for c in relation_checks(measured, mounting_is_known=False)}
+    assert {verdicts[f"{n}.sign"] for n in names} == {"undecided"}
+
+
+def test_on_a_circle_the_mean_is_the_signal() -> None:
+    rng, everywhere = np.random.default_rng(0), np.ones(1200, np.bool_)
+    turning = 0.3 + 0.001 * np.cumsum(rng.standard_normal(1200)) / 3.0
+    mirrored = -turning + 0.02 * rng.standard_normal(1200)
+    for bias, is_shown in ((np.inf, False), (BIAS_RAD_S, True)):
+        (relation,) = compare("", {}, turning, mirrored, everywhere, GAIN_RANGE, bias=bias)
+        assert bool(relation.correlation < -0.9) is is_shown
+        assert bool(abs(relation.gain + 1.0) < 0.1) is is_shown
+
+
+def test_driving_in_reverse_is_no_offset_of_the_heading() -> None:
+    seconds = np.arange(0.0, 120.0, 0.05)
+    speed, rate = -8.0 - np.sin(0.2 * seconds), 0.1 * np.sin(0.5 * seconds)
+    columns = {"truth.vx_m_s": speed, "truth.vy_m_s": 0.3 * rate, "yaw_rate_rad_s": rate, "ay_m_s2": speed * rate}
+    wrong, right = (sideslip_offset(c) for c in (columns, {**columns, "speed_m_s": speed}))
+    assert right is not None and right[1] < 0.01
+    assert wrong is None or wrong[1] > 0.1
 
 
 def test_marks_of_invalid_values_are_no_motion() -> None:

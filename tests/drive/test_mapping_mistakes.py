@@ -58,7 +58,7 @@ def test_every_mistake_in_a_double_lane_change_is_named(sample_logs_dir: Path, t
 def test_impossible_magnitudes_need_no_second_signal(name: str, factor: float, remedy: str) -> None:
     channel = drive(3)[name.replace("roll", "yaw")]
     checks = check_drive({name: replace(channel, name=name, values=channel.values * factor)})
-    (check,) = (c for c in checks if c.name == f"{name}.magnitude")
+    (check,) = (c for c in checks if c.name == f"{name}.unit")
     assert check.verdict == "failed"
     assert remedy in check.remedy
     assert misread_channels([check]).keys() == {name}

@@ -241,13 +241,6 @@ def test_an_accelerometer_whose_gravity_is_not_upward_is_said_to_be_mounted_othe
     assert undecided(found(vn__common=topic(**imu_fields()), **SPEED)) == set()
 
 
-def test_axes_that_are_not_the_cars_do_not_follow_its_motion() -> None:
-    turned = imu_fields()
-    turned["linear_acceleration__x"], turned["linear_acceleration__y"] = -AY, AX
-    turned["angular_velocity__z"] = RATE
-    assert "ay_m_s2.candidate" in undecided(found(vn__common=topic(**turned), **SPEED))
-
-
 def test_the_unit_of_a_speed_by_positions() -> None:
     auto = found(gps__fix=topic("sensor_msgs/msg/NavSatFix", **WHERE), bus=topic(vehicle_speed=3.6 * V))
     assert taken(auto) == {"speed_m_s": ("/bus.vehicle_speed", round(1 / 3.6, 6))}
@@ -292,12 +285,6 @@ def test_the_path_shows_how_a_heading_counts(
         assert source.scale == (1.0, 1.0, -1.0 if names[2] == "vel_d" else 1.0)
 
 
-def test_a_magnitude_without_its_sign_is_said() -> None:
-    bus = topic(yaw_rate_dps=np.abs(RATE) / DEG, lat_accel_mps2=AY, long_accel_mps2=AX)
-    checks = {c.name: c.evidence for c in found(bus=bus, **SPEED).mapping.checks}
-    assert "never negative" in checks["yaw_rate_rad_s.candidate"]
-
-
 def test_a_magnitude_whose_sign_is_a_text_is_no_signal_and_the_others_are() -> None:
     bus = topic(steering_angle_deg=np.abs(STEER) / DEG, yaw_rate_dps=RATE / DEG)
     bus.fields["steering_angle_deg_sign"] = np.where(STEER < 0.0, "right", "left").astype(object)
@@ -328,14 +315,6 @@ def test_a_steering_without_a_unit_may_be_a_share(share: float) -> None:
     auto = found(controls=topic(steer=STEER * share), imu__data=topic(**imu_fields()), **SPEED)
     doubts = [c.evidence for c in auto.mapping.checks if c.name == "steer_rad.candidate"]
     assert any("a share of the largest angle" in doubt for doubt in doubts) is (share > 1.0)
-
-
-def test_steering_and_yaw_rate_alone_may_both_be_mirrored() -> None:
-    bus = topic(steering_wheel_angle_deg=-STEER * 16.0 / DEG, yaw_rate_dps=-RATE / DEG)
-    doubted = {c.subject for c in found(bus=bus, **SPEED).mapping.checks if c.name == "mapping.names"}
-    assert doubted == {"steering_wheel_rad", "yaw_rate_rad_s"}
-    bus.fields |= {"lat_accel_mps2": AY}
-    assert "mapping.names" not in undecided(found(bus=bus, **SPEED))
 
 
 def test_a_velocity_in_the_axes_of_the_world_is_no_speed() -> None:
@@ -380,13 +359,6 @@ def test_wheels_in_si_units_where_all_else_is_in_si_units(speed: bool) -> None:
     auto = found(log=topic(**rates, **beside) if speed else topic(**rates), **({} if speed else SPEED))
     assert ("wheel_speed_fl_rad_s" if speed else "wheel_speed_fl_m_s") in auto.mapping.signals
     assert any("as well" in c.evidence for c in auto.mapping.checks)
-
-
-def test_axes_are_held_against_wheels_of_unknown_radius_too() -> None:
-    turned = imu_fields()
-    turned["linear_acceleration__x"], turned["linear_acceleration__y"] = -AY, AX
-    wheels = topic("raptor_dbw_msgs/msg/WheelSpeedReport", **dict.fromkeys(("front_left", "rear_right"), V / 0.3))
-    assert "ay_m_s2.candidate" in undecided(found(vn__common=topic(**turned), wheels=wheels))
 
 
 def test_an_adma_is_sensor_and_truth() -> None:

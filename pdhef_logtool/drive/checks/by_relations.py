@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pdhef_logtool.drive.checks.kind import CheckKind
-from pdhef_logtool.drive.hypotheses import FOREIGN, Hypothesis, Posterior, Relation, units_of
+from pdhef_logtool.drive.hypotheses import FOREIGN, MOST_ENERGY, Hypothesis, Posterior, Relation, units_of
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured
 from pdhef_logtool.drive.relations import COURSE_RATE
 from pdhef_logtool.records.checks import Check
@@ -35,6 +35,7 @@ _LACKS = {
     "speed_m_s": "a wheel speed, an accelerometer or ground truth to compare with, and speeding up or bends",
 }
 _BENDS = "bends to both sides at speed"
+_LACKS_FOR_SIGN = "needs a path, a course, wheel speeds or a documented sign"
 
 
 def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int = 2) -> dict[str, tuple[float, str]]:
@@ -94,8 +95,7 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
         if wrong > FAILS:
             return checks
         words = " or ".join(dict.fromkeys(h.words + " is another field" * (h.kind == "field") for h in likely))
-        are_units = not any(h.kind == "sign" for h in likely)
-        weak = f"{_lacks(name, for_unit=are_units)} to rule out that {words}"
+        weak = f"{_lacks_for(name, likely)} to rule out that {words}"
         return [replace(c, verdict="undecided", remedy=c.remedy if wrong > 0.5 else weak) for c in checks]
     factors = {r.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
     usable = [r for r in relations if not math.isnan(factors[r.text])]
@@ -138,9 +138,10 @@ def _is_cleared(name: str, unrelated: Relation, relations: Sequence[Relation]) -
 def _failed(
     name: str, mistakes: Sequence[Hypothesis], relations: Sequence[Relation], measured: Measured
 ) -> list[Check]:
+    counts = "; raw counts of a converter need its resolution" if relations[0].most_energy > MOST_ENERGY else ""
     if math.isnan(mistakes[0].factors[name]):
         look_at = " and ".join(relations[0].powers)
-        remedy = f"{SUSPICIONS[1]}: look at the field, unit and sign of {look_at}"
+        remedy = f"{SUSPICIONS[1]}: look at the field, unit and sign of {look_at}{counts}"
         return [UNIT.failed(relations[0].evidence, name, remedy=remedy)]
     mistakes = [h for h in mistakes if not math.isnan(h.factors[name])]
     wrong = [c for a, c in (("sign", SIGN), ("unit", UNIT)) if any(a in _ASPECTS[h.kind] for h in mistakes)]
@@ -158,10 +159,16 @@ def _failed(
     else:
         shown = [f"{h.words} ({line})" if (line := lines[h.factors[name]]) else h.words for h in mistakes]
         remedy = SUSPICIONS[0] + " or ".join(shown)
-    return [kind.failed(evidence, name, remedy=remedy) for kind in wrong]
+    return [kind.failed(evidence, name, remedy=remedy + counts) for kind in wrong]
 
 
-_ASPECTS = {"sign": ("sign",), "unit": ("unit",), "foreign": ("unit",), "sign and unit": ("sign", "unit")}
+_ASPECTS = {
+    "sign": ("sign",),
+    "open sign": ("sign",),
+    "unit": ("unit",),
+    "foreign": ("unit",),
+    "sign and unit": ("sign", "unit"),
+}
 
 
 def _not_excited(name: str, relations: Sequence[Relation]) -> Check:
@@ -173,6 +180,12 @@ def _not_excited(name: str, relations: Sequence[Relation]) -> Check:
     return SIGN.undecided(evidence, name, _lacks(name))
 
 
+def _lacks_for(name: str, mistakes: Sequence[Hypothesis]) -> str:
+    if mistakes[0].kind == "open sign":
+        return _LACKS_FOR_SIGN
+    return _lacks(name, for_unit=not any(h.kind == "sign" for h in mistakes))
+
+
 def _lacks(name: str, *, for_unit: bool = False) -> str:
     lacks = _LACKS.get(name, _BENDS)
     return f"needs {_LACKS_FOR_UNIT.get(name, lacks) if for_unit else lacks}"
@@ -181,7 +194,7 @@ def _lacks(name: str, *, for_unit: bool = False) -> str:
 SIGN = CheckKind(
     "SIGNAL.sign",
     compares="a_y with v r, steering with curvature, v̇ with a_x, wheel speeds, wheel differences and the ground "
-    "ground truth's path with the signals that they correspond to",
+    "ground truth's path with the signals that they correspond to, and values with the limits of all vehicles",
     fails="they contradict the signal by its sign",
     remedy="{remedy}",
     lacks=f"needs {_BENDS}",

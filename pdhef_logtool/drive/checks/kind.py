@@ -108,9 +108,8 @@ class CheckedDrive:
 
     @property
     def wrong(self) -> set[str]:
-        """Signals with a failed check of relation or magnitude."""
-        sizes = (c for c in self.judged if c.name.endswith(".magnitude"))
-        return {c.subject for c in (*self.related, *sizes) if c.verdict == "failed"}
+        """Signals with a failed check of a relation."""
+        return {c.subject for c in self.related if c.verdict == "failed"}
 
     def once(self, make: Callable[[CheckedDrive], _T]) -> _T:
         """Return ``make(self)``, computed at the first call."""

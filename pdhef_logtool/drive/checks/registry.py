@@ -12,7 +12,6 @@ MODULES = (
     "mounting",
     "changed",
     "by_relations",
-    "magnitude",
     "level",
     "truth_sideslip",
     "truth_position",

@@ -18,7 +18,7 @@ from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import Channel
 
 #: If a check of one of these aspects fails, the channel is not the signal that it is mapped to.
-_MISREAD = frozenset({"sign", "unit", "scale", "axis", "mounting", "magnitude"})
+_MISREAD = frozenset({"sign", "unit", "scale", "axis", "mounting"})
 _BADNESS = {"passed": 0, "undecided": 1, "failed": 2}
 
 
@@ -68,7 +68,7 @@ def check_drive(
         return checks
     evidence = "{:.0%} of the car's motion is during its stuck or dead samples"
     faults = [FAULT.failed(evidence.format(share), n) for n, share in shares.items() if share > FAULTY_SHARE]
-    again = replace(measure(sound, truth, derived, vehicle), scales=whole.scales)
+    again = replace(measure(sound, truth, derived, vehicle), scales=whole.scales, open_signs=whole.open_signs)
     # A check of a faulty sensor that passes only without the faulty samples is undecided.
     doubted = {c.name: c.remedy for c in checks if c.verdict == "failed" and c.subject in shares}
     checks = checks_of(again)

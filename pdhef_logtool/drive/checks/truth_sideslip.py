@@ -27,7 +27,7 @@ def _checks(drive: CheckedDrive) -> list[Check]:
     if not drive.has_truth or not all(f"truth.{n}" in columns for n in ("vx_m_s", "vy_m_s")):
         return []
     vx, vy = columns["truth.vx_m_s"], columns["truth.vy_m_s"]
-    sideslip = np.arctan2(vy, vx)
+    sideslip = _sideslip(columns)
     moving = moving_at(np.hypot(vx, vy))
     finite = moving & np.isfinite(sideslip)
     if not finite.any():
@@ -41,6 +41,13 @@ def _checks(drive: CheckedDrive) -> list[Check]:
         return [Check(f"{n}.axis", n, "failed", f"{evidence}, and v_y is the speed", remedy) for n in names]
     offset = _offset_check(columns) if frame.verdict == "passed" else None
     return [frame] if offset is None else [frame, offset]
+
+
+def _sideslip(columns: Mapping[str, FloatArray]) -> FloatArray:
+    """Return the angle [N] of the ground-truth velocity from the direction of travel, which is backwards in reverse."""
+    vx, vy = columns["truth.vx_m_s"], columns["truth.vy_m_s"]
+    way = np.where(columns.get("speed_m_s", vx * 0.0) < 0.0, -1.0, 1.0)
+    return np.asarray(np.arctan2(way * vy, way * vx))
 
 
 def _is_speed(drive: CheckedDrive, column: FloatArray) -> bool:
@@ -61,7 +68,7 @@ def sideslip_offset(columns: Mapping[str, FloatArray]) -> tuple[float, float] | 
     moving = moving_at(np.hypot(vx, vy))
     with np.errstate(divide="ignore", invalid="ignore"):
         regressors = [np.ones_like(vx), rate / vx, ay]
-    result = fit(np.arctan2(vy, vx), regressors, gentle_at(rate * vx, moving))
+    result = fit(_sideslip(columns), regressors, gentle_at(rate * vx, moving))
     if result is None:
         return None
     (offset, _, compliance), (error, *_), _ = result
