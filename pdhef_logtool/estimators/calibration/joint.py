@@ -77,7 +77,7 @@ PARTS = ("lag", "roll", "bank")
 USUAL_LEVEL, USUAL_RATIO = 1.5, 0.68
 #: Log standard deviations of level and ratio, of cars and of a file that describes the driven tyres; prior probability
 #: of such a file.
-USUAL_STDS, FILE_STDS, FILE_SHARE = (0.5, 0.2), (0.2, 0.15), 1.0 / 3.0
+USUAL_STDS, FILE_STDS, FILE_SHARE = (0.5, 0.2), (0.1, 0.1), 1.0 / 3.0
 #: Log standard deviation of a file's peak force (wet or icy roads), and of its stiffness without a calibration.
 FILE_TYRE_STD = 0.5
 #: Ratio of the a_y levels of two drives: below the first, no information is shared; above the second, all of it.
