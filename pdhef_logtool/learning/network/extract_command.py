@@ -47,7 +47,6 @@ from pdhef_logtool.learning.network.dataset import (
     read_manifest,
     remove_unnamed,
     split_folder,
-    vehicle_entry,
     write_drive,
     write_manifest,
 )
@@ -140,11 +139,7 @@ class ExtractSettings:
         return {
             **{k: config[k] for k in used},
             **{k: config[k] for k in ("friction", "reference", "gnss") if config[k] != "auto"},
-            "truth_smoothing": self.truth_smoothing,
-            "split": self.split,
-            "model": self.model,
-            "where": self.where,
-            "per_cell_s": self.per_cell_s,
+            **{k: getattr(self, k) for k in ("truth_smoothing", "split", "model", "where", "per_cell_s")},
         }
 
 
@@ -269,7 +264,7 @@ def extract(
         results = _without_copies(_extract_all(work, jobs, reporter), reporter.warn)
         for job in work:
             sha, vehicle = job.physics
-            vehicles[sha] = vehicle_entry(sha, vehicle)
+            vehicles[sha] = {"name": vehicle.name, "sha256": sha, "parameters": vehicle.model_dump(mode="json")}
         manifest = write(results)
         with writing(output):
             remove_unnamed(output, manifest)
@@ -341,15 +336,6 @@ def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
                 )
 
 
-def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[DriveResult, ...]:
-    by_log: dict[str, DriveResult] = {}
-    for done, result in enumerate(_run_jobs(work, jobs, reporter), start=1):
-        by_log[result.record.name] = result
-        tell_drive(result.record, reporter.warn)
-        reporter.progress(result.record.name, done / len(work))
-    return tuple(by_log[job.log_input.stem] for job in work)
-
-
 def _earlier(output: Path, settings: ExtractSettings) -> dict[str, Any]:
     """Return the manifest of the dataset to extend; empty for a new dataset.
 
@@ -418,11 +404,13 @@ def _car(path: Path | None) -> Car:
     return Car.load(path, network=NO_MODEL, intervals=NO_INTERVALS)
 
 
-def _run_jobs(work: Sequence[_Job], jobs: int, reporter: Reporter) -> Iterator[DriveResult]:
-    """Yield one result per job, in any order; a crashed process loses only its own drive."""
+def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[DriveResult, ...]:
+    """Return the result of each job; a crashed process loses only its own drive."""
     if len(work) == 1:
-        yield _extract(work[0], partial(reporter.progress, work[0].log_input.stem))
-        return
+        result = _extract(work[0], partial(reporter.progress, work[0].log_input.stem))
+        tell_drive(result.record, reporter.warn)
+        return (result,)
+    results: dict[int, DriveResult] = {}
     shares: dict[int, float] = {}
 
     def told(number: int, name: str, share: float) -> None:
@@ -435,8 +423,11 @@ def _run_jobs(work: Sequence[_Job], jobs: int, reporter: Reporter) -> Iterator[D
     )
     with closing(ends):
         for ended in ends:
-            shares[ended.number] = 1.0
-            yield ended.result or _failure(ended.item, ended.failure.reason if ended.failure else "")
+            result = ended.result or _failure(ended.item, ended.failure.reason if ended.failure else "")
+            results[ended.number] = result
+            tell_drive(result.record, reporter.warn)
+            told(ended.number, result.record.name, 1.0)
+    return tuple(results[number] for number in range(len(work)))
 
 
 def _extract_guarded(job: _Job, progress: Progress) -> DriveResult:
@@ -466,12 +457,12 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         _check_plan(plan, job, estimated=reference is not None)
         smoothing = _choose_smoothing(plan, settings)
         truth = _truth_facts(plan, smoothing, estimated=reference is not None)
-        service = _in_service(drive, job)
-        physics = filter_of(service.car.calibrated_car, settings.model, use_speed=drive.options.use_speed)
+        car, calibration, taught = _in_service(drive, job)
+        physics = filter_of(car.calibrated_car, settings.model, use_speed=drive.options.use_speed)
         validated = drive.car.has_evidence
         drive.friction = friction_of(plan, physics.vehicle, drive.options, validated=validated, of_truth=True)
         condition = None if settings.where is None else condition_of(settings.where)
-        rows = _residuals(drive, physics, smoothing, service, reference)
+        rows = _residuals(drive, physics, smoothing, (car, taught), reference)
         if not len(rows):
             raise no_samples(job.log_input.path)
         picked = pick(rows, condition, f"{settings.seed}:{source}")
@@ -488,8 +479,8 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             "vehicle_sha256": job.physics[0],
             "settings_sha256": fingerprint,
             "mapping_sha256": drive.mapping.sha256,
-            "calibration": service.calibration,
-            "taught_sha256": None if service.model is None else service.model.sha256,
+            "calibration": calibration,
+            "taught_sha256": None if taught is None else taught.sha256,
             "period_s": plan.alignment.grid_period_s,
             **_counts(rows, picked, drive.log.start_ns),
             "truth": truth,
@@ -503,24 +494,15 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
     return DriveResult(replace(record, seconds=entry["duration_s"]), entry)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Service:
-    """Settings of a run on a drive: car, calibration, active residual model."""
-
-    car: Car
-    calibration: str
-    model: LadderModel | None
-
-
-def _in_service(drive: Drive, job: _Job) -> _Service:
-    """Return the car settings of a run on this drive; a trained car is calibrated on each drive."""
+def _in_service(drive: Drive, job: _Job) -> tuple[Car, str, LadderModel | None]:
+    """Return car, calibration and residual model of a run on this drive; a taught car is calibrated on each drive."""
     car, taught = job.car, job.car.taught
     if taught is None or job.settings.model != PHYSICS_MODEL:
-        return _Service(car, "", None)
+        return car, "", None
     calibration = self_calibrate([read_driving(drive)], car.vehicle, taught=car.taught_prior)
     text = f"refused: {calibration.refused}" if calibration.refused else calibration.text
     acts = taught.residual if taught.calibrated != bool(calibration.refused) else None
-    return _Service(self_calibrated(drive, calibration), text, acts)
+    return self_calibrated(drive, calibration), text, acts
 
 
 def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) -> DriveResult | None:
@@ -541,24 +523,26 @@ def _residuals(
     drive: Drive,
     physics: VehicleUkf,
     smoothing: _Smoothing,
-    service: _Service,
+    service: tuple[Car, LadderModel | None],
     reference: TruthAt | None,
 ) -> ResidualRows:
     """Return the residuals of a drive."""
     whole = drive.whole()
     truth = whole.truth if reference is None else reference(whole.signals.stamps_ns)
+    assert truth is not None, "the plan of the drive derives it"
     period_s = drive.plan.alignment.grid_period_s
     half_window = round(smoothing.half_s / period_s)
-    taught = service.model if physics.equations == "forces" else None
+    car, taught = service
+    is_physics = physics.equations == "forces"
     noise = smoothing.noise[0] * period_s / math.sqrt(2.0)  # of v_y itself
     return residual_rows(
-        calibrated_signals(whole.signals, service.car) if physics.equations == "forces" else whole.signals,
+        calibrated_signals(whole.signals, car) if is_physics else whole.signals,
         truth,
         physics,
         period_s=period_s,
         half_window=half_window,
         truth_std_m_s=noise if math.isfinite(noise) else 0.0,
-        taught=taught,
+        taught=taught if is_physics else None,
     )
 
 
