@@ -18,7 +18,7 @@ from pdhef_logtool.residual_model.bundle import (
 from pdhef_logtool.residual_model.features import EVEN_COUNT, FEATURES, ODD_COUNT, PAPER_FEATURES
 from pdhef_logtool.residual_model.ladder import LadderModel
 from pdhef_logtool.residual_model.linear_model import LinearModel
-from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.residual_model.network import ResidualNetwork
 
 
 def random_network(
@@ -35,7 +35,7 @@ def random_network(
     """Return a network of 8 units with random weights, scaled by an input and an output; or with a constant output."""
     torch.manual_seed(seed)
     size = len(names)
-    network = ResidualNetwork(Architecture(size, 8, layers, head, outputs=outputs))
+    network = ResidualNetwork(size, 8, layers, head, outputs=outputs)
     weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
     if constant is not None:
         last = max(k for k in weights if k.startswith("head") and k.endswith("bias"))

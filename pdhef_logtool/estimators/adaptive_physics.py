@@ -29,8 +29,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputState, check_inputs, r_scale, residual_of
-from pdhef_logtool.estimators.sensor_faults import no_faults
+from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputState, check_inputs, r_scale
 from pdhef_logtool.estimators.vehicle_model import VX
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, PosteriorSteps, VehicleUkf, of_car, sideslip_std
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
@@ -48,6 +47,8 @@ CURES = {"force_scale": 0.5, "bank": 0.0}
 #: Time constant with which the likelihood is forgotten, s. Chosen on simulated drives that no table contains; from 1 to
 #: 5 s little changes.
 FORGET_S = 2.0
+#: Columns of the state to mix; the first three have a covariance.
+MOTION_COLUMNS = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2")
 #: Smaller weights are set to 0.
 LEAST_WEIGHT = 1e-6
 
@@ -79,94 +80,50 @@ class AdaptiveState:
 
 
 @njit(cache=True)
-def _gather(dt, likelihood, starts, evidence, out):  # type: ignore[no-untyped-def]
-    """Write Λ [K, H] of each step; ``evidence`` [H] belongs to the step before the first, and is updated in place."""
-    for k in range(dt.shape[0]):
-        forgets = starts[k] or not dt[k] <= RESTART_GAP_S
-        kept = 0.0 if forgets else math.exp(-dt[k] / FORGET_S)
+def gather_evidence(dt_s, likelihood, starts, evidence):  # type: ignore[no-untyped-def]
+    """Return Λ [K, H] of steps with durations and starts [K] and log-likelihoods [K, H].
+
+    ``evidence`` [H] is Λ before the first step and becomes that of the last.
+    """
+    out = np.empty_like(likelihood)
+    for k in range(dt_s.shape[0]):
+        forgets = starts[k] or not dt_s[k] <= RESTART_GAP_S
+        kept = 0.0 if forgets else math.exp(-dt_s[k] / FORGET_S)
         heeds = not forgets
         for h in range(evidence.shape[0]):
             heeds = heeds and math.isfinite(likelihood[k, h])
         for h in range(evidence.shape[0]):
             evidence[h] = kept * evidence[h] + (likelihood[k, h] if heeds else 0.0)
             out[k, h] = evidence[h]
-
-
-def gather_evidence(dt_s: FloatArray, likelihood: FloatArray, starts: BoolArray, evidence: FloatArray) -> FloatArray:
-    """Return Λ [K, H] of steps with durations and starts [K] and log-likelihoods [K, H].
-
-    ``evidence`` [H] is Λ before the first step and becomes that of the last.
-    """
-    out = np.empty_like(likelihood)
-    _gather(dt_s, likelihood, starts, evidence, out)
     return out
 
 
 def weigh(evidence: FloatArray, usable: BoolArray) -> FloatArray:
     """Return weights [K, H] that go with exp(evidence), 0 where ``usable`` [K, H] is not; a row of zeros for none."""
-    weights = np.empty_like(evidence)
-    _weigh(evidence, usable, weights)
-    return weights
+    best = np.max(evidence, axis=1, keepdims=True, initial=-math.inf, where=usable)
+    weights = np.exp(np.where(usable, evidence - best, -math.inf))
+    weights[weights < LEAST_WEIGHT * weights.sum(axis=1, keepdims=True)] = 0.0
+    return _shares(weights)
 
 
-@njit(cache=True)
-def _weigh(evidence, usable, out):  # type: ignore[no-untyped-def]
-    for k in range(evidence.shape[0]):
-        best, total = -math.inf, 0.0
-        for h in range(evidence.shape[1]):
-            if usable[k, h]:
-                best = max(best, evidence[k, h])
-        for h in range(evidence.shape[1]):
-            out[k, h] = math.exp(evidence[k, h] - best) if usable[k, h] else 0.0
-            total += out[k, h]
-        for h in range(evidence.shape[1]):
-            if out[k, h] < LEAST_WEIGHT * total:
-                out[k, h] = 0.0
-    _share(out)
+def weights_of(steps: Sequence[PosteriorSteps], dt_s: FloatArray, evidence: FloatArray) -> FloatArray:
+    """Return the weights [K, H] of the steps of all filters [H]; ``evidence`` as in :func:`gather_evidence`."""
+    likelihood, starts = np.stack([s.log_likelihood for s in steps], axis=1), ~np.isfinite(steps[0].prior[:, VX])
+    gathered = gather_evidence(dt_s, likelihood, starts, evidence)
+    return weigh(gathered, np.stack([s.valid for s in steps], axis=1))
 
 
-@njit(cache=True)
-def _share(weights):  # type: ignore[no-untyped-def]
-    """Divide weights [K, H] by their sums, in place; a row of zeros stays."""
-    for k in range(weights.shape[0]):
-        total = 0.0
-        for h in range(weights.shape[1]):
-            total += weights[k, h]
-        for h in range(weights.shape[1]):
-            weights[k, h] = weights[k, h] / total if total > 0.0 else 0.0
+def _shares(weights: FloatArray) -> FloatArray:
+    """Return weights [K, H] divided by their sums; a row of zeros stays."""
+    total = weights.sum(axis=1, keepdims=True)
+    shares: FloatArray = np.divide(weights, total, out=np.zeros_like(weights), where=total > 0.0)
+    return shares
 
 
-@njit(cache=True)
-def _mix(weights, valid, states, covariances, w, x, P):  # type: ignore[no-untyped-def]
-    """Write the mixtures of states [H, N, 4] and covariances [H, N, 3, 3]; the first three states have a covariance.
-
-    ``w`` [N, H] becomes the weights of valid states; if all their weights are 0, they have equal ones.
-    """
-    for k in range(w.shape[0]):
-        total = 0.0
-        for h in range(w.shape[1]):
-            w[k, h] = weights[k, h] if valid[k, h] else 0.0
-            total += w[k, h]
-        for h in range(w.shape[1]):
-            if not total > 0.0:
-                w[k, h] = 1.0 if valid[k, h] else 0.0
-    _share(w)
-    for k in range(w.shape[0]):
-        x[k, :] = 0.0
-        P[k, :, :] = 0.0
-        for h in range(w.shape[1]):
-            if w[k, h] > 0.0:
-                for i in range(4):
-                    x[k, i] += w[k, h] * states[h, k, i]
-                for i in range(3):
-                    for j in range(3):
-                        P[k, i, j] += w[k, h] * covariances[h, k, i, j]
-        for h in range(w.shape[1]):
-            if 0.0 < w[k, h] < 1.0:
-                for i in range(3):
-                    for j in range(i + 1):
-                        P[k, i, j] += w[k, h] * (states[h, k, i] - x[k, i]) * (states[h, k, j] - x[k, j])
-                        P[k, j, i] = P[k, i, j]
+def _column(track: StateTrack, name: str) -> FloatArray:
+    """Return a column of a track [N], zeros if it has none."""
+    column: FloatArray = getattr(track, name)
+    return column if len(column) == len(track) else np.zeros(len(track))
 
 
 def mix(weights: FloatArray, tracks: Sequence[StateTrack]) -> StateTrack:
@@ -175,41 +132,34 @@ def mix(weights: FloatArray, tracks: Sequence[StateTrack]) -> StateTrack:
     Invalid states have weight 0; if all weights of valid ones are 0, these have equal weights.
     """
     valid = np.stack([t.valid for t in tracks], axis=1)
-    count = len(valid)
-    w, x, P = np.empty(valid.shape), np.empty((count, 4)), np.empty((count, 3, 3))
-    states = np.stack([np.stack([t.vx_m_s, t.vy_m_s, t.yaw_rate_rad_s, t.ay_m_s2], axis=1) for t in tracks])
-    _mix(weights, valid, states, np.stack([t.covariance for t in tracks]), w, x, P)
+    w = np.where(valid, weights, 0.0)
+    w = _shares(np.where(w.sum(axis=1, keepdims=True) > 0.0, w, valid))
+    # A filter without one of the estimates beside the motion counts as 0.
+    names = [*MOTION_COLUMNS, *(n for n in ESTIMATED_COLUMNS if any(len(getattr(t, n)) for t in tracks))]
+    used, states = w > 0.0, [np.stack([_column(t, n) for n in names], axis=1) for t in tracks]
+    x, P = np.zeros((len(w), len(names))), np.zeros((len(w), 3, 3))
+    for share, rows, state in zip(w.T, used.T, states, strict=True):
+        x[rows] += share[rows, None] * state[rows]
+    for share, rows, state, track in zip(w.T, used.T, states, tracks, strict=True):
+        away = (state[rows] - x[rows])[:, :3]
+        P[rows] += share[rows, None, None] * (track.covariance[rows] + away[:, :, None] * away[:, None, :])
     any_valid: BoolArray = valid.any(axis=1)  # type: ignore[assignment]
     x[~any_valid], P[~any_valid] = np.nan, np.nan
     likeliest = np.argmax(w, axis=1)
+    mixed: dict[str, Any] = {name: x[:, i].copy() for i, name in enumerate(names)}
 
     def of_likeliest(name: str) -> Any:
         return np.choose(likeliest, [getattr(t, name) for t in tracks])
 
     return replace(
         tracks[0],
-        vx_m_s=x[:, 0].copy(),
-        vy_m_s=x[:, 1].copy(),
-        yaw_rate_rad_s=x[:, 2].copy(),
-        ay_m_s2=x[:, 3].copy(),
+        **mixed,
         sideslip_rad=np.arctan2(x[:, 1], x[:, 0]),
         covariance=P,
         sideslip_std_rad=sideslip_std(x[:, 0], x[:, 1], P),
         **{name: of_likeliest(name) for name in ("nis", "nis_dof", "friction", "diverged")},
         valid=any_valid,
-        **_mixed_columns(w, tracks),
     )
-
-
-def _mixed_columns(w: FloatArray, tracks: Sequence[StateTrack]) -> dict[str, Any]:
-    """Return the mixed estimates beside the motion; a filter without such a state counts as 0."""
-    mixed = {}
-    for name in ESTIMATED_COLUMNS:
-        columns = [getattr(t, name) for t in tracks]
-        if any(len(c) == len(w) for c in columns):
-            parts = [np.where(w[:, h] > 0.0, w[:, h] * c, 0.0) for h, c in enumerate(columns) if len(c) == len(w)]
-            mixed[name] = np.where(w.sum(axis=1) > 0.0, np.sum(parts, axis=0), np.nan)
-    return mixed
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,10 +208,7 @@ class AdaptivePhysics:
 
     def inputs(self, signals: Signals, state: InputState | None) -> tuple[CheckedInputs, InputState]:
         """Return the inputs of the filters, checked signals with the residual at gain 1, and the state."""
-        if self.adaptive:
-            return check_inputs(self.physics, self.network, signals, state)
-        residual, after = residual_of(self.physics, self.network, signals, state)
-        return CheckedInputs(no_faults(signals), residual), after
+        return check_inputs(self.physics, self.network, signals, state, detects=self.adaptive)
 
     def run(self, signals: Signals, state: AdaptiveState | None) -> tuple[MixtureSteps, AdaptiveState]:
         """Process one window (see :class:`~.base.Estimator`)."""
@@ -271,11 +218,9 @@ class AdaptivePhysics:
         members = zip(filters, before, self.residual_shares, strict=True)
         runs = [f.run(faults.filtered, b, share * rate, faults.extra_r) for f, b, share in members]
         steps = tuple(filter_steps for filter_steps, _ in runs)
-        likelihood, starts = np.stack([s.log_likelihood for s in steps], axis=1), ~np.isfinite(steps[0].prior[:, VX])
         dt_s = step_durations_s(signals.stamps_ns, state.filters[0].last_stamp_ns if state else None)
         evidence = state.evidence.copy() if state else np.zeros(len(filters))
-        gathered = gather_evidence(dt_s, likelihood, starts, evidence)
-        weights = weigh(gathered, np.stack([filter_steps.valid for filter_steps in steps], axis=1))
+        weights = weights_of(steps, dt_s, evidence)
         raised = r_scale(faults.extra_r, self.physics.measurement_std)
         after = AdaptiveState(inputs, tuple(state for _, state in runs), evidence)
         return MixtureSteps(steps, weights, raised, faults.reason, self.trust * checked.residual.gain), after

@@ -6,17 +6,16 @@ filter's prediction in place of a bad sample. Without a model there is no parall
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.plug_ins import contained, package_of
-from pdhef_logtool.estimators.sensor_faults import FaultState, SensorFaults, find_faults
+from pdhef_logtool.estimators.sensor_faults import FaultState, SensorFaults, find_faults, no_faults
 from pdhef_logtool.estimators.vehicle_ukf import FilterState, VehicleUkf
 from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.records.steps import step_durations_s
 from pdhef_logtool.residual_model.interface import Residual, ResidualModel, checked_residual
 
 
@@ -43,42 +42,28 @@ class CheckedInputs:
 
 
 def check_inputs(
-    physics: VehicleUkf, model: ResidualModel | None, signals: Signals, state: InputState | None
+    physics: VehicleUkf, model: ResidualModel | None, signals: Signals, state: InputState | None, *, detects: bool
 ) -> tuple[CheckedInputs, InputState]:
     """Detect faults in one window, and run parallel filter and residual model on the accepted samples.
 
-    Joined windows give the same bits as one call over the whole log.
+    Without the detector (``detects``) all samples are accepted; without a model the residual is 0. Joined windows give
+    the same bits as one call over the whole log.
     """
-    faults, fault_carry = find_faults(signals, physics.vehicle, state.faults if state else None)
-    residual, carried = residual_of(physics, model, faults.filtered, state, faults)
-    return CheckedInputs(faults, residual), replace(carried, faults=fault_carry)
-
-
-def residual_of(
-    physics: VehicleUkf,
-    model: ResidualModel | None,
-    signals: Signals,
-    state: InputState | None,
-    faults: SensorFaults | None = None,
-) -> tuple[Residual, InputState]:
-    """Return the residual of a window's steps; 0 without a model."""
+    faults, fault_state = no_faults(signals), None
+    if detects:
+        faults, fault_state = find_faults(signals, physics.vehicle, state.faults if state else None)
     if model is None:
-        return Residual.zero(len(signals)), InputState(None)
-    features, steps, after = run_features(
-        physics,
-        signals,
-        state.physics if state else None,
-        seen=None if faults is None else faults.network,
-        extra_r=None if faults is None else faults.extra_r,
+        return CheckedInputs(faults, Residual.zero(len(signals))), InputState(fault_state)
+    before = state.physics if state else None
+    features, dt_s, _, after = run_features(
+        physics, faults.filtered, before, seen=faults.network, extra_r=faults.extra_r
     )
-    dt_s = step_durations_s(signals.stamps_ns, state.physics.last_stamp_ns if state and state.physics else None)
-    dt_s[~np.isfinite(steps.prior[:, 0])] = np.nan
     package = package_of(model)
     with contained(f"residual model {type(model).__name__}", package):
         residual, said = model.residual(features, dt_s, state.model if state else None)
         if package:
             residual = checked_residual(residual, len(signals))
-    return residual, InputState(None, after, said)
+    return CheckedInputs(faults, residual), InputState(fault_state, after, said)
 
 
 def r_scale(extra_r: FloatArray, r_std: FloatArray) -> FloatArray:

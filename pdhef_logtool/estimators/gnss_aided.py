@@ -32,7 +32,7 @@ from pdhef_logtool.estimators.base import notes_of, predict_track
 from pdhef_logtool.estimators.intervals import scaled_covariance
 from pdhef_logtool.estimators.reference.gnss import LEAST_COURSE_SPEED_M_S
 from pdhef_logtool.estimators.reference.inputs import RATE_HZ, ROLL_PER_AY_RAD_S2_M, SLOW_S
-from pdhef_logtool.estimators.vehicle_ukf import LIMIT_TIME_S, LINEAR_SHARE, VehicleUkf, sideslip_std
+from pdhef_logtool.estimators.vehicle_ukf import LIMIT_TIME_S, LINEAR_SHARE, sideslip_std
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, ExtendedSteps, Extrapolation, last_stamp_ns, step_durations_s
 from pdhef_logtool.records.tracks import StateTrack
@@ -288,10 +288,6 @@ class GnssAided:
         """Estimator that provides the intervals if this one has no calibrated intervals."""
         return self.estimator
 
-    @property
-    def _physics(self) -> VehicleUkf:
-        return self.estimator.physics
-
     def run(self, signals: Signals, state: AidedState | None) -> tuple[AidedSteps, AidedState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         before_ns = None if state is None else state.last_stamp_ns
@@ -300,7 +296,7 @@ class GnssAided:
         everywhere = np.ones(count, dtype=np.bool_)
         at_steps = Extrapolation(np.arange(count), everywhere, np.zeros(count), np.asarray(steps.valid))
         track = predict_track(self.estimator, steps, at_steps, stamps_ns)
-        vehicle = self._physics.vehicle
+        vehicle = self.estimator.physics.vehicle
         ay_m_s2 = signals.ay_m_s2 / (1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2)
         columns = (
             np.nan_to_num(step_durations_s(stamps_ns, before_ns)), (signals.ready_ns - stamps_ns) * 1e-9, ay_m_s2,

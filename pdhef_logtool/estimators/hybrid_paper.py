@@ -25,50 +25,13 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.estimators import vehicle_ukf as ukf
 from pdhef_logtool.estimators.fuzzy_trust import NOMINAL_TRUST, fuzzy_trust
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.speed_slip import believable
-from pdhef_logtool.estimators.unscented import cholesky, draw, moments, update
-from pdhef_logtool.estimators.vehicle_model import (
-    MOTION,
-    NOMINAL,
-    PLACES,
-    READINGS,
-    VX,
-    WIDTH,
-    Z_AY,
-    advance,
-    planar_ay,
-    push,
-)
-from pdhef_logtool.estimators.vehicle_ukf import (
-    PHY_UKF_Q_STD,
-    U_AX,
-    U_AX_KNOWN,
-    U_FRICTION,
-    U_STEER,
-    FilterState,
-    PosteriorSteps,
-    StepInputs,
-    VehicleUkf,
-    columns_of,
-    diverges,
-    due_predictions,
-    expect,
-    held_inputs,
-    held_over_step,
-    innovate,
-    is_finite,
-    make_window,
-    no_posterior,
-    no_prediction,
-    nominal_filter,
-    predicted_track,
-    process_noise,
-    remember,
-    resume,
-)
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.estimators.unscented import update
+from pdhef_logtool.estimators.vehicle_model import NOMINAL, PLACES, READINGS, VX, WIDTH, Z_AY
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import Extrapolation, last_stamp_ns
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
@@ -103,7 +66,7 @@ CHOSEN = Constants(1.0, 0.1, (0.03, 0.1, 0.25), (0.03, 0.06, 0.085), 3.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PaperSteps(PosteriorSteps):
+class PaperSteps(ukf.PosteriorSteps):
     """Posteriors, and by step, [K]: ``trust`` is β_k, ``r_scale`` R_k / R_0 of a_y.
 
     ``residual_rate`` is the network's at the step, before β.
@@ -117,38 +80,10 @@ class PaperSteps(PosteriorSteps):
 class PaperState:
     """States of the parallel filter, the network and this filter between windows; ``adapted`` [1] is β and C."""
 
-    physics: FilterState
+    physics: ukf.FilterState
     network: NetworkCarry
-    filtered: FilterState
+    filtered: ukf.FilterState
     adapted: np.ndarray[Any, Any]
-
-
-class Parallel(NamedTuple):
-    """Steps of the parallel filter: state [K, 4], state before the update, held inputs, and whether they are right.
-
-    ``nominal_ay`` [K] is a_y of the state before the update, without residual.
-    """
-
-    x: FloatArray
-    prior: FloatArray
-    inputs: FloatArray
-    valid: BoolArray
-    nominal_ay: FloatArray
-
-
-# positional: to hand structures of arrays on at every step would cost as much as the step.
-@njit(cache=True)
-def _predict(x, P, over, rate, dt, noise_dt, q_std, model, points, E):  # type: ignore[no-untyped-def]
-    """Move state and covariance by ``dt`` s, with the increment of the residual ``rate`` whole at the end (Eq 19)."""
-    layout, places, p, f = model
-    n, vx = x.shape[0], x[VX]
-    L, q = np.zeros((n, n)), np.empty(n)
-    cholesky(P, L)
-    draw(x, L, places, columns_of(n), points)
-    advance(points, columns_of(n), over, dt, layout, p, f)
-    push(points, columns_of(n), vx, rate, dt, p)
-    process_noise(q_std, over.ax_known, noise_dt, layout, q)
-    moments(points, places, columns_of(n), q, x, P, E)
 
 
 @njit(cache=True)
@@ -171,26 +106,27 @@ def adapted_noise(innovation_variance, innovation, predicted_variance, r0, forge
 def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted):  # type: ignore[no-untyped-def]
     """Run over one window; ``belief`` is moved in place.
 
-    Where the prior of the parallel filter is missing it starts, and this filter with it. ``r0`` [3] is R_0, and
-    ``adapted`` residual gain and scale of R at each step, [K] each.
+    ``parallel`` has the columns of the parallel filter's steps, and a_y [K] of its prior without residual. Where its
+    prior is missing it starts, and this filter with it. ``r0`` [3] is R_0, and ``adapted`` residual gain and scale of R
+    at each step, [K] each.
     """
     forgetting, process_noise_gain, deviation_tops, intensity_tops, _ = constants
     layout, places, p, f = model
-    start_x, prior, inputs, start_ok, nominal_ay = parallel
+    (start_x, _, inputs, _, _, _, _, start_ok, _, prior), nominal_ay = parallel
     (x, P, memory), adapted_memory = belief
     out_x, out_P, _, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_trust, out_r_scale = adapted
     n = x.shape[0]
     points, E, readings = np.zeros(PLACES * WIDTH), np.zeros(n * WIDTH), np.zeros(READINGS * WIDTH)
-    L, S, Pxz = np.zeros((n, n)), np.zeros((READINGS, READINGS)), np.zeros((READINGS, n))
+    L, q, S, Pxz = np.zeros((n, n)), np.zeros(n), np.zeros((READINGS, READINGS)), np.zeros((READINGS, n))
     z_hat, nu, use = np.zeros(READINGS), np.zeros(READINGS), np.zeros(READINGS, np.bool_)
     no_r = np.zeros(READINGS)  # R is added when it is adapted
     for k in range(window.dt_s.shape[0]):
         m, a, ok, dt = memory[0], adapted_memory[0], start_ok[k], window.dt_s[k]
-        steer, friction, has_ax = inputs[k, U_STEER], inputs[k, U_FRICTION], inputs[k, U_AX_KNOWN] > 0.0
+        steer, friction, has_ax = inputs[k, ukf.U_STEER], inputs[k, ukf.U_FRICTION], inputs[k, ukf.U_AX_KNOWN] > 0.0
         ay = window.ay[k] if ok else math.nan  # without steering no a_y can be predicted
         speed = window.speed[k] if tuning.rules.use_speed else math.nan
-        now = StepInputs(dt, steer, inputs[k, U_AX], has_ax, friction, ok, ok, ay, window.yaw_rate[k], speed)
+        now = ukf.StepInputs(dt, steer, inputs[k, ukf.U_AX], has_ax, friction, ok, ok, ay, window.yaw_rate[k], speed)
         out_r_scale[k] = 1.0
         if not math.isfinite(prior[k, VX]):
             m.runs = 0.0
@@ -206,14 +142,15 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
             trust = fuzzy_trust(abs(window.ay[k] - nominal_ay[k]), intensity, deviation_tops, intensity_tops)
             if math.isfinite(trust):
                 a.trust = trust
-            over, rate = held_over_step(now, m), (a.trust * m.rate_vy, a.trust * m.rate_r)
+            over, rate = ukf.held_over_step(now, m), (a.trust * m.rate_vy, a.trust * m.rate_r)
             noise_dt = (1.0 + process_noise_gain * a.trust) * dt  # Eq 26
-            _predict(x, P, over, rate, dt, noise_dt, tuning.q_std, model, points, E)
-            alive = is_finite(x, P)
+            ukf.process_noise(tuning.q_std, over.ax_known, noise_dt, layout, q)
+            ukf.predict(x, P, L, over, rate, dt, 0.0, q, layout, places, p, f, points, E)  # Eq 19
+            alive = ukf.is_finite(x, P)
             out_prior[k] = x
             if alive:
-                expect(x, P, L, now, rate[0], no_r, layout, places, p, f, points, readings, z_hat, S, Pxz)
-                innovate(now, z_hat, nu)
+                ukf.expect(x, P, L, now, rate[0], no_r, layout, places, p, f, points, readings, z_hat, S, Pxz)
+                ukf.innovate(now, z_hat, nu)
                 for i in range(READINGS):
                     use[i] = math.isfinite(nu[i])
                     r = r0[i]
@@ -228,38 +165,15 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
                 nis, dof, out_likelihood[k] = update(x, P, nu, S, Pxz, use)
                 if dof > 0:
                     out_nis[k], out_dof[k] = nis, dof
-                alive = is_finite(x, P)
+                alive = ukf.is_finite(x, P)
             out_valid[k] = alive and ok
-            out_diverged[k] = not alive or diverges(tuning.rules, x, m)
+            out_diverged[k] = not alive or ukf.diverges(tuning.rules, x, m)
             if not alive:
                 m.runs = 0.0
-        remember(k, now, window.residual_rate, m)
+        ukf.remember(k, now, window.residual_rate, m)
         out_trust[k] = a.trust
         out_x[k] = x
         out_P[k] = P
-
-
-@njit(cache=True)
-def _predict_outputs(due, held, trust, q_std, process_noise_gain, model, out):  # type: ignore[no-untyped-def]
-    """Predict the steps that are due with inputs, residual and ``trust`` [K] held; the rows of no step are left."""
-    step, horizon_s = due
-    held_x, held_P, inputs, rate = held
-    out_x, out_P, out_ay = out
-    n = held_x.shape[1]
-    points, E, x, P = np.zeros(PLACES * WIDTH), np.zeros(n * WIDTH), np.empty(n), np.empty((n, n))
-    for row in range(step.shape[0]):
-        k = step[row]
-        if k < 0:
-            continue
-        x[:], P[:, :] = held_x[k], held_P[k]
-        over = held_inputs(inputs, k)
-        trusted = (trust[k] * rate[k, 0], trust[k] * rate[k, 1])
-        if horizon_s[row] > 0.0:
-            noise_dt = (1.0 + process_noise_gain * trust[k]) * horizon_s[row]
-            _predict(x, P, over, trusted, horizon_s[row], noise_dt, q_std, model, points, E)
-        if is_finite(x, P):
-            out_x[row], out_P[row] = x, P[:MOTION, :MOTION]
-            out_ay[row] = planar_ay(x, over.steer, over.friction, trusted[0], model.layout, model.p)
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,18 +185,16 @@ class PaperHybridUkf:
     q_std : Q_0 as process 1-sigma per √s of [v_x, v_y, r, b_ax].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
     constants : that the paper leaves open.
-    slip_gate : as for ``phy-ukf``: leave out the speed of wheels that spin or lock.
     """
 
     algorithm = "paper-hybrid-ukf"
     version = 2
-    options = ("slip_gate", "constants")
+    options = ("constants",)
 
     vehicle: VehicleParameters
     network: NetworkService
-    q_std: tuple[float, float, float, float] = PHY_UKF_Q_STD
+    q_std: tuple[float, float, float, float] = ukf.PHY_UKF_Q_STD
     use_speed: bool = True
-    slip_gate: bool = True
     name: str = "pd-hef-paper"
     causal: bool = True
     constants: Constants = CHOSEN
@@ -305,26 +217,24 @@ class PaperHybridUkf:
         return variance
 
     @property
-    def parallel(self) -> VehicleUkf:
+    def parallel(self) -> ukf.VehicleUkf:
         """The physics filter in parallel, whose model, initial covariance and Q_0 are those of this filter."""
-        return nominal_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate, name="parallel")
+        return ukf.nominal_filter(self.vehicle, use_speed=self.use_speed, name="parallel")
 
     def run(self, signals: Signals, state: PaperState | None) -> tuple[PaperSteps, PaperState]:
         """Process one window (see :class:`~.base.Estimator`)."""
-        features, physics, after = run_features(self.parallel, signals, state.physics if state else None)
-        starts = ~np.isfinite(physics.prior[:, VX])
-        rate, network = self.network.run(features, starts, state.network if state else None)
+        features, dt_s, physics, after = run_features(self.parallel, signals, state.physics if state else None)
+        rate, network = self.network.run(features, np.isnan(dt_s), state.network if state else None)
         before = (state.filtered, state.adapted) if state else (None, None)
         steps, filtered, adapted = self.filter_steps(signals, physics, rate, *before)
         return steps, PaperState(after, network, filtered, adapted)
 
     def predict(self, steps: PaperSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate steps with the nominal model and the residual held (see :class:`~.base.ModelPredictor`)."""
-        held = (steps.x, steps.P, steps.inputs, steps.residual_rate)
-        predicted = no_prediction(len(stamps_ns), steps.x.shape[1])
-        due, gain = due_predictions(ahead), self.constants.process_noise_gain
-        _predict_outputs(due, held, steps.trust, np.array(self.q_std), gain, self.parallel.parameters, predicted)
-        track = predicted_track(self.name, stamps_ns, steps, ahead, predicted)
+        rate = steps.trust[:, None] * steps.residual_rate
+        noise = 1.0 + self.constants.process_noise_gain * steps.trust
+        q_std, model = np.array(self.q_std), self.parallel.parameters
+        track = ukf.predicted_track(self.name, steps, ahead, stamps_ns, q_std, model, rate=rate, noise=noise, early=0.0)
         return replace(
             track,
             network_trust=np.where(track.valid, steps.trust[ahead.step], np.nan),
@@ -334,26 +244,27 @@ class PaperHybridUkf:
     def filter_steps(
         self,
         signals: Signals,
-        physics: PosteriorSteps,
+        physics: ukf.PosteriorSteps,
         rate: FloatArray,
-        state: FilterState | None = None,
+        state: ukf.FilterState | None = None,
         adapted: np.ndarray[Any, Any] | None = None,
-    ) -> tuple[PaperSteps, FilterState, np.ndarray[Any, Any]]:
+    ) -> tuple[PaperSteps, ukf.FilterState, np.ndarray[Any, Any]]:
         """Filter one window with the results of the parallel filter and the residual ``rate`` [K, 2] of the network.
 
         Return its steps, and the states for the next window.
         """
-        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None, gate=self.slip_gate)
+        before_ns = state.last_stamp_ns if state else None
+        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None, before_ns)
         count, n, nominal = len(signals), NOMINAL.size, self.parallel
-        belief, remembered = resume(state, n), np.zeros(1, ADAPTED) if adapted is None else adapted.copy()
-        nominal_ay = nominal.expected_ay(physics.prior, physics.inputs)
-        parallel = Parallel(physics.x, physics.prior, physics.inputs, physics.valid, nominal_ay)
-        out, columns = no_posterior(count, n)._replace(inputs=physics.inputs), (np.empty(count), np.empty(count))
-        window, r0 = make_window(signals, state, rate), self.measurement_variance
-        tuning = nominal.tuning._replace(q_std=np.array(self.q_std))
-        _filter(window, tuning, r0, self.constants, nominal.parameters, parallel, (belief, remembered), out, columns)
-        after = FilterState(belief, last_stamp_ns(signals.stamps_ns, state.last_stamp_ns if state else None), slip)
-        return PaperSteps(signals.stamps_ns, *out, rate, *columns), after, remembered
+        belief, remembered = ukf.resume(state, n), np.zeros(1, ADAPTED) if adapted is None else adapted.copy()
+        parallel = physics.written, nominal.expected_ay(physics.prior, physics.inputs)
+        steps, columns = ukf.no_posterior(signals.stamps_ns, n, rate), (np.empty(count), np.empty(count))
+        steps = replace(steps, inputs=physics.inputs)
+        window, r0 = ukf.make_window(signals, state, rate), self.measurement_variance
+        tuning, kept = nominal.tuning._replace(q_std=np.array(self.q_std)), (belief, remembered)
+        _filter(window, tuning, r0, self.constants, nominal.parameters, parallel, kept, steps.written, columns)
+        after = ukf.FilterState(belief, last_stamp_ns(signals.stamps_ns, before_ns), slip)
+        return PaperSteps(steps.stamps_ns, *[*steps.written, rate, *columns]), after, remembered
 
 
 def build(name: str, car: Car, options: Options) -> PaperHybridUkf:

@@ -70,7 +70,10 @@ class TrackCalibrator:
         matched = self._found(track.name)
         if self.intervals is None or matched is None:
             return self.posterior[track.name](track, signals) if track.name in self.posterior else track
-        return calibrated(track, signals, matched[0].inflation, self.intervals.roll_gradient_rad_per_m_s2)
+        from pdhef_logtool.estimators.error_features import error_terms  # compiled
+
+        terms = error_terms(track, signals, self.intervals.roll_gradient_rad_per_m_s2)
+        return inflated(track, terms, matched[0].inflation)
 
     def notes(self, name: str) -> tuple[str, ...]:
         """Return the report's notes on an estimator's intervals; empty without intervals."""
@@ -123,24 +126,6 @@ class TrackCalibrator:
             if algorithm.identity in entries:
                 return entries[algorithm.identity], algorithm
         return None
-
-
-def calibrated(
-    track: StateTrack,
-    signals: Signals,
-    inflation: Inflation,
-    roll_gradient_rad_per_m_s2: float,
-) -> StateTrack:
-    """Return a track with calibrated 1-sigmas and covariance.
-
-    Parameters
-    ----------
-    track, signals : [N] at the same stamps. roll_gradient_rad_per_m_s2 : of the car of the fit.
-    """
-    from pdhef_logtool.estimators.error_features import error_terms
-
-    terms = error_terms(track, signals, roll_gradient_rad_per_m_s2)
-    return inflated(track, terms, inflation)
 
 
 def inflated(track: StateTrack, terms: FloatArray, inflation: Inflation) -> StateTrack:

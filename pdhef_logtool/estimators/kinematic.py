@@ -52,10 +52,9 @@ class Kinematic:
 
     algorithm = "kinematic"
     version = 1
-    options = ("leak_s", "slip_gate", *_PROFILE)
+    options = ("leak_s", *_PROFILE)
 
     leak_s: float = LEAK_S
-    slip_gate: bool = True
     speed_hold_s: float = Sensors().speed_hold_s
     speed_zero_m_s: float = Sensors().speed_zero_m_s
     speed_least_m_s: float = Sensors().speed_least_m_s
@@ -65,7 +64,7 @@ class Kinematic:
     def run(self, signals: Signals, state: StepState | None) -> tuple[Steps, StepState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         profile = Sensors(**{name: getattr(self, name) for name in _PROFILE})
-        s, dt, steps, after = prepared_steps(signals, state, 4, slip_gate=self.slip_gate, sensors=profile)
+        s, dt, steps, after = prepared_steps(signals, state, 4, profile)
         window = (dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s)
         limits = self.leak_s, self.speed_hold_s, self.speed_zero_m_s
         _kinematic(window, *limits, after.state, steps.values, steps.rates, steps.valid)

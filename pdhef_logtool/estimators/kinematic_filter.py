@@ -25,6 +25,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.estimators.gaussian import correct, dot, times
 
 #: Entries of the state: up to PITCH_RATE_BIAS always, all with GNSS velocity.
 (
@@ -63,26 +64,6 @@ STILL_M_S, STILL_RAD_S, CAUCHY = 0.02, 0.002, 3.0
 
 
 @njit(cache=True)
-def _dot(a, b):  # type: ignore[no-untyped-def]
-    total = 0.0  # NumPy's product would load SciPy's BLAS
-    for i in range(a.shape[0]):
-        total += a[i] * b[i]
-    return total
-
-
-@njit(cache=True)
-def _times(a, b):  # type: ignore[no-untyped-def]
-    """Return the product of a sparse and a dense matrix."""
-    out = np.zeros((a.shape[0], b.shape[1]))
-    for i in range(a.shape[0]):
-        for m in range(a.shape[1]):
-            if a[i, m] != 0.0:
-                for j in range(b.shape[1]):
-                    out[i, j] += a[i, m] * b[m, j]
-    return out
-
-
-@njit(cache=True)
 def predict(x, p, point, step_s, row, before, noise):  # type: ignore[no-untyped-def]
     """Return the state after a step, its covariance, and Cov(x, new x); linearised about ``point``.
 
@@ -91,24 +72,11 @@ def predict(x, p, point, step_s, row, before, noise):  # type: ignore[no-untyped
     f = np.zeros(p.shape)
     new = _transition(point, step_s, row, f)
     for i in range(new.shape[0]):
-        new[i] += _dot(f[i], x - point)
-    cross = _times(f, p).T.copy()
-    predicted = _times(f, cross)
+        new[i] += dot(f[i], x - point)
+    cross = times(f, p).T.copy()
+    predicted = times(f, cross)
     _add_process_noise(predicted, point, step_s, row, before, noise)
     return new, predicted, cross
-
-
-@njit(cache=True)
-def correct(x, p, h, residual, variance):  # type: ignore[no-untyped-def]
-    """Update state and covariance in place with a scalar measurement of Jacobian h [n]."""
-    ph = np.empty_like(h)
-    for i in range(h.shape[0]):
-        ph[i] = _dot(p[i], h)
-    s = _dot(h, ph) + variance
-    for i in range(x.shape[0]):
-        x[i] += ph[i] / s * residual
-        for j in range(x.shape[0]):
-            p[i, j] -= ph[i] * ph[j] / s
 
 
 @njit(cache=True)
@@ -120,7 +88,7 @@ def use(x, p, point, h, measured, robust):  # type: ignore[no-untyped-def]
     residual, variance = measured
     if robust:
         variance *= 1.0 + residual * residual / (variance * CAUCHY * CAUCHY)
-    correct(x, p, h, residual - _dot(h, x - point), variance)
+    correct(x, p, h, residual - dot(h, x - point), variance)
 
 
 @njit(cache=True)

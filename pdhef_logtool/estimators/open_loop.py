@@ -75,17 +75,15 @@ class OpenLoop:
 
     algorithm = "open-loop"
     version = 1
-    options = ("slip_gate",)
 
     vehicle: VehicleParameters
-    slip_gate: bool = True
     name: str = "open-loop"
     causal: bool = True
 
     def run(self, signals: Signals, state: StepState | None) -> tuple[Steps, StepState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         p, mu, sensors = model_parameters(self.vehicle), self.vehicle.assumed_friction, self.vehicle.sensors
-        s, dt, steps, after = prepared_steps(signals, state, 6, slip_gate=self.slip_gate, sensors=sensors)
+        s, dt, steps, after = prepared_steps(signals, state, 6, sensors)
         inputs = (dt, s.steer_rad, s.ax_m_s2, s.speed_m_s, s.friction)
         _open_loop(inputs, sensors.speed_hold_s, mu, p, after.state, steps.values, steps.rates, steps.valid)
         return steps, after

@@ -25,6 +25,7 @@ from pdhef_logtool.estimators.vehicle_ukf import (
 )
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.steps import step_durations_s
 from pdhef_logtool.residual_model.bundle import PHYSICS_MODEL
 from pdhef_logtool.residual_model.features import make_features
 
@@ -49,7 +50,7 @@ def run_features(
     *,
     seen: Signals | None = None,
     extra_r: FloatArray | None = None,
-) -> tuple[FloatArray, PosteriorSteps, FilterState]:
+) -> tuple[FloatArray, FloatArray, PosteriorSteps, FilterState]:
     """Run the parallel filter over a window.
 
     Parameters
@@ -61,6 +62,7 @@ def run_features(
     -------
     features : [K, 15], NaN without steering, without a state of the filter, or if the filter moves backwards against
         the speed sensor.
+    dt_s : [K], duration before each step, NaN where the filter starts.
     steps, state : of the filter.
     """
     steps, after = physics.run(signals, state, extra_r=extra_r)
@@ -77,4 +79,6 @@ def run_features(
     )  # fmt: skip
     steers = steps.inputs[:, U_STEER_KNOWN] > 0.0
     features[~(steps.valid & steers & rolls_forward(steps.x[:, VX], steps.inputs[:, U_SPEED]))] = np.nan
-    return features, steps, after
+    dt_s = step_durations_s(signals.stamps_ns, state.last_stamp_ns if state else None)
+    dt_s[~np.isfinite(steps.prior[:, VX])] = np.nan
+    return features, dt_s, steps, after

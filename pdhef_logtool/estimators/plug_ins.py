@@ -6,15 +6,12 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
-from dataclasses import fields, replace
 from pathlib import Path
 from traceback import extract_tb
 from typing import Any
 
-import numpy as np
-
 from pdhef_logtool.records.errors import EstimatorError, PdhefError
-from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.signals import SIGNAL_COLUMNS, Signals
 
 _PACKAGE = __name__.partition(".")[0]
 
@@ -58,9 +55,7 @@ def contained(name: str, package: str) -> Iterator[None]:
 
 def read_only(signals: Signals) -> Signals:
     """Return copies with read-only columns."""
-    copies: dict[str, Any] = {
-        f.name: np.array(getattr(signals, f.name)) for f in fields(signals) if f.name != "available"
-    }
-    for copy in copies.values():
-        copy.setflags(write=False)
-    return replace(signals, **copies)
+    copies = signals.copy()
+    for name in SIGNAL_COLUMNS:
+        getattr(copies, name).setflags(write=False)
+    return copies

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, gather_evidence, weigh
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, weights_of
 from pdhef_logtool.estimators.vehicle_model import VX, VY
 from pdhef_logtool.estimators.vehicle_ukf import PosteriorSteps, StepLinks
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
@@ -67,9 +67,7 @@ def residual_response(physics: AdaptivePhysics, signals: Signals, row: IntArray)
         runs.append(steps)
         transitions.append(transition)
         drives.append(drive)
-    likelihood, starts = np.stack([s.log_likelihood for s in runs], axis=1), ~np.isfinite(runs[0].prior[:, VX])
-    evidence = gather_evidence(step_durations_s(signals.stamps_ns, None), likelihood, starts, np.zeros(len(runs)))
-    weights = weigh(evidence, np.stack([steps.valid for steps in runs], axis=1))
+    weights = weights_of(runs, step_durations_s(signals.stamps_ns, None), np.zeros(len(runs)))
     sideslip = np.stack([w * _sideslip_per_vy(s) for w, s in zip(weights.T, runs, strict=True)])
     return ResidualResponse(transitions, drives, sideslip, row)
 

@@ -60,15 +60,6 @@ def smooth_steps(forward: ForwardSteps) -> tuple[FloatArray, FloatArray]:
     return smooth_states(steps.x, predicted_x, predicted_P, cross), smooth_covariances(steps.P, predicted_P, cross)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FilteredDrive:
-    """The smoothed track of one filter over a drive [N], its log-likelihood and starts [N]."""
-
-    track: StateTrack
-    log_likelihood: FloatArray
-    starts: BoolArray
-
-
 @njit(cache=True)
 def _add_later(dt, likelihood, starts, evidence):  # type: ignore[no-untyped-def]
     """Add to Λ [N, H] of each step the likelihood of the following steps."""
@@ -141,17 +132,19 @@ class SmoothedPhysics:
         """Return the smoothed tracks of all filters [H], and their weights [N, H]."""
         members = zip(self.filtered.filters, self.filtered.residual_shares, strict=True)
         drives = [self._smoothed(f, signals, share * rate, extra_r) for f, share in members]
-        tracks = [d.track for d in drives]
+        tracks = [track for track, _, _ in drives]
         if len(drives) == 1:
             return tracks, np.ones((len(signals), 1))
-        likelihood = np.stack([d.log_likelihood for d in drives], axis=1)
-        dt_s, starts = step_durations_s(signals.stamps_ns, None), drives[0].starts
+        likelihood, starts = np.stack([of_one for _, of_one, _ in drives], axis=1), drives[0][2]
+        dt_s = step_durations_s(signals.stamps_ns, None)
         evidence = gather_evidence(dt_s, likelihood, starts, np.zeros(len(drives)))
         _add_later(dt_s, likelihood, starts, evidence)
         return tracks, weigh(evidence, np.stack([t.valid for t in tracks], axis=1))
 
-    def _smoothed(self, physics: VehicleUkf, signals: Signals, rate: FloatArray, extra_r: FloatArray) -> FilteredDrive:
-        """Filter a drive and smooth it block by block."""
+    def _smoothed(
+        self, physics: VehicleUkf, signals: Signals, rate: FloatArray, extra_r: FloatArray
+    ) -> tuple[StateTrack, FloatArray, BoolArray]:
+        """Filter a drive and smooth it block by block; return its track, log-likelihood and starts, [N]."""
         before: FilterState | None = None
         tracks, likelihood, starts = [], [], []
         pending: ForwardSteps | None = None
@@ -166,7 +159,7 @@ class SmoothedPhysics:
             pending = forward
         if pending is not None:
             tracks.append(smoothed_track(physics, pending, None))
-        return FilteredDrive(concatenate(tracks), np.concatenate(likelihood), np.concatenate(starts))
+        return concatenate(tracks), np.concatenate(likelihood), np.concatenate(starts)
 
 
 def smoothed_track(physics: VehicleUkf, steps: ForwardSteps, following: ForwardSteps | None) -> StateTrack:

@@ -20,7 +20,7 @@ recovery is no slip either: the speed of spinning wheels falls while the car acc
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from pdhef_logtool.car.vehicle import Sensors
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.records.steps import RESTART_GAP_S, last_stamp_ns, step_durations_s
+from pdhef_logtool.records.steps import RESTART_GAP_S, step_durations_s
 
 #: Allowed difference between the change of speed and the accelerometer; no hill is steeper.
 CONTRADICTION_M_S2 = 3.0
@@ -66,14 +66,6 @@ _SUM, _FROM, _SINCE, _LEARNT, _BEYOND = range(5)
 # a_x, smoothed.
 _SLOW_AX = 27
 _MEMORY = 28
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SlipState:
-    """Memory between windows; ``last_stamp_ns`` is the stamp of the last step."""
-
-    memory: FloatArray
-    last_stamp_ns: int | None
 
 
 @njit(cache=True)
@@ -254,40 +246,26 @@ def _gate(window, sensor, m, believed, reckoned):  # type: ignore[no-untyped-def
     return changed
 
 
-def _run(signals: Signals, sensors: Sensors, state: SlipState | None) -> tuple[bool, FloatArray, FloatArray, SlipState]:
-    count = len(signals)
-    before_ns = state.last_stamp_ns if state else None
-    memory = np.zeros(_MEMORY) if state is None else state.memory.copy()
-    believed, reckoned = np.empty(count), np.empty(count)
-    dt_s = step_durations_s(signals.stamps_ns, before_ns)
-    window = (dt_s, signals.ax_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.wheel_speed_m_s)
-    bound = max(LEAST_BOUND_M_S, BOUND_SIGMAS * sensors.speed_std_m_s)
-    changed = _gate(window, (bound, sensors.speed_zero_m_s, sensors.speed_least_m_s), memory, believed, reckoned)
-    last = last_stamp_ns(signals.stamps_ns, before_ns)
-    return changed, believed, reckoned, SlipState(memory, last)
+def believable(
+    signals: Signals, sensors: Sensors, memory: FloatArray | None, before_ns: int | None, *, reckoned: bool = False
+) -> tuple[Signals, FloatArray]:
+    """Return the signals without impossible readings and without the speed samples of slipping wheels, and the memory.
 
-
-def without_slip(
-    signals: Signals, sensors: Sensors, state: SlipState | None, *, reckoned: bool = False
-) -> tuple[Signals, SlipState]:
-    """Return the signals without the speed samples of slipping wheels; the same object if no sample is removed.
-
-    Causal: step k depends on samples up to k. Joined windows give the same bits as one call over the whole log.
+    The same object if nothing is removed. Causal: step k depends on samples up to k. Joined windows give the same bits
+    as one call over the whole log.
 
     Parameters
     ----------
-    sensors : profile of the speed sensor. state : state after the previous window.
+    sensors : profile of the speed sensor. memory, before_ns : after the previous window; None at the start of a log.
     reckoned : replace missing samples by the dead-reckoned speed, for estimators that need one.
     """
-    changed, believed, with_reckoned, after = _run(signals, sensors, state)
-    if not changed:
-        return signals, after
-    return replace(signals, speed_m_s=with_reckoned if reckoned else believed), after
-
-
-def believable(
-    signals: Signals, sensors: Sensors, state: SlipState | None, *, gate: bool, reckoned: bool = False
-) -> tuple[Signals, SlipState | None]:
-    """Return signals without impossible readings and, with ``gate``, without the speed of slipping wheels."""
     signals = without_impossible(signals)
-    return without_slip(signals, sensors, state, reckoned=reckoned) if gate else (signals, None)
+    memory = np.zeros(_MEMORY) if memory is None else memory.copy()
+    believed, with_reckoned = np.empty(len(signals)), np.empty(len(signals))
+    dt_s = step_durations_s(signals.stamps_ns, before_ns)
+    window = (dt_s, signals.ax_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.wheel_speed_m_s)
+    bound = max(LEAST_BOUND_M_S, BOUND_SIGMAS * sensors.speed_std_m_s)
+    limits = (bound, sensors.speed_zero_m_s, sensors.speed_least_m_s)
+    if _gate(window, limits, memory, believed, with_reckoned):
+        signals = replace(signals, speed_m_s=with_reckoned if reckoned else believed)
+    return signals, memory

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import SENSOR_PROFILES, Sensors
+from pdhef_logtool.car.vehicle import Sensors
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.base import VX, Steps
-from pdhef_logtool.estimators.speed_slip import SlipState, believable
+from pdhef_logtool.estimators.speed_slip import believable
+from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.steps import last_stamp_ns, step_durations_s
 
@@ -21,26 +22,24 @@ class StepState:
 
     state: FloatArray
     last_stamp_ns: int | None
-    slip: SlipState | None = None
+    slip: FloatArray | None = None
 
 
 def prepared_steps(
-    signals: Signals,
-    before: StepState | None,
-    state_size: int,
-    *,
-    slip_gate: bool = False,
-    sensors: Sensors = SENSOR_PROFILES["production"],
+    signals: Signals, before: StepState | None, state_size: int, slip_sensors: Sensors | None = None
 ) -> tuple[Signals, FloatArray, Steps, StepState]:
     """Return the usable signals of a window, the time ``dt`` [K] before each step, empty steps, and a state to advance.
 
-    The state vector starts as NaN; ``dt[0]`` is NaN at the start of a log. With ``slip_gate`` the speed of slipping
-    wheels is replaced by the dead-reckoned speed.
+    The state vector starts as NaN; ``dt[0]`` is NaN at the start of a log. With ``slip_sensors`` the speed of
+    slipping wheels is replaced by the dead-reckoned speed.
     """
-    signals, slip = believable(signals, sensors, before.slip if before else None, gate=slip_gate, reckoned=True)
-    count = len(signals)
+    count, slip = len(signals), None
     state = np.full(state_size, np.nan) if before is None else before.state.copy()
     before_ns = before.last_stamp_ns if before else None
+    if slip_sensors is None:
+        signals = without_impossible(signals)
+    else:
+        signals, slip = believable(signals, slip_sensors, before.slip if before else None, before_ns, reckoned=True)
     steps = Steps(np.full((count, 4), np.nan), np.zeros((count, 4)), np.zeros(count, dtype=np.bool_))
     after = StepState(state, last_stamp_ns(signals.stamps_ns, before_ns), slip)
     return signals, step_durations_s(signals.stamps_ns, before_ns), steps, after

@@ -161,19 +161,28 @@ def physics_parameters(vehicle: VehicleParameters) -> PhysicsParameters:
     )
 
 
-class _Step(NamedTuple):
-    """Constants of a step, common to all points."""
+class _Nominal(NamedTuple):
+    """Constants of a step by steering and friction, common to all points."""
 
     cos: float
     r_kin_per_vx: float
-    ax: float
     b_front: float
     b_rear: float
-    peak_front: float  # over the mass, friction and braking applied, m/s²
+    peak_front: float  # over the mass, m/s²
     peak_rear: float
+    inertia: float  # m / I_z
+    per_blend: float
+
+
+class _Step(NamedTuple):
+    """Constants of a step of the model with axle forces, common to all points."""
+
+    nominal: _Nominal
+    ax: float
+    front_grip: float  # factor by braking
+    rear_grip: float
     kept: float  # share of an axle's initial force that remains at the end of the step
     tyre_s: float  # t*: time from the step's start to the evaluation of the tyres
-    inertia: float  # m / I_z
     front_held: float  # s_z if the front axle's formula already contains the transfer of steady cornering, else 0
     rear_held: float
 
@@ -198,6 +207,21 @@ def grip_under_braking(ax, friction, load_per_ax):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
+def _prepare_nominal(steer, friction, p):  # type: ignore[no-untyped-def]
+    """Return the constants of the nominal model at a steering angle."""
+    return _Nominal(
+        math.cos(steer),
+        math.tan(steer) / (p.front_m + p.rear_m),
+        p.front_B / friction if p.front_fixed_stiffness else p.front_B,
+        p.rear_B / friction if p.rear_fixed_stiffness else p.rear_B,
+        friction * p.front_D_n / p.mass_kg,
+        friction * p.rear_D_n / p.mass_kg,
+        p.mass_kg / p.yaw_inertia_kg_m2,
+        1.0 / (p.blend_high_m_s - p.blend_low_m_s),
+    )
+
+
+@njit(cache=True)
 def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
     """Return the constants of a step of ``h`` s at a speed of about ``vx``."""
     kept, tyre_s = 0.0, h
@@ -206,19 +230,26 @@ def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
         kept = math.exp(-x)
         tyre_s = h * (1.0 - (1.0 - x * kept / (1.0 - kept)) / x) if x > 1e-3 else h * (0.5 + x / 12.0)
     return _Step(
-        math.cos(steer),
-        math.tan(steer) / (p.front_m + p.rear_m),
+        _prepare_nominal(steer, friction, p),
         ax,
-        p.front_B / friction if p.front_fixed_stiffness else p.front_B,
-        p.rear_B / friction if p.rear_fixed_stiffness else p.rear_B,
-        friction * p.front_D_n / p.mass_kg * grip_under_braking(ax, friction, f.front_load_per_ax),
-        friction * p.rear_D_n / p.mass_kg * grip_under_braking(ax, friction, f.rear_load_per_ax),
+        grip_under_braking(ax, friction, f.front_load_per_ax),
+        grip_under_braking(ax, friction, f.rear_load_per_ax),
         kept,
         tyre_s,
-        p.mass_kg / p.yaw_inertia_kg_m2,
         f.load_sensitivity if f.front_holds_transfer else 0.0,
         f.load_sensitivity if f.rear_holds_transfer else 0.0,
     )
+
+
+# positional: numbers of one point in an inner loop for vectorization.
+@_inline
+def _magic_formula(v, vy, r, angle, c, p):  # type: ignore[no-untyped-def]
+    """Return F_yf/m and F_yr/m of the tyres in m/s² (Eq 3, 4), each along its own axle."""
+    front = c.b_front * (angle - arctangent(vy + p.front_m * r, v))
+    rear = -c.b_rear * arctangent(vy - p.rear_m * r, v)
+    front = arctangent(front - p.front_E * (front - arctangent(front, 1.0)), 1.0)
+    rear = arctangent(rear - p.rear_E * (rear - arctangent(rear, 1.0)), 1.0)
+    return c.peak_front * sine(p.front_C * front), c.peak_rear * sine(p.rear_C * rear)
 
 
 @_inline
@@ -232,12 +263,9 @@ def _transfer_factor(ay, sensitivity, f):  # type: ignore[no-untyped-def]
 @_inline
 def _tyre_forces(v, vy, r, angle, ay, force, c, p, f):  # type: ignore[no-untyped-def]
     """Return the steady F_yf/m and F_yr/m in m/s²; the load transfer depends on ``ay``."""
-    front = c.b_front * (angle - arctangent(vy + p.front_m * r, v))
-    rear = -c.b_rear * arctangent(vy - p.rear_m * r, v)
-    front = arctangent(front - p.front_E * (front - arctangent(front, 1.0)), 1.0)
-    rear = arctangent(rear - p.rear_E * (rear - arctangent(rear, 1.0)), 1.0)
-    ff = c.peak_front * sine(p.front_C * front)
-    fr = c.peak_rear * sine(p.rear_C * rear)
+    ff, fr = _magic_formula(v, vy, r, angle, c.nominal, p)
+    ff *= c.front_grip
+    fr *= c.rear_grip
     factor = _transfer_factor(ay, f.load_sensitivity, f)
     ff *= force * factor / _transfer_factor(ff / f.front_share, c.front_held, f)
     fr *= force * factor / _transfer_factor(fr / f.rear_share, c.rear_held, f)
@@ -266,7 +294,7 @@ def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ig
     """Advance states of the model with axle forces in ``n`` steps."""
     h = dt / n
     c = _prepare(vx, h, over.steer, over.ax, over.friction, p, f)
-    per_blend = 1.0 / (p.blend_high_m_s - p.blend_low_m_s)
+    nominal = c.nominal
     per_kinematic = 1.0 / KINEMATIC_TIME_CONSTANT_S
     rolls = layout.roll >= 0
     stiffness = f.roll_frequency_rad_s**2 if rolls else 0.0
@@ -287,14 +315,14 @@ def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ig
                 slope = GRAVITY_M_S2 * block[BANK * WIDTH + j]
                 force = max(0.1, 1.0 + block[FORCE_SCALE * WIDTH + j])
                 ax = c.ax - block[AX_BIAS * WIDTH + j]
-                w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * per_blend))
+                w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * nominal.per_blend))
                 follow = (1.0 - w) * per_kinematic
                 # at the start
-                ffc = ff * c.cos
-                r_kin = vx * c.r_kin_per_vx
+                ffc = ff * nominal.cos
+                r_kin = vx * nominal.r_kin_per_vx
                 vx_dot = ax + r * r * p.imu_x_m + vy * r
                 vy_dot = w * (ffc + fr - slope - vx * r) + follow * (p.rear_m * r_kin - vy)
-                r_dot = w * c.inertia * (p.front_m * ffc - p.rear_m * fr) + follow * (r_kin - r)
+                r_dot = w * nominal.inertia * (p.front_m * ffc - p.rear_m * fr) + follow * (r_kin - r)
                 vx_dot += r_dot * p.imu_y_m
                 ay = w * (ffc + fr) + (1.0 - w) * vx * r
                 roll_acc = stiffness * (f.roll_gradient * ay - phi) - damping * phi_dot
@@ -308,10 +336,10 @@ def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ig
                 # the mean over the step
                 mf = 0.5 * (ff + ff1)
                 mr = 0.5 * (fr + fr1)
-                mfc = mf * c.cos
+                mfc = mf * nominal.cos
                 mx, my, mrate = vx + half * vx_dot, vy + half * vy_dot, r + half * r_dot
-                r_kin = mx * c.r_kin_per_vx
-                r_dot = w * c.inertia * (p.front_m * mfc - p.rear_m * mr) + follow * (r_kin - mrate)
+                r_kin = mx * nominal.r_kin_per_vx
+                r_dot = w * nominal.inertia * (p.front_m * mfc - p.rear_m * mr) + follow * (r_kin - mrate)
                 mrate = r + half * r_dot
                 vy_dot = w * (mfc + mr - slope - mx * mrate) + follow * (p.rear_m * r_kin - my)
                 my = vy + half * vy_dot
@@ -333,13 +361,8 @@ def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ig
 @_inline
 def _nominal_accelerations(vx, vy, r, steer, c, p):  # type: ignore[no-untyped-def]
     """Return a_y in m/s² and the yaw acceleration in rad/s² of the tyres (Eq 1-4)."""
-    v = max(vx, p.blend_low_m_s)
-    front = c.b_front * (steer - arctangent(vy + p.front_m * r, v))
-    rear = -c.b_rear * arctangent(vy - p.rear_m * r, v)
-    front = arctangent(front - p.front_E * (front - arctangent(front, 1.0)), 1.0)
-    rear = arctangent(rear - p.rear_E * (rear - arctangent(rear, 1.0)), 1.0)
-    ff = c.peak_front * c.cos * sine(p.front_C * front)
-    fr = c.peak_rear * sine(p.rear_C * rear)
+    ff, fr = _magic_formula(max(vx, p.blend_low_m_s), vy, r, steer, c, p)
+    ff *= c.cos
     return ff + fr, c.inertia * (p.front_m * ff - p.rear_m * fr)
 
 
@@ -353,34 +376,6 @@ def _nominal_derivative(vx, vy, r, ax, steer, c, p):  # type: ignore[no-untyped-
     vy_dot = w * (ay - vx * r) + (follow * (p.rear_m * r_kin - vy) if w < 1.0 else 0.0)
     r_dot = w * turn + (follow * (r_kin - r) if w < 1.0 else 0.0)  # tan δ may be infinite
     return ax + r_dot * p.imu_y_m + r * r * p.imu_x_m + vy * r, vy_dot, r_dot
-
-
-class _Nominal(NamedTuple):
-    """Constants of a step of the nominal model, common to all points."""
-
-    cos: float
-    r_kin_per_vx: float
-    b_front: float
-    b_rear: float
-    peak_front: float
-    peak_rear: float
-    inertia: float
-    per_blend: float
-
-
-@njit(cache=True)
-def _prepare_nominal(steer, friction, p):  # type: ignore[no-untyped-def]
-    """Return the constants of the nominal model at a steering angle."""
-    return _Nominal(
-        math.cos(steer),
-        math.tan(steer) / (p.front_m + p.rear_m),
-        p.front_B / friction if p.front_fixed_stiffness else p.front_B,
-        p.rear_B / friction if p.rear_fixed_stiffness else p.rear_B,
-        friction * p.front_D_n / p.mass_kg,
-        friction * p.rear_D_n / p.mass_kg,
-        p.mass_kg / p.yaw_inertia_kg_m2,
-        1.0 / (p.blend_high_m_s - p.blend_low_m_s),
-    )
 
 
 @_compiled
@@ -453,11 +448,11 @@ def settle_forces(x, steer, ax, friction, layout, p, f):  # type: ignore[no-unty
     force = max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
     x[FRONT], x[REAR] = 0.0, 0.0
     for _ in range(3):  # converges fast
-        ay = x[FRONT] * c.cos + x[REAR]
+        ay = x[FRONT] * c.nominal.cos + x[REAR]
         x[FRONT], x[REAR] = _tyre_forces(v, x[VY], x[YAW_RATE], steer, ay, force, c, p, f)
     if layout.roll >= 0:
         w = dynamic_share(x[VX], p)
-        ay = w * (x[FRONT] * c.cos + x[REAR]) + (1.0 - w) * x[VX] * x[YAW_RATE]
+        ay = w * (x[FRONT] * c.nominal.cos + x[REAR]) + (1.0 - w) * x[VX] * x[YAW_RATE]
         x[layout.roll] = f.roll_gradient * ay
 
 

@@ -19,7 +19,7 @@ and yaw rate then determine v_y. ``phy-ukf`` waits for the steering instead.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -29,7 +29,7 @@ from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters
 from pdhef_logtool.car.parts import LIMIT_GAIN, PHYSICS, FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.speed_slip import SlipState, believable
+from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.estimators.unscented import cholesky, cross_covariance, draw, moments, reading_moments, update
 from pdhef_logtool.estimators.vehicle_model import (
     AX_BIAS,
@@ -162,7 +162,6 @@ class Rules(NamedTuple):
     """Settings of the filter, beside its constants."""
 
     use_speed: bool  # False: the speed sensor only starts the filter
-    still_after_s: float
     default_friction: float
     dynamic_speed_m_s: float  # above it a sideslip beyond DIVERGED_SIDESLIP_RAD is divergence
     steer_hold_s: float
@@ -334,10 +333,11 @@ def yield_to_kinematics(x, friction, dt, rules, p, f, m):  # type: ignore[no-unt
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
 @_compiled
-def predict(x, P, L, over, rate, dt, q, layout, places, p, f, points, E):  # type: ignore[no-untyped-def]
+def predict(x, P, L, over, rate, dt, early, q, layout, places, p, f, points, E):  # type: ignore[no-untyped-def]
     """Move state and covariance by ``dt`` s with the residual ``rate`` of v̇_y and ṙ.
 
-    Leaves the root of the former covariance in L, and the deviations of the moved points in E.
+    The share ``early`` of the residual's increment comes before the model's step (Strang splitting: half of it), the
+    rest behind it. Leaves the root of the former covariance in L, and the deviations of the moved points in E.
     """
     columns = columns_of(x.shape[0])
     cholesky(P, L)
@@ -345,10 +345,10 @@ def predict(x, P, L, over, rate, dt, q, layout, places, p, f, points, E):  # typ
     vx = x[VX]
     draw(x, L, places, columns, points)
     if given:
-        push(points, columns, vx, rate, 0.5 * dt, p)
+        push(points, columns, vx, rate, early * dt, p)
     advance(points, columns, over, dt, layout, p, f)
     if given:
-        push(points, columns, vx, rate, 0.5 * dt, p)
+        push(points, columns, vx, rate, (1.0 - early) * dt, p)
     moments(points, places, columns, q, x, P, E)
 
 
@@ -423,7 +423,7 @@ def settle(now, gated, rules, standstill_std, x, P, m):  # type: ignore[no-untyp
     elif m.still > 0.0:
         m.speed_age += now.dt
         m.still = m.still + now.dt if m.speed_age <= STANDSTILL_SILENCE_S and not turns else 0.0
-    if m.still < rules.still_after_s:
+    if m.still < STANDSTILL_AFTER_S:
         return False
     for i in range(x.shape[0]):
         if math.isfinite(standstill_std[i]):
@@ -514,7 +514,7 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
                 factor, f = yield_to_kinematics(x, over.friction, now.dt, rules, p, f, m)
                 q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             process_noise(q_std, over.ax_known, now.dt, layout, q)
-            predict(x, P, L, over, rate, now.dt, q, layout, places, p, f, points, E)
+            predict(x, P, L, over, rate, now.dt, 0.5, q, layout, places, p, f, points, E)
             if linked:
                 cross_covariance(L, E, out_cross[k])
                 out_predicted_P[k] = P
@@ -561,10 +561,10 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
 
 
 @njit(cache=True)
-def _predict_outputs(due, held, q_std, model, out):  # type: ignore[no-untyped-def]
+def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-untyped-def]
     """Predict the steps that are due with their inputs held; the rows of no step (−1) are left."""
     step, horizon_s = due
-    held_x, held_P, inputs, residual_rate = held
+    held_x, held_P, inputs, residual_rate, noise = held
     out_x, out_P, out_ay = out
     layout, places, p, f = model
     n = held_x.shape[1]
@@ -579,8 +579,8 @@ def _predict_outputs(due, held, q_std, model, out):  # type: ignore[no-untyped-d
         over = held_inputs(inputs, k)
         rate = (residual_rate[k, 0], residual_rate[k, 1])
         if horizon_s[row] > 0.0:
-            process_noise(q_std, over.ax_known, horizon_s[row], layout, q)
-            predict(x, P, L, over, rate, horizon_s[row], q, layout, places, p, f, points, E)
+            process_noise(q_std, over.ax_known, noise[k] * horizon_s[row], layout, q)
+            predict(x, P, L, over, rate, horizon_s[row], early, q, layout, places, p, f, points, E)
         if is_finite(x, P):
             out_x[row] = x
             out_P[row] = P[:MOTION, :MOTION]
@@ -588,21 +588,6 @@ def _predict_outputs(due, held, q_std, model, out):  # type: ignore[no-untyped-d
 
 
 # ------------------------------------------------------------------------------------------------ records
-
-
-class Posterior(NamedTuple):
-    """Output arrays of a kernel, one row per step (see :class:`PosteriorSteps`)."""
-
-    x: FloatArray
-    P: FloatArray
-    inputs: FloatArray
-    nis: FloatArray
-    nis_dof: FloatArray
-    log_likelihood: FloatArray
-    innovation: FloatArray
-    valid: BoolArray
-    diverged: BoolArray
-    prior: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -626,6 +611,11 @@ class PosteriorSteps(StepColumns):
     prior: FloatArray
     residual_rate: FloatArray
 
+    @property
+    def written(self) -> tuple[Any, ...]:
+        """The columns that a kernel writes: all but the first and the last."""
+        return tuple(getattr(self, f.name) for f in fields(PosteriorSteps)[1:-1])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilterState:
@@ -633,7 +623,7 @@ class FilterState:
 
     belief: Belief
     last_stamp_ns: int | None
-    slip: SlipState | None
+    slip: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -648,14 +638,6 @@ class StepLinks(StepColumns):
     linked: BoolArray
     predicted_P: FloatArray
     cross: FloatArray
-
-
-class Predicted(NamedTuple):
-    """Predictions: state [M, n], covariance of the motion [M, 3, 3], planar a_y [M]; NaN for none."""
-
-    x: FloatArray
-    P: FloatArray
-    ay: FloatArray
 
 
 def make_window(
@@ -679,9 +661,11 @@ def make_window(
     )
 
 
-def no_posterior(count: int, n: int) -> Posterior:
-    """Return the arrays that a kernel writes ``count`` steps of ``n`` states to, with no estimate in them."""
-    return Posterior(
+def no_posterior(stamps_ns: IntArray, n: int, residual_rate: FloatArray) -> PosteriorSteps:
+    """Return steps of ``n`` states for a kernel to write to, with no estimate in them."""
+    count = len(stamps_ns)
+    return PosteriorSteps(
+        stamps_ns=stamps_ns,
         x=np.empty((count, n)),
         P=np.empty((count, n, n)),
         inputs=np.empty((count, INPUTS)),
@@ -692,29 +676,31 @@ def no_posterior(count: int, n: int) -> Posterior:
         valid=np.zeros(count, dtype=np.bool_),
         diverged=np.zeros(count, dtype=np.bool_),
         prior=np.full((count, n), np.nan),
+        residual_rate=residual_rate,
     )
-
-
-def due_predictions(ahead: Extrapolation) -> tuple[IntArray, FloatArray]:
-    """Return step (−1 for none) and horizon in s of each prediction, [M], as a kernel reads them."""
-    return np.where(ahead.usable, ahead.step, -1), ahead.horizon_s
-
-
-def no_prediction(count: int, n: int) -> Predicted:
-    """Return empty arrays for predictions of ``n`` states."""
-    return Predicted(*(np.full((count, *shape), np.nan) for shape in ((n,), (MOTION, MOTION), ())))
 
 
 def predicted_track(
     name: str,
-    stamps_ns: IntArray,
     steps: PosteriorSteps,
     ahead: Extrapolation,
-    predicted: Predicted,
-    layout: Layout = NOMINAL,
+    stamps_ns: IntArray,
+    q_std: FloatArray,
+    model: Model,
+    *,
+    rate: FloatArray,
+    noise: FloatArray,
+    early: float = 0.5,
 ) -> StateTrack:
-    """Return the track of predicted states at the scored stamps [M]."""
-    step, x, covariance = ahead.step, predicted.x, predicted.P
+    """Return the track of steps [K], predicted to the scored stamps [M] with their inputs held.
+
+    ``rate`` [K, 2] is the residual, ``noise`` [K] a factor on the time over which process noise adds up.
+    """
+    step, count, n = ahead.step, len(stamps_ns), model.layout.size
+    x, covariance, ay = np.full((count, n), np.nan), np.full((count, MOTION, MOTION), np.nan), np.full(count, np.nan)
+    due = (np.where(ahead.usable, step, -1), ahead.horizon_s)
+    held = (steps.x, steps.P, steps.inputs, rate, noise)
+    _predict_outputs(due, held, q_std, early, model, (x, covariance, ay))
     usable = ahead.usable & np.isfinite(x[:, VX]) & rolls_forward(x[:, VX], steps.inputs[step, U_SPEED])
     return make_track(
         name,
@@ -722,16 +708,16 @@ def predicted_track(
         vx_m_s=x[:, VX].copy(),
         vy_m_s=x[:, VY].copy(),
         yaw_rate_rad_s=x[:, YAW_RATE].copy(),
-        ay_m_s2=predicted.ay,
+        ay_m_s2=ay,
         covariance=covariance,
         sideslip_std_rad=sideslip_std(x[:, VX], x[:, VY], covariance),
-        r_scale=np.ones(len(stamps_ns)),
+        r_scale=np.ones(count),
         nis=np.where(usable, steps.nis[step], np.nan),
         nis_dof=np.where(usable, steps.nis_dof[step], 0.0),
         friction=np.where(usable, steps.inputs[step, U_FRICTION], np.nan),
         valid=usable,
         diverged=usable & steps.diverged[step],
-        **{column: np.where(usable, x[:, i], np.nan) for column, i in layout.named.items()},
+        **{column: np.where(usable, x[:, i], np.nan) for column, i in model.layout.named.items()},
     )
 
 
@@ -767,13 +753,11 @@ class VehicleUkf:
     limit_lag_m : growth of the length over which they return to the tyres' beyond it, none within; 0: the car's lag.
     roll_correction : of a_y in the nominal model.
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
-    slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
-    standstill : contain the motion at zero while the car is.
     """
 
     algorithm = "vehicle-ukf"
     version = 1
-    options = ("equations", "slip_gate", "standstill", "limit_gain", "limit_lag_m", "roll_correction")
+    options = ("equations", "limit_gain", "limit_lag_m", "roll_correction")
 
     vehicle: VehicleParameters
     equations: Literal["forces", "nominal"] = "forces"
@@ -783,8 +767,6 @@ class VehicleUkf:
     limit_lag_m: float = 0.0
     roll_correction: bool = False
     use_speed: bool = True
-    slip_gate: bool = True
-    standstill: bool = True
     name: str = PHYSICS
     causal: bool = True
 
@@ -803,21 +785,6 @@ class VehicleUkf:
     def measurement_std(self) -> FloatArray:
         """1-sigma of [a_y, r, v_x], [3]."""
         return np.array(self.r_std or self.vehicle.sensors.measurement_std)
-
-    @property
-    def _rules(self) -> Rules:
-        sensors = self.vehicle.sensors
-        return Rules(
-            self.use_speed,
-            STANDSTILL_AFTER_S if self.standstill else math.inf,
-            self.vehicle.assumed_friction,
-            self.vehicle.low_speed_blend_m_s,
-            sensors.steer_hold_s,
-            sensors.speed_zero_m_s,
-            sensors.still_yaw_rate_rad_s,
-            self.limit_gain,
-            self.limit_lag_m,
-        )
 
     @cached_property
     def tuning(self) -> Tuning:
@@ -839,7 +806,11 @@ class VehicleUkf:
             initial[layout.steer_bias : i + 2] = s.steer_bias_std_rad, s.ay_bias_std_m_s2, s.yaw_rate_bias_std_rad_s
             of_ay, of_rate, of_steer = BIAS_WALK_STD
             walk[layout.steer_bias : i + 2] = of_steer, of_ay, of_rate
-        return Tuning(walk, self.measurement_std, initial, still, self._rules)
+        rules = Rules(
+            self.use_speed, self.vehicle.assumed_friction, self.vehicle.low_speed_blend_m_s, s.steer_hold_s,
+            s.speed_zero_m_s, s.still_yaw_rate_rad_s, self.limit_gain, self.limit_lag_m,
+        )  # fmt: skip
+        return Tuning(walk, self.measurement_std, initial, still, rules)
 
     def run(
         self,
@@ -853,7 +824,7 @@ class VehicleUkf:
         ``residual_rate`` [N, 2] is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
         ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
         """
-        steps, after, _ = self._steps(signals, state, residual_rate, extra_r, linked=False)
+        steps, after, _ = self.linked_steps(signals, state, residual_rate, extra_r, linked=False)
         return steps, after
 
     def linked_steps(
@@ -862,36 +833,25 @@ class VehicleUkf:
         state: FilterState | None,
         residual_rate: FloatArray | None = None,
         extra_r: FloatArray | None = None,
-    ) -> tuple[PosteriorSteps, FilterState, StepLinks]:
-        """Return the result of :meth:`run`, bit for bit, and the links between the steps."""
-        return self._steps(signals, state, residual_rate, extra_r, linked=True)
-
-    def _steps(
-        self,
-        signals: Signals,
-        state: FilterState | None,
-        residual_rate: FloatArray | None,
-        extra_r: FloatArray | None,
         *,
-        linked: bool,
+        linked: bool = True,
     ) -> tuple[PosteriorSteps, FilterState, StepLinks]:
-        slip = state.slip if state else None
-        signals, slip = believable(signals, self.vehicle.sensors, slip, gate=self.slip_gate)
+        """Return the result of :meth:`run`, bit for bit, and the links between the steps if they are ``linked``."""
+        before_ns = state.last_stamp_ns if state else None
+        signals, slip = believable(signals, self.vehicle.sensors, state.slip if state else None, before_ns)
         window, count, n = make_window(signals, state, residual_rate, extra_r), len(signals), self.layout.size
-        rows, out = count if linked else 0, no_posterior(count, n)
+        steps, belief = no_posterior(signals.stamps_ns, n, window.residual_rate), resume(state, n)
+        rows = count if linked else 0
         links = (np.zeros(rows, dtype=np.bool_), np.zeros((rows, n, n)), np.zeros((rows, n, n)))
-        belief = resume(state, n)
-        _filter(window, self.tuning, self.parameters, belief, out, links)
-        after = FilterState(belief, last_stamp_ns(signals.stamps_ns, state.last_stamp_ns if state else None), slip)
-        return PosteriorSteps(signals.stamps_ns, *out, window.residual_rate), after, StepLinks(*links)
+        _filter(window, self.tuning, self.parameters, belief, steps.written, links)
+        return steps, FilterState(belief, last_stamp_ns(signals.stamps_ns, before_ns), slip), StepLinks(*links)
 
     def predict(self, steps: PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
         """Extrapolate steps with the filter's model (see :class:`~.base.ModelPredictor`)."""
-        predicted = no_prediction(len(stamps_ns), steps.x.shape[1])
-        due = due_predictions(ahead)
-        held = (steps.x, steps.P, steps.inputs, steps.residual_rate)
-        _predict_outputs(due, held, self.tuning.q_std, self.parameters, predicted)
-        return predicted_track(self.name, stamps_ns, steps, ahead, predicted, self.layout)
+        rate, noise = steps.residual_rate, np.ones(len(steps.x))
+        return predicted_track(
+            self.name, steps, ahead, stamps_ns, self.tuning.q_std, self.parameters, rate=rate, noise=noise
+        )
 
     def expected_ay(self, x: FloatArray, inputs: FloatArray) -> FloatArray:
         """Return the accelerometer's reading [K] in states [K, n] with inputs [K, 6], without residual."""
@@ -922,11 +882,9 @@ def resume(state: FilterState | None, n: int) -> Belief:
 # ------------------------------------------------------------------------------------------------ presets
 
 
-def nominal_filter(
-    vehicle: VehicleParameters, *, use_speed: bool = True, slip_gate: bool = True, name: str = "phy-ukf"
-) -> VehicleUkf:
+def nominal_filter(vehicle: VehicleParameters, *, use_speed: bool = True, name: str = "phy-ukf") -> VehicleUkf:
     """Return the frozen ``phy-ukf``: the paper's physics baseline, R at sensor level, Q by innovation likelihood."""
-    return VehicleUkf(vehicle, "nominal", PHY_UKF_Q_STD, use_speed=use_speed, slip_gate=slip_gate, name=name)
+    return VehicleUkf(vehicle, "nominal", PHY_UKF_Q_STD, use_speed=use_speed, name=name)
 
 
 def build_nominal(name: str, car: Car, options: Options) -> VehicleUkf:

@@ -118,12 +118,10 @@ def dead_reckon(
         return empty, empty.copy(), empty.copy()
     dt = np.diff(stamps_ns) * 1e-9
     ok = np.isfinite(vx_m_s + vy_m_s + yaw_rate_rad_s)
-    whole = bool(ok.all())
-    if not whole:
-        dt = np.where(ok[1:] & ok[:-1], dt, 0.0)
+    dt = np.where(ok[1:] & ok[:-1], dt, 0.0)
 
     def mid(a: FloatArray) -> FloatArray:
-        a = a if whole else np.where(ok, a, 0.0)
+        a = np.where(ok, a, 0.0)
         return 0.5 * (a[1:] + a[:-1])
 
     def accumulate(first: float, steps: FloatArray) -> FloatArray:

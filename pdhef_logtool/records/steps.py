@@ -73,17 +73,12 @@ class Release:
     needed: int
 
 
-def released_steps(ready_ns: IntArray, stamps_ns: IntArray) -> IntArray:
-    """Return for each scored stamp the newest step with all data arrived by then, −1 without one.
-
-    ``ready_ns`` [K] is non-decreasing, ``stamps_ns`` [M]; the result is int64 [M] (docs/method.md#delay).
-    """
-    return np.searchsorted(ready_ns, stamps_ns, side="right").astype(np.int64) - 1
-
-
 def release(ready_ns: IntArray, stamps_ns: IntArray) -> Release:
-    """Return the result of :func:`released_steps` as indices of the steps; [0] without stamps."""
-    index = released_steps(ready_ns, stamps_ns)
+    """Return for each scored stamp [M] the newest step with all data arrived by then (docs/method.md#delay).
+
+    ``ready_ns`` [K] is non-decreasing.
+    """
+    index = np.searchsorted(ready_ns, stamps_ns, side="right").astype(np.int64) - 1
     row = np.maximum(index, 0)
     return Release(index >= 0, row, int(row[-1]) if len(row) else 0)
 

@@ -12,6 +12,13 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 #: Name of the sideslip reference in tables, files and recordings.
 REFERENCE = "reference"
+#: Quantities that a filter may estimate in addition to the motion.
+ESTIMATED_COLUMNS = (
+    "roll_rad", "bank_rad", "force_scale", "steer_bias_rad", "ay_bias_m_s2", "yaw_rate_bias_rad_s",
+)  # fmt: skip
+#: Shares of the information on v_y of the sideslip reference, and whether (1, 0) estimators with the same IMU may be
+#: ranked by it.
+SHARE_COLUMNS = ("share_law", "share_kinematics", "share_gnss", "independent")
 #: Columns of estimates.parquet in order, without ``estimator`` (the name of the track).
 TRACK_COLUMNS = (
     "stamp_ns",
@@ -35,22 +42,9 @@ TRACK_COLUMNS = (
     "diverged",
     "mixture_weight",
     "reason",
-    "roll_rad",
-    "bank_rad",
-    "force_scale",
-    "steer_bias_rad",
-    "ay_bias_m_s2",
-    "yaw_rate_bias_rad_s",
-    "share_law",
-    "share_kinematics",
-    "share_gnss",
-    "independent",
+    *ESTIMATED_COLUMNS,
+    *SHARE_COLUMNS,
 )
-#: Shares of the information on v_y of the sideslip reference, and whether (1, 0) estimators with the same IMU may be
-#: ranked by it.
-SHARE_COLUMNS = TRACK_COLUMNS[-4:]
-#: Quantities that a filter may estimate in addition to the motion.
-ESTIMATED_COLUMNS = TRACK_COLUMNS[-10:-4]
 #: Above this share of GNSS in its information the reference is independent of estimators that use the same IMU.
 INDEPENDENT_SHARE = 0.5
 #: Columns that a source may lack.
@@ -153,8 +147,7 @@ class StateTrack:
         if not slow.any():
             return self
         beta, std = (np.where(slow, np.nan, c) for c in (self.sideslip_rad, self.sideslip_std_rad))
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        return StateTrack(**(columns | {"sideslip_rad": beta, "sideslip_std_rad": std}))
+        return replace(self, sideslip_rad=beta, sideslip_std_rad=std)
 
     @property
     def something_known(self) -> BoolArray:

@@ -40,21 +40,7 @@ PAPER_FEATURES = FEATURES[:6]
 #: Features of networks for the residual of the nominal model.
 NOMINAL_FEATURES = FEATURES[:10]
 #: Features that change their sign when left and right are exchanged.
-ODD_FEATURES = frozenset(
-    {
-        "ay_m_s2",
-        "steer_rad",
-        "yaw_rate_rad_s",
-        "delta_yaw_rate_rad_s",
-        "delta_sideslip_rad",
-        "physics_vy_m_s",
-        "physics_yaw_rate_rad_s",
-        "roll_rad",
-        "roll_rate_rad_s",
-        "front_force_per_mass",
-        "rear_force_per_mass",
-    }
-)
+ODD_FEATURES = frozenset(FEATURES) - {"vx_m_s", "friction", "ax_m_s2", "utilisation"}
 
 # Entries of the filter's state, as in estimators.vehicle_model.
 _VX, _VY, _YAW_RATE = 0, 1, 2

@@ -22,7 +22,7 @@ from pdhef_logtool.residual_model.interface import Residual
 from pdhef_logtool.storage.documents import digest
 
 if TYPE_CHECKING:
-    from pdhef_logtool.residual_model.ladder_kernels import LadderArrays
+    from pdhef_logtool.residual_model.ladder_kernels import Basis
 
 NONE, LINEAR, RANDOM = ("none", "linear", "random")
 #: Squared distance over its 98 % quantile up to which the gain is 1, and from which it is 0.
@@ -92,20 +92,20 @@ class LadderModel(BaseModel):
         return digest(self.model_dump(mode="json"))
 
     @cached_property
-    def _arrays(self) -> LadderArrays:
-        from pdhef_logtool.residual_model.ladder_kernels import LadderArrays
+    def _arrays(self) -> tuple[Basis, FloatArray, FloatArray]:
+        """Basis of the features, weights and whitening."""
+        from pdhef_logtool.residual_model.ladder_kernels import Basis
 
-        def matrix(rows: tuple[tuple[float, ...], ...], columns: int) -> FloatArray:
-            return np.array(rows, dtype=np.float64).reshape(len(rows), columns)
-
-        return LadderArrays(
+        random = len(self.phases)
+        basis = Basis(
             np.array(self.scale),
-            matrix(self.odd_directions, ODD_COUNT),
-            matrix(self.even_directions, EVEN_COUNT),
+            np.array(self.even_mean),
+            np.array(self.even_scale),
+            np.array(self.odd_directions, dtype=np.float64).reshape(random, ODD_COUNT),
+            np.array(self.even_directions, dtype=np.float64).reshape(random, EVEN_COUNT),
             np.array(self.phases, dtype=np.float64),
-            np.array(self.weights),
-            matrix(self.whitening, ODD_COUNT),
         )
+        return basis, np.array(self.weights), np.array(self.whitening)
 
     def residual(self, features: FloatArray, dt_s: FloatArray, state: FloatArray | None) -> tuple[Residual, FloatArray]:
         """Return the residual of consecutive steps (see :class:`~.interface.ResidualModel`)."""
@@ -120,8 +120,7 @@ class LadderModel(BaseModel):
 
         count = len(features.odd)
         residual, distance2 = np.empty(count), np.empty(count)
-        even_mean, even_scale = np.array(self.even_mean), np.array(self.even_scale)
-        evaluate(features.odd, features.even, self._arrays, even_mean, even_scale, residual, distance2)
+        evaluate(features.odd, features.even, *self._arrays, residual, distance2)
         limit = LARGEST * self.largest_m_s2
         return Correction(np.clip(residual, -limit, limit), self._gain(distance2, features.even[:, SPEED_COLUMN]))
 

@@ -26,7 +26,7 @@ from pdhef_logtool.residual_model.ladder import (
     LadderModel,
     plain,
 )
-from pdhef_logtool.residual_model.ladder_kernels import expand
+from pdhef_logtool.residual_model.ladder_kernels import Basis, expand
 
 #: Ridge parameters, in seconds of driving with features of variance 1. Blocks of the same drive favour values down to
 #: 30 s, but on other drives of the car a residual with less than 1000 s often increases the error.
@@ -35,6 +35,8 @@ LAMBDAS = (1000.0, 3000.0, 10000.0)
 #: features of the next block depend on it.
 MOST_BLOCKS, LEAST_BLOCK_S, FORGET_S = 10, 4.0, 2.0
 LEAST_DRIVES = 3
+#: Arrays of the random features.
+RANDOM_ARRAYS = ("odd_directions", "even_directions", "phases")
 #: Number of features whose responses are computed together, for the memory of a long drive.
 TOGETHER = 25
 #: A model replaces a simpler one if its squared error in held-out blocks is lower by at least this many standard errors
@@ -169,11 +171,11 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
     even_mean, even_scale = even.mean(axis=0), np.maximum(even.std(axis=0), 1e-3)
     count = RANDOM_FEATURES if RANDOM in rungs and seconds >= RANDOM_LEAST_S else 0
     rng = np.random.default_rng(seed)
-    basis = _Basis(
+    basis = Basis(
         scale, even_mean, even_scale, rng.normal(size=(count, ODD_COUNT)) * FREQUENCY,
         rng.normal(size=(count, EVEN_COUNT)) * FREQUENCY, rng.uniform(0.0, 2.0 * math.pi, count),
     )  # fmt: skip
-    responses = [basis.responses(s) for s in samples]
+    responses = [_responses(basis, s) for s in samples]
     unit = max(float(np.sqrt(np.mean(np.concatenate([r[:, :ODD_COUNT] for r in responses]) ** 2))), 1e-12)
     problem = _problem(samples, [r / unit for r in responses], seconds)
     linear = problem.only(ODD_COUNT)
@@ -185,7 +187,7 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
     random = 0 if chosen == LINEAR else count
     used = ODD_COUNT + random
     weights = _solve(list(taken.whole), ridge) / unit
-    phi = np.concatenate([basis.features(s.drive.features, s.rows) for s in samples])[:, :used]
+    phi = np.concatenate([_features(basis, s.drive.features, s.rows) for s in samples])[:, :used]
     speed = np.quantile(even[:, SPEED_COLUMN], [1.0 - QUANTILE, QUANTILE])
     model = LadderModel(
         rung=chosen,  # type: ignore[arg-type]
@@ -203,33 +205,22 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
     return LadderFit(model, ridge, trials, seconds, len(problem.blocks))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Basis:
-    """Scales of the features and directions of the random ones."""
+def _features(basis: Basis, features: SlowFeatures, rows: IntArray | slice) -> FloatArray:
+    """Return the features of rows, 0 where an input is unknown: the odd ones, then the random ones."""
+    odd, even = features.odd[rows], features.even[rows]
+    out = np.empty((len(odd), ODD_COUNT + len(basis.phases)))
+    expand(odd, even, basis, out)
+    return out
 
-    scale: FloatArray
-    even_mean: FloatArray
-    even_scale: FloatArray
-    odd_directions: FloatArray
-    even_directions: FloatArray
-    phases: FloatArray
 
-    def features(self, features: SlowFeatures, rows: IntArray | slice, part: slice = slice(None)) -> FloatArray:
-        """Return the features of rows, 0 where an input is unknown: the odd ones, then a part of the random ones."""
-        z, e = features.odd[rows] / self.scale, (features.even[rows] - self.even_mean) / self.even_scale
-        unknown = ~np.isfinite(z.sum(axis=1) + e.sum(axis=1))
-        z[unknown], e[unknown] = 0.0, 0.0
-        out = np.empty((len(z), ODD_COUNT + len(self.phases[part])))
-        expand(z, e, self.odd_directions[part], self.even_directions[part], self.phases[part], out)
-        return out
-
-    def responses(self, sample: _Sample) -> FloatArray:
-        """Return the changes of the sideslip by each feature as a rate, at the rows of a sample."""
-        drive, columns = sample.drive, []
-        for first in range(0, max(len(self.phases), 1), TOGETHER):
-            phi = self.features(drive.features, slice(None), slice(first, first + TOGETHER))
-            columns.append(drive.response(phi if first == 0 else phi[:, ODD_COUNT:])[sample.rows])
-        return np.concatenate(columns, axis=1)
+def _responses(basis: Basis, sample: _Sample) -> FloatArray:
+    """Return the changes of the sideslip by each feature as a rate, at the rows of a sample."""
+    columns = []
+    for first in range(0, max(len(basis.phases), 1), TOGETHER):
+        part = basis._replace(**{n: getattr(basis, n)[first : first + TOGETHER] for n in RANDOM_ARRAYS})
+        phi = _features(part, sample.drive.features, slice(None))
+        columns.append(sample.drive.response(phi if first == 0 else phi[:, ODD_COUNT:])[sample.rows])
+    return np.concatenate(columns, axis=1)
 
 
 def _thinned(drive: TaughtDrive) -> _Sample:

@@ -11,56 +11,59 @@ from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.records.signals import FloatArray
 
 
-class LadderArrays(NamedTuple):
-    """A fitted residual model as arrays, with the fields of :class:`~.ladder.LadderModel`."""
+class Basis(NamedTuple):
+    """Scales of the features and directions of the random ones (:class:`~.ladder.LadderModel`)."""
 
     scale: FloatArray
+    even_mean: FloatArray
+    even_scale: FloatArray
     odd_directions: FloatArray
     even_directions: FloatArray
     phases: FloatArray
-    weights: FloatArray
-    whitening: FloatArray
 
 
 @njit(cache=True)
-def _features(z, e, odd_directions, even_directions, phases, out):  # type: ignore[no-untyped-def]
-    """Write the features of a step: z, then the random products."""
-    count = z.shape[0]
-    out[:count] = z
-    for j in range(phases.shape[0]):
-        a, b = 0.0, phases[j]
+def _features(odd, even, basis, out):  # type: ignore[no-untyped-def]
+    """Write the features of a step: odd signals over their scale, then random products; return whether they are known.
+
+    Unknown features are 0.
+    """
+    out[:] = 0.0
+    count, random = odd.shape[0], basis.phases.shape[0]
+    if not math.isfinite(odd.sum() + even.sum()):
+        return False
+    for i in range(count):
+        out[i] = odd[i] / basis.scale[i]
+    for j in range(random):
+        a, b = 0.0, basis.phases[j]
         for i in range(count):
-            a += z[i] * odd_directions[j, i]
-        for i in range(e.shape[0]):
-            b += e[i] * even_directions[j, i]
+            a += out[i] * basis.odd_directions[j, i]
+        for i in range(even.shape[0]):
+            b += (even[i] - basis.even_mean[i]) / basis.even_scale[i] * basis.even_directions[j, i]
         out[count + j] = math.sqrt(2.0) * math.sin(a) * math.cos(b)
+    return True
 
 
 @njit(cache=True)
-def evaluate(odd, even, arrays, even_mean, even_scale, residual, distance2):  # type: ignore[no-untyped-def]
+def evaluate(odd, even, basis, weights, whitening, residual, distance2):  # type: ignore[no-untyped-def]
     """Write the residual, m/s², and the squared whitened distance of steps [K]."""
-    z, e, phi = np.empty(odd.shape[1]), np.empty(even.shape[1]), np.empty(arrays.weights.shape[0])
+    phi = np.empty(weights.shape[0])
     for k in range(odd.shape[0]):
         residual[k], distance2[k] = 0.0, math.nan
-        if not math.isfinite(odd[k].sum() + even[k].sum()):
+        if not _features(odd[k], even[k], basis, phi):
             continue
-        for i in range(z.shape[0]):
-            z[i] = odd[k, i] / arrays.scale[i]
-        for i in range(e.shape[0]):
-            e[i] = (even[k, i] - even_mean[i]) / even_scale[i]
-        _features(z, e, arrays.odd_directions, arrays.even_directions, arrays.phases, phi)
         for i in range(phi.shape[0]):
-            residual[k] += phi[i] * arrays.weights[i]
+            residual[k] += phi[i] * weights[i]
         distance2[k] = 0.0
-        for j in range(z.shape[0]):
+        for j in range(whitening.shape[0]):
             part = 0.0
-            for i in range(z.shape[0]):
-                part += arrays.whitening[j, i] * z[i]
+            for i in range(whitening.shape[1]):
+                part += whitening[j, i] * phi[i]
             distance2[k] += part * part
 
 
 @njit(cache=True)
-def expand(z, e, odd_directions, even_directions, phases, out):  # type: ignore[no-untyped-def]
-    """Write the features of steps [K]: standardised odd ones z, even ones e, and ``out`` [K, 16 + random]."""
-    for k in range(z.shape[0]):
-        _features(z[k], e[k], odd_directions, even_directions, phases, out[k])
+def expand(odd, even, basis, out):  # type: ignore[no-untyped-def]
+    """Write the features of steps [K] to ``out`` [K, 16 + random]."""
+    for k in range(odd.shape[0]):
+        _features(odd[k], even[k], basis, out[k])

@@ -55,6 +55,18 @@ class LinearModel:
             total += weighted[:, i]
         return total
 
+    def lateral_velocity(
+        self, features: FloatArray, dt_s: FloatArray, state: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return v_y [N] and the state after; ``dt_s`` [N] is NaN where a sequence starts."""
+        from pdhef_logtool.residual_model.low_pass import low_pass  # compiled
+
+        memory = np.zeros(1) if state is None else state.copy()
+        beta = self.sideslip_rad(features)[:, None]
+        low_pass(beta, dt_s, self.low_pass_hz, memory, beta)
+        # Sideslip is the direction of the velocity: beyond 80 degrees the linear model is out of its range.
+        return features[:, 0] * np.tan(np.clip(beta[:, 0], -1.4, 1.4)), memory
+
     def _document(self) -> dict[str, Any]:
         return {
             "format": FORMAT,

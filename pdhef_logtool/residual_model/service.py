@@ -65,6 +65,13 @@ class NetworkService:
         rate, after = self.run(features, np.isnan(dt_s), state)
         return Residual(rate, np.ones(len(rate))), after
 
+    def lateral_velocity(
+        self, features: FloatArray, dt_s: FloatArray, state: NetworkCarry
+    ) -> tuple[FloatArray, NetworkCarry]:
+        """Return v_y [N] of such a network and the state after; ``dt_s`` [N] is NaN where a sequence starts."""
+        output, after = self.run(features, np.isnan(dt_s), state)
+        return output[:, 0], after
+
     def _sequence(self, scaled: FloatArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkState]:
         both = np.zeros((len(scaled), SIDES, scaled.shape[1]), dtype=np.float32)
         both[:, 0] = scaled

@@ -32,7 +32,7 @@ def load_drive(
     ``needs`` : required signals. ``least_scored`` : required number of stamps with a true sideslip above the low-speed
     limit of the car.
     """
-    with read_drive(log, task.car, task.mapping, task.options) as drive:
+    with read_drive(log, task.car, task.mapping, task.settings.config.read_options) as drive:
         missing = ", ".join(sorted(needs - drive.available))
         if left_out := no_true_sideslip(drive.plan) or (f"the log has no {missing}" if missing else ""):
             return record_of(drive, left_out=left_out), None

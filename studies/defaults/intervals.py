@@ -99,7 +99,7 @@ def fit_intervals(task: Task, spread: float) -> Change:
 
 def _run_drive(log: LogInput, number: int, task: Task, spread: float) -> tuple[DriveRecord, _Ran | None]:
     """Run the estimators on a drive, once as given and some times with a wrong vehicle; return errors and terms."""
-    car, vehicle, options = task.car, task.car.vehicle, task.options
+    car, vehicle, options = task.car, task.car.vehicle, task.settings.config.read_options
     record, drive = load_drive(log, task, fill_friction=False)
     if drive is None or drive.truth is None:
         return record, None

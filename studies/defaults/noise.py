@@ -75,7 +75,7 @@ def tune(task: Task, trials: int) -> Change:
     EstimatorError
         No drive can be scored.
     """
-    options, slow = task.options, task.car.vehicle.low_speed_blend_m_s
+    options, slow = task.settings.config.read_options, task.car.vehicle.low_speed_blend_m_s
 
     def read(log: LogInput) -> tuple[DriveRecord, WholeDrive | None]:
         return load_drive(log, task, needs=FEATURES, least_scored=MIN_SCORED_STAMPS)

@@ -69,8 +69,8 @@ class Case:
     def _inputs(self) -> tuple[Signals, FloatArray, PosteriorSteps, FloatArray]:
         whole = as_logged(self.drive, self.car)
         physics = nominal_filter(self.car.vehicle, use_speed=self.use_speed)
-        features, steps, _ = run_features(physics, whole.signals, None)
-        rate, _ = self._network.run(features, ~np.isfinite(steps.prior[:, 0]), None)
+        features, dt_s, steps, _ = run_features(physics, whole.signals, None)
+        rate, _ = self._network.run(features, np.isnan(dt_s), None)
         assert whole.truth is not None
         return whole.signals, whole.truth.sideslip_rad, steps, rate
 

@@ -47,7 +47,7 @@ def residual_fit(drive: ReadDrive, car: Car) -> ResidualFit:
     """Compare the residual of a drive with the output of the paper's network, features as in service."""
     whole = drive.whole
     assert isinstance(car.network, ModelBundle)
-    assert car.network.paper_network is not None
+    assert car.network.paper_network is not None and whole.truth is not None
     network, period_s = car.network.paper_network, whole.plan.alignment.grid_period_s
     parallel = filter_of(car, network.model)
     rows = residual_rows(whole.signals, whole.truth, parallel, period_s=period_s)

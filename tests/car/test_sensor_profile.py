@@ -16,7 +16,7 @@ from pdhef_logtool.car.vehicle import SENSOR_PROFILES, Sensors, VehicleParameter
 from pdhef_logtool.estimators.kinematic import Kinematic
 from pdhef_logtool.estimators.pass_through import PassThrough
 from pdhef_logtool.estimators.sensor_faults import find_faults
-from pdhef_logtool.estimators.speed_slip import without_slip
+from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.estimators.vehicle_ukf import nominal_filter
 from pdhef_logtool.records import reasons
 from pdhef_logtool.records.errors import VehicleError
@@ -120,8 +120,8 @@ def test_the_lowest_speed_of_wheels_with_few_pulses_is_no_slip() -> None:
     t = seconds(rolling)
     gone = (t > 3.0) & (t < 4.0)
     silent = masked(rolling, "speed_m_s", gone, 0.0)
-    assert without_slip(silent, Sensors(), None)[0] is not silent
-    assert without_slip(silent, Sensors(speed_least_m_s=2.0), None)[0] is silent
+    assert believable(silent, Sensors(), None, None)[0] is not silent
+    assert believable(silent, Sensors(speed_least_m_s=2.0), None, None)[0] is silent
 
 
 def test_a_standstill_has_the_speed_and_the_yaw_rate_of_the_profile() -> None:

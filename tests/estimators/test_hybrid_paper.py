@@ -64,8 +64,8 @@ def test_the_undisturbed_norm_is_the_papers():
 
 def numpy_reference(signals: Signals, bundle: ModelBundle, constants: Constants) -> dict[str, np.ndarray]:
     """Compute Eq 19-26 in plain numpy, predicted to the stamps, from the package's parallel filter and network."""
-    features, physics, _ = run_features(nominal_filter(VEHICLE), signals, None)
-    rate, _ = NetworkService(bundle).run(features, ~np.isfinite(physics.prior[:, 0]), None)
+    features, dt_s, physics, _ = run_features(nominal_filter(VEHICLE), signals, None)
+    rate, _ = NetworkService(bundle).run(features, np.isnan(dt_s), None)
     signals = without_impossible(signals)
     q = np.array([0.089, 0.31, 0.062, 0.021])
     theta, gamma, deviation_tops, intensity_tops, ay_variance = constants

@@ -102,14 +102,14 @@ def test_intervals_that_do_not_apply_are_named_on_stderr_and_in_the_report(
     car = Path(shutil.copytree(SHIPPED_CARS["saloon"], tmp_path / "car"))
     document = json.loads((car / INTERVALS_FILE).read_text())
     (entry,) = (e for e in document["entries"] if e["estimator"] == "phy-ukf")
-    entry["algorithm"]["options"]["standstill"] = False
+    entry["algorithm"]["options"]["limit_gain"] = 1.0
     (car / INTERVALS_FILE).write_text(json.dumps(document))
     log = Path(__file__).parents[2] / "sample_logs/dlc.mcap"
     arguments = ("--car", car, "-e", "phy-ukf,zero", "--annotate", "none", "--no-report", "--start", "2", "--end", "4")
     pdhef("run", log, "-o", tmp_path / "out", *arguments)
     message = (
         "the calibrated intervals of phy-ukf are not applied: "
-        "expected vehicle-ukf 1 (equations=nominal, standstill=False), got vehicle-ukf 1 (equations=nominal)"
+        "expected vehicle-ukf 1 (equations=nominal, limit_gain=1.0), got vehicle-ukf 1 (equations=nominal)"
     )
     assert "".join(capsys.readouterr().err.split()).count("".join(message.split())) == 1
     report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())

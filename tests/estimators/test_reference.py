@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.estimators import kinematic_filter as kinematics
-from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference, refer, sideslip_std
+from pdhef_logtool.estimators.reference.drive import ReferencePrior, SideslipReference, refer
+from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
 from pdhef_logtool.records.signals import FloatArray, Signals
 
 RATE_HZ = 100
@@ -33,7 +34,9 @@ class Driven:
         stamps = self.signals.stamps_ns
         beta = np.interp(found.stamps_ns, stamps, np.arctan2(self.vy, self.vx))
         error = np.arctan2(found.vy_m_s, found.vx_m_s) - beta
-        return np.degrees(error), np.degrees(sideslip_std(found.vx_m_s, found.vy_m_s, found.covariance))
+        return np.degrees(error), np.degrees(
+            sideslip_std(found.vx_m_s, found.vy_m_s, found.covariance[:, [[0, 1], [1, 2]]])
+        )
 
 
 def _saturating(slip: float, stiffness: float, limit: float) -> float:
@@ -130,7 +133,7 @@ def test_in_a_slide_the_reference_is_given_with_a_larger_standard_deviation():
 def test_long_after_the_last_linear_driving_the_reference_is_not_valid():
     found = refer(LONG.signals, PRIOR)
     seconds = (found.stamps_ns - START_NS) * 1e-9
-    trusted = sideslip_std(found.vx_m_s, found.vy_m_s, found.covariance) < np.radians(0.5)
+    trusted = sideslip_std(found.vx_m_s, found.vy_m_s, found.covariance[:, [[0, 1], [1, 2]]]) < np.radians(0.5)
     nearest = np.abs(seconds[:, None] - seconds[trusted]).min(axis=1)
     np.testing.assert_array_equal(found.valid[nearest > 5.1], False)
     assert found.valid[nearest < 4.9].all()

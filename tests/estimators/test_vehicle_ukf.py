@@ -28,6 +28,7 @@ from scipy.stats import multivariate_normal
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.nominal_model import model_parameters
 from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators import vehicle_ukf
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import Options, make_estimator
 from pdhef_logtool.estimators.vehicle_model import LANES, PLACES, WIDTH, advance, physics_parameters
@@ -44,8 +45,6 @@ VEHICLE = default_vehicle()
 UKF = nominal_filter(VEHICLE)
 #: The drives of reference_car.py have no roll.
 PHYSICS = VehicleUkf(vehicle(roll_gradient_rad_per_m_s2=0.0))
-#: For speeds that change as no car does: they never reach the gate of innovations otherwise.
-WITH_SLIP = replace(UKF, slip_gate=False)
 CHANNELS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 DEGREE = math.radians(1.0)
 models = pytest.mark.parametrize("estimator", [UKF, PHYSICS], ids=["nominal", "forces"])
@@ -258,10 +257,12 @@ def test_a_single_spike_is_as_if_the_sample_were_missing(column, estimator, good
 
 
 @pytest.mark.parametrize(("column", "offset"), [("ay_m_s2", 12.0), ("yaw_rate_rad_s", 0.5), ("speed_m_s", 8.0)])
-def test_the_gate_holds_for_a_fifth_of_a_second_and_never_longer(column, offset, good):
+def test_the_gate_holds_for_a_fifth_of_a_second_and_never_longer(column, offset, good, monkeypatch):
+    # The check of wheel slip would remove speeds that change as no car's do.
+    monkeypatch.setattr(vehicle_ukf, "believable", lambda signals, _sensors, memory, _before_ns: (signals, memory))
     late = good.time_s >= 4.0
     changed = replace(good.signals, **{column: getattr(good.signals, column) + np.where(late, offset, 0.0)})
-    steps, undisturbed = posteriors(changed, WITH_SLIP), posteriors(good.signals)
+    steps, undisturbed = posteriors(changed), posteriors(good.signals)
     k = {"ay_m_s2": 0, "yaw_rate_rad_s": 1, "speed_m_s": 2}[column]
     first = 400
     while not np.isfinite(steps.innovation[first, k]):
@@ -307,7 +308,6 @@ def test_standstill_holds_and_lets_go(bias, estimator):
     assert np.abs(steps.x[going, 0] - made.vx[going]).max() < 0.3
     assert np.abs(steps.x[going, 2] - made.r[going]).max() < 0.05 + bias
     assert steps.valid.all()
-    assert (posteriors(signals, replace(estimator, standstill=False)).x[standing, 2] != 0.0).all()
 
 
 def test_standstill_determines_the_biases_of_the_sensors():

@@ -22,13 +22,13 @@ from pdhef_logtool.residual_model.bundle import (
     load_bundle,
 )
 from pdhef_logtool.residual_model.features import FEATURES, make_features
-from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.residual_model.network import ResidualNetwork
 from pdhef_logtool.residual_model.service import LIMITS, NetworkService
 
 
 def make_bundle(seed: int = 0, names: tuple[str, ...] = FEATURES, hidden: int = 16) -> ModelBundle:
     torch.manual_seed(seed)
-    network = ResidualNetwork(Architecture(len(names), hidden, 2, (8,)))
+    network = ResidualNetwork(len(names), hidden, 2, (8,))
     return ModelBundle(
         feature_names=names,
         hidden=hidden,
@@ -114,9 +114,7 @@ def test_wrong_bundles_are_one_clear_error(tmp_path: Path, damage: str) -> None:
 def said_by_torch(bundle: ModelBundle, features: FloatArray) -> FloatArray:
     """Run PyTorch's own network, the oracle, over normalised features [N, k]; returns normalised outputs [N, o]."""
     head, outputs = bundle.head, OUTPUT_COUNT[bundle.target]
-    network = ResidualNetwork(
-        Architecture(len(bundle.feature_names), bundle.hidden, bundle.layers, head, outputs=outputs)
-    )
+    network = ResidualNetwork(len(bundle.feature_names), bundle.hidden, bundle.layers, head, outputs=outputs)
     network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in bundle.weights.items()})
     with torch.inference_mode():
         output, _ = network.eval()(torch.from_numpy(features.astype(np.float32))[None])

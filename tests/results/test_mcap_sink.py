@@ -44,7 +44,7 @@ OUR_TOPICS = {
 TOPICS = SOURCE_TOPICS | OUR_TOPICS
 NAMES = {"phy_ukf": "phy-ukf", "zero": "zero", "truth": "truth"}
 
-ALGORITHM = {"algorithm": "vehicle-ukf", "sha256": "ab" * 32, "options": {"slip_gate": True}}
+ALGORITHM = {"algorithm": "vehicle-ukf", "sha256": "ab" * 32, "options": {"limit_gain": 1.0}}
 RMSE = {"signal": "sideslip_rad", "metric": "rmse", "unit": "rad"}
 REPORT = {
     "format": "pdhef.report",

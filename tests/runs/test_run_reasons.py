@@ -16,7 +16,7 @@ from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.records.reasons import STUCK_YAW_RATE
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.residual_model.network import ResidualNetwork
 from pdhef_logtool.results.parquet_sink import read_track
 from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.runs.config import RunConfig
@@ -38,7 +38,7 @@ def stuck_run(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -
     write_drive(simulate_drive("sine-sweep", seed=5, duration_s=8.0, faults=[fault]), folder / "stuck.mcap")
     torch.manual_seed(0)
     n = len(FEATURES)
-    network = ResidualNetwork(Architecture(n, 8, 1, (4,)))
+    network = ResidualNetwork(n, 8, 1, (4,))
     weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
     scale = Normalisation((0.0,) * n, (10.0,) * n, (1.0, 1.0))
     ModelBundle(FEATURES, 8, 1, (4,), 0.01, scale, weights).save(folder / "model")

@@ -19,7 +19,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.peers.gaussian import propagate, update
+from pdhef_logtool.estimators.gaussian import propagate, update
 from pdhef_logtool.estimators.peers.peer import PUBLISHED_HZ, Peer, Samples
 from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S, LONGEST_STEP_S, matrices, single_track, solve
 from pdhef_logtool.records.signals import FloatArray

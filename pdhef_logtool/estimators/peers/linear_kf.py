@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.peers.gaussian import propagate, update
+from pdhef_logtool.estimators.gaussian import propagate, update
 from pdhef_logtool.estimators.peers.peer import PUBLISHED_HZ, Peer, Samples
 from pdhef_logtool.estimators.peers.single_track import (
     LEAST_SPEED_M_S,

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.estimators.peers.gaussian import update
+from pdhef_logtool.estimators.gaussian import update
 from pdhef_logtool.estimators.peers.peer import PUBLISHED_HZ, Peer, Samples
 from pdhef_logtool.estimators.peers.single_track import LEAST_SPEED_M_S, SingleTrack, single_track
 from pdhef_logtool.records.signals import FloatArray, IntArray

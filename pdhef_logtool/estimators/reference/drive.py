@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from pdhef_logtool.estimators.reference.gnss import (
     without_jumps,
 )
 from pdhef_logtool.estimators.reference.inputs import ANTENNA_Y_STD_M, LINEAR_FRICTION, RATE_HZ, knots, sensor_noise
+from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 
 #: Wheelbase for the priors of lengths; for smaller cars they are scaled by the wheelbase.
@@ -107,61 +109,41 @@ class SideslipReference:
         return replace(self, **columns)
 
 
-_PARAMETERS = (
-    (s.COMPLIANCE, "rear axle compliance", "rad s^2/m"),
-    (s.YAW_COMPLIANCE, "rear slip per yaw acceleration", "s^2"),
-    (s.RATE_COMPLIANCE, "lag of the rear axle", "s^2"),
-    (s.LAW_ANGLE, "rear axle angle", "rad"),
-    (s.REAR_AXLE, "rear axle distance error", "m"),
-    (s.ROLL_GAIN, "roll gain of a_y", "1"),
-    (s.AX_GAIN, "pitch gain of a_x", "1"),
-    (s.IMU_YAW, "IMU yaw", "rad"),
-    (s.SPEED_SCALE, "speed scale error", "1"),
-    (s.IMU_X, "accelerometer x", "m"),
-    (s.IMU_Y, "accelerometer y", "m"),
-    (s.YAW_RATE_BIAS, "yaw rate bias", "rad/s"),
-    (s.YAW_RATE_GAIN, "yaw rate gain error", "1"),
-    (s.ANTENNA_X, "antenna x", "m"),
-    (s.ANTENNA_Y, "antenna y", "m"),
-    (s.GNSS_DELAY, "GNSS delay", "s"),
-    (s.ANTENNA_HEIGHT, "antenna height over the roll axis", "m"),
-)
+#: Entry of the state, mean and 1-sigma of its first value; of a parameter, name and unit (others have empty ones).
+_Entry: TypeAlias = tuple[int, float, float, str, str]
 
 
-def _priors(prior: ReferencePrior, n: int, *, tilts: bool) -> tuple[FloatArray, FloatArray]:
-    """Return mean and 1-sigma of the first state, [n] each, except entries that :func:`_smooth` sets.
+def _entries(prior: ReferencePrior, *, tilts: bool) -> Iterator[_Entry]:
+    """Yield the entries of the first state, except those that :func:`_smooth` sets.
 
     ``tilts``: roll and pitch rate provide the tilt of the accelerometers, so that a_y and a_x have no gain.
     """
     small = min(1.0, prior.wheelbase_m / WHEELBASE_M)
-    mean, std = np.zeros(s.WITH_GNSS), np.zeros(s.WITH_GNSS)
-    x, y = prior.antenna_m
-    has_antenna = math.isfinite(x)
-    for entry, value, sigma in (
-        ([s.VX, s.VY, s.LAW_ERROR], 0.0, 1.0),
-        ([s.AX_BIAS, s.AY_BIAS], 0.0, s.BIAS_M_S2),
-        (s.COMPLIANCE, 0.006, 0.004),
-        (s.YAW_COMPLIANCE, 0.003, 0.004),
-        (s.RATE_COMPLIANCE, 0.006 * small, 0.006 * small),
-        (s.LAW_ANGLE, 0.0, math.radians(0.2)),
-        (s.REAR_AXLE, 0.0, REAR_AXLE_STD_M * small),
-        (s.ROLL_GAIN, 0.0 if tilts else prior.ay_gain - 1.0, TILT_GAIN_STD if tilts else prior.ay_gain_std),
-        (s.AX_GAIN, 0.0 if tilts else 0.02, TILT_GAIN_STD if tilts else 0.02),
-        (s.IMU_YAW, 0.0, IMU_YAW_STD_RAD),
-        (s.IMU_Y, 0.0, 0.2 * small),
-        ([s.ROLL_RATE_BIAS, s.PITCH_RATE_BIAS], 0.0, 0.01),
-        (s.SPEED_SCALE, 0.0, 0.02),
-        (s.IMU_X, prior.imu_x_m, prior.imu_x_std_m),
-        (s.YAW_RATE_BIAS, prior.yaw_rate_bias_rad_s, 0.005),
-        (s.YAW_RATE_GAIN, 0.0, YAW_RATE_GAIN_STD),
-        ([s.EAST_ERROR, s.NORTH_ERROR], 0.0, s.RECEIVER_M_S),
-        (s.ANTENNA_X, x if has_antenna else 0.0, (0.1 if has_antenna else 0.7) * small),
-        (s.ANTENNA_Y, y if has_antenna else 0.0, (0.1 if has_antenna else ANTENNA_Y_STD_M) * small),
-        (s.GNSS_DELAY, 0.0, 0.06),
-        (s.ANTENNA_HEIGHT, 1.2 * small, 0.6 * small),
-    ):
-        mean[entry], std[entry] = value, sigma
-    return mean[:n], std[:n]
+    has_antenna = math.isfinite(prior.antenna_m[0])
+    x, y = prior.antenna_m if has_antenna else (0.0, 0.0)
+    ay_gain = (0.0, TILT_GAIN_STD) if tilts else (prior.ay_gain - 1.0, prior.ay_gain_std)
+    ax_gain = (0.0, TILT_GAIN_STD) if tilts else (0.02, 0.02)
+    yield from ((i, 0.0, 1.0, "", "") for i in (s.VX, s.VY, s.LAW_ERROR))
+    yield from ((i, 0.0, s.BIAS_M_S2, "", "") for i in (s.AX_BIAS, s.AY_BIAS))
+    yield from ((i, 0.0, 0.01, "", "") for i in (s.ROLL_RATE_BIAS, s.PITCH_RATE_BIAS))
+    yield from ((i, 0.0, s.RECEIVER_M_S, "", "") for i in (s.EAST_ERROR, s.NORTH_ERROR))
+    yield s.COMPLIANCE, 0.006, 0.004, "rear axle compliance", "rad s^2/m"
+    yield s.YAW_COMPLIANCE, 0.003, 0.004, "rear slip per yaw acceleration", "s^2"
+    yield s.RATE_COMPLIANCE, 0.006 * small, 0.006 * small, "lag of the rear axle", "s^2"
+    yield s.LAW_ANGLE, 0.0, math.radians(0.2), "rear axle angle", "rad"
+    yield s.REAR_AXLE, 0.0, REAR_AXLE_STD_M * small, "rear axle distance error", "m"
+    yield s.ROLL_GAIN, *ay_gain, "roll gain of a_y", "1"
+    yield s.AX_GAIN, *ax_gain, "pitch gain of a_x", "1"
+    yield s.IMU_YAW, 0.0, IMU_YAW_STD_RAD, "IMU yaw", "rad"
+    yield s.SPEED_SCALE, 0.0, 0.02, "speed scale error", "1"
+    yield s.IMU_X, prior.imu_x_m, prior.imu_x_std_m, "accelerometer x", "m"
+    yield s.IMU_Y, 0.0, 0.2 * small, "accelerometer y", "m"
+    yield s.YAW_RATE_BIAS, prior.yaw_rate_bias_rad_s, 0.005, "yaw rate bias", "rad/s"
+    yield s.YAW_RATE_GAIN, 0.0, YAW_RATE_GAIN_STD, "yaw rate gain error", "1"
+    yield s.ANTENNA_X, x, (0.1 if has_antenna else 0.7) * small, "antenna x", "m"
+    yield s.ANTENNA_Y, y, (0.1 if has_antenna else ANTENNA_Y_STD_M) * small, "antenna y", "m"
+    yield s.GNSS_DELAY, 0.0, 0.06, "GNSS delay", "s"
+    yield s.ANTENNA_HEIGHT, 1.2 * small, 0.6 * small, "antenna height over the roll axis", "m"
 
 
 def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> SideslipReference:
@@ -187,7 +169,7 @@ def refer(signals: Signals, prior: ReferencePrior, *, use_gnss: bool = True) -> 
     parameters = _parameters(best, prior, tilts=bool(rows[0, s.TILT]))
     refused = _refusal(best, parameters)
     measured = rows[:, s.GAP] == 0.0
-    sure = measured & (sideslip_std(vx, vy, best.covariance) < SURE_STD_RAD)
+    sure = measured & (sideslip_std(vx, vy, best.covariance[:, [[0, 1], [1, 2]]]) < SURE_STD_RAD)
     error = SIDESLIP_SHARE * np.arctan2(vy, np.abs(vx))
     covariance = best.covariance + (error**2 * np.stack([vy * vy, -vx * vy, vx * vx])).T
     return SideslipReference(
@@ -211,12 +193,6 @@ def corrected_inputs(states: FloatArray, rows: FloatArray) -> tuple[FloatArray, 
     return rate, *s.accelerations.py_func(states.T, ax, ay, slow_ax, slow_ay, rate, turning)
 
 
-def sideslip_std(vx: FloatArray, vy: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the 1-sigma of sideslip [K] for a covariance [K, 3] of v_x, v_y (xx, xy, yy)."""
-    variance = vy**2 * covariance[:, 0] - 2.0 * vx * vy * covariance[:, 1] + vx**2 * covariance[:, 2]
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)) / np.maximum(vx**2 + vy**2, 1e-6))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Smoothed:
     states: FloatArray
@@ -237,7 +213,10 @@ def _smooth(
     rows: FloatArray, prior: ReferencePrior, noise: FloatArray, n: int, velocity: FloatArray | None = None
 ) -> _Smoothed:
     """Smooth with n states; ``velocity`` [K, 3] is an optional first estimate of v_x, v_y and heading."""
-    mean, std = _priors(prior, n, tilts=bool(rows[0, s.TILT]))
+    mean, std = np.zeros(n), np.zeros(n)
+    for entry, value, sigma, *_ in _entries(prior, tilts=bool(rows[0, s.TILT])):
+        if entry < n:
+            mean[entry], std[entry] = value, sigma
     speed = rows[:, s.SPEED]
     first = np.flatnonzero(np.isfinite(speed))
     mean[s.VX] = speed[first[0]] if first.size else 0.0
@@ -262,15 +241,11 @@ def _smooth(
 
 
 def _parameters(smoothed: _Smoothed, prior: ReferencePrior, *, tilts: bool) -> tuple[ReferenceParameter, ...]:
-    n = smoothed.states.shape[1]
-    mean, std = _priors(prior, n, tilts=tilts)
-    value, sigma = smoothed.states[-1], np.sqrt(np.maximum(smoothed.last_variance, 0.0))
+    value, std = smoothed.states[-1], np.sqrt(np.maximum(smoothed.last_variance, 0.0))
     return tuple(
-        ReferenceParameter(
-            name, unit, *map(float, (value[i], sigma[i], mean[i], std[i], FAR_STD_OF.get(i, FAR_STD) * std[i]))
-        )
-        for i, name, unit in _PARAMETERS
-        if i < n
+        ReferenceParameter(name, unit, float(value[i]), float(std[i]), mean, sigma, FAR_STD_OF.get(i, FAR_STD) * sigma)
+        for i, mean, sigma, name, unit in _entries(prior, tilts=tilts)
+        if name and i < len(value)
     )
 
 

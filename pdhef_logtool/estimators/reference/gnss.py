@@ -31,6 +31,18 @@ SMALL_DELAY_S, COURSE_S = 0.06, 10.0
 WHEEL_ERROR_M_S = 2.0
 
 
+def _sampled(rows: FloatArray) -> IntArray:
+    """Return the knots [M] with a GNSS velocity."""
+    return np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
+
+
+def _distance(sampled: IntArray, k: IntArray) -> IntArray:
+    """Return the distance of knots [K] from the nearest of ``sampled`` [M]."""
+    after = np.minimum(np.searchsorted(sampled, k), sampled.size - 1)
+    before = np.maximum(after - 1, 0)
+    return np.asarray(np.minimum(np.abs(sampled[after] - k), np.abs(sampled[before] - k)), dtype=np.int64)
+
+
 def with_gnss_speed(rows: FloatArray) -> FloatArray:
     """Return the inputs without speeds that are GNSS speeds, and with a larger uncertainty where GNSS differs.
 
@@ -38,13 +50,12 @@ def with_gnss_speed(rows: FloatArray) -> FloatArray:
     """
     aided = rows.copy()
     aided[aided[:, s.LENGTH] > 0.0, s.SPEED] = np.nan
-    sampled = np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
+    sampled = _sampled(rows)
     over_ground = np.hypot(rows[sampled, s.GNSS_EAST], rows[sampled, s.GNSS_NORTH])
     k = np.arange(len(rows))
     difference = np.abs(rows[:, s.SPEED]) - np.interp(k, sampled, over_ground)
     apart = np.max(np.abs([np.interp(k + i, k, difference) for i in (-2, 0, 2)]), axis=0)
-    after = np.minimum(np.searchsorted(sampled, k), sampled.size - 1)
-    near = np.minimum(np.abs(sampled[after] - k), np.abs(sampled[np.maximum(after - 1, 0)] - k)) < RATE_HZ
+    near = _distance(sampled, k) < RATE_HZ
     aided[near & (apart > WHEEL_ERROR_M_S), s.SPEED] = np.nan
     aided[:, s.SPEED_STD] = np.where(near, np.hypot(rows[:, s.SPEED_STD], apart), rows[:, s.SPEED_STD])
     return aided
@@ -58,7 +69,7 @@ def first_guess(rows: FloatArray, alone: FloatArray) -> FloatArray:
     """
     k = np.arange(len(rows))
     gyro = np.cumsum(rows[:, s.MEAN_YAW_RATE] - alone[:, s.YAW_RATE_BIAS]) / RATE_HZ
-    sampled = np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
+    sampled = _sampled(rows)
     velocity = rows[sampled, s.GNSS_EAST] + 1j * rows[sampled, s.GNSS_NORTH]
     rolls = sampled[rolls_freely(rows)[sampled]]
     rolls = rolls if rolls.size else sampled
@@ -69,8 +80,7 @@ def first_guess(rows: FloatArray, alone: FloatArray) -> FloatArray:
     offset = np.unwrap(np.angle(around[np.minimum(i + n, rolls.size)] - around[np.maximum(i - n, 0)]))
     heading = gyro + np.interp(k, rolls, offset)
     body = np.interp(k, sampled, velocity) * np.exp(-1j * heading)
-    after = np.minimum(np.searchsorted(sampled, k), sampled.size - 1)
-    near = np.minimum(np.abs(sampled[after] - k), np.abs(sampled[np.maximum(after - 1, 0)] - k)) <= RATE_HZ
+    near = _distance(sampled, k) <= RATE_HZ
     vx, vy = np.where(near, body.real, alone[:, s.VX]), np.where(near, body.imag, alone[:, s.VY])
     return np.stack([vx, vy, heading], axis=1)
 
@@ -90,7 +100,7 @@ def gnss_follows_imu(rows: FloatArray) -> bool:
 
     Without significant accelerations the result is True.
     """
-    sampled = np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
+    sampled = _sampled(rows)
     sampled = sampled[np.diff(sampled // round(CHANGE_S * RATE_HZ), prepend=-1) > 0]
     if sampled.size < 3:
         return False
@@ -123,7 +133,7 @@ def increments(rows: FloatArray, sampled: IntArray, delay_s: float) -> tuple[Com
 
 def scanned_delay(rows: FloatArray) -> float:
     """Return the delay of GNSS velocity in s for which changes of GNSS and IMU velocity match best."""
-    sampled = np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
+    sampled = _sampled(rows)
     if sampled.size < 8:
         return 0.0
     costs = []
@@ -137,7 +147,7 @@ def scanned_delay(rows: FloatArray) -> float:
 
 def without_jumps(rows: FloatArray) -> FloatArray:
     """Return the inputs without GNSS velocities between a jump against the IMU and a jump back (multipath)."""
-    sampled = np.flatnonzero(np.isfinite(rows[:, s.GNSS_EAST]))
+    sampled = _sampled(rows)
     if sampled.size < 3:
         return rows
     by_gnss, by_imu = increments(rows, sampled, 0.0)

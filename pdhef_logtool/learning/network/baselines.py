@@ -120,9 +120,7 @@ def fit_dataset(data: Dataset, names: tuple[str, ...]) -> LinearModel:
     return replace(model, provenance=provenance)
 
 
-def fit_linear(
-    sequences: Sequence[SideslipSequence], names: tuple[str, ...], low_pass_hz: float = LOW_PASS_HZ
-) -> LinearModel:
+def fit_linear(sequences: Sequence[SideslipSequence], names: tuple[str, ...]) -> LinearModel:
     """Return the least-squares coefficients of the sideslip on the low-passed features and a constant.
 
     Features that do not vary, such as the friction of drives on one road, get a coefficient of 0.
@@ -136,7 +134,7 @@ def fit_linear(
     inputs, targets = [], []
     for s in sequences:
         used = np.isfinite(s.sideslip_rad)
-        inputs.append(_smooth(s.features[:, columns], s.dt_s, low_pass_hz)[used])
+        inputs.append(_smooth(s.features[:, columns], s.dt_s, LOW_PASS_HZ)[used])
         targets.append(s.sideslip_rad[used])
     rows = np.concatenate(inputs) if inputs else np.empty((0, len(names)))
     if rows.shape[0] <= len(names):
@@ -157,7 +155,7 @@ def fit_linear(
         feature_names=names,
         coefficients=tuple(float(c) for c in coefficients),
         intercept_rad=float(weights[-1] - coefficients @ mean),
-        low_pass_hz=low_pass_hz,
+        low_pass_hz=LOW_PASS_HZ,
     )
 
 
@@ -180,7 +178,7 @@ def _rmse_deg(model: LinearModel, sequences: Sequence[SideslipSequence]) -> floa
 def _sequences(data: Dataset, split: str) -> Iterable[SideslipSequence]:
     """Yield the runs of a split, with the network's rows where ground truth is above the low-speed blend."""
     for drive in data.drives:
-        if drive.split != split:
+        if drive.entry["split"] != split:
             continue
         slowest = data.vehicle(drive).low_speed_blend_m_s
         rows = drive.load()

@@ -223,30 +223,17 @@ def remove_unnamed(folder: Path, manifest: Mapping[str, Any]) -> None:
                     parent.rmdir()
 
 
-def vehicle_entry(sha256: str, vehicle: VehicleParameters) -> dict[str, Any]:
-    """Return the manifest's entry for a vehicle."""
-    return {"name": vehicle.name, "sha256": sha256, "parameters": vehicle.model_dump(mode="json")}
-
-
 def _checked_sha256(path: Path, named: str | None) -> str:
     """Return the digest of a drive's file; raises OutputError if it differs from the one that the manifest names."""
+    sha256, got = "", "another content"
     try:
         with path.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise OutputError(
-            expected="a drive's file of the dataset",
-            got=error.strerror or str(error),
-            where=str(path),
-            remedy="extract it again",
-        ) from None
-    if named not in (None, sha256):
-        raise OutputError(
-            expected="the file that the manifest names",
-            got="another content",
-            where=str(path),
-            remedy="extract it again",
-        )
+        got = error.strerror or str(error)
+    if not sha256 or named not in (None, sha256):
+        expected = "the drive's file that the manifest names"
+        raise OutputError(expected=expected, got=got, where=str(path), remedy="extract it again")
     return sha256
 
 
@@ -282,10 +269,7 @@ class DatasetDrive:
     ``entry`` is its entry in the manifest; ``limits`` are the limits of the cells, None for no limits.
     """
 
-    name: str
-    split: str
     path: Path
-    period_s: float
     entry: Mapping[str, Any]
     limits: Sequence[float] | None = None
 
@@ -301,25 +285,25 @@ class DatasetDrive:
         table = pq.read_table(self.path, partitioning=None)
         column = {name: table[name].to_numpy() for name in table.column_names if name != "split"}
         stamps = column["stamp_ns"].astype(np.int64)
-        step_s = np.full(stamps.shape[0], self.period_s)
+        step_s = np.full(stamps.shape[0], float(self.entry["period_s"]))
         step_s[:-1] = np.diff(stamps) * 1e-9
-        features = np.stack([column[name] for name in FEATURES], axis=1).astype(np.float32)
-        targets = np.stack([column[name] for name, _ in TARGETS], axis=1).astype(np.float32)
+        rows = np.isfinite([column[name] for name in FEATURES]).all(axis=0)  # with a state of the filter
+        column = {name: values[rows] for name, values in column.items()}
         weight = column["weight"].astype(np.float32)
+        targets = np.stack([column[name] for name, _ in TARGETS], axis=1).astype(np.float32)
         targets[weight == 0.0] = 0.0
-        is_complete = np.isfinite(features).all(axis=1)
-        chosen: BoolArray = column.get("chosen", np.ones_like(is_complete))
+        chosen: BoolArray = column["chosen"]
         if self.limits is not None:
             chosen = chosen & is_chosen(column["cell"], column["draw"], self.limits)
         return DriveArrays(
-            stamps_ns=stamps[is_complete],
-            features=features[is_complete],
-            targets=targets[is_complete],
-            step_s=step_s[is_complete],
-            weight=weight[is_complete],
-            segment=column["segment"].astype(np.int64)[is_complete],
-            truth_velocity=np.stack([column[name] for name in TRUTH], axis=1).astype(np.float32)[is_complete],
-            chosen=None if chosen[is_complete].all() else chosen[is_complete],
+            stamps_ns=stamps[rows],
+            features=np.stack([column[name] for name in FEATURES], axis=1).astype(np.float32),
+            targets=targets,
+            step_s=step_s[rows],
+            weight=weight,
+            segment=column["segment"].astype(np.int64),
+            truth_velocity=np.stack([column[name] for name in TRUTH], axis=1).astype(np.float32),
+            chosen=None if chosen.all() else chosen,
         )
 
 
@@ -381,14 +365,7 @@ def read_dataset(folder: Path) -> Dataset:
             model=str(document["model"]),
             sha256=str(document["sha256"]),
             drives=tuple(
-                DatasetDrive(
-                    name=d["name"],
-                    split=d["split"],
-                    path=folder / d["file"],
-                    period_s=float(d["period_s"]),
-                    entry=d,
-                    limits=limits if d["split"] == CHOSEN_SPLIT else None,
-                )
+                DatasetDrive(folder / d["file"], d, limits if d["split"] == CHOSEN_SPLIT else None)
                 for d in document["drives"]
             ),
             manifest=document,

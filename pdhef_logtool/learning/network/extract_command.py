@@ -46,7 +46,6 @@ from pdhef_logtool.learning.network.dataset import (
     read_manifest,
     remove_unnamed,
     split_folder,
-    vehicle_entry,
     write_drive,
     write_manifest,
 )
@@ -139,11 +138,7 @@ class ExtractSettings:
         return {
             **{k: config[k] for k in used},
             **{k: config[k] for k in ("friction", "reference", "gnss") if config[k] != "auto"},
-            "truth_smoothing": self.truth_smoothing,
-            "split": self.split,
-            "model": self.model,
-            "where": self.where,
-            "per_cell_s": self.per_cell_s,
+            **{k: getattr(self, k) for k in ("truth_smoothing", "split", "model", "where", "per_cell_s")},
         }
 
 
@@ -268,7 +263,7 @@ def extract(
         results = _without_copies(_extract_all(work, jobs, reporter), reporter.warn)
         for job in work:
             sha, vehicle = job.physics
-            vehicles[sha] = vehicle_entry(sha, vehicle)
+            vehicles[sha] = {"name": vehicle.name, "sha256": sha, "parameters": vehicle.model_dump(mode="json")}
         manifest = write(results)
         with writing(output):
             remove_unnamed(output, manifest)
@@ -340,15 +335,6 @@ def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
                 )
 
 
-def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[DriveResult, ...]:
-    by_log: dict[str, DriveResult] = {}
-    for done, result in enumerate(_run_jobs(work, jobs, reporter), start=1):
-        by_log[result.record.name] = result
-        tell_drive(result.record, reporter.warn)
-        reporter.progress(result.record.name, done / len(work))
-    return tuple(by_log[job.log_input.stem] for job in work)
-
-
 def _earlier(output: Path, settings: ExtractSettings) -> dict[str, Any]:
     """Return the manifest of the dataset to extend; empty for a new dataset.
 
@@ -417,11 +403,13 @@ def _car(path: Path | None) -> Car:
     return Car.load(path, network=NO_MODEL, intervals=NO_INTERVALS)
 
 
-def _run_jobs(work: Sequence[_Job], jobs: int, reporter: Reporter) -> Iterator[DriveResult]:
-    """Yield one result per job, in any order; a crashed process loses only its own drive."""
+def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[DriveResult, ...]:
+    """Return the result of each job; a crashed process loses only its own drive."""
     if len(work) == 1:
-        yield _extract(work[0], partial(reporter.progress, work[0].log_input.stem))
-        return
+        result = _extract(work[0], partial(reporter.progress, work[0].log_input.stem))
+        tell_drive(result.record, reporter.warn)
+        return (result,)
+    results: dict[int, DriveResult] = {}
     shares: dict[int, float] = {}
 
     def told(number: int, name: str, share: float) -> None:
@@ -434,8 +422,11 @@ def _run_jobs(work: Sequence[_Job], jobs: int, reporter: Reporter) -> Iterator[D
     )
     with closing(ends):
         for ended in ends:
-            shares[ended.number] = 1.0
-            yield ended.result or _failure(ended.item, ended.failure.reason if ended.failure else "")
+            result = ended.result or _failure(ended.item, ended.failure.reason if ended.failure else "")
+            results[ended.number] = result
+            tell_drive(result.record, reporter.warn)
+            told(ended.number, result.record.name, 1.0)
+    return tuple(results[number] for number in range(len(work)))
 
 
 def _extract_guarded(job: _Job, progress: Progress) -> DriveResult:
@@ -465,12 +456,12 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         _check_plan(plan, job, estimated=reference is not None)
         smoothing = _choose_smoothing(plan, settings)
         truth = _truth_facts(plan, smoothing, estimated=reference is not None)
-        service = _in_service(drive, job)
-        physics = filter_of(service.model.car.calibrated_car, settings.model, use_speed=drive.options.use_speed)
+        model, calibration, taught = _in_service(drive, job)
+        physics = filter_of(model.car.calibrated_car, settings.model, use_speed=drive.options.use_speed)
         validated = drive.car.has_evidence
         drive.friction = friction_of(plan, physics.vehicle, drive.options, validated=validated, of_truth=True)
         condition = None if settings.where is None else condition_of(settings.where)
-        rows = _residuals(drive, physics, smoothing, service, reference)
+        rows = _residuals(drive, physics, smoothing, (model, taught), reference)
         if not len(rows):
             raise no_samples(job.log_input.path)
         picked = pick(rows, condition, f"{settings.seed}:{source}")
@@ -487,8 +478,8 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             "vehicle_sha256": job.physics[0],
             "settings_sha256": fingerprint,
             "mapping_sha256": drive.mapping.sha256,
-            "calibration": service.calibration,
-            "taught_sha256": None if service.residual is None else service.residual.sha256,
+            "calibration": calibration,
+            "taught_sha256": None if taught is None else taught.sha256,
             "period_s": plan.alignment.grid_period_s,
             **_counts(rows, picked, drive.log.start_ns),
             "truth": truth,
@@ -502,24 +493,15 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
     return DriveResult(replace(record, seconds=entry["duration_s"]), entry)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Service:
-    """Settings of a run on a drive: its model, calibration, active residual model."""
-
-    model: DriveModel
-    calibration: str
-    residual: LadderModel | None
-
-
-def _in_service(drive: Drive, job: _Job) -> _Service:
-    """Return the car settings of a run on this drive; a trained car is calibrated on each drive."""
+def _in_service(drive: Drive, job: _Job) -> tuple[DriveModel, str, LadderModel | None]:
+    """Return model, calibration and residual of a run on this drive; a taught car is calibrated on each drive."""
     car, taught = job.car, job.car.taught
     if taught is None or job.settings.model != PHYSICS_MODEL:
-        return _Service(DriveModel.of(drive), "", None)
+        return DriveModel.of(drive), "", None
     calibration = self_calibrate([read_driving(drive)], car.vehicle, taught=car.taught_prior)
     text = f"refused: {calibration.refused}" if calibration.refused else calibration.text
     acts = taught.residual if taught.calibrated != bool(calibration.refused) else None
-    return _Service(DriveModel.of(drive, calibration), text, acts)
+    return DriveModel.of(drive, calibration), text, acts
 
 
 def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) -> DriveResult | None:
@@ -540,24 +522,26 @@ def _residuals(
     drive: Drive,
     physics: VehicleUkf,
     smoothing: _Smoothing,
-    service: _Service,
+    service: tuple[DriveModel, LadderModel | None],
     reference: TruthAt | None,
 ) -> ResidualRows:
     """Return the residuals of a drive."""
     whole = drive.whole()
     truth = whole.truth if reference is None else reference(whole.signals.stamps_ns)
+    assert truth is not None, "the plan of the drive derives it"
     period_s = drive.plan.alignment.grid_period_s
     half_window = round(smoothing.half_s / period_s)
-    taught = service.residual if physics.equations == "forces" else None
+    model, taught = service
+    is_physics = physics.equations == "forces"
     noise = smoothing.noise[0] * period_s / math.sqrt(2.0)  # of v_y itself
     return residual_rows(
-        service.model.apply(whole.signals).calibrated if physics.equations == "forces" else whole.signals,
+        model.apply(whole.signals).calibrated if is_physics else whole.signals,
         truth,
         physics,
         period_s=period_s,
         half_window=half_window,
         truth_std_m_s=noise if math.isfinite(noise) else 0.0,
-        taught=taught,
+        taught=taught if is_physics else None,
     )
 
 

@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import OUTPUT_COUNT, RESIDUAL, ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES, PAPER_FEATURES
-from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork, State
+from pdhef_logtool.residual_model.network import ResidualNetwork, State
 from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.files import write_bytes, writing
 
@@ -143,11 +143,7 @@ def normalisation_of(
         deviations = _summed(deviations, (s.features[s.weight > 0][:, columns] - mean) ** 2)
     std = np.maximum(np.sqrt(deviations / count), 1e-6)
     spread = np.maximum(np.sqrt(squares / count), 1e-6)
-    return Normalisation(
-        tuple(float(x) for x in mean),
-        tuple(float(x) for x in std),
-        tuple(float(x) for x in spread),
-    )
+    return Normalisation(*(tuple(map(float, column)) for column in (mean, std, spread)))
 
 
 def _summed(before: FloatArray, rows: FloatArray) -> FloatArray:
@@ -198,7 +194,9 @@ def train(
     with PieceFile(work) as train_pieces, PieceFile(work) as validation_pieces:
         train_pieces.fill(training, lambda s: _pieces(s, recipe, normalisation))
         validation_pieces.fill(validation, lambda s: [_balanced(_scaled(s, recipe, normalisation))])
-        identity = _identity(recipe, normalisation, train_pieces, validation_pieces, init)
+        document = {"recipe": asdict(recipe), "normalisation": asdict(normalisation), "init": init and init.sha256}
+        document |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
+        identity = json.loads(json.dumps(document))  # as it is read from a checkpoint
         history, best, best_loss = _resume(work, identity, network, optimiser, device)
         for epoch in range(len(history), recipe.epochs):
             if len(history) - 1 - _best_epoch(history) >= recipe.patience:
@@ -232,8 +230,7 @@ def train(
 # ---- data ----
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Piece:
+class _Piece(NamedTuple):
     features: torch.Tensor
     target: torch.Tensor
     weight: torch.Tensor
@@ -291,7 +288,7 @@ class PieceFile:
 
     def _add(self, piece: _Piece) -> None:
         self._shape = (piece.features.shape[1], piece.target.shape[1])
-        data = b"".join(x.numpy().tobytes() for x in (piece.features, piece.target, piece.weight))
+        data = b"".join(column.numpy().tobytes() for column in piece)
         with writing(self._folder):
             self._places.append((self._file.tell(), len(piece.weight)))
             self._file.write(data)
@@ -338,21 +335,19 @@ def _pieces(sequence: FeatureSequence, recipe: Recipe, n: Normalisation) -> Iter
     for first in range(0, whole.features.shape[0], recipe.piece_steps):
         part = slice(first, first + recipe.piece_steps)
         if float(whole.weight[part].sum()) > 0.0:
-            yield _balanced(_Piece(whole.features[part], whole.target[part], whole.weight[part]))
+            yield _balanced(_Piece(*(column[part] for column in whole)))
 
 
 def _balanced(piece: _Piece) -> _Piece:
     """Divide the weights of a piece by the mean square of its target."""
     square = (piece.target**2).mean(dim=1)
     mean = float((square * piece.weight).sum() / piece.weight.sum())
-    return _Piece(piece.features, piece.target, piece.weight / (mean + WEIGHT_FLOOR))
+    return piece._replace(weight=piece.weight / (mean + WEIGHT_FLOOR))
 
 
 def _padded(pieces: Sequence[_Piece], device: str) -> _Piece:
-    def pad(columns: list[torch.Tensor]) -> torch.Tensor:
-        return torch.nn.utils.rnn.pad_sequence(columns, batch_first=True).to(device)
-
-    return _Piece(pad([p.features for p in pieces]), pad([p.target for p in pieces]), pad([p.weight for p in pieces]))
+    pad = torch.nn.utils.rnn.pad_sequence
+    return _Piece(*(pad(list(columns), batch_first=True).to(device) for columns in zip(*pieces, strict=True)))
 
 
 # ---- one epoch ----
@@ -444,11 +439,8 @@ def _learning_rate(recipe: Recipe, share: float) -> float:
 
 def _new_network(recipe: Recipe, init: ModelBundle | None) -> ResidualNetwork:
     torch.manual_seed(recipe.seed)
-    shape = Architecture(
-        len(recipe.feature_names), recipe.hidden, recipe.layers, recipe.head, recipe.dropout,
-        OUTPUT_COUNT[recipe.target],
-    )  # fmt: skip
-    network = ResidualNetwork(shape)
+    sizes, outputs = (len(recipe.feature_names), recipe.hidden, recipe.layers), OUTPUT_COUNT[recipe.target]
+    network = ResidualNetwork(*sizes, recipe.head, recipe.dropout, outputs=outputs)
     if init is not None:
         network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in init.weights.items()})
     return network
@@ -460,24 +452,6 @@ def _weights(network: ResidualNetwork) -> dict[str, Any]:
 
 def _best_epoch(history: Sequence[Epoch]) -> int:
     return int(np.argmin([e.validation_loss for e in history])) if history else -1
-
-
-def _identity(
-    recipe: Recipe,
-    n: Normalisation,
-    training: PieceFile,
-    validation: PieceFile,
-    init: ModelBundle | None,
-) -> dict[str, Any]:
-    document = {
-        "recipe": asdict(recipe),
-        "normalisation": asdict(n),
-        "training": training.sha256,
-        "validation": validation.sha256,
-        "init": None if init is None else init.sha256,
-    }
-    plain: dict[str, Any] = json.loads(json.dumps(document))
-    return plain
 
 
 def _write_checkpoint(

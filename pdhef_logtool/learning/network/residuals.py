@@ -28,26 +28,12 @@ import numpy as np
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.drive.truth import cubic_equations
+from pdhef_logtool.estimators import vehicle_model as ukf_model
 from pdhef_logtool.estimators.parallel_physics import run_features
-from pdhef_logtool.estimators.vehicle_model import (
-    AX_BIAS,
-    FRONT,
-    LANES,
-    PLACES,
-    REAR,
-    ROLL,
-    ROLL_RATE,
-    VY,
-    WIDTH,
-    YAW_RATE,
-    advance,
-    settle_forces,
-)
 from pdhef_logtool.estimators.vehicle_ukf import U_AX, U_FRICTION, U_STEER, HeldInputs, VehicleUkf
 from pdhef_logtool.learning.truth import weight_of
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import step_durations_s
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.ladder import LadderModel
 
@@ -152,7 +138,7 @@ _RUN = 5
 def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  # type: ignore[no-untyped-def]
     """Write the model's change of v_y and r [N − 1, 2] from each true state; NaN where that state is unknown."""
     layout, places, p, f = model
-    block = np.zeros((PLACES, WIDTH))
+    block = np.zeros((ukf_model.PLACES, ukf_model.WIDTH))
     for k in range(states.shape[0] - 1):
         out[k, 0] = math.nan
         out[k, 1] = math.nan
@@ -168,19 +154,19 @@ def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  #
             0.5 * (inputs[k, U_FRICTION] + inputs[k + 1, U_FRICTION]),
         )
         if run[0] == 0.0:
-            settle_forces(x, over.steer, over.ax, over.friction, layout, p, f)
+            ukf_model.settle_forces(x, over.steer, over.ax, over.friction, layout, p, f)
         else:
-            x[FRONT], x[REAR] = run[1], run[2]
+            x[ukf_model.FRONT], x[ukf_model.REAR] = run[1], run[2]
             if layout.roll >= 0:
                 x[layout.roll], x[layout.roll + 1] = run[3], run[4]
         for i in range(x.shape[0]):
-            block[places[i], :LANES] = x[i]
-        advance(block.reshape(-1), LANES, over, dt, layout, p, f)
-        out[k, 0] = block[VY, 0] - x[VY]
-        out[k, 1] = block[YAW_RATE, 0] - x[YAW_RATE]
-        run[0], run[1], run[2] = 1.0, block[FRONT, 0], block[REAR, 0]
+            block[places[i], : ukf_model.LANES] = x[i]
+        ukf_model.advance(block.reshape(-1), ukf_model.LANES, over, dt, layout, p, f)
+        out[k, 0] = block[ukf_model.VY, 0] - x[ukf_model.VY]
+        out[k, 1] = block[ukf_model.YAW_RATE, 0] - x[ukf_model.YAW_RATE]
+        run[0], run[1], run[2] = 1.0, block[ukf_model.FRONT, 0], block[ukf_model.REAR, 0]
         if layout.roll >= 0:
-            run[3], run[4] = block[ROLL, 0], block[ROLL_RATE, 0]
+            run[3], run[4] = block[ukf_model.ROLL, 0], block[ukf_model.ROLL_RATE, 0]
 
 
 def physics_increments(
@@ -207,7 +193,7 @@ def physics_increments(
     good = _dynamic(state, model.p) & _complete(x) & _complete(inputs)
     states = np.zeros_like(x)
     states[:, :3] = np.where(good[:, None], state, 1.0)
-    states[:, AX_BIAS] = np.where(good, x[:, AX_BIAS], 0.0)
+    states[:, ukf_model.AX_BIAS] = np.where(good, x[:, ukf_model.AX_BIAS], 0.0)
     moved = np.empty((max(len(stamps_ns) - 1, 0), 2))
     _run_model(stamps_ns, states, inputs, good, max_step_s, model, np.zeros(_RUN), moved)
     increments: FloatArray = np.diff(state[:, 1:3], axis=0) - moved
@@ -271,7 +257,7 @@ def difference_noise(stamps_ns: IntArray, values: FloatArray) -> float:
 
 def residual_rows(
     signals: Signals,
-    truth: StateTrack | None,
+    truth: StateTrack,
     physics: VehicleUkf,
     *,
     period_s: float,
@@ -283,23 +269,23 @@ def residual_rows(
 
     Parameters
     ----------
-    signals, truth : at the same stamps [N], less biases of the vehicle file; targets need ground truth.
+    signals, truth : at the same stamps [N], less biases of the vehicle file.
     physics : the parallel filter with the settings of operation; residuals refer to its model.
     period_s : of the IMU. half_window : steps on each side of the smoothing of targets.
     truth_std_m_s : 1-sigma of the true v_y for ground truth without an uncertainty. taught : the car's taught residual.
     """
     count = len(signals)
-    features, filtered, _ = run_features(physics, signals, None)
+    features, dt_s, filtered, _ = run_features(physics, signals, None)
     complete = _complete(features)
     fresh: BoolArray = complete & ~(np.concatenate([[False], complete[:-1]]) & np.isfinite(filtered.prior[:, 0]))
     segment = np.maximum(np.cumsum(fresh) - 1, 0)
     region = np.full(count, np.nan)
     if taught is not None:
-        dt_s = step_durations_s(signals.stamps_ns, None)
-        dt_s[~np.isfinite(filtered.prior[:, 0])] = np.nan
         residual, _ = taught.residual(features, dt_s, None)
         region = np.where(filtered.valid, residual.gain, np.nan)
-    inputs, state = filtered.inputs.copy(), _true_state(truth, count)
+    inputs = filtered.inputs.copy()
+    state = np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)
+    state[~truth.valid] = np.nan
     # A predicted steering angle must not affect a residual.
     inputs[~np.isfinite(without_impossible(signals).steer_rad), U_STEER] = np.nan
     stamps_ns, gap_s = signals.stamps_ns, GAP_PERIODS * period_s
@@ -315,7 +301,8 @@ def residual_rows(
     usable = _complete(targets) & complete
     # If the filter restarts at the next row, the network starts without a state in operation, too.
     usable[:-1] &= complete[1:] & (segment[1:] == segment[:-1])
-    truth_std = _truth_std(truth, state, truth_std_m_s)
+    truth_std = truth_std_m_s / np.maximum(np.abs(state[:, 0]), 1.0)
+    truth_std = np.where(np.isfinite(truth.sideslip_std_rad), truth.sideslip_std_rad, truth_std)
     return ResidualRows(
         stamps_ns=signals.stamps_ns,
         features=features,
@@ -331,17 +318,3 @@ def residual_rows(
 
 def _complete(values: FloatArray) -> BoolArray:
     return np.asarray(np.isfinite(values).all(axis=1), dtype=np.bool_)
-
-
-def _truth_std(truth: StateTrack | None, state: FloatArray, std_m_s: float) -> FloatArray:
-    """Return the 1-sigma of the true sideslip [N] in rad, from the ground truth if finite, else from its v_y."""
-    of_noise = std_m_s / np.maximum(np.abs(state[:, 0]), 1.0)
-    of_track = of_noise if truth is None else truth.sideslip_std_rad
-    return np.where(np.isfinite(of_track), of_track, of_noise)
-
-
-def _true_state(truth: StateTrack | None, count: int) -> FloatArray:
-    if truth is None:
-        return np.full((count, 3), np.nan)
-    state = np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)
-    return np.where(truth.valid[:, None], state, np.nan)

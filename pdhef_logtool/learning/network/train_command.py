@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.learning.network.dataset import SPLITS, Dataset, DatasetDrive, DriveArrays, read_dataset
+from pdhef_logtool.learning.network.dataset import SPLITS, Dataset, DriveArrays, read_dataset
 from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
 from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
@@ -143,10 +143,7 @@ def train_on(
     progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> TrainResult:
     """Train one network by a recipe, which contains the target; otherwise as :func:`run_training`."""
-    splits = {
-        name: SplitSequences(tuple(d for d in data.drives if d.split == name), recipe.target, recipe.odd, data.vehicle)
-        for name in SPLITS
-    }
+    splits = {name: SplitSequences(data, name, recipe.target, recipe.odd) for name in SPLITS}
 
     def tell(epoch: Epoch, of: int) -> None:
         progress(
@@ -246,16 +243,16 @@ class SplitSequences:
     A sequence is a gap-free run with residual increments divided by the true step, or with the true v_y.
     """
 
-    drives: tuple[DatasetDrive, ...]
+    data: Dataset
+    split: str
     target: str
     odd: bool
-    vehicle_of: Callable[[DatasetDrive], VehicleParameters]
 
     def __iter__(self) -> Iterator[FeatureSequence]:
         """Yield the sequences in the order of the drives; one drive is in memory at a time."""
-        for drive in self.drives:
+        for drive in (d for d in self.data.drives if d.entry["split"] == self.split):
             rows = drive.load()
-            offset = steering_offset(rows, self.vehicle_of(drive)) if self.odd else np.zeros(2)
+            offset = steering_offset(rows, self.data.vehicle(drive)) if self.odd else np.zeros(2)
             for part in gap_free_runs(rows):
                 weight = weights_of(rows, part)
                 features = np.asarray(rows.features[part], dtype=np.float64)
@@ -266,7 +263,7 @@ class SplitSequences:
                     weight = weight * np.isfinite(values[:, 0])
                 values[weight == 0.0] = 0.0
                 if weight.sum() > 0.0:
-                    yield FeatureSequence(drive.name, features, values, weight)
+                    yield FeatureSequence(drive.entry["name"], features, values, weight)
 
 
 def _history_table(history: Iterable[Epoch]) -> bytes:

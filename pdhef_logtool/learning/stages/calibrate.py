@@ -33,7 +33,7 @@ def calibrate(task: Task) -> StageOutput:
     car = Car.of(start)
 
     def read(log: LogInput) -> tuple[DriveRecord, tuple[Driving, Sensors] | None]:
-        with read_drive(log, car, task.mapping, task.options) as drive:
+        with read_drive(log, car, task.mapping, task.settings.config.read_options) as drive:
             if missing := lacking(drive):
                 return record_of(drive, left_out=f"the log has no {', '.join(missing)}"), None
             driving = read_driving(drive)

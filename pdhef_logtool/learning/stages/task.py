@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.store import Change
-from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.learning.drives import DriveRecord, LearnSettings, tell_drive
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
@@ -34,11 +33,6 @@ class Task:
     mapping: SignalMapping | None = None
     set_splits: Mapping[str, str] = field(default_factory=dict)
     reporter: Reporter = SILENT
-
-    @property
-    def options(self) -> ReadOptions:
-        """Options for reading logs."""
-        return self.settings.config.read_options
 
     def read(
         self, read: Callable[[LogInput], tuple[DriveRecord, _Read | None]], share: float = 1.0

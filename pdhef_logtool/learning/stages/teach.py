@@ -11,7 +11,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -39,7 +39,7 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.model.drive_model import DriveModel, lacking, read_driving
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
-from pdhef_logtool.records.steps import release, step_durations_s
+from pdhef_logtool.records.steps import release
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.features import SlowFeatures, slow_features
 from pdhef_logtool.residual_model.ladder import NONE
@@ -140,7 +140,7 @@ def teach(task: Task) -> StageOutput:
     car = Car.of(task.car.datasheet)
 
     def read(log: LogInput) -> tuple[DriveRecord, OpenedDrive | None]:
-        with read_drive(log, car, task.mapping, task.options) as drive:
+        with read_drive(log, car, task.mapping, task.settings.config.read_options) as drive:
             return open_drive(drive, task.settings.config)
 
     records, drives = task.read(read, 0.3)
@@ -194,10 +194,8 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
         correction = None if ladder.model is None else ladder.model.evaluate(lack.features)
         line = {"name": drive.drive.name, "seconds": round(drive.taught.driving.seconds, 1)}
         line |= {"calibration": calibration.refused or "as later drives"}
-        for name, rmse in (
-            ("physics", corrected_rmse_deg(lack, None)),
-            ("corrected", corrected_rmse_deg(lack, correction)),
-        ):
+        for name, corrected in (("physics", None), ("corrected", correction)):
+            rmse = corrected_rmse_deg(lack, corrected)
             line |= {f"{name}_deg": rmse[0], f"{name}_without_constant_deg": rmse[1]}
         lines.append(line)
     truth = " and ".join(sorted({ESTIMATED if d.truth.name == REFERENCE else GROUND_TRUTH for d in drives}))
@@ -238,28 +236,21 @@ def lacking_of(drive: OpenedDrive, calibration: SelfCalibration) -> TaughtDrive:
 def features_of(physics: AdaptivePhysics, signals: Signals) -> SlowFeatures:
     """Return the features of a drive's steps, as the filter in service computes them."""
     faults = physics.inputs(signals, None)[0].faults
-    given = faults.filtered, None
-    table, steps, _ = run_features(physics.physics, *given, seen=faults.network, extra_r=faults.extra_r)
-    dt_s = step_durations_s(signals.stamps_ns, None)
-    dt_s[~np.isfinite(steps.prior[:, 0])] = np.nan
+    table, dt_s, *_ = run_features(physics.physics, faults.filtered, None, seen=faults.network, extra_r=faults.extra_r)
     return slow_features(table, dt_s, None)[0]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fold:
-    """Training drives, and the scored part of another drive or of the same drive."""
-
-    taught: tuple[TaughtDriving, ...]
-    scored: OpenedDrive
-    part: slice
+#: Training drives, and the scored part of another drive or of the same drive.
+_Fold: TypeAlias = tuple[tuple[TaughtDriving, ...], OpenedDrive, slice]
 
 
 def _folds(drives: Sequence[OpenedDrive]) -> list[_Fold]:
     """Return folds that leave out one drive each; a single drive is split into halves."""
     if len(drives) > 1:
         left_out = drives[:MOST_LEFT_OUT]
-        return [_Fold(tuple(d.taught for d in drives if d is not drive), drive, slice(None)) for drive in left_out]
-    folds, (drive,) = [], drives
+        return [(tuple(d.taught for d in drives if d is not drive), drive, slice(None)) for drive in left_out]
+    folds: list[_Fold] = []
+    (drive,) = drives
     driving, stamps = drive.taught.driving, drive.whole.signals.stamps_ns
     cells, known_cells = len(driving.stamps_ns), np.cumsum(np.isfinite(drive.taught.slopes))
     half_way = int(np.searchsorted(known_cells, known_cells[-1] // 2))
@@ -267,7 +258,7 @@ def _folds(drives: Sequence[OpenedDrive]) -> list[_Fold]:
     for first, last, part in ((0, half_way, slice(middle, None)), (half_way, cells, slice(0, middle))):
         half = replace(drive.taught, driving=driving.between(first, last))
         if half.driving.seconds >= LEAST_HALF_S:
-            folds.append(_Fold((half,), drive, part))
+            folds.append(((half,), drive, part))
     return folds
 
 
@@ -279,13 +270,13 @@ def _prior_test(drives: Sequence[OpenedDrive], progress: Any) -> Interval | None
     errors: tuple[list[FloatArray], list[FloatArray]] = ([], [])
     stamps, folds = [], _folds(drives)
     vehicle = drives[0].drive.car.vehicle
-    for number, fold in enumerate(folds):
-        progress(f"testing the prior on {fold.scored.drive.name}", 0.35 + 0.4 * number / len(folds))
-        prior = taught_parameters(fold.taught, vehicle)
-        stamps.append(fold.scored.whole.signals.stamps_ns[fold.part])
+    for number, (taught, drive, part) in enumerate(folds):
+        progress(f"testing the prior on {drive.drive.name}", 0.35 + 0.4 * number / len(folds))
+        prior = taught_parameters(taught, vehicle)
+        stamps.append(drive.whole.signals.stamps_ns[part])
         for column, parameters in zip(errors, (prior, ()), strict=True):
-            scored = lacking_of(fold.scored, _calibration(fold.scored, parameters))
-            lack, root = scored.lacking_rad[fold.part], np.sqrt(np.asarray(scored.weight)[fold.part])
+            scored = lacking_of(drive, _calibration(drive, parameters))
+            lack, root = scored.lacking_rad[part], np.sqrt(np.asarray(scored.weight)[part])
             column.append(root * (lack - np.nanmedian(lack)) if np.isfinite(lack).any() else lack)
     if not folds:
         return None
