@@ -83,9 +83,11 @@ class DriveModel:
     @property
     def file(self) -> ModelFile:
         """The content of model.toml: sensors and parameters for later drives of this car and recorder."""
+        from pdhef_logtool.estimators.calibration.calibration import as_prior
+
         parameters = () if self.prior is None else self.prior.parameters
         if self.posterior is not None and self.posterior.parameters and not self.posterior.refused:
-            parameters = taught_of(self.posterior)
+            parameters = as_prior(self.posterior.parameters)
         return ModelFile.of(self.sensors, self.car, parameters)
 
     @property
@@ -94,11 +96,6 @@ class DriveModel:
         if self.posterior is None:
             return None
         return self.posterior.to_dict() | {"text": _text(self.posterior, self.prior)}
-
-
-def taught_of(posterior: SelfCalibration) -> tuple[TaughtParameter, ...]:
-    """Return a posterior as the prior of later drives."""
-    return tuple(TaughtParameter(name=p.name, value=p.value, std=p.sd) for p in posterior.parameters)
 
 
 def of_earlier_drives(model: ModelFile | None) -> tuple[TaughtParameter, ...]:

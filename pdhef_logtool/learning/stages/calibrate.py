@@ -11,12 +11,12 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.store import Change
 from pdhef_logtool.drive.model_file import ModelFile, Sensors
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.estimators.calibration.calibration import self_calibrate
+from pdhef_logtool.estimators.calibration.calibration import as_prior, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import Driving
 from pdhef_logtool.learning.drives import CALIBRATE, DriveRecord, record_of
 from pdhef_logtool.learning.stages.task import StageOutput, Task
 from pdhef_logtool.logs.discovery import LogInput
-from pdhef_logtool.model.drive_model import lacking, read_driving, taught_of
+from pdhef_logtool.model.drive_model import lacking, read_driving
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.results.opened_run import MODEL_FILE
 
@@ -59,6 +59,6 @@ def calibrate(task: Task) -> StageOutput:
         )
     learnt_on = [r.learnt_on for r in records if not r.left_out]
     head = f"Written by pdhef learn --stages calibrate: no ground truth was used.\n{calibration.text}."
-    files = {MODEL_FILE: ModelFile.of(drives[0][1], car, taught_of(calibration)).toml(head).encode()}
+    files = {MODEL_FILE: ModelFile.of(drives[0][1], car, as_prior(calibration.parameters)).toml(head).encode()}
     change = Change(f"learn --stages {CALIBRATE}", MODEL_FILE, files, task.settings.to_dict(), learnt_on)
     return StageOutput(change, records, calibration.text, {"self_calibration": calibration.to_dict()})
