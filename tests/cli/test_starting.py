@@ -18,7 +18,7 @@ try:
     main()
 except SystemExit as done:
     assert not done.code, done.code
-heavy = ("torch", "rerun", "scipy.linalg", "scipy.special", "scipy.ndimage", "matplotlib", "jinja2", "polars")
+heavy = ("torch", "rerun", "scipy.linalg", "scipy.special", "scipy.ndimage", "matplotlib", "polars")
 print("loaded:", *(name for name in heavy if name in sys.modules))
 """
 
