@@ -121,8 +121,6 @@ DIVERGED_SIDESLIP_RAD = math.radians(60.0)
 FORWARD_M_S = 0.5
 #: Time of a rejection at its first sample, s; 0 is "the last sample was accepted".
 _JUST_REJECTED_S = 1e-9
-#: Share of a residual's increment before the model's step (Strang splitting).
-STRANG = 0.5
 
 # Inputs of a step; a_x is 0 where U_AX_KNOWN is 0. U_SPEED is the last speed sample that was accepted, 0 before any.
 U_STEER, U_AX, U_FRICTION, U_AX_KNOWN, U_SPEED, U_STEER_KNOWN = range(6)
@@ -338,8 +336,8 @@ def yield_to_kinematics(x, friction, dt, rules, p, f, m):  # type: ignore[no-unt
 def predict(x, P, L, over, rate, dt, early, q, layout, places, p, f, points, E):  # type: ignore[no-untyped-def]
     """Move state and covariance by ``dt`` s with the residual ``rate`` of v̇_y and ṙ.
 
-    The share ``early`` of the residual's increment comes before the model's step, the rest behind it. Leaves the root
-    of the former covariance in L, and the deviations of the moved points in E.
+    The share ``early`` of the residual's increment comes before the model's step (Strang splitting: half of it), the
+    rest behind it. Leaves the root of the former covariance in L, and the deviations of the moved points in E.
     """
     columns = columns_of(x.shape[0])
     cholesky(P, L)
@@ -516,7 +514,7 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
                 factor, f = yield_to_kinematics(x, over.friction, now.dt, rules, p, f, m)
                 q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             process_noise(q_std, over.ax_known, now.dt, layout, q)
-            predict(x, P, L, over, rate, now.dt, STRANG, q, layout, places, p, f, points, E)
+            predict(x, P, L, over, rate, now.dt, 0.5, q, layout, places, p, f, points, E)
             if linked:
                 cross_covariance(L, E, out_cross[k])
                 out_predicted_P[k] = P
@@ -692,7 +690,7 @@ def predicted_track(
     *,
     rate: FloatArray,
     noise: FloatArray,
-    early: float = STRANG,
+    early: float = 0.5,
 ) -> StateTrack:
     """Return the track of steps [K], predicted to the scored stamps [M] with their inputs held.
 

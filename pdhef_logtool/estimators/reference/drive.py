@@ -119,8 +119,8 @@ def _entries(prior: ReferencePrior, *, tilts: bool) -> Iterator[_Entry]:
     ``tilts``: roll and pitch rate provide the tilt of the accelerometers, so that a_y and a_x have no gain.
     """
     small = min(1.0, prior.wheelbase_m / WHEELBASE_M)
-    known = math.isfinite(prior.antenna_m[0])
-    x, y = prior.antenna_m if known else (0.0, 0.0)
+    has_antenna = math.isfinite(prior.antenna_m[0])
+    x, y = prior.antenna_m if has_antenna else (0.0, 0.0)
     ay_gain = (0.0, TILT_GAIN_STD) if tilts else (prior.ay_gain - 1.0, prior.ay_gain_std)
     ax_gain = (0.0, TILT_GAIN_STD) if tilts else (0.02, 0.02)
     yield from ((i, 0.0, 1.0, "", "") for i in (s.VX, s.VY, s.LAW_ERROR))
@@ -140,8 +140,8 @@ def _entries(prior: ReferencePrior, *, tilts: bool) -> Iterator[_Entry]:
     yield s.IMU_Y, 0.0, 0.2 * small, "accelerometer y", "m"
     yield s.YAW_RATE_BIAS, prior.yaw_rate_bias_rad_s, 0.005, "yaw rate bias", "rad/s"
     yield s.YAW_RATE_GAIN, 0.0, YAW_RATE_GAIN_STD, "yaw rate gain error", "1"
-    yield s.ANTENNA_X, x, (0.1 if known else 0.7) * small, "antenna x", "m"
-    yield s.ANTENNA_Y, y, (0.1 if known else ANTENNA_Y_STD_M) * small, "antenna y", "m"
+    yield s.ANTENNA_X, x, (0.1 if has_antenna else 0.7) * small, "antenna x", "m"
+    yield s.ANTENNA_Y, y, (0.1 if has_antenna else ANTENNA_Y_STD_M) * small, "antenna y", "m"
     yield s.GNSS_DELAY, 0.0, 0.06, "GNSS delay", "s"
     yield s.ANTENNA_HEIGHT, 1.2 * small, 0.6 * small, "antenna height over the roll axis", "m"
 

@@ -64,7 +64,7 @@ class ReferenceEstimator:
 def _interpolated(span: SideslipReference, stamps_ns: IntArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
     """Return v_x, v_y, r [K, 3], covariance of v_x, v_y and shares [K, 3] each, and validity at stamps of a span."""
     left = np.clip(np.searchsorted(span.stamps_ns, stamps_ns, side="right") - 1, 0, len(span.stamps_ns) - 2)
-    step_s: FloatArray = (span.stamps_ns[left + 1] - span.stamps_ns[left]) * 1e-9
+    step_s = np.asarray((span.stamps_ns[left + 1] - span.stamps_ns[left]) * 1e-9, dtype=np.float64)
     share = (stamps_ns - span.stamps_ns[left]) * 1e-9 / step_s
 
     def between(column: FloatArray) -> FloatArray:

@@ -194,8 +194,7 @@ def train(
     with PieceFile(work) as train_pieces, PieceFile(work) as validation_pieces:
         train_pieces.fill(training, lambda s: _pieces(s, recipe, normalisation))
         validation_pieces.fill(validation, lambda s: [_balanced(_scaled(s, recipe, normalisation))])
-        start = None if init is None else init.sha256
-        document = {"recipe": asdict(recipe), "normalisation": asdict(normalisation), "init": start}
+        document = {"recipe": asdict(recipe), "normalisation": asdict(normalisation), "init": init and init.sha256}
         document |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
         identity = json.loads(json.dumps(document))  # as it is read from a checkpoint
         history, best, best_loss = _resume(work, identity, network, optimiser, device)
