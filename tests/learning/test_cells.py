@@ -116,14 +116,14 @@ def test_extract_chooses_leaves_copies_out_and_older_sets_still_open(sample_logs
     assert rows.chosen is not None
     cell = cell_of(rows.features.astype(np.float64))
     use = rows.chosen & (rows.weight > 0.0)
-    seconds = np.bincount(cell[use], minlength=COUNT) * drive.period_s
+    seconds = np.bincount(cell[use], minlength=COUNT) * drive.entry["period_s"]
     held = np.array(result.manifest["cells"]["usable_s"]["train"])
     assert held.max() > 4.0 and seconds.max() < 2.05, "a row or two may lie on an edge in float32"
     assert (seconds[held > 0] > 0).all()
     # The same signals under another name, in another call, replace the existing ones.
     extract([str(tmp_path / "b.mcap")], out, replace(asked, split="validation", per_cell_s=None))
     (other,) = read_dataset(out).drives
-    assert (other.name, other.split, other.limits) == ("b", "validation", None)
+    assert (other.entry["name"], other.entry["split"], other.limits) == ("b", "validation", None)
     for wrong in ({"where": "vx > 1"}, {"per_cell_s": 0.0}):
         with pytest.raises(UsageError):
             extract([str(log)], tmp_path / "new", replace(asked, **wrong))  # type: ignore[arg-type]

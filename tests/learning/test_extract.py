@@ -232,9 +232,9 @@ def test_a_taught_car_is_calibrated_and_each_row_has_the_gain_of_its_region(
 def test_damaged_dataset_is_told(dataset: ExtractResult, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(dataset.output, copy)
-    files = {d.name: d.path for d in read_dataset(copy).drives}
+    files = {d.entry["name"]: d.path for d in read_dataset(copy).drives}
     files["dlc"].write_bytes(files["sweep"].read_bytes())
-    broken = next(d for d in read_dataset(copy).drives if d.name == "dlc")
+    broken = next(d for d in read_dataset(copy).drives if d.entry["name"] == "dlc")
     with pytest.raises(OutputError, match="another content"):
         broken.load()
     document = json.loads((copy / MANIFEST).read_text())
@@ -289,7 +289,7 @@ def test_one_bad_log_stops_no_other(sample_logs_dir: Path, tmp_path: Path) -> No
     follows(result.manifest, "dataset.schema.json")
     assert [f["log"] for f in result.manifest["failed"]] == ["bad"]
     assert any(t.startswith("bad is left out: ") for t in told)
-    assert [d.name for d in read_dataset(tmp_path / "out").drives] == ["good"]
+    assert [d.entry["name"] for d in read_dataset(tmp_path / "out").drives] == ["good"]
     with pytest.raises(LogError):
         extract([str(logs / "bad.mcap")], tmp_path / "alone", ExtractSettings(RunConfig()))
 
@@ -347,7 +347,10 @@ def test_calls_add_up_by_log_and_slice(sample_logs_dir: Path, tmp_path: Path) ->
         ("road.0-8.0", "train"),
         ("road.10.0-14.0", "validation"),
     ]
-    assert [d.name for d in read_dataset(out).drives if len(d.load().stamps_ns)] == ["road.0-8.0", "road.10.0-14.0"]
+    assert [d.entry["name"] for d in read_dataset(out).drives if len(d.load().stamps_ns)] == [
+        "road.0-8.0",
+        "road.10.0-14.0",
+    ]
     again = extract([log], out, second).manifest
     assert again["sha256"] == both["sha256"], "what is extracted again takes its own place"
     other = extract([str(sample_logs_dir / "dlc.mcap")], out, ExtractSettings(RunConfig(), split="train")).manifest
