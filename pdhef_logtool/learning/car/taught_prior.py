@@ -15,7 +15,7 @@ import numpy as np
 
 from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.calibration.calibration import CORRELATION, as_prior, posterior_of
+from pdhef_logtool.estimators.calibration.calibration import as_prior, posterior_of
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving
 from pdhef_logtool.estimators.calibration.joint import (
     ERROR_STD,
@@ -34,6 +34,8 @@ from pdhef_logtool.records.running_mean import running_mean
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
+#: Correlation of a parameter between a drive with ground truth and a later drive, about the mean of its prior.
+CORRELATION = 0.6
 #: Parameters trained with ground truth.
 TYRES = (RATIO, REAR_STIFFNESS, PEAK, RELAXATION)
 #: Window of the mean to remove, in s. If only a constant is removed, the bank of simulated roads doubles the sideslip
