@@ -185,14 +185,14 @@ def _relations(cells: _Cells) -> tuple[_Relation, _Relation]:
     """Return the relations of kinematics and steering."""
     ay, r, steer, v, _ = (_mean(column, 1 - MEAN_CELLS, 1) for column in cells)
     v = np.where(v > LEAST_SPEED_M_S, v, np.nan)
-    one, turning = np.ones_like(v), v * r
+    constant, turning = np.ones_like(v), v * r
 
     def rate(column: FloatArray) -> FloatArray:
         before = np.concatenate([np.full(MEAN_CELLS, np.nan), column[:-MEAN_CELLS]])[: len(column)]
         return np.asarray((column - before) / (MEAN_CELLS * CELL_S))
 
-    kinematics = np.stack([ay, one, turning, rate(r), rate(turning), v * rate(turning)], axis=1)
-    return _fitted(kinematics), _fitted(np.stack([steer, one, r / v, turning, rate(r)], axis=1))
+    kinematics = np.stack([ay, constant, turning, rate(r), rate(turning), v * rate(turning)], axis=1)
+    return _fitted(kinematics), _fitted(np.stack([steer, constant, r / v, turning, rate(r)], axis=1))
 
 
 def _fitted(table: FloatArray) -> _Relation:
