@@ -16,10 +16,7 @@ from pdhef_logtool.car.parts import Algorithm, Inflation, IntervalEntry, Interva
 from pdhef_logtool.car.toml_files import vehicle_toml
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.error_features import FLOOR_RAD, TERMS, error_terms
-from pdhef_logtool.estimators.intervals import (
-    TrackCalibrator,
-    calibrated,
-)
+from pdhef_logtool.estimators.intervals import TrackCalibrator, inflated
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.reasons import STUCK_AY, STUCK_YAW_RATE
 from pdhef_logtool.records.signals import Signals
@@ -99,7 +96,7 @@ def test_what_has_not_arrived_changes_nothing(at: int) -> None:
 
 def test_the_estimate_stays_and_the_covariance_is_scaled_as_one() -> None:
     signals, track = _drive()
-    out = calibrated(track, signals, INFLATION, ROLL)
+    out = inflated(track, error_terms(track, signals, ROLL), INFLATION)
     for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad"):
         assert getattr(out, name) is getattr(track, name)
     assert np.array_equal(np.isnan(out.sideslip_std_rad), np.isnan(track.sideslip_std_rad))
