@@ -13,6 +13,7 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.sensor_changes import SensorChange, find_changes
+from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.runs.estimating import estimate_drive
@@ -110,7 +111,9 @@ def test_the_interval_is_wider_from_a_correction_on(sample_logs_dir: Path) -> No
     )
     changed = replace(sound, changes=(change,))
     physics = make_estimator("physics", car)
-    before, after = (estimate_drive(d, car, [physics]).tracks["physics"] for d in (sound, changed))
+    before, after = (
+        estimate_drive(d, DriveSignals.of(d.signals, car), [physics]).tracks["physics"] for d in (sound, changed)
+    )
     np.testing.assert_array_equal(after.vy_m_s, before.vy_m_s)
     np.testing.assert_array_equal(after.sideslip_std_rad[:600], before.sideslip_std_rad[:600])
     assert np.nanmean((after.sideslip_std_rad / before.sideslip_std_rad)[700:]) > 1.02
@@ -121,7 +124,7 @@ def test_a_run_names_the_change(tmp_path: Path) -> None:
     log, out = tmp_path / "road.mcap", tmp_path / "out"
     fault = ("--fault", "bias0.05:yaw_rate:12:end")
     assert called("simulate", "road", "--duration", 25, "--seed", 3, *fault, "-o", log).returncode == 0
-    ran = called("run", log, "-o", out, "-e", "physics", "--calibrate", "off")
+    ran = called("run", log, "-o", out, "-e", "physics", "--model", "off")
     assert ran.returncode == 3, ran.stderr
     assert "yaw_rate_rad_s.change: its bias jumps by 0.05" in ran.stdout
     report = json.loads((out / "logs" / "road" / "report.json").read_text())
