@@ -122,7 +122,7 @@ def find_changes(signals: Signals, ignored: Collection[str] = ()) -> tuple[Signa
     if len(signals) < 2:
         return signals, ()
     sound, changes = _without_stuck(signals, [n for n in ("steer_rad", "speed_m_s") if n not in ignored])
-    fitted, after_ns = sound, 0
+    fitted, after_ns = _without_repeats(sound), 0
     while len(changes) < MOST_CHANGES and (jump := _first_jump(fitted, after_ns, ignored)) is not None:
         changes.append(jump)
         after_ns = jump.start_ns
@@ -353,6 +353,16 @@ def _without_stuck(signals: Signals, names: Sequence[str]) -> tuple[Signals, lis
             size = float(getattr(signals, name)[start])
             changes.append(SensorChange(name, "stuck", start_ns, known_ns, end_ns + 1, size, float(std)))
     return (replace(signals, **columns) if changes else signals), changes
+
+
+def _without_repeats(signals: Signals) -> Signals:
+    """Return signals without stuck values of accelerometer and gyro, whose end would be a jump."""
+    cells = _cells(signals)
+    columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in ("ay_m_s2", "yaw_rate_rad_s")}
+    for name, column in columns.items():
+        for start, end, _ in _long_runs(signals, name, cells):
+            column[start:end] = np.nan
+    return replace(signals, **columns)
 
 
 def _long_runs(signals: Signals, name: str, cells: _Cells) -> Iterator[tuple[int, int, int]]:

@@ -81,6 +81,11 @@ def test_a_sound_drive_stays_as_it_is(road: Signals) -> None:
     assert find_changes(road.rows(0, 1))[1] == ()
 
 
+def test_stuck_readings_that_move_again_are_no_jump(sample_logs_dir: Path) -> None:
+    with read_drive(sample_logs_dir / "faults.mcap", sample_logs_dir / "vehicle.toml") as drive:
+        assert drive.recorded().changes == ()
+
+
 def test_a_waived_sensor_is_not_changed(road: Signals) -> None:
     signals = changed(road, "ay_m_s2", 1.0)
     assert find_changes(signals, ["ay_m_s2"])[0] is signals
