@@ -15,7 +15,9 @@ HEADS = re.findall(r"^\*\*(.*)\*\*$", PAGE, re.MULTILINE)
 @pytest.fixture(scope="module")
 def sources() -> str:
     """All of the package with texts that stand in several literals joined to one."""
-    text = "\n".join(p.read_text(encoding="utf-8") for p in sorted((ROOT / "pdhef_logtool").rglob("*.py")))
+    package = ROOT / "pdhef_logtool"
+    files = (p for kind in ("*.py", "templates/*.txt") for p in sorted(package.rglob(kind)))
+    text = "\n".join(p.read_text(encoding="utf-8") for p in files)
     return re.sub(r"[\"']\s*\n\s*f?[\"']", "", text)
 
 

@@ -111,7 +111,7 @@ def test_bounds_and_ends(sample_logs_dir: Path, car: Car, monkeypatch: pytest.Mo
     closed: list[str] = []
     open_log = reading.open_log
 
-    def watched_log(path: Path, budget: ResourceLimits, msgs: Path | None = None, **_: object) -> DriveLog:
+    def watched_log(path: Path, budget: ResourceLimits, *_: object) -> DriveLog:
         log = open_log(path, budget)
         close = log.close
         monkeypatch.setattr(type(log), "close", lambda _self: closed.append(path.name) or close())

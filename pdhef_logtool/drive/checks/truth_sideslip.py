@@ -46,7 +46,7 @@ def _checks(drive: CheckedDrive) -> list[Check]:
 def _sideslip(columns: Mapping[str, FloatArray]) -> FloatArray:
     """Return the angle [N] of the ground-truth velocity from the direction of travel, which is backwards in reverse."""
     vx, vy = columns["truth.vx_m_s"], columns["truth.vy_m_s"]
-    way = np.where(columns.get("speed_m_s", vx * 0.0) < 0.0, -1.0, 1.0)
+    way = np.where((columns.get("speed_m_s", vx * 0.0) < 0.0) & (vx < 0.0), -1.0, 1.0)
     return np.asarray(np.arctan2(way * vy, way * vx))
 
 
