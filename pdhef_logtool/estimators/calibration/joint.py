@@ -78,6 +78,8 @@ USUAL_LEVEL, USUAL_RATIO = 1.5, 0.68
 #: Log standard deviations of level and ratio, of cars and of a file that describes the driven tyres; prior probability
 #: of such a file.
 USUAL_STDS, FILE_STDS, FILE_SHARE = (0.5, 0.2), (0.1, 0.1), 1.0 / 3.0
+#: The ratio of models below this mass varies more; vehicles below the mass of cars have the level of cars.
+MODEL_KG, MODEL_STDS, CAR_KG = 50.0, (0.5, 0.5), 400.0
 #: Log standard deviation of a file's peak force (wet or icy roads), and of its stiffness without a calibration.
 FILE_TYRE_STD = 0.5
 #: Ratio of the a_y levels of two drives: below the first, no information is shared; above the second, all of it.
@@ -157,8 +159,10 @@ def parameters_of(vehicle_file: VehicleParameters) -> tuple[Parameter, ...]:
     sensors = vehicle_file.sensors
     gradient = vehicle_file.roll_gradient_rad_per_m_s2 or USUAL_ROLL_GRADIENT
     reach = IMU_X_REACH * vehicle_file.wheelbase_m
+    level = USUAL_LEVEL * stiffness_per_load(max(vehicle_file.mass_kg, CAR_KG))
+    stds = MODEL_STDS if vehicle_file.mass_kg < MODEL_KG else USUAL_STDS
     return (
-        *_tyres(vehicle_file, USUAL_LEVEL * stiffness_per_load(vehicle_file.mass_kg), USUAL_RATIO, USUAL_STDS),
+        *_tyres(vehicle_file, level, USUAL_RATIO, stds),
         _factor(PEAK, "1", 1.0, FILE_TYRE_STD, 6.0),
         _factor(INERTIA, "kg m^2", vehicle_file.yaw_inertia_kg_m2, 0.2, 2.0),
         _factor(RELAXATION, "m", vehicle_file.relaxation_length_m or 0.5, 0.4, 4.0),
