@@ -23,8 +23,8 @@ from pdhef_logtool.drive.relations import (
     measured_relations,
 )
 from pdhef_logtool.drive.truth import TruthTrack, channel_of
-from pdhef_logtool.mapping.path import DEGREE_M
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
+from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import GNSS, GNSS_POSITION, WHEELS, Channel, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 

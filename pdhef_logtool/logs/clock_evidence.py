@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.logs.constants import CONSTANTS
+from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import IntArray
 
 _MOTION: Mapping[str, Any] = CONSTANTS["clocks"]["motion"]
@@ -36,7 +37,7 @@ def decades_too_short(columns: Mapping[str, Any], rows: IntArray, stamps: IntArr
     # Long steps average the noise of the positions.
     corners = rows[:: max(1, len(rows) // _MOTION["steps"])]
     north, east = np.diff(latitude[corners]), np.diff(longitude[corners]) * np.cos(np.radians(latitude[corners[1:]]))
-    path_m = _MOTION["metres_per_degree"] * float(np.hypot(north, east).sum())
+    path_m = DEGREE_M * float(np.hypot(north, east).sum())
     length = float(np.nansum(np.abs(speed[rows[1:]]) * np.diff(stamps) * 1e-9))
     is_moving = _MOTION["shortest_path_m"] < path_m < _MOTION["longest_path_m"] and length > 0.0
     return math.ceil(math.log10(path_m / length) - _MOTION["noise_decades"]) if is_moving else 0

@@ -20,8 +20,8 @@ from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen
 from pdhef_logtool.mapping.naming import Meaning, meaning_of, unit_of, words_of
-from pdhef_logtool.mapping.path import DEGREE_M
 from pdhef_logtool.mapping.records import SignalSource
+from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import FloatArray
 
 #: Minimum speed for the course to be the direction of the car.

@@ -8,14 +8,13 @@ import numpy as np
 
 from pdhef_logtool.mapping.evidence import CELL_NS
 from pdhef_logtool.mapping.fields import Fields
+from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import FloatArray
 
 #: Half of the window for a course from positions, in cells.
 _HALF = 5
 #: Quantities of positions.
 PLACES = ("latitude", "longitude", "position")
-#: Length of a degree of latitude in m.
-DEGREE_M = 111_200.0
 
 
 def _path(fields: Fields) -> tuple[FloatArray, FloatArray] | None:

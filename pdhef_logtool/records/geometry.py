@@ -9,6 +9,8 @@ from pdhef_logtool.records.signals import FloatArray, IntArray
 #: Degrees of a radian, and standard gravity.
 DEGREES, GRAVITY_M_S2 = 180.0 / np.pi, 9.80665
 
+#: Length of a degree of latitude on a sphere, m: for paths, whose shape counts.
+DEGREE_M = 111_200.0
 WGS84_A_M = 6378137.0
 WGS84_E2 = 6.69437999014e-3
 

@@ -63,7 +63,7 @@ def estimate_drive(
 
     Parameters
     ----------
-    car : its estimators; the signals of the drive were read with its vehicle file.
+    corrected : signals of the drive for the two vehicles of its car, whose estimators these are.
     watched : complete ``diverged`` by the monitor of wrong branches. drawn : dead-reckon poses.
     intervals : calibrates them; None leaves them as the estimators give them.
     causality : collects the estimators that fail, or declare themselves causal and look ahead: they have no track.
