@@ -78,15 +78,16 @@ def _cards(inspection: Inspection, section: str, samples: Mapping[tuple[str, str
         report = getattr(inspection, section)[name]
         chosen = next((c for c in candidates if c.taken and c.source.name == name), None)
         bad = [c for c in inspection.checks if c.subject == f"{prefix}{name}" and c.verdict != "passed"]
-        values = report.minimum, report.maximum, report.rate_hz
-        cards[name] = [_Card(source, chosen, sparkline(_cells(source, samples)), *values, taken=True, checks=bad)]
+        picture, low, high = sparkline(_cells(source, samples)), report.minimum, report.maximum
+        cards[name] = [_Card(source, chosen, picture, low, high, report.rate_hz, taken=True, checks=bad)]
     for candidate in candidates:
         source, cells = candidate.source, _cells(candidate.source, samples)
         others = sum(not card.taken for card in cards.get(source.name, ()))
         if not candidate.taken and cells.size and others < _ALTERNATIVES:
-            values = float(np.nanmin(cells, initial=np.inf)), float(np.nanmax(cells, initial=-np.inf))
+            low, high = float(np.nanmin(cells, initial=np.inf)), float(np.nanmax(cells, initial=-np.inf))
             rate_hz = samples[source.topic, source.paths[0]].rate_hz
-            cards.setdefault(source.name, []).append(_Card(source, candidate, sparkline(cells), *values, rate_hz))
+            card = _Card(source, candidate, sparkline(cells), low, high, rate_hz)
+            cards.setdefault(source.name, []).append(card)
     return cards
 
 
