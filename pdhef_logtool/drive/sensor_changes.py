@@ -382,6 +382,6 @@ def _long_runs(column: FloatArray, cells: _Cells, share: float = 0.0) -> list[tu
     least = round(LEAST_STUCK_S / CELL_S)
     return [
         (int(rows[s]), int(rows[e - 1]) + 1, max(int(cell[s + n] - cell[s]), least))
-        for s, e, n in zip(starts, ends, needed, strict=True)
+        for s, e, n in zip(starts, ends, needed, strict=False)  # without readings, there is an end alone
         if e - s > n and s > 0
     ]
