@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.cli.console import cell, table, three_lines
@@ -89,35 +88,7 @@ def render_extraction(result: ExtractResult, console: Console) -> None:
     splits = result.manifest["splits"].items()
     split_texts = (f"{name}: {s['drives']} drives, {s['usable_rows']} usable rows" for name, s in splits)
     console.print(", ".join(split_texts))
-    _print_cells(result.manifest["cells"], result.manifest["choice"], console)
     console.print(f"dataset in {result.output}", soft_wrap=True)
-
-
-def _print_cells(held: Mapping[str, Any], choice: Mapping[str, Any] | None, console: Console) -> None:
-    """Print the duration of training data in each cell of driving, and the number of empty cells."""
-    from pdhef_logtool.learning.network.cells import AY_M_S2, FRICTION, SPEED_M_S, cells
-    from pdhef_logtool.learning.network.dataset import CHOSEN_SPLIT
-
-    seconds, empty = (held[key][CHOSEN_SPLIT] for key in ("usable_s", "empty"))
-    most = math.inf if choice is None else choice["per_cell_s"]
-    shown = table("friction", "|a_y|\nm/s²", *(f">{_span(SPEED_M_S, i)}\nm/s" for i in range(len(SPEED_M_S))))
-    for first in range(0, len(seconds), len(SPEED_M_S)):
-        row, bins = first // len(SPEED_M_S), cells()[first : first + len(SPEED_M_S)]
-        row_of = zip(bins, seconds[first : first + len(bins)], strict=True)
-        shown.add_row(
-            _span(FRICTION, row // len(AY_M_S2)),
-            _span(AY_M_S2, row % len(AY_M_S2)),
-            *(f"{min(s, most):.0f}" if s >= 0.5 else "<1" if s else "-" if c.in_reach else "" for c, s in row_of),
-        )
-    console.print(f"seconds to learn from in split {CHOSEN_SPLIT}" + ("" if most == math.inf else ", as chosen"))
-    console.print(shown)
-    within = sum(c.in_reach for c in cells())
-    console.print(f"{len(empty)} of the {within} cells below the friction limit are empty")
-
-
-def _span(edges: Sequence[float], number: int) -> str:
-    low = f"{edges[number]:g}"
-    return f"{low} to {edges[number + 1]:g}" if number + 1 < len(edges) else f"{low} up"
 
 
 def render_training(result: TrainResult, console: Console) -> None:
