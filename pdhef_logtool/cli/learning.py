@@ -25,7 +25,6 @@ def learn(
         Path, Option("--output", "-o", metavar="CAR", help="Folder of the car to write; may equal --car.")
     ],
     config: RunConfig,
-    stages: Annotated[str, Option(help="Stage: teach or calibrate.")] = "teach",
     seed: Annotated[int, Option(help="Seed of the residual's random features.")] = 0,
     split: Annotated[
         str | None,
@@ -33,13 +32,13 @@ def learn(
     ] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Learn the prior and the residual of a car, or calibrate it."""
+    """Learn a car from its drives: parameters for later drives and, with ground truth, a residual."""
     from pdhef_logtool.learning.drives import LearnSettings
-    from pdhef_logtool.learning.engine import learn as run_stage
+    from pdhef_logtool.learning.learn import learn as learn_car
 
-    settings = LearnSettings(config=config, stage=stages, seed=seed, split=split)
+    settings = LearnSettings(config=config, seed=seed, split=split)
     with console.reporter() as reporter:
-        result = run_stage(logs, output, settings, reporter=reporter)
+        result = learn_car(logs, output, settings, reporter=reporter)
     console.finish(result, learning_tables.render_learning, as_json)
 
 

@@ -10,7 +10,7 @@ from pdhef_logtool.cli.console import cell, table, three_lines
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pdhef_logtool.learning.engine import LearnResult
+    from pdhef_logtool.learning.learn import LearnResult
     from pdhef_logtool.learning.network.baselines import BaselinesResult
     from pdhef_logtool.learning.network.extract_command import ExtractResult
     from pdhef_logtool.learning.network.train_command import TrainResult
@@ -21,16 +21,16 @@ MOST_DRIVES = 40
 
 
 def render_learning(result: LearnResult, console: Console) -> None:
-    """Print result, assumptions and next step, and the tables of the stage."""
-    left = f", {len(result.left_out)} left out" if result.left_out else ""
-    calibrated = result.stage == "calibrate"
+    """Print result, assumptions and next step, and the tables of teaching."""
+    used, left_out = len(result.drives), len(result.records) - len(result.drives)
+    left = f", {left_out} left out" if left_out else ""
     head = three_lines(
         result.text,
-        f"{len(result.drives)} drive{'s' * (len(result.drives) != 1)}{left}; decisions by held-out driving",
-        f"pdhef run LOG --car {result.car}{' --model ' + str(result.car / 'model.toml') if calibrated else ''} -o OUT",
+        f"{used} drive{'s' * (used != 1)}{left}; decisions by held-out driving",
+        f"pdhef run LOG --car {result.car} -o OUT",
     )
     console.print(head)
-    if not calibrated:
+    if "rungs" in result.figures:
         console.print()
         _teaching(result.figures, console)
 
@@ -54,8 +54,6 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         console.print(
             f"  tyre prior at {p['ay_m_s2']:.1f} m/s²: helps with a probability of {p['support']:.2f} (0: unused)"
         )
-    for text in figures["more"]:
-        console.print(f"  {text}")
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:

@@ -15,7 +15,7 @@ from fake_drive_log import FakeLog, FakeTopic
 from residual_car import CAR, Motion, Wave, drive
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.taught import Taught
+from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.toml_files import vehicle_toml
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive import reading
@@ -202,8 +202,8 @@ def test_a_taught_car_is_calibrated_on_each_drive(sample_logs_dir: Path, tmp_pat
     (car / "vehicle.toml").write_text(text[: text.index("[network]")] + "\n" + text[text.index("[sensors]") :])
     logs, settings = [str(sample_logs_dir / "dlc.mcap")], ExtractSettings(RunConfig(car=car))
     bare = extract(logs, tmp_path / "bare", settings).manifest
-    taught = Taught(physics_sha256=Car.load(car, network="none").physics_sha256)
-    (car / "taught.json").write_text(json.dumps(taught.model_dump(mode="json")))
+    model = CarModel(physics_sha256=Car.load(car, network="none").physics_sha256)
+    (car / "model.toml").write_text(model.toml("Of a test."))
     taught_set = extract(logs, tmp_path / "taught", settings).manifest
     follows(taught_set, "dataset.schema.json")
     assert bare["drives"][0]["calibration"] == "" and "stiffness" in taught_set["drives"][0]["calibration"]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.car.car import HISTORY_FILE, INTERVALS_FILE, NOISE_FILE, UNSURE_FILE, Car
+from pdhef_logtool.car.car import INTERVALS_FILE, UNSURE_FILE, Car
 from studies.defaults import train_default
 
 pytestmark = [pytest.mark.fleet, pytest.mark.slow]
@@ -44,5 +44,3 @@ def test_noise_and_intervals_of_a_car_are_made_from_its_validation_drives(
     for document in documents:
         assert {"pd-hef", "physics", "phy-ukf:tuned"} <= {e["estimator"] for e in document["entries"]}
         assert [d["name"] for d in document["drives"]] == sorted(LOGS)
-    parts = [json.loads(line)["part"] for line in (car / HISTORY_FILE).read_text().splitlines()[-2:]]
-    assert parts == [NOISE_FILE, INTERVALS_FILE]

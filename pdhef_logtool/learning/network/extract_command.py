@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import VEHICLE_FILE, Car
+from pdhef_logtool.car.model import ESTIMATED
 from pdhef_logtool.car.names import NO_INTERVALS
 from pdhef_logtool.car.parts import physics_sha256
-from pdhef_logtool.car.taught import ESTIMATED
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.plan import DrivePlan
@@ -463,7 +463,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
 def _in_service(drive: Drive, job: _Job) -> tuple[DriveModel, str]:
     """Return the model of a run on this drive, and its calibration: a taught car is calibrated on each drive."""
     car = job.car
-    if car.taught is None or job.settings.model != PHYSICS_MODEL:
+    if car.model is None or job.settings.model != PHYSICS_MODEL:
         return DriveModel.of(drive), ""
     calibration = self_calibrate([read_driving(drive)], car.vehicle, taught=car.taught_prior)
     return DriveModel.of(drive, calibration), calibration.text
@@ -632,7 +632,7 @@ def _fingerprint(job: _Job, split: str) -> str:
         "settings": {k: v for k, v in job.settings.to_dict().items() if k not in ("split", "car", "mapping")},
         "split": split,
         "vehicle": [job.physics[0], {name: noise.model_dump(mode="json") for name, noise in job.car.noise.items()}],
-        "taught": None if job.car.taught is None else digest(job.car.taught.model_dump(mode="json")),
+        "model": None if job.car.model is None else digest(job.car.model.model_dump(mode="json")),
         **({} if job.log_input.span_s is None else {"span_s": job.log_input.span_s}),
         "mapping": None if mapping is None else hash_log(Path(mapping)),
         "versions": tool_versions(),
