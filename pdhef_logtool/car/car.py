@@ -19,7 +19,6 @@ from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, AssumedValue
 from pdhef_logtool.car.model import GROUND_TRUTH, MODEL_FILE, CarModel, TaughtParameter, read_model
 from pdhef_logtool.car.names import NO_INTERVALS as NO_INTERVALS
 from pdhef_logtool.car.names import SHIPPED_CARS as SHIPPED_CARS
-from pdhef_logtool.car.names import UNSURE as UNSURE
 from pdhef_logtool.car.parts import (
     PHYSICS,
     FilterNoise,
@@ -32,7 +31,7 @@ from pdhef_logtool.car.parts import (
 )
 from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file, with_sensors
 from pdhef_logtool.car.vehicle import DEFAULT_VEHICLE_NAME, VehicleParameters, default_vehicle
-from pdhef_logtool.records.errors import UsageError, VehicleError
+from pdhef_logtool.records.errors import VehicleError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
@@ -47,8 +46,7 @@ from pdhef_logtool.residual_model.interface import PlugInModel, load_plug_in, pl
 from pdhef_logtool.storage.documents import read_json, read_toml, validated
 
 VEHICLE_FILE, FIT_FILE = "vehicle.toml", "fit.toml"
-INTERVALS_FILE, UNSURE_FILE = "intervals.json", "intervals-unsure.json"
-NETWORK_FOLDER = "network"
+INTERVALS_FILE, NETWORK_FOLDER = "intervals.json", "network"
 #: Number of digits of a hash in messages.
 SHOWN_DIGITS = 12
 
@@ -131,7 +129,7 @@ class Car:
         ----------
         path : a car's folder, a vehicle.toml, ``saloon`` (the shipped car); None: the default sedan.
         network : instead of the car's own: the name of a shipped network or an installed model, a folder, ``none``.
-        intervals : instead of the car's own: an ``intervals.json``, ``unsure``, ``none``.
+        intervals : instead of the car's own: an ``intervals.json``, ``none``.
         sensors : instead of the car's own: a profile's name, or a file with ``[sensors]``.
 
         Raises
@@ -157,11 +155,9 @@ class Car:
         car = replace(car, network=bundle, network_name=name, intervals=selected)
         if str(intervals) == NO_INTERVALS and car.fitted_physics is not None:
             car = replace(car, fitted_physics=car.fitted_physics.model_copy(update={"varied": ()}))
-        stale = list(car.notes)
-        has_intervals_file = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
-        if has_intervals_file and selected is not None and selected.physics_sha256 != car.physics_sha256:
-            stale.append(f"{INTERVALS_FILE} was made with other physics")
-        return replace(car, notes=tuple(stale))
+        if intervals is None and selected is not None and selected.physics_sha256 != car.physics_sha256:
+            car = replace(car, notes=(*car.notes, f"{INTERVALS_FILE} was made with other physics"))
+        return car
 
     @property
     def file_name(self) -> str | None:
@@ -321,16 +317,9 @@ def _network_of(folder: Path | None, chosen: Place) -> tuple[str, Path | None]:
 
 def _intervals_of(folder: Path | None, chosen: Place) -> Intervals | None:
     """Return the intervals in force: the chosen ones, otherwise the car's."""
-    if chosen is not None and str(chosen) == NO_INTERVALS:
-        return None
-    file = UNSURE_FILE if str(chosen) == UNSURE else INTERVALS_FILE
-    if chosen is not None and str(chosen) != UNSURE:
-        return load_intervals(Path(chosen))
-    if folder is not None and (folder / file).is_file():
-        return load_intervals(folder / file)
     if chosen is not None:
-        raise UsageError(expected=f"a car with {file}", got="none", where=f"intervals = {UNSURE}")
-    return None
+        return None if str(chosen) == NO_INTERVALS else load_intervals(Path(chosen))
+    return load_intervals(folder) if folder is not None and (folder / INTERVALS_FILE).is_file() else None
 
 
 def load_intervals(path: Path) -> Intervals:

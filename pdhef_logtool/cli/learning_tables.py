@@ -16,10 +16,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.learning.network.train_command import TrainResult
 
 
-#: Above this number of drives, only the drives without data are listed.
-MOST_DRIVES = 40
-
-
 def render_learning(result: LearnResult, console: Console) -> None:
     """Print result, assumptions and next step, and the tables of teaching."""
     used, left_out = len(result.drives), len(result.records) - len(result.drives)
@@ -36,7 +32,7 @@ def render_learning(result: LearnResult, console: Console) -> None:
 
 
 def _teaching(figures: Mapping[str, Any], console: Console) -> None:
-    """Print the tested residual models, the improvement by teaching, and the recommended drives."""
+    """Print the tested residual models and priors."""
     rungs = table("residual model", ">RMSE °, held-out\nblocks", ">difference °²", ">± 1 se", "outcome")
     for t in figures["rungs"]:
         outcome = "" if not t["against"] else "better" if t["taken"] else "not better"
@@ -44,12 +40,6 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         against = [cell(t[k] if t["against"] else None, digits=4) for k in ("difference_deg2", "standard_error_deg2")]
         rungs.add_row(t["rung"], cell(t["rmse_deg"], digits=3), *against, outcome)
     console.print(rungs)
-    console.print()
-    drives = table("drive", ">seconds", ">physics °", ">with residual °", "calibration", fold=4)
-    for d in figures["drives"]:
-        errors = (cell(d[key], digits=3) for key in ("physics_deg", "corrected_deg"))
-        drives.add_row(d["name"], cell(d["seconds"], digits=0), *errors, d["calibration"])
-    console.print(drives)
     for p in figures["priors"]:
         console.print(
             f"  tyre prior at {p['ay_m_s2']:.1f} m/s²: helps with a probability of {p['support']:.2f} (0: unused)"
@@ -57,35 +47,11 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:
-    """Print the data of each drive and of the dataset."""
-    residuals = (">v̇_y residual\nRMS m/s²", ">ṙ residual\nRMS rad/s²")
-    drives = table("drive", ">seconds", ">usable", *residuals, "split", "truth", fold=1)
-    few = len(result.results) <= MOST_DRIVES
-    shown = [r for r in result.results if few or r.entry is None]
-    for drive in shown:
-        if drive.entry is None:
-            said = f"as {drive.copy_of}" if drive.copy_of else "failed"
-            drives.add_row(drive.record.name, "-", "-", "-", "-", "-", said)
-            continue
-        e, truth, rms = drive.entry, drive.entry["truth"], drive.entry["residual_rms"]
-        half_s = truth["smoothing_half_s"]
-        drives.add_row(
-            drive.record.name,
-            f"{e['duration_s']:.1f}",
-            f"{100.0 * e['usable_rows'] / max(e['rows'], 1):.1f} %",
-            cell(rms["vy_dot_m_s2"], digits=3),
-            cell(rms["yaw_acceleration_rad_s2"], digits=3),
-            e["split"],
-            truth["kind"] + (f", ±{half_s:g} s" if half_s else "") + (", kept" if drive.kept else ""),
-        )
-    if not few:
-        what = "these contain no new data" if shown else "all contain data"
-        console.print(f"{len(result.results)} drives, listed in manifest.json; {what}")
-    if shown:
-        console.print(drives)
-    splits = result.manifest["splits"].items()
-    split_texts = (f"{name}: {s['drives']} drives, {s['usable_rows']} usable rows" for name, s in splits)
-    console.print(", ".join(split_texts))
+    """Print the data of the dataset by split; the manifest lists the drives."""
+    splits = table("split", ">drives", ">usable rows", ">rows")
+    for name, of in result.manifest["splits"].items():
+        splits.add_row(name, *(str(of[key]) for key in ("drives", "usable_rows", "rows")))
+    console.print(splits)
     console.print(f"dataset in {result.output}", soft_wrap=True)
 
 

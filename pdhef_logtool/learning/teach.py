@@ -40,7 +40,6 @@ from pdhef_logtool.residual_model.ladder import NONE
 from pdhef_logtool.residual_model.ladder_fit import (
     LadderFit,
     TaughtDrive,
-    corrected_rmse_deg,
     fit_ladder,
 )
 from pdhef_logtool.runs.config import RunConfig
@@ -94,7 +93,6 @@ class Teaching:
     ladder: LadderFit
     calibrated: bool
     truth: str
-    drives: tuple[dict[str, Any], ...]
 
     @property
     def evidence(self) -> str:
@@ -150,17 +148,8 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
     calibrated = seconds[True] >= seconds[False]  # calibrated and uncalibrated physics differ
     fitted = [lack for lack, c in zip(lacks, calibrations, strict=True) if calibrated is not bool(c.refused)]
     ladder = fit_ladder(fitted, seed=seed)
-    lines = []
-    for drive, calibration, lack in zip(drives, calibrations, lacks, strict=True):
-        correction = None if ladder.model is None else ladder.model.evaluate(lack.features)
-        line = {"name": drive.drive.name, "seconds": round(drive.taught.driving.seconds, 1)}
-        line |= {"calibration": calibration.refused or "as later drives"}
-        for name, corrected in (("physics", None), ("corrected", correction)):
-            rmse = corrected_rmse_deg(lack, corrected)
-            line |= {f"{name}_deg": rmse[0], f"{name}_without_constant_deg": rmse[1]}
-        lines.append(line)
     truth = " and ".join(sorted({ESTIMATED if d.truth.name == REFERENCE else GROUND_TRUTH for d in drives}))
-    return Teaching(priors, parameters, ladder, calibrated, truth, tuple(lines))
+    return Teaching(priors, parameters, ladder, calibrated, truth)
 
 
 def _prior_of(drives: Sequence[OpenedDrive], progress: Any) -> TestedPrior:
@@ -278,5 +267,4 @@ def figures_of(taught: Teaching) -> dict[str, Any]:
         "calibrated": taught.calibrated,
         "truth": taught.truth,
         "priors": priors,
-        "drives": list(taught.drives),
     }

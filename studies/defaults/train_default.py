@@ -29,7 +29,6 @@ from pdhef_logtool.car.car import (
     INTERVALS_FILE,
     NETWORK_FOLDER,
     SHIPPED_CARS,
-    UNSURE_FILE,
     VEHICLE_FILE,
     Car,
     read_fit,
@@ -59,9 +58,8 @@ PAPER_DRIVES, PAPER_RESIDUALS = "paper", "paper-residuals"
 #: An epoch of the paper's network is one batch of windows of 6.4 s, so that 200 epochs take less than half an hour.
 PAPER_WINDOWS: dict[str, Any] = {"piece_steps": 640, "pieces_per_epoch": 64, "chunk_steps": 25}
 TRIALS = 64
-#: Relative errors of friction and vehicle files that the intervals allow for: of a usual car (load alone causes such
-#: errors), and of a car that may have changed.
-USUAL_SPREAD, UNSURE_SPREAD = 0.08, 0.2
+#: Relative errors of friction and vehicle files that the intervals allow for; load alone causes such errors.
+SPREAD = 0.08
 MAPPING = """# Recognised types, and the friction that the simulator drove on.
 fill_recognised = true
 
@@ -158,10 +156,9 @@ def paper(t: Training) -> None:
 
 
 def intervals(t: Training) -> None:
-    """Calibrate the intervals: for a car that is nearly as in its file, and for a car that may have changed."""
-    task = t.validation_task()
-    for spread, name in ((USUAL_SPREAD, INTERVALS_FILE), (UNSURE_SPREAD, UNSURE_FILE)):
-        write_json(t.car / name, fit_intervals(task, spread).model_dump(mode="json"))
+    """Calibrate the intervals."""
+    fitted = fit_intervals(t.validation_task(), SPREAD)
+    write_json(t.car / INTERVALS_FILE, fitted.model_dump(mode="json"))
 
 
 STEPS: dict[str, Callable[[Training], None]] = {

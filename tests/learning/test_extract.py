@@ -400,7 +400,7 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = str(sample_logs_dir / "dlc.mcap")
     result = called("extract", log, "-o", str(out), "--car", str(sample_logs_dir / "vehicle.toml"), "--split", "train")
     assert result.returncode == 0, result.stderr
-    assert "dlc" in result.stdout and "train: 1 drives" in result.stdout
+    assert "usable rows" in result.stdout and "train" in result.stdout
     assert result.stderr.splitlines() == ["warning: dlc: perfect ground truth used; /rtk/fix, /rtk/odometry not used"]
     (drive,) = read_dataset(out).drives
     assert drive.entry["usable_rows"] > 0.99 * drive.entry["rows"]

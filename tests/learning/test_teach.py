@@ -81,7 +81,7 @@ def test_the_figures_say_which_rung_is_used(result: LearnResult) -> None:
     console = Console(width=150, record=True, file=io.StringIO())
     render_learning(result, console)
     text = console.export_text()
-    assert "held-out" in text and "road" in text
+    assert "held-out" in text and "1 drive;" in text
     model = read_model(result.car / MODEL_FILE)
     assert [d.name for d in model.drives] == ["road"] and model.evidence == figures["evidence"]
 
