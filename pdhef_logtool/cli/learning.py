@@ -25,7 +25,6 @@ def learn(
         Path, Option("--output", "-o", metavar="CAR", help="Folder of the car to write; may equal --car.")
     ],
     config: RunConfig,
-    seed: Annotated[int, Option(help="Seed of the residual's random features.")] = 0,
     split: Annotated[
         str | None,
         Option(help="Only drives of this split of a simulated set; any: also of splits that are refused by default."),
@@ -36,7 +35,7 @@ def learn(
     from pdhef_logtool.learning.drives import LearnSettings
     from pdhef_logtool.learning.learn import learn as learn_car
 
-    settings = LearnSettings(config=config, seed=seed, split=split)
+    settings = LearnSettings(config=config, split=split)
     with console.reporter() as reporter:
         result = learn_car(logs, output, settings, reporter=reporter)
     console.finish(result, learning_tables.render_learning, as_json)

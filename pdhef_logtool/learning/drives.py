@@ -18,7 +18,7 @@ from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, logs_of, lost_t
 from pdhef_logtool.logs.discovery import LogInput, Logs
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import mapping_of
-from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
+from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, UsageError
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
@@ -40,19 +40,12 @@ class LearnSettings:
     Attributes
     ----------
     config : car, mapping, slice, sensors, truth channel.
-    seed : seed of every random draw.
     split : use only drives that their set's manifest assigns to this split; "any" accepts drives of all splits, also
         of :data:`HELD_OUT`.
     """
 
     config: RunConfig
-    seed: int = 0
     split: str | None = None
-
-    def __post_init__(self) -> None:
-        """Check the values; raises UsageError."""
-        if self.seed < 0:
-            raise UsageError(expected="a seed of at least 0", got=str(self.seed), where="--seed")
 
 
 def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInput], dict[str, str]]:
@@ -220,16 +213,6 @@ def exit_code(records: Sequence[DriveRecord]) -> int:
     if all(r.left_out for r in records):
         return EXIT_FAILURE
     return EXIT_PARTIAL if any(r.left_out or r.lost for r in records) else EXIT_OK
-
-
-def no_drive(expected: str, where: str) -> EstimatorError:
-    """Return the error for a command without a usable drive."""
-    return EstimatorError(
-        expected=f"at least one drive with {expected}",
-        got="none",
-        where=where,
-        remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
-    )
 
 
 def drives_document(records: Sequence[DriveRecord]) -> dict[str, list[dict[str, Any]]]:

@@ -134,7 +134,7 @@ def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[s
     seconds, slow = math.fsum(d.seconds for d in teachers), car.vehicle.low_speed_blend_m_s
     few = "" if seconds >= LEAST_S else f"{seconds:.1f} s"
     _check(few, f"at least {LEAST_S:g} s of driving with ground truth above {slow:g} m/s")
-    taught = learn_from(teachers, seed=drives.settings.seed, progress=progress)
+    taught = learn_from(teachers, progress)
     sensors = next(r.sensors for r in content if r.opened is not None)
     return records, model_of(car, sensors, **taught.entries), figures_of(taught)
 

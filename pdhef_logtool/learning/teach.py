@@ -133,7 +133,7 @@ def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDriv
     return record if truth_at is None else replace(record, truth=(ESTIMATED,)), OpenedDrive(drive, whole, taught)
 
 
-def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = lambda _text, _share: None) -> Teaching:
+def learn_from(drives: Sequence[OpenedDrive], progress: Any = lambda _text, _share: None) -> Teaching:
     """Return prior and residual from drives of one car, read with its vehicle file."""
     progress("fitting the prior", 0.3)
     groups = like_drives([level_of([d.taught.driving]) for d in drives])
@@ -147,7 +147,7 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
         seconds[not calibration.refused] += drive.taught.driving.seconds
     calibrated = seconds[True] >= seconds[False]  # calibrated and uncalibrated physics differ
     fitted = [lack for lack, c in zip(lacks, calibrations, strict=True) if calibrated is not bool(c.refused)]
-    ladder = fit_ladder(fitted, seed=seed)
+    ladder = fit_ladder(fitted)
     truth = " and ".join(sorted({ESTIMATED if d.truth.name == REFERENCE else GROUND_TRUTH for d in drives}))
     return Teaching(priors, parameters, ladder, calibrated, truth)
 

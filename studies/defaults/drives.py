@@ -11,6 +11,9 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.records.tracks import StateTrack
 
+#: Seed of the random draws on validation drives.
+SEED = 0
+
 
 def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
     """Return a mask [N]: sideslip of the ground truth available, speed above the low-speed limit."""

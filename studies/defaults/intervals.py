@@ -24,7 +24,7 @@ from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.estimating import estimate_drive
-from studies.defaults.drives import load_drive
+from studies.defaults.drives import SEED, load_drive
 from studies.defaults.interval_fit import (
     COVERED,
     FOLDS,
@@ -84,7 +84,7 @@ def fit_intervals(task: DriveSet, spread: float) -> Intervals:
         roll_gradient_rad_per_m_s2=vehicle.roll_gradient_rad_per_m_s2,
         spread=spread,
         entries=tuple(entries),
-        settings={"seed": task.settings.seed, "split": task.settings.split},
+        settings={"seed": SEED, "split": task.settings.split},
         fit={"covered": COVERED, "folds": FOLDS, "wrong_runs": WRONG_RUNS, "sample_every_s": SAMPLE_EVERY_S},
         drives=tuple(r.learnt_on for r in records if not r.left_out),
         versions=tool_versions(),
@@ -100,7 +100,7 @@ def _run_drive(log: LogInput, number: int, task: DriveSet, spread: float) -> tup
     signals = drive.signals
     runs = [(vehicle, 1.0, False)]
     if spread > 0.0:
-        draws = itertools.islice(made_wrong(vehicle, spread, f"{task.settings.seed}:{record.sha256}"), WRONG_RUNS)
+        draws = itertools.islice(made_wrong(vehicle, spread, f"{SEED}:{record.sha256}"), WRONG_RUNS)
         runs += [(*draw, True) for draw in draws]
     ran: _Ran = []
     for assumed, factor, wrong in runs:

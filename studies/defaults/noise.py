@@ -24,11 +24,11 @@ from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import FEATURES, Options, spec_of
 from pdhef_logtool.estimators.vehicle_ukf import PHY_UKF_Q_STD
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.learning.drives import DriveRecord, DriveSet, no_drive
+from pdhef_logtool.learning.drives import DriveRecord, DriveSet
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
-from studies.defaults.drives import load_drive, scorable_stamps
+from studies.defaults.drives import SEED, load_drive, scorable_stamps
 
 #: Filters with a searched noise; the noise of ``physics`` is identified together with its values.
 TUNED = ("phy-ukf:tuned",)
@@ -65,7 +65,7 @@ def tune(task: DriveSet, trials: int) -> dict[str, FilterNoise]:
 
     Raises
     ------
-    EstimatorError
+    SystemExit
         No drive can be scored.
     """
     options, slow = task.settings.config.read_options, task.car.vehicle.low_speed_blend_m_s
@@ -75,7 +75,7 @@ def tune(task: DriveSet, trials: int) -> dict[str, FilterNoise]:
 
     _, drives = task.read(read)
     if not drives:
-        raise no_drive("a true sideslip and the signals of the filters", "noise")
+        raise SystemExit("noise: at least one drive with a true sideslip and the signals of the filters is needed")
 
     def objective(name: str, values: Point) -> float:
         car = task.car.with_noise(name, filter_noise(values))
@@ -87,7 +87,7 @@ def tune(task: DriveSet, trials: int) -> dict[str, FilterNoise]:
 
     best = {}
     for name in TUNED:
-        best[name] = min(search(partial(objective, name), trials, task.settings.seed), key=_order)
+        best[name] = min(search(partial(objective, name), trials, SEED), key=_order)
         print(f"{name}: trial {best[name].number} of {trials}, {best[name].objective_deg:.4f}°", flush=True)
     return {name: _noise(trial) for name, trial in best.items()}
 

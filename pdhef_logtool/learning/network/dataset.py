@@ -39,8 +39,6 @@ from pdhef_logtool.storage.documents import DIGEST, digest, is_sealed, read_seal
 FORMAT = "pdhef.residual-dataset"
 FORMAT_VERSION = 7
 MANIFEST = "manifest.json"
-#: Maximum number of vehicles that a bundle names; beyond, it contains their number.
-NAMED_VEHICLES = 4
 #: Glob pattern of the drives' files in a dataset.
 FILES = "split=*/car=*/part-*.parquet"
 TARGETS = (("target_dvy_m_s", "m/s"), ("target_dyaw_rate_rad_s", "rad/s"))
@@ -296,8 +294,7 @@ class Dataset:
     @property
     def vehicle_name(self) -> str:
         """Names of the vehicles behind the residuals."""
-        names = sorted({str(v["name"]) for v in self.manifest["vehicles"]})
-        return ", ".join(names) if len(names) <= NAMED_VEHICLES else f"{len(names)} vehicles"
+        return ", ".join(sorted({str(v["name"]) for v in self.manifest["vehicles"]}))
 
     def vehicle(self, drive: DatasetDrive) -> VehicleParameters:
         """Return the vehicle behind the residuals of a drive."""
@@ -317,7 +314,7 @@ def read_dataset(folder: Path) -> Dataset:
     """
     path = folder / MANIFEST
     try:
-        document = read_manifest(folder)
+        document = read_sealed(path, _EXPECTED, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
         kind = (document["format"], document["version"])
         if kind[0] != FORMAT or kind[1] != FORMAT_VERSION or document["features"] != list(FEATURES):
             raise OutputError(
@@ -337,8 +334,3 @@ def read_dataset(folder: Path) -> Dataset:
         raise OutputError(
             expected=_EXPECTED, got=str(error) or type(error).__name__, where=str(folder), remedy=_REMEDY
         ) from None
-
-
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """Return a dataset's manifest; raises OutputError if it is missing or damaged."""
-    return read_sealed(folder / MANIFEST, _EXPECTED, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)

@@ -37,13 +37,12 @@ from pdhef_logtool.learning.drives import (
 )
 from pdhef_logtool.learning.network.dataset import (
     COLUMNS,
-    FORMAT,
     FORMAT_VERSION,
     MANIFEST,
     SPLITS,
     drive_file,
+    read_dataset,
     read_entry,
-    read_manifest,
     remove_unnamed,
     split_folder,
     write_drive,
@@ -66,7 +65,7 @@ from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import BoolArray, Loss
-from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, NOMINAL_MODEL, PHYSICS_MODEL
+from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, PHYSICS_MODEL
 from pdhef_logtool.results.condition import parse_condition
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
@@ -308,36 +307,24 @@ def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
                 )
 
 
-def _earlier(output: Path, settings: ExtractSettings) -> dict[str, Any]:
+def _earlier(output: Path, settings: ExtractSettings) -> Mapping[str, Any]:
     """Return the manifest of the dataset to extend; empty for a new dataset.
 
     Raises
     ------
     UsageError
-        The folder contains another manifest, or an incompatible dataset.
+        The folder contains another manifest, or a dataset of another filter.
     """
-    path = output / MANIFEST
-    remedy = "choose another folder with -o"
-    if not path.exists():
+    if not (output / MANIFEST).exists():
         return {}
+    expected, remedy = f"a new folder, or a residual dataset for {settings.model}", "choose another folder with -o"
     try:
-        document = read_manifest(output)
-        got = "" if document.get("format") == FORMAT else f"a folder with another {MANIFEST}"
+        data = read_dataset(output)
     except OutputError as error:
-        got = f"a folder with another {MANIFEST}: {error.got}"
-    if got:
-        expected = "a new folder, or the folder of a residual dataset"
-        raise UsageError(expected=expected, got=got, where=str(output), remedy=remedy)
-    wanted = (FORMAT_VERSION, settings.model)
-    if (format_of_file := (document.get("version"), document.get("model"))) != wanted:
-        raise UsageError(
-            expected=f"a dataset of version {wanted[0]} for {wanted[1]}",
-            got=f"version {format_of_file[0]} for {format_of_file[1] or NOMINAL_MODEL}",
-            where=str(output),
-            remedy=remedy,
-        )
-    whole: dict[str, Any] = document
-    return whole
+        raise UsageError(expected=expected, got=error.got, where=str(output), remedy=remedy) from None
+    if data.model != settings.model:
+        raise UsageError(expected=expected, got=f"one for {data.model}", where=str(output), remedy=remedy)
+    return data.manifest
 
 
 def _check(jobs: int, settings: ExtractSettings) -> None:
