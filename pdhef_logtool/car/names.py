@@ -6,6 +6,5 @@ from pathlib import Path
 
 #: Cars of the package, by name.
 SHIPPED_CARS = {"saloon": Path(__file__).parents[1] / "models" / "default"}
-#: Names in place of an intervals file: uncalibrated intervals of the estimators; wide intervals for a car that may
-#: differ from its vehicle file.
-NO_INTERVALS, UNSURE = "none", "unsure"
+#: Name in place of an intervals file: uncalibrated intervals of the estimators.
+NO_INTERVALS = "none"
