@@ -418,8 +418,9 @@ def _by_drive(rows: pl.DataFrame | None) -> dict[tuple[str, str], tuple[float, i
     """Return value, number of stamps and unit of a figure by log and estimator, where it has a value."""
     if rows is None:
         return {}
-    known = rows.select("log", "estimator", "value", "n", "unit").iter_rows()
-    return {(r[0], r[1]): (r[2], r[3], r[4]) for r in known if r[2] is not None and math.isfinite(r[2])}
+    columns = ("log", "estimator", "value", "n", "unit")
+    table = rows.select(columns).iter_rows()
+    return {(r[0], r[1]): (r[2], r[3], r[4]) for r in table if r[2] is not None and math.isfinite(r[2])}
 
 
 def _notes(drives: Sequence[DriveFigure], tainted: int) -> Iterator[str]:
