@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich import box
 from rich.table import Table
@@ -13,7 +13,7 @@ from rich.text import Text
 
 from pdhef_logtool.logs.recording_span import shown_time
 from pdhef_logtool.mapping.candidates import Candidate
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
 from pdhef_logtool.runs.inspection.report import Inspection, SignalReport, TopicReport
 from pdhef_logtool.runs.inspection.step_statistics import number_text
 
@@ -52,7 +52,7 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
         console.print(line)
 
 
-def table_of(title: str, headings: Sequence[str | Text], rows: Iterable[Sequence[str | Text]], *, words: int) -> Table:
+def table_of(title: str, headings: Sequence[str | Text], rows: Iterable[Sequence[Any]], *, words: int) -> Table:
     """Return a table with ``words`` columns of text, then numbers."""
     table = Table(
         title=Text(title),
@@ -162,13 +162,7 @@ def findings_of(inspection: Inspection) -> list[tuple[str, str, str]]:
     if passed := [c for c in inspection.checks if c.verdict == "passed"]:
         subjects = ", ".join(dict.fromkeys(c.subject for c in passed))
         rows.append(("passed", "green", f"{len(passed)} checks of {subjects}"))
-    for loss in inspection.lost:
-        facts = [f"{loss.count} times"] if loss.count is not None and loss.count != 1 else []
-        if loss.start_ns is not None:
-            until = "" if loss.end_ns is None else f" to {(loss.end_ns - inspection.start_ns) * 1e-9:.2f} s"
-            facts.append(f"from {(loss.start_ns - inspection.start_ns) * 1e-9:.2f} s{until}")
-        head, style = ("lost", "red") if loss.severity == "lost" else ("note", "cyan")
-        rows.append((head, style, f"{loss.where}: {loss.what}{' (' + ', '.join(facts) + ')' if facts else ''}"))
+    rows += [_loss_row(loss, inspection.start_ns) for loss in inspection.lost]
     rows += [("note", "cyan", n) for n in inspection.notes]
     if inspection.mapping.quality is not None:
         rows.append(("note", "cyan", f"ground truth is used where {inspection.mapping.quality.describe()}"))
@@ -178,6 +172,15 @@ def findings_of(inspection: Inspection) -> list[tuple[str, str, str]]:
     elif inspection.missing:
         rows.append(("next", "cyan", "pdhef inspect LOG --fields lists all numeric fields of the log"))
     return rows
+
+
+def _loss_row(loss: Loss, start_ns: int) -> tuple[str, str, str]:
+    facts = [f"{loss.count} times"] if loss.count is not None and loss.count != 1 else []
+    if loss.start_ns is not None:
+        until = "" if loss.end_ns is None else f" to {(loss.end_ns - start_ns) * 1e-9:.2f} s"
+        facts.append(f"from {(loss.start_ns - start_ns) * 1e-9:.2f} s{until}")
+    head, style = ("lost", "red") if loss.severity == "lost" else ("note", "cyan")
+    return head, style, f"{loss.where}: {loss.what}{' (' + ', '.join(facts) + ')' if facts else ''}"
 
 
 def _short(field: str) -> str:
