@@ -11,6 +11,7 @@ import shutil
 import weakref
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
+from io import DEFAULT_BUFFER_SIZE
 from pathlib import Path
 from threading import Lock
 from typing import BinaryIO
@@ -22,7 +23,6 @@ from pdhef_logtool.storage.files import scratch_folder
 
 #: Size of all copies together; least recently used ones are removed.
 CACHE_BYTES = 4 << 30
-_STEP_BYTES = 1 << 20
 
 
 class RemoteCopy:
@@ -54,7 +54,7 @@ class RemoteCopy:
         if not (_lock(self._index, exclusive=False) and index.exists()):
             raise FileNotFoundError  # another process is removing the copy
         os.utime(index)
-        self.path.touch(mode=0o600)
+        self.path.touch()
         self._file = stack.enter_context(self.path.open("r+b", buffering=0))
 
     def write(self, offset: int, data: bytes) -> None:
@@ -79,8 +79,8 @@ class RemoteCopy:
             with suppress(ValueError):  # a line that was cut off
                 start, end, stated = map(int, line.split())
                 crc = 0
-                for offset in range(start, end, _STEP_BYTES):
-                    crc = crc32(self.read(offset, min(_STEP_BYTES, end - offset)), crc)
+                for offset in range(start, end, DEFAULT_BUFFER_SIZE):
+                    crc = crc32(self.read(offset, min(DEFAULT_BUFFER_SIZE, end - offset)), crc)
                 if crc == stated:
                     yield start, end
 
