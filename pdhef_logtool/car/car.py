@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, AssumedValue
-from pdhef_logtool.car.model import GROUND_TRUTH, MODEL_FILE, CarModel, TaughtParameter, read_model
+from pdhef_logtool.car.model import GROUND_TRUTH, CarModel, TaughtParameter, read_model
+from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.names import NO_INTERVALS as NO_INTERVALS
 from pdhef_logtool.car.names import SHIPPED_CARS as SHIPPED_CARS
 from pdhef_logtool.car.parts import (

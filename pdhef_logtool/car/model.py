@@ -18,7 +18,6 @@ from pdhef_logtool.residual_model.ladder import LadderModel
 from pdhef_logtool.storage.documents import read_toml, validated
 from pdhef_logtool.storage.toml_text import toml_text
 
-MODEL_FILE = "model.toml"
 #: Sources of the error that teaching uses.
 GROUND_TRUTH, ESTIMATED = "ground truth", "estimated reference"
 

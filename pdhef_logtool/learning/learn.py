@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.model import MODEL_FILE, CarModel
-from pdhef_logtool.car.names import NO_INTERVALS
+from pdhef_logtool.car.model import CarModel
+from pdhef_logtool.car.names import MODEL_FILE, NO_INTERVALS
 from pdhef_logtool.car.store import check_output, update_car
 from pdhef_logtool.drive.model_file import Sensors
 from pdhef_logtool.drive.reading import read_drive

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict
 
-from pdhef_logtool.car.model import MODEL_FILE as MODEL_FILE
+from pdhef_logtool.car.names import MODEL_FILE as MODEL_FILE
 from pdhef_logtool.logs.discovery import RUN_FILE
 from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.storage.documents import file_sha256, read_json, read_sealed, validated

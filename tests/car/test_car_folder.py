@@ -23,7 +23,7 @@ from pdhef_logtool.car.car import (
     VEHICLE_FILE,
     Car,
 )
-from pdhef_logtool.car.model import MODEL_FILE
+from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.parts import (
     FilterNoise,
     Fit,

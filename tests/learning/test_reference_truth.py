@@ -9,7 +9,8 @@ import polars as pl
 import pytest
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.model import ESTIMATED, MODEL_FILE, read_model
+from pdhef_logtool.car.model import ESTIMATED, read_model
+from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.drive import reading
 from pdhef_logtool.learning import learn as learning
 from pdhef_logtool.learning.drives import LearnSettings

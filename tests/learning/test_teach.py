@@ -11,7 +11,8 @@ import pytest
 from rich.console import Console
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.model import MODEL_FILE, read_model
+from pdhef_logtool.car.model import read_model
+from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.parts import Fit, LearntOn
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.cli.learning_tables import render_learning
