@@ -60,6 +60,14 @@ VALID_FIT = {
     "filter": {"phy-ukf:tuned": {"q_std": [0.1, 0.1, 0.1], "r_std": {"ay_m_s2": 1.0}}},
     "drives": [{"name": "lap", "sha256": "cd", "start_s": 0.0, "end_s": 9.5}],
 }
+VALID_MODEL = {
+    "format": "pdhef-model",
+    "version": 1,
+    "physics_sha256": "ab" * 32,
+    "truth": "ground truth",
+    "parameters": [{"name": "yaw inertia", "value": 1500.0, "std": 0.1}],
+    "drives": [{"name": "lap", "sha256": "cd", "start_s": 0.0, "end_s": 9.5}],
+}
 VALID_PLAN = {"requirement": [{"id": "SR-1", "signal": "sideslip_rad", "metric": "rmse", "limit_deg": 0.5}]}
 
 
@@ -87,6 +95,7 @@ LOADERS = [
     Loader("plan.toml", load_plan, VALID_PLAN),
     Loader("vehicle.toml", read_vehicle_file, tomllib.loads((CAR / "vehicle.toml").read_text())),
     Loader("fit.toml", _part, VALID_FIT),
+    Loader("model.toml", _part, VALID_MODEL),
     Loader("intervals.json", load_intervals, json.loads((CAR / "intervals.json").read_text())),
     Loader(DOCUMENT_FILE, _model, json.loads((SHIPPED / DOCUMENT_FILE).read_text())),
     Loader(
@@ -268,7 +277,7 @@ def test_the_nearest_name_is_told() -> None:
         (LOADERS[1], "[estimates.a.vy_ms]\ntopic = '/a'", "estimates.a.vy_ms", "estimates.a.vy_m_s"),
         (LOADERS[2], "[[requirement]]\nlimits = 3", "requirement[0].limits", "requirement[0].limit"),
         (LOADERS[3], "[sensors]\nay_std = 1.0", "sensors.ay_std", "sensors.ay_std_m_s2"),
-        (LOADERS[5], "[filter.physics]\nq_sdt = [0.1, 0.1, 0.1]", "filter.physics.q_sdt", "filter.physics.q_std"),
+        (LOADERS[4], "[filter.physics]\nq_sdt = [0.1, 0.1, 0.1]", "filter.physics.q_sdt", "filter.physics.q_std"),
     ],
 )
 def test_misspelt_entries_are_told_with_the_nearest_name(
