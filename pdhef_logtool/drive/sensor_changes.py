@@ -9,7 +9,8 @@ Two relations that every car on wheels obeys are fitted to the drive so far, by 
 At each cell, a generalised likelihood ratio test compares the residuals in the windows after it with the window before
 it, in units of the same statistic in the drive so far:
 
-* gyro: its samples have a step that the kinematic residual confirms and the steering residual does not contradict;
+* gyro: its samples have a step that the kinematic residual confirms, or the steering residual if that of the kinematics
+  is too noisy, and neither contradicts;
 * a_y: the residual of the kinematics has a flat step, and steering and gyro agree that the car did not change its
   motion. A slide moves the steering residual too; a banked road begins slowly.
 * frozen: a value repeats for longer than the share of repetitions so far explains by chance (probability
@@ -295,8 +296,9 @@ def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> Se
         by_ay, by_steer = ay.scaled(-1.0 / v), of_steer.scaled(-1.0 / (steering.fit[:, 1] / v + steering.fit[:, 2] * v))
         step, at_ns = _sample_steps(signals, cells)
         step_std = np.fmax(_std_so_far(step, LEAST_GYRO_STD), np.sqrt(_mean(step**2, 3, WINDOW_CELLS)))  # a burst
-        is_gyro = (np.abs(step) > np.maximum(ALARM * step_std, LEAST_GYRO_JUMP_RAD_S)) & by_ay.confirms(step)
-        is_gyro &= ~by_steer.contradicts(step)
+        is_gyro = np.abs(step) > np.maximum(ALARM * step_std, LEAST_GYRO_JUMP_RAD_S)
+        is_gyro &= by_ay.confirms(step) | (by_steer.confirms(step) & (SURE * by_ay.std > np.abs(step)))
+        is_gyro &= ~by_ay.contradicts(step) & ~by_steer.contradicts(step)
         is_ay = (np.abs(ay.size) > np.maximum(ALARM * ay.std, LEAST_AY_JUMP_M_S2)) & ay.is_sharp
         is_ay &= (np.abs(by_steer.size) < ABSENT * np.abs(by_ay.size)) & (np.abs(by_ay.size) > SURE * by_steer.std)
     is_gyro &= "yaw_rate_rad_s" not in ignored
