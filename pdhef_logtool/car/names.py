@@ -1,4 +1,4 @@
-"""Words that are accepted in place of the path of a car or of its intervals."""
+"""Names of cars and of their files."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 
 #: Cars of the package, by name.
 SHIPPED_CARS = {"saloon": Path(__file__).parents[1] / "models" / "default"}
-#: Names in place of an intervals file: uncalibrated intervals of the estimators; wide intervals for a car that may
-#: differ from its vehicle file.
-NO_INTERVALS, UNSURE = "none", "unsure"
+#: What earlier drives show about a car, in its folder and in the outputs of a run (:mod:`~.model`).
+MODEL_FILE = "model.toml"
+#: Name in place of an intervals file: uncalibrated intervals of the estimators.
+NO_INTERVALS = "none"

@@ -210,18 +210,18 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
     vy = columns.get(CG_VY, vy)
     gyro, ay = columns.get("yaw_rate_rad_s"), columns.get("ay_m_s2")
     if rate is not None and gyro is not None:
-        fitted = fit(gyro, [rate, derivative(rate), np.ones_like(rate)], np.ones(rate.shape[0], np.bool_))
-        gain = UNKNOWN if fitted is None else (float(fitted[0][0]), math.hypot(fitted[1][0], RESAMPLED_GAIN))
+        solved = fit(gyro, [rate, derivative(rate), np.ones_like(rate)], np.ones(rate.shape[0], np.bool_))
+        gain = UNKNOWN if solved is None else (float(solved[0][0]), math.hypot(solved[1][0], RESAMPLED_GAIN))
     if vx is not None and vy is not None and rate is not None and ay is not None:
         lateral = derivative(vy) + vx * rate
         slow = running_mean(lateral, round(0.5 * SLOW_S / GRID_S))
         regressors = [derivative(rate), lateral, derivative(lateral), np.ones_like(rate), slow]
         late_s = 0.0
         for _ in range(DELAY_STEPS):  # iterates, because the lever-arm term is late too
-            fitted = fit(earlier(ay, late_s), regressors, moving_at(vx))
-            if fitted is None or fitted[0][1] <= 0.0:
+            solved = fit(earlier(ay, late_s), regressors, moving_at(vx))
+            if solved is None or solved[0][1] <= 0.0:
                 break
-            (lever, scale, slope), (lever_error, scale_error, slope_error) = (map(float, x[:3]) for x in fitted[:2])
+            (lever, scale, slope), (lever_error, scale_error, slope_error) = (map(float, x[:3]) for x in solved[:2])
             late_s -= slope / scale
             is_converged = abs(slope / scale) < LAST_STEP_S and late_s < MOST_DELAY_S
             roll = min(max(scale, 1.0), TABLE["ay_m_s2.gain"]["limits"][1]) - 1.0
@@ -346,10 +346,10 @@ def sideslip_offset(columns: Mapping[str, FloatArray]) -> Figure:
     rate, ay, vx, vy = (columns[n] for n in names)
     with np.errstate(divide="ignore", invalid="ignore"):
         regressors = [np.ones_like(vx), rate / vx, ay]
-    fitted = fit(_sideslip(columns), regressors, gentle_at(rate * vx, moving_at(np.hypot(vx, vy))))
-    if fitted is None:
+    solved = fit(_sideslip(columns), regressors, gentle_at(rate * vx, moving_at(np.hypot(vx, vy))))
+    if solved is None:
         return UNKNOWN
-    return float(fitted[0][0]), math.hypot(fitted[1][0], fitted[0][2] * AY_BIAS_M_S2)
+    return float(solved[0][0]), math.hypot(solved[1][0], solved[0][2] * AY_BIAS_M_S2)
 
 
 def offset_check(columns: Mapping[str, FloatArray]) -> Check:
@@ -404,14 +404,14 @@ def _steering(drive: CheckedDrive) -> Iterator[Check]:
         curved = vehicle.wheelbase_m * rate / speed
     lateral = rate * speed
     gentle = gentle_at(lateral, moving_at(speed))
-    fitted = fit(steer, [curved, lateral, np.ones_like(steer)], gentle)
+    solved = fit(steer, [curved, lateral, np.ones_like(steer)], gentle)
     speeds = np.abs(speed[gentle & np.isfinite(speed)])
     (share, share_std), (gradient, std), file = UNKNOWN, UNKNOWN, 0.0
     # At constant speed, curvature and lateral acceleration are proportional.
-    if fitted is not None and np.quantile(speeds, 0.9) >= SPEED_SPREAD * np.quantile(speeds, 0.1):
+    if solved is not None and np.quantile(speeds, 0.9) >= SPEED_SPREAD * np.quantile(speeds, 0.1):
         spread = float(np.std(steer[gentle & np.isfinite(steer)]))
-        if fitted[0][0] > 0.0 and fitted[2] <= UNEXPLAINED_STEERING * spread:
-            (share, gradient, _), (share_std, std, _) = fitted[:2]
+        if solved[0][0] > 0.0 and solved[2] <= UNEXPLAINED_STEERING * spread:
+            (share, gradient, _), (share_std, std, _) = solved[:2]
             file = vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction)
     yield judge("vehicle.steering", share, share_std)
     drive_mrad, std_mrad, file_mrad = (1e3 * float(x) for x in (gradient, std, file))

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from pdhef_logtool.car.names import NO_INTERVALS, SHIPPED_CARS, UNSURE
+from pdhef_logtool.car.names import NO_INTERVALS, SHIPPED_CARS
 from pdhef_logtool.car.vehicle import SENSOR_PROFILES
 from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.drive.options import AUTO, OFF, ReadOptions, parse_time
@@ -31,7 +31,7 @@ _NO_RESULT = ("allow_private_redirects", "log_timeout_s", "max_memory_mb", "full
 _KEYWORDS = {
     "car": tuple(SHIPPED_CARS),
     "network": (*SHIPPED_FOLDERS, NO_MODEL),
-    "intervals": (NO_INTERVALS, UNSURE),
+    "intervals": (NO_INTERVALS,),
     "sensor_profile": tuple(SENSOR_PROFILES),
     "model": (str(AUTO), str(OFF)),
 }
@@ -86,8 +86,7 @@ class RunConfig:
         times and different columns are one recording.
     plan : validation plan (plan.toml); None = the default plan, which decides no exit code.
     network : network folder, ``default``, ``none`` or the name of an installed residual model; None = the car's.
-    intervals : intervals file, ``none``, or ``unsure`` (wide intervals, for a car that may have changed); None = the
-        car's.
+    intervals : intervals file, or ``none``; None = the car's.
     model : ``auto`` (sensors, and a car without validation data, are fitted to the whole log without ground truth; not
         causal), ``off`` (the car is not fitted, only its prior is used), or the model.toml of an earlier run or of
         ``learn``, for sensors and car of earlier drives (causal).

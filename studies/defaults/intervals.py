@@ -7,9 +7,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from pdhef_logtool.car.car import INTERVALS_FILE
 from pdhef_logtool.car.parts import Algorithm, IntervalEntry, Intervals
-from pdhef_logtool.car.store import Change
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.drive.reading import friction_of
 from pdhef_logtool.estimators.algorithm import resolve
@@ -20,14 +18,13 @@ from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, runnable
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ
 from pdhef_logtool.evaluation.smoothing import smooth
-from pdhef_logtool.learning.drives import DriveRecord
-from pdhef_logtool.learning.stages.task import Task
+from pdhef_logtool.learning.drives import DriveRecord, DriveSet
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.run_report import json_bytes, tool_versions
+from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.estimating import estimate_drive
-from studies.defaults.drives import load_drive
+from studies.defaults.drives import SEED, load_drive
 from studies.defaults.interval_fit import (
     COVERED,
     FOLDS,
@@ -49,7 +46,7 @@ MIN_SAMPLES = 20
 _Ran = list[tuple[str, Algorithm, Samples]]
 
 
-def fit_intervals(task: Task, spread: float) -> Change:
+def fit_intervals(task: DriveSet, spread: float) -> Intervals:
     """Return the intervals of every algorithm that has enough drives.
 
     ``spread`` : 1-sigma of the random errors of friction and vehicle in further runs of each drive.
@@ -80,24 +77,21 @@ def fit_intervals(task: Task, spread: float) -> Change:
         )
     if not entries:
         raise SystemExit(f"intervals: at least {MIN_DRIVES} drives with a true sideslip are needed, got {len(ran)}")
-    vehicle, settings = task.car.vehicle, {**task.settings.to_dict(), "spread": spread}
-    fitted_intervals = Intervals(
+    vehicle = task.car.vehicle
+    return Intervals(
         car=vehicle.name,
         physics_sha256=task.car.physics_sha256,
         roll_gradient_rad_per_m_s2=vehicle.roll_gradient_rad_per_m_s2,
         spread=spread,
         entries=tuple(entries),
-        settings=settings,
+        settings={"seed": SEED, "split": task.settings.split},
         fit={"covered": COVERED, "folds": FOLDS, "wrong_runs": WRONG_RUNS, "sample_every_s": SAMPLE_EVERY_S},
         drives=tuple(r.learnt_on for r in records if not r.left_out),
         versions=tool_versions(),
     )
-    files = {INTERVALS_FILE: json_bytes(fitted_intervals.model_dump(mode="json"))}
-    command = "studies.defaults.train_default intervals"
-    return Change(command, INTERVALS_FILE, files, settings=settings, drives=fitted_intervals.drives)
 
 
-def _run_drive(log: LogInput, number: int, task: Task, spread: float) -> tuple[DriveRecord, _Ran | None]:
+def _run_drive(log: LogInput, number: int, task: DriveSet, spread: float) -> tuple[DriveRecord, _Ran | None]:
     """Run the estimators on a drive, once as given and some times with a wrong vehicle; return errors and terms."""
     car, vehicle, options = task.car, task.car.vehicle, task.settings.config.read_options
     record, drive = load_drive(log, task, fill_friction=False)
@@ -106,7 +100,7 @@ def _run_drive(log: LogInput, number: int, task: Task, spread: float) -> tuple[D
     signals = drive.signals
     runs = [(vehicle, 1.0, False)]
     if spread > 0.0:
-        draws = itertools.islice(made_wrong(vehicle, spread, f"{task.settings.seed}:{record.sha256}"), WRONG_RUNS)
+        draws = itertools.islice(made_wrong(vehicle, spread, f"{SEED}:{record.sha256}"), WRONG_RUNS)
         runs += [(*draw, True) for draw in draws]
     ran: _Ran = []
     for assumed, factor, wrong in runs:

@@ -28,22 +28,19 @@ from pdhef_logtool.car.car import (
     FIT_FILE,
     INTERVALS_FILE,
     NETWORK_FOLDER,
-    NOISE_FILE,
     SHIPPED_CARS,
-    UNSURE_FILE,
     VEHICLE_FILE,
     Car,
+    read_fit,
 )
-from pdhef_logtool.car.store import update_car
-from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_toml
-from pdhef_logtool.learning.drives import LearnSettings, choose_drives
+from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file, vehicle_toml
+from pdhef_logtool.learning.drives import DriveSet, LearnSettings
 from pdhef_logtool.learning.network.fit import PAPER_RECIPE, Recipe
 from pdhef_logtool.learning.network.train_command import dataset_for, train_on
-from pdhef_logtool.learning.stages.task import Task
-from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import MODELS, NOMINAL_MODEL, PAPER_FOLDER, PHYSICS_MODEL
+from pdhef_logtool.results.run_report import write_json
 from pdhef_logtool.runs.config import RunConfig
 from studies.defaults import fit_physics, paper_drives
 from studies.defaults.intervals import fit_intervals
@@ -61,9 +58,8 @@ PAPER_DRIVES, PAPER_RESIDUALS = "paper", "paper-residuals"
 #: An epoch of the paper's network is one batch of windows of 6.4 s, so that 200 epochs take less than half an hour.
 PAPER_WINDOWS: dict[str, Any] = {"piece_steps": 640, "pieces_per_epoch": 64, "chunk_steps": 25}
 TRIALS = 64
-#: Relative errors of friction and vehicle files that the intervals allow for: of a usual car (load alone causes such
-#: errors), and of a car that may have changed.
-USUAL_SPREAD, UNSURE_SPREAD = 0.08, 0.2
+#: Relative errors of friction and vehicle files that the intervals allow for; load alone causes such errors.
+SPREAD = 0.08
 MAPPING = """# Recognised types, and the friction that the simulator drove on.
 fill_recognised = true
 
@@ -95,16 +91,11 @@ class Training:
         """Options that name the car and the mapping."""
         return "--car", self.car, "--mapping", self.work / "mapping.toml"
 
-    def validation_task(self) -> Task:
+    def validation_task(self) -> DriveSet:
         """Return the validation drives with car and network."""
         config = RunConfig(car=self.car, mapping=self.work / "mapping.toml")
         settings = LearnSettings(config=config, split="validation")
-        inputs, splits = choose_drives([str(self.work / "one_car")], settings)
-        reporter = Reporter(warn=print)
-        car, mapping = Car.load(config.car), mapping_of(config.mapping)
-        return Task(
-            car=car, settings=settings, logs=tuple(inputs), mapping=mapping, set_splits=splits, reporter=reporter
-        )
+        return DriveSet.of([str(self.work / "one_car")], Car.load(config.car), settings, Reporter(warn=print))
 
 
 def simulate(t: Training) -> None:
@@ -116,8 +107,7 @@ def simulate(t: Training) -> None:
     )
     (t.car / VEHICLE_FILE).write_text(f"{text}\n[network]\ngain = {GAIN}\n", encoding="utf-8")
     if t.seed:
-        for part in (FIT_FILE, NOISE_FILE):
-            shutil.copyfile(HOME / part, t.car / part)
+        shutil.copyfile(HOME / FIT_FILE, t.car / FIT_FILE)
     (t.work / "mapping.toml").write_text(MAPPING, encoding="utf-8")
     what = ("--count", t.drives, "--seed", SEED, "--vehicles", "default", "--jobs", t.jobs)
     pdhef("simulate", "suite", *what, "-o", t.work / "one_car")
@@ -127,6 +117,12 @@ def simulate(t: Training) -> None:
 def fit(t: Training) -> None:
     """Fit ``physics``; the network learns its residual."""
     fit_physics.main(["-o", str(t.car), "--work", str(t.work / "fit"), "--jobs", str(t.jobs)])
+
+
+def noise(t: Training) -> None:
+    """Tune the noise of all tuned filters alike, on validation drives."""
+    fitted = read_fit(t.car / FIT_FILE).model_copy(update={"filter": tune(t.validation_task(), t.trials)})
+    (t.car / FIT_FILE).write_text(part_toml(fitted, fit_physics.HEAD), encoding="utf-8")
 
 
 def extract(t: Training) -> None:
@@ -159,22 +155,14 @@ def paper(t: Training) -> None:
     )  # fmt: skip
 
 
-def noise(t: Training) -> None:
-    """Tune the noise of all tuned filters alike, on validation drives."""
-    task = t.validation_task()
-    update_car(task.car, t.car, tune(task, t.trials))
-
-
 def intervals(t: Training) -> None:
-    """Calibrate the intervals: for a car that is nearly as in its file, and for a car that may have changed."""
-    task = t.validation_task()
-    for spread, place in ((USUAL_SPREAD, t.car), (UNSURE_SPREAD, t.work / "unsure")):
-        update_car(task.car, place, fit_intervals(task, spread))
-    shutil.copyfile(t.work / "unsure" / INTERVALS_FILE, t.car / UNSURE_FILE)
+    """Calibrate the intervals."""
+    fitted = fit_intervals(t.validation_task(), SPREAD)
+    write_json(t.car / INTERVALS_FILE, fitted.model_dump(mode="json"))
 
 
 STEPS: dict[str, Callable[[Training], None]] = {
-    step.__name__: step for step in (simulate, fit, extract, train, paper, noise, intervals)
+    step.__name__: step for step in (simulate, fit, noise, extract, train, paper, intervals)
 }
 #: Seeds other than 0 take these parts from the shipped car.
 ONLY_OF_SEED_0 = ("fit", "noise", "intervals")

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from pdhef_logtool.car.car import INTERVALS_FILE, SHIPPED_CARS, UNSURE_FILE, Car, load_intervals
+from pdhef_logtool.car.car import INTERVALS_FILE, SHIPPED_CARS, Car, load_intervals
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
@@ -52,9 +52,8 @@ def test_the_identities_of_the_shipped_presets_are_frozen(saloon: Car) -> None:
     assert {name: (a.identity, a.sha256[:12]) for name, a in found.items()} == SHIPPED
 
 
-@pytest.mark.parametrize("file", [INTERVALS_FILE, UNSURE_FILE])
-def test_the_shipped_intervals_are_those_of_the_shipped_estimators(file: str, saloon: Car) -> None:
-    entries = load_intervals(SHIPPED_CARS["saloon"] / file).entries
+def test_the_shipped_intervals_are_those_of_the_shipped_estimators(saloon: Car) -> None:
+    entries = load_intervals(SHIPPED_CARS["saloon"]).entries
     assert {e.estimator for e in entries} >= {"phy-ukf", "physics", "pd-hef", "pd-hef-smoothed"}
     for entry in entries:
         assert entry.algorithm == resolve(make_estimator(entry.estimator, saloon)), entry.estimator

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from reference_car import signals_at
 
-from pdhef_logtool.car.car import INTERVALS_FILE, UNSURE_FILE, Car, load_intervals
+from pdhef_logtool.car.car import INTERVALS_FILE, Car, load_intervals
 from pdhef_logtool.car.parts import Algorithm, Inflation, IntervalEntry, Intervals
 from pdhef_logtool.car.toml_files import vehicle_toml
 from pdhef_logtool.car.vehicle import default_vehicle
@@ -205,13 +205,9 @@ def test_which_intervals_a_run_takes(tmp_path: Path) -> None:
     shipped = Car.load("saloon").intervals
     assert shipped is not None
     assert taken(None) is None, "those of the shipped car are another car's"
-    with pytest.raises(PdhefError, match="unsure"):
-        taken("unsure")
-    for name, file in (("mine", INTERVALS_FILE), ("mine, unsure", UNSURE_FILE)):
-        (folder / file).write_text(json.dumps(_document() | {"car": name}))
+    (folder / INTERVALS_FILE).write_text(json.dumps(_document() | {"car": "mine"}))
     assert taken(None) == "mine"
     assert taken("none") is None
-    assert taken("unsure") == taken(Path("unsure")) == "mine, unsure"
     assert taken(folder, None) == taken(folder / INTERVALS_FILE, None) == "mine"
     assert taken(None, None) is None
     assert taken(None, Path("saloon")) == shipped.car

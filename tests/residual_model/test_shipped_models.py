@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.car.car import NO_INTERVALS, UNSURE, Car
+from pdhef_logtool.car.car import NO_INTERVALS, Car
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.table import all_names, make_estimator
 from pdhef_logtool.records.errors import ModelError
@@ -37,13 +37,11 @@ def test_noise_evidence_and_calibration_are_of_the_shipped_network() -> None:
     assert (car.residual_gain, model.physics_sha256) == (0.75, car.physics_of("physics"))
     assert car.notes == ()
     assert {"phy-ukf:tuned", "physics"} == set(car.noise)
-    for chosen in (None, UNSURE):
-        intervals = Car.load("saloon", intervals=chosen).intervals
-        assert intervals is not None
-        by_name = {e.estimator: e.algorithm for e in intervals.entries}
-        assert by_name["pd-hef"].network_sha256 == model.sha256
-        assert by_name["pd-hef"].physics_sha256 == car.physics_of("physics")
-        assert intervals.physics_sha256 == car.physics_sha256
+    assert car.intervals is not None
+    by_name = {e.estimator: e.algorithm for e in car.intervals.entries}
+    assert by_name["pd-hef"].network_sha256 == model.sha256
+    assert by_name["pd-hef"].physics_sha256 == car.physics_of("physics")
+    assert car.intervals.physics_sha256 == car.physics_sha256
     assert Car.load("saloon", intervals=NO_INTERVALS).intervals is None
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.car.car import HISTORY_FILE, INTERVALS_FILE, NOISE_FILE, UNSURE_FILE, Car
+from pdhef_logtool.car.car import INTERVALS_FILE, Car
 from studies.defaults import train_default
 
 pytestmark = [pytest.mark.fleet, pytest.mark.slow]
@@ -39,10 +39,7 @@ def test_noise_and_intervals_of_a_car_are_made_from_its_validation_drives(
     noise = after.noise["phy-ukf:tuned"]
     assert noise.trial is not None and noise.trial < 4 and noise != before.noise["phy-ukf:tuned"]
     assert after.noise["physics"] == before.noise["physics"]
-    documents = [json.loads((car / name).read_text()) for name in (INTERVALS_FILE, UNSURE_FILE)]
-    assert [d["spread"] for d in documents] == [0.08, 0.2]
-    for document in documents:
-        assert {"pd-hef", "physics", "phy-ukf:tuned"} <= {e["estimator"] for e in document["entries"]}
-        assert [d["name"] for d in document["drives"]] == sorted(LOGS)
-    parts = [json.loads(line)["part"] for line in (car / HISTORY_FILE).read_text().splitlines()[-2:]]
-    assert parts == [NOISE_FILE, INTERVALS_FILE]
+    document = json.loads((car / INTERVALS_FILE).read_text())
+    assert document["spread"] == 0.08
+    assert {"pd-hef", "physics", "phy-ukf:tuned"} <= {e["estimator"] for e in document["entries"]}
+    assert [d["name"] for d in document["drives"]] == sorted(LOGS)
