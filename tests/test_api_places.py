@@ -13,7 +13,7 @@ from pdhef_logtool.logs.definitions import read_definitions
 
 KINDS = [str, Path]
 MAPPING = '[signals.yaw_rate_rad_s]\ntopic = "/imu/data"\nfield = "angular_velocity.z"\n'
-FILES = ("car", "cars", "mapping", "msgs", "plan", "network", "intervals")
+FILES = ("car", "cars", "mapping", "msgs", "plan", "network")
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +47,8 @@ def test_inspect_log(dlc: Path, mapping: Path, tmp_path: Path, kind: Any) -> Non
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_car_load(sample_logs_dir: Path, kind: Any) -> None:
-    car = pdhef.Car.load(kind(sample_logs_dir / "vehicle.toml"), network=kind("default"), intervals=kind("none"))
+    car = pdhef.Car.load(kind(sample_logs_dir / "vehicle.toml"), network=kind("default"))
     assert car.network is not None
-    assert car.intervals is None
 
 
 @pytest.mark.parametrize("kind", KINDS)

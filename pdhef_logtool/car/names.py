@@ -1,4 +1,4 @@
-"""Words that are accepted in place of the path of a car or of its intervals."""
+"""Words that are accepted in place of the path of a car."""
 
 from __future__ import annotations
 
@@ -6,6 +6,3 @@ from pathlib import Path
 
 #: Cars of the package, by name.
 SHIPPED_CARS = {"saloon": Path(__file__).parents[1] / "models" / "default"}
-#: Names in place of an intervals file: uncalibrated intervals of the estimators; wide intervals for a car that may
-#: differ from its vehicle file.
-NO_INTERVALS, UNSURE = "none", "unsure"

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.names import NO_INTERVALS
 from pdhef_logtool.car.store import check_output, update_car
 from pdhef_logtool.learning.drives import (
     CALIBRATE,
@@ -84,7 +83,7 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
         raise UsageError(
             expected="a car's folder", got=output.name, where="--output", remedy="a car has more than a file contains"
         )
-    car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
+    car = Car.load(config.car, network=NO_MODEL)
     if config.car is None:
         reporter.warn(f"no --car: mass, geometry and priors come from the default {car.datasheet.name}")
     check_output(car, output)

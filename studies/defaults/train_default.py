@@ -1,4 +1,4 @@
-"""Regenerate the shipped car: simulate, fit, extract, train, tune, calibrate.
+"""Regenerate the shipped car: simulate, fit, extract, train, tune.
 
     python -m studies.defaults.train_default [--seed 0] [-o FOLDER] [--work out/train-default] [--steps STEP ...]
 
@@ -26,11 +26,9 @@ import torch
 
 from pdhef_logtool.car.car import (
     FIT_FILE,
-    INTERVALS_FILE,
     NETWORK_FOLDER,
     NOISE_FILE,
     SHIPPED_CARS,
-    UNSURE_FILE,
     VEHICLE_FILE,
     Car,
 )
@@ -46,7 +44,6 @@ from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import MODELS, NOMINAL_MODEL, PAPER_FOLDER, PHYSICS_MODEL
 from pdhef_logtool.runs.config import RunConfig
 from studies.defaults import fit_physics, paper_drives
-from studies.defaults.intervals import fit_intervals
 from studies.defaults.noise import tune
 from studies.pages import SAMPLE_VEHICLE, options
 
@@ -61,9 +58,6 @@ PAPER_DRIVES, PAPER_RESIDUALS = "paper", "paper-residuals"
 #: An epoch of the paper's network is one batch of windows of 6.4 s, so that 200 epochs take less than half an hour.
 PAPER_WINDOWS: dict[str, Any] = {"piece_steps": 640, "pieces_per_epoch": 64, "chunk_steps": 25}
 TRIALS = 64
-#: Relative errors of friction and vehicle files that the intervals allow for: of a usual car (load alone causes such
-#: errors), and of a car that may have changed.
-USUAL_SPREAD, UNSURE_SPREAD = 0.08, 0.2
 MAPPING = """# Recognised types, and the friction that the simulator drove on.
 fill_recognised = true
 
@@ -165,19 +159,11 @@ def noise(t: Training) -> None:
     update_car(task.car, t.car, tune(task, t.trials))
 
 
-def intervals(t: Training) -> None:
-    """Calibrate the intervals: for a car that is nearly as in its file, and for a car that may have changed."""
-    task = t.validation_task()
-    for spread, place in ((USUAL_SPREAD, t.car), (UNSURE_SPREAD, t.work / "unsure")):
-        update_car(task.car, place, fit_intervals(task, spread))
-    shutil.copyfile(t.work / "unsure" / INTERVALS_FILE, t.car / UNSURE_FILE)
-
-
 STEPS: dict[str, Callable[[Training], None]] = {
-    step.__name__: step for step in (simulate, fit, extract, train, paper, noise, intervals)
+    step.__name__: step for step in (simulate, fit, extract, train, paper, noise)
 }
 #: Seeds other than 0 take these parts from the shipped car.
-ONLY_OF_SEED_0 = ("fit", "noise", "intervals")
+ONLY_OF_SEED_0 = ("fit", "noise")
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.car.car import SHIPPED_CARS, Car, load_intervals
+from pdhef_logtool.car.car import SHIPPED_CARS, Car
 from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.evaluation.validation_plan import load_plan
 from pdhef_logtool.logs.can_decoding import load_dbc
@@ -79,7 +79,7 @@ def _model(path: Path) -> object:
 def _part(path: Path) -> object:
     """Read the car that this part stands in."""
     shutil.copy(CAR / "vehicle.toml", path.parent)
-    return Car.load(path.parent, network="none", intervals="none")
+    return Car.load(path.parent, network="none")
 
 
 LOADERS = [
@@ -89,7 +89,6 @@ LOADERS = [
     Loader("vehicle.toml", read_vehicle_file, tomllib.loads((CAR / "vehicle.toml").read_text())),
     Loader("fit.toml", _part, VALID_FIT),
     Loader("noise.toml", _part, tomllib.loads((CAR / "noise.toml").read_text())),
-    Loader("intervals.json", load_intervals, json.loads((CAR / "intervals.json").read_text())),
     Loader(DOCUMENT_FILE, _model, json.loads((SHIPPED / DOCUMENT_FILE).read_text())),
     Loader(
         "regression.json",
@@ -196,7 +195,7 @@ def test_what_cannot_be_read_is_one_line(loader: Loader, tmp_path: Path) -> None
         assert outcome(loader, path)
     path.unlink()
     path.mkdir()
-    assert any(word in outcome(loader, path) for word in ("directory", "folder")) or loader.name == "intervals.json"
+    assert any(word in outcome(loader, path) for word in ("directory", "folder"))
 
 
 @every_loader

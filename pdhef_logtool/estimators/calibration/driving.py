@@ -12,12 +12,14 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.calibration.single_track import AY, FRICTION, SPEED, STEER, YAW_RATE
 from pdhef_logtool.estimators.speed_slip import believable
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 
 #: Step of the grid. The model is valid to 4 Hz; the integration is exact for tyre lags (12 ms at 40 m/s).
 STEP_S = 0.02
 #: Minimum length of a stretch; longest gap to interpolate, in general and for the speed, which varies slowly.
 LEAST_STRETCH_S, BRIDGED_S, SPEED_BRIDGED_S = 2.0, 0.3, 0.6
+#: Longest driving of one log in a fit, and length of the pieces from which it is selected.
+MOST_S, PIECE_S = 300.0, 10.0
 
 _COLUMNS = 5
 _PAUSE_CELLS = 100
@@ -45,6 +47,17 @@ class Driving:
     def seconds(self) -> float:
         """Driving in all stretches."""
         return float(np.sum(np.diff(self.stretches, axis=1))) * STEP_S
+
+    def informative(self) -> Driving:
+        """Return the same grid with at most :data:`MOST_S` of driving: the pieces in which a_y varies most."""
+        if self.seconds <= MOST_S:
+            return self
+        size, ay = round(PIECE_S / STEP_S), self.columns[AY]
+        pieces = [slice(k, min(k + size, last)) for first, last in self.stretches for k in range(first, last, size)]
+        inside = np.zeros(ay.size, dtype=np.bool_)
+        for piece in sorted(pieces, key=lambda p: -float(np.var(ay[p])))[: round(MOST_S / PIECE_S)]:
+            inside[piece] = True
+        return replace(self, stretches=_long(_spans(inside)))
 
     def between(self, first: int, last: int) -> Driving:
         """Return the same grid with the stretches between two cells alone."""
@@ -105,8 +118,13 @@ def _bridged(values: FloatArray, most: int) -> FloatArray:
 def _stretches(columns: FloatArray, least_speed_m_s: float) -> IntArray:
     """Return [first, last) of each stretch that is complete, fast and long enough."""
     good = np.isfinite(columns).all(axis=0) & (columns[SPEED] > least_speed_m_s)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
-    return _long(edges.reshape(-1, 2).astype(np.int64))
+    return _long(_spans(good))
+
+
+def _spans(mask: BoolArray) -> IntArray:
+    """Return [first, last) of each run of true values in a mask [N]."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return edges.reshape(-1, 2).astype(np.int64)
 
 
 def _long(spans: IntArray) -> IntArray:
