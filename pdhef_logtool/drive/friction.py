@@ -63,11 +63,6 @@ class FrictionSource:
             return replace(signals, friction=np.full(len(signals), self.constant))
         return signals
 
-    @property
-    def from_log(self) -> bool:
-        """Whether the log's own friction is used."""
-        return self.label.startswith("topic")
-
 
 def friction_source(
     choice: str | float, vehicle: VehicleParameters, available: frozenset[str], topic: str = ""

@@ -26,7 +26,6 @@ ALL = frozenset({"steer_rad", "ay_m_s2", "friction"})
 def test_the_source_is_named(choice, vehicle, available, label):
     source = friction_source(choice, vehicle, available, "/road.mu")
     assert source.label == label
-    assert source.from_log == label.startswith("topic")
     assert bool(source.note) == label.startswith("assumed")
 
 

@@ -31,7 +31,7 @@ class Driving:
 
     Attributes
     ----------
-    columns : float64 [5, N], steering, speed, yaw rate, a_y and friction on the grid, as ``read_with`` reads them.
+    columns : float64 [5, N], steering, speed, yaw rate, a_y and friction on the grid.
     stamps_ns : int64 [N], end of each cell of the grid.
     stretches : int64 [k, 2], [first, last) of each stretch without a gap above the vehicle's low-speed limit.
     has_ay : whether a_y was measured; if not, the column contains v_x r, which is not compared with the model.
@@ -40,7 +40,6 @@ class Driving:
     columns: FloatArray
     stamps_ns: IntArray
     stretches: IntArray
-    read_with: VehicleParameters
     has_ay: bool = True
 
     @property
@@ -68,7 +67,7 @@ def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
     """Thin the signals of a drive [N] to a grid of cell means."""
     if not len(signals):
         none = np.empty(0, dtype=np.int64)
-        return Driving(np.empty((_COLUMNS, 0)), none, none.reshape(0, 2), vehicle)
+        return Driving(np.empty((_COLUMNS, 0)), none, none.reshape(0, 2))
     signals, _ = believable(signals, vehicle.sensors, None, None)
     start_ns = int(signals.stamps_ns[0])
     cell = (signals.stamps_ns - start_ns) // round(STEP_S * 1e9)
@@ -100,7 +99,7 @@ def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
     if not (has_ay := bool(np.isfinite(columns[AY]).any())):
         columns[AY] = columns[SPEED] * columns[YAW_RATE]
     stretches = _stretches(columns, vehicle.low_speed_blend_m_s)
-    return Driving(columns, stamps_ns, stretches, vehicle, has_ay)
+    return Driving(columns, stamps_ns, stretches, has_ay)
 
 
 def _bridged(values: FloatArray, most: int) -> FloatArray:
