@@ -13,7 +13,7 @@ from pdhef_logtool.logs.definitions import read_definitions
 
 KINDS = [str, Path]
 MAPPING = '[signals.yaw_rate_rad_s]\ntopic = "/imu/data"\nfield = "angular_velocity.z"\n'
-FILES = ("car", "cars", "mapping", "msgs", "plan", "network", "intervals")
+FILES = ("car", "cars", "mapping", "msgs", "plan", "network")
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +44,8 @@ def test_inspect_log(dlc: Path, mapping: Path, tmp_path: Path) -> None:
 
 
 def test_car_load(sample_logs_dir: Path) -> None:
-    car = pdhef.Car.load(str(sample_logs_dir / "vehicle.toml"), network=Path("default"), intervals=Path("none"))
+    car = pdhef.Car.load(str(sample_logs_dir / "vehicle.toml"), network=Path("default"))
     assert car.network is not None
-    assert car.intervals is None
 
 
 def test_run_config() -> None:

@@ -338,7 +338,7 @@ def _without_stuck(signals: Signals, cells: _Cells, names: Sequence[str]) -> tup
     travelled = np.cumsum(np.nan_to_num(cells.ax)) * CELL_S
     columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in names}
     for name, column in columns.items():
-        for start, end, known, unseen in _long_runs(column, cells):
+        for start, end, certain, unseen in _long_runs(column, cells):
             k0, k = cell[start], np.arange(cell[start], cell[end - 1] + 1)
             if name == "steer_rad":
                 expected = steering.table[k, 1:] @ steering.fit[k0]
@@ -349,7 +349,7 @@ def _without_stuck(signals: Signals, cells: _Cells, names: Sequence[str]) -> tup
                 expected = travelled[k] - travelled[k0] - grade * (k - k0)
                 change, limit, std, expected = expected, LEAST_SPEED_CHANGE_M_S, math.nan, np.full(len(k), np.nan)
             is_stuck = (np.abs(change) > limit) | (k - k0 >= unseen)
-            missed = known + np.flatnonzero(is_stuck[known:])
+            missed = certain + np.flatnonzero(is_stuck[certain:])
             if not len(missed):
                 continue
             known_ns = cells.time_of(k[missed[0]] + 1)
@@ -376,13 +376,13 @@ def _without_repeats(signals: Signals, cells: _Cells) -> Signals:
 class _Run(NamedTuple):
     """Rows [start, end) of a value that repeats beyond chance.
 
-    ``known``: cells until chance is excluded. ``unseen``: cells until it repeats ``LONGER`` times as long as any value
+    ``certain``: cells until chance is excluded. ``unseen``: cells until it repeats ``LONGER`` times as long as any value
     before it.
     """
 
     start: int
     end: int
-    known: int
+    certain: int
     unseen: int
 
 

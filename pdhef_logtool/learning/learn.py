@@ -13,7 +13,7 @@ from typing import Any
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel
-from pdhef_logtool.car.names import MODEL_FILE, NO_INTERVALS
+from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.store import check_output, update_car
 from pdhef_logtool.drive.model_file import Sensors
 from pdhef_logtool.drive.reading import read_drive
@@ -84,7 +84,7 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
         raise UsageError(
             expected="a car's folder", got=output.name, where="--output", remedy="a car has more than a file contains"
         )
-    source = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
+    source = Car.load(config.car, network=NO_MODEL)
     if config.car is None:
         reporter.warn(f"no --car: mass, geometry and priors come from the default {source.datasheet.name}")
     check_output(source, output)

@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 
 from pdhef_logtool.car.car import SHIPPED_CARS
-from pdhef_logtool.car.parts import FilterNoise, Fit, FittedSensors, FittedValues, Intervals, LearntOn
+from pdhef_logtool.car.parts import FilterNoise, Fit, FittedSensors, FittedValues, LearntOn
 from pdhef_logtool.car.toml_files import VehicleEntries, part_toml
 from pdhef_logtool.car.vehicle import Record, default_vehicle
 from pdhef_logtool.results.arrow_schema import load_schema
@@ -22,7 +22,6 @@ FOLDER = Path(__file__).parents[2] / "schemas"
 MODELS: dict[str, type[Record]] = {
     "vehicle": VehicleEntries,
     "fit": Fit,
-    "intervals": Intervals,
 }
 every_part = pytest.mark.parametrize("part", MODELS)
 FIT = Fit(

@@ -93,7 +93,7 @@ def rough() -> Signals:
 
 def _calibrated() -> WithoutTruth:
     vehicle = VEHICLE.model_copy(update={"yaw_inertia_kg_m2": 1700.0, "steer_offset_rad": 0.003})
-    return WithoutTruth(vehicle, NOISE, True, "calibrated")
+    return WithoutTruth(vehicle, NOISE, "calibrated")
 
 
 def _taught() -> Car:

@@ -29,7 +29,7 @@ def report(label: str, **changes: Any) -> dict[str, Any]:
         "vehicle": {"name": "golf"},
         "truth": {"available": True, "not_independent": []},
         "answer": {"main": "pd-hef", "naive": "zero"},
-        "friction": {"source": "option, 0.9", "estimated": False},
+        "friction": {"source": "option, 0.9"},
         "checks": [],
         "faults": [],
         "verdicts": [{"signal": "sideslip_rad", "outcome": "better", "text": "x"}],

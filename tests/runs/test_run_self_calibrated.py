@@ -72,7 +72,7 @@ def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the
     assert report["self_calibration"]["understeer"]["contradicts"]
     assert "calibrated on this log without ground truth" in report["answer"]["texts"]["assumed"]
     assert "the understeer gradient of the drive contradicts" in report["answer"]["texts"]["assumed"]
-    assert told["physics"]["intervals"] == ["intervals: own, parameters and d2"]
+    assert told["physics"]["intervals"] == ["intervals: own, parameters and sensors"]
     assert told["open-loop:calibrated"]["intervals"] == []
 
 

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.car.car import SHIPPED_CARS, Car, load_intervals
+from pdhef_logtool.car.car import SHIPPED_CARS, Car
 from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.evaluation.validation_plan import load_plan
 from pdhef_logtool.logs.can_decoding import load_dbc
@@ -86,7 +86,7 @@ def _model(path: Path) -> object:
 def _part(path: Path) -> object:
     """Read the car that this part stands in."""
     shutil.copy(CAR / "vehicle.toml", path.parent)
-    return Car.load(path.parent, network="none", intervals="none")
+    return Car.load(path.parent, network="none")
 
 
 LOADERS = [
@@ -96,7 +96,6 @@ LOADERS = [
     Loader("vehicle.toml", read_vehicle_file, tomllib.loads((CAR / "vehicle.toml").read_text())),
     Loader("fit.toml", _part, VALID_FIT),
     Loader("model.toml", _part, VALID_MODEL),
-    Loader("intervals.json", load_intervals, json.loads((CAR / "intervals.json").read_text())),
     Loader(DOCUMENT_FILE, _model, json.loads((SHIPPED / DOCUMENT_FILE).read_text())),
     Loader(
         "regression.json", load_linear_model, json.loads((SHIPPED / "baselines" / "linear-regression.json").read_text())
@@ -207,10 +206,10 @@ def test_what_cannot_be_read_is_one_line(loader: Loader, tmp_path: Path) -> None
     if path.suffix == ".json":
         for document in ([], [1], "text", 3, None, True):
             line = outcome(loader, write(path, document))
-            assert f"a {type(document).__name__} instead of named entries" in line or loader.load is load_intervals
+            assert f"a {type(document).__name__} instead of named entries" in line
     path.unlink()
     path.mkdir()
-    assert any(word in outcome(loader, path) for word in ("directory", "folder")) or loader.name == "intervals.json"
+    assert any(word in outcome(loader, path) for word in ("directory", "folder"))
 
 
 def test_nesting_up_to_the_limit_is_read(tmp_path: Path) -> None:
