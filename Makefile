@@ -68,7 +68,7 @@ lock: $(VENV)/installed-release
 	mv constraints.new constraints.txt
 
 demo: $(VENV)/installed $(VENV)/compiled
-	$(BIN)/pdhef run sample_logs/dlc.mcap sample_logs/road.mcap -o $(OUT) --car $(CAR)
+	$(BIN)/pdhef run sample_logs/dlc.mcap sample_logs/road.mcap -o $(OUT) --car $(CAR) --plan sample_logs/plan.toml
 	$(BIN)/pdhef run sample_logs/sweep.mcap -o $(OUT)-low-friction --car $(CAR) --friction 0.3
 	@echo
 	@echo "Outputs: $(OUT)/ and $(OUT)-low-friction/"

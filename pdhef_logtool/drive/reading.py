@@ -9,7 +9,7 @@ from typing import Self
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.checks.changed import CHANGE_SUFFIX, change_checks
+from pdhef_logtool.drive.checks import CHANGE_SUFFIX, change_checks
 from pdhef_logtool.drive.friction import FrictionSource, friction_source
 from pdhef_logtool.drive.model_file import CLOCK_START_S, Sensors, is_device_clock, with_earlier_drive
 from pdhef_logtool.drive.options import AS_IT_IS, AUTO, OFF, ReadOptions, time_slice
