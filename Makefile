@@ -68,7 +68,7 @@ lock: $(VENV)/installed-release
 	mv constraints.new constraints.txt
 
 demo: $(VENV)/installed $(VENV)/compiled
-	$(BIN)/pdhef run sample_logs/dlc.mcap sample_logs/road.mcap -o $(OUT) --car $(CAR)
+	$(BIN)/pdhef run sample_logs/dlc.mcap sample_logs/road.mcap -o $(OUT) --car $(CAR) --plan sample_logs/plan.toml
 	$(BIN)/pdhef run sample_logs/sweep.mcap -o $(OUT)-low-friction --car $(CAR) --friction 0.3
 	@echo
 	@echo "Outputs: $(OUT)/ and $(OUT)-low-friction/"
@@ -137,7 +137,7 @@ gates-quick: $(VENV)/installed-dev $(VENV)/compiled
 gates-freeze: $(VENV)/installed-dev $(VENV)/compiled
 	$(GATES) --freeze $$(git rev-parse --short=8 HEAD)
 
-# List the stages and durations: python -m studies.recalibrate --list. Run some: make recalibrate ONLY="noise gain".
+# List the stages and durations: python -m studies.recalibrate --list. Run some: make recalibrate ONLY="fit intervals".
 recalibrate: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.recalibrate $(if $(ONLY),--only $(ONLY))
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.drive.reading import Drive as Drive
     from pdhef_logtool.drive.reading import read_drive as read_drive
     from pdhef_logtool.learning.drives import LearnSettings as LearnSettings
-    from pdhef_logtool.learning.engine import learn as learn
+    from pdhef_logtool.learning.learn import learn as learn
     from pdhef_logtool.learning.network.extract_command import ExtractSettings as ExtractSettings
     from pdhef_logtool.learning.network.extract_command import extract as extract
     from pdhef_logtool.learning.network.train_command import run_training as train  # noqa: F401
@@ -36,7 +36,7 @@ _HOMES = {
     "read_drive": "drive.reading",
     "inspect_log": "runs.inspection",
     "LearnSettings": "learning.drives",
-    "learn": "learning.engine",
+    "learn": "learning.learn",
     "ExtractSettings": "learning.network.extract_command",
     "extract": "learning.network.extract_command",
     "train": "learning.network.train_command:run_training",

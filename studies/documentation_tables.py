@@ -13,7 +13,7 @@ from typing import Any
 
 from pdhef_logtool.car.assumed_values import RULES
 from pdhef_logtool.car.vehicle import Sensors
-from pdhef_logtool.drive.checks import registry as checks
+from pdhef_logtool.drive.check_table import TABLE
 from pdhef_logtool.evaluation.metrics import registry as metrics
 from pdhef_logtool.runs.config import RunConfig
 
@@ -34,9 +34,9 @@ def _metrics() -> Iterator[str]:
 def _checks() -> Iterator[str]:
     yield "| check | compares | fails where | remedy |"
     yield "| --- | --- | --- | --- |"
-    for kind in checks.registered().values():
-        remedy = re.sub(r"{\w+(:[^}]*)?}", "…", kind.remedy)
-        yield f"| `{kind.name}` | {kind.compares} | {kind.fails} | {'–' if remedy == '…' else remedy} |"
+    for name, entry in TABLE.items():
+        remedy = re.sub(r"{\w+(:[^}]*)?}", "…", entry["remedy"])
+        yield f"| `{name}` | {entry['compares']} | {entry['fails']} | {'–' if remedy == '…' else remedy} |"
 
 
 def _settings() -> Iterator[str]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import permutations
@@ -165,8 +166,8 @@ def learn(tool: Tool, car: Path, parts: Sequence[TeachPart], name: str) -> tuple
     output = tool.work / "cars" / name
     _, *options_of = inputs(tool, parts[0])  # parts that teach together have the same mapping and slice
     tool.json("learn", *(DRIVES / part.log for part in parts), *options_of, "--car", car, "-o", output)
-    taught = json.loads((output / "taught.json").read_text(encoding="utf-8"))
-    return output, (taught.get("residual") or {}).get("rung", "none")
+    taught = tomllib.loads((output / "model.toml").read_text(encoding="utf-8"))
+    return output, taught.get("residual", {}).get("rung", "none")
 
 
 def learn_by_reference(tool: Tool, car: Path, part: TeachPart, name: str) -> Path | None:

@@ -11,6 +11,9 @@ from dataclasses import dataclass, field
 from email.utils import formatdate
 from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from tempfile import TemporaryDirectory
+
+import pytest
 
 
 @dataclass(frozen=True)
@@ -49,11 +52,11 @@ class CountingServer:
         return sum(r.end - r.start for r in self.requests)
 
     def twice(self) -> int:
-        """Return how many bytes went out more than once, by file."""
+        """Return how many bytes went out more than once, by file; a request of a byte is a check of the version."""
         total = 0
         for path in {r.path for r in self.requests}:
             reached = 0
-            for start, end in sorted((r.start, r.end) for r in self.requests if r.path == path):
+            for start, end in sorted((r.start, r.end) for r in self.requests if r.path == path and r.end > r.start + 1):
                 total += max(0, min(reached, end) - start)
                 reached = max(reached, end)
         return total
@@ -126,8 +129,16 @@ def _etag(data: bytes) -> str:
 
 
 @contextmanager
+def empty_cache() -> Iterator[None]:
+    """Use an empty cache folder for remote logs."""
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PDHEF_CACHE_DIR", folder)
+        yield
+
+
+@contextmanager
 def serving(**files: bytes) -> Iterator[CountingServer]:
-    """Serve files, by path, until the block ends."""
+    """Serve files, by path, until the block ends; no earlier command has fetched any."""
     of = CountingServer(dict(files))
     handler = type("Handler", (_Handler,), {"of": of})
     server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
@@ -136,7 +147,8 @@ def serving(**files: bytes) -> Iterator[CountingServer]:
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
     thread.start()
     try:
-        yield of
+        with empty_cache():
+            yield of
     finally:
         server.shutdown()
         server.server_close()

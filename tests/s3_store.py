@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from tests.counting_server import empty_cache
+
 #: moto keeps its buckets for the life of the process, whichever server they were made through.
 _numbers = itertools.count(1)
 
@@ -58,7 +60,7 @@ def s3_store() -> Iterator[S3Store]:
     server.start()
     host, port = server.get_host_and_port()
     try:
-        with pytest.MonkeyPatch.context() as patch:
+        with empty_cache(), pytest.MonkeyPatch.context() as patch:
             patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
             for name, value in (("ACCESS_KEY_ID", "key"), ("SECRET_ACCESS_KEY", "hidden")):
                 patch.setenv(f"AWS_{name}", value)

@@ -31,7 +31,7 @@ def test_the_api_page_runs_as_it_stands(sample_logs_dir: Path, tmp_path: Path) -
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "adaptive-physics" in done.stdout
-    assert (tmp_path / "out" / "mycar" / "taught.json").is_file()
+    assert (tmp_path / "out" / "mycar" / "model.toml").is_file()
 
 
 def test_importing_the_package_loads_nothing() -> None:

@@ -1,8 +1,8 @@
 """Parameters and identified parts of one vehicle, for estimators and commands.
 
-A car is a folder. The user writes ``vehicle.toml``, and no command changes it; each command writes its part beside it
-(:mod:`~.parts`). A single ``vehicle.toml`` is a car without parts. A part with a changed basis is stale: it is not
-used, and the car has a note.
+A car is a folder. The user writes ``vehicle.toml``, and no command changes it; ``learn`` writes ``model.toml`` beside
+it, ``train`` the folder ``network``. The shipped car has ``fit.toml`` (:mod:`~.parts`). A single
+``vehicle.toml`` is a car without parts. A part of another vehicle file is not used, and the car has a note.
 """
 
 from __future__ import annotations
@@ -10,9 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, AssumedValue
+from pdhef_logtool.car.model import GROUND_TRUTH, CarModel, TaughtParameter, read_model
+from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.names import SHIPPED_CARS as SHIPPED_CARS
 from pdhef_logtool.car.parts import (
     PHYSICS,
@@ -21,12 +23,10 @@ from pdhef_logtool.car.parts import (
     FittedPhysics,
     FittedValues,
     LearntOn,
-    Noise,
     physics_sha256,
 )
-from pdhef_logtool.car.taught import GROUND_TRUTH, Taught, TaughtParameter
 from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file, with_sensors
-from pdhef_logtool.car.vehicle import DEFAULT_VEHICLE_NAME, Record, VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import DEFAULT_VEHICLE_NAME, VehicleParameters, default_vehicle
 from pdhef_logtool.records.errors import VehicleError
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
@@ -38,18 +38,15 @@ from pdhef_logtool.residual_model.bundle import (
     load_bundle,
 )
 from pdhef_logtool.residual_model.interface import PlugInModel, load_plug_in, plug_in_names
-from pdhef_logtool.storage.documents import read_json, read_toml, validated
+from pdhef_logtool.storage.documents import read_toml, validated
 
-VEHICLE_FILE, FIT_FILE, NOISE_FILE = "vehicle.toml", "fit.toml", "noise.toml"
-HISTORY_FILE = "history.jsonl"
+VEHICLE_FILE, FIT_FILE = "vehicle.toml", "fit.toml"
+NETWORK_FOLDER = "network"
 #: Part of earlier versions.
 INTERVALS_FILE = "intervals.json"
-NETWORK_FOLDER = "network"
-TAUGHT_FILE = "taught.json"
 #: Number of digits of a hash in messages.
 SHOWN_DIGITS = 12
 
-PartT = TypeVar("PartT", bound=Record)
 #: A file or folder, or the name of a shipped one.
 Place = Path | str | None
 
@@ -79,9 +76,9 @@ class Car:
     ----------
     vehicle : physics and sensors, including identified values.
     datasheet : physics and sensors from the user's file.
-    noise : of filters, by the name of :data:`~.parts.NOISY_FILTERS`; only noise that belongs to ``vehicle``.
+    noise : of filters, by the name of :data:`~.parts.NOISY_FILTERS`.
     fitted_physics : values and noise identified with the filter ``physics``, None without.
-    taught : prior and residual from drives with ground truth, for the calibration of later drives; None without.
+    model : prior of the calibration, and residual, from earlier drives; None without.
     network, network_name : the residual network, None without.
     network_gain : residual gain of ``pd-hef``; None: 1 with a network that was trained with these physics, otherwise 0.
     learnt_on : drives on which ``vehicle`` was identified.
@@ -98,7 +95,7 @@ class Car:
     network_gain: float | None = None
     learnt_on: tuple[LearntOn, ...] = ()
     fitted_physics: FittedPhysics | None = None
-    taught: Taught | None = None
+    model: CarModel | None = None
     self_calibrated: WithoutTruth | None = None
     assumed: tuple[AssumedValue, ...] = ()
     source: Path | None = None
@@ -164,10 +161,6 @@ class Car:
         """Return the digest of the physics that a filter uses and its noise belongs to."""
         return physics_sha256(self.physics_vehicle if name == PHYSICS else self.vehicle)
 
-    def owns_noise(self, name: str, noise: FilterNoise) -> bool:
-        """Whether the noise of a filter belongs to the physics of this car."""
-        return noise.physics_sha256 in (None, self.physics_of(name))
-
     @property
     def residual_network(self) -> ModelBundle | PlugInModel | None:
         """The network if its residual is of ``physics``; the paper's network predicts the residual of ``phy-ukf``."""
@@ -182,8 +175,8 @@ class Car:
 
     @property
     def taught_prior(self) -> tuple[TaughtParameter, ...]:
-        """Prior of the calibration from drives with ground truth; empty without."""
-        return () if self.taught is None else self.taught.parameters
+        """Prior of the calibration from earlier drives; empty without."""
+        return () if self.model is None else self.model.parameters
 
     @property
     def has_evidence(self) -> bool:
@@ -211,14 +204,13 @@ class Car:
     def with_fit(self, fit: Fit) -> Car:
         """Return the car with identified parameters; a residual gain of other parameters is dropped."""
         vehicle = fit.values.applied_to(self.datasheet)
-        fitted_car = replace(self, vehicle=vehicle, fitted_physics=fit.physics)
         if vehicle != self.datasheet and not vehicle.name.endswith("(identified)"):
             vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} (identified)"})
-        noise = {n: noise for n, noise in self.noise.items() if fitted_car.owns_noise(n, noise)} | fit.filter
-        if fit.physics is not None:
-            noise[PHYSICS] = fit.physics.noise
+        noise = dict(fit.filter) if fit.physics is None else fit.filter | {PHYSICS: fit.physics.noise}
         gain = self.network_gain if vehicle == self.datasheet else None
-        return replace(fitted_car, vehicle=vehicle, noise=noise, network_gain=gain, learnt_on=fit.drives)
+        return replace(
+            self, vehicle=vehicle, noise=noise, network_gain=gain, fitted_physics=fit.physics, learnt_on=fit.drives
+        )
 
     def with_noise(self, name: str, noise: FilterNoise) -> Car:
         """Return the car with different noise of one filter."""
@@ -250,38 +242,32 @@ def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:
 
 
 def _with_parts(car: Car, folder: Path) -> Car:
-    """Return the car with the valid parts of its folder: ``taught.json``, or fit and noise."""
+    """Return the car with the valid parts of its folder: ``model.toml``, or a fit."""
     notes: list[str] = []
-    taught = _part(folder / TAUGHT_FILE, Taught)
-    if taught is not None and taught.physics_sha256 == physics_sha256(car.datasheet):
-        others = [name for name in (FIT_FILE, NOISE_FILE) if (folder / name).is_file()]
-        if others:
-            notes.append(f"{', '.join(others)}: not used, {TAUGHT_FILE} takes their place")
-        if taught.truth != GROUND_TRUTH:
-            notes.append(f"{TAUGHT_FILE}: taught by {taught.truth}")
-        return replace(car, taught=taught, notes=tuple(notes))
-    if taught is not None:
-        notes.append(f"{TAUGHT_FILE} is not used: {VEHICLE_FILE} has changed since; pdhef learn creates it again")
-    fit = _part(folder / FIT_FILE, Fit)
-    if fit is not None and fit.physics_sha256 == physics_sha256(car.datasheet):
-        car = car.with_fit(fit)
-    elif fit is not None:
-        notes.append(f"{FIT_FILE} is not used: {VEHICLE_FILE} has changed since")
-    tuned = _part(folder / NOISE_FILE, Noise)
-    noise: Mapping[str, FilterNoise] = {} if tuned is None else tuned.filter
-    if stale := [n for n, of_filter in noise.items() if not car.owns_noise(n, of_filter)]:
-        notes.append(f"noise of {', '.join(stale)} is not used: it belongs to other physics")
-    noise = {**car.noise, **{n: of_filter for n, of_filter in noise.items() if n not in stale}}
-    return replace(car, noise=noise, notes=tuple(notes))
+    if (folder / MODEL_FILE).is_file():
+        model = read_model(folder / MODEL_FILE)
+        if model.belongs_to(car.datasheet):
+            if (folder / FIT_FILE).is_file():
+                notes.append(f"{FIT_FILE}: not used, {MODEL_FILE} takes its place")
+            if model.truth not in ("", GROUND_TRUTH):
+                notes.append(f"{MODEL_FILE}: taught by {model.truth}")
+            return replace(car, model=model, notes=tuple(notes))
+        notes.append(f"{MODEL_FILE} is not used: {VEHICLE_FILE} has changed since; pdhef learn creates it again")
+    if (folder / FIT_FILE).is_file():
+        fit = read_fit(folder / FIT_FILE)
+        if fit.physics_sha256 == physics_sha256(car.datasheet):
+            car = car.with_fit(fit)
+        else:
+            notes.append(f"{FIT_FILE} is not used: {VEHICLE_FILE} has changed since")
+    return replace(car, notes=tuple(notes))
 
 
-def _part(path: Path, kind: type[PartT]) -> PartT | None:
-    """Return a part of a folder, None without its file; raises VehicleError."""
-    if not path.exists():
-        return None
-    what = f"a car's {path.name}"
-    raw = read_json(path, what, VehicleError) if path.suffix == ".json" else read_toml(path, what, VehicleError)
-    return validated(kind, raw, str(path), VehicleError, expected=f"the entries of {what}")
+def read_fit(path: Path) -> Fit:
+    """Read a fit.toml; raises VehicleError."""
+    what = "a car's fit.toml"
+    return validated(
+        Fit, read_toml(path, what, VehicleError), str(path), VehicleError, expected=f"the entries of {what}"
+    )
 
 
 def _network_of(folder: Path | None, chosen: Place) -> tuple[str, Path | None]:

@@ -1,4 +1,4 @@
-"""Parts of a car, one per command: fit, noise, intervals.
+"""Parts of a car: fit.
 
 Each part contains the digest of its inputs. If an input has changed, the part is stale and is not used.
 """
@@ -116,7 +116,6 @@ class FilterNoise(Record):
         the two axle forces. Empty for the filter's default.
     r_std : by measurement; the filter's default for missing ones.
     limit_gain : growth of the process noise of the axle forces of ``physics`` beyond the linear range; 0 without.
-    physics_sha256 : of the physics that it belongs to.
     score_deg : objective of the noise search, lower is better; None without a search. trial : number of its trial.
     """
 
@@ -125,7 +124,6 @@ class FilterNoise(Record):
         Field(default_factory=dict)
     )
     limit_gain: NonNegative = 0.0
-    physics_sha256: Sha256 | None = None
     score_deg: Positive | None = None
     trial: int | None = None
 
@@ -181,8 +179,8 @@ class FittedPhysics(Record):
 class Fit(Record):
     """``fit.toml``: identified physics of the car.
 
-    The noise in ``filter`` was identified together with the values (docs/method.md#identification). ``physics``
-    contains the values and noise of the filter ``physics``, which has other model parts and is identified separately.
+    ``filter`` : noise of the filters with ``values`` (docs/method.md#noise). ``physics`` : values and noise of the
+    filter ``physics``, which has other model parts and is identified separately.
     """
 
     format: Literal["pdhef-fit"] = "pdhef-fit"
@@ -191,18 +189,6 @@ class Fit(Record):
     values: FittedValues = FittedValues()
     filter: FilterTables = Field(default_factory=dict)
     physics: FittedPhysics | None = None
-    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
-    scores: dict[str, dict[str, float]] = Field(default_factory=dict)
-    notes: Annotated[tuple[str, ...], Field(strict=False)] = ()
-
-
-class Noise(Record):
-    """``noise.toml``: noise by filter, and the search for it."""
-
-    format: Literal["pdhef-noise"] = "pdhef-noise"
-    version: Literal[1] = 1
-    filter: FilterTables
-    search: dict[str, Any] = Field(default_factory=dict)
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
 
 
@@ -235,14 +221,3 @@ class Algorithm(Record):
         """Algorithm, version and options as text."""
         options = ", ".join(f"{name}={self.options[name]}" for name in sorted(self.options))
         return f"{self.algorithm} {self.version}{options and f' ({options})'}"
-
-
-class HistoryLine(Record):
-    """A line of ``history.jsonl``: which command wrote which part from which drives, with which options."""
-
-    command: str
-    part: str
-    sha256: Sha256
-    version: str
-    settings: dict[str, Any] = Field(default_factory=dict)
-    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()

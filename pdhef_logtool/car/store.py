@@ -1,51 +1,23 @@
-"""Atomic change of a part in a car's folder.
+"""Atomic change of files in a car's folder.
 
 A new folder is written beside the old one and exchanged with it, so that a reader sees one of the two.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from pdhef_logtool.car.car import (
-    HISTORY_FILE,
-    VEHICLE_FILE,
-    Car,
-)
-from pdhef_logtool.car.parts import HistoryLine, LearntOn
+from pdhef_logtool.car.car import VEHICLE_FILE, Car
 from pdhef_logtool.car.toml_files import vehicle_toml
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.version import __version__
-from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.files import write_bytes, writing
 from pdhef_logtool.storage.outputs import LOCK_FILE, FolderLock, FolderTransaction
 
 #: Timeout for waiting until another command has changed the same car.
 LONGEST_WAIT_S = 60.0
-
-
-@dataclass(frozen=True, slots=True)
-class Change:
-    """A command's change of a car.
-
-    Attributes
-    ----------
-    command : its name. part : the file of the part that it wrote, by name in the folder.
-    files : content of the part's file and of related files (records, plots), by name in the folder.
-    settings, drives : of the command, for the history.
-    """
-
-    command: str
-    part: str
-    files: Mapping[str, bytes]
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    drives: Iterable[LearntOn] = ()
 
 
 def check_output(source: Car, output: Path) -> None:
@@ -81,8 +53,8 @@ def vehicle_file(car: Car) -> bytes:
     return (car.source / VEHICLE_FILE if car.source.is_dir() else car.source).read_bytes()
 
 
-def update_car(source: Car, output: Path, change: Change) -> Path:
-    """Write a change into the car's folder ``output``; return the path of the part.
+def update_car(source: Car, output: Path, files: Mapping[str, bytes]) -> None:
+    """Write files, by name, into the car's folder ``output``.
 
     A new folder contains the source's vehicle.toml and parts as well. ``output`` may be the source itself.
 
@@ -105,9 +77,8 @@ def update_car(source: Car, output: Path, change: Change) -> Path:
                 shutil.copytree(base, fresh, dirs_exist_ok=True, ignore=shutil.ignore_patterns(f"{LOCK_FILE}*"))
             else:
                 write_bytes(fresh / VEHICLE_FILE, vehicle_file(source))
-            for name, content in change.files.items():
+            for name, content in files.items():
                 write_bytes(fresh / name, content)
-            _log(fresh, change)
             lock.hold_next(fresh)
     except BaseException:
         if new:
@@ -116,17 +87,3 @@ def update_car(source: Car, output: Path, change: Change) -> Path:
         raise
     finally:
         lock.release()
-    return output / change.part
-
-
-def _log(folder: Path, change: Change) -> None:
-    line = HistoryLine(
-        command=change.command,
-        part=change.part,
-        sha256=digest((folder / change.part).read_text(encoding="utf-8")),
-        version=__version__,
-        settings=dict(change.settings),
-        drives=tuple(change.drives),
-    )
-    with (folder / HISTORY_FILE).open("a", encoding="utf-8") as file:
-        file.write(json.dumps(line.model_dump(mode="json"), sort_keys=True, ensure_ascii=False) + "\n")

@@ -85,10 +85,10 @@ def vehicle_of_entries(raw: Mapping[str, Any], *, where: str) -> VehicleFile:
     return VehicleFile(vehicle, None if file.network is None else file.network.gain, assumed)
 
 
-def part_toml(part: Record, head: str, comments: Mapping[str, str] | None = None) -> str:
-    """Return a part of a car's folder as TOML with ``head`` above it and ``comments`` on entries by dotted name."""
+def part_toml(part: Record, head: str) -> str:
+    """Return a part of a car's folder as TOML with ``head`` above it."""
     plain: dict[str, Any] = part.model_dump(mode="json", exclude_none=True)
-    return toml_text({k: v for k, v in plain.items() if v not in ([], {})}, head, comments)
+    return toml_text({k: v for k, v in plain.items() if v not in ([], {})}, head)
 
 
 def vehicle_toml(vehicle: VehicleParameters, head: str = "") -> str:

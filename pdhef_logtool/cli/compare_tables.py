@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rich.text import Text
 
 from pdhef_logtool.cli.console import print_indented, table, three_lines
-from pdhef_logtool.cli.plan_tables import joined, plan_line, render_plan
+from pdhef_logtool.cli.plan_tables import plan_line, render_plan
 from pdhef_logtool.evaluation.units import read_unit
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.comparison_words import (
@@ -37,7 +37,7 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
     """Print a comparison: verdict, assumptions and next step, then their basis."""
     requirements = comparison.requirements
     said = "; gate closed: ".join((verdict_text(comparison), *comparison.failures))
-    result = said if requirements is None else joined(plan_line(requirements), said, requirements.plan.file)
+    result = said if requirements is None else Text.assemble(said, "; ", plan_line(requirements))
     console.print(three_lines(result, assumed_text(comparison), next_text(comparison)))
     console.print()
     console.print(Text.assemble(("A ", "bold"), comparison.a, ("  B ", "bold"), comparison.b), soft_wrap=True)

@@ -25,21 +25,19 @@ def learn(
         Path, Option("--output", "-o", metavar="CAR", help="Folder of the car to write; may equal --car.")
     ],
     config: RunConfig,
-    stages: Annotated[str, Option(help="Stage: teach or calibrate.")] = "teach",
-    seed: Annotated[int, Option(help="Seed of the residual's random features.")] = 0,
     split: Annotated[
         str | None,
         Option(help="Only drives of this split of a simulated set; any: also of splits that are refused by default."),
     ] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Learn the prior and the residual of a car, or calibrate it."""
+    """Learn a car from its drives: parameters for later drives and, with ground truth, a residual."""
     from pdhef_logtool.learning.drives import LearnSettings
-    from pdhef_logtool.learning.engine import learn as run_stage
+    from pdhef_logtool.learning.learn import learn as learn_car
 
-    settings = LearnSettings(config=config, stage=stages, seed=seed, split=split)
+    settings = LearnSettings(config=config, split=split)
     with console.reporter() as reporter:
-        result = run_stage(logs, output, settings, reporter=reporter)
+        result = learn_car(logs, output, settings, reporter=reporter)
     console.finish(result, learning_tables.render_learning, as_json)
 
 
@@ -49,21 +47,11 @@ def extract(
     logs: options.TruthLogs,
     output: Annotated[Path, Option("--output", "-o", help="Folder for the dataset.")],
     config: RunConfig,
-    truth_smoothing: Annotated[
-        str, Option(help="Smoothing of the ground truth: auto (by its noise), none, or seconds to each side.")
-    ] = "auto",
     split: Annotated[str | None, Option(help="Split of all drives of this command: train, validation or test.")] = None,
-    seed: Annotated[int, Option(help="Seed of the split by drive.")] = 0,
     model: Annotated[
         str, Option("--filter", help="Filter of the residuals: physics, or phy-ukf for train --paper and --baselines.")
     ] = "physics",
     where: Annotated[str | None, Option(metavar="EXPR", help="Condition on the rows to keep.")] = None,
-    per_cell: Annotated[
-        float | None,
-        Option(
-            metavar="SECONDS", help="Largest duration per cell of speed, |a_y| and friction; a random sample is kept."
-        ),
-    ] = None,
     jobs: options.Jobs = 1,
     resume: Annotated[bool, Option("--resume", help="Keep drives with unchanged log and settings.")] = False,
     as_json: options.JsonFlag = False,
@@ -72,15 +60,7 @@ def extract(
     from pdhef_logtool.learning.network.extract_command import ExtractSettings
     from pdhef_logtool.learning.network.extract_command import extract as write_residuals
 
-    settings = ExtractSettings(
-        config,
-        truth_smoothing=truth_smoothing,
-        split=split,
-        seed=seed,
-        model=model,
-        where=where,
-        per_cell_s=per_cell,
-    )
+    settings = ExtractSettings(config, split=split, model=model, where=where)
     with console.reporter() as reporter:
         result = write_residuals(logs, output, settings, jobs=jobs, resume=resume, reporter=reporter)
     console.finish(result, learning_tables.render_extraction, as_json)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.cli.console import cell, table, three_lines
@@ -11,33 +10,29 @@ from pdhef_logtool.cli.console import cell, table, three_lines
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pdhef_logtool.learning.engine import LearnResult
+    from pdhef_logtool.learning.learn import LearnResult
     from pdhef_logtool.learning.network.baselines import BaselinesResult
     from pdhef_logtool.learning.network.extract_command import ExtractResult
     from pdhef_logtool.learning.network.train_command import TrainResult
 
 
-#: Above this number of drives, only the drives without data are listed.
-MOST_DRIVES = 40
-
-
 def render_learning(result: LearnResult, console: Console) -> None:
-    """Print result, assumptions and next step, and the tables of the stage."""
-    left = f", {len(result.left_out)} left out" if result.left_out else ""
-    calibrated = result.stage == "calibrate"
+    """Print result, assumptions and next step, and the tables of teaching."""
+    used, left_out = len(result.drives), len(result.records) - len(result.drives)
+    left = f", {left_out} left out" if left_out else ""
     head = three_lines(
         result.text,
-        f"{len(result.drives)} drive{'s' * (len(result.drives) != 1)}{left}; decisions by held-out driving",
-        f"pdhef run LOG --car {result.car}{' --model ' + str(result.car / 'model.toml') if calibrated else ''} -o OUT",
+        f"{used} drive{'s' * (used != 1)}{left}; decisions by held-out driving",
+        f"pdhef run LOG --car {result.car} -o OUT",
     )
     console.print(head)
-    if not calibrated:
+    if "rungs" in result.figures:
         console.print()
         _teaching(result.figures, console)
 
 
 def _teaching(figures: Mapping[str, Any], console: Console) -> None:
-    """Print the tested residual models, the improvement by teaching, and the recommended drives."""
+    """Print the tested residual models and priors."""
     rungs = table("residual model", ">RMSE °, held-out\nblocks", ">difference °²", ">± 1 se", "outcome")
     for t in figures["rungs"]:
         outcome = "" if not t["against"] else "better" if t["taken"] else "not better"
@@ -45,79 +40,19 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         against = [cell(t[k] if t["against"] else None, digits=4) for k in ("difference_deg2", "standard_error_deg2")]
         rungs.add_row(t["rung"], cell(t["rmse_deg"], digits=3), *against, outcome)
     console.print(rungs)
-    console.print()
-    drives = table("drive", ">seconds", ">physics °", ">with residual °", "calibration", fold=4)
-    for d in figures["drives"]:
-        errors = (cell(d[key], digits=3) for key in ("physics_deg", "corrected_deg"))
-        drives.add_row(d["name"], cell(d["seconds"], digits=0), *errors, d["calibration"])
-    console.print(drives)
     for p in figures["priors"]:
         console.print(
             f"  tyre prior at {p['ay_m_s2']:.1f} m/s²: helps with a probability of {p['support']:.2f} (0: unused)"
         )
-    for text in figures["more"]:
-        console.print(f"  {text}")
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:
-    """Print the data of each drive and of the dataset."""
-    residuals = (">v̇_y residual\nRMS m/s²", ">ṙ residual\nRMS rad/s²")
-    drives = table("drive", ">seconds", ">usable", *residuals, "split", "truth", fold=1)
-    few = len(result.results) <= MOST_DRIVES
-    shown = [r for r in result.results if few or r.entry is None]
-    for drive in shown:
-        if drive.entry is None:
-            said = f"as {drive.copy_of}" if drive.copy_of else "failed"
-            drives.add_row(drive.record.name, "-", "-", "-", "-", "-", said)
-            continue
-        e, truth, rms = drive.entry, drive.entry["truth"], drive.entry["residual_rms"]
-        half_s = truth["smoothing_half_s"]
-        drives.add_row(
-            drive.record.name,
-            f"{e['duration_s']:.1f}",
-            f"{100.0 * e['usable_rows'] / max(e['rows'], 1):.1f} %",
-            cell(rms["vy_dot_m_s2"], digits=3),
-            cell(rms["yaw_acceleration_rad_s2"], digits=3),
-            e["split"],
-            truth["kind"] + (f", ±{half_s:g} s" if half_s else "") + (", kept" if drive.kept else ""),
-        )
-    if not few:
-        what = "these contain no new data" if shown else "all contain data"
-        console.print(f"{len(result.results)} drives, listed in manifest.json; {what}")
-    if shown:
-        console.print(drives)
-    splits = result.manifest["splits"].items()
-    split_texts = (f"{name}: {s['drives']} drives, {s['usable_rows']} usable rows" for name, s in splits)
-    console.print(", ".join(split_texts))
-    _print_cells(result.manifest["cells"], result.manifest["choice"], console)
+    """Print the data of the dataset by split; the manifest lists the drives."""
+    splits = table("split", ">drives", ">usable rows", ">rows")
+    for name, of in result.manifest["splits"].items():
+        splits.add_row(name, *(str(of[key]) for key in ("drives", "usable_rows", "rows")))
+    console.print(splits)
     console.print(f"dataset in {result.output}", soft_wrap=True)
-
-
-def _print_cells(held: Mapping[str, Any], choice: Mapping[str, Any] | None, console: Console) -> None:
-    """Print the duration of training data in each cell of driving, and the number of empty cells."""
-    from pdhef_logtool.learning.network.cells import AY_M_S2, FRICTION, SPEED_M_S, cells
-    from pdhef_logtool.learning.network.dataset import CHOSEN_SPLIT
-
-    seconds, empty = (held[key][CHOSEN_SPLIT] for key in ("usable_s", "empty"))
-    most = math.inf if choice is None else choice["per_cell_s"]
-    shown = table("friction", "|a_y|\nm/s²", *(f">{_span(SPEED_M_S, i)}\nm/s" for i in range(len(SPEED_M_S))))
-    for first in range(0, len(seconds), len(SPEED_M_S)):
-        row, bins = first // len(SPEED_M_S), cells()[first : first + len(SPEED_M_S)]
-        row_of = zip(bins, seconds[first : first + len(bins)], strict=True)
-        shown.add_row(
-            _span(FRICTION, row // len(AY_M_S2)),
-            _span(AY_M_S2, row % len(AY_M_S2)),
-            *(f"{min(s, most):.0f}" if s >= 0.5 else "<1" if s else "-" if c.in_reach else "" for c, s in row_of),
-        )
-    console.print(f"seconds to learn from in split {CHOSEN_SPLIT}" + ("" if most == math.inf else ", as chosen"))
-    console.print(shown)
-    within = sum(c.in_reach for c in cells())
-    console.print(f"{len(empty)} of the {within} cells below the friction limit are empty")
-
-
-def _span(edges: Sequence[float], number: int) -> str:
-    low = f"{edges[number]:g}"
-    return f"{low} to {edges[number + 1]:g}" if number + 1 < len(edges) else f"{low} up"
 
 
 def render_training(result: TrainResult, console: Console) -> None:

@@ -32,11 +32,6 @@ def outcomes_text(counts: Mapping[str, int], file: str) -> Text:
     return Text.assemble(Text(", ").join(parts), f" ({name})")
 
 
-def joined(verdicts: Text, said: str, file: str | None) -> Text:
-    """Return verdicts and result, with the verdicts of the default plan last."""
-    return Text.assemble(verdicts, "; ", said) if file else Text.assemble(said, "; ", verdicts)
-
-
 def render_plan(plan_result: PlanVerdicts, console: Console) -> None:
     """Print the requirements in a table, and the next steps for inconclusive ones."""
     made = table("", "id", "requirement", ">value", ">margin", fold=3)

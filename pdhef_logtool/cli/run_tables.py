@@ -12,13 +12,13 @@ from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, print_indented, table, three_lines
-from pdhef_logtool.cli.plan_tables import joined, outcomes_text, plan_line, render_plan
+from pdhef_logtool.cli.plan_tables import outcomes_text, plan_line, render_plan
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.printable import all_printable, listed
-from pdhef_logtool.results.opened_run import PAGE_FILE
+from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
 from pdhef_logtool.results.run_report import diverged_line, reasons_line
 from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, degrees, truth_of
 
@@ -104,7 +104,7 @@ def render_run(result: RunResult, console: Console) -> None:
         done = f"{len(result.results) - len(failed)} done, {len(failed)} failed, {len(lost)} with input lost"
         console.print(f"{len(result.results)} logs: {done}")
     if result.place is not None:
-        _print_outputs(result.place, console)
+        _print_outputs(result.place, console, [r.outcome.log for r in result.results])
 
 
 def _assumed(reports: Sequence[_Report]) -> list[str]:
@@ -131,7 +131,7 @@ def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str])
     steps += dict.fromkeys(c for t in texts for c in _clauses(t, "next"))
     steps = next_steps(None if given is None else given.to_dict(), steps)
     return three_lines(
-        said if given is None else joined(plan_line(given), said, given.plan.file),
+        said if given is None else Text.assemble(said, "; ", plan_line(given)),
         "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "none"),
         steps[0] if steps else f"no action needed; pdhef view {result.place or 'OUT'} shows the drive",
     )
@@ -165,7 +165,7 @@ def _fleet_head(summary: Mapping[str, Any]) -> Table:
     said = f"{rmse} of {summary['scored']} drives"
     steps = next_steps(plan, ["read the failures below"] if summary["failed"] else ())
     return three_lines(
-        joined(outcomes_text(counts, plan.get("file") or ""), said, plan.get("file")) if counts else said,
+        Text.assemble(said, "; ", outcomes_text(counts, plan.get("file") or "")) if counts else said,
         "differs by drive, see report.json",
         steps[0] if steps else f"open {Path(summary['output']) / PAGE_FILE}",
     )
@@ -203,8 +203,10 @@ def render_fleet(summary: Mapping[str, Any], console: Console) -> None:
     _print_outputs(summary["output"], console)
 
 
-def _print_outputs(output: Path | str, console: Console) -> None:
-    page = Path(output) / PAGE_FILE
+def _print_outputs(output: Path | str, console: Console, labels: Sequence[str] = ()) -> None:
+    """Print the folder of the outputs, and the page of the run or of its only log."""
+    folders = [Path(output) / LOGS / label for label in labels] if len(labels) == 1 else []
+    page = next((f / PAGE_FILE for f in folders if (f / PAGE_FILE).is_file()), Path(output) / PAGE_FILE)
     shown = f"; open {page} in a browser" if page.is_file() else ""
     console.print(f"outputs in {output}{shown}", soft_wrap=True)
 

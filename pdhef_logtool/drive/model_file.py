@@ -1,28 +1,25 @@
-"""model.toml: sensors and car of a drive, for later drives of the same car and recorder.
+"""Sensors of an earlier drive, for later drives of the same car and recorder (:mod:`pdhef_logtool.car.model`).
 
 In a car, mounting, delays, clocks and parameters are known from earlier drives. Offline they come from the log itself,
-so that estimates depend on later samples. With a model file they do not. Every run writes one for each drive.
+so that estimates depend on later samples. With a model file they do not.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import physics_sha256
-from pdhef_logtool.car.taught import TaughtParameter
+from pdhef_logtool.car.model import read_model
 from pdhef_logtool.drive.alignment import AlignmentPlan
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, Mapping, check_mapping, fit_clocks
 from pdhef_logtool.mapping.records import CanSettings, SignalSource
-from pdhef_logtool.records.errors import MappingError
-from pdhef_logtool.storage.documents import read_toml, validated
-from pdhef_logtool.storage.toml_text import toml_text
+from pdhef_logtool.records.errors import VehicleError
+from pdhef_logtool.storage.documents import validated
 
 #: The offset of a device clock changes between logs: it is estimated from the messages of this duration.
 CLOCK_START_S = 1.0
@@ -52,47 +49,24 @@ class Sensors:
         return replace(mapping, signals=self.signals, can=self.can, origin="file")
 
 
-@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid", defer_build=True))
-class ModelFile:
-    """Content of a model.toml.
+def with_earlier_drive(car: Car, path: Path) -> tuple[Car, Sensors]:
+    """Return a car with the model of an earlier drive, and the sensors of that drive.
 
-    Attributes
-    ----------
-    vehicle, physics_sha256 : name and digest of the vehicle file of the parameters.
-    parameters : mean and standard deviation of the car's parameters; empty without a calibration.
+    Raises
+    ------
+    VehicleError : The file is missing, wrong, of another vehicle file, or without sensors.
     """
-
-    sensors: Sensors
-    vehicle: str
-    physics_sha256: str
-    parameters: Annotated[tuple[TaughtParameter, ...], Field(strict=False)] = ()
-    format: Literal["pdhef-model"] = "pdhef-model"
-    version: Literal[1] = 1
-
-    @classmethod
-    def of(cls, sensors: Sensors, car: Car, parameters: tuple[TaughtParameter, ...]) -> ModelFile:
-        """Return the model of a car's drive."""
-        return cls(sensors, car.datasheet.name, physics_sha256(car.datasheet), parameters)
-
-    def toml(self, head: str) -> str:
-        """Return the file, without loss; ``head`` : comment."""
-        from pydantic import RootModel
-
-        return toml_text(RootModel[ModelFile](self).model_dump(mode="json", exclude_none=True), head)
-
-
-def load_model(path: Path, car: Car) -> ModelFile:
-    """Read a model.toml for a car; raises MappingError if it is missing, wrong, or of another vehicle file."""
-    raw = read_toml(path, "auto, off or a model.toml", MappingError, _REMEDY)
-    model = validated(ModelFile, raw, str(path), MappingError, expected="the entries of a model.toml", remedy=_REMEDY)
-    if model.parameters and model.physics_sha256 != physics_sha256(car.datasheet):
-        raise MappingError(
+    model = read_model(path, "auto, off or a model.toml", _REMEDY)
+    if not model.belongs_to(car.datasheet):
+        raise VehicleError(
             expected=f"a model of the car {car.datasheet.name}",
             got=f"one of the vehicle file of {model.vehicle}, which differs",
             where=str(path),
             remedy="give the --car of that run, or a model of this car",
         )
-    return model
+    what = "the entries of a model.toml"
+    sensors = validated(Sensors, model.sensors, f"{path}: sensors", VehicleError, expected=what, remedy=_REMEDY)
+    return replace(car, model=model.over(car.model)), sensors
 
 
 def clocks_of(sensors: Sensors, log: DriveLog, mapping: Mapping, start_ns: int) -> dict[str, ClockModel]:

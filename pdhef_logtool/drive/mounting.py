@@ -18,10 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
-from pdhef_logtool.drive.checks import check_drive
-from pdhef_logtool.drive.checks.by_relations import CERTAIN, explained_factors
-from pdhef_logtool.drive.checks.mounting import CORRECTED, MOUNTING
-from pdhef_logtool.drive.checks.running import misread_channels
+from pdhef_logtool.drive.check_table import result
+from pdhef_logtool.drive.checks import check_drive, misread_channels
 from pdhef_logtool.drive.columns import derivative, halves, independent_samples, moving_at
 from pdhef_logtool.drive.delays import LateSensor, late_sensors
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
@@ -36,6 +34,7 @@ from pdhef_logtool.drive.frames import (
 )
 from pdhef_logtool.drive.measured import Measured, measure
 from pdhef_logtool.drive.other_fields import with_other_fields
+from pdhef_logtool.drive.relation_checks import CERTAIN, explained_factors
 from pdhef_logtool.drive.relations import BIAS_RAD_S, compare, gentle_at, steering_references, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
@@ -375,7 +374,7 @@ class Survey:
 
     @cached_property
     def checks(self) -> tuple[Check, ...]:
-        """Checks of the mounting and of :func:`~pdhef_logtool.drive.checks.running.check_drive`."""
+        """Checks of the mounting and of :func:`~pdhef_logtool.drive.checks.check_drive`."""
         drive_checks = self._drive_checks(self.channels.truth, self.truth, self.latency, self.measured)
         checks = (*self.mounted, *self.corrected, *self._of_names(drive_checks), *drive_checks)
         return checks if self.reread is None else self.reread(checks)
@@ -572,7 +571,7 @@ def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_
 
 
 def _corrected(name: str, source: SignalSource, note: str) -> Check:
-    return CORRECTED.failed(note, name, entries=entries_of(source, "field", "scale"))
+    return result("SIGNAL.corrected", "failed", name, evidence=note, entries=entries_of(source, "field", "scale"))
 
 
 def scaled_source(source: SignalSource, factor: float) -> SignalSource:
@@ -628,9 +627,10 @@ def mounting_checks(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | 
         right = np.allclose(mounting.rows[i], mounting.named[i], atol=1e-3)
         if right:
             if mounting.confident:
-                checks.append(MOUNTING.passed(mounting.evidence, name))
+                checks.append(result("SIGNAL.mounting", "passed", name, evidence=mounting.evidence))
             continue
         evidence = f"{mounting.text}: {mounting.evidence}"
-        check = MOUNTING.failed(evidence, name, entries=entries_of(turned[name], "field", "scale"))
+        entries = entries_of(turned[name], "field", "scale")
+        check = result("SIGNAL.mounting", "failed", name, evidence=evidence, entries=entries)
         checks.append(check if mounting.confident else replace(check, verdict="undecided"))
     return checks

@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from pdhef_logtool.drive.checks.by_relations import AXIS, SUSPICIONS
+from pdhef_logtool.drive.check_table import TEXTS, result
+from pdhef_logtool.drive.relation_checks import SUSPICIONS
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.mapping.mapping_file import entries_of
 from pdhef_logtool.mapping.records import SignalSource
@@ -82,6 +83,6 @@ def _replaced(mapping: Mapping, others: dict[str, SignalSource]) -> Mapping:
 def _check(name: str, source: SignalSource, checks: Sequence[Check]) -> Check:
     doubts = [c for verdict in ("failed", "undecided") for c in checks if (c.subject, c.verdict) == (name, verdict)]
     evidence = doubts[0].evidence if doubts else "it contradicts others that fail"
-    check = AXIS.failed(f"{evidence}; with {source.label} all checks of it pass", name, signal_name=name)
+    evidence = TEXTS["other_field"].format(evidence=evidence, label=source.label)
     entries = entries_of(source, "topic", "field", "scale")
-    return replace(check, remedy=f"another field is mapped: in the mapping {entries}")
+    return result("SIGNAL.axis", "failed", name, cause="other", evidence=evidence, entries=entries)

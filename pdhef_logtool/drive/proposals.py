@@ -10,11 +10,9 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from pdhef_logtool.drive.checks.by_relations import explained_factors
-from pdhef_logtool.drive.checks.kind import is_beyond
-from pdhef_logtool.drive.checks.sensor_errors import ay_delay, sensor_errors
-from pdhef_logtool.drive.checks.truth_sideslip import SIDESLIP_OFFSET_RAD, sideslip_offset
+from pdhef_logtool.drive.checks import ay_delay, offset_check, sensor_errors, sideslip_offset
 from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
+from pdhef_logtool.drive.relation_checks import explained_factors
 from pdhef_logtool.drive.truth import LATE_GYRO_S
 from pdhef_logtool.mapping.records import Mapping, SignalSource
 
@@ -95,14 +93,11 @@ def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
 
 def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
     """Return corrected ground-truth sources if the sideslip has a constant offset that a mapping can correct."""
-    offset_and_error = sideslip_offset(survey.measured.columns)
-    if offset_and_error is None or survey.truth is None:
+    columns, truth = survey.measured.columns, survey.mapping.truth
+    check = None if survey.truth is None else offset_check(columns)
+    if check is None or check.verdict != "failed":
         return []
-    offset, error = offset_and_error
-    if not is_beyond(offset, error, (-SIDESLIP_OFFSET_RAD, SIDESLIP_OFFSET_RAD)):
-        return []
-    truth = survey.mapping.truth
-    evidence = f"sideslip is {math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg in straight driving"
+    (offset, _), evidence = sideslip_offset(columns), check.evidence
     vx, vy = truth.get("vx_m_s"), truth.get("vy_m_s")
     changed: dict[str, SignalSource] = {}
     if "sideslip_rad" in truth:

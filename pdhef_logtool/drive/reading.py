@@ -9,9 +9,9 @@ from typing import Self
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.checks.changed import CHANGE_SUFFIX, change_checks
+from pdhef_logtool.drive.checks import CHANGE_SUFFIX, change_checks
 from pdhef_logtool.drive.friction import FrictionSource, friction_source
-from pdhef_logtool.drive.model_file import CLOCK_START_S, ModelFile, is_device_clock, load_model
+from pdhef_logtool.drive.model_file import CLOCK_START_S, Sensors, is_device_clock, with_earlier_drive
 from pdhef_logtool.drive.options import AS_IT_IS, AUTO, OFF, ReadOptions, time_slice
 from pdhef_logtool.drive.plan import DrivePlan, plan_drive
 from pdhef_logtool.drive.recorded import Recorded, read_recorded
@@ -79,7 +79,7 @@ class Drive:
     name : of the log in tables and folders. chosen : the mapping before the drive changed it.
     plan : decisions from the first minutes; may be replaced before reading.
     friction : friction source for :meth:`whole`; may be replaced before reading.
-    prior : model of an earlier drive, None without.
+    earlier : sensors of an earlier drive, None without.
     notes : warnings to the user about this drive. remarks : other information.
     """
 
@@ -91,7 +91,7 @@ class Drive:
     chosen: ChosenMapping
     notes: list[str]
     friction: FrictionSource
-    prior: ModelFile | None
+    earlier: Sensors | None
     _tell: Tell
     remarks: list[str] = field(default_factory=list)
     _recorded: Recorded | None = None
@@ -126,7 +126,7 @@ class Drive:
     @property
     def causal_from_s(self) -> float | None:
         """Time in the slice, s, from which the sensors depend on past samples only; None: they depend on all."""
-        if self.prior is None:
+        if self.earlier is None:
             return None
         return CLOCK_START_S if any(map(is_device_clock, self.plan.clocks.values())) else 0.0
 
@@ -276,7 +276,9 @@ def read_drive(
     tables = tables_for(mapping, options.tables)
     opened = open_log(log_input.path, options.limits, options.msgs, Wanted(frozenset()), tables)
     try:
-        prior = None if options.model in (AUTO, OFF) else load_model(options.model, car)
+        earlier = None
+        if options.model not in (AUTO, OFF):
+            car, earlier = with_earlier_drive(car, options.model)
         prefer = options.prefer_truth
         chosen = choose_mapping(opened, mapping, prefer_truth=prefer, require_signals=require_sensors)
         for ambiguity in chosen.ambiguities:
@@ -294,7 +296,7 @@ def read_drive(
             slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
         plan = plan_drive(
             opened, used, car.vehicle, *slice_ns, require_imu=require_sensors,
-            sensors=None if prior is None else prior.sensors, waived=options.waived,
+            sensors=earlier, waived=options.waived,
         )  # fmt: skip
         for note in plan.mapping.notes[len(used.notes) :]:
             told(note)
@@ -307,7 +309,7 @@ def read_drive(
         opened.close()
         raise
     return Drive(
-        log_input.stem, opened, car, options, plan, chosen, notes, friction, prior, tell, remarks, _state=state
+        log_input.stem, opened, car, options, plan, chosen, notes, friction, earlier, tell, remarks, _state=state
     )
 
 

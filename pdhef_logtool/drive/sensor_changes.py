@@ -22,7 +22,7 @@ causal estimators stay causal.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -54,6 +54,8 @@ CHANCE, LEAST_STUCK_S = 1e-6, 0.3
 #: Change that a stuck channel has missed: of the steering relation, with its standard deviations; of the speed by a_x
 #: against the mean a_x of the time before.
 LEAST_STEER_CHANGE_RAD, MISSED, LEAST_SPEED_CHANGE_M_S, GRADE_S = 0.006, 5.0, 1.5, 5.0
+#: Share of the usual step of a value below which an accelerometer or a gyro repeats it.
+LEAKED = 0.1
 #: Cells with the information of one independent sample; share of prior information, of the value 0.
 INDEPENDENT_CELLS, RIDGE = 10.0, 1e-3
 #: Largest number of changes of a drive.
@@ -81,13 +83,20 @@ class SensorChange:
 
 
 class _Cells(NamedTuple):
-    """Means of the signals in the cells of a grid [n]; NaN without a recent sample."""
+    """Cell of each stamp [N], and means of the signals in the cells [n]; NaN without a recent sample."""
 
+    stamps_ns: IntArray
+    of_stamp: IntArray
     ay: FloatArray
     yaw_rate: FloatArray
     steer: FloatArray
     speed: FloatArray
     ax: FloatArray
+
+    def time_of(self, cell: int) -> int:
+        """Return the first stamp in a cell or behind it."""
+        row = int(np.searchsorted(self.of_stamp, cell))
+        return int(self.stamps_ns[row]) if row < len(self.stamps_ns) else int(self.stamps_ns[-1]) + 1
 
 
 class _Relation(NamedTuple):
@@ -121,8 +130,9 @@ def find_changes(signals: Signals, ignored: Collection[str] = ()) -> tuple[Signa
     """
     if len(signals) < 2:
         return signals, ()
-    sound, changes = _without_stuck(signals, [n for n in ("steer_rad", "speed_m_s") if n not in ignored])
-    fitted, after_ns = _without_repeats(sound), 0
+    cells = _cells(signals)
+    sound, changes = _without_stuck(signals, cells, [n for n in ("steer_rad", "speed_m_s") if n not in ignored])
+    fitted, after_ns = _without_repeats(sound, cells), 0
     while len(changes) < MOST_CHANGES and (jump := _first_jump(fitted, after_ns, ignored)) is not None:
         changes.append(jump)
         after_ns = jump.start_ns
@@ -140,21 +150,10 @@ def shifted(signals: Signals, name: str, by: float, start_ns: int, end_ns: int) 
 # ------------------------------------------------------------------------------------------------ relations
 
 
-def _cell_of(signals: Signals) -> IntArray:
-    """Return the cell of each stamp [N]."""
-    steps_ns = np.diff(signals.stamps_ns, prepend=signals.stamps_ns[0])
-    return np.asarray(np.cumsum(np.minimum(steps_ns, round(LONGEST_GAP_S * 1e9))) // round(CELL_S * 1e9))
-
-
-def _time_of(signals: Signals, cell: int) -> int:
-    """Return the first stamp in a cell or behind it."""
-    row = int(np.searchsorted(_cell_of(signals), cell))
-    return int(signals.stamps_ns[row]) if row < len(signals) else int(signals.stamps_ns[-1]) + 1
-
-
 def _cells(signals: Signals) -> _Cells:
     """Average the samples of each cell; a cell without one repeats the last, for up to a tenth of a second."""
-    cell = _cell_of(signals)
+    steps_ns = np.diff(signals.stamps_ns, prepend=signals.stamps_ns[0])
+    cell = np.cumsum(np.minimum(steps_ns, round(LONGEST_GAP_S * 1e9))) // round(CELL_S * 1e9)
     count = int(cell[-1]) + 1
 
     def mean(column: FloatArray, most: int) -> FloatArray:
@@ -167,7 +166,7 @@ def _cells(signals: Signals) -> _Cells:
 
     s = without_impossible(signals)
     columns = (s.ay_m_s2, s.yaw_rate_rad_s, s.steer_rad, s.speed_m_s, s.ax_m_s2)
-    return _Cells(*map(mean, columns, (2, 2, 2, 10, 2)))
+    return _Cells(signals.stamps_ns, cell, *map(mean, columns, (2, 2, 2, 10, 2)))
 
 
 def _mean(column: FloatArray, start: int, end: int) -> FloatArray:
@@ -183,7 +182,7 @@ def _mean(column: FloatArray, start: int, end: int) -> FloatArray:
 
 def _relations(cells: _Cells) -> tuple[_Relation, _Relation]:
     """Return the relations of kinematics and steering."""
-    ay, r, steer, v, _ = (_mean(column, 1 - MEAN_CELLS, 1) for column in cells)
+    ay, r, steer, v, _ = (_mean(column, 1 - MEAN_CELLS, 1) for column in cells[2:])
     v = np.where(v > LEAST_SPEED_M_S, v, np.nan)
     constant, turning = np.ones_like(v), v * r
 
@@ -260,15 +259,15 @@ def _std_so_far(column: FloatArray, least: float) -> FloatArray:
     return np.where(count < 0.5 * LEAST_CELLS, np.inf, np.maximum(few * np.sqrt(total / np.maximum(count, 1.0)), least))
 
 
-def _sample_steps(signals: Signals) -> tuple[FloatArray, IntArray]:
+def _sample_steps(signals: Signals, cells: _Cells) -> tuple[FloatArray, IntArray]:
     """Return the largest step between neighbouring samples of the gyro in each cell, [n], and its stamp.
 
     A straight line with a step is fitted to the samples up to ``STEP_S`` before and after.
     """
     signals = without_impossible(signals)
     finite = np.isfinite(signals.yaw_rate_rad_s)
-    values, stamps, cell = signals.yaw_rate_rad_s[finite], signals.stamps_ns[finite], _cell_of(signals)[finite]
-    count = int(_cell_of(signals)[-1]) + 1
+    values, stamps, cell = signals.yaw_rate_rad_s[finite], signals.stamps_ns[finite], cells.of_stamp[finite]
+    count = len(cells.speed)
     largest, stamp_ns = np.zeros(count), np.zeros(count, np.int64)
     half = max(2, round(STEP_S * 1e9 / float(np.median(np.diff(stamps))))) if len(stamps) > 1 else 2
     if len(values) < 2 * half:
@@ -290,7 +289,7 @@ def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> Se
     with np.errstate(invalid="ignore", divide="ignore"):
         ay, of_steer = _step(kinematics, LEAST_AY_STD), _step(steering, LEAST_STEER_STD)
         by_ay, by_steer = ay.scaled(-1.0 / v), of_steer.scaled(-1.0 / (steering.fit[:, 1] / v + steering.fit[:, 2] * v))
-        step, at_ns = _sample_steps(signals)
+        step, at_ns = _sample_steps(signals, cells)
         step_std = np.fmax(_std_so_far(step, LEAST_GYRO_STD), np.sqrt(_mean(step**2, 3, WINDOW_CELLS)))  # a burst
         is_gyro = (np.abs(step) > np.maximum(ALARM * step_std, LEAST_GYRO_JUMP_RAD_S)) & by_ay.confirms(step)
         is_gyro &= ~by_steer.contradicts(step)
@@ -298,18 +297,18 @@ def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> Se
         is_ay &= (np.abs(by_steer.size) < ABSENT * np.abs(by_ay.size)) & (np.abs(by_ay.size) > SURE * by_steer.std)
     is_gyro &= "yaw_rate_rad_s" not in ignored
     is_ay &= "ay_m_s2" not in ignored
-    first = _cell_of(signals)[np.searchsorted(signals.stamps_ns, after_ns)]
+    first = cells.of_stamp[np.searchsorted(signals.stamps_ns, after_ns)]
     possible = np.arange(len(v)) > first + WINDOW_CELLS
     alarms = np.flatnonzero((is_gyro | is_ay) & possible)
     if not len(alarms):
         return None
     k = int(alarms[0])
-    known_ns = _time_of(signals, k + DECIDED_CELLS)
+    known_ns = cells.time_of(k + DECIDED_CELLS)
     if is_gyro[k]:
         three = (step, step_std), (by_ay.size, by_ay.std), (by_steer.size, by_steer.std)
         return SensorChange("yaw_rate_rad_s", "jump", int(at_ns[k]), known_ns, end_ns, *_weighted(three, k))
     k += int(np.argmax(np.abs(ay.size[k : k + PEAK_CELLS + 1])))
-    return SensorChange("ay_m_s2", "jump", _time_of(signals, k), known_ns, end_ns, float(ay.size[k]), float(ay.std[k]))
+    return SensorChange("ay_m_s2", "jump", cells.time_of(k), known_ns, end_ns, float(ay.size[k]), float(ay.std[k]))
 
 
 def _weighted(measured: Sequence[tuple[FloatArray, FloatArray]], k: int) -> tuple[float, float]:
@@ -325,15 +324,15 @@ def _weighted(measured: Sequence[tuple[FloatArray, FloatArray]], k: int) -> tupl
 # ------------------------------------------------------------------------------------------------ stuck values
 
 
-def _without_stuck(signals: Signals, names: Sequence[str]) -> tuple[Signals, list[SensorChange]]:
+def _without_stuck(signals: Signals, cells: _Cells, names: Sequence[str]) -> tuple[Signals, list[SensorChange]]:
     """Replace stuck steering by the steering relation, and remove stuck speeds."""
-    cells, cell, changes = _cells(signals), _cell_of(signals), []
+    cell, changes = cells.of_stamp, []
     _, steering = _relations(cells)
     error = _std_so_far(steering.residual(steering.table), 0.0)
     travelled = np.cumsum(np.nan_to_num(cells.ax)) * CELL_S
     columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in names}
     for name, column in columns.items():
-        for start, end, first in _long_runs(signals, name, cells):
+        for start, end, first in _long_runs(column, cells):
             k0, k = cell[start], np.arange(cell[start], cell[end - 1] + 1)
             if name == "steer_rad":
                 expected = steering.table[k, 1:] @ steering.fit[k0]
@@ -346,7 +345,7 @@ def _without_stuck(signals: Signals, names: Sequence[str]) -> tuple[Signals, lis
             missed = first + np.flatnonzero(np.abs(change[first:]) > limit)
             if not len(missed):
                 continue
-            known_ns = _time_of(signals, k[missed[0]] + 1)
+            known_ns = cells.time_of(k[missed[0]] + 1)
             rows = np.arange(start, end)[signals.stamps_ns[start:end] >= known_ns]
             column[rows] = expected[np.maximum(cell[rows] - 1 - k0, 0)]
             start_ns, end_ns = (int(signals.stamps_ns[i]) for i in (start, end - 1))
@@ -355,25 +354,34 @@ def _without_stuck(signals: Signals, names: Sequence[str]) -> tuple[Signals, lis
     return (replace(signals, **columns) if changes else signals), changes
 
 
-def _without_repeats(signals: Signals) -> Signals:
-    """Return signals without stuck values of accelerometer and gyro, whose end would be a jump."""
-    cells = _cells(signals)
+def _without_repeats(signals: Signals, cells: _Cells) -> Signals:
+    """Return signals without stuck values of accelerometer and gyro, whose end would be a jump.
+
+    A stuck axis of a sensor that is mounted askew has a small part of the other axes' noise.
+    """
     columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in ("ay_m_s2", "yaw_rate_rad_s")}
-    for name, column in columns.items():
-        for start, end, _ in _long_runs(signals, name, cells):
+    for column in columns.values():
+        for start, end, _ in _long_runs(column, cells, LEAKED):
             column[start:end] = np.nan
     return replace(signals, **columns)
 
 
-def _long_runs(signals: Signals, name: str, cells: _Cells) -> Iterator[tuple[int, int, int]]:
-    """Yield the rows [start, end) of values that repeat beyond chance, and the cells until that is sure."""
-    column, cell = getattr(signals, name), _cell_of(signals)
-    rows = np.flatnonzero(np.isfinite(column) & (np.nan_to_num(cells.speed)[cell] > LEAST_SPEED_M_S))
-    same = np.diff(column[rows], prepend=math.nan) == 0.0
+def _long_runs(column: FloatArray, cells: _Cells, share: float = 0.0) -> list[tuple[int, int, int]]:
+    """Return the rows [start, end) of values that repeat beyond chance, and the cells until that is sure.
+
+    A value repeats if its step is at most a share of the RMS of the steps so far.
+    """
+    rows = np.flatnonzero(np.isfinite(column) & (np.nan_to_num(cells.speed)[cells.of_stamp] > LEAST_SPEED_M_S))
+    cell, step = cells.of_stamp[rows], np.abs(np.diff(column[rows], prepend=math.nan))
+    usual = np.sqrt(np.cumsum(np.nan_to_num(step) ** 2) / np.maximum(np.arange(len(rows)), 1))
+    same = step <= share * usual
     starts = np.flatnonzero(~same)
     ends = np.append(starts[1:], len(rows))
-    share = np.clip(np.cumsum(same)[starts] / np.maximum(starts, 1), 1e-3, 0.9999)
-    needed = np.ceil(1.0 + math.log(CHANCE) / np.log(share)).astype(int)
-    for i in np.flatnonzero((ends - starts > needed) & (starts > 0)):
-        start, end = int(rows[starts[i]]), int(rows[ends[i] - 1]) + 1
-        yield start, end, max(int(cell[rows[starts[i] + needed[i]]] - cell[start]), round(LEAST_STUCK_S / CELL_S))
+    repeats = np.clip(np.cumsum(same)[starts] / np.maximum(starts, 1), 1e-3, 0.9999)
+    needed = np.ceil(1.0 + math.log(CHANCE) / np.log(repeats)).astype(int)
+    least = round(LEAST_STUCK_S / CELL_S)
+    return [
+        (int(rows[s]), int(rows[e - 1]) + 1, max(int(cell[s + n] - cell[s]), least))
+        for s, e, n in zip(starts, ends, needed, strict=False)  # without readings, there is an end alone
+        if e - s > n and s > 0
+    ]

@@ -29,12 +29,12 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
 
     The residual gain of the network comes from the name or the car; a name with options selects the network.
     """
-    taught = car.taught
-    if name == PRESET and taught is not None and taught.residual is not None:
+    model = car.model
+    if name == PRESET and model is not None and model.residual is not None:
         physics = AdaptivePhysics(of_car(car, use_speed=options.use_speed), name=name)
-        if (car.fitted_physics is not None) == taught.calibrated:
-            return replace(physics, network=taught.residual, trust=1.0, notes=(taught.evidence,))
-        state, other = ("calibrated", "not calibrated") if taught.calibrated else ("not calibrated", "calibrated")
+        if (car.fitted_physics is not None) == model.calibrated:
+            return replace(physics, network=model.residual, trust=1.0, notes=(model.evidence,))
+        state, other = ("calibrated", "not calibrated") if model.calibrated else ("not calibrated", "calibrated")
         return replace(physics, notes=(f"residual gain 0: it belongs to a {state} car, this drive has one {other}",))
     return _with_network(name, car, options)
 
@@ -57,7 +57,7 @@ def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
     filtered = _with_network(name, car, options)
     factors = SMOOTHING if car.fitted_physics is None else car.fitted_physics.smoothing
     filtered = replace(filtered, physics=for_smoothing(filtered.physics, factors))
-    taught = () if car.taught is None or car.taught.residual is None else (FILTER_ALONE,)
+    taught = () if car.model is None or car.model.residual is None else (FILTER_ALONE,)
     return SmoothedPhysics(filtered, name=name, notes=(NOT_CAUSAL, *taught, *filtered.notes))
 
 

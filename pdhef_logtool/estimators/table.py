@@ -81,7 +81,7 @@ class Spec:
         if preset_of(self.name) in SELF_CALIBRATED:
             car = car.calibrated_car
         if self.needs_noise and self.name not in car.noise:
-            return f"the car has no noise for {self.name} in noise.toml"
+            return f"the car has no noise for {self.name} in fit.toml"
         if self.network in ("", "optional"):
             return ""
         if car.network is None:

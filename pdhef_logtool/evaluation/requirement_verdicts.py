@@ -448,12 +448,11 @@ def joint_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def next_steps(plan: Mapping[str, Any] | None, more: Sequence[str] = ()) -> list[str]:
-    """Return the next steps of a document: failed requirements, inconclusive ones, ``more``; the default plan last."""
+    """Return the next steps of a document: failed requirements, inconclusive ones, ``more``."""
     requirements = (plan or {}).get("requirements") or ()
     ids: dict[str, list[str]] = {}
     for r in (*of_documents(requirements, "FAIL"), *of_documents(requirements, "INCONCLUSIVE")):
         if r["next"]:
             ids.setdefault(str(r["next"]), []).append(str(r["id"]))
     asked = [f"{', '.join(names)}: {text}" for text, names in ids.items()]
-    others = [*filter(None, more)]
-    return [*asked, *others] if (plan or {}).get("file") else [*others, *asked]
+    return [*asked, *filter(None, more)]

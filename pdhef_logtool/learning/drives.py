@@ -4,30 +4,29 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import LearntOn
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, logs_of, lost_texts
 from pdhef_logtool.logs.discovery import LogInput, Logs
-from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
+from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.mapping import mapping_of
+from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, UsageError
+from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
 
-#: Stages of ``pdhef learn``. ``teach``, the default: prior of the calibration and residual of a car, from drives
-#: with ground truth. ``calibrate``: the car from its sensors alone.
-TEACH, CALIBRATE = STAGES = ("teach", "calibrate")
+_Read = TypeVar("_Read")
+
 #: Splits of a simulated set for results.
 HELD_OUT = ("test", "extrapolation")
-#: Entries of the configuration that affect the result of learning.
-_SETTINGS = (
-    "car", "mapping", "start", "end", "sensors", "friction", "prefer_truth", "reference", "gnss",
-)  # fmt: skip
 #: Value of ``split`` that accepts every drive.
 ANY_SPLIT = "any"
 #: Maximum number of drives to name in an error.
@@ -41,29 +40,12 @@ class LearnSettings:
     Attributes
     ----------
     config : car, mapping, slice, sensors, truth channel.
-    stage : one of :data:`STAGES`.
-    seed : seed of every random draw.
     split : use only drives that their set's manifest assigns to this split; "any" accepts drives of all splits, also
-        of those that the stage otherwise rejects.
+        of :data:`HELD_OUT`.
     """
 
     config: RunConfig
-    stage: str = TEACH
-    seed: int = 0
     split: str | None = None
-
-    def __post_init__(self) -> None:
-        """Check the values; raises UsageError."""
-        if self.seed < 0:
-            raise UsageError(expected="a seed of at least 0", got=str(self.seed), where="--seed")
-        if self.stage not in STAGES:
-            raise UsageError(expected=f"one of {', '.join(STAGES)}", got=self.stage or "none", where="--stages")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the settings as JSON-able values; files by name only."""
-        values = {"stages": [self.stage], "seed": self.seed, "split": self.split}
-        document = self.config.to_dict()
-        return {**{k: document[k] for k in _SETTINGS}, **values}
 
 
 def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInput], dict[str, str]]:
@@ -87,15 +69,55 @@ def choose_drives(arguments: Logs, settings: LearnSettings) -> tuple[list[LogInp
                 where="--split",
             )
     refused = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in HELD_OUT]
-    if refused and settings.split != ANY_SPLIT and settings.stage != CALIBRATE:
+    if refused and settings.split != ANY_SPLIT:
         more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
         raise UsageError(
             expected="drives that no result is reported on",
             got=", ".join(refused[:_NAMED]) + more,
             where="learn",
-            remedy="drives used by a stage are no longer test drives: use --split validation, or --split any",
+            remedy="drives that a car learns from are no longer test drives: use --split validation, or --split any",
         )
     return list(inputs), {i.stem: splits[i.stem] for i in inputs if splits[i.stem]}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveSet:
+    """Drives of one car, as a command names them.
+
+    Attributes
+    ----------
+    car : car to read them with. logs : of the drives.
+    splits : split of each log in its simulated set, by log name.
+    """
+
+    car: Car
+    settings: LearnSettings
+    logs: tuple[LogInput, ...]
+    mapping: SignalMapping | None
+    splits: Mapping[str, str]
+    reporter: Reporter
+
+    @classmethod
+    def of(cls, arguments: Logs, car: Car, settings: LearnSettings, reporter: Reporter) -> DriveSet:
+        """Return the drives of arguments; raises UsageError as :func:`choose_drives`."""
+        logs, splits = choose_drives(arguments, settings)
+        return cls(car, settings, tuple(logs), mapping_of(settings.config.mapping), splits, reporter)
+
+    def read(
+        self, read: Callable[[LogInput], tuple[DriveRecord, _Read | None]], share: float = 1.0
+    ) -> tuple[tuple[DriveRecord, ...], list[_Read]]:
+        """Read the logs in order; return a record of each, and the contents of usable logs.
+
+        ``share`` : share of the reading in the progress.
+        """
+        records, drives = [], list[_Read]()
+        for number, log in enumerate(self.logs):
+            self.reporter.progress(f"reading {log.stem}", share * number / len(self.logs))
+            record, drive = read(log)
+            records.append(replace(record, split=self.splits.get(log.stem)))
+            if drive is not None:
+                drives.append(drive)
+        return tuple(records), drives
 
 
 def set_manifest(folder: Path | None) -> Mapping[str, Mapping[str, Any]]:
@@ -191,17 +213,6 @@ def exit_code(records: Sequence[DriveRecord]) -> int:
     if all(r.left_out for r in records):
         return EXIT_FAILURE
     return EXIT_PARTIAL if any(r.left_out or r.lost for r in records) else EXIT_OK
-
-
-def no_drive(expected: str, where: str) -> EstimatorError:
-    """Return the error for a command without a usable drive."""
-    return EstimatorError(
-        expected=f"at least one drive with {expected}",
-        got="none",
-        where=where,
-        remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference; "
-        "--stages calibrate calibrates a car by its sensors alone",
-    )
 
 
 def drives_document(records: Sequence[DriveRecord]) -> dict[str, list[dict[str, Any]]]:

@@ -1,4 +1,4 @@
-"""Bytes of an object on a server, by fsspec: each block is fetched once, into a local file from which all reads come.
+"""Bytes of an object on a server, by fsspec: each block is fetched once, into a local copy from which all reads come.
 
 Missing blocks that follow each other are one request of at most 8 MB; four requests run in parallel. Each answer is
 compared with the state of the object when it was opened.
@@ -9,19 +9,20 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import re
-import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping
 from concurrent.futures import Future
-from contextlib import ExitStack, asynccontextmanager
+from contextlib import asynccontextmanager
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from pdhef_logtool.logs.byte_source import ByteSource, ChangedError, SourceError, read_at
+from isal.isal_zlib import crc32
+
+from pdhef_logtool.logs.byte_source import ByteSource, ChangedError, SourceError
 from pdhef_logtool.logs.redirect_guard import PrivateRedirectError, guarded_client
+from pdhef_logtool.logs.remote_copy import RemoteCopy
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.extras import required
-from pdhef_logtool.storage.files import scratch_folder
 from pdhef_logtool.storage.object_store import s3_system, words_of
 
 BLOCK_BYTES, MOST_RANGE_BYTES = 64 << 10, 8 << 20
@@ -29,8 +30,6 @@ AT_ONCE = 4
 #: Waits before a request is repeated, and timeouts. S3 requests are repeated by its library.
 WAITS_S = (0.5, 1.0, 2.0, 4.0)
 CONNECT_S, SILENCE_S = 15.0, 30.0
-#: Copies of closed objects are kept up to this size, so that the next pass over the same log does not fetch it again.
-KEPT_BYTES = 1 << 30
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-\d+/(\d+)")
 
 
@@ -46,17 +45,35 @@ class RemoteSource(ByteSource):
     is_remote = True
 
     def __init__(self, place: RemotePlace) -> None:
-        self._copy = _acquire(place, self)
-        super().__init__(self._copy.size or 0)
+        self._place, self._system = place, _file_system(place)
+        self._size: int | None = None
+        self._version = ""
+        self._blocks: dict[int, Future[None]] = {}  # by number, the request that fetches a block
+        self._lock = Lock()
+        self._at_once = asyncio.Semaphore(AT_ONCE)
+        self._start(self._get, 0, 1).result()
+        super().__init__(self._size or 0)
+        for start, end in self._copy.extents():
+            self._blocks |= dict.fromkeys(_blocks(start, end), _DONE)
 
     @property
     def path(self) -> Path:
         """The copy: fetched blocks are valid, all of it after :meth:`fetch_whole`."""
         return self._copy.path
 
+    @property
+    def identity(self) -> str:
+        """Hash of the URL without access tokens, of the size, and of ETag or time of modification."""
+        return self._identity(self.size)
+
+    def _identity(self, size: int) -> str:
+        return hashlib.sha256("\0".join((self._place.identity, str(size), self._version)).encode()).hexdigest()
+
     def fetch(self, offset: int, size: int) -> bytes:
         """See :class:`ByteSource`."""
-        return self._copy.read(offset, min(offset + size, self.size))
+        end = min(offset + size, self.size)
+        self._wait(offset, end)
+        return self._copy.read(offset, end - offset) if end > offset else b""
 
     def held_size(self, offset: int, size: int) -> int:
         """Return the bytes up to the end of the block: a read fetches whole blocks."""
@@ -64,140 +81,66 @@ class RemoteSource(ByteSource):
 
     def prefetch(self, extents: Iterable[tuple[int, int]]) -> None:
         """See :class:`ByteSource`."""
-        self._copy.order([(max(start, 0), min(end, self.size)) for start, end in extents])
+        self._order([(max(start, 0), min(end, self.size)) for start, end in extents])
 
     def fetch_whole(self) -> None:
         """Fetch the whole object into the copy."""
-        self._copy.wait(0, self.size)
+        self._wait(0, self.size)
 
     def close(self) -> None:
-        """Release the copy; copies without users are removed, oldest first, until the others fit in KEPT_BYTES."""
-        with _registry:
-            self._copy.users.discard(self)
-            if not self._copy.users:
-                self._copy.cancel()
-            idle = [copy for copy in _copies.values() if not copy.users]
-            kept_bytes = 0
-            for copy in reversed(idle):
-                kept_bytes += len(copy.blocks) * BLOCK_BYTES
-                if kept_bytes > KEPT_BYTES:
-                    del _copies[copy.place]
+        """Stop all requests and release the copy."""
+        for request in set(self._blocks.values()):
+            request.cancel()
+        self._copy.close()
 
-
-class _Copy:
-    """A local file with the blocks that were fetched of one object.
-
-    Attributes
-    ----------
-    size, version : bytes of the object (None: not known yet), and its ETag or time of modification.
-    blocks : by number, the request that fetches a block. users : open sources that read the copy.
-    """
-
-    def __init__(self, place: RemotePlace, head_bytes: int) -> None:
-        self.place, self._system = place, _file_system(place)
-        self.size: int | None = None
-        self.version = ""
-        self.blocks: dict[int, Future[None]] = {}
-        self.users: set[RemoteSource] = set()
-        self._lock = Lock()
-        self._at_once = asyncio.Semaphore(AT_ONCE)
-        stack = ExitStack()
-        weakref.finalize(self, stack.close)
-        self.path = Path(stack.enter_context(scratch_folder())) / (place.name.replace("/", "_")[-80:] or "log")
-        self._file = stack.enter_context(self.path.open("x+b", buffering=0))
-        first = self._start(self._get, 0, head_bytes)
-        first.result()
-        if head_bytes >= BLOCK_BYTES:
-            self.blocks.setdefault(0, first)
-
-    @property
-    def identity(self) -> str:
-        """Hash of the URL without access tokens, of the size, and of ETag or time of modification."""
-        return hashlib.sha256("\0".join((self.place.identity, str(self.size), self.version)).encode()).hexdigest()
-
-    def order(self, extents: Iterable[tuple[int, int]]) -> Collection[Future[None]]:
+    def _order(self, extents: Iterable[tuple[int, int]]) -> Collection[Future[None]]:
         """Start to fetch the missing blocks of some extents; return the requests that bring all blocks of them."""
-        blocks = (range(start // BLOCK_BYTES, -(-end // BLOCK_BYTES)) for start, end in extents if end > start)
-        wanted = sorted({n for numbers in blocks for n in numbers})
+        wanted = sorted({n for start, end in extents if end > start for n in _blocks(start, end)})
         with self._lock:
             runs: list[range] = []
-            for n in (n for n in wanted if n not in self.blocks):
+            for n in (n for n in wanted if n not in self._blocks):
                 if runs and n == runs[-1].stop and len(runs[-1]) * BLOCK_BYTES < MOST_RANGE_BYTES:
                     runs[-1] = range(runs[-1].start, n + 1)
                 else:
                     runs.append(range(n, n + 1))
             for run in runs:
-                request = self._start(self._get, run.start * BLOCK_BYTES, min(run.stop * BLOCK_BYTES, self.size or 0))
-                self.blocks |= dict.fromkeys(run, request)
-            return dict.fromkeys(self.blocks[n] for n in wanted)
+                request = self._start(self._get, run.start * BLOCK_BYTES, min(run.stop * BLOCK_BYTES, self.size))
+                self._blocks |= dict.fromkeys(run, request)
+            return dict.fromkeys(self._blocks[n] for n in wanted)
 
-    def wait(self, start: int, end: int) -> None:
-        """Return when bytes [start, end) are in the file; raises SourceError if they cannot be fetched."""
-        for request in self.order([(start, end)]):
+    def _wait(self, start: int, end: int) -> None:
+        """Return when bytes [start, end) are in the copy; raises SourceError if they cannot be fetched."""
+        for request in self._order([(start, end)]):
             request.result()
 
-    def read(self, start: int, end: int) -> bytes:
-        """Return bytes [start, end)."""
-        if end <= start:
-            return b""
-        self.wait(start, end)
-        with self._lock:
-            return read_at(self._file, start, end - start, end)
-
-    def is_current(self) -> bool:
-        """Return whether the object is the one that was copied, and no request for it has failed."""
-        if any(request.done() and request.exception() for request in set(self.blocks.values())):
-            return False
-        try:
-            self._start(self._compare).result()
-        except ChangedError:
-            return False
-        return True
-
-    def cancel(self) -> None:
-        """Stop all requests."""
-        with self._lock:
-            self.blocks = {n: request for n, request in self.blocks.items() if not request.cancel()}
-
     def _start(self, request: Callable[..., Awaitable[None]], *arguments: int) -> Future[None]:
-        return asyncio.run_coroutine_threadsafe(_repeated(self.place, request, *arguments), self._system.loop)
-
-    async def _compare(self) -> None:
-        async with self._ask(0, 1):
-            pass
+        return asyncio.run_coroutine_threadsafe(_repeated(self._place, request, *arguments), self._system.loop)
 
     async def _get(self, start: int, end: int) -> None:
         async with self._at_once, self._ask(start, end) as (size, first, blocks):
-            position = first
+            position, crc = first, 0
             async for block in blocks:
-                self._write(position, block)
-                position += len(block)
+                try:
+                    self._copy.write(position, block)
+                except OSError:
+                    remedy = "set PDHEF_CACHE_DIR to a folder on another"
+                    raise _error(self._place, "no room for its bytes on this disk", remedy) from None
+                position, crc = position + len(block), crc32(block, crc)
         size = position if size is None else size
         if position < min(end, size):
             raise ConnectionError("an answer that is cut")
-        if self.size is None:
-            self.size = size
-        if first == 0 and position >= size > end:  # the server gives no ranges
-            done: Future[None] = Future()
-            done.set_result(None)
-            with self._lock:
-                self.blocks |= dict.fromkeys(range(-(-size // BLOCK_BYTES)), done)
-
-    def _write(self, position: int, block: bytes) -> None:
-        try:
-            with self._lock:
-                self._file.seek(position)
-                self._file.write(block)
-        except OSError:
-            raise _error(self.place, "no room for its bytes on this disk", "set TMPDIR to another") from None
+        if self._size is None:
+            self._size = size
+        if position - first >= min(BLOCK_BYTES, size):
+            self._copy.note(first, position, crc)
 
     @asynccontextmanager
     async def _ask(self, start: int, end: int) -> AsyncIterator[tuple[int | None, int, AsyncIterator[bytes]]]:
         """Request bytes [start, end); yield object size, offset of the response (0: all bytes) and its blocks."""
-        place, part = self.place, f"bytes={start}-{end - 1}"
+        place, part = self._place, f"bytes={start}-{end - 1}"
         if place.scheme == "s3":
             asked = {"Bucket": place.host, "Key": place.key, "Range": part}
-            if self.size is None and (await self._system._info(f"{place.host}/{place.key}"))["size"] == 0:
+            if self._size is None and (await self._system._info(f"{place.host}/{place.key}"))["size"] == 0:
                 del asked["Range"]  # an empty object has no range
             response = await self._system._call_s3("get_object", **asked)
             async with response["Body"] as body:
@@ -222,13 +165,14 @@ class _Copy:
         part = _CONTENT_RANGE.match(str(head.get("Content-Range", "")))
         length = part[2] if part else head.get("Content-Length")
         size, version = None if length is None else int(length), head.get("ETag") or head.get("Last-Modified") or ""
-        if self.size is None:
-            self.version = version
-        elif version not in ("", self.version) or size not in (None, self.size):
+        if self._size is None:
+            self._version = version
+            self._copy = RemoteCopy(self._place.name, self._identity(size) if version and size else "")
+        elif version not in ("", self._version) or size not in (None, self._size):
             raise ChangedError(
                 expected="the object that was opened",
                 got="another one (its size, ETag or time of modification differs)",
-                where=str(self.place),
+                where=str(self._place),
                 remedy="run again when the object no longer changes",
             )
         return size, int(part[1]) if part else 0
@@ -236,7 +180,9 @@ class _Copy:
 
 def identity_of_object(place: RemotePlace) -> str:
     """Return the hash of URL, size and version of an object; raises SourceError."""
-    return _Copy(place, 1).identity
+    source = RemoteSource(place)
+    source.close()
+    return source.identity
 
 
 def keys_below(prefix: RemotePlace) -> list[str]:
@@ -317,17 +263,11 @@ def _file_system(place: RemotePlace) -> Any:
     return fsspec.filesystem("http", client_kwargs=client, encoded=encoded, **options)
 
 
-#: By place, in order of their last opening.
-_copies: dict[RemotePlace, _Copy] = {}
-_registry = Lock()
+def _blocks(start: int, end: int) -> range:
+    """Return the numbers of the blocks with bytes [start, end)."""
+    return range(start // BLOCK_BYTES, -(-end // BLOCK_BYTES))
 
 
-def _acquire(place: RemotePlace, user: RemoteSource) -> _Copy:
-    copy = _copies.get(place)
-    if copy is None or not (copy.users or copy.is_current()):
-        copy = _Copy(place, BLOCK_BYTES)
-    with _registry:
-        _copies.pop(place, None)
-        _copies[place] = copy
-        copy.users.add(user)
-    return copy
+#: The request of blocks that the copy has.
+_DONE: Future[None] = Future()
+_DONE.set_result(None)

@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.car import Car, WithoutTruth
-from pdhef_logtool.car.taught import TaughtParameter
-from pdhef_logtool.drive.model_file import ModelFile, Sensors
+from pdhef_logtool.car.model import CarModel, TaughtParameter
+from pdhef_logtool.car.parts import physics_sha256
+from pdhef_logtool.drive.model_file import Sensors
 from pdhef_logtool.drive.options import AUTO
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.drive_signals import DriveSignals, calibrated_signals
@@ -36,14 +37,12 @@ class DriveModel:
     reading : field, unit, sign and axes of every signal.
     sensors : clocks, delays and alignment. car : the car with the vehicle of the posterior.
     posterior : of the car's parameters; None: the vehicle file is used unchanged.
-    prior : model of an earlier drive; None without.
     """
 
     reading: Mapping
     sensors: Sensors
     car: Car
     posterior: SelfCalibration | None = None
-    prior: ModelFile | None = None
 
     @classmethod
     def fit(cls, drive: Drive) -> DriveModel:
@@ -54,7 +53,7 @@ class DriveModel:
         """
         from pdhef_logtool.estimators.calibration.calibration import prior_calibration, self_calibrate
 
-        car, taught = drive.car, of_earlier_drives(drive.prior) or drive.car.taught_prior
+        car, taught = drive.car, drive.car.taught_prior
         # A validated car is not calibrated; the paper's suite has no speed for it.
         if car.has_evidence or not drive.options.use_speed:
             return cls.of(drive)
@@ -69,7 +68,7 @@ class DriveModel:
         car = drive.car
         if posterior is not None and not posterior.refused:
             car = replace(car, self_calibrated=_without_truth(drive, posterior))
-        return cls(drive.mapping, drive.plan.sensors, car, posterior, drive.prior)
+        return cls(drive.mapping, drive.plan.sensors, car, posterior)
 
     def apply(self, signals: Signals) -> DriveSignals:
         """Return the signals [N] of the drive, corrected for the vehicle file and for the vehicle of the posterior."""
@@ -83,33 +82,41 @@ class DriveModel:
         return CalibratedSignals(calibrated_signals(signals, self.car), vehicle, delay_s)
 
     @property
-    def file(self) -> ModelFile:
+    def file(self) -> CarModel:
         """The content of model.toml: sensors and parameters for later drives of this car and recorder."""
-        from pdhef_logtool.estimators.calibration.calibration import as_prior
-
-        parameters = () if self.prior is None else self.prior.parameters
-        if self.posterior is not None and self.posterior.parameters and not self.posterior.refused:
-            parameters = as_prior(self.posterior.parameters)
-        return ModelFile.of(self.sensors, self.car, parameters)
+        posterior, parameters = self.posterior, self.car.taught_prior
+        if posterior is not None and posterior.parameters and not posterior.refused:
+            parameters = for_later_drives(posterior)
+        return model_of(self.car, self.sensors, parameters=parameters)
 
     @property
     def document(self) -> dict[str, Any] | None:
         """The entry ``self_calibration`` of report.json."""
         if self.posterior is None:
             return None
-        return self.posterior.to_dict() | {"text": _text(self.posterior, self.prior)}
+        return self.posterior.to_dict() | {"text": _text(self.posterior, self.car)}
 
 
-def of_earlier_drives(model: ModelFile | None) -> tuple[TaughtParameter, ...]:
-    """Return the parameters of a model file for another drive: the peak force and the steering channel differ."""
+def model_of(car: Car, sensors: Sensors, **entries: Any) -> CarModel:
+    """Return the model of drives of a car with the sensors of one of them."""
+    from pydantic import TypeAdapter
+
+    plain = TypeAdapter(Sensors).dump_python(sensors, mode="json", exclude_none=True)
+    file = car.datasheet
+    return CarModel(vehicle=file.name, physics_sha256=physics_sha256(file), sensors=plain, **entries)
+
+
+def for_later_drives(posterior: SelfCalibration) -> tuple[TaughtParameter, ...]:
+    """Return a posterior without ground truth as the prior of another drive; peak force and steering ratio differ."""
+    from pdhef_logtool.estimators.calibration.calibration import as_prior
     from pdhef_logtool.estimators.calibration.joint import PEAK, STEER_RATIO
 
-    return () if model is None else tuple(p for p in model.parameters if p.name not in (PEAK, STEER_RATIO))
+    return as_prior([p for p in posterior.parameters if p.name not in (PEAK, STEER_RATIO)])
 
 
-def _text(posterior: SelfCalibration, prior: ModelFile | None) -> str:
+def _text(posterior: SelfCalibration, car: Car) -> str:
     """Return a posterior in one line."""
-    if posterior.parameters or not of_earlier_drives(prior):
+    if posterior.parameters or posterior.refused or not car.taught_prior:
         return posterior.text
     return "parameters of the car from earlier drives"
 
@@ -136,7 +143,7 @@ def _without_truth(drive: Drive, posterior: SelfCalibration) -> WithoutTruth:
     return WithoutTruth(
         posterior.vehicle,
         posterior.noise,
-        note=_text(posterior, drive.prior) if causal else note,
+        note=_text(posterior, drive.car) if causal else note,
         varied=posterior.varied,
         causal=causal,
         error_scale=max(posterior.error_scale, _EARLIER_ERROR_SCALE if causal else 0.0),

@@ -38,10 +38,11 @@ _TIMEOUT_S = 180.0
 
 @dataclass(frozen=True, slots=True)
 class DriveSection:
-    """One drive of the document: verdicts, facts, next steps, and pictures with their captions."""
+    """One drive of the document: its report, verdicts, facts, next steps, and pictures with their captions."""
 
     label: str
     outcome: str
+    report: Mapping[str, Any] | None
     head: PlanHead | None
     facts: Sequence[tuple[str, str]]
     steps: Sequence[str]
@@ -154,7 +155,7 @@ def _gravity(report: Mapping[str, Any] | None) -> tuple[int, float]:
 
 def _section(log: OpenedLog, report: Mapping[str, Any] | None, *, positions: bool) -> DriveSection:
     if report is None:
-        return DriveSection(log.label, log.outcome, None, (), (), ())
+        return DriveSection(log.label, log.outcome, None, None, (), (), ())
     charts = drive_page(log).charts
     keys = (*_FIGURES, *(_POSITIONS if positions else ()))
     drawn = [
@@ -165,6 +166,7 @@ def _section(log: OpenedLog, report: Mapping[str, Any] | None, *, positions: boo
     return DriveSection(
         log.label,
         log.outcome,
+        report,
         plan_head(report.get("plan")),
         tested_drive(report, log.outcome),
         steps_of(report),

@@ -46,7 +46,7 @@ class Correction(NamedTuple):
 
 
 class LadderModel(BaseModel):
-    """A fitted residual model, as in ``taught.json``.
+    """A fitted residual model, as in ``model.toml``.
 
     Attributes
     ----------

@@ -22,7 +22,6 @@ from pdhef_logtool.residual_model.ladder import (
     NONE,
     RANDOM,
     REGION_RIDGE,
-    Correction,
     LadderModel,
     plain,
 )
@@ -294,12 +293,3 @@ def _whitening(z: FloatArray) -> FloatArray:
     root = np.linalg.inv(np.linalg.cholesky(second))
     distance2 = np.sum((z @ root.T) ** 2, axis=1)
     return np.asarray(root / math.sqrt(max(float(np.quantile(distance2, QUANTILE)), 1e-9)), dtype=np.float64)
-
-
-def corrected_rmse_deg(drive: TaughtDrive, correction: Correction | None) -> tuple[float, float]:
-    """Return the RMSE of a drive's error in degrees with a correction, and the same without its constant."""
-    lacking = drive.lacking_rad
-    if correction is not None:
-        lacking = lacking - drive.response((correction.gain * correction.rate_m_s2)[:, None])[:, 0]
-    error = np.degrees(lacking[drive.usable])
-    return float(np.sqrt(np.mean(error**2))), float(np.std(error))

@@ -30,6 +30,9 @@ from pdhef_logtool.results.run_differences import run_differences
 if TYPE_CHECKING:
     import polars as pl
 
+    #: Rows of figures by signal, segment and metric.
+    _Rows: TypeAlias = Mapping[tuple[object, ...], pl.DataFrame]
+
 #: ``no figure``: no drive has it on both sides.
 FigureVerdict: TypeAlias = Verdict | Literal["no figure"]
 
@@ -328,41 +331,45 @@ class _Tables:
 
     def compared(self, figures: Sequence[Figure], grouping: _Grouping) -> list[ComparedFigure]:
         """Return figures over all pairs; only their rows are read."""
-        rows = self._rows(figures)
-        return [self._compared(figure, rows, grouping) for figure in figures]
+        a, b = (rows.partition_by("signal", "segment", "metric", as_dict=True) for rows in self._rows(figures))
+        return [self._compared(figure, a, b, grouping) for figure in figures]
 
-    def _compared(self, figure: Figure, tables: Sequence[pl.DataFrame], grouping: _Grouping) -> ComparedFigure:
-        import polars as pl
-
+    def _compared(self, figure: Figure, a: _Rows, b: _Rows, grouping: _Grouping) -> ComparedFigure:
+        key = (figure.signal, figure.segment, figure.metric)
+        of_a, of_b = _by_drive(a.get(key)), _by_drive(b.get(key))
+        tainted_a, tainted_b = (_by_drive(rows.get((figure.signal, "all", "not_independent"))) for rows in (a, b))
         names = self._main if figure.estimator == MAIN else [figure.estimator] * len(self._pairs)
-        wanted = pl.DataFrame(
-            {
-                "a": [p.a.label for p in self._pairs],
-                "b": [p.b.label for p in self._pairs],
-                "estimator": names,
-                "place": range(len(self._pairs)),
-            }
+        drives: list[DriveFigure] = []
+        places: list[int] = []
+        only: dict[str, list[str]] = {"a": [], "b": [], "": []}
+        unit, tainted = "", 0
+        for place, (pair, name) in enumerate(zip(self._pairs, names, strict=True)):
+            key_a, key_b = (pair.a.label, name), (pair.b.label, name)
+            if key_a not in of_a or key_b not in of_b:
+                only["a" * (key_a in of_a) + "b" * (key_b in of_b)].append(pair.a.label)
+                continue
+            (value_a, n_a, unit), (value_b, n_b, _) = of_a[key_a], of_b[key_b]
+            share = _share(value_a, value_b)
+            drives.append(DriveFigure(pair.a.label, pair.b.label, value_a, value_b, n_a, n_b, share))
+            places.append(place)
+            tainted += key_a in tainted_a or key_b in tainted_b
+        ratios = log_ratios(np.array([d.a for d in drives]), np.array([d.b for d in drives]))
+        change = paired_change(ratios, *grouping.of(places))
+        verdict: FigureVerdict = change.verdict(figure.limit or 0.0)
+        if all((d.a, d.n_a) == (d.b, d.n_b) for d in drives):
+            verdict = "equal" if drives else "no figure"
+        ordered = [drives[i] for i in np.argsort(-ratios, kind="stable")]
+        return ComparedFigure(
+            figure,
+            verdict,
+            change,
+            unit=unit,
+            drives=tuple(ordered),
+            only_a=tuple(only["a"]),
+            only_b=tuple(only["b"]),
+            neither=len(only[""]),
+            notes=tuple(_notes(ordered, tainted)),
         )
-        of_figure = {"signal": figure.signal, "segment": figure.segment}
-        is_it = [pl.col(k) == v for k, v in of_figure.items()]
-        sides = []
-        for side, table in zip(("a", "b"), tables, strict=True):
-            rows = table.filter(pl.col("metric") == figure.metric, *is_it).select(
-                pl.col("log").alias(side),
-                "estimator",
-                *(pl.col(c).alias(f"{c}_{side}") for c in ("value", "n", "unit")),
-            )
-            tainted = table.filter(pl.col("metric") == "not_independent", is_it[0])
-            rows = rows.join(
-                tainted.select(pl.col("log").alias(side), "estimator", pl.lit(value=True).alias(f"tainted_{side}")),
-                on=[side, "estimator"],
-                how="left",
-            )
-            sides.append(rows.unique([side, "estimator"]))
-        both = wanted.join(sides[0], on=["a", "estimator"], how="left").join(
-            sides[1], on=["b", "estimator"], how="left"
-        )
-        return _of_rows(figure, both.sort("place"), grouping)
 
     def check_estimators(self, figures: Sequence[ComparedFigure]) -> None:
         """Raise UsageError for an estimator that no drive of either run has, and for runs without a selected one."""
@@ -407,36 +414,13 @@ def _by_parts(run: OpenedRun, query: Callable[[pl.LazyFrame], pl.LazyFrame]) -> 
     return pl.concat(pieces) if pieces else query(run.metrics()).collect()
 
 
-def _of_rows(figure: Figure, both: pl.DataFrame, grouping: _Grouping) -> ComparedFigure:
-    import polars as pl
-
-    known_a, known_b = (both[f"value_{side}"].is_not_null() & both[f"value_{side}"].is_finite() for side in "ab")
-    known_a, known_b = known_a.fill_null(value=False), known_b.fill_null(value=False)
-    used = both.filter(known_a & known_b)
-    a, b = used["value_a"].to_numpy(), used["value_b"].to_numpy()
-    ratios = log_ratios(a, b)
-    change = paired_change(ratios, *grouping.of(used["place"].to_list()))
-    same = bool(np.array_equal(a, b)) and bool(np.array_equal(used["n_a"].to_numpy(), used["n_b"].to_numpy()))
-    verdict: FigureVerdict = change.verdict(figure.limit or 0.0)
-    if same:
-        verdict = "equal" if len(used) else "no figure"
-    order = np.argsort(-ratios, kind="stable")
-    drives = [
-        DriveFigure(r["a"], r["b"], r["value_a"], r["value_b"], r["n_a"], r["n_b"], _share(r["value_a"], r["value_b"]))
-        for r in (used.row(int(i), named=True) for i in order)
-    ]
-    tainted = used.filter(pl.col("tainted_a").fill_null(value=False) | pl.col("tainted_b").fill_null(value=False))
-    return ComparedFigure(
-        figure,
-        verdict,
-        change,
-        unit=str(used["unit_a"][0]) if len(used) else "",
-        drives=tuple(drives),
-        only_a=tuple(both.filter(known_a & ~known_b)["a"]),
-        only_b=tuple(both.filter(known_b & ~known_a)["b"]),
-        neither=len(both.filter(~known_a & ~known_b)),
-        notes=tuple(_notes(drives, len(tainted))),
-    )
+def _by_drive(rows: pl.DataFrame | None) -> dict[tuple[str, str], tuple[float, int, str]]:
+    """Return value, number of stamps and unit of a figure by log and estimator, where it has a value."""
+    if rows is None:
+        return {}
+    columns = ("log", "estimator", "value", "n", "unit")
+    table = rows.select(columns).iter_rows()
+    return {(r[0], r[1]): (r[2], r[3], r[4]) for r in table if r[2] is not None and math.isfinite(r[2])}
 
 
 def _notes(drives: Sequence[DriveFigure], tainted: int) -> Iterator[str]:

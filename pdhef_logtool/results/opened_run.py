@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict
 
+from pdhef_logtool.car.names import MODEL_FILE as MODEL_FILE
 from pdhef_logtool.logs.discovery import RUN_FILE
 from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.storage.documents import file_sha256, read_json, read_sealed, validated
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 #: Folder of logs in the outputs of a run, the figures of all logs, and the files of a log's folder.
 LOGS = "logs"
 METRICS_FILE = "metrics.parquet"
-REPORT_FILE, MODEL_FILE = "report.json", "model.toml"
+REPORT_FILE = "report.json"
 #: Journal of a run of several logs, a line per drive; and the folder of their figures, by run and car.
 JOURNAL_FILE = "journal.jsonl"
 PARTS = "metrics"

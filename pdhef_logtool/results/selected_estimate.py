@@ -75,7 +75,7 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
         "consistency": "" if report["truth"]["available"] else words.consistency(main, value),
         "band": words.band(main, intervals, value(main.name, "coverage95")),
         "assumed": "; ".join(_assumed(report, main)),
-        "next": "; ".join(_next_steps(report, main, figures)[:_MOST_STEPS]),
+        "next": "; ".join(_next_steps(report, main)[:_MOST_STEPS]),
     }
     texts = {key: one_line(text) for key, text in texts.items()}
     best = _best_in_hindsight(report, main, figures)
@@ -160,7 +160,7 @@ def _car(vehicle: Mapping[str, Any]) -> str:
     return "default sedan (no car given)" if vehicle["file"] is None else f"car {vehicle['file']}"
 
 
-def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]:
+def _next_steps(report: Report, main: MainFacts) -> list[str]:
     """Return the remedies, most important first."""
     vehicle, steps = report["vehicle"], []
     if any(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks", ())):
@@ -172,12 +172,7 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
     elif main.distrusted:
         steps.append("check the vehicle file: mass, wheelbase, tyres, steering ratio")
     if vehicle["file"] is not None and not (vehicle["proven"] or vehicle.get("taught")):
-        given = f"--car {vehicle['file']} -o mycar"
-        steps.append(
-            f"teach the car with this ground truth: pdhef learn LOG {given}"
-            if _error(figures, main.name) is not None
-            else f"calibrate the car with several logs: pdhef learn LOGS {given} --stages calibrate"
-        )
+        steps.append(f"learn the car from its drives: pdhef learn LOGS --car {vehicle['file']} -o mycar")
     friction = report["friction"]
     if friction is not None and friction["source"].startswith("assumed"):
         steps.append("give the friction if it is known: --friction 0.8")

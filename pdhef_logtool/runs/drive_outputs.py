@@ -207,7 +207,7 @@ def write_run(
     output: Path,
     config: dict[str, Any],
     results: Sequence[LogResult],
-    verdicts: PlanVerdicts,
+    verdicts: PlanVerdicts | None,
     network: tuple[str, str] | None = None,
     remaining: int = 0,
 ) -> None:

@@ -72,25 +72,28 @@ def judge_drive(
     blocks: Sequence[RequirementBlocks],
     space: OperatingSpace,
 ) -> dict[str, Any]:
-    """Return the entries of report.json on one drive alone: verdicts of a plan, blocks of time and operating space."""
+    """Return the entries of report.json on one drive: verdicts of a plan file, blocks of time, operating space."""
     from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
 
     entries = {"requirement_blocks": jsonable(blocks), "operating_space": jsonable(space)}
     judged = JudgedDrive(drive.name, main, lambda: entries, {"car": drive.car.vehicle.name})
-    return {"plan": plan_verdicts(plan, figures_of_rows(rows), [judged]).to_dict(), **entries}
+    verdicts = plan_verdicts(plan, figures_of_rows(rows), [judged]).to_dict() if plan.file else None
+    return {"plan": verdicts, **entries}
 
 
 def judge(
     plan: ValidationPlan, results: Sequence[LogResult], strict: bool, metrics: Path | None = None
-) -> PlanVerdicts:
-    """Return the verdicts of a plan on logs; a log that failed has no figures.
+) -> PlanVerdicts | None:
+    """Return the verdicts of a plan on logs; None for the default plan on few logs.
 
-    ``metrics``: the file with the figures of all logs, None: they are in memory.
+    ``metrics``: the file with the figures of all logs, None: they are in memory. A log that failed has no figures.
     """
     from pdhef_logtool.results.plan_against import other_runs
     from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_file, figures_of_rows, plan_verdicts
 
     done = [r for r in results if r.outcome.failed is None or r.document is not None]
+    if not plan.file and len(done) < LEAST_DRIVES:
+        return None
     drives = [
         JudgedDrive(r.outcome.log, r.outcome.main, partial(_report, r), factors_of(asdict(r.outcome), None))
         for r in done
@@ -110,10 +113,10 @@ def _report(result: LogResult) -> Mapping[str, Any] | None:
     return result.report
 
 
-def write_verdicts(junit: Path | None, verdicts: PlanVerdicts, results: Sequence[LogResult]) -> None:
+def write_verdicts(junit: Path | None, verdicts: PlanVerdicts | None, results: Sequence[LogResult]) -> None:
     """Write JUnit XML if ``junit`` is a file; raises OutputError."""
     from pdhef_logtool.results.junit import write_junit
 
-    if junit is not None:
+    if junit is not None and verdicts is not None:
         checks = {r.outcome.log: (r.report or {}).get("checks", ()) for r in results}
         write_junit(junit, verdicts, checks)

@@ -6,11 +6,13 @@ import numpy as np
 
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.learning.drives import DriveRecord, no_true_sideslip, record_of
-from pdhef_logtool.learning.stages.task import Task
+from pdhef_logtool.learning.drives import DriveRecord, DriveSet, no_true_sideslip, record_of
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.records.tracks import StateTrack
+
+#: Seed of the random draws on validation drives.
+SEED = 0
 
 
 def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
@@ -21,7 +23,7 @@ def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
 
 def load_drive(
     log: LogInput,
-    task: Task,
+    task: DriveSet,
     *,
     needs: frozenset[str] = frozenset(),
     least_scored: int = 1,

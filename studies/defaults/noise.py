@@ -1,4 +1,4 @@
-"""Noise of the tuned filters of the shipped car, by one search for all (docs/method.md#noise): ``noise.toml``.
+"""Noise of the tuned filters of the shipped car, by one search for all (docs/method.md#noise).
 
 A trial is a point of the space. The first half of the trials is a scrambled Sobol sequence, the same points for all
 filters. The rest are Gaussian steps from each filter's best point so far, in the logarithms of the factors, with a
@@ -10,7 +10,6 @@ mean in degrees: every drive counts by its relative error. The floor limits the 
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,22 +17,18 @@ from functools import partial
 
 import numpy as np
 
-from pdhef_logtool.car.car import NOISE_FILE, Car
-from pdhef_logtool.car.parts import FilterNoise, Noise
-from pdhef_logtool.car.store import Change
-from pdhef_logtool.car.toml_files import part_toml
+from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import FEATURES, Options, spec_of
 from pdhef_logtool.estimators.vehicle_ukf import PHY_UKF_Q_STD
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.learning.drives import DriveRecord, no_drive
-from pdhef_logtool.learning.stages.task import Task
+from pdhef_logtool.learning.drives import DriveRecord, DriveSet
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
-from studies.defaults.drives import load_drive, scorable_stamps
+from studies.defaults.drives import SEED, load_drive, scorable_stamps
 
 #: Filters with a searched noise; the noise of ``physics`` is identified together with its values.
 TUNED = ("phy-ukf:tuned",)
@@ -51,8 +46,6 @@ STEP_FIRST, STEP_LAST = 0.15, 0.02
 #: rate (rad/s). The other noises remain unchanged.
 LOW = np.array([0.002, 0.001, 0.02, 0.0002])
 HIGH = np.array([2.0, 1.0, 5.0, 0.05])
-OBJECTIVE = "geometric mean over drives of the sideslip RMSE, each with the floor added as squares"
-HEAD = "Written by python -m studies.defaults.train_default. For the physics of this car only."
 
 #: A point of the space, four significant digits each.
 Point = tuple[float, ...]
@@ -67,12 +60,12 @@ class Trial:
     objective_deg: float
 
 
-def tune(task: Task, trials: int) -> Change:
+def tune(task: DriveSet, trials: int) -> dict[str, FilterNoise]:
     """Return the noise of the tuned filters: the best of ``trials`` each.
 
     Raises
     ------
-    EstimatorError
+    SystemExit
         No drive can be scored.
     """
     options, slow = task.settings.config.read_options, task.car.vehicle.low_speed_blend_m_s
@@ -80,9 +73,9 @@ def tune(task: Task, trials: int) -> Change:
     def read(log: LogInput) -> tuple[DriveRecord, WholeDrive | None]:
         return load_drive(log, task, needs=FEATURES, least_scored=MIN_SCORED_STAMPS)
 
-    records, drives = task.read(read)
+    _, drives = task.read(read)
     if not drives:
-        raise no_drive("a true sideslip and the signals of the filters", "noise")
+        raise SystemExit("noise: at least one drive with a true sideslip and the signals of the filters is needed")
 
     def objective(name: str, values: Point) -> float:
         car = task.car.with_noise(name, filter_noise(values))
@@ -94,37 +87,18 @@ def tune(task: Task, trials: int) -> Change:
 
     best = {}
     for name in TUNED:
-        best[name] = min(search(partial(objective, name), trials, task.settings.seed), key=_order)
+        best[name] = min(search(partial(objective, name), trials, SEED), key=_order)
         print(f"{name}: trial {best[name].number} of {trials}, {best[name].objective_deg:.4f}°", flush=True)
-    return _change(task, best, trials, [r for r in records if not r.left_out])
+    return {name: _noise(trial) for name, trial in best.items()}
+
+
+def _noise(trial: Trial) -> FilterNoise:
+    score = {"score_deg": round(trial.objective_deg, 4), "trial": trial.number}
+    return filter_noise(trial.values).model_copy(update=score)
 
 
 def _order(trial: Trial) -> tuple[float, int]:
     return trial.objective_deg, trial.number
-
-
-def _change(task: Task, best: dict[str, Trial], trials: int, records: Sequence[DriveRecord]) -> Change:
-    together = hashlib.sha256("".join(sorted(r.sha256 for r in records)).encode()).hexdigest()
-    search_of = {"trials": trials, "seed": task.settings.seed, "objective": OBJECTIVE, "drives_sha256": together}
-    part = Noise(
-        filter={name: _part(trial, task.car, name) for name, trial in best.items()},
-        search=search_of,
-        drives=tuple(r.learnt_on for r in records),
-    )
-    text = part_toml(part, HEAD, {f"filter.{n}.q_std": "v_x, v_y, yaw rate" for n in best})
-    return Change(
-        "studies.defaults.train_default noise",
-        NOISE_FILE,
-        {NOISE_FILE: text.encode()},
-        settings={**task.settings.to_dict(), "trials": trials},
-        drives=part.drives,
-    )
-
-
-def _part(trial: Trial, car: Car, name: str) -> FilterNoise:
-    """Return the noise of a trial with the physics that it belongs to."""
-    belongs = {"physics_sha256": car.physics_of(name), "score_deg": round(trial.objective_deg, 4)}
-    return filter_noise(trial.values).model_copy(update={**belongs, "trial": trial.number})
 
 
 def filter_noise(values: Point) -> FilterNoise:

@@ -27,18 +27,15 @@ import torch
 from pdhef_logtool.car.car import (
     FIT_FILE,
     NETWORK_FOLDER,
-    NOISE_FILE,
     SHIPPED_CARS,
     VEHICLE_FILE,
     Car,
+    read_fit,
 )
-from pdhef_logtool.car.store import update_car
-from pdhef_logtool.car.toml_files import read_vehicle_file, vehicle_toml
-from pdhef_logtool.learning.drives import LearnSettings, choose_drives
+from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file, vehicle_toml
+from pdhef_logtool.learning.drives import DriveSet, LearnSettings
 from pdhef_logtool.learning.network.fit import PAPER_RECIPE, Recipe
 from pdhef_logtool.learning.network.train_command import dataset_for, train_on
-from pdhef_logtool.learning.stages.task import Task
-from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import MODELS, NOMINAL_MODEL, PAPER_FOLDER, PHYSICS_MODEL
@@ -89,16 +86,11 @@ class Training:
         """Options that name the car and the mapping."""
         return "--car", self.car, "--mapping", self.work / "mapping.toml"
 
-    def validation_task(self) -> Task:
+    def validation_task(self) -> DriveSet:
         """Return the validation drives with car and network."""
         config = RunConfig(car=self.car, mapping=self.work / "mapping.toml")
         settings = LearnSettings(config=config, split="validation")
-        inputs, splits = choose_drives([str(self.work / "one_car")], settings)
-        reporter = Reporter(warn=print)
-        car, mapping = Car.load(config.car), mapping_of(config.mapping)
-        return Task(
-            car=car, settings=settings, logs=tuple(inputs), mapping=mapping, set_splits=splits, reporter=reporter
-        )
+        return DriveSet.of([str(self.work / "one_car")], Car.load(config.car), settings, Reporter(warn=print))
 
 
 def simulate(t: Training) -> None:
@@ -110,8 +102,7 @@ def simulate(t: Training) -> None:
     )
     (t.car / VEHICLE_FILE).write_text(f"{text}\n[network]\ngain = {GAIN}\n", encoding="utf-8")
     if t.seed:
-        for part in (FIT_FILE, NOISE_FILE):
-            shutil.copyfile(HOME / part, t.car / part)
+        shutil.copyfile(HOME / FIT_FILE, t.car / FIT_FILE)
     (t.work / "mapping.toml").write_text(MAPPING, encoding="utf-8")
     what = ("--count", t.drives, "--seed", SEED, "--vehicles", "default", "--jobs", t.jobs)
     pdhef("simulate", "suite", *what, "-o", t.work / "one_car")
@@ -121,6 +112,12 @@ def simulate(t: Training) -> None:
 def fit(t: Training) -> None:
     """Fit ``physics``; the network learns its residual."""
     fit_physics.main(["-o", str(t.car), "--work", str(t.work / "fit"), "--jobs", str(t.jobs)])
+
+
+def noise(t: Training) -> None:
+    """Tune the noise of all tuned filters alike, on validation drives."""
+    fitted = read_fit(t.car / FIT_FILE).model_copy(update={"filter": tune(t.validation_task(), t.trials)})
+    (t.car / FIT_FILE).write_text(part_toml(fitted, fit_physics.HEAD), encoding="utf-8")
 
 
 def extract(t: Training) -> None:
@@ -153,14 +150,8 @@ def paper(t: Training) -> None:
     )  # fmt: skip
 
 
-def noise(t: Training) -> None:
-    """Tune the noise of all tuned filters alike, on validation drives."""
-    task = t.validation_task()
-    update_car(task.car, t.car, tune(task, t.trials))
-
-
 STEPS: dict[str, Callable[[Training], None]] = {
-    step.__name__: step for step in (simulate, fit, extract, train, paper, noise)
+    step.__name__: step for step in (simulate, fit, noise, extract, train, paper)
 }
 #: Seeds other than 0 take these parts from the shipped car.
 ONLY_OF_SEED_0 = ("fit", "noise")

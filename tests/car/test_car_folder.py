@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import tomllib
@@ -17,14 +16,13 @@ from pdhef_logtool.car import store
 from pdhef_logtool.car.assumed_values import completed
 from pdhef_logtool.car.car import (
     FIT_FILE,
-    HISTORY_FILE,
     INTERVALS_FILE,
     NETWORK_FOLDER,
-    NOISE_FILE,
     SHIPPED_CARS,
     VEHICLE_FILE,
     Car,
 )
+from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.parts import (
     FilterNoise,
     Fit,
@@ -32,13 +30,12 @@ from pdhef_logtool.car.parts import (
     FittedSensors,
     FittedValues,
     LearntOn,
-    Noise,
     Record,
     TriedParts,
     car_folder,
     physics_sha256,
 )
-from pdhef_logtool.car.store import Change, check_output, update_car
+from pdhef_logtool.car.store import check_output, update_car
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.table import make_estimator
@@ -77,11 +74,6 @@ def folder(tmp_path: Path) -> Path:
     return path
 
 
-def history(folder: Path) -> list[dict[str, Any]]:
-    """Return the lines of a car's history, oldest first."""
-    return [json.loads(line) for line in (folder / HISTORY_FILE).read_text().splitlines()]
-
-
 def load(path: Path, network: str = "none") -> Car:
     return Car.load(path, network=network)
 
@@ -99,12 +91,6 @@ def add_fit(folder: Path, **values: Any) -> Fit:
     )
     write_part(folder / FIT_FILE, fit)
     return fit
-
-
-def add_noise(folder: Path, name: str = OURS, **entries: Any) -> FilterNoise:
-    noise = FilterNoise(q_std=(0.4, 0.5, 0.6), physics_sha256=load(folder).physics_sha256, **entries)
-    write_part(folder / NOISE_FILE, Noise(filter={name: noise}))
-    return noise
 
 
 def edit(folder: Path, old: str, new: str) -> None:
@@ -150,9 +136,6 @@ def test_parts_come_one_by_one(folder: Path) -> None:
     )
     assert dict(car.noise) == fit.filter
     assert car.learnt_on == DRIVES
-    noise = add_noise(folder)
-    car = load(folder)
-    assert dict(car.noise) == {**fit.filter, OURS: noise}
     assert car.notes == ()
 
 
@@ -217,18 +200,14 @@ def test_what_was_found_through_physics_is_its_own(folder: Path, tmp_path: Path)
         ("[tyres.front]", "[sensors]\nay_bias_m_s2 = 0.1\n[tyres.front]"),
     ],
 )
-def test_other_physics_leave_fit_and_noise_out_and_say_so(folder: Path, old: str, new: str) -> None:
+def test_other_physics_leave_the_fit_out_and_say_so(folder: Path, old: str, new: str) -> None:
     add_fit(folder)
-    add_noise(folder)
     edit(folder, old, new)
     car = load(folder, "default")
     assert car.vehicle == car.datasheet
     assert dict(car.noise) == {}
     assert car.learnt_on == ()
-    assert car.notes == (
-        "fit.toml is not used: vehicle.toml has changed since",
-        "noise of physics is not used: it belongs to other physics",
-    )
+    assert car.notes == ("fit.toml is not used: vehicle.toml has changed since",)
 
 
 @pytest.mark.parametrize(
@@ -244,7 +223,6 @@ def test_other_physics_leave_fit_and_noise_out_and_say_so(folder: Path, old: str
 )
 def test_what_is_no_physics_makes_nothing_stale(folder: Path, old: str, new: str) -> None:
     add_fit(folder)
-    add_noise(folder)
     before = load(folder, "default")
     edit(folder, old, new)
     car = load(folder, "default")
@@ -277,8 +255,9 @@ def test_a_network_is_no_car(tmp_path: Path) -> None:
         Car.load(tmp_path)
 
 
-NOISE = f'format = "pdhef-noise"\nversion = 1\n[filter."{TUNED}"]\n'
 FIT = f'format = "pdhef-fit"\nversion = 1\nphysics_sha256 = "{"ab" * 32}"\n'
+NOISE = f'{FIT}[filter."{TUNED}"]\n'
+MODEL = FIT.replace("fit", "model")
 
 
 @pytest.mark.parametrize(
@@ -292,13 +271,15 @@ FIT = f'format = "pdhef-fit"\nversion = 1\nphysics_sha256 = "{"ab" * 32}"\n'
         (FIT_FILE, FIT + "[values]\nsteering_ration = 3.0\n", "did you mean values.steering_ratio?"),
         (FIT_FILE, FIT + "[values.sensors]\nay_bias = 3.0\n", "did you mean values.sensors.ay_bias_m_s2?"),
         (FIT_FILE, FIT.replace("version = 1", "version = 2") + "[values]\n", "version: should be 1"),
-        (NOISE_FILE, NOISE + "q_sdt = []\n", f"did you mean filter.{TUNED}.q_std?"),
-        (NOISE_FILE, NOISE + "r_std = {ay = 1.0}\n", f"did you mean filter.{TUNED}.r_std.ay_m_s2?"),
-        (NOISE_FILE, NOISE.replace("tuned", "tunde") + "q_std = []\n", f"did you mean filter.{TUNED}?"),
-        (NOISE_FILE, NOISE + "q_std = [1.0]\n", "q_std needs 3 or 4 entries"),
-        (NOISE_FILE, NOISE + "q_std = [0.02, -0.006, 0.002]\n", "greater than or equal to 0"),
-        (NOISE_FILE, NOISE + f"q_std = {[0.1] * 6}\n", "6 are physics's"),
-        (NOISE_FILE, NOISE.replace("noise", "fit"), "format: should be 'pdhef-noise'"),
+        (FIT_FILE, NOISE + "q_sdt = []\n", f"did you mean filter.{TUNED}.q_std?"),
+        (FIT_FILE, NOISE + "r_std = {ay = 1.0}\n", f"did you mean filter.{TUNED}.r_std.ay_m_s2?"),
+        (FIT_FILE, NOISE.replace("tuned", "tunde") + "q_std = []\n", f"did you mean filter.{TUNED}?"),
+        (FIT_FILE, NOISE + "q_std = [1.0]\n", "q_std needs 3 or 4 entries"),
+        (FIT_FILE, NOISE + "q_std = [0.02, -0.006, 0.002]\n", "greater than or equal to 0"),
+        (FIT_FILE, NOISE + f"q_std = {[0.1] * 6}\n", "6 are physics's"),
+        (FIT_FILE, MODEL, "format: should be 'pdhef-fit'"),
+        (MODEL_FILE, MODEL + "parameters = [{name = 'x', value = 1.0, std = -1.0}]\n", "parameters[1].std"),
+        (MODEL_FILE, MODEL + "parameter = []\n", "parameter: unknown, did you mean parameters?"),
     ],
 )
 def test_wrong_entries_of_every_part_are_told_in_one_line(folder: Path, name: str, text: str, said: str) -> None:
@@ -319,12 +300,7 @@ def test_tables_of_parts_have_no_place_in_vehicle_toml(tmp_path: Path) -> None:
 # --- writing ---------------------------------------------------------------------------------------------------------
 
 
-def noise_change(noise: dict[str, FilterNoise], **more: Any) -> Change:
-    data = part_toml(Noise(filter=noise), "Written by hand.").encode()
-    return Change("tune", NOISE_FILE, {NOISE_FILE: data}, settings={"trials": 8}, drives=DRIVES, **more)
-
-
-NEW = {OURS: FilterNoise(q_std=(0.1, 0.2, 0.3), r_std={"ay_m_s2": 0.7}, score_deg=0.11, trial=5)}
+NEW = {MODEL_FILE: f'format = "pdhef-model"\nphysics_sha256 = "{"ab" * 32}"\n'.encode()}
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
@@ -333,40 +309,31 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 def test_a_new_folder_gets_the_persons_file_byte_for_byte_and_the_parts(folder: Path, tmp_path: Path) -> None:
     add_fit(folder)
-    written = update_car(load(folder), tmp_path / "deep" / "new", noise_change(NEW))
-    assert written == tmp_path / "deep" / "new" / NOISE_FILE
-    assert {*files_of(written.parent)} == {VEHICLE_FILE, FIT_FILE, NOISE_FILE, HISTORY_FILE}
-    assert (written.parent / VEHICLE_FILE).read_bytes() == (folder / VEHICLE_FILE).read_bytes()
-    assert load(written.parent).noise[OURS] == NEW[OURS]
+    written = tmp_path / "deep" / "new"
+    update_car(load(folder), written, NEW)
+    files = {name: (folder / name).read_bytes() for name in (VEHICLE_FILE, FIT_FILE)}
+    assert files_of(written) == {**files, **NEW}
     assert {p.name for p in folder.iterdir()} == {VEHICLE_FILE, FIT_FILE}
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["new"]
 
 
 def test_a_bare_file_and_the_default_car_become_folders(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(PERSONS)
-    update_car(load(tmp_path / "mine.toml"), tmp_path / "mine", noise_change(NEW))
+    update_car(load(tmp_path / "mine.toml"), tmp_path / "mine", NEW)
     assert (tmp_path / "mine" / VEHICLE_FILE).read_text() == PERSONS
     mask = os.umask(0)
     os.umask(mask)
     assert (tmp_path / "mine").stat().st_mode & 0o777 == 0o777 & ~mask
-    update_car(Car.load(None, network="none"), tmp_path / "sedan", noise_change(NEW))
+    update_car(Car.load(None, network="none"), tmp_path / "sedan", NEW)
     assert load(tmp_path / "sedan").datasheet == default_vehicle()
 
 
-def test_the_same_folder_is_updated_and_every_command_leaves_a_line(folder: Path) -> None:
+def test_the_same_folder_is_updated(folder: Path) -> None:
     (folder / "notes.txt").write_text("mine too")
     vehicle = (folder / VEHICLE_FILE).read_bytes()
-    update_car(load(folder), folder, noise_change(NEW))
-    update_car(load(folder), folder, noise_change({TUNED: NEW[OURS]}))
-    assert (folder / VEHICLE_FILE).read_bytes() == vehicle
-    assert (folder / "notes.txt").read_text() == "mine too"
-    assert set(load(folder).noise) == {TUNED}
-    lines = history(folder)
-    assert [(line["command"], line["part"], line["settings"]) for line in lines] == [
-        ("tune", NOISE_FILE, {"trials": 8})
-    ] * 2
-    assert lines[0]["drives"] == [DRIVES[0].model_dump(mode="json")]
-    assert lines[1]["sha256"] == digest((folder / NOISE_FILE).read_text()) != lines[0]["sha256"]
+    update_car(load(folder), folder, {MODEL_FILE: b"x"})
+    update_car(load(folder / VEHICLE_FILE), folder, NEW)
+    assert files_of(folder) == {VEHICLE_FILE: vehicle, "notes.txt": b"mine too", **NEW}
     assert [p.name for p in folder.parent.iterdir()] == [folder.name]
 
 
@@ -378,17 +345,17 @@ def _raise(error: BaseException) -> Callable[..., Any]:
 
 
 @pytest.mark.parametrize("error", [OSError(28, "no space left"), KeyboardInterrupt()])
-@pytest.mark.parametrize("place", ["file", "log", "exchange"])
+@pytest.mark.parametrize("place", ["file", "exchange"])
 @pytest.mark.parametrize("new", [False, True])
 def test_a_failure_in_the_middle_leaves_the_old_car_and_nothing_else(
     folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, place: str, new: bool
 ) -> None:
     car, before = load(folder), files_of(folder)
-    places = {"file": (store, "write_bytes"), "log": (store, "_log"), "exchange": (outputs, "_exchanged")}
+    places = {"file": (store, "write_bytes"), "exchange": (outputs, "_exchanged")}
     monkeypatch.setattr(*places[place], _raise(error))
     output = folder.with_name("new") if new else folder
     with pytest.raises(OutputError if isinstance(error, OSError) else type(error)):
-        update_car(car, output, noise_change(NEW))
+        update_car(car, output, NEW)
     assert files_of(folder) == before
     assert [p.name for p in folder.parent.iterdir()] == [folder.name]
 
@@ -407,7 +374,7 @@ def test_what_is_no_place_for_a_car_is_refused_and_untouched(folder: Path, tmp_p
         (file, "a new folder or a car's folder"),
         (tmp_path / "new.toml", r"a new folder or a car's folder, got new\.toml"),
     ):
-        for act in (lambda o=output: check_output(car, o), lambda o=output: update_car(car, o, noise_change(NEW))):
+        for act in (lambda o=output: check_output(car, o), lambda o=output: update_car(car, o, NEW)):
             with pytest.raises(UsageError, match=said):
                 act()
     assert files_of(tmp_path) == before
@@ -421,11 +388,10 @@ def test_what_is_no_place_for_a_car_is_refused_and_untouched(folder: Path, tmp_p
 def test_changes_by_several_commands_at_once_are_all_there(folder: Path, new: bool) -> None:
     car = load(folder)
     output = folder.with_name("new") if new else folder
-    changes = [Change("tune", f"part-{i}.toml", {f"part-{i}.toml": b"x = 1\n"}) for i in range(8)]
+    changes = [{f"part-{i}.toml": b"x = 1\n"} for i in range(8)]
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda change: update_car(car, output, change), changes))
     assert {f"part-{i}.toml" for i in range(8)} <= set(files_of(output))
-    assert len([line for line in history(output) if line["part"].startswith("part-")]) == 8
     assert not [p for p in folder.parent.iterdir() if p.name.startswith(".")]
 
 

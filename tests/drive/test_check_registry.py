@@ -1,44 +1,49 @@
-"""A check is one file and one line: the example of the package's docstring, added that way, is in every output."""
+"""A check is an entry of checks.toml and a function: added that way, it is in every output."""
 
 from __future__ import annotations
 
 import io
 import json
 import re
-import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive import checks
-from pdhef_logtool.drive.checks import registry
-from pdhef_logtool.drive.checks.registry import registered
-from pdhef_logtool.records.entries import load_entries
+from pdhef_logtool.drive.check_table import TABLE, judge
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.inspection import inspect_log
 from studies.documentation_tables import on_page_markdown
 
 NAME = "speed_m_s.range"
+ENTRY = {
+    "compares": "the fastest speed with a limit",
+    "fails": "it is above 1 m/s",
+    "limits": [0.0, 1.0],
+    "evidence": "the fastest speed is {value:.1f} m/s",
+    "remedy": "check the scale of the speed, which should be in {unit}",
+}
 DOCS = Path(__file__).parents[2] / "docs"
 PLAN = '[[requirement]]\nid = "a"\nsignal = "sideslip_rad"\nlimit_deg = 90.0\n'
 
 
+def fastest(drive: checks.CheckedDrive) -> Iterator[Check]:
+    if drive.speed is not None:
+        yield judge(NAME, float(np.nanmax(drive.speed, initial=0.0)), unit="m/s")
+
+
 @pytest.fixture
-def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Add the example, which fails above 100 m/s, at 1 m/s as a file beside the package's and as a line of its list."""
-    example = re.sub(r"^    ", "", str(checks.__doc__).partition("::\n\n")[2], flags=re.MULTILINE)
-    (tmp_path / "checks").mkdir()
-    (tmp_path / "checks" / "speed_range.py").write_text(example.replace("100.0", "1.0"), encoding="utf-8")
-    monkeypatch.setattr(checks, "__path__", [*checks.__path__, str(tmp_path / "checks")])
-    monkeypatch.setattr(registry, "MODULES", (*registry.MODULES, "speed_range"))
-    yield NAME
-    sys.modules.pop(f"{checks.__name__}.speed_range", None)
-    load_entries.cache_clear()
+def toy(monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setitem(TABLE, NAME, ENTRY)
+    monkeypatch.setattr(checks, "FUNCTIONS", (*checks.FUNCTIONS, fastest))
+    return NAME
 
 
 @pytest.mark.slow
@@ -84,19 +89,12 @@ def test_inspect_shows_it(toy: str, sample_logs_dir: Path) -> None:
 
 def test_the_documentation_lists_it(toy: str) -> None:
     found = on_page_markdown((DOCS / "formats.md").read_text(encoding="utf-8"))
-    for kind in registered().values():
-        assert f"| `{kind.name}` | {kind.compares} | {kind.fails} |" in found
-    assert f"| `{toy}` | the fastest speed with the top speed of road cars |" in found
+    for name, entry in TABLE.items():
+        assert f"| `{name}` | {entry['compares']} | {entry['fails']} |" in found
 
 
-def test_a_name_is_registered_once(toy: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "MODULES", (*registry.MODULES, "speed_range"))
-    with pytest.raises(ValueError, match=f"{toy}.*registered twice"):
-        registered()
-
-
-def test_names_of_checks_are_registered(sample_logs_dir: Path) -> None:
-    patterns = [re.escape(name).replace("SIGNAL", r"[\w.]+") for name in registered()]
+def test_names_of_checks_are_in_the_table(sample_logs_dir: Path) -> None:
+    patterns = [re.escape(name).replace("SIGNAL", r"[\w.]+") for name in TABLE]
     for log in ("dlc", "sweep", "faults"):
         found = inspect_log(sample_logs_dir / f"{log}.mcap").checks
         assert found

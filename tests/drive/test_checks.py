@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.checks import check_drive
-from pdhef_logtool.drive.checks.by_relations import relation_checks
-from pdhef_logtool.drive.checks.truth_sideslip import sideslip_offset
+from pdhef_logtool.drive.checks import check_drive, sideslip_offset
 from pdhef_logtool.drive.columns import columns_on_grid
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.mounting import truth_latency
+from pdhef_logtool.drive.relation_checks import relation_checks
 from pdhef_logtool.drive.relations import BIAS_RAD_S, GAIN_RANGE, compare
 from pdhef_logtool.drive.truth import LatencyEstimate, booked_on_the_late, derive_truth
 from pdhef_logtool.logs.open_log import open_log
@@ -498,8 +497,8 @@ def test_driving_in_reverse_is_no_offset_of_the_heading() -> None:
     speed, rate = -8.0 - np.sin(0.2 * seconds), 0.1 * np.sin(0.5 * seconds)
     columns = {"truth.vx_m_s": speed, "truth.vy_m_s": 0.3 * rate, "yaw_rate_rad_s": rate, "ay_m_s2": speed * rate}
     wrong, right = (sideslip_offset(c) for c in (columns, {**columns, "speed_m_s": speed}))
-    assert right is not None and right[1] < 0.01
-    assert wrong is None or wrong[1] > 0.1
+    assert right[1] < 0.01
+    assert wrong[1] > 0.1
 
 
 def test_marks_of_invalid_values_are_no_motion() -> None:

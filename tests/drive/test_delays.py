@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.drive.checks.late_sensors import delay_checks
+from pdhef_logtool.drive.checks import delay_checks
 from pdhef_logtool.drive.correlation import has_peak_within, on_common_grid
 from pdhef_logtool.drive.delays import late_sensors
 from pdhef_logtool.drive.mounting import survey_log

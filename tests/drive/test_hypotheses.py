@@ -110,4 +110,4 @@ def test_inspect_and_run_refuse_the_same_channels(sample_logs_dir: Path) -> None
     log.close()
     assert inspection.refused == plan.refused
     assert set(plan.refused) == {"truth.yaw_rate_rad_s"}
-    assert "estimate sideslip" in inspection.uses["can"]
+    assert "physics" in inspection.estimators

@@ -14,8 +14,7 @@ from typer.testing import CliRunner
 
 from pdhef_logtool import PdhefError, ReadOptions, RunConfig, read_drive, run
 from pdhef_logtool.cli.app import app
-from pdhef_logtool.drive.checks import check_drive
-from pdhef_logtool.drive.checks.running import misread_channels
+from pdhef_logtool.drive.checks import check_drive, misread_channels
 from pdhef_logtool.records.signals import Channel
 from studies.mapping_mistakes import look_at, mistaken, outcomes, subjects
 from studies.pages import write_toml

@@ -10,11 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
-from pdhef_logtool.drive.checks import check_drive
-from pdhef_logtool.drive.checks.by_relations import SUSPICIONS
-from pdhef_logtool.drive.checks.running import misread_channels
+from pdhef_logtool.drive.checks import check_drive, misread_channels
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.other_fields import with_other_fields
+from pdhef_logtool.drive.relation_checks import SUSPICIONS
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.records.checks import Check

@@ -40,7 +40,7 @@ def planned(log, mapping=None) -> DrivePlan:
 
 
 def signals_of(log, plan: DrivePlan) -> Signals:
-    return read_recorded(log, plan, IMU).signals  # the log has faults, which are not the mounting's
+    return read_recorded(log, plan).signals
 
 
 def difference(a: Signals, b: Signals) -> float:

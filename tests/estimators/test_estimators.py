@@ -14,8 +14,8 @@ from made_models import full_network, linear_residual
 from reference_car import cut, drive, keep, rolling_drive, slalom, tanh_tyre, with_noise
 
 from pdhef_logtool.car.car import Car, WithoutTruth
+from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.car.taught import Taught
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators import latency_compensation
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
@@ -98,7 +98,7 @@ def _calibrated() -> WithoutTruth:
 
 def _taught() -> Car:
     car = Car.of(default_vehicle())
-    return replace(car, taught=Taught(physics_sha256=car.physics_sha256, residual=linear_residual()))
+    return replace(car, model=CarModel(physics_sha256=car.physics_sha256, residual=linear_residual()))
 
 
 #: Every estimator with steps, and every wrapper that an option or a part of the car puts around one.

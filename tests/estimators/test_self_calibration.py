@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import FRICTION, Drive, cut, drive, keep, with_noise
 
-from pdhef_logtool.car.taught import TaughtParameter
+from pdhef_logtool.car.model import TaughtParameter
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.calibration import calibration as rules
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate

@@ -113,7 +113,7 @@ def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec: Any) -> None:
         ([], [spec.name]) if lacks else ([spec.name], [])
     )
     if lacks:
-        assert "--network" in skipped[0].reason or "noise.toml" in skipped[0].reason
+        assert "--network" in skipped[0].reason or "fit.toml" in skipped[0].reason
         with pytest.raises(UsageError, match=spec.name):
             make_estimator(spec.name, Car.of(VEHICLE))
     assert (spec.name in all_names(Car.of(VEHICLE))) == (spec.group == ALL_ESTIMATORS and not lacks)

@@ -11,8 +11,8 @@ from made_models import linear_residual, random_network
 from reference_car import drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car, WithoutTruth
+from pdhef_logtool.car.model import CarModel, TaughtParameter
 from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.car.taught import Taught, TaughtParameter
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.joint import parameters_of, prior_vehicle, with_taught
@@ -28,8 +28,8 @@ SEDAN = default_vehicle()
 
 
 def taught_car(residual: LadderModel | None, *, calibrated: bool = False) -> Car:
-    taught = Taught(physics_sha256=Car.of(SEDAN).physics_sha256, residual=residual, calibrated=calibrated)
-    return replace(Car.of(SEDAN), taught=taught)
+    model = CarModel(physics_sha256=Car.of(SEDAN).physics_sha256, residual=residual, calibrated=calibrated)
+    return replace(Car.of(SEDAN), model=model)
 
 
 def acts(estimator: Any) -> bool:

@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import pytest
-
-from pdhef_logtool.learning.drives import DriveRecord, LearnSettings, exit_code, tell_drive
-from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.learning.drives import DriveRecord, exit_code, tell_drive
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.runs.config import RunConfig
-
-SALOON = RunConfig(car=Path("saloon"))
 
 
 def record(name: str, **changes: Any) -> DriveRecord:
@@ -28,12 +21,3 @@ def test_what_a_user_must_know_of_a_drive_is_told_in_order_and_decides_the_exit_
     assert told == ["a: perfect ground truth", "a: 2 s are gone (/imu)", "a is left out: it is short"]
     good, bad = record("a", losses=(note,)), record("b", left_out="x")
     assert [exit_code(r) for r in ([good], [good, bad], [good, record("c", losses=(lost,))], [bad])] == [0, 3, 3, 1]
-
-
-@pytest.mark.parametrize(
-    ("wrong", "place"),
-    [({"seed": -1}, "--seed"), ({"stage": "noise"}, "--stages"), ({"stage": "teach,gain"}, "--stages")],
-)
-def test_wrong_settings_are_usage_errors(wrong: dict[str, Any], place: str) -> None:
-    with pytest.raises(UsageError, match=place):
-        LearnSettings(config=SALOON, **wrong)

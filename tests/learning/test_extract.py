@@ -15,7 +15,7 @@ from fake_drive_log import FakeLog, FakeTopic
 from residual_car import CAR, Motion, Wave, drive
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.taught import Taught
+from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.toml_files import vehicle_toml
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive import reading
@@ -24,8 +24,7 @@ from pdhef_logtool.learning.network.extract_command import ExtractResult, Extrac
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.records.errors import LogError, OutputError, UsageError
 from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.residual_model.features import EVEN_COUNT, FEATURES, ODD_COUNT
-from pdhef_logtool.residual_model.ladder import LadderModel, plain
+from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.outputs import OutputFolder
@@ -130,11 +129,7 @@ def test_noisy_truth_is_smoothed_and_unbiased(motion: Motion, tmp_path: Path, mo
     error, _ = _errors(result, motion)
     assert np.abs(error.mean(axis=0)).max() < 0.02
     smoothed = np.sqrt(np.mean(error**2, axis=0))
-    assert smoothed[0] < 0.12
-    raw, _ = _errors(_extract(tmp_path, monkeypatch, log, truth_smoothing="none"), motion)
-    assert np.sqrt(np.mean(raw**2, axis=0))[0] > 1.0
-    wide = _extract(tmp_path, monkeypatch, log, truth_smoothing="0.2")
-    assert wide.manifest["drives"][0]["truth"]["smoothing_half_s"] == 0.2
+    assert smoothed[0] < 0.12, "the noise of one-step differences is above 1"
 
 
 def test_a_drive_below_the_low_speed_limit_gives_rows_and_is_told(
@@ -154,7 +149,7 @@ def test_a_drive_below_the_low_speed_limit_gives_rows_and_is_told(
 def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> ExtractResult:
     out = tmp_path_factory.mktemp("dataset")
     logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "sweep.mcap")]
-    return extract(logs, out, ExtractSettings(RunConfig(), seed=4))
+    return extract(logs, out, ExtractSettings(RunConfig()))
 
 
 def test_manifest_follows_its_schema(dataset: ExtractResult, sample_logs_dir: Path) -> None:
@@ -182,21 +177,17 @@ def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
         "truth_vy_m_s",
         "truth_std_rad",
         "truth_source",
-        "region",
         "weight",
         "segment",
         "chosen",
-        "cell",
-        "draw",
     ]
     assert frame["stamp_ns"].diff().drop_nulls().min() > 0  # type: ignore[operator]
     entry = next(d for d in dataset.manifest["drives"] if d["log"] == "dlc")
     assert (len(frame), int((frame["weight"] > 0).sum())) == (entry["rows"], entry["usable_rows"])
     usable = frame.filter(pl.col("weight") > 0)
-    assert usable.drop("region").null_count().sum_horizontal().item() == 0
-    assert usable["region"].is_null().all() and 0.9 < usable["weight"].min() <= usable["weight"].max() <= 1.0
-    assert frame["chosen"].all() and set(frame["cell"].unique()) <= {-1, *(int(n) for n in entry["cells"])}
-    assert sum(entry["cells"].values()) == entry["usable_rows"]
+    assert usable.null_count().sum_horizontal().item() == 0
+    assert 0.9 < usable["weight"].min() <= usable["weight"].max() <= 1.0
+    assert frame["chosen"].all()
     whole = pl.scan_parquet(dataset.output / "**/*.parquet", hive_partitioning=True)
     sums = whole.group_by("split").agg(pl.len()).collect()
     assert dict(sums.iter_rows()) == {
@@ -204,29 +195,18 @@ def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
     }  # fmt: skip
 
 
-def test_a_taught_car_is_calibrated_and_each_row_has_the_gain_of_its_region(
-    sample_logs_dir: Path, tmp_path: Path
-) -> None:
+def test_a_taught_car_is_calibrated_on_each_drive(sample_logs_dir: Path, tmp_path: Path) -> None:
     car = tmp_path / "car"
     car.mkdir()
     text = (sample_logs_dir / "vehicle.toml").read_text()
     (car / "vehicle.toml").write_text(text[: text.index("[network]")] + "\n" + text[text.index("[sensors]") :])
-    ones = np.ones(ODD_COUNT)
-    model = LadderModel(
-        rung="linear", scale=plain(ones), even_mean=plain(np.zeros(EVEN_COUNT)), even_scale=plain(np.ones(EVEN_COUNT)),
-        weights=plain(0.01 * ones), whitening=plain(0.6 * np.eye(ODD_COUNT)),
-        speed_m_s=(5.0, 60.0), largest_m_s2=0.1,
-    )  # fmt: skip
-    taught = Taught(physics_sha256=Car.load(car, network="none").physics_sha256, residual=model)
-    (car / "taught.json").write_text(json.dumps(taught.model_dump(mode="json")))
-    config = RunConfig(car=car)
-    result = extract([str(sample_logs_dir / "dlc.mcap")], tmp_path / "set", ExtractSettings(config))
-    (entry,) = result.manifest["drives"]
-    follows(json.loads((tmp_path / "set" / MANIFEST).read_text()), "dataset.schema.json")
-    assert entry["taught_sha256"] == model.sha256 and "stiffness" in entry["calibration"]
-    (file,) = (tmp_path / "set").rglob("part-*.parquet")
-    region = pl.read_parquet(file, hive_partitioning=False)["region"].drop_nulls().to_numpy()
-    assert region.min() == 0.0 and region.max() == 1.0 and ((region > 0.0) & (region < 1.0)).any()
+    logs, settings = [str(sample_logs_dir / "dlc.mcap")], ExtractSettings(RunConfig(car=car))
+    bare = extract(logs, tmp_path / "bare", settings).manifest
+    model = CarModel(physics_sha256=Car.load(car, network="none").physics_sha256)
+    (car / "model.toml").write_text(model.toml("Of a test."))
+    taught_set = extract(logs, tmp_path / "taught", settings).manifest
+    follows(taught_set, "dataset.schema.json")
+    assert bare["drives"][0]["calibration"] == "" and "stiffness" in taught_set["drives"][0]["calibration"]
 
 
 def test_damaged_dataset_is_told(dataset: ExtractResult, tmp_path: Path) -> None:
@@ -253,7 +233,7 @@ def test_damaged_dataset_is_told(dataset: ExtractResult, tmp_path: Path) -> None
 @pytest.mark.slow
 def test_processes_and_order_change_no_byte(dataset: ExtractResult, sample_logs_dir: Path, tmp_path: Path) -> None:
     logs = [str(sample_logs_dir / name) for name in ("sweep.mcap", "dlc.mcap")]
-    again = extract(logs, tmp_path / "out", ExtractSettings(RunConfig(), seed=4), jobs=2)
+    again = extract(logs, tmp_path / "out", ExtractSettings(RunConfig()), jobs=2)
     assert again.manifest == dataset.manifest
     for one in read_dataset(dataset.output).drives:
         again_there = tmp_path / "out" / one.path.relative_to(dataset.output)
@@ -268,13 +248,13 @@ def test_resume_keeps_what_is_as_it_was(dataset: ExtractResult, sample_logs_dir:
     (torn,) = out.glob("split=*/car=*/part-sweep.parquet")
     torn.write_bytes(b"PAR1 torn")
     logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "sweep.mcap")]
-    settings = ExtractSettings(RunConfig(), seed=4)
+    settings = ExtractSettings(RunConfig())
     resumed = extract(logs, out, settings, resume=True)
     assert [r.kept for r in resumed.results] == [True, False]
     assert resumed.manifest == dataset.manifest
-    other = extract(logs, out, replace(settings, truth_smoothing="0.1"), resume=True)
-    assert not any(r.kept for r in other.results)
-    afresh = extract(logs, out, replace(settings, truth_smoothing="0.1"))
+    settings = replace(settings, where="vx_m_s > 1")
+    assert not any(r.kept for r in extract(logs, out, settings, resume=True).results)
+    afresh = extract(logs, out, settings)
     assert not any(r.kept for r in afresh.results)
 
 
@@ -294,18 +274,42 @@ def test_one_bad_log_stops_no_other(sample_logs_dir: Path, tmp_path: Path) -> No
         extract([str(logs / "bad.mcap")], tmp_path / "alone", ExtractSettings(RunConfig()))
 
 
+@pytest.mark.slow
+def test_extract_chooses_rows_and_leaves_copies_out(sample_logs_dir: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for name in ("a", "b"):
+        shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / f"{name}.mcap")
+    told: list[str] = []
+    asked = ExtractSettings(
+        RunConfig(), split="train", where="abs(ay_m_s2) > 0.5 and not vx_km_h < 60 or truth_vx_m_s < 0"
+    )
+    logs = [str(tmp_path / f"{name}.mcap") for name in ("a", "b")]
+    result = extract(logs, out, asked, reporter=Reporter(warn=told.append))
+    assert "b is left out: it contains the same signals as a" in told and result.exit_code == 0
+    assert result.manifest["duplicates"] == [{"log": "b", "file": "b.mcap", "of": "a"}]
+    assert [p.name for p in out.rglob("*.parquet")] == ["part-a.parquet"]
+    (made,) = read_dataset(out).drives
+    rows = made.load()
+    vx, ay = (rows.features[:, FEATURES.index(n)] for n in ("vx_m_s", "ay_m_s2"))
+    assert rows.chosen is not None and 0.1 < rows.chosen.mean() < 0.9
+    np.testing.assert_array_equal(rows.chosen, (np.abs(ay) > 0.5) & ~(vx * 3.6 < 60.0))
+    # The same signals under another name, in another call, replace the existing ones.
+    extract(logs[1:], out, replace(asked, split="validation"))
+    (other,) = read_dataset(out).drives
+    assert (other.entry["name"], other.entry["split"]) == ("b", "validation")
+
+
 # ---- split ----
 
 
 def test_hash_split_is_stable_and_about_70_15_15() -> None:
     names = [f"{i:064x}" for i in range(4000)]
-    splits = [choose_split(n, 0)[0] for n in names]
+    splits = [choose_split(n)[0] for n in names]
     shares = [splits.count(s) / len(splits) for s in SPLITS]
     np.testing.assert_allclose(shares, [0.70, 0.15, 0.15], atol=0.02)
-    assert splits == [choose_split(n, 0)[0] for n in reversed(names)][::-1]
-    assert splits != [choose_split(n, 1)[0] for n in names]
+    assert splits == [choose_split(n)[0] for n in reversed(names)][::-1]
     # Written down: a split that changed between versions would leak test drives into training.
-    assert " ".join(choose_split(n, 0)[0] for n in names[:8]) == "train train train validation train train train train"
+    assert " ".join(choose_split(n)[0] for n in names[:8]) == "train train train validation train train train train"
 
 
 @pytest.mark.slow
@@ -315,10 +319,10 @@ def test_manifest_beside_the_logs_decides_and_the_option_wins(sample_logs_dir: P
     suite = {"format": 1, "drives": [{"file": "a.mcap", "split": "extrapolation"}, {"file": "c.mcap", "split": "test"}]}
     (tmp_path / "manifest.json").write_text(json.dumps(suite))
     logs = [str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap")]
-    result = extract(logs, tmp_path / "out", ExtractSettings(RunConfig(), seed=3))
+    result = extract(logs, tmp_path / "out", ExtractSettings(RunConfig()))
     found = {d["log"]: (d["split"], d["split_from"]) for d in result.manifest["drives"]}
     assert found["a"] == ("extrapolation", "manifest")
-    assert found["b"] == choose_split(hash_log(tmp_path / "b.mcap"), 3)
+    assert found["b"] == choose_split(hash_log(tmp_path / "b.mcap"))
     follows(result.manifest, "dataset.schema.json")
     chosen = extract(logs, tmp_path / "out", ExtractSettings(RunConfig(), split="validation"))
     assert {(d["split"], d["split_from"]) for d in chosen.manifest["drives"]} == {("validation", "option")}
@@ -327,7 +331,12 @@ def test_manifest_beside_the_logs_decides_and_the_option_wins(sample_logs_dir: P
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"truth_smoothing": "5"}, {"truth_smoothing": "much"}, {"split": "other"}, {"seed": -1}]
+    "wrong",
+    [{"split": "other"}, {"model": "other"}]
+    + [
+        {"where": text}
+        for text in ("sideslip_rad > 1", "truth.vx_m_s > 1", "vx_m_s > 1 and (select 1)", "vx_m_s", "friction > 1 and")
+    ],
 )
 def test_wrong_settings_are_told_before_any_log_is_read(tmp_path: Path, wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
@@ -370,14 +379,14 @@ def test_a_dataset_of_an_older_version_is_refused_in_one_line(tmp_path: Path) ->
     with pytest.raises(OutputError, match="pdhef extract") as refused:
         read_dataset(out)
     assert "\n" not in str(refused.value)
-    with pytest.raises(UsageError, match="version 2"):
+    with pytest.raises(UsageError, match=r"got pdhef\.residual-dataset 2"):
         extract([str(Path("sample_logs/dlc.mcap"))], out, ExtractSettings(RunConfig()))
 
 
 def test_another_manifest_is_not_overwritten(sample_logs_dir: Path, tmp_path: Path) -> None:
     shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / "a.mcap")
     (tmp_path / "manifest.json").write_text('{"format": 1, "drives": []}')
-    with pytest.raises(UsageError, match="another manifest"):
+    with pytest.raises(UsageError, match="a new folder, or a residual dataset"):
         extract([str(tmp_path / "a.mcap")], tmp_path, ExtractSettings(RunConfig()))
     assert (tmp_path / "manifest.json").read_text() == '{"format": 1, "drives": []}'
 
@@ -391,7 +400,7 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = str(sample_logs_dir / "dlc.mcap")
     result = called("extract", log, "-o", str(out), "--car", str(sample_logs_dir / "vehicle.toml"), "--split", "train")
     assert result.returncode == 0, result.stderr
-    assert "dlc" in result.stdout and "train: 1 drives" in result.stdout
+    assert "usable rows" in result.stdout and "train" in result.stdout
     assert result.stderr.splitlines() == ["warning: dlc: perfect ground truth used; /rtk/fix, /rtk/odometry not used"]
     (drive,) = read_dataset(out).drives
     assert drive.entry["usable_rows"] > 0.99 * drive.entry["rows"]
@@ -415,7 +424,7 @@ def test_a_dataset_never_replaces_what_it_is_made_from(sample_logs_dir: Path, tm
     file = tmp_path / "out" / "manifest.json"
     file.parent.mkdir()
     file.symlink_to(log)
-    with pytest.raises(UsageError, match=r"replace the input|another manifest"):
+    with pytest.raises(UsageError, match=r"replace the input|a new folder"):
         extract([str(log)], tmp_path / "out", ExtractSettings(RunConfig()))
     assert log.read_bytes() == (sample_logs_dir / "dlc.mcap").read_bytes()
 

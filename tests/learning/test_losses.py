@@ -9,12 +9,13 @@ from typing import Any
 
 import pytest
 
+from pdhef_logtool.learning.drives import LearnSettings
+from pdhef_logtool.learning.learn import learn
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.records.errors import EXIT_PARTIAL
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from tests.learning.stage_run import run_stage
 
 pytestmark = pytest.mark.slow
 
@@ -28,7 +29,7 @@ def _losses_by_command(log: Path, out: Path, config: RunConfig) -> dict[str, tup
     physics = replace(config, network=Path("none"), estimators=("phy-ukf",))
     commands = {
         "extract": lambda tell: extract(logs, out / "2", ExtractSettings(physics), reporter=Reporter(warn=tell)),
-        "teach": lambda tell: run_stage("teach", logs, out / "4", config, reporter=Reporter(warn=tell)),
+        "teach": lambda tell: learn(logs, out / "4", LearnSettings(config), reporter=Reporter(warn=tell)),
         "run": lambda tell: run_logs(logs, out / "6", replace(physics, annotate="none"), reporter=Reporter(warn=tell)),
     }
     for name, command in commands.items():

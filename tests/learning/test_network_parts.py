@@ -14,7 +14,7 @@ from residual_car import START_NS
 from pdhef_logtool.learning.network.baselines import SideslipSequence, fit_linear
 from pdhef_logtool.learning.network.dataset import DriveArrays
 from pdhef_logtool.learning.network.fit import FeatureSequence, Recipe, normalisation_of
-from pdhef_logtool.learning.network.train_command import gap_free_runs, make_recipe
+from pdhef_logtool.learning.network.train_command import LEAD_STEPS, gap_free_runs, make_recipe, weights_of
 from pdhef_logtool.records.errors import ModelError, UsageError
 from pdhef_logtool.residual_model.features import FEATURES
 
@@ -83,3 +83,17 @@ def test_what_hardly_varies_beside_its_size_is_a_constant() -> None:
     dt = np.array([np.nan, *[0.01] * 399])
     model = fit_linear([SideslipSequence(features, dt, rng.standard_normal(400))], FEATURES[:3])
     assert model.coefficients[:2] == (0.0, 0.0) and model.coefficients[2] != 0.0
+
+
+def test_what_is_not_chosen_teaches_nothing_and_only_what_leads_to_the_chosen_is_run() -> None:
+    chosen = np.zeros(2000, dtype=np.bool_)
+    chosen[[700, 740]] = True
+    chosen[1500] = True
+    weight = np.ones(2000, dtype=np.float32)
+    weight[1500] = 0.0  # chosen, but of no use
+    rows = arrays(2000, chosen=chosen, weight=weight)
+    (run,) = gap_free_runs(rows)
+    assert run == slice(700 - LEAD_STEPS, 741)
+    assert weights_of(rows, run).sum() == 2.0
+    cut = replace(rows, segment=np.where(np.arange(2000) < 720, 0, 1))
+    assert list(gap_free_runs(cut)) == [slice(700 - LEAD_STEPS, 720)], "what is left behind the cut is too short"

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 
-from pdhef_logtool.car.car import TAUGHT_FILE, Car
-from pdhef_logtool.car.taught import ESTIMATED
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.model import ESTIMATED, read_model
+from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.drive import reading
+from pdhef_logtool.learning import learn as learning
 from pdhef_logtool.learning.drives import LearnSettings
-from pdhef_logtool.learning.engine import learn
+from pdhef_logtool.learning.learn import learn
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
-from pdhef_logtool.learning.stages import teach
 from pdhef_logtool.learning.truth import weight_of
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import FloatArray, IntArray
@@ -98,14 +98,13 @@ def test_extract_takes_it_where_it_is_independent_and_says_so(
 def test_learn_is_taught_by_it_on_request_alone(
     config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(teach, "LEAST_S", 3.0)
+    monkeypatch.setattr(learning, "LEAST_S", 3.0)
     log = [str(tmp_path / "drive.mcap")]
-    with pytest.raises(EstimatorError, match="at least one drive"):
-        learn(log, tmp_path / "off", LearnSettings(config=RunConfig(car=config.car, mapping=config.mapping)))
+    off = learn(log, tmp_path / "off", LearnSettings(config=RunConfig(car=config.car, mapping=config.mapping)))
+    assert off.drives[0].truth == () and read_model(off.car / MODEL_FILE).truth == ""
     result = learn(log, tmp_path / "car", LearnSettings(config=config))
     assert result.drives[0].truth == (ESTIMATED,) and f"taught by {ESTIMATED}" in result.text
-    document = json.loads((tmp_path / "car" / TAUGHT_FILE).read_text())
-    assert document["truth"] == ESTIMATED and document["figures"]["truth"] == ESTIMATED
+    assert read_model(tmp_path / "car" / MODEL_FILE).truth == ESTIMATED == result.figures["truth"]
     assert any(f"taught by {ESTIMATED}" in note for note in Car.load(tmp_path / "car").notes)
 
 
@@ -113,5 +112,5 @@ def test_ground_truth_has_priority(config: RunConfig, sample_logs_dir: Path, mon
     monkeypatch.undo()
     car = Car.load(config.car, network="none")
     with reading.read_drive(sample_logs_dir / "step.mcap", car) as drive:
-        record, opened = teach.open_drive(drive, config)
+        record, opened = learning.open_drive(drive, config)
     assert opened is not None and opened.truth.name != "reference" and record.truth != (ESTIMATED,)

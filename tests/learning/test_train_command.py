@@ -50,7 +50,7 @@ def test_train_writes_a_model_that_runs(
     assert document["sha256"] == bundle.sha256
     assert len(document["history"]) == 2
     assert {p.name for p in (tmp_path / "model").iterdir()} == {
-        "history.parquet", "history.png", "model.json", "weights.safetensors",
+        "history.parquet", "model.json", "weights.safetensors",
     }  # fmt: skip
     assert pl.read_parquet(tmp_path / "model" / "history.parquet").height == 2
     assert bundle.provenance["dataset_sha256"]

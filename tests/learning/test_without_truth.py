@@ -1,21 +1,26 @@
-"""``pdhef learn --stages calibrate``: a model is made from a pool of logs, and insufficient pools are rejected."""
+"""``pdhef learn`` without ground truth: a model is made from a pool of logs, and insufficient pools are rejected."""
 
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.drive.reading import Tell, read_drive
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.learning.engine import LearnResult
+from pdhef_logtool.learning import learn as learning
+from pdhef_logtool.learning.drives import LearnSettings
+from pdhef_logtool.learning.learn import LearnResult, learn
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.runs.config import RunConfig
-from tests.learning.stage_run import run_stage
 
 pytestmark = pytest.mark.slow
 
@@ -33,13 +38,19 @@ def config(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> R
 @pytest.fixture(scope="module")
 def pool(sample_logs_dir: Path, config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> LearnResult:
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step", "fishhook")]
-    return run_stage("calibrate", logs, tmp_path_factory.mktemp("out") / "car", config)
+
+    def without(_log: DriveLog, mapping: Mapping, _tell: Tell) -> Mapping:
+        return replace(mapping, truth={})
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learning, "read_drive", partial(read_drive, adjust=without))
+        return learn(logs, tmp_path_factory.mktemp("out") / "car", LearnSettings(config=config))
 
 
 def test_a_pool_of_logs_mends_the_file_without_ground_truth(pool: LearnResult, sample_logs_dir: Path) -> None:
     right, car = Car.load(sample_logs_dir / "vehicle.toml").vehicle, Car.load(pool.car)
     text = (pool.car / "model.toml").read_text()
-    assert "no ground truth was used" in text
+    assert "calibrated without ground truth on" in text and car.model is not None and car.model.truth == ""
     values = {p["name"]: p["value"] for p in tomllib.loads(text)["parameters"]}
     for front, axle in ((True, "front"), (False, "rear")):
         expected = right.cornering_stiffness_n_per_rad(front, 0.85)
@@ -54,10 +65,8 @@ def test_a_pool_of_logs_mends_the_file_without_ground_truth(pool: LearnResult, s
     )
 
 
-def test_logs_that_do_not_know_the_stiffness_are_refused(
-    sample_logs_dir: Path, config: RunConfig, tmp_path: Path
-) -> None:
-    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("no_truth", "faults")]
-    with pytest.raises(EstimatorError, match=r"cornering stiffness|are needed"):
-        run_stage("calibrate", logs, tmp_path / "car", config)
+def test_too_little_driving_is_refused(sample_logs_dir: Path, config: RunConfig, tmp_path: Path) -> None:
+    short = LearnSettings(config=replace(config, end="4"))
+    with pytest.raises(EstimatorError, match="are needed"):
+        learn([str(sample_logs_dir / "no_truth.mcap")], tmp_path / "car", short)
     assert not (tmp_path / "car").exists()

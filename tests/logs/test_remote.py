@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import random
 import struct
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.logs import remote_source
+from pdhef_logtool.logs import remote_copy, remote_source
 from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
@@ -105,8 +106,8 @@ def test_a_drive_costs_no_more_than_its_file(sample_logs_dir: Path, saloon: Car)
                 sha256 = drive.sha256
             if place is not file:
                 assert server.bytes_sent <= 1.02 * file.stat().st_size
-                assert server.twice() <= 2  # of asking for the identity
-                assert len(server.requests) <= 12
+                assert server.twice() == 0
+                assert len(server.requests) <= 14
                 assert sha256 == identity_of(LogInput(place, "x"))
         assert found[0] == found[1]
 
@@ -199,6 +200,37 @@ def test_a_server_without_ranges_gives_all_at_once(sample_logs_dir: Path) -> Non
         assert len(server.requests) == 1
 
 
+def _copies() -> list[Path]:
+    """Return the copies in the cache."""
+    return sorted(Path(os.environ["PDHEF_CACHE_DIR"]).glob("remote/*/object/*"))
+
+
+def test_a_later_command_fetches_no_byte_again(served: CountingServer, sample_logs_dir: Path) -> None:
+    place = _place(served, "dlc.mcap")
+    first = _read(place)
+    served.requests.clear()
+    assert _read(place) == first
+    assert served.bytes_sent == 1, "the check of the version"
+    (copy,) = _copies()
+    damaged = bytearray(copy.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    copy.write_bytes(damaged)
+    assert _read(place) == first
+    assert served.bytes_sent > remote_source.BLOCK_BYTES
+    served.files["dlc.mcap"] = (sample_logs_dir / "road.mcap").read_bytes()
+    assert _read(place) == _read(sample_logs_dir / "road.mcap")
+
+
+def test_copies_in_use_stay_and_the_others_are_removed(served: CountingServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    served.files["again.mcap"] = served.files["dlc.mcap"]
+    log = open_log(_place(served, "dlc.mcap"))
+    monkeypatch.setattr(remote_copy, "CACHE_BYTES", 0)
+    _read(_place(served, "again.mcap"))
+    assert [path.name for path in _copies()] == ["dlc.mcap"]
+    log.close()
+    assert _copies() == []
+
+
 def test_metadata_is_read_from_head_and_tail(sample_logs_dir: Path) -> None:
     file = sample_logs_dir / "road.mcap"
     with serving(**{file.name: file.read_bytes()}) as server:
@@ -234,7 +266,7 @@ def served(sample_logs_dir: Path) -> Iterator[CountingServer]:
         (status(404), "no such object", 1),
         (status(403), "a refusal (status 403); give credentials", 1),
         (status(302, {"Location": "/dlc.mcap"}), "cannot be requested", None),
-        (cutting(100), "an answer that is cut, 3 times in turn", 3),
+        (cutting(100), "an answer that is cut, 3 times in turn", 4),
         (stalling(0.4), "silence of 0.2 s, 3 times in turn", 3),
     ],
     ids=["429", "503", "503 later", "404", "403", "round and round", "cuts", "stalls"],
@@ -295,7 +327,7 @@ def test_no_room_is_said(served: CountingServer) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
     try:
-        assert "set TMPDIR" in str(_error(served))
+        assert "set PDHEF_CACHE_DIR" in str(_error(served))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.taught import TaughtParameter
+from pdhef_logtool.car.model import CarModel, TaughtParameter, read_model
 from pdhef_logtool.drive import reading
-from pdhef_logtool.drive.model_file import ModelFile, load_model
+from pdhef_logtool.drive.model_file import with_earlier_drive
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.table import spec_of
 from pdhef_logtool.model.drive_model import DriveModel
-from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.errors import MappingError, VehicleError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.runs.frames import estimate
 
@@ -49,7 +49,7 @@ class ChangedLater:
         return columns
 
 
-def signals(log: Path, options: ReadOptions) -> tuple[Signals, ModelFile]:
+def signals(log: Path, options: ReadOptions) -> tuple[Signals, CarModel]:
     with read_drive(log, Car.load("saloon"), options=options) as drive:
         return drive.whole().signals, DriveModel.of(drive).file
 
@@ -128,16 +128,22 @@ def test_no_causal_estimate_depends_on_the_future(road: Path, file: Path, monkey
 
 def test_a_model_is_read_back_as_it_was_written_and_gives_the_same_signals(road: Path, tmp_path: Path) -> None:
     whole, model = signals(road, ReadOptions())
-    model = replace(model, parameters=(TaughtParameter(name="steering ratio", value=15.1, std=0.02),))
+    model = model.model_copy(update={"parameters": (TaughtParameter(name="yaw inertia", value=1510.0, std=0.02),)})
     path = tmp_path / "model.toml"
     path.write_text(model.toml("Of a test.\nTwo lines."))
     assert path.read_text().startswith("# Of a test.\n# Two lines.\n")
-    assert repr(load_model(path, Car.load("saloon"))) == repr(model)  # NaN is NaN
+    assert repr(read_model(path)) == repr(model)  # NaN is NaN
+    saloon = Car.load("saloon")
+    car, _ = with_earlier_drive(saloon, path)
+    assert car.taught_prior == model.parameters
+    own = CarModel(physics_sha256=saloon.physics_sha256, truth="ground truth", parameters=model.parameters[:0])
+    car, _ = with_earlier_drive(replace(saloon, model=own), path)
+    assert car.model is not None and (car.model.truth, car.taught_prior) == ("ground truth", model.parameters)
     again, _ = signals(road, ReadOptions(model=path))
     np.testing.assert_array_equal(whole.ay_m_s2, again.ay_m_s2)
     np.testing.assert_array_equal(whole.ready_ns, again.ready_ns)
-    with pytest.raises(MappingError, match=r"expected a model of the car .*, got one of the vehicle file"):
-        load_model(path, Car.load())
+    with pytest.raises(VehicleError, match=r"expected a model of the car .*, got one of the vehicle file"):
+        with_earlier_drive(Car.load(), path)
 
 
 def test_a_model_that_does_not_fit_is_refused_in_one_line(road: Path, file: Path) -> None:
@@ -146,7 +152,7 @@ def test_a_model_that_does_not_fit_is_refused_in_one_line(road: Path, file: Path
     with pytest.raises(MappingError, match="/imu/other"):
         signals(road, ReadOptions(model=file))
     file.write_text(text.replace("decided_s", "decided"))
-    with pytest.raises(MappingError, match="decided_s"):
+    with pytest.raises(VehicleError, match="decided_s"):
         signals(road, ReadOptions(model=file))
-    with pytest.raises(MappingError, match=r"auto, off or a model\.toml"):
+    with pytest.raises(VehicleError, match=r"auto, off or a model\.toml"):
         signals(road, ReadOptions(model="of"))  # type: ignore[arg-type]

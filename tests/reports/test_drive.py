@@ -136,10 +136,14 @@ def plan_of(*outcomes: str) -> dict:
     }  # fmt: skip
 
 
-def test_the_first_screen_has_verdicts_what_was_tested_the_worst_place_and_next_steps_in_this_order(tmp_path):
-    page = page_of(write_run(tmp_path, drive_tracks(), plan=plan_of("PASS", "FAIL", "INCONCLUSIVE")))
+def test_the_first_screen_has_answer_verdicts_what_was_tested_the_worst_place_and_next_steps_in_this_order(tmp_path):
+    check = {"name": "a.sign", "verdict": "failed", "evidence": "gain -1", "remedy": "", "waived": False}
+    answer = {"main": "pd-hef", "why": "", "texts": {"result": "Sideslip RMSE 0.1°", "assumed": "not causal"}}
+    plan = plan_of("PASS", "FAIL", "INCONCLUSIVE")
+    page = page_of(write_run(tmp_path, drive_tracks(), plan=plan, checks=[check], answer=answer))
     text = words(page)
     order = [
+        "Result Sideslip RMSE 0.1° Assumed: not causal.", "Check failed: a.sign: gain -1",
         "Plan plan.toml: 1 FAIL, 1 INCONCLUSIVE, 1 PASS", "FAIL Title 1 SR-1", "INCONCLUSIVE Title 2 SR-2",
         "PASS Title 0 SR-0 value 0.458° limit ≤ 0.573° margin +0.115° scored 1 drive, 2.0 min, 3.0 km",
         "Note: interval from blocks of 10 s.", "Tested Car sedan", "Largest error", "Next SR-1: do 1 SR-2: do 2",

@@ -16,10 +16,12 @@ import pytest
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
 from pdhef_logtool.evaluation.requirement_verdicts import RequirementVerdict
-from pdhef_logtool.evaluation.validation_plan import ExposureNeed, Requirement, ValidationPlan
+from pdhef_logtool.evaluation.validation_plan import ExposureNeed, Requirement, ValidationPlan, default_plan
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_file, figures_of_rows, plan_verdicts
-from pdhef_logtool.runs.judging import read_validation_plan
+from pdhef_logtool.results.run_report import LogOutcome
+from pdhef_logtool.runs.judging import judge, read_validation_plan
+from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import jsonable
 
 BETA = Requirement("A", "", "sideslip_rad", limit=0.02)
@@ -195,3 +197,11 @@ def test_exposure_in_conditions(need: dict[str, Any], outcome: str, words: str) 
     drives = [JudgedDrive(x, "pd-hef", partial(report, 0.3 if x < "d" else 0.9), {"car": "golf"}) for x in SIX]
     verdict = judged(scored(), replace(BETA, exposure=(ExposureNeed(**need),)), drives=drives)
     assert verdict.outcome == outcome and words in verdict.reason
+
+
+@pytest.mark.parametrize(("logs", "judged_logs"), [(4, None), (5, 5)])
+def test_the_default_plan_judges_only_as_many_drives_as_a_bootstrap_needs(logs: int, judged_logs: int | None) -> None:
+    outcomes = [LogOutcome(str(i), f"{i}.mcap", "0" * 64, main="pd-hef") for i in range(logs)]
+    results = [LogResult(o, None, {}, tuple(scored([o.log]))) for o in outcomes]
+    verdicts = judge(default_plan(), results, strict=False)
+    assert (None if verdicts is None else verdicts.verdicts[0].exposure.drives) == judged_logs

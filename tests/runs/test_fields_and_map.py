@@ -1,9 +1,10 @@
-"""Every number of a log, the way to a mapping by question and answer, and the possible uses of a log."""
+"""Every number of a log, the way to a mapping by question and answer, and the estimators that can run."""
 
 from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,6 @@ from pdhef_logtool.runs.inspection import (
     render_inspection,
     write_mapping,
 )
-from pdhef_logtool.runs.inspection.uses import uses_of
 
 
 def text_of(render: object, found: object, width: int = 80) -> str:
@@ -54,36 +54,25 @@ def test_all_topics_are_listed_and_a_wrong_one_is_refused(sample_logs_dir: Path)
         fields_of_log(sample_logs_dir / "dlc.mcap", "/imu")
 
 
-@pytest.mark.parametrize(
-    ("signals", "truth", "can", "needs"),
-    [
-        ((), (), "list its topics", "a steering angle, a speed or wheel speeds"),
-        (("ay_m_s2", "yaw_rate_rad_s", "speed_m_s"), (), "estimate sideslip", "a steering angle"),
-        (("ax_m_s2", "speed_m_s"), (), "export its signals", "a steering angle"),
-        (
-            ("steering_wheel_rad", "ay_m_s2", "yaw_rate_rad_s", "wheel_speed_rl_rad_s"),
-            (),
-            "without ground truth it has no score",
-            "",
-        ),
-        (("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"), ("vx_m_s", "vy_m_s"), "and score it", ""),
-        (("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"), ("lat_deg", "lon_deg"), "contains no sideslip", ""),
-    ],
-)
-def test_what_a_log_is_good_for(signals: tuple[str, ...], truth: tuple[str, ...], can: str, needs: str) -> None:
-    uses = uses_of(Mapping(sources(*signals), sources(*truth)))
-    assert can in uses["can"]
-    assert uses["sideslip_needs"] == needs
+def test_estimators_that_can_run(sample_logs_dir: Path) -> None:
+    found = inspect_log(sample_logs_dir / "dlc.mcap")
+    assert "can run" in text_of(render_inspection, found, 200)
+    for signals, able in (
+        ((), ()),
+        (("ax_m_s2", "speed_m_s"), ()),
+        (("ay_m_s2", "yaw_rate_rad_s", "speed_m_s"), ("physics",)),
+        (("steering_wheel_rad", "ay_m_s2", "yaw_rate_rad_s", "wheel_speed_rl_rad_s"), ("physics",)),
+    ):
+        names = replace(found, mapping=Mapping(sources(*signals), {})).estimators
+        assert set(able) <= set(names)
+        assert bool(names) is bool(able), signals
 
 
 @pytest.mark.slow
-def test_inspect_ends_with_what_can_be_done(sample_logs_dir: Path, shared_dir: Path) -> None:
-    assert "Possible uses of this log: estimate sideslip" in text_of(
-        render_inspection, inspect_log(sample_logs_dir / "dlc.mcap"), 200
-    )
+def test_inspect_names_missing_signals_and_the_next_command(shared_dir: Path) -> None:
     dart = inspect_log(shared_dir / "reader_corpus" / "dart_ros1" / "4_sept_random_driving_fast.bag")
     text = text_of(render_inspection, dart, 200)
-    assert "sideslip estimation still needs: a speed or wheel speeds" in text
+    assert "speed_m_s" in next(line for line in text.splitlines() if line.startswith("missing"))
     assert "pdhef map LOG" in text
 
 
@@ -109,5 +98,5 @@ def test_a_mapping_by_question_and_answer(shared_dir: Path) -> None:
     assert mapping.signals["yaw_rate_rad_s"].field == "yaw_rate_gnss_deg_s"
     assert mapping.signals["ay_m_s2"] == SignalSource("ay_m_s2", "/vbox/sample", "y_accel_g", scale=-9.81)
     assert "ax_m_s2" not in mapping.signals
-    assert said[-1] == "sideslip estimation needs no further signal"
+    assert said[-1] == "missing: ax_m_s2"
     assert any("*" in line and "steer_ang_deg" in line for line in said)

@@ -57,10 +57,10 @@ def car(count: int = 300) -> dict[str, np.ndarray]:
     }
 
 
-@given(st.lists(_VALUES, min_size=1, max_size=120))
+@given(st.lists(_VALUES, min_size=1, max_size=100))
 def test_a_sparkline_shows_each_run_of_finite_values_within_its_box(values: list[float]) -> None:
     v = np.array(values)
-    drawn = str(sparkline(v, v))
+    drawn = str(sparkline(v))
     finite = np.isfinite(v)
     runs = int(np.count_nonzero(np.diff(np.concatenate([[False], finite]).astype(int)) == 1))
     assert drawn.count("M") == runs
@@ -97,9 +97,9 @@ def test_a_page_shows_fields_reasons_and_a_mapping_to_paste(tmp_path: Path) -> N
     assert "71.9 to 72.1" not in text  # SI, as it is used
     assert "range 20 to 20 m/s" in text
     assert "rate 20 Hz" in text
-    assert "temperature range 0 to 299" in text
+    assert "temperature range" not in text
     drawn = [n for n in re.findall(r'<path d="([^"]*)"', page) if n]
-    assert len(drawn) == len(inspection.signals) + len([c for c in inspection.candidates if not c.taken]) + 1
+    assert len(drawn) == len(inspection.signals) + len([c for c in inspection.candidates if not c.taken])
     pasted = tmp_path / "mapping.toml"
     pasted.write_text(html.unescape(re.search(r'<pre class="paste"[^>]*>(.*?)</pre>', page, re.DOTALL)[1]))  # type: ignore[index]
     assert load_mapping(pasted).signals == inspection.mapping.signals
@@ -114,8 +114,6 @@ def test_a_log_of_many_fields_stays_below_the_limit(tmp_path: Path) -> None:
     log = write_log(tmp_path / "many.mcap", {"/car": car(120), **topics})
     page = _page(log)
     assert len(page) < _MOST_BYTES
-    assert "330 further fields" in _text(page)
-    assert page.count('class="spark"') >= 150
 
 
 def test_the_log_is_never_replaced_and_fields_stand_alone(tmp_path: Path) -> None:

@@ -59,7 +59,6 @@ VALID_FIT = {
     "values": {"friction": 0.9, "sensors": {"ay_bias_m_s2": 0.01, "yaw_rate_bias_rad_s": 0.0}},
     "filter": {"phy-ukf:tuned": {"q_std": [0.1, 0.1, 0.1], "r_std": {"ay_m_s2": 1.0}}},
     "drives": [{"name": "lap", "sha256": "cd", "start_s": 0.0, "end_s": 9.5}],
-    "scores": {"lap": {"rmse": 0.2}},
 }
 VALID_PLAN = {"requirement": [{"id": "SR-1", "signal": "sideslip_rad", "metric": "rmse", "limit_deg": 0.5}]}
 
@@ -88,7 +87,6 @@ LOADERS = [
     Loader("plan.toml", load_plan, VALID_PLAN),
     Loader("vehicle.toml", read_vehicle_file, tomllib.loads((CAR / "vehicle.toml").read_text())),
     Loader("fit.toml", _part, VALID_FIT),
-    Loader("noise.toml", _part, tomllib.loads((CAR / "noise.toml").read_text())),
     Loader(DOCUMENT_FILE, _model, json.loads((SHIPPED / DOCUMENT_FILE).read_text())),
     Loader(
         "regression.json",

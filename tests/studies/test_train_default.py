@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.car.car import HISTORY_FILE, NOISE_FILE, Car
+from pdhef_logtool.car.car import Car
 from studies.defaults import train_default
 
 pytestmark = [pytest.mark.fleet, pytest.mark.slow]
@@ -37,5 +37,3 @@ def test_the_noise_of_a_car_is_tuned_on_its_validation_drives(
     noise = after.noise["phy-ukf:tuned"]
     assert noise.trial is not None and noise.trial < 4 and noise != before.noise["phy-ukf:tuned"]
     assert after.noise["physics"] == before.noise["physics"]
-    (line,) = (car / HISTORY_FILE).read_text().splitlines()[-1:]
-    assert json.loads(line)["part"] == NOISE_FILE

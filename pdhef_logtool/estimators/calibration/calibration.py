@@ -9,14 +9,14 @@ come from the file. Parameters that are not observable in the driving keep their
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.car.model import TaughtParameter
 from pdhef_logtool.car.parts import LIMIT_GAIN, FilterNoise
-from pdhef_logtool.car.taught import TaughtParameter
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.calibration.driving import Driving
 from pdhef_logtool.estimators.calibration.joint import (
@@ -53,8 +53,6 @@ LARGEST_SHARE, LARGEST_ERROR = 0.5, 1.0
 SLIDING_RAD, SLIDING_S, SLIDING_SHARE = math.radians(8.0), 10.0, 0.2
 #: Correlation of a parameter between two drives of a car, about the mean of its prior.
 CORRELATION = 0.9
-#: Largest standard deviation of a log stiffness for a car file.
-EXPORTED_STD = 0.16
 #: Maximum number of posterior directions in an interval.
 VARIED = 5
 #: Smallest difference of understeer gradients that is reported as a contradiction, rad/(m/s²).
@@ -192,8 +190,6 @@ def self_calibrate(
     vehicle_file: VehicleParameters,
     *,
     taught: Sequence[TaughtParameter] = (),
-    exported: bool = False,
-    progress: Callable[[float], None] = lambda _share: None,
 ) -> SelfCalibration:
     """Calibrate a car on the driving of its logs, which were read with ``vehicle_file``.
 
@@ -201,7 +197,6 @@ def self_calibrate(
     ----------
     taught : prior from drives with ground truth. It cannot make a rejected calibration acceptable, as the model
         explains such driving with no parameters. It is omitted if the fit is rejected only with it.
-    exported : whether the result is for a car file, for which both cornering stiffnesses must be observable.
     """
     drives = [d.informative() for d in drives if len(d.stretches)]
     seconds = sum(d.seconds for d in drives)
@@ -218,11 +213,7 @@ def self_calibrate(
         if not _refusal(with_prior, place, drives):
             problem, theta, prior = with_prior, place, with_prior.parameters
     theta, covariance = problem.posterior(theta)
-    progress(1.0)
     parameters = posterior_of(problem, theta, covariance, prior)
-    idle = [p.name for p in parameters if p.name in (FRONT_STIFFNESS, REAR_STIFFNESS) and p.sd > EXPORTED_STD]
-    if exported and idle and not refused:
-        refused = f"the driving does not determine the {' and the '.join(idle)}"
     root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     varied = varied_parameters(theta, root, problem.sideslip, VARIED)
     return SelfCalibration(

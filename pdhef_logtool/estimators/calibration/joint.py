@@ -30,7 +30,7 @@ import numpy as np
 
 from pdhef_logtool.car.assumed_values import stiffness_per_load
 from pdhef_logtool.car.descent import descend
-from pdhef_logtool.car.taught import TaughtParameter
+from pdhef_logtool.car.model import TaughtParameter
 from pdhef_logtool.car.vehicle import (
     GRAVITY_M_S2,
     STIFFNESS_TYRE_SHAPE,

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.car.parts import car_folder
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.learning.network.cells import COUNT, Picked, draw_limits, is_chosen, table_of
 from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
@@ -38,17 +37,15 @@ from pdhef_logtool.results.run_report import tool_versions, write_json
 from pdhef_logtool.storage.documents import DIGEST, digest, is_sealed, read_sealed, seal, validated
 
 FORMAT = "pdhef.residual-dataset"
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 MANIFEST = "manifest.json"
-#: Maximum number of vehicles that a bundle names; beyond, it contains their number.
-NAMED_VEHICLES = 4
 #: Glob pattern of the drives' files in a dataset.
 FILES = "split=*/car=*/part-*.parquet"
 TARGETS = (("target_dvy_m_s", "m/s"), ("target_dyaw_rate_rad_s", "rad/s"))
 TRUTH = ("truth_vx_m_s", "truth_vy_m_s")
+#: Columns for conditions of ``--where``; ground truth is never an input, but may select training data.
+COLUMNS = (*FEATURES, *TRUTH)
 SPLITS = ("train", "validation", "test")
-#: Split that --per-cell selects from; the others keep the distribution of the fleet.
-CHOSEN_SPLIT = "train"
 #: Rows of a row group, which takes less than 2 MB.
 ROWS_A_GROUP = 32768
 
@@ -63,15 +60,14 @@ FloatArray32: TypeAlias = NDArray[np.float32]
 def write_drive(
     path: Path,
     rows: ResidualRows,
-    picked: Picked,
+    chosen: BoolArray,
     entry: Mapping[str, Any],
     *,
     truth_source: str = "",
 ) -> None:
     """Write the Parquet file of one drive, with the drive's entry.
 
-    ``picked`` has the condition, cell and random number of each row; ``truth_source`` is the source of the true
-    sideslip.
+    ``chosen`` : rows [N] for training; ``truth_source`` : source of the true sideslip.
 
     Raises
     ------
@@ -79,19 +75,18 @@ def write_drive(
         When the file cannot be written.
     """
     schema = arrow_schema(_SCHEMA)
-    with parquet_writer(path, schema, ["segment", "cell", "draw"]) as writer:
-        writer.write_table(_table(rows, picked, truth_source, schema), row_group_size=ROWS_A_GROUP)
+    with parquet_writer(path, schema, ["segment"]) as writer:
+        writer.write_table(_table(rows, chosen, truth_source, schema), row_group_size=ROWS_A_GROUP)
         writer.add_key_value_metadata({_ENTRY.decode(): json.dumps(seal(entry), sort_keys=True)})
 
 
-def _table(rows: ResidualRows, picked: Picked, truth_source: str, schema: pa.Schema) -> pa.Table:
+def _table(rows: ResidualRows, chosen: BoolArray, truth_source: str, schema: pa.Schema) -> pa.Table:
     columns: dict[str, Any] = {name: rows.features[:, i] for i, name in enumerate(FEATURES)}
     columns |= {name: rows.targets[:, i] for i, (name, _) in enumerate(TARGETS)}
     columns |= {name: rows.truth_velocity[:, i] for i, name in enumerate(TRUTH)}
     columns |= {"stamp_ns": rows.stamps_ns, "weight": rows.weight, "segment": rows.segment.astype(np.int32)}
-    columns |= {"truth_std_rad": rows.truth_std_rad, "region": rows.region}
+    columns |= {"truth_std_rad": rows.truth_std_rad, "chosen": chosen}
     columns |= {"truth_source": np.full(len(rows), truth_source)}
-    columns |= {"chosen": picked.chosen, "cell": picked.cell, "draw": picked.draw}
     arrays = [arrow_array(columns[f.name], f.type) for f in schema]
     return pa.Table.from_arrays(arrays, schema=schema)
 
@@ -136,7 +131,6 @@ def write_manifest(
     failed: Sequence[Mapping[str, str]],
     *,
     settings: Mapping[str, Any],
-    seed: int,
     vehicles: Mapping[str, Mapping[str, Any]],
     duplicates: Sequence[Mapping[str, str]] = (),
 ) -> dict[str, Any]:
@@ -147,7 +141,7 @@ def write_manifest(
     entries : one per drive, from its file or an earlier manifest.
     failed : log, file and reason of the logs without a drive.
     duplicates : log, file and name of the equal drive, for the logs that were excluded as duplicates.
-    settings, seed : of the latest call; ``per_cell_s`` limits the selected seconds of each cell of split train.
+    settings : of the latest call.
     vehicles : by the digest of their physics; unused vehicles are omitted.
 
     Raises
@@ -166,23 +160,17 @@ def write_manifest(
         total["drives"] += 1
         total["rows"] += d["rows"]
         total["usable_rows"] += d["usable_rows"]
-    cells = {name: _seconds_by_cell([d for d in drives if d["split"] == name]) for name in splits}
-    per_cell_s = settings.get("per_cell_s")
-    limits = None if per_cell_s is None else _limits(folder, drives, per_cell_s)
     document = {
         "format": FORMAT,
         "version": FORMAT_VERSION,
         "model": settings["model"],
-        "sha256": digest([[[d["name"], d["file_sha256"]] for d in drives], limits]),
+        "sha256": digest([[d["name"], d["file_sha256"]] for d in drives]),
         "features": list(FEATURES),
         "targets": [{"name": name, "unit": unit} for name, unit in TARGETS],
         "period_s": float(np.median([d["period_s"] for d in drives])) if drives else None,
         "settings": dict(settings),
-        "seed": seed,
         "vehicles": [vehicles[sha256] for sha256 in sorted({d["vehicle_sha256"] for d in drives})],
         "splits": splits,
-        "cells": table_of(cells),
-        "choice": None if limits is None else {"per_cell_s": per_cell_s, "limits": limits},
         "drives": drives,
         "failed": list(failed),
         "duplicates": list(duplicates),
@@ -190,26 +178,6 @@ def write_manifest(
     }
     write_json(folder / MANIFEST, seal(document))
     return document
-
-
-def _seconds_by_cell(drives: Sequence[Mapping[str, Any]]) -> list[float]:
-    seconds = [0.0] * COUNT
-    for d in drives:
-        for number, rows in d.get("cells", {}).items():
-            seconds[int(number)] += rows * d["period_s"]
-    return seconds
-
-
-def _limits(folder: Path, drives: Sequence[Mapping[str, Any]], per_cell_s: float) -> list[float]:
-    def usable() -> Iterator[tuple[NDArray[np.int16], FloatArray32, float]]:
-        for d in drives:
-            if d["split"] == CHOSEN_SPLIT:
-                names = ["cell", "draw", "weight", "chosen"]
-                table = pq.read_table(folder / d["file"], columns=names, partitioning=None)
-                use = (table["weight"].to_numpy() > 0.0) & table["chosen"].to_numpy()
-                yield table["cell"].to_numpy()[use], table["draw"].to_numpy()[use], float(d["period_s"])
-
-    return draw_limits(usable(), per_cell_s)
 
 
 def remove_unnamed(folder: Path, manifest: Mapping[str, Any]) -> None:
@@ -266,12 +234,11 @@ class DriveArrays:
 class DatasetDrive:
     """One drive of a dataset. Its arrays are read on every access, as a dataset may exceed the memory.
 
-    ``entry`` is its entry in the manifest; ``limits`` are the limits of the cells, None for no limits.
+    ``entry`` is its entry in the manifest.
     """
 
     path: Path
     entry: Mapping[str, Any]
-    limits: Sequence[float] | None = None
 
     def load(self) -> DriveArrays:
         """Read the drive's file.
@@ -293,8 +260,6 @@ class DatasetDrive:
         targets = np.stack([column[name] for name, _ in TARGETS], axis=1).astype(np.float32)
         targets[weight == 0.0] = 0.0
         chosen: BoolArray = column["chosen"]
-        if self.limits is not None:
-            chosen = chosen & is_chosen(column["cell"], column["draw"], self.limits)
         return DriveArrays(
             stamps_ns=stamps[rows],
             features=np.stack([column[name] for name in FEATURES], axis=1).astype(np.float32),
@@ -329,8 +294,7 @@ class Dataset:
     @property
     def vehicle_name(self) -> str:
         """Names of the vehicles behind the residuals."""
-        names = sorted({str(v["name"]) for v in self.manifest["vehicles"]})
-        return ", ".join(names) if len(names) <= NAMED_VEHICLES else f"{len(names)} vehicles"
+        return ", ".join(sorted({str(v["name"]) for v in self.manifest["vehicles"]}))
 
     def vehicle(self, drive: DatasetDrive) -> VehicleParameters:
         """Return the vehicle behind the residuals of a drive."""
@@ -350,7 +314,7 @@ def read_dataset(folder: Path) -> Dataset:
     """
     path = folder / MANIFEST
     try:
-        document = read_manifest(folder)
+        document = read_sealed(path, _EXPECTED, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
         kind = (document["format"], document["version"])
         if kind[0] != FORMAT or kind[1] != FORMAT_VERSION or document["features"] != list(FEATURES):
             raise OutputError(
@@ -359,23 +323,14 @@ def read_dataset(folder: Path) -> Dataset:
                 where=str(path),
                 remedy="pdhef extract LOG... -o DATASET creates it again, in another folder",
             )
-        limits = (document.get("choice") or {}).get("limits")
         return Dataset(
             folder=folder,
             model=str(document["model"]),
             sha256=str(document["sha256"]),
-            drives=tuple(
-                DatasetDrive(folder / d["file"], d, limits if d["split"] == CHOSEN_SPLIT else None)
-                for d in document["drives"]
-            ),
+            drives=tuple(DatasetDrive(folder / d["file"], d) for d in document["drives"]),
             manifest=document,
         )
     except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:  # format without a digest
         raise OutputError(
             expected=_EXPECTED, got=str(error) or type(error).__name__, where=str(folder), remedy=_REMEDY
         ) from None
-
-
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """Return a dataset's manifest; raises OutputError if it is missing or damaged."""
-    return read_sealed(folder / MANIFEST, _EXPECTED, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import VEHICLE_FILE, Car
+from pdhef_logtool.car.model import ESTIMATED
 from pdhef_logtool.car.parts import physics_sha256
-from pdhef_logtool.car.taught import ESTIMATED
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.plan import DrivePlan
@@ -34,15 +34,14 @@ from pdhef_logtool.learning.drives import (
     set_manifest,
     tell_drive,
 )
-from pdhef_logtool.learning.network.cells import Picked, condition_of, pick, rows_by_cell
 from pdhef_logtool.learning.network.dataset import (
-    FORMAT,
+    COLUMNS,
     FORMAT_VERSION,
     MANIFEST,
     SPLITS,
     drive_file,
+    read_dataset,
     read_entry,
-    read_manifest,
     remove_unnamed,
     split_folder,
     write_drive,
@@ -64,9 +63,9 @@ from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, NOMINAL_MODEL, PHYSICS_MODEL
-from pdhef_logtool.residual_model.ladder import LadderModel
+from pdhef_logtool.records.signals import BoolArray, Loss
+from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, PHYSICS_MODEL
+from pdhef_logtool.results.condition import parse_condition
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.storage.documents import digest
@@ -76,7 +75,6 @@ from pdhef_logtool.workers.supervisor import supervise
 
 #: Upper bounds of train and validation in [0, 1); the rest is test.
 SPLIT_ENDS = (0.70, 0.85)
-MAX_SMOOTHING_HALF_S = 1.0
 
 Progress = Callable[[str, float], None]
 
@@ -88,21 +86,15 @@ class ExtractSettings:
     Attributes
     ----------
     config : vehicle, mapping, slice, sensors, friction, truth channel; the other entries are not used.
-    truth_smoothing : ``auto`` (per drive, by the noise of ground truth), ``none``, or a half window in seconds.
     split : split of all drives; None = the split in a set's manifest, else 70/15/15 by a hash of the content.
-    seed : seed of that hash.
     model : filter of the residuals, one of :data:`~.bundle.MODELS`.
-    where : condition on the columns of a row (``cells.COLUMNS``) for its use in training.
-    per_cell_s : maximum number of seconds per cell of driving in split train; None = all.
+    where : condition on :data:`~.dataset.COLUMNS` of a row for its use in training.
     """
 
     config: RunConfig
-    truth_smoothing: str = "auto"
     split: str | None = None
-    seed: int = 0
     model: str = PHYSICS_MODEL
     where: str | None = None
-    per_cell_s: float | None = None
 
     def name_of(self, log: str) -> str:
         """Return the name of a log's slice in the dataset."""
@@ -112,24 +104,6 @@ class ExtractSettings:
         # Times of day contain colons, which some file systems reject in file names.
         return f"{log}.{start or 0}-{'' if end is None else end}".replace(":", "")
 
-    def smoothing_half_s(self) -> float | None:
-        """Return the requested half window, 0 for none, None for ``auto``; raises UsageError."""
-        if self.truth_smoothing == "auto":
-            return None
-        if self.truth_smoothing == "none":
-            return 0.0
-        try:
-            half_s = float(self.truth_smoothing)
-        except ValueError:
-            half_s = math.nan
-        if not 0.0 < half_s <= MAX_SMOOTHING_HALF_S:
-            raise UsageError(
-                expected=f"auto, none, or a half window of up to {MAX_SMOOTHING_HALF_S:g} s",
-                got=repr(self.truth_smoothing),
-                where="--truth-smoothing",
-            )
-        return half_s
-
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON-able values; files by name only."""
         config = self.config.to_dict()
@@ -137,7 +111,7 @@ class ExtractSettings:
         return {
             **{k: config[k] for k in used},
             **{k: config[k] for k in ("friction", "reference", "gnss") if config[k] != "auto"},
-            **{k: getattr(self, k) for k in ("truth_smoothing", "split", "model", "where", "per_cell_s")},
+            **{k: getattr(self, k) for k in ("split", "model", "where")},
         }
 
 
@@ -239,8 +213,7 @@ def extract(
         The only log cannot be used.
     """
     output = local_path(output)
-    settings.smoothing_half_s()
-    _check_counts(jobs, settings)
+    _check(jobs, settings)
     inputs = logs_of(arguments, settings.config.read_options)
     mapping = mapping_of(settings.config.mapping)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, reporter.warn))
@@ -268,7 +241,7 @@ def extract(
             remove_unnamed(output, manifest)
     empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
     if empty and manifest["drives"] and settings.split is None:
-        reporter.warn(f"no drive is in {' and '.join(empty)}: with few drives choose with --split, or another --seed")
+        reporter.warn(f"no drive is in {' and '.join(empty)}: with few drives choose with --split")
     return ExtractResult(output, manifest, results)
 
 
@@ -292,7 +265,6 @@ def _write(
         entries,
         failed,
         settings=settings.to_dict(),
-        seed=settings.seed,
         vehicles=vehicles,
         duplicates=copies,
     )
@@ -334,49 +306,33 @@ def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
                 )
 
 
-def _earlier(output: Path, settings: ExtractSettings) -> dict[str, Any]:
+def _earlier(output: Path, settings: ExtractSettings) -> Mapping[str, Any]:
     """Return the manifest of the dataset to extend; empty for a new dataset.
 
     Raises
     ------
     UsageError
-        The folder contains another manifest, or an incompatible dataset.
+        The folder contains another manifest, or a dataset of another filter.
     """
-    path = output / MANIFEST
-    remedy = "choose another folder with -o"
-    if not path.exists():
+    if not (output / MANIFEST).exists():
         return {}
+    expected, remedy = f"a new folder, or a residual dataset for {settings.model}", "choose another folder with -o"
     try:
-        document = read_manifest(output)
-        got = "" if document.get("format") == FORMAT else f"a folder with another {MANIFEST}"
+        data = read_dataset(output)
     except OutputError as error:
-        got = f"a folder with another {MANIFEST}: {error.got}"
-    if got:
-        expected = "a new folder, or the folder of a residual dataset"
-        raise UsageError(expected=expected, got=got, where=str(output), remedy=remedy)
-    wanted = (FORMAT_VERSION, settings.model)
-    if (format_of_file := (document.get("version"), document.get("model"))) != wanted:
-        raise UsageError(
-            expected=f"a dataset of version {wanted[0]} for {wanted[1]}",
-            got=f"version {format_of_file[0]} for {format_of_file[1] or NOMINAL_MODEL}",
-            where=str(output),
-            remedy=remedy,
-        )
-    whole: dict[str, Any] = document
-    return whole
+        raise UsageError(expected=expected, got=error.got, where=str(output), remedy=remedy) from None
+    if data.model != settings.model:
+        raise UsageError(expected=expected, got=f"one for {data.model}", where=str(output), remedy=remedy)
+    return data.manifest
 
 
-def _check_counts(jobs: int, settings: ExtractSettings) -> None:
+def _check(jobs: int, settings: ExtractSettings) -> None:
     if jobs < 1:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
-    if settings.seed < 0:
-        raise UsageError(expected="a seed of at least 0", got=str(settings.seed), where="--seed")
     if settings.split is not None and settings.split not in SPLITS:
         raise UsageError(expected=f"one of {', '.join(SPLITS)}", got=repr(settings.split), where="--split")
     if settings.where is not None:
-        condition_of(settings.where)
-    if settings.per_cell_s is not None and not 0.0 < settings.per_cell_s < math.inf:
-        raise UsageError(expected="seconds above 0", got=str(settings.per_cell_s), where="--per-cell")
+        parse_condition(settings.where, COLUMNS, of_tracks=False)
     if settings.model not in MODELS:
         raise UsageError(expected=f"one of {', '.join(MODELS)}", got=repr(settings.model), where="--filter")
 
@@ -445,7 +401,7 @@ def _failure(job: _Job, reason: str) -> DriveResult:
 
 def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
     settings, source = job.settings, identity_of(job.log_input)
-    split, split_from = choose_split(source, settings.seed, chosen=settings.split, listed=job.listed_split)
+    split, split_from = choose_split(source, chosen=settings.split, listed=job.listed_split)
     fingerprint, target = _fingerprint(job, split), job.target(split)
     if job.resume and (kept := _kept(job, target, source, split, fingerprint)) is not None:
         return kept
@@ -453,16 +409,15 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         drive.plan = plan = _strict_truth(drive.plan)
         reference, _ = teaching_reference(drive, settings.config)
         _check_plan(plan, job, estimated=reference is not None)
-        smoothing = _choose_smoothing(plan, settings)
+        smoothing = _choose_smoothing(plan)
         truth = _truth_facts(plan, smoothing, estimated=reference is not None)
-        model, calibration, taught = _in_service(drive, job)
+        model, calibration = _in_service(drive, job)
         physics = filter_of(model.car.calibrated_car, settings.model, use_speed=drive.options.use_speed)
         drive.friction = friction_of(plan, physics.vehicle, drive.options, of_truth=True)
-        condition = None if settings.where is None else condition_of(settings.where)
-        rows = _residuals(drive, physics, smoothing, (model, taught), reference)
+        rows = _residuals(drive, physics, smoothing, model, reference)
         if not len(rows):
             raise no_samples(job.log_input.path)
-        picked = pick(rows, condition, f"{settings.seed}:{source}")
+        chosen = _chosen(rows, settings.where)
         progress(1.0)
         entry = {
             "name": job.name,
@@ -476,29 +431,26 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             "settings_sha256": fingerprint,
             "mapping_sha256": drive.mapping.sha256,
             "calibration": calibration,
-            "taught_sha256": None if taught is None else taught.sha256,
             "period_s": plan.alignment.grid_period_s,
-            **_counts(rows, picked, drive.log.start_ns),
+            **_counts(rows, drive.log.start_ns),
             "truth": truth,
             "friction_from": drive.friction.label,
             "losses": [asdict(x) for x in drive.losses],
         }
-        write_drive(target, rows, picked, entry, truth_source=truth["kind"])
+        write_drive(target, rows, chosen, entry, truth_source=truth["kind"])
         if not entry["usable_rows"]:
             drive.tell("not one usable target: no ground truth above the low-speed limit")
         record = record_of(drive, split=split)
     return DriveResult(replace(record, seconds=entry["duration_s"]), entry)
 
 
-def _in_service(drive: Drive, job: _Job) -> tuple[DriveModel, str, LadderModel | None]:
-    """Return model, calibration and residual of a run on this drive; a taught car is calibrated on each drive."""
-    car, taught = job.car, job.car.taught
-    if taught is None or job.settings.model != PHYSICS_MODEL:
-        return DriveModel.of(drive), "", None
+def _in_service(drive: Drive, job: _Job) -> tuple[DriveModel, str]:
+    """Return the model of a run on this drive, and its calibration: a taught car is calibrated on each drive."""
+    car = job.car
+    if car.model is None or job.settings.model != PHYSICS_MODEL:
+        return DriveModel.of(drive), ""
     calibration = self_calibrate([read_driving(drive)], car.vehicle, taught=car.taught_prior)
-    text = f"refused: {calibration.refused}" if calibration.refused else calibration.text
-    acts = taught.residual if taught.calibrated != bool(calibration.refused) else None
-    return DriveModel.of(drive, calibration), text, acts
+    return DriveModel.of(drive, calibration), calibration.text
 
 
 def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) -> DriveResult | None:
@@ -519,7 +471,7 @@ def _residuals(
     drive: Drive,
     physics: VehicleUkf,
     smoothing: _Smoothing,
-    service: tuple[DriveModel, LadderModel | None],
+    model: DriveModel,
     reference: TruthAt | None,
 ) -> ResidualRows:
     """Return the residuals of a drive."""
@@ -528,7 +480,6 @@ def _residuals(
     assert truth is not None, "the plan of the drive derives it"
     period_s = drive.plan.alignment.grid_period_s
     half_window = round(smoothing.half_s / period_s)
-    model, taught = service
     is_physics = physics.equations == "forces"
     noise = smoothing.noise[0] * period_s / math.sqrt(2.0)  # of v_y itself
     return residual_rows(
@@ -538,14 +489,11 @@ def _residuals(
         period_s=period_s,
         half_window=half_window,
         truth_std_m_s=noise if math.isfinite(noise) else 0.0,
-        taught=taught if is_physics else None,
     )
 
 
-def choose_split(
-    source_sha256: str, seed: int, *, chosen: str | None = None, listed: str | None = None
-) -> tuple[str, str]:
-    """Return a drive's split and its source: option, a set's manifest, or a hash of content and seed.
+def choose_split(source_sha256: str, *, chosen: str | None = None, listed: str | None = None) -> tuple[str, str]:
+    """Return a drive's split and its source: option, a set's manifest, or a hash of the content.
 
     The hash does not depend on other drives, names or order, so that copies of a drive are in the same split.
     """
@@ -553,7 +501,7 @@ def choose_split(
         return chosen, "option"
     if listed is not None:
         return listed, "manifest"
-    drawn = hashlib.sha256(f"{seed}:{source_sha256}".encode()).digest()
+    drawn = hashlib.sha256(f"0:{source_sha256}".encode()).digest()
     place = int.from_bytes(drawn[:8], "big") / 2.0**64
     return SPLITS[sum(place >= end for end in SPLIT_ENDS)], "hash"
 
@@ -602,16 +550,13 @@ class _Smoothing:
     noise: tuple[float, float]
 
 
-def _choose_smoothing(plan: DrivePlan, settings: ExtractSettings) -> _Smoothing:
+def _choose_smoothing(plan: DrivePlan) -> _Smoothing:
     """Decide by the survey whether one-step differences of the ground truth need smoothing."""
     truth = derive_truth(plan.survey_truth, plan=plan.truth).track
     noise = (
         difference_noise(truth.stamps_ns, truth.vy_m_s),
         difference_noise(truth.stamps_ns, truth.yaw_rate_rad_s),
     )
-    asked = settings.smoothing_half_s()
-    if asked is not None:
-        return _Smoothing(asked, "as asked for", noise)
     said = f"one-step noise of the ground truth {noise[0]:.3g} m/s² and {noise[1]:.3g} rad/s²"
     limits = f"{NEGLIGIBLE_NOISE[0]:g} m/s² and {NEGLIGIBLE_NOISE[1]:g} rad/s²"
     if all(n <= limit for n, limit in zip(noise, NEGLIGIBLE_NOISE, strict=True)):  # False for NaN
@@ -633,18 +578,25 @@ def _truth_facts(plan: DrivePlan, smoothing: _Smoothing, *, estimated: bool = Fa
     }
 
 
+def _chosen(rows: ResidualRows, where: str | None) -> BoolArray:
+    """Return the rows [N] that meet the condition; all rows without one."""
+    if where is None:
+        return np.ones(len(rows), dtype=np.bool_)
+    columns = dict(zip(COLUMNS, [*rows.features.T, *rows.truth_velocity.T], strict=True))
+    return parse_condition(where, COLUMNS, of_tracks=False).is_true(columns)
+
+
 def _pair(values: Sequence[float]) -> dict[str, float | None]:
     names = ("vy_dot_m_s2", "yaw_acceleration_rad_s2")
     return {n: float(v) if math.isfinite(v) else None for n, v in zip(names, values, strict=True)}
 
 
-def _counts(rows: ResidualRows, picked: Picked, log_start_ns: int) -> dict[str, Any]:
+def _counts(rows: ResidualRows, log_start_ns: int) -> dict[str, Any]:
     """Return the span of a drive's rows in seconds from the log's start, and counts of rows."""
     use = rows.weight > 0.0
     first, last = int(rows.stamps_ns[0]), int(rows.stamps_ns[-1])
     squares = np.square(rows.targets[use] / rows.step_s[use, None])
     mean = np.cumsum(squares, axis=0)[-1] / len(squares) if len(squares) else np.full(2, math.nan)
-    by_cell = rows_by_cell(picked.cell, use & picked.chosen)
     return {
         "start_s": (first - log_start_ns) * 1e-9,
         "end_s": (last - log_start_ns) * 1e-9,
@@ -653,7 +605,6 @@ def _counts(rows: ResidualRows, picked: Picked, log_start_ns: int) -> dict[str, 
         "usable_rows": len(squares),
         "segments": len(np.unique(rows.segment[use])),
         "residual_rms": _pair(np.sqrt(mean).tolist()),
-        "cells": {str(n): int(count) for n, count in enumerate(by_cell) if count},
     }
 
 
@@ -662,13 +613,10 @@ def _fingerprint(job: _Job, split: str) -> str:
     mapping = job.settings.config.mapping
     document = {
         "format": FORMAT_VERSION,
-        "settings": {
-            k: v for k, v in job.settings.to_dict().items() if k not in ("split", "car", "mapping", "per_cell_s")
-        },
+        "settings": {k: v for k, v in job.settings.to_dict().items() if k not in ("split", "car", "mapping")},
         "split": split,
-        "seed": job.settings.seed,
         "vehicle": [job.physics[0], {name: noise.model_dump(mode="json") for name, noise in job.car.noise.items()}],
-        "taught": None if job.car.taught is None else digest(job.car.taught.model_dump(mode="json")),
+        "model": None if job.car.model is None else digest(job.car.model.model_dump(mode="json")),
         **({} if job.log_input.span_s is None else {"span_s": job.log_input.span_s}),
         "mapping": None if mapping is None else hash_log(Path(mapping)),
         "versions": tool_versions(),

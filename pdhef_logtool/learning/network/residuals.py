@@ -35,7 +35,6 @@ from pdhef_logtool.learning.truth import weight_of
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.residual_model.ladder import LadderModel
 
 #: Steps longer than this many periods are gaps without an increment.
 GAP_PERIODS = 1.5
@@ -68,8 +67,7 @@ class ResidualRows:
         truth, 1/2 if the uncertainty of its sideslip equals the error of a single track (:func:`~..truth.weight_of`).
     segment : int64 [N], changes wherever the parallel filter restarts: sequences must not cross it.
     truth_velocity : [N, 2], true v_x and v_y at the stamp, as targets of other networks; NaN where unknown.
-    truth_std_rad : [N], 1-sigma of the true sideslip. region : [N], gain of the region of validity of the car's taught
-        residual; NaN without one.
+    truth_std_rad : [N], 1-sigma of the true sideslip.
     """
 
     stamps_ns: IntArray
@@ -80,7 +78,6 @@ class ResidualRows:
     segment: IntArray
     truth_velocity: FloatArray
     truth_std_rad: FloatArray
-    region: FloatArray
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -263,7 +260,6 @@ def residual_rows(
     period_s: float,
     half_window: int = 0,
     truth_std_m_s: float = 0.0,
-    taught: LadderModel | None = None,
 ) -> ResidualRows:
     """Turn a drive into residual rows, one per stamp.
 
@@ -272,17 +268,13 @@ def residual_rows(
     signals, truth : at the same stamps [N], less biases of the vehicle file.
     physics : the parallel filter with the settings of operation; residuals refer to its model.
     period_s : of the IMU. half_window : steps on each side of the smoothing of targets.
-    truth_std_m_s : 1-sigma of the true v_y for ground truth without an uncertainty. taught : the car's taught residual.
+    truth_std_m_s : 1-sigma of the true v_y for ground truth without an uncertainty.
     """
     count = len(signals)
-    features, dt_s, filtered, _ = run_features(physics, signals, None)
+    features, _, filtered, _ = run_features(physics, signals, None)
     complete = _complete(features)
     fresh: BoolArray = complete & ~(np.concatenate([[False], complete[:-1]]) & np.isfinite(filtered.prior[:, 0]))
     segment = np.maximum(np.cumsum(fresh) - 1, 0)
-    region = np.full(count, np.nan)
-    if taught is not None:
-        residual, _ = taught.residual(features, dt_s, None)
-        region = np.where(filtered.valid, residual.gain, np.nan)
     inputs = filtered.inputs.copy()
     state = np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)
     state[~truth.valid] = np.nan
@@ -312,7 +304,6 @@ def residual_rows(
         segment=segment,
         truth_velocity=state[:, :2],
         truth_std_rad=truth_std,
-        region=region,
     )
 
 

@@ -1,4 +1,4 @@
-"""``pdhef train``: train a model bundle on a dataset, with loss history, plot and resumption."""
+"""``pdhef train``: train a model bundle on a dataset, with loss history and resumption."""
 
 from __future__ import annotations
 
@@ -31,7 +31,6 @@ from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path
 
 HISTORY_FILE = "history.parquet"
-PLOT_FILE = "history.png"
 #: Minimum length of a training sequence between two restarts.
 MIN_SEQUENCE_STEPS = 50
 #: Length of the warm-up of the recurrent state before a selected stretch.
@@ -71,7 +70,7 @@ def run_training(
     device: str = "cpu",
     progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> TrainResult:
-    """Train on a residual dataset and write the bundle, ``history.parquet`` and its plot to ``output``.
+    """Train on a residual dataset and write the bundle, ``history.parquet`` to ``output``.
 
     If an interrupted call (even by kill -9) is repeated, it continues after its last complete epoch.
 
@@ -165,7 +164,6 @@ def train_on(
     }
     bundle = replace(bundle, provenance=provenance, model=data.model, physics_sha256=data.physics_sha256)
     write_bytes(output / HISTORY_FILE, _history_table(history))
-    write_bytes(output / PLOT_FILE, _plot_history(history))
     bundle.save(output)
     (output / CHECKPOINT).unlink(missing_ok=True)
     return TrainResult(output, bundle, tuple(history), test_loss)
@@ -272,20 +270,3 @@ def _history_table(history: Iterable[Epoch]) -> bytes:
     whole = io.BytesIO()  # polars raises errors of other types for a full disk
     pl.DataFrame([asdict(e) for e in history]).write_parquet(whole)
     return whole.getvalue()
-
-
-def _plot_history(history: list[Epoch]) -> bytes:
-    """Return the loss by epoch as a PNG without time stamp and version, so that equal losses give equal bytes."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 4.0), dpi=110, layout="constrained")
-    axes = figure.subplots()
-    epochs = [e.epoch for e in history]
-    axes.semilogy(epochs, [e.train_loss for e in history], label="training", color="#0072B2")
-    axes.semilogy(epochs, [e.validation_loss for e in history], label="validation", color="#D55E00")
-    axes.set(xlabel="epoch", ylabel="mean square of normalised targets")
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
-    content = io.BytesIO()
-    figure.savefig(content, format="png", metadata={"Software": None})
-    return content.getvalue()

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.mapping.candidates import Candidate
+from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.runs.inspection.report import Inspection
-from pdhef_logtool.runs.inspection.uses import missing_for_sideslip
 
 #: Questions in order; a steering angle is either of two signals.
 QUESTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
@@ -46,8 +46,7 @@ def ask_mapping(inspection: Inspection, ask: Callable[[str], str], tell: Callabl
         if answer is not None:
             sources[answer.name] = answer
         mapping = replace(mapping, signals=sources) if section == "signals" else replace(mapping, truth=sources)
-    lacking = missing_for_sideslip(mapping)
-    tell(f"sideslip estimation still needs: {lacking}" if lacking else "sideslip estimation needs no further signal")
+    tell(f"missing: {', '.join(missing_signals(mapping)) or 'no signal'}")
     return replace(mapping, checks=())
 
 

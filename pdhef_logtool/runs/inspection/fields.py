@@ -19,8 +19,9 @@ from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces, Seen
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.runs.inspection.rendering import empty_table, number_text
+from pdhef_logtool.runs.inspection.rendering import table_of
 from pdhef_logtool.runs.inspection.report import COVARIANCE, INDEX, collapsed
+from pdhef_logtool.runs.inspection.step_statistics import number_text
 from pdhef_logtool.storage.documents import jsonable
 
 if TYPE_CHECKING:
@@ -138,11 +139,9 @@ def render_fields(report: FieldsOfLog, console: Console) -> None:
     console.print(f"Values over {part} of the log, {report.seconds:.0f} s, in recorded units.")
     for topic in report.topics:
         title = f"{topic.name} ({topic.type}), {number_text(topic.rate_hz)} Hz"
-        table = empty_table(title, "field", "type", "min", "mean", "max", words=2)
-        for row in topic.fields:
-            numbers = (number_text(v) for v in (row.minimum, row.mean, row.maximum))
-            table.add_row(Text(row.path), row.type, *numbers)
+        numbers = [[number_text(v) for v in (row.minimum, row.mean, row.maximum)] for row in topic.fields]
+        rows = ((Text(row.path), row.type, *texts) for row, texts in zip(topic.fields, numbers, strict=True))
         if topic.fields and not topic.reason:
-            console.print(table)
+            console.print(table_of(title, ("field", "type", "min", "mean", "max"), rows, words=2))
         else:
             console.print(Text(f"{topic.name} ({topic.type}): {topic.reason}"))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 from rich import box
 from rich.table import Table
@@ -11,8 +13,9 @@ from rich.text import Text
 
 from pdhef_logtool.logs.recording_span import shown_time
 from pdhef_logtool.mapping.candidates import Candidate
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
-from pdhef_logtool.runs.inspection.report import Inspection, TopicReport
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
+from pdhef_logtool.runs.inspection.report import Inspection, SignalReport, TopicReport
+from pdhef_logtool.runs.inspection.step_statistics import number_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -41,7 +44,7 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
         console.print(_statistics_table(inspection))
     if inspection.candidates:
         console.print(_candidates_table(inspection.candidates))
-    for head, style, text in (*findings_of(inspection), *_uses(inspection)):
+    for head, style, text in findings_of(inspection):
         line = Table.grid(padding=(0, 1))
         line.add_column(width=9)
         line.add_column(overflow="fold")
@@ -49,8 +52,8 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
         console.print(line)
 
 
-def empty_table(title: str, *headings: str | Text, words: int) -> Table:
-    """Return an empty table with ``words`` columns of text, then numbers."""
+def table_of(title: str, headings: Sequence[str | Text], rows: Iterable[Sequence[Any]], *, words: int) -> Table:
+    """Return a table with ``words`` columns of text, then numbers."""
     table = Table(
         title=Text(title),
         title_justify="left",
@@ -65,35 +68,30 @@ def empty_table(title: str, *headings: str | Text, words: int) -> Table:
             table.add_column(heading, overflow="fold", no_wrap=heading == "signal")
         else:
             table.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
 def _topics_table(topics: tuple[TopicReport, ...]) -> Table:
     encodings = sorted({t.encoding for t in topics})
-    headings = (
-        Text.assemble("topic\n", ("type", "dim")),
-        "count",
-        "Hz",
-        "jitter\nms",
-        "longest gap\ns @ s",
-        "delay\nms",
-    )
-    table = empty_table(f"Topics ({', '.join(encodings)})", *headings, words=1)
-    for topic in topics:
-        gap = "-"
-        if math.isfinite(topic.largest_gap_s):
-            gap = f"{number_text(topic.largest_gap_s)} @ {topic.largest_gap_at_s:.1f}"
+    name = Text.assemble("topic\n", ("type", "dim"))
+    headings = (name, "count", "Hz", "jitter\nms", "longest gap\ns @ s", "delay\nms")
+
+    def row(topic: TopicReport) -> tuple[str | Text, ...]:
+        gap = f"{number_text(topic.largest_gap_s)} @ {topic.largest_gap_at_s:.1f}"
         delay, late = number_text(topic.delay_median_s * 1e3), number_text(topic.delay_p95_s * 1e3)
         kind = topic.type.replace("/msg/", "/") + (f" ({topic.encoding})" if len(encodings) > 1 else "")
-        table.add_row(
+        return (
             Text.assemble(f"{topic.name}\n", (kind, "dim")),
             str(topic.messages),
             number_text(topic.rate_hz),
             number_text(topic.jitter_p95_s * 1e3),
-            gap,
+            gap if math.isfinite(topic.largest_gap_s) else "-",
             _delay_text(topic.delay_median_s) or (delay if delay == late else f"{delay} to {late}"),
         )
-    return table
+
+    return table_of(f"Topics ({', '.join(encodings)})", headings, map(row, topics), words=1)
 
 
 def _delay_text(delay_s: float) -> str:
@@ -103,58 +101,51 @@ def _delay_text(delay_s: float) -> str:
     return "other clock" if abs(delay_s) > OTHER_CLOCK_S else ""
 
 
+def _by_section(
+    inspection: Inspection, row: Callable[[SignalReport], Sequence[str | Text]]
+) -> Iterator[Sequence[str | Text]]:
+    """Yield the rows of signals, and of ground truth below a heading."""
+    yield from map(row, inspection.signals.values())
+    if inspection.truth:
+        yield [Text("truth", "bold")]
+        yield from map(row, inspection.truth.values())
+
+
 def _sources_table(inspection: Inspection) -> Table:
     rows = "recognised types and candidates" if any(c.taken for c in inspection.candidates) else "recognised types"
     origin = rows if inspection.mapping.origin == "auto" else "mapping file"
-    table = empty_table(f"Mapping ({origin})", "signal", "topic", "field", "stamp", words=4)
     stamps = {clock.topic: clock.stamp for clock in inspection.clocks}
-    for section in (inspection.signals, inspection.truth):
-        for report in section.values():
-            table.add_row(report.name, Text(report.topic), Text(_short(report.field)), stamps.get(report.topic, ""))
-        if section is inspection.signals and inspection.truth:
-            table.add_row(Text("truth", "bold"), "", "", "")
-    return table
+
+    def row(report: SignalReport) -> tuple[str | Text, ...]:
+        return report.name, Text(report.topic), Text(_short(report.field)), stamps.get(report.topic, "")
+
+    headings = ("signal", "topic", "field", "stamp")
+    return table_of(f"Mapping ({origin})", headings, _by_section(inspection, row), words=4)
 
 
 def _candidates_table(candidates: tuple[Candidate, ...]) -> Table:
     """Return the candidates beside recognised types: those taken, and the best others of each signal."""
-    table = empty_table("Candidates by name and physics (* taken)", "signal", "field and reason", "score", words=2)
-    shown: dict[str, int] = {}
+    rows, shown = [], Counter[str]()
     order = [*SIGNAL_UNITS, *TRUTH_UNITS]
     for item in sorted(candidates, key=lambda c: (c.section, order.index(c.source.name), not c.taken, -c.score)):
         name = f"{'truth ' if item.section == 'truth' else ''}{item.source.name}"
-        shown[name] = shown.get(name, 0) + 1
+        shown[name] += 1
         if shown[name] <= (1 + CANDIDATES_SHOWN):
             doubt = Text(f"\nunsure: {item.doubt}", "yellow") if item.doubt else ""
             text = Text.assemble(item.source.label, Text(f"\n{item.reason}", "dim"), doubt)
-            table.add_row(f"{'* ' if item.taken else '  '}{name}", text, f"{item.score:.2f}")
-    return table
-
-
-def _uses(inspection: Inspection) -> list[tuple[str, str, str]]:
-    """Return the last lines: uses of the log, and missing signals."""
-    uses = inspection.uses
-    lines = [("can", "green", f"Possible uses of this log: {uses['can']}")]
-    if uses["sideslip_needs"]:
-        lines.append(("needs", "yellow", f"sideslip estimation still needs: {uses['sideslip_needs']}"))
-        if any(not c.taken for c in inspection.candidates):
-            lines.append(("next", "cyan", "pdhef map LOG builds a mapping.toml interactively from the candidates"))
-        else:
-            lines.append(("next", "cyan", "pdhef inspect LOG --fields lists all numeric fields of the log"))
-    return lines
+            rows.append((f"{'* ' if item.taken else '  '}{name}", text, f"{item.score:.2f}"))
+    return table_of("Candidates by name and physics (* taken)", ("signal", "field and reason", "score"), rows, words=2)
 
 
 def _statistics_table(inspection: Inspection) -> Table:
     headings = ("signal", "Hz", "delay\nms", "min", "mean", "max", "std", "gaps", "drop")
-    table = empty_table("Values in SI units", *headings, words=1)
-    for section in (inspection.signals, inspection.truth):
-        for report in section.values():
-            dropped = sum(report.dropped.values())
-            values = (report.rate_hz, report.latency_s * 1e3, report.minimum, report.mean, report.maximum, report.std)
-            table.add_row(report.name, *map(number_text, values), str(report.gaps or "-"), str(dropped or "-"))
-        if section is inspection.signals and inspection.truth:
-            table.add_row(Text("truth", "bold"), *[""] * 8)
-    return table
+
+    def row(report: SignalReport) -> tuple[str, ...]:
+        values = (report.rate_hz, report.latency_s * 1e3, report.minimum, report.mean, report.maximum, report.std)
+        counts = (report.gaps, sum(report.dropped.values()))
+        return report.name, *map(number_text, values), *(str(count or "-") for count in counts)
+
+    return table_of("Values in SI units", headings, _by_section(inspection, row), words=1)
 
 
 def findings_of(inspection: Inspection) -> list[tuple[str, str, str]]:
@@ -171,31 +162,28 @@ def findings_of(inspection: Inspection) -> list[tuple[str, str, str]]:
     if passed := [c for c in inspection.checks if c.verdict == "passed"]:
         subjects = ", ".join(dict.fromkeys(c.subject for c in passed))
         rows.append(("passed", "green", f"{len(passed)} checks of {subjects}"))
-    for loss in inspection.lost:
-        facts = [f"{loss.count} times"] if loss.count is not None and loss.count != 1 else []
-        if loss.start_ns is not None:
-            until = "" if loss.end_ns is None else f" to {(loss.end_ns - inspection.start_ns) * 1e-9:.2f} s"
-            facts.append(f"from {(loss.start_ns - inspection.start_ns) * 1e-9:.2f} s{until}")
-        head, style = ("lost", "red") if loss.severity == "lost" else ("note", "cyan")
-        rows.append((head, style, f"{loss.where}: {loss.what}{' (' + ', '.join(facts) + ')' if facts else ''}"))
+    rows += [_loss_row(loss, inspection.start_ns) for loss in inspection.lost]
     rows += [("note", "cyan", n) for n in inspection.notes]
     if inspection.mapping.quality is not None:
         rows.append(("note", "cyan", f"ground truth is used where {inspection.mapping.quality.describe()}"))
+    rows.append(("can run", "green", ", ".join(inspection.estimators) or "no estimator"))
+    if inspection.missing and any(not c.taken for c in inspection.candidates):
+        rows.append(("next", "cyan", "pdhef map LOG builds a mapping.toml interactively from the candidates"))
+    elif inspection.missing:
+        rows.append(("next", "cyan", "pdhef inspect LOG --fields lists all numeric fields of the log"))
     return rows
+
+
+def _loss_row(loss: Loss, start_ns: int) -> tuple[str, str, str]:
+    facts = [f"{loss.count} times"] if loss.count is not None and loss.count != 1 else []
+    if loss.start_ns is not None:
+        until = "" if loss.end_ns is None else f" to {(loss.end_ns - start_ns) * 1e-9:.2f} s"
+        facts.append(f"from {(loss.start_ns - start_ns) * 1e-9:.2f} s{until}")
+    head, style = ("lost", "red") if loss.severity == "lost" else ("note", "cyan")
+    return head, style, f"{loss.where}: {loss.what}{' (' + ', '.join(facts) + ')' if facts else ''}"
 
 
 def _short(field: str) -> str:
     """Write several fields of one struct as ``struct.{w,x,y,z}``."""
     stems, _, leaves = zip(*(path.rpartition(".") for path in field.split(", ")), strict=True)
     return f"{stems[0]}.{{{','.join(leaves)}}}" if len(leaves) > 1 and stems[0] and len(set(stems)) == 1 else field
-
-
-def number_text(value: float) -> str:
-    """Return a number in few digits, a dash without one."""
-    if not math.isfinite(value):
-        return "-"
-    if value == 0.0:
-        return "0"
-    if 100.0 <= abs(value) < 1e5:
-        return f"{value:.0f}"
-    return f"{value:.3g}" if 1e-4 <= abs(value) < 1e4 else f"{value:.1e}"

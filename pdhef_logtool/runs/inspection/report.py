@@ -16,6 +16,8 @@ import numpy as np
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
+from pdhef_logtool.estimators.presets import preset_of
+from pdhef_logtool.estimators.table import all_specs
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo
@@ -43,12 +45,10 @@ from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.mapping.clocks import sources_by_clock, survey_windows
 from pdhef_logtool.mapping.mapping_file import missing_signals
-from pdhef_logtool.mapping.records import RECORDER_STAMPS
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, FloatArray, Loss
-from pdhef_logtool.runs.inspection.step_statistics import Steps, outline
-from pdhef_logtool.runs.inspection.uses import uses_of
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, Loss
+from pdhef_logtool.runs.inspection.step_statistics import Steps, number_text
 from pdhef_logtool.storage.documents import jsonable
 from pdhef_logtool.storage.files import write_bytes
 
@@ -70,6 +70,7 @@ CLOCK_RESIDUAL_S = 0.02
 _IN_DOCUMENT = (
     "path", "kind", "start_ns", "end_ns", "duration_s", "sample", "topics", "clocks", "mapping_origin", "signals",
     "truth", "truth_quality", "missing", "ambiguities", "notes", "checks", "proposals", "lost", "candidates",
+    "estimators",
 )  # fmt: skip
 
 
@@ -92,25 +93,21 @@ class TopicReport:
     largest_gap_at_s: float
     delay_median_s: float
     delay_p95_s: float
-    delay_drift_ppm: float
-    delay_negative_share: float
     fields: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class ClockReport:
-    """The stamps that mapped signals use, against log time; ``reason``: evidence for them, or for log time instead."""
+    """The stamps that mapped signals use, against log time."""
 
     topic: str
     stamp: str
     clock: str
     delay_median_s: float
     delay_p95_s: float
-    delay_min_s: float
     drift_ppm: float
     residual_s: float
     delay_known: bool
-    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,8 +166,7 @@ class Inspection:
     ambiguities, notes : of the mapping. candidates : fields that were weighed for it.
     checks : of signals and ground truth by physics. proposals : certain corrections of the mapping.
     lost : every loss and note of reading. sample : the part that was read; None: all.
-    lines : extremes in equal parts of the log [C] by section and signal, no part of the JSON.
-    refused : by channel the reason why a run does not use it.
+    refused : by channel the reason why a run does not use it. estimators : that can run with the other channels.
     """
 
     path: str
@@ -190,15 +186,15 @@ class Inspection:
     lost: tuple[Loss, ...]
     candidates: tuple[Candidate, ...] = ()
     sample: Sample | None = None
-    lines: MappingABC[tuple[str, str], tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     refused: MappingABC[str, str] = field(default_factory=dict)
 
     @property
-    def uses(self) -> MappingABC[str, str]:
-        """Possible uses of the log (``can``), and missing signals for sideslip (``sideslip_needs``, may be empty)."""
-        signals = {n: s for n, s in self.mapping.signals.items() if n not in self.refused}
-        truth = {n: s for n, s in self.mapping.truth.items() if f"truth.{n}" not in self.refused}
-        return uses_of(replace(self.mapping, signals=signals, truth=truth))
+    def estimators(self) -> tuple[str, ...]:
+        """Estimators that can run with these signals, without a network or noise parameters of the car."""
+        used = replace(self.mapping, signals={n: s for n, s in self.mapping.signals.items() if n not in self.refused})
+        have = frozenset(used.signals) | set(missing_signals(Mapping())).difference(missing_signals(used))
+        able = (s for s in all_specs() if not (s.lacking(have) or s.network or s.needs_noise))
+        return tuple(dict.fromkeys(preset_of(spec.name) for spec in able))
 
     @property
     def duration_s(self) -> float:
@@ -217,7 +213,6 @@ class Inspection:
             "mapping_origin": self.mapping.origin,
             "truth_quality": None if self.mapping.quality is None else self.mapping.quality.describe(),
             "proposals": [{"subject": p.subject, "evidence": p.evidence} for p in self.proposals],
-            **self.uses,
         }
         return {key: jsonable(value) for key, value in document.items()}
 
@@ -292,12 +287,11 @@ def inspect_drive_log(
     mapping = looked_at.mapping
     parts = [read_signals(log, mapping, clocks, start, end, stamps=look.stamps) for start, end in look.windows]
     losses = merge_losses(part.losses for part in parts)
-    channels = {("signals", n): [part.signals[n] for part in parts] for n in mapping.signals}
-    channels |= {("truth", n): [part.truth[n] for part in parts] for n in mapping.truth}
     signals, truth = (
-        {n: _signal_report(s, section, channels[section, n], clocks[clock_key(s)], losses, log, mapping.quality)
-         for n, s in sources.items()}
-        for section, sources in (("signals", mapping.signals), ("truth", mapping.truth))
+        {n: _signal_report(s, section, [getattr(part, section)[n] for part in parts], clocks[clock_key(s)], losses, log,
+                           mapping.quality)
+         for n, s in getattr(mapping, section).items()}
+        for section in ("signals", "truth")
     )  # fmt: skip
     return Inspection(
         path=str(log.path),
@@ -318,7 +312,6 @@ def inspect_drive_log(
         lost=merge_losses([log.lost, losses]),
         candidates=candidates,
         sample=None if look.sample is None else look.sample(),
-        lines={key: _line(of, log.end_ns - log.start_ns) for key, of in channels.items()},
         refused=looked_at.refused(),
     )
 
@@ -382,7 +375,6 @@ def _topic_report(topic: TopicInfo, steps: Steps, stamps: Sequence[Columns], log
     gap_s, gap_at_s = steps.longest(log.start_ns)
     log_s = (log.end_ns - log.start_ns) * 1e-9
     numbers = tuple(name for name, _, _ in collapsed(log.fields(topic.name)))
-    times = np.concatenate([np.empty(0), *((c.log_time_ns - log.start_ns) * 1e-9 for c in stamps)])
     delays = np.concatenate([np.empty(0), *((c.log_time_ns - c.publish_time_ns) * 1e-9 for c in stamps)])
     median, late = np.quantile(delays, [0.5, 0.95]).tolist() if delays.size else (math.nan, math.nan)
     return TopicReport(
@@ -396,28 +388,7 @@ def _topic_report(topic: TopicInfo, steps: Steps, stamps: Sequence[Columns], log
         largest_gap_at_s=gap_at_s,
         delay_median_s=median,
         delay_p95_s=late,
-        delay_drift_ppm=_slope(times, delays) * 1e6,
-        delay_negative_share=float(np.mean(delays < 0.0)) if delays.size else math.nan,
         fields=numbers[:MAX_LISTED_FIELDS],
-    )
-
-
-def _slope(x: FloatArray, y: FloatArray) -> float:
-    """Return the slope of y over x by least squares, [N] each; NaN without a span."""
-    x = x - x.mean() if x.size else x
-    spread = float(np.dot(x, x))
-    return float(np.dot(x, y - y.mean()) / spread) if spread > 0.0 else math.nan
-
-
-def _values(channels: Sequence[Channel]) -> FloatArray:
-    """Return the values of a channel's parts [N]; of vectors their lengths."""
-    values = (c.values if c.values.ndim == 1 else np.linalg.norm(c.values, axis=1) for c in channels)
-    return np.concatenate([np.empty(0), *values])
-
-
-def _line(channels: Sequence[Channel], span_ns: int) -> tuple[FloatArray, FloatArray]:
-    return outline(
-        np.concatenate([np.empty(0, np.int64), *(c.stamps_ns for c in channels)]), _values(channels), span_ns
     )
 
 
@@ -430,7 +401,9 @@ def _signal_report(
     log: DriveLog,
     quality: QualityGate | None,
 ) -> SignalReport:
-    steps, values = Steps.of([c.stamps_ns for c in channels]), _values(channels)
+    steps = Steps.of([c.stamps_ns for c in channels])
+    lengths = (c.values if c.values.ndim == 1 else np.linalg.norm(c.values, axis=1) for c in channels)
+    values = np.concatenate([np.empty(0), *lengths])
     gap_s, gap_at_s = steps.longest(log.start_ns, steps.gap_limit_s)
     places = {f"{source.name} ({source.label})"}
     if section == "truth" and quality is not None:
@@ -468,25 +441,10 @@ def _clock_report(source: SignalSource, clock: ClockModel) -> ClockReport:
         clock=source.clock,
         delay_median_s=clock.median_delay_s,
         delay_p95_s=clock.p95_delay_s,
-        delay_min_s=clock.min_delay_s,
         drift_ppm=clock.drift * 1e6,
         residual_s=clock.residual_s,
         delay_known=clock.delay_known,
-        reason=_why_stamp(source, clock),
     )
-
-
-def _why_stamp(source: SignalSource, clock: ClockModel) -> str:
-    """Return the evidence for the stamps in use."""
-    if clock.unusable:
-        return f"{source.stamp}: {clock.unusable}"
-    if source.stamp in RECORDER_STAMPS or not clock.samples:
-        return "" if clock.samples else "no message in the parts that were examined"
-    steps = f"steps of {_number(clock.median_period_s * 1e3)} ms"
-    if source.clock == "device":
-        return f"{steps} on a separate clock, fitted to log time"
-    delays = f"{_number(clock.median_delay_s * 1e3)} to {_number(clock.p95_delay_s * 1e3)} ms before log time"
-    return f"{steps}, {delays}" if clock.delay_known else f"{steps}; all topics are off from log time as one"
 
 
 def _clock_notes(mapping: Mapping, clocks: dict[str, ClockModel]) -> list[str]:
@@ -511,9 +469,9 @@ def mapping_comments(inspection: Inspection) -> dict[str, str]:
     comments: dict[str, str] = {}
     for section, reports in (("signals", inspection.signals), ("truth", inspection.truth)):
         for name, report in reports.items():
-            text = ", ".join(t for t in (types.get(report.topic), f"{_number(report.rate_hz)} Hz") if t)
+            text = ", ".join(t for t in (types.get(report.topic), f"{number_text(report.rate_hz)} Hz") if t)
             if math.isfinite(report.minimum):
-                text += f", {_number(report.minimum)} to {_number(report.maximum)} {report.unit}"
+                text += f", {number_text(report.minimum)} to {number_text(report.maximum)} {report.unit}"
             subject = name if section == "signals" else f"truth.{name}"
             doubts = [c for c in bad if subject in (c.subject, c.name.removesuffix(".candidate"))]
             done = any(p.subject == subject for p in inspection.proposals)
@@ -548,7 +506,3 @@ def write_mapping(inspection: Inspection, path: Path) -> None:
             expected="a new file", got="one that exists", where=str(path), remedy="give another name or remove it"
         )
     write_bytes(path, mapping_text(inspection).encode())
-
-
-def _number(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) else "?"

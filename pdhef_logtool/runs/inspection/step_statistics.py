@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,8 +16,6 @@ GAP_PERIODS = 5.0
 MIN_GAP_S = 0.1
 #: If the median step differs from the mean step by more, messages come in bursts.
 BURST = 0.75
-#: Number of parts of a log with stored extremes.
-COLUMNS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,12 +84,12 @@ class Steps:
 _NONE = np.empty(0, dtype=np.int64)
 
 
-def outline(stamps_ns: IntArray, values: FloatArray, span_ns: int) -> tuple[FloatArray, FloatArray]:
-    """Return the extremes of values [N] in each of ``COLUMNS`` equal parts of a span from the first stamp on."""
-    low, high = np.full(COLUMNS, np.inf), np.full(COLUMNS, -np.inf)
-    if stamps_ns.shape[0]:
-        column = (stamps_ns - stamps_ns[0]) * (COLUMNS / max(1, span_ns))
-        column = np.clip(column, 0, COLUMNS - 1).astype(np.int64)
-        np.fmin.at(low, column, values)
-        np.fmax.at(high, column, values)
-    return low, high
+def number_text(value: float) -> str:
+    """Return a number in few digits, a dash without one."""
+    if not math.isfinite(value):
+        return "-"
+    if value == 0.0:
+        return "0"
+    if 100.0 <= abs(value) < 1e5:
+        return f"{value:.0f}"
+    return f"{value:.3g}" if 1e-4 <= abs(value) < 1e4 else f"{value:.1e}"

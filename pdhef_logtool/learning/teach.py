@@ -1,4 +1,4 @@
-"""Stage ``teach``: prior and residual of a car from drives with ground truth (``taught.json``).
+"""Prior and residual of a car from drives with ground truth.
 
 All driving with ground truth above the car's low-speed limit is used. First, the prior for the calibration of later
 drives is fitted. Then the drives calibrate the car like later drives, without ground truth, and residual models of
@@ -7,7 +7,6 @@ increasing order are fitted to the sideslip error of ``physics`` (docs/learn.md)
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -15,11 +14,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.car.car import TAUGHT_FILE, Car
+from pdhef_logtool.car.model import ESTIMATED, GROUND_TRUTH, TaughtParameter
 from pdhef_logtool.car.parts import PHYSICS
-from pdhef_logtool.car.store import Change
-from pdhef_logtool.car.taught import ESTIMATED, GROUND_TRUTH, Taught, TaughtParameter
-from pdhef_logtool.drive.reading import Drive, WholeDrive, read_drive
+from pdhef_logtool.drive.reading import Drive, WholeDrive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
 from pdhef_logtool.estimators.calibration.driving import STEP_S
@@ -31,13 +28,10 @@ from pdhef_logtool.estimators.table import FEATURES, make_estimator
 from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.evaluation.requirement_blocks import BLOCK_S
-from pdhef_logtool.learning.car.taught_prior import TaughtDriving, taught_driving, taught_parameters
-from pdhef_logtool.learning.drives import TEACH, DriveRecord, no_drive, record_of
-from pdhef_logtool.learning.stages.task import StageOutput, Task
+from pdhef_logtool.learning.drives import DriveRecord, record_of
+from pdhef_logtool.learning.taught_prior import TaughtDriving, taught_driving, taught_parameters
 from pdhef_logtool.learning.truth import teaching_reference, weight_of
-from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.model.drive_model import DriveModel, lacking, read_driving
-from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import release
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
@@ -46,21 +40,18 @@ from pdhef_logtool.residual_model.ladder import NONE
 from pdhef_logtool.residual_model.ladder_fit import (
     LadderFit,
     TaughtDrive,
-    corrected_rmse_deg,
     fit_ladder,
 )
 from pdhef_logtool.runs.config import RunConfig
 
-#: Minimum driving with ground truth, and length beyond which the gain is small (docs/learn.md).
-LEAST_S, ENOUGH_S = 20.0, 150.0
+#: Minimum driving with ground truth.
+LEAST_S = 20.0
 #: Settling time of a filter, which is excluded from scoring.
 SETTLE_NS = 3_000_000_000
 #: Minimum length of each half of a drive that is split for a test, and block length of a test.
 LEAST_HALF_S, TEST_BLOCK_S = 8.0, 5.0
 #: Maximum number of drives for the leave-one-out test of the prior.
 MOST_LEFT_OUT = 8
-#: Lateral acceleration above which driving gives information on tyres, and that near the limit, m/s².
-BENDS_M_S2, LIMIT_M_S2 = 2.0, 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,15 +86,13 @@ class TestedPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Teaching:
-    """Result of teaching: priors, parameters, residual, whether the drives calibrated their car, recommended drives."""
+    """Result of teaching: priors, parameters, residual, whether the drives calibrated their car."""
 
     priors: tuple[TestedPrior, ...]
     parameters: tuple[TaughtParameter, ...]
     ladder: LadderFit
     calibrated: bool
     truth: str
-    drives: tuple[dict[str, Any], ...]
-    more: tuple[str, ...]
 
     @property
     def evidence(self) -> str:
@@ -115,46 +104,16 @@ class Teaching:
             f" (RMSE without constants: {tried or 'not tried'})"
         )
 
-    def part(self, car: Car, records: Sequence[DriveRecord] = ()) -> Taught:
-        """Return the part of a car file, from drives with these records."""
-        return Taught(
-            physics_sha256=car.physics_sha256,
-            parameters=self.parameters,
-            residual=self.ladder.model,
-            calibrated=self.calibrated,
-            truth=self.truth,
-            evidence=self.evidence,
-            drives=tuple(r.learnt_on for r in records if not r.left_out),
-            figures=figures_of(self),
-        )
-
-
-def teach(task: Task) -> StageOutput:
-    """Learn the prior and the residual of a car from all drives with ground truth, starting from its vehicle file.
-
-    Raises
-    ------
-    EstimatorError
-        There is too little driving.
-    """
-    car = Car.of(task.car.datasheet)
-
-    def read(log: LogInput) -> tuple[DriveRecord, OpenedDrive | None]:
-        with read_drive(log, car, task.mapping, task.settings.config.read_options) as drive:
-            return open_drive(drive, task.settings.config)
-
-    records, drives = task.read(read, 0.3)
-    if not drives:
-        raise no_drive("a true sideslip and the signals of a calibration", TEACH)
-    seconds = math.fsum(d.seconds for d in drives)
-    if seconds < LEAST_S:
-        expected = f"at least {LEAST_S:g} s of driving with ground truth above {car.vehicle.low_speed_blend_m_s:g} m/s"
-        raise EstimatorError(expected=expected, got=f"{seconds:.1f} s", where=TEACH, remedy="give more drives")
-    taught = learn_from(drives, seed=task.settings.seed, progress=task.reporter.progress)
-    part = taught.part(car, records)
-    files = {TAUGHT_FILE: (json.dumps(part.model_dump(mode="json"), indent=1) + "\n").encode()}
-    change = Change(f"learn --stages {TEACH}", TAUGHT_FILE, files, task.settings.to_dict(), part.drives)
-    return StageOutput(change, records, taught.evidence, part.figures)
+    @property
+    def entries(self) -> dict[str, Any]:
+        """Entries of the car's model."""
+        return {
+            "parameters": self.parameters,
+            "residual": self.ladder.model,
+            "calibrated": self.calibrated,
+            "truth": self.truth,
+            "evidence": self.evidence,
+        }
 
 
 def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDrive | None]:
@@ -174,7 +133,7 @@ def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDriv
     return record if truth_at is None else replace(record, truth=(ESTIMATED,)), OpenedDrive(drive, whole, taught)
 
 
-def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = lambda _text, _share: None) -> Teaching:
+def learn_from(drives: Sequence[OpenedDrive], progress: Any = lambda _text, _share: None) -> Teaching:
     """Return prior and residual from drives of one car, read with its vehicle file."""
     progress("fitting the prior", 0.3)
     groups = like_drives([level_of([d.taught.driving]) for d in drives])
@@ -188,18 +147,9 @@ def learn_from(drives: Sequence[OpenedDrive], *, seed: int = 0, progress: Any = 
         seconds[not calibration.refused] += drive.taught.driving.seconds
     calibrated = seconds[True] >= seconds[False]  # calibrated and uncalibrated physics differ
     fitted = [lack for lack, c in zip(lacks, calibrations, strict=True) if calibrated is not bool(c.refused)]
-    ladder = fit_ladder(fitted, seed=seed)
-    lines = []
-    for drive, calibration, lack in zip(drives, calibrations, lacks, strict=True):
-        correction = None if ladder.model is None else ladder.model.evaluate(lack.features)
-        line = {"name": drive.drive.name, "seconds": round(drive.taught.driving.seconds, 1)}
-        line |= {"calibration": calibration.refused or "as later drives"}
-        for name, corrected in (("physics", None), ("corrected", correction)):
-            rmse = corrected_rmse_deg(lack, corrected)
-            line |= {f"{name}_deg": rmse[0], f"{name}_without_constant_deg": rmse[1]}
-        lines.append(line)
+    ladder = fit_ladder(fitted)
     truth = " and ".join(sorted({ESTIMATED if d.truth.name == REFERENCE else GROUND_TRUTH for d in drives}))
-    return Teaching(priors, parameters, ladder, calibrated, truth, tuple(lines), _more(drives, ladder))
+    return Teaching(priors, parameters, ladder, calibrated, truth)
 
 
 def _prior_of(drives: Sequence[OpenedDrive], progress: Any) -> TestedPrior:
@@ -301,25 +251,6 @@ def _support(test: Interval | None) -> float:
     return 0.5 * math.erfc(test.value * NORMAL_95 / (test.high - test.value) / math.sqrt(2.0))
 
 
-def _more(drives: Sequence[OpenedDrive], ladder: LadderFit) -> tuple[str, ...]:
-    """Return sentences that recommend further drives."""
-    texts = []
-    ay = np.concatenate([d.truth.vx_m_s * d.truth.yaw_rate_rad_s for d in drives])
-    ay = ay[np.isfinite(ay)]
-    if ladder.seconds < ENOUGH_S:
-        texts.append(
-            f"{ladder.seconds:.0f} s of driving were used; up to {ENOUGH_S:g} s of driving like later drives "
-            "lower the error further"
-        )
-    left, right = np.mean(ay > BENDS_M_S2), np.mean(ay < -BENDS_M_S2)
-    if min(left, right) < 0.25 * max(left, right):
-        side = "right" if right < left else "left"
-        texts.append(f"few bends to the {side}: an asymmetric error cannot be distinguished from a constant")
-    if np.mean(np.abs(ay) > LIMIT_M_S2) < 0.02:
-        texts.append(f"little driving above {LIMIT_M_S2:g} m/s²: the peak force of the tyres keeps its prior")
-    return tuple(texts)
-
-
 def figures_of(taught: Teaching) -> dict[str, Any]:
     """Return the figures as JSON-able values."""
     ladder, priors = taught.ladder, []
@@ -330,14 +261,10 @@ def figures_of(taught: Teaching) -> dict[str, Any]:
     return {
         "evidence": taught.evidence,
         "rung": ladder.rung,
-        "ridge": ladder.ridge if math.isfinite(ladder.ridge) else None,
         "seconds": round(ladder.seconds, 1),
         "blocks": ladder.blocks,
         "rungs": [asdict(t) for t in ladder.trials],
         "calibrated": taught.calibrated,
         "truth": taught.truth,
         "priors": priors,
-        "parameters": [p.model_dump() for p in taught.parameters],
-        "drives": list(taught.drives),
-        "more": list(taught.more),
     }

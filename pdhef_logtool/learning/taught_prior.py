@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.car.taught import TaughtParameter
+from pdhef_logtool.car.model import TaughtParameter
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.calibration.calibration import as_prior, posterior_of
 from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving

@@ -9,33 +9,21 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pdhef_logtool.drive.checks.kind import CheckKind
+from pdhef_logtool.drive.check_table import NEEDS, TEXTS, result
 from pdhef_logtool.drive.hypotheses import FOREIGN, MOST_ENERGY, Hypothesis, Posterior, Relation, units_of
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured
 from pdhef_logtool.drive.relations import COURSE_RATE
-from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.checks import Check, Verdict
 from pdhef_logtool.records.signals import GNSS
 
 #: Probability of a mistake at which a check fails, below which it passes, and at which the mistake is corrected; least
 #: share of a mistake in all mistakes of a signal to be named.
 FAILS, DOUBTED, CERTAIN, NAMED = 0.85, 0.005, 0.97, 0.05
-#: Remedy of an undecided check if the drive contradicts the signal and no unit or sign explains it.
-UNEXPLAINED = "no unit or sign explains it: the car may slide, a sensor may fail for a while, or the field is another"
 #: Beginnings of the remedies of certain or suspected mistakes.
-SUSPICIONS = ("perhaps ", "no single mistake explains it", UNEXPLAINED)
-_LACKS_WHEELBASE = "the wheelbase of a vehicle file, or speeds that only full-size vehicles reach"
-_LACKS_SIDESLIP = "sideslip that changes fast"
-#: Missing excitation if a drive shows the sign of a signal but not its unit.
-_LACKS_FOR_UNIT = {
-    **dict.fromkeys(("steer_rad", "steering_wheel_rad"), _LACKS_WHEELBASE),
-    **dict.fromkeys(("truth.vy_m_s", "truth.sideslip_rad"), _LACKS_SIDESLIP),
-}
-_LACKS = {
-    "ax_m_s2": "speeding up and braking, on straights",
-    "speed_m_s": "a wheel speed, an accelerometer or ground truth to compare with, and speeding up or bends",
-}
-_BENDS = "bends to both sides at speed"
-_LACKS_FOR_SIGN = "needs a path, a course, wheel speeds or a documented sign"
+SUSPICIONS = tuple(TEXTS[n].partition("{")[0].partition(":")[0] for n in ("perhaps", "several", "unexplained"))
+_JUDGED = "vx_m_s vy_m_s yaw_rate_rad_s yaw_rad sideslip_rad ay_m_s2 y_m"
+_JUDGED_TRUTH = (*(f"truth.{n}" for n in _JUDGED.split()),)
+SIGN, UNIT = "SIGNAL.sign", "SIGNAL.unit"
 
 
 def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int = 2) -> dict[str, tuple[float, str]]:
@@ -71,8 +59,8 @@ def relation_checks(measured: Measured, *, mounting_is_known: bool) -> tuple[Che
         unrelated = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
         judged = _judged(name, [r for r in mine if r.tells], probable, measured)
         for r in unrelated[:1]:
-            evidence = f"{r.text}: only one of them moves, correlation {r.correlation:.2f}"
-            checks.append(AXIS.failed(evidence, name, signal_name=name))
+            evidence = TEXTS["unrelated"].format(pair=r.text, correlation=r.correlation)
+            checks.append(result("SIGNAL.axis", "failed", name, evidence=evidence))
         checks += judged or ([] if unrelated else [_not_excited(name, mine)])
     return tuple(_of_place(c, *measured.positions) if c.subject == COURSE_RATE else c for c in checks)
 
@@ -91,19 +79,16 @@ def _judged(name: str, relations: Sequence[Relation], probable: Posterior, measu
     wrong = sum(p for p, _ in mistakes)
     if wrong > DOUBTED:
         likely = [h for p, h in mistakes if p > NAMED * wrong]
-        checks = _failed(name, likely, [r for r in relations if not r.accepts()] or relations, measured)
-        if wrong > FAILS:
-            return checks
-        words = " or ".join(dict.fromkeys(h.words + " is another field" * (h.kind == "field") for h in likely))
-        weak = f"{_lacks_for(name, likely)} to rule out that {words}"
-        return [replace(c, verdict="undecided", remedy=c.remedy if wrong > 0.5 else weak) for c in checks]
+        contradicted = [r for r in relations if not r.accepts()] or relations
+        return _wrong(name, likely, contradicted, measured, wrong)
     factors = {r.text: math.prod(h.acts_on(r) for h in chosen) for r in relations}
     usable = [r for r in relations if not math.isnan(factors[r.text])]
     if not usable:
         others = " and ".join(sorted({n for h in chosen for n in h.factors} & set(relations[0].powers)))
-        return [UNIT.undecided(relations[0].evidence, name, f"needs {others} that is right")]
+        remedy = TEXTS["rest"].format(others=others)
+        return [result(UNIT, "undecided", name, evidence=relations[0].evidence, remedy=remedy)]
     if not any(r.accepts(factors[r.text]) for r in usable):
-        return [UNIT.undecided(usable[0].evidence, name, UNEXPLAINED)]
+        return [result(UNIT, "undecided", name, evidence=usable[0].evidence, remedy=TEXTS["unexplained"])]
     return _passed(name, usable, factors)
 
 
@@ -113,15 +98,12 @@ def _passed(name: str, usable: Sequence[Relation], factors: dict[str, float]) ->
     foreign = () if name.startswith(("steer", "wheel")) else FOREIGN
     units = {f for f, said in units_of(name.removeprefix("truth.")) if said not in ("is in m/s", "is in rad/s")}
     units |= {f**p for f in foreign for p in (1.0, -1.0)}
-    units = {f for f in units if name not in _LACKS_FOR_UNIT or max(f, 1.0 / f) > 3.0}
-    if any(all(r.accepts(factors[r.text] * f ** r.powers.get(name, 0)) for r in usable) for f in units):
-        lacks = _lacks(name, for_unit=True)
-        return [SIGN.passed(best.evidence, name), UNIT.undecided(best.evidence, name, lacks)]
-    return [kind.passed(best.evidence, name) for kind in (SIGN, UNIT)]
-
-
-_JUDGED = "vx_m_s vy_m_s yaw_rate_rad_s yaw_rad sideslip_rad ay_m_s2 y_m"
-_JUDGED_TRUTH = (*(f"truth.{n}" for n in _JUDGED.split()),)
+    units = {f for f in units if name not in NEEDS["units"] or max(f, 1.0 / f) > 3.0}
+    is_open = any(all(r.accepts(factors[r.text] * f ** r.powers.get(name, 0)) for r in usable) for f in units)
+    return [
+        result(SIGN, "passed", name, evidence=best.evidence),
+        result(UNIT, "undecided" if is_open else "passed", name, evidence=best.evidence, remedy=_needs(name, "unit")),
+    ]
 
 
 def _is_cleared(name: str, unrelated: Relation, relations: Sequence[Relation]) -> bool:
@@ -135,81 +117,51 @@ def _is_cleared(name: str, unrelated: Relation, relations: Sequence[Relation]) -
     return name in paces or (shown(name) and not all(shown(n) for n in others))
 
 
-def _failed(
-    name: str, mistakes: Sequence[Hypothesis], relations: Sequence[Relation], measured: Measured
+def _wrong(
+    name: str, likely: Sequence[Hypothesis], relations: Sequence[Relation], measured: Measured, probability: float
 ) -> list[Check]:
-    counts = "; raw counts of a converter need its resolution" if relations[0].most_energy > MOST_ENERGY else ""
-    if math.isnan(mistakes[0].factors[name]):
-        look_at = " and ".join(relations[0].powers)
-        remedy = f"{SUSPICIONS[1]}: look at the field, unit and sign of {look_at}{counts}"
-        return [UNIT.failed(relations[0].evidence, name, remedy=remedy)]
-    mistakes = [h for h in mistakes if not math.isnan(h.factors[name])]
-    wrong = [c for a, c in (("sign", SIGN), ("unit", UNIT)) if any(a in _ASPECTS[h.kind] for h in mistakes)]
-    evidence = "; ".join(r.evidence for r in relations[:2])
-    scale = measured.scales.get(name)
-    lines = {
-        f: f"scale = {scale * f:.6g}" if isinstance(scale, float | int) else ""
-        for f in (h.factors[name] for h in mistakes)
-    }
+    """Return the failed or undecided checks of a signal with likely mistakes."""
+    counts = TEXTS["counts"] if relations[0].most_energy > MOST_ENERGY else ""
+    mistakes = [h for h in likely if not math.isnan(h.factors[name])]
+    if math.isnan(likely[0].factors[name]):
+        names, evidence = [UNIT], relations[0].evidence
+        remedy = TEXTS["several"].format(signals=" and ".join(relations[0].powers))
+    else:
+        kinds = {h.kind for h in mistakes}
+        of_kinds = {SIGN: {"sign", "open sign", "sign and unit"}, UNIT: {"unit", "foreign", "sign and unit"}}
+        names = [n for n, of in of_kinds.items() if kinds & of]
+        evidence = "; ".join(r.evidence for r in relations[:2])
+        remedy = TEXTS["perhaps"].format(mistakes=_corrections(name, mistakes, measured.scales.get(name)))
+    remedy += counts
+    verdict: Verdict = "failed" if probability > FAILS else "undecided"
+    if probability <= 0.5:
+        words = " or ".join(dict.fromkeys(h.words + " is another field" * (h.kind == "field") for h in likely))
+        aspect = "sign" if any(h.kind == "sign" for h in likely) else "unit"
+        needs = NEEDS["open_sign"] if likely[0].kind == "open sign" else _needs(name, aspect)
+        remedy = TEXTS["rule_out"].format(needs=needs, mistakes=words)
+    return [result(n, verdict, name, evidence=evidence, remedy=remedy) for n in names]
+
+
+def _corrections(name: str, mistakes: Sequence[Hypothesis], scale: object) -> str:
+    """Return the words of the mistakes with the scales that undo them."""
+    factors = dict.fromkeys(h.factors[name] for h in mistakes)
+    lines = {f: f"scale = {scale * f:.6g}" if isinstance(scale, float | int) else "" for f in factors}
     if len(lines) == 1:
         ((factor, line),) = lines.items()
         words = " or ".join(dict.fromkeys(h.words for h in mistakes))
-        times = f"multiply its scale in the mapping by {factor:.6g}"
-        remedy = f"{SUSPICIONS[0]}{words}: {times}" + (f", {line}" if line else "")
-    else:
-        shown = [f"{h.words} ({line})" if (line := lines[h.factors[name]]) else h.words for h in mistakes]
-        remedy = SUSPICIONS[0] + " or ".join(shown)
-    return [kind.failed(evidence, name, remedy=remedy + counts) for kind in wrong]
-
-
-_ASPECTS = {
-    "sign": ("sign",),
-    "open sign": ("sign",),
-    "unit": ("unit",),
-    "foreign": ("unit",),
-    "sign and unit": ("sign", "unit"),
-}
+        return f"{words}: multiply its scale in the mapping by {factor:.6g}" + (f", {line}" if line else "")
+    return " or ".join(f"{h.words} ({line})" if (line := lines[h.factors[name]]) else h.words for h in mistakes)
 
 
 def _not_excited(name: str, relations: Sequence[Relation]) -> Check:
-    if not relations:
-        evidence = "no other signal of the log is related to it"
-    else:
+    evidence = TEXTS["alone"]
+    if relations:
         best = max(relations, key=lambda r: abs(r.correlation))
-        evidence = f"{best.text}: correlation {best.correlation:.2f} over {best.samples:.0f} independent samples"
-    return SIGN.undecided(evidence, name, _lacks(name))
+        evidence = TEXTS["quiet"].format(pair=best.text, correlation=best.correlation, samples=best.samples)
+    return result(SIGN, "undecided", name, evidence=evidence, remedy=_needs(name, "sign"))
 
 
-def _lacks_for(name: str, mistakes: Sequence[Hypothesis]) -> str:
-    if mistakes[0].kind == "open sign":
-        return _LACKS_FOR_SIGN
-    return _lacks(name, for_unit=not any(h.kind == "sign" for h in mistakes))
-
-
-def _lacks(name: str, *, for_unit: bool = False) -> str:
-    lacks = _LACKS.get(name, _BENDS)
-    return f"needs {_LACKS_FOR_UNIT.get(name, lacks) if for_unit else lacks}"
-
-
-SIGN = CheckKind(
-    "SIGNAL.sign",
-    compares="a_y with v r, steering with curvature, v̇ with a_x, wheel speeds, wheel differences and the ground "
-    "ground truth's path with the signals that they correspond to, and values with the limits of all vehicles",
-    fails="they contradict the signal by its sign",
-    remedy="{remedy}",
-    lacks=f"needs {_BENDS}",
-    function=lambda drive: drive.related,
-)
-UNIT = CheckKind(
-    "SIGNAL.unit",
-    compares="the same as `SIGNAL.sign`",
-    fails="they contradict the signal by a factor",
-    remedy="{remedy}",
-)
-AXIS = CheckKind(
-    "SIGNAL.axis",
-    compares="the signal with correlated signals, and an accelerometer's mean with gravity",
-    fails="it does not correlate, or it contains gravity",
-    remedy="map another field or axis to {signal_name}",
-)
-CHECKS = (SIGN, UNIT, AXIS)
+def _needs(name: str, aspect: str) -> str:
+    """Return the driving that shows the sign or the unit of a signal."""
+    shows = NEEDS["signals"].get(name, NEEDS["bends"])
+    return str(NEEDS["units"].get(name, shows) if aspect == "unit" else shows)

@@ -1,0 +1,146 @@
+"""``pdhef learn``: the model of a car (``model.toml``) from its drives, with or without ground truth.
+
+The drives of a car are pooled to the prior of later drives (:mod:`~.taught_prior`). Drives with ground truth
+also give a residual, which is chosen on held-out driving (:mod:`~.teach`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.model import CarModel
+from pdhef_logtool.car.names import MODEL_FILE
+from pdhef_logtool.car.store import check_output, update_car
+from pdhef_logtool.drive.model_file import Sensors
+from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.estimators.calibration.calibration import self_calibrate
+from pdhef_logtool.estimators.calibration.driving import Driving
+from pdhef_logtool.learning.drives import (
+    DriveRecord,
+    DriveSet,
+    LearnSettings,
+    drives_document,
+    exit_code,
+    tell_drive,
+)
+from pdhef_logtool.learning.teach import LEAST_S, OpenedDrive, figures_of, learn_from, open_drive
+from pdhef_logtool.logs.discovery import LogInput, Logs
+from pdhef_logtool.model.drive_model import for_later_drives, lacking, model_of, read_driving
+from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.reporter import SILENT, Reporter
+from pdhef_logtool.residual_model.bundle import NO_MODEL
+from pdhef_logtool.storage.outputs import check_no_input, local_path
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LearnResult:
+    """The folder of the car, a record of every drive, a summary line, and figures as JSON-able values."""
+
+    car: Path
+    records: tuple[DriveRecord, ...]
+    text: str
+    figures: dict[str, Any]
+
+    @property
+    def exit_code(self) -> int:
+        """0 if all drives were used completely, 3 otherwise."""
+        return exit_code(self.records)
+
+    @property
+    def drives(self) -> tuple[DriveRecord, ...]:
+        """Drives that were used."""
+        return tuple(r for r in self.records if not r.left_out)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as one JSON-able document."""
+        shared = {"car": str(self.car), "exit_code": self.exit_code, **drives_document(self.records)}
+        return {**shared, "text": self.text, "figures": self.figures}
+
+
+def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, reporter: Reporter = SILENT) -> LearnResult:
+    """Learn a car from drives and write it to the folder ``output``.
+
+    Drives with ground truth teach; the others are used if there is no such drive.
+
+    Parameters
+    ----------
+    arguments : logs, folders, glob patterns.
+
+    Raises
+    ------
+    UsageError
+        An option is wrong, or the set of a drive excludes it from learning.
+    PdhefError
+        A file or log cannot be read; without it the result would differ.
+    EstimatorError
+        There is too little driving.
+    """
+    output, config = local_path(output), settings.config
+    if output.suffix in (".toml", ".json"):
+        raise UsageError(
+            expected="a car's folder", got=output.name, where="--output", remedy="a car has more than a file contains"
+        )
+    source = Car.load(config.car, network=NO_MODEL)
+    if config.car is None:
+        reporter.warn(f"no --car: mass, geometry and priors come from the default {source.datasheet.name}")
+    check_output(source, output)
+    drives = DriveSet.of(arguments, Car.of(source.datasheet), settings, reporter)
+    read = [*(i.local for i in drives.logs), *(path for path in config.files if path != config.car)]
+    check_no_input(read, [], [output])
+    records, model, figures = _learnt(drives)
+    for record in records:
+        tell_drive(record, reporter.warn)
+    learnt_on = tuple(r.learnt_on for r in records if not r.left_out)
+    text = model.model_copy(update={"drives": learnt_on}).toml(f"Written by pdhef learn.\n{model.evidence}")
+    update_car(source, output, {MODEL_FILE: text.encode()})
+    reporter.progress("done", 1.0)
+    return LearnResult(output, records, model.evidence, figures)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Read:
+    """Driving and sensors of a drive; ``opened`` : what it teaches, None without ground truth."""
+
+    driving: Driving | None
+    sensors: Sensors
+    opened: OpenedDrive | None
+
+
+def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[str, Any]]:
+    """Return the records of drives, their model, and figures."""
+    config, car, progress = drives.settings.config, drives.car, drives.reporter.progress
+
+    def read(log: LogInput) -> tuple[DriveRecord, _Read]:
+        with read_drive(log, car, drives.mapping, config.read_options) as drive:
+            record, opened = open_drive(drive, config)
+            driving = None if lacking(drive) else read_driving(drive) if opened is None else opened.taught.driving
+            return record, _Read(driving, drive.plan.sensors, opened)
+
+    records, content = drives.read(read, 0.3)
+    teachers = [r.opened for r in content if r.opened is not None]
+    if not teachers and config.reference != "on":
+        used = [r.driving is not None and len(r.driving.stretches) > 0 for r in content]
+        records = tuple(replace(r, left_out="" if u else r.left_out) for r, u in zip(records, used, strict=True))
+        calibration = self_calibrate([r.driving for r in content if r.driving is not None], car.vehicle)
+        _check(calibration.refused, "driving that calibrates the car, such as lane changes and bends")
+        parameters, evidence = for_later_drives(calibration), calibration.text
+        model = model_of(car, content[used.index(True)].sensors, parameters=parameters, evidence=evidence)
+        return records, model, {"self_calibration": calibration.to_dict()}
+    _check("" if teachers else "none", "at least one drive with a true sideslip and the signals of a calibration")
+    seconds, slow = math.fsum(d.seconds for d in teachers), car.vehicle.low_speed_blend_m_s
+    few = "" if seconds >= LEAST_S else f"{seconds:.1f} s"
+    _check(few, f"at least {LEAST_S:g} s of driving with ground truth above {slow:g} m/s")
+    taught = learn_from(teachers, progress)
+    sensors = next(r.sensors for r in content if r.opened is not None)
+    return records, model_of(car, sensors, **taught.entries), figures_of(taught)
+
+
+def _check(got: str, expected: str) -> None:
+    """Raise EstimatorError if the drives lack something."""
+    if got:
+        remedy = "give more drives; ground truth is v_y, sideslip, or position and heading of a reference"
+        raise EstimatorError(expected=expected, got=got, where="learn", remedy=remedy)

@@ -1,1 +1,0 @@
-"""The stages of `pdhef learn`: each determines one part of a car from drives."""
