@@ -244,16 +244,16 @@ def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:
 def _with_parts(car: Car, folder: Path) -> Car:
     """Return the car with the valid parts of its folder: ``model.toml``, or a fit."""
     notes: list[str] = []
-    if (folder / MODEL_FILE).is_file():
+    if (folder / MODEL_FILE).exists():
         model = read_model(folder / MODEL_FILE)
         if model.belongs_to(car.datasheet):
-            if (folder / FIT_FILE).is_file():
+            if (folder / FIT_FILE).exists():
                 notes.append(f"{FIT_FILE}: not used, {MODEL_FILE} takes its place")
             if model.truth not in ("", GROUND_TRUTH):
                 notes.append(f"{MODEL_FILE}: taught by {model.truth}")
             return replace(car, model=model, notes=tuple(notes))
         notes.append(f"{MODEL_FILE} is not used: {VEHICLE_FILE} has changed since; pdhef learn creates it again")
-    if (folder / FIT_FILE).is_file():
+    if (folder / FIT_FILE).exists():
         fit = read_fit(folder / FIT_FILE)
         if fit.physics_sha256 == physics_sha256(car.datasheet):
             car = car.with_fit(fit)

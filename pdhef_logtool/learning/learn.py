@@ -117,8 +117,12 @@ def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[s
     def read(log: LogInput) -> tuple[DriveRecord, _Read]:
         with read_drive(log, car, drives.mapping, config.read_options) as drive:
             record, opened = open_drive(drive, config)
-            driving = None if lacking(drive) else read_driving(drive) if opened is None else opened.taught.driving
-            return record, _Read(driving, drive.plan.sensors, opened)
+            if opened is not None:
+                return record, _Read(opened.taught.driving, drive.plan.sensors, opened)
+            start_s, end_s = ((t - drive.log.start_ns) * 1e-9 for t in (drive.plan.start_ns, drive.plan.end_ns))
+            driving = None if lacking(drive) else read_driving(drive)
+            record = replace(record, seconds=end_s - start_s, span_s=(start_s, end_s))
+            return record, _Read(driving, drive.plan.sensors, None)
 
     records, content = drives.read(read, 0.3)
     teachers = [r.opened for r in content if r.opened is not None]
@@ -142,5 +146,5 @@ def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[s
 def _check(got: str, expected: str) -> None:
     """Raise EstimatorError if the drives lack something."""
     if got:
-        remedy = "give more drives; ground truth is v_y, sideslip, or position and heading of a reference"
+        remedy = "give more drives of this car, or map v_y, sideslip, or position and heading as ground truth"
         raise EstimatorError(expected=expected, got=got, where="learn", remedy=remedy)

@@ -128,17 +128,13 @@ class ColumnarLog(DriveLog):
         """When the log was recorded; determined at the first access."""
         return survey(self.containers, self._times, str(self.path))
 
-    def _times(self, c: int, span: Span) -> tuple[IntArray, IntArray] | None:
-        """Return channels and log times of a span's messages on known channels [N]; None if they cannot be read."""
+    def _times(self, c: int, span: Span) -> Mapping[int, IntArray] | None:
+        """Return the log times [N] of a span's messages by known channel; None if they cannot be read."""
         container = self.containers[c]
         try:
             container.meter.check()
             with container.meter.running():
-                channel, log_time = container.times(span)
-            if container.by_index:
-                return channel, log_time
-            declared = np.isin(channel, list(container.channels))
-            return channel[declared], log_time[declared]
+                return {id_: times for id_, times in container.times(span).items() if id_ in container.channels}
         except SourceError:
             raise
         except Exception:  # noqa: BLE001 (a read of the span reports the damage)
@@ -246,13 +242,9 @@ class ColumnarLog(DriveLog):
         for c, container in enumerate(self.containers):
             for span in container.spans:
                 stamps = self._times(c, span) if span.overlaps(start_ns, end_ns) else None
-                if stamps is None:
-                    continue
-                channel, times = stamps
-                keep = in_window(times, start_ns, end_ns)
-                channel, times = (channel, times) if keep is None else (channel[keep], times[keep])
-                for id_ in span.counts:
-                    parts[container.channels[id_].topic].append(times[channel == id_])
+                for id_, times in (stamps or {}).items():
+                    keep = in_window(times, start_ns, end_ns)
+                    parts[container.channels[id_].topic].append(times if keep is None else times[keep])
         return {topic: np.sort(np.concatenate(part)) for topic, part in parts.items() if part}
 
     def covered_topics(self, topics: Collection[str]) -> frozenset[str]:

@@ -278,7 +278,7 @@ MODEL = FIT.replace("fit", "model")
         (FIT_FILE, NOISE + "q_std = [0.02, -0.006, 0.002]\n", "greater than or equal to 0"),
         (FIT_FILE, NOISE + f"q_std = {[0.1] * 6}\n", "6 are physics's"),
         (FIT_FILE, MODEL, "format: should be 'pdhef-fit'"),
-        (MODEL_FILE, MODEL + "parameters = [{name = 'x', value = 1.0, std = -1.0}]\n", "parameters[1].std"),
+        (MODEL_FILE, MODEL + "parameters = [{name = 'x', value = 1.0, std = -1.0}]\n", "std: should be greater than 0"),
         (MODEL_FILE, MODEL + "parameter = []\n", "parameter: unknown, did you mean parameters?"),
     ],
 )

@@ -36,8 +36,8 @@ def files(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def run(log: Path, out: Path, **changes: Any) -> tuple[dict[str, Any], pl.DataFrame]:
-    values: dict[str, Any] = {"annotate": "none", "network": Path("none"), "estimators": ("phy-ukf",), **changes}
-    result = run_logs([str(log)], out, RunConfig(**values))
+    values: dict[str, Any] = {"keep": "estimates", "network": Path("none"), "estimators": ("phy-ukf",), **changes}
+    result = run_logs([str(log)], out, RunConfig(**values), report=False)
     report = result.results[0].report
     assert report is not None
     table = pl.read_parquet(out / "logs" / log.stem / "estimates.parquet")
@@ -50,7 +50,6 @@ def run(log: Path, out: Path, **changes: Any) -> tuple[dict[str, Any], pl.DataFr
         ("auto", True, "sample", "topic /truth/perfect/state.friction", SLIPPERY),
         ("auto", False, "sample", "vehicle file, 0.85", 0.85),
         ("file", True, "sample", "vehicle file, 0.85", 0.85),
-        (0.5, True, "sample", "option, 0.5", 0.5),
         (0.5, False, "car", "option, 0.5", 0.5),
         ("auto", False, "car", "assumed, 1", 1.0),
     ],

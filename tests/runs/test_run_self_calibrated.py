@@ -42,8 +42,8 @@ def wrong_car(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -
 
 
 def run(log: Path, car: Path, out: Path, **changes: Any) -> dict[str, Any]:
-    values: dict[str, Any] = {"car": car, "annotate": "none", "estimators": NAMES, "end": END, **changes}
-    run_logs([str(log)], out, RunConfig(**values))
+    values: dict[str, Any] = {"car": car, "keep": "estimates", "estimators": NAMES, "end": END, **changes}
+    run_logs([str(log)], out, RunConfig(**values), report=False)
     return json.loads((out / "logs" / log.stem / "report.json").read_text())
 
 
