@@ -1,7 +1,7 @@
 """Parameters and identified parts of one vehicle, for estimators and commands.
 
 A car is a folder. The user writes ``vehicle.toml``, and no command changes it; ``learn`` writes ``model.toml`` beside
-it, ``train`` the folder ``network``. The shipped car has ``fit.toml`` and ``intervals.json`` (:mod:`~.parts`). A single
+it, ``train`` the folder ``network``. The shipped car has ``fit.toml`` (:mod:`~.parts`). A single
 ``vehicle.toml`` is a car without parts. A part of another vehicle file is not used, and the car has a note.
 """
 
@@ -41,8 +41,6 @@ from pdhef_logtool.residual_model.interface import PlugInModel, load_plug_in, pl
 from pdhef_logtool.storage.documents import read_toml, validated
 
 VEHICLE_FILE, FIT_FILE = "vehicle.toml", "fit.toml"
-#: Part of earlier versions.
-INTERVALS_FILE = "intervals.json"
 NETWORK_FOLDER = "network"
 #: Number of digits of a hash in messages.
 SHOWN_DIGITS = 12
@@ -135,11 +133,7 @@ class Car:
         name, home = _network_of(folder, network)
         plugged = load_plug_in(name) if home is None and name != NO_MODEL else None
         bundle = plugged if home is None else load_bundle(home)
-        car = replace(car, network=bundle, network_name=name)
-        if folder is not None and (folder / INTERVALS_FILE).is_file():
-            note = f"{INTERVALS_FILE} is not used: intervals follow from the uncertainty of the parameters"
-            car = replace(car, notes=(*car.notes, note))
-        return car
+        return replace(car, network=bundle, network_name=name)
 
     @property
     def file_name(self) -> str | None:

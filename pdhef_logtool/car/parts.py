@@ -1,4 +1,4 @@
-"""Parts of a car: fit and intervals.
+"""Parts of a car: fit.
 
 Each part contains the digest of its inputs. If an input has changed, the part is stale and is not used.
 """
