@@ -391,8 +391,8 @@ def _without_repeats(signals: Signals, cells: _Cells) -> Signals:
 class _Run(NamedTuple):
     """Rows [start, end) of a value that repeats beyond chance.
 
-    ``certain``: cells until chance is excluded. ``unseen``: cells until it repeats ``LONGER`` times as long as any value
-    before it.
+    ``certain``: cells until chance is excluded. ``unseen``: cells until it repeats ``LONGER`` times longer than any
+    value before it.
     """
 
     start: int

@@ -239,9 +239,6 @@ def test_an_entry_that_a_later_version_adds_makes_no_car_stale(tmp_path: Path) -
     assert load(tmp_path / "mine.toml").physics_sha256 == digest(said)
 
 
-def test_intervals_of_earlier_versions_are_noted(folder: Path) -> None:
-
-
 # --- rejected inputs -------------------------------------------------------------------------------------------------
 
 
