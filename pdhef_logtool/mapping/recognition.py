@@ -110,7 +110,7 @@ class _Draft:
     quality: QualityGate | None = None
     ambiguities: list[Ambiguity] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    axes: dict[str, Axes] = field(default_factory=dict)
+    axes: dict[tuple[str, ...], Axes] = field(default_factory=dict)
 
     def values(self, topic: str, path: str) -> FloatArray:
         return self.samples.get(topic, {}).get(path, np.empty(0))
@@ -390,26 +390,24 @@ def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
 
 
 def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> Axes:
-    """Return the axes of a twist by the path of its pose or of a fix, and by the yaw rate; each is read once."""
-    if twist.name not in draft.axes:
-        draft.axes[twist.name] = _read_axes(draft, twist, topics)
-    return draft.axes[twist.name]
-
-
-def _read_axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> Axes:
+    """Return the axes of a twist by the path of its pose or of a fix, and by the yaw rate."""
     x, y = (_twist(twist, "linear", axis) for axis in "xy")
     if not (draft.is_given(twist.name, x) and draft.is_given(twist.name, y)):
         return ""
-    places: _Sources = {}
+    references: _Sources = {}
     if _has_pose(draft, twist):
         for axis in "xy":
-            draft.take(places, f"{axis}_m", twist.name, _join(_FIELDS["pose"][_type(twist)], f"position.{axis}"))
+            draft.take(references, f"{axis}_m", twist.name, _join(_FIELDS["pose"][_type(twist)], f"position.{axis}"))
     elif fix := next((t for t in topics if _has_fix(draft, t)), None):
         for name, path in (("lat_deg", "latitude"), ("lon_deg", "longitude")):
-            draft.take(places, name, fix.name, path)
-    rate = draft.signals.get("yaw_rate_rad_s")
-    references = [*places.values(), *([] if rate is None else [rate])]
-    return twist_axes(draft.log, SignalSource("speed_m_s", twist.name, (x, y)), references)
+            draft.take(references, name, fix.name, path)
+    if "yaw_rate_rad_s" in draft.signals:
+        references["yaw_rate_rad_s"] = draft.signals["yaw_rate_rad_s"]
+    key = (twist.name, *(source.label for source in references.values()))
+    if key not in draft.axes:  # asked for speed, ground truth and GNSS
+        velocity = SignalSource("speed_m_s", twist.name, (x, y))
+        draft.axes[key] = twist_axes(draft.log, velocity, [*references.values()])
+    return draft.axes[key]
 
 
 def _device(topic: str) -> str:

@@ -390,8 +390,7 @@ class _Weighing:
     def _truth_turns(self) -> bool:
         """Return whether the yaw rates of ground truth and sensor are equal up to the sign."""
         sensor, true = self._chosen("yaw_rate_rad_s"), self.truth.get("yaw_rate_rad_s")
-        relation = None if sensor is None or true is None else fit(sensor.si, true.si)
-        return relation is not None and abs(relation.correlation) > 0.97 and abs(abs(relation.slope) - 1.0) < 0.1
+        return sensor is not None and true is not None and any(agree(sensor.si, s * true.si) for s in (1.0, -1.0))
 
     # ------------------------------------------------------------------------------------------------- reporting
 
