@@ -9,11 +9,14 @@ Two relations that every car on wheels obeys are fitted to the drive so far, by 
 At each cell, a generalised likelihood ratio test compares the residuals in the windows after it with the window before
 it, in units of the same statistic in the drive so far:
 
-* gyro: its samples have a step that the kinematic residual confirms and the steering residual does not contradict;
-* a_y: the residual of the kinematics has a flat step, and steering and gyro agree that the car did not change its
-  motion. A slide moves the steering residual too; a banked road begins slowly.
+* gyro: its samples have a step that the kinematic residual confirms, or the steering residual if that of the kinematics
+  is too noisy, and neither contradicts;
+* a_y: the residual of the kinematics has a flat step, and the steering residual excludes that the car changed its
+  motion; or it does not decide, and of the samples of both sensors only those of a_y have the step. A slide moves the
+  steering residual too; a banked road begins slowly.
 * frozen: a value repeats for longer than the share of repetitions so far explains by chance (probability
-  ``CHANCE``), while the other sensors show that it changes: the steering relation, or a_x for the speed.
+  ``CHANCE``), and either the other sensors show that it changes (the steering relation, or a_x for the speed), or it
+  repeats ``LONGER`` times as long as any value before.
 
 The decision is made ``DECIDED_CELLS`` after the change, from samples up to then, and corrections begin then, so that
 causal estimators stay causal.
@@ -56,6 +59,9 @@ CHANCE, LEAST_STUCK_S = 1e-6, 0.3
 LEAST_STEER_CHANGE_RAD, MISSED, LEAST_SPEED_CHANGE_M_S, GRADE_S = 0.006, 5.0, 1.5, 5.0
 #: Share of the usual step of a value below which an accelerometer or a gyro repeats it.
 LEAKED = 0.1
+#: A value is stuck without a change that it misses if it repeats this many times as long as any value before, in a
+#: drive of at least this time.
+LONGER, SEEN_S = 4, 20.0
 #: Cells with the information of one independent sample; share of prior information, of the value 0.
 INDEPENDENT_CELLS, RIDGE = 10.0, 1e-3
 #: Largest number of changes of a drive.
@@ -223,6 +229,10 @@ class _Step(NamedTuple):
         """Return where another step differs by more than the uncertainty; False where this one is not finite."""
         return np.abs(self.size - other) > AGREES * np.abs(other) + SURE * self.std
 
+    def excludes(self, other: FloatArray, std: FloatArray) -> BoolArray:
+        """Return where another step with this 1-sigma is absent, although it would be significant."""
+        return (np.abs(other) < ABSENT * np.abs(self.size)) & (np.abs(self.size) > SURE * std)
+
     def scaled(self, by: FloatArray) -> _Step:
         """Return the step in another unit."""
         return _Step(self.size * by, self.is_sharp, self.std * np.abs(by))
@@ -259,14 +269,13 @@ def _std_so_far(column: FloatArray, least: float) -> FloatArray:
     return np.where(count < 0.5 * LEAST_CELLS, np.inf, np.maximum(few * np.sqrt(total / np.maximum(count, 1.0)), least))
 
 
-def _sample_steps(signals: Signals, cells: _Cells) -> tuple[FloatArray, IntArray]:
-    """Return the largest step between neighbouring samples of the gyro in each cell, [n], and its stamp.
+def _sample_steps(column: FloatArray, cells: _Cells) -> tuple[FloatArray, IntArray]:
+    """Return the largest step between neighbouring samples of a column [N] in each cell, [n], and its stamp.
 
     A straight line with a step is fitted to the samples up to ``STEP_S`` before and after.
     """
-    signals = without_impossible(signals)
-    finite = np.isfinite(signals.yaw_rate_rad_s)
-    values, stamps, cell = signals.yaw_rate_rad_s[finite], signals.stamps_ns[finite], cells.of_stamp[finite]
+    finite = np.isfinite(column)
+    values, stamps, cell = column[finite], cells.stamps_ns[finite], cells.of_stamp[finite]
     count = len(cells.speed)
     largest, stamp_ns = np.zeros(count), np.zeros(count, np.int64)
     half = max(2, round(STEP_S * 1e9 / float(np.median(np.diff(stamps))))) if len(stamps) > 1 else 2
@@ -281,20 +290,32 @@ def _sample_steps(signals: Signals, cells: _Cells) -> tuple[FloatArray, IntArray
     return largest, stamp_ns
 
 
+def _largest_near(steps: FloatArray) -> FloatArray:
+    """Return the largest of each step and the ``PEAK_CELLS`` behind it, [n]."""
+    rows = np.lib.stride_tricks.sliding_window_view(np.append(steps, np.zeros(PEAK_CELLS)), PEAK_CELLS + 1)
+    return np.take_along_axis(rows, np.argmax(np.abs(rows), axis=1)[:, None], axis=1)[:, 0]
+
+
 def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> SensorChange | None:
     """Return the first jump of gyro or accelerometer behind a time."""
     cells, end_ns = _cells(signals), int(signals.stamps_ns[-1]) + 1
+    s = without_impossible(signals)
     kinematics, steering = _relations(cells)
     v = _mean(np.where(cells.speed > LEAST_SPEED_M_S, cells.speed, np.nan), -PART_CELLS, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         ay, of_steer = _step(kinematics, LEAST_AY_STD), _step(steering, LEAST_STEER_STD)
         by_ay, by_steer = ay.scaled(-1.0 / v), of_steer.scaled(-1.0 / (steering.fit[:, 1] / v + steering.fit[:, 2] * v))
-        step, at_ns = _sample_steps(signals, cells)
+        step, at_ns = _sample_steps(s.yaw_rate_rad_s, cells)
         step_std = np.fmax(_std_so_far(step, LEAST_GYRO_STD), np.sqrt(_mean(step**2, 3, WINDOW_CELLS)))  # a burst
-        is_gyro = (np.abs(step) > np.maximum(ALARM * step_std, LEAST_GYRO_JUMP_RAD_S)) & by_ay.confirms(step)
-        is_gyro &= ~by_steer.contradicts(step)
+        is_gyro = np.abs(step) > np.maximum(ALARM * step_std, LEAST_GYRO_JUMP_RAD_S)
+        is_gyro &= by_ay.confirms(step) | (by_steer.confirms(step) & (SURE * by_ay.std > np.abs(step)))
+        is_gyro &= ~by_ay.contradicts(step) & ~by_steer.contradicts(step)
         is_ay = (np.abs(ay.size) > np.maximum(ALARM * ay.std, LEAST_AY_JUMP_M_S2)) & ay.is_sharp
-        is_ay &= (np.abs(by_steer.size) < ABSENT * np.abs(by_ay.size)) & (np.abs(by_ay.size) > SURE * by_steer.std)
+        # The steering shows that the car did not change its motion, or the samples of both sensors do.
+        sampled, turned = (_largest_near(steps) for steps in (_sample_steps(s.ay_m_s2, cells)[0], step))
+        is_sampled = np.abs(sampled - ay.size) < AGREES * np.abs(ay.size)
+        is_sampled &= by_ay.excludes(turned, step_std) & ~by_steer.contradicts(0.0 * step)
+        is_ay &= by_ay.excludes(by_steer.size, by_steer.std) | is_sampled
     is_gyro &= "yaw_rate_rad_s" not in ignored
     is_ay &= "ay_m_s2" not in ignored
     first = cells.of_stamp[np.searchsorted(signals.stamps_ns, after_ns)]
@@ -332,7 +353,7 @@ def _without_stuck(signals: Signals, cells: _Cells, names: Sequence[str]) -> tup
     travelled = np.cumsum(np.nan_to_num(cells.ax)) * CELL_S
     columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in names}
     for name, column in columns.items():
-        for start, end, first in _long_runs(column, cells):
+        for start, end, certain, unseen in _long_runs(column, cells):
             k0, k = cell[start], np.arange(cell[start], cell[end - 1] + 1)
             if name == "steer_rad":
                 expected = steering.table[k, 1:] @ steering.fit[k0]
@@ -342,7 +363,8 @@ def _without_stuck(signals: Signals, cells: _Cells, names: Sequence[str]) -> tup
                 grade = (travelled[k0] - travelled[before]) / max(k0 - before, 1)
                 expected = travelled[k] - travelled[k0] - grade * (k - k0)
                 change, limit, std, expected = expected, LEAST_SPEED_CHANGE_M_S, math.nan, np.full(len(k), np.nan)
-            missed = first + np.flatnonzero(np.abs(change[first:]) > limit)
+            is_stuck = (np.abs(change) > limit) | (k - k0 >= unseen)
+            missed = certain + np.flatnonzero(is_stuck[certain:])
             if not len(missed):
                 continue
             known_ns = cells.time_of(k[missed[0]] + 1)
@@ -361,13 +383,26 @@ def _without_repeats(signals: Signals, cells: _Cells) -> Signals:
     """
     columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in ("ay_m_s2", "yaw_rate_rad_s")}
     for column in columns.values():
-        for start, end, _ in _long_runs(column, cells, LEAKED):
+        for start, end, *_ in _long_runs(column, cells, LEAKED):
             column[start:end] = np.nan
     return replace(signals, **columns)
 
 
-def _long_runs(column: FloatArray, cells: _Cells, share: float = 0.0) -> list[tuple[int, int, int]]:
-    """Return the rows [start, end) of values that repeat beyond chance, and the cells until that is sure.
+class _Run(NamedTuple):
+    """Rows [start, end) of a value that repeats beyond chance.
+
+    ``certain``: cells until chance is excluded. ``unseen``: cells until it repeats ``LONGER`` times longer than any
+    value before it.
+    """
+
+    start: int
+    end: int
+    certain: int
+    unseen: int
+
+
+def _long_runs(column: FloatArray, cells: _Cells, share: float = 0.0) -> list[_Run]:
+    """Return the long repetitions of a column [N] while the car moves.
 
     A value repeats if its step is at most a share of the RMS of the steps so far.
     """
@@ -376,12 +411,16 @@ def _long_runs(column: FloatArray, cells: _Cells, share: float = 0.0) -> list[tu
     usual = np.sqrt(np.cumsum(np.nan_to_num(step) ** 2) / np.maximum(np.arange(len(rows)), 1))
     same = step <= share * usual
     starts = np.flatnonzero(~same)
-    ends = np.append(starts[1:], len(rows))
+    lengths = np.append(starts[1:], len(rows))[: len(starts)] - starts
     repeats = np.clip(np.cumsum(same)[starts] / np.maximum(starts, 1), 1e-3, 0.9999)
     needed = np.ceil(1.0 + math.log(CHANCE) / np.log(repeats)).astype(int)
-    least = round(LEAST_STUCK_S / CELL_S)
-    return [
-        (int(rows[s]), int(rows[e - 1]) + 1, max(int(cell[s + n] - cell[s]), least))
-        for s, e, n in zip(starts, ends, needed, strict=False)  # without readings, there is an end alone
-        if e - s > n and s > 0
-    ]
+    longer = LONGER * np.maximum.accumulate(np.append(1, lengths))[:-1]
+
+    def until(count: IntArray) -> IntArray:
+        passed = cell[np.minimum(starts + count, len(rows) - 1)] - cell[starts]
+        return np.where(count < lengths, np.maximum(passed, round(LEAST_STUCK_S / CELL_S)), len(cells.speed))
+
+    unseen = np.where(cell[starts] > round(SEEN_S / CELL_S), until(longer), len(cells.speed))
+    ends = rows[starts + lengths - 1] + 1
+    runs = np.stack([rows[starts], ends, until(needed), unseen], axis=1)
+    return [_Run(*map(int, run)) for run in runs[(lengths > needed) & (starts > 0)]]

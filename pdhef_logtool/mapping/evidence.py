@@ -28,11 +28,10 @@ FEWEST_CELLS = 40
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """``y = slope * x + a`` over ``cells`` cells of 0.1 s, and the correlation of the two."""
+    """``y = slope * x + a`` over cells of 0.1 s, and the correlation of the two."""
 
     slope: float
     correlation: float
-    cells: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,8 +206,7 @@ def fit(y: FloatArray, x: FloatArray, where: BoolArray | None = None) -> Fit | N
     use = np.isfinite(y) & np.isfinite(x)
     if where is not None:
         use &= where
-    n = int(np.count_nonzero(use))
-    if n < FEWEST_CELLS:
+    if np.count_nonzero(use) < FEWEST_CELLS:
         return None
     a, b = y[use], x[use]
     # Exclude a few outliers, such as a sensor's "invalid".
@@ -221,4 +219,4 @@ def fit(y: FloatArray, x: FloatArray, where: BoolArray | None = None) -> Fit | N
     if not (sa > 1e-12 and sb > 1e-12):
         return None
     both = float(np.mean(da * db))
-    return Fit(both / (sb * sb), both / (sa * sb), n)
+    return Fit(both / (sb * sb), both / (sa * sb))
