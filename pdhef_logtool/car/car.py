@@ -42,8 +42,6 @@ from pdhef_logtool.storage.documents import read_toml, validated
 
 VEHICLE_FILE, FIT_FILE = "vehicle.toml", "fit.toml"
 NETWORK_FOLDER = "network"
-#: Part of earlier versions.
-INTERVALS_FILE = "intervals.json"
 #: Number of digits of a hash in messages.
 SHOWN_DIGITS = 12
 
@@ -135,10 +133,7 @@ class Car:
         name, home = _network_of(folder, network)
         plugged = load_plug_in(name) if home is None and name != NO_MODEL else None
         bundle = plugged if home is None else load_bundle(home)
-        notes = car.notes
-        if folder is not None and (folder / INTERVALS_FILE).is_file():
-            notes = (*notes, f"{INTERVALS_FILE} is not used: intervals follow from the uncertainty of the parameters")
-        return replace(car, network=bundle, network_name=name, notes=notes)
+        return replace(car, network=bundle, network_name=name)
 
     @property
     def file_name(self) -> str | None:

@@ -1,4 +1,4 @@
-"""Words that are accepted in place of the path of a car or of its intervals, and the file of its model."""
+"""Words that are accepted in place of the path of a car, and the file of its model."""
 
 from __future__ import annotations
 

@@ -283,7 +283,7 @@ def read_drive(
         chosen = choose_mapping(opened, mapping, prefer_truth=prefer, require_signals=require_sensors)
         for ambiguity in chosen.ambiguities:
             told(str(ambiguity))
-        remarks += chosen.remarks
+        remarks += chosen.mapping.notes
         used = chosen.mapping
         if adjust is not None:
             used = adjust(opened, used, told)

@@ -11,8 +11,9 @@ it, in units of the same statistic in the drive so far:
 
 * gyro: its samples have a step that the kinematic residual confirms, or the steering residual if that of the kinematics
   is too noisy, and neither contradicts;
-* a_y: the residual of the kinematics has a flat step, and steering and gyro agree that the car did not change its
-  motion. A slide moves the steering residual too; a banked road begins slowly.
+* a_y: the residual of the kinematics has a flat step, and the steering residual excludes that the car changed its
+  motion; or it does not decide, and of the samples of both sensors only those of a_y have the step. A slide moves the
+  steering residual too; a banked road begins slowly.
 * frozen: a value repeats for longer than the share of repetitions so far explains by chance (probability
   ``CHANCE``), and either the other sensors show that it changes (the steering relation, or a_x for the speed), or it
   repeats ``LONGER`` times as long as any value before.
@@ -228,6 +229,10 @@ class _Step(NamedTuple):
         """Return where another step differs by more than the uncertainty; False where this one is not finite."""
         return np.abs(self.size - other) > AGREES * np.abs(other) + SURE * self.std
 
+    def excludes(self, other: FloatArray, std: FloatArray) -> BoolArray:
+        """Return where another step with this 1-sigma is absent, although it would be significant."""
+        return (np.abs(other) < ABSENT * np.abs(self.size)) & (np.abs(self.size) > SURE * std)
+
     def scaled(self, by: FloatArray) -> _Step:
         """Return the step in another unit."""
         return _Step(self.size * by, self.is_sharp, self.std * np.abs(by))
@@ -264,14 +269,13 @@ def _std_so_far(column: FloatArray, least: float) -> FloatArray:
     return np.where(count < 0.5 * LEAST_CELLS, np.inf, np.maximum(few * np.sqrt(total / np.maximum(count, 1.0)), least))
 
 
-def _sample_steps(signals: Signals, cells: _Cells) -> tuple[FloatArray, IntArray]:
-    """Return the largest step between neighbouring samples of the gyro in each cell, [n], and its stamp.
+def _sample_steps(column: FloatArray, cells: _Cells) -> tuple[FloatArray, IntArray]:
+    """Return the largest step between neighbouring samples of a column [N] in each cell, [n], and its stamp.
 
     A straight line with a step is fitted to the samples up to ``STEP_S`` before and after.
     """
-    signals = without_impossible(signals)
-    finite = np.isfinite(signals.yaw_rate_rad_s)
-    values, stamps, cell = signals.yaw_rate_rad_s[finite], signals.stamps_ns[finite], cells.of_stamp[finite]
+    finite = np.isfinite(column)
+    values, stamps, cell = column[finite], cells.stamps_ns[finite], cells.of_stamp[finite]
     count = len(cells.speed)
     largest, stamp_ns = np.zeros(count), np.zeros(count, np.int64)
     half = max(2, round(STEP_S * 1e9 / float(np.median(np.diff(stamps))))) if len(stamps) > 1 else 2
@@ -286,21 +290,32 @@ def _sample_steps(signals: Signals, cells: _Cells) -> tuple[FloatArray, IntArray
     return largest, stamp_ns
 
 
+def _largest_near(steps: FloatArray) -> FloatArray:
+    """Return the largest of each step and the ``PEAK_CELLS`` behind it, [n]."""
+    rows = np.lib.stride_tricks.sliding_window_view(np.append(steps, np.zeros(PEAK_CELLS)), PEAK_CELLS + 1)
+    return np.take_along_axis(rows, np.argmax(np.abs(rows), axis=1)[:, None], axis=1)[:, 0]
+
+
 def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> SensorChange | None:
     """Return the first jump of gyro or accelerometer behind a time."""
     cells, end_ns = _cells(signals), int(signals.stamps_ns[-1]) + 1
+    s = without_impossible(signals)
     kinematics, steering = _relations(cells)
     v = _mean(np.where(cells.speed > LEAST_SPEED_M_S, cells.speed, np.nan), -PART_CELLS, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         ay, of_steer = _step(kinematics, LEAST_AY_STD), _step(steering, LEAST_STEER_STD)
         by_ay, by_steer = ay.scaled(-1.0 / v), of_steer.scaled(-1.0 / (steering.fit[:, 1] / v + steering.fit[:, 2] * v))
-        step, at_ns = _sample_steps(signals, cells)
+        step, at_ns = _sample_steps(s.yaw_rate_rad_s, cells)
         step_std = np.fmax(_std_so_far(step, LEAST_GYRO_STD), np.sqrt(_mean(step**2, 3, WINDOW_CELLS)))  # a burst
         is_gyro = np.abs(step) > np.maximum(ALARM * step_std, LEAST_GYRO_JUMP_RAD_S)
         is_gyro &= by_ay.confirms(step) | (by_steer.confirms(step) & (SURE * by_ay.std > np.abs(step)))
         is_gyro &= ~by_ay.contradicts(step) & ~by_steer.contradicts(step)
         is_ay = (np.abs(ay.size) > np.maximum(ALARM * ay.std, LEAST_AY_JUMP_M_S2)) & ay.is_sharp
-        is_ay &= (np.abs(by_steer.size) < ABSENT * np.abs(by_ay.size)) & (np.abs(by_ay.size) > SURE * by_steer.std)
+        # The steering shows that the car did not change its motion, or the samples of both sensors do.
+        sampled, turned = (_largest_near(steps) for steps in (_sample_steps(s.ay_m_s2, cells)[0], step))
+        is_sampled = np.abs(sampled - ay.size) < AGREES * np.abs(ay.size)
+        is_sampled &= by_ay.excludes(turned, step_std) & ~by_steer.contradicts(0.0 * step)
+        is_ay &= by_ay.excludes(by_steer.size, by_steer.std) | is_sampled
     is_gyro &= "yaw_rate_rad_s" not in ignored
     is_ay &= "ay_m_s2" not in ignored
     first = cells.of_stamp[np.searchsorted(signals.stamps_ns, after_ns)]
@@ -338,7 +353,7 @@ def _without_stuck(signals: Signals, cells: _Cells, names: Sequence[str]) -> tup
     travelled = np.cumsum(np.nan_to_num(cells.ax)) * CELL_S
     columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in names}
     for name, column in columns.items():
-        for start, end, known, unseen in _long_runs(column, cells):
+        for start, end, certain, unseen in _long_runs(column, cells):
             k0, k = cell[start], np.arange(cell[start], cell[end - 1] + 1)
             if name == "steer_rad":
                 expected = steering.table[k, 1:] @ steering.fit[k0]
@@ -349,7 +364,7 @@ def _without_stuck(signals: Signals, cells: _Cells, names: Sequence[str]) -> tup
                 expected = travelled[k] - travelled[k0] - grade * (k - k0)
                 change, limit, std, expected = expected, LEAST_SPEED_CHANGE_M_S, math.nan, np.full(len(k), np.nan)
             is_stuck = (np.abs(change) > limit) | (k - k0 >= unseen)
-            missed = known + np.flatnonzero(is_stuck[known:])
+            missed = certain + np.flatnonzero(is_stuck[certain:])
             if not len(missed):
                 continue
             known_ns = cells.time_of(k[missed[0]] + 1)
@@ -376,13 +391,13 @@ def _without_repeats(signals: Signals, cells: _Cells) -> Signals:
 class _Run(NamedTuple):
     """Rows [start, end) of a value that repeats beyond chance.
 
-    ``known``: cells until chance is excluded. ``unseen``: cells until it repeats ``LONGER`` times as long as any value
-    before it.
+    ``certain``: cells until chance is excluded. ``unseen``: cells until it repeats ``LONGER`` times longer than any
+    value before it.
     """
 
     start: int
     end: int
-    known: int
+    certain: int
     unseen: int
 
 

@@ -153,10 +153,18 @@ class ColumnarLog(DriveLog):
                 losses.append(_out_of_time(container, list(self._late[c].values())))
             losses.extend(self._undecodable_losses(c, container))
             for (of, channel), schema in schemas:
-                wanted = of == c and (of, channel) in self._asked
-                if wanted and isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
-                    what = f"its messages cannot be decoded: {schema}"
-                    losses.append(Loss("bad-schema", what, container.channels[channel].topic))
+                if of != c:
+                    continue
+                topic = container.channels[channel].topic
+                is_bad = isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError)
+                if is_bad and (c, channel) in self._asked:
+                    losses.append(Loss("bad-schema", f"its messages cannot be decoded: {schema}", topic))
+                if (c, channel) in self._wanted and isinstance(schema, MessageSchema) and schema.borrowed:
+                    what = (
+                        f"read by {', '.join(map(str, schema.borrowed))} of this machine, as the log does not define "
+                    )
+                    what += "its type: correct only if they match the recorded version"
+                    losses.append(Loss("borrowed-definition", what, topic, severity="note"))
         return tuple(losses)
 
     def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
@@ -293,11 +301,6 @@ class ColumnarLog(DriveLog):
             else:
                 reasons.append(str(schema))
         return reasons[0] if reasons else ""
-
-    def borrowed(self, topic: str) -> tuple[Path, ...]:
-        """Return the files of an installed ROS that define a topic's type."""
-        schemas = (self.schema_of(c, channel) for c, channel in self._by_topic.get(topic, ()))
-        return tuple(dict.fromkeys(f for s in schemas if isinstance(s, MessageSchema) for f in s.borrowed))
 
     def first_messages(self, topic: str, most: int) -> list[object]:
         """Return the first messages of a topic, decoded; messages that do not decode are left out."""

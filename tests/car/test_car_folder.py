@@ -16,7 +16,6 @@ from pdhef_logtool.car import store
 from pdhef_logtool.car.assumed_values import completed
 from pdhef_logtool.car.car import (
     FIT_FILE,
-    INTERVALS_FILE,
     NETWORK_FOLDER,
     SHIPPED_CARS,
     VEHICLE_FILE,
@@ -238,11 +237,6 @@ def test_an_entry_that_a_later_version_adds_makes_no_car_stale(tmp_path: Path) -
     defaults = {k: f.default for k, f in VehicleParameters.model_fields.items()}
     said = {k: v for k, v in entries.items() if k not in ("name", "truth_position_m") and v != defaults[k]}
     assert load(tmp_path / "mine.toml").physics_sha256 == digest(said)
-
-
-def test_intervals_of_earlier_versions_are_noted(folder: Path) -> None:
-    (folder / INTERVALS_FILE).write_text("{}")
-    assert any("intervals.json is not used" in note for note in load(folder).notes)
 
 
 # --- rejected inputs -------------------------------------------------------------------------------------------------
