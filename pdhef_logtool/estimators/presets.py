@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 
 #: Presets built on ``physics``. They use the calibrated vehicle if available; all others use the vehicle file.
 SELF_CALIBRATED = frozenset({"physics", "pd-hef", "pd-hef-smoothed"})
+#: The filter on the vehicle file.
+ON_FILE = "phy-ukf"
 #: The open-loop model on the calibrated vehicle.
 OPEN_LOOP = "open-loop:calibrated"
 

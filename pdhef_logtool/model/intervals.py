@@ -30,7 +30,7 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.calibration.joint import prior_variations
 from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.presets import preset_of, uses_calibration
+from pdhef_logtool.estimators.presets import ON_FILE, preset_of, uses_calibration
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, of_car, physics_filter
 from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
@@ -39,7 +39,6 @@ from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_A
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, release, step_durations_s
 from pdhef_logtool.records.tracks import StateTrack, scaled_covariance
-from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 
 #: Factor of the consistency of a whole drive, and s_car; from seven simulated cars and real drives of four cars.
 DRIVE_SHARE, CAR_STD_RAD = 0.7, math.radians(0.15)
@@ -135,7 +134,7 @@ def drive_intervals(car: Car, estimators: Sequence[Estimator]) -> DriveIntervals
         calibrated = _of_drive(car, car.self_calibrated)
     names = [e.name for e in estimators if e.name not in notes]
     by_name = {name: calibrated for name in names if uses_calibration(name)}
-    return DriveIntervals(by_name | {name: of_file for name in names if preset_of(name) == NOMINAL_MODEL}, notes)
+    return DriveIntervals(by_name | {name: of_file for name in names if preset_of(name) == ON_FILE}, notes)
 
 
 def _of_drive(car: Car, calibration: WithoutTruth) -> Interval:
