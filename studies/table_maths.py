@@ -27,13 +27,10 @@ class Bound:
 
 def pooled_rmse(rmse: FloatArray, samples: FloatArray) -> float:
     """Return the RMSE over all samples of all drives from each drive's RMSE [N] and number of samples [N]."""
-    return float(np.sqrt(pooled_mean(rmse**2, samples)))
-
-
-def pooled_mean(mean: FloatArray, samples: FloatArray) -> float:
-    """Return the mean over all samples of all drives from each drive's mean [N] and number of samples [N]."""
-    finite = np.isfinite(mean) & (samples > 0)
-    return float(np.sum(samples[finite] * mean[finite]) / np.sum(samples[finite])) if finite.any() else float("nan")
+    finite = np.isfinite(rmse) & (samples > 0)
+    if not finite.any():
+        return float("nan")
+    return float(np.sqrt(np.sum(samples[finite] * rmse[finite] ** 2) / np.sum(samples[finite])))
 
 
 def percentiles(values: FloatArray, levels: tuple[float, ...] = (10.0, 50.0, 90.0)) -> tuple[float, ...]:

@@ -10,17 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from reference_car import (
-    FRICTION,
-    FRONT_M,
-    MASS_KG,
-    REAR_M,
-    WHEELBASE_M,
-    YAW_INERTIA,
-    Drive,
-    magic_tyre,
-    make_signals,
-)
+from reference_car import FRICTION, FRONT_M, MASS_KG, REAR_M, WHEELBASE_M, YAW_INERTIA, Drive, magic_tyre, make_signals
 from scipy.integrate import solve_ivp
 
 from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters, default_vehicle

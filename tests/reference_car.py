@@ -137,13 +137,7 @@ def drive(
             state[k + 1, 1] += side_pull_m_s2 * dt[k]
     measured_speed = np.where(np.arange(n) % speed_every == 0, state[:, 0], np.nan)
     signals = make_signals(
-        dt,
-        delay_ns,
-        steer_rad=delta,
-        ax_m_s2=ax,
-        ay_m_s2=ay,
-        yaw_rate_rad_s=state[:, 2],
-        speed_m_s=measured_speed,
+        dt, delay_ns, steer_rad=delta, ax_m_s2=ax, ay_m_s2=ay, yaw_rate_rad_s=state[:, 2], speed_m_s=measured_speed
     )
     return Drive(signals, state[:, 0], state[:, 1], state[:, 2], ay)
 

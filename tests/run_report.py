@@ -45,11 +45,6 @@ TRUTH = truth(*VELOCITY, ("sideslip_rad", "derived", "atan2(v_y, v_x)"))
 GNSS = truth(("vx_m_s", "derived", "ground speed of /fix.{a,b} taken as v_x, no heading known"))
 
 
-def friction(source: str, **changes: Any) -> dict[str, Any]:
-    unknown = {"estimated": False, "observable_share": None, "observable_std": None, "summary": ""}
-    return {"source": source, **unknown, **changes}
-
-
 def figures(*given: tuple[str, str, str, float]) -> list[MetricRow]:
     return [MetricRow("drive", e, s, "all", m, v, "", 9) for e, s, m, v in given]
 
@@ -86,12 +81,12 @@ def report(
         "vehicle": car | (vehicle or {}),
         "estimators": [
             ran("zero", algorithm={"physics_sha256": None, "options": {}}),
-            ran("physics", intervals=["intervals calibrated on x"]),
-            ran("pd-hef", intervals=["intervals calibrated on x"]),
+            ran("physics", intervals=["intervals: own, parameters and sensors"]),
+            ran("pd-hef", intervals=["intervals: own, parameters and sensors"]),
         ],
         "truth": TRUTH,
         "model": None,
-        "friction": friction("option, 0.9"),
+        "friction": {"source": "option, 0.9"},
         "self_calibration": None,
         "reference": None,
         "ledger": {"samples": []},

@@ -1,4 +1,4 @@
-"""Run ``pdhef`` as on Windows, as far as Linux can imitate it: ``python without_posix.py COMMAND ...``.
+"""Run ``pdhef`` as on Windows, as far as Linux can imitate it: ``python without_posix.py COMMAND [then COMMAND]``.
 
 Modules and functions that Windows does not have are hidden, folders cannot be opened as files, files open for reading
 cannot be flushed, and open files can be neither removed nor renamed. Libraries are imported first: their own builds for
@@ -105,4 +105,10 @@ if __name__ == "__main__":
     imitate()
     from pdhef_logtool.__main__ import main
 
-    main()
+    for command in " ".join(sys.argv[1:]).split(" then "):
+        sys.argv[1:] = command.split()
+        try:
+            main()
+        except SystemExit as ended:
+            if ended.code:
+                raise

@@ -1,24 +1,20 @@
 """Parameters and identified parts of one vehicle, for estimators and commands.
 
 A car is a folder. The user writes ``vehicle.toml``, and no command changes it; ``learn`` writes ``model.toml`` beside
-it, ``train`` the folder ``network``. The shipped car has ``fit.toml`` and ``intervals.json`` (:mod:`~.parts`). A single
+it, ``train`` the folder ``network``. The shipped car has ``fit.toml`` (:mod:`~.parts`). A single
 ``vehicle.toml`` is a car without parts. A part of another vehicle file is not used, and the car has a note.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, AssumedValue
 from pdhef_logtool.car.model import GROUND_TRUTH, CarModel, TaughtParameter, read_model
 from pdhef_logtool.car.names import MODEL_FILE
-from pdhef_logtool.car.names import NO_INTERVALS as NO_INTERVALS
 from pdhef_logtool.car.names import SHIPPED_CARS as SHIPPED_CARS
 from pdhef_logtool.car.parts import (
     PHYSICS,
@@ -26,14 +22,12 @@ from pdhef_logtool.car.parts import (
     Fit,
     FittedPhysics,
     FittedValues,
-    Intervals,
     LearntOn,
     physics_sha256,
 )
 from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file, with_sensors
 from pdhef_logtool.car.vehicle import DEFAULT_VEHICLE_NAME, VehicleParameters, default_vehicle
 from pdhef_logtool.records.errors import VehicleError
-from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
     NO_MODEL,
@@ -44,10 +38,10 @@ from pdhef_logtool.residual_model.bundle import (
     load_bundle,
 )
 from pdhef_logtool.residual_model.interface import PlugInModel, load_plug_in, plug_in_names
-from pdhef_logtool.storage.documents import read_json, read_toml, validated
+from pdhef_logtool.storage.documents import read_toml, validated
 
 VEHICLE_FILE, FIT_FILE = "vehicle.toml", "fit.toml"
-INTERVALS_FILE, NETWORK_FOLDER = "intervals.json", "network"
+NETWORK_FOLDER = "network"
 #: Number of digits of a hash in messages.
 SHOWN_DIGITS = 12
 
@@ -59,27 +53,17 @@ Place = Path | str | None
 class WithoutTruth:
     """The vehicle as calibrated without ground truth, for one log.
 
-    ``told_friction`` : whether the calibration used the signals' friction; an estimated friction does not count.
     ``noise`` : of ``physics``. ``note`` : a warning for the reader of the report. ``varied`` : the vehicle one
-    posterior 1-sigma away, in independent directions. ``driven_d2_m_s`` : part of the v̇_y residual of ``physics`` on
-    the log that correlates with the driving, NaN if unknown. ``causal`` : whether it depends on no sample of the log.
-    ``cg_std_m`` : as :attr:`Car.cg_std_m`. ``error_scale`` : residual of the sensors after the fit, relative to the
-    assumption of the calibration.
+    posterior 1-sigma away, in independent directions. ``causal`` : whether it depends on no sample of the log.
+    ``error_scale`` : residual of the sensors after the fit, relative to the assumption of the calibration.
     """
 
     vehicle: VehicleParameters
     noise: FilterNoise
-    told_friction: bool
     note: str
     varied: tuple[VehicleParameters, ...] = ()
-    driven_d2_m_s: float = math.nan
     causal: bool = False
-    cg_std_m: float = 0.0
     error_scale: float = 1.0
-
-    def without_estimated_friction(self, signals: Signals) -> Signals:
-        """Return signals [N] without a friction that was estimated with the vehicle file."""
-        return signals if self.told_friction else replace(signals, friction=np.full(len(signals), np.nan))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +79,6 @@ class Car:
     model : prior of the calibration, and residual, from earlier drives; None without.
     network, network_name : the residual network, None without.
     network_gain : residual gain of ``pd-hef``; None: 1 with a network that was trained with these physics, otherwise 0.
-    intervals : calibrated 95 % intervals, None without.
     learnt_on : drives on which ``vehicle`` was identified.
     self_calibrated : the vehicle as calibrated on the current log, for the estimators that use it; None without.
     assumed : missing entries of the file. source : folder or file, None for the default car.
@@ -108,7 +91,6 @@ class Car:
     network: ModelBundle | PlugInModel | None = None
     network_name: str = NO_MODEL
     network_gain: float | None = None
-    intervals: Intervals | None = None
     learnt_on: tuple[LearntOn, ...] = ()
     fitted_physics: FittedPhysics | None = None
     model: CarModel | None = None
@@ -123,14 +105,13 @@ class Car:
         return cls(vehicle, vehicle, **parts)
 
     @classmethod
-    def load(cls, path: Place = None, *, network: Place = None, intervals: Place = None, sensors: Place = None) -> Car:
+    def load(cls, path: Place = None, *, network: Place = None, sensors: Place = None) -> Car:
         """Read a car.
 
         Parameters
         ----------
         path : a car's folder, a vehicle.toml, ``saloon`` (the shipped car); None: the default sedan.
         network : instead of the car's own: the name of a shipped network or an installed model, a folder, ``none``.
-        intervals : instead of the car's own: an ``intervals.json``, ``none``.
         sensors : instead of the car's own: a profile's name, or a file with ``[sensors]``.
 
         Raises
@@ -152,13 +133,7 @@ class Car:
         name, home = _network_of(folder, network)
         plugged = load_plug_in(name) if home is None and name != NO_MODEL else None
         bundle = plugged if home is None else load_bundle(home)
-        selected = _intervals_of(folder, intervals)
-        car = replace(car, network=bundle, network_name=name, intervals=selected)
-        if str(intervals) == NO_INTERVALS and car.fitted_physics is not None:
-            car = replace(car, fitted_physics=car.fitted_physics.model_copy(update={"varied": ()}))
-        if intervals is None and selected is not None and selected.physics_sha256 != car.physics_sha256:
-            car = replace(car, notes=(*car.notes, f"{INTERVALS_FILE} was made with other physics"))
-        return car
+        return replace(car, network=bundle, network_name=name)
 
     @property
     def file_name(self) -> str | None:
@@ -176,12 +151,6 @@ class Car:
         """The vehicle for the filter ``physics``: with the values identified with it, otherwise as for all filters."""
         fitted = self.fitted_physics
         return self.vehicle if fitted is None else fitted.values.applied_to(self.datasheet)
-
-    @property
-    def varied_physics(self) -> tuple[VehicleParameters, ...]:
-        """:attr:`physics_vehicle` one posterior 1-sigma away in each retained direction; empty without a posterior."""
-        varied = () if self.fitted_physics is None else self.fitted_physics.varied
-        return tuple(values.applied_to(self.physics_vehicle) for values in varied)
 
     def physics_of(self, name: str) -> str:
         """Return the digest of the physics that a filter uses and its noise belongs to."""
@@ -251,8 +220,7 @@ class Car:
         other = {k: v for k, v in vehicle if v != getattr(self.vehicle, k)}
         if physics is not None:
             overridden = {k: None for k in FittedValues.model_fields if k in other}
-            values, *varied = (v.model_copy(update=overridden) for v in (physics.values, *physics.varied))
-            physics = physics.model_copy(update={"values": values, "varied": tuple(varied)})
+            physics = physics.model_copy(update={"values": physics.values.model_copy(update=overridden)})
         datasheet, gain = self.datasheet.model_copy(update=other), self.residual_gain
         return replace(self, vehicle=vehicle, datasheet=datasheet, network_gain=gain, fitted_physics=physics)
 
@@ -271,16 +239,16 @@ def _file_of(source: Path | None, folder: Path | None) -> VehicleFile:
 def _with_parts(car: Car, folder: Path) -> Car:
     """Return the car with the valid parts of its folder: ``model.toml``, or a fit."""
     notes: list[str] = []
-    if (folder / MODEL_FILE).is_file():
+    if (folder / MODEL_FILE).exists():
         model = read_model(folder / MODEL_FILE)
         if model.belongs_to(car.datasheet):
-            if (folder / FIT_FILE).is_file():
+            if (folder / FIT_FILE).exists():
                 notes.append(f"{FIT_FILE}: not used, {MODEL_FILE} takes its place")
             if model.truth not in ("", GROUND_TRUTH):
                 notes.append(f"{MODEL_FILE}: taught by {model.truth}")
             return replace(car, model=model, notes=tuple(notes))
         notes.append(f"{MODEL_FILE} is not used: {VEHICLE_FILE} has changed since; pdhef learn creates it again")
-    if (folder / FIT_FILE).is_file():
+    if (folder / FIT_FILE).exists():
         fit = read_fit(folder / FIT_FILE)
         if fit.physics_sha256 == physics_sha256(car.datasheet):
             car = car.with_fit(fit)
@@ -314,23 +282,3 @@ def _network_of(folder: Path | None, chosen: Place) -> tuple[str, Path | None]:
     home = Path(name)
     # The path may be a car's folder that contains the network.
     return name, home / NETWORK_FOLDER if (home / NETWORK_FOLDER / DOCUMENT_FILE).is_file() else home
-
-
-def _intervals_of(folder: Path | None, chosen: Place) -> Intervals | None:
-    """Return the intervals in force: the chosen ones, otherwise the car's."""
-    if chosen is not None:
-        return None if str(chosen) == NO_INTERVALS else load_intervals(Path(chosen))
-    return load_intervals(folder) if folder is not None and (folder / INTERVALS_FILE).is_file() else None
-
-
-def load_intervals(path: Path) -> Intervals:
-    """Read the intervals of a file or of a car's folder.
-
-    Raises
-    ------
-    VehicleError
-        The file is missing or wrong.
-    """
-    file = path / INTERVALS_FILE if path.is_dir() else path
-    raw = read_json(file, "an intervals.json", VehicleError)
-    return validated(Intervals, raw, str(file), VehicleError, expected="the entries of an intervals.json")

@@ -1,4 +1,4 @@
-"""Names of cars and of their files."""
+"""Words that are accepted in place of the path of a car, and the file of its model."""
 
 from __future__ import annotations
 
@@ -6,7 +6,5 @@ from pathlib import Path
 
 #: Cars of the package, by name.
 SHIPPED_CARS = {"saloon": Path(__file__).parents[1] / "models" / "default"}
-#: What earlier drives show about a car, in its folder and in the outputs of a run (:mod:`~.model`).
+#: Model of a car in its folder, and of a drive in the outputs of a run.
 MODEL_FILE = "model.toml"
-#: Name in place of an intervals file: uncalibrated intervals of the estimators.
-NO_INTERVALS = "none"

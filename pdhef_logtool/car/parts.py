@@ -1,4 +1,4 @@
-"""Parts of a car: fit and intervals.
+"""Parts of a car: fit.
 
 Each part contains the digest of its inputs. If an input has changed, the part is stale and is not used.
 """
@@ -167,14 +167,12 @@ class TriedParts(Record):
 class FittedPhysics(Record):
     """Values and noise that were identified with the filter ``physics``, and the evidence for its model parts.
 
-    ``varied``: values one posterior 1-sigma away, by direction. The directions are independent and have the largest
-    influence on the sideslip of the drives. ``smoothing``: as :data:`SMOOTHING`, found with the smoother.
+    ``smoothing``: as :data:`SMOOTHING`, found with the smoother.
     """
 
     values: FittedValues
     noise: FilterNoise
     smoothing: Annotated[tuple[Positive, Positive], Field(strict=False)] = SMOOTHING
-    varied: Annotated[tuple[FittedValues, ...], Field(strict=False)] = ()
     tried: Annotated[tuple[TriedParts, ...], Field(strict=False)] = ()
 
 
@@ -192,37 +190,6 @@ class Fit(Record):
     filter: FilterTables = Field(default_factory=dict)
     physics: FittedPhysics | None = None
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
-
-
-class YawRateCoefficients(Record):
-    """Coefficients by term of the yaw rate's variance; ``filter``: the variance of the filter."""
-
-    floor: NonNegative
-    filter: NonNegative
-    yaw_rate: NonNegative
-
-
-class SideslipCoefficients(YawRateCoefficients):
-    """Coefficients by term of the sideslip's variance."""
-
-    sideslip: NonNegative
-    grip: NonNegative
-    grip2: NonNegative
-    kinematic: NonNegative
-    cure: NonNegative = 0.0
-    bank: NonNegative = 0.0
-
-
-class Inflation(Record):
-    """Coefficients of the calibrated 1-sigmas of one algorithm (:mod:`pdhef_logtool.estimators.intervals`).
-
-    ``grip_factors`` : factors on the 1-sigma of the sideslip at low, medium and high grip utilization.
-    """
-
-    sideslip: SideslipCoefficients
-    yaw_rate: YawRateCoefficients
-    vy_factor: NonNegative = 1.0
-    grip_factors: Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)] = (1.0, 1.0, 1.0)
 
 
 class Algorithm(Record):
@@ -251,38 +218,6 @@ class Algorithm(Record):
 
     @property
     def identity(self) -> str:
-        """Algorithm, version and options as text, the key of calibrated intervals."""
+        """Algorithm, version and options as text."""
         options = ", ".join(f"{name}={self.options[name]}" for name in sorted(self.options))
         return f"{self.algorithm} {self.version}{options and f' ({options})'}"
-
-
-class IntervalEntry(Record):
-    """Intervals of one algorithm; ``estimator`` is its name in the run, for information.
-
-    ``unseen_factor``: ratio of the width for drives outside the fit to the fitted width, over all grip utilization.
-    """
-
-    estimator: str
-    algorithm: Algorithm
-    inflation: Inflation
-    unseen_factor: float = 1.0
-    coverage: Annotated[tuple[dict[str, Any], ...], Field(strict=False)] = ()
-
-
-class Intervals(Record):
-    """``intervals.json``: 95 % intervals by resolved algorithm.
-
-    ``spread``: size of the deliberate errors of friction and vehicle in the fit; 0 without.
-    """
-
-    format: Literal["pdhef-intervals"] = "pdhef-intervals"
-    version: Literal[1] = 1
-    car: str
-    physics_sha256: Sha256
-    roll_gradient_rad_per_m_s2: float
-    spread: Annotated[float, Field(ge=0)] = 0.0
-    entries: Annotated[tuple[IntervalEntry, ...], Field(strict=False)]
-    settings: dict[str, Any] = Field(default_factory=dict)
-    fit: dict[str, Any] = Field(default_factory=dict)
-    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
-    versions: dict[str, str] = Field(default_factory=dict)

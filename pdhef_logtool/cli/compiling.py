@@ -24,7 +24,7 @@ def compile_() -> None:
 
     began_s = time.perf_counter()
     saloon = RunConfig(car=Path("saloon"), estimators=(ALL_ESTIMATORS,), keep="metrics", reference="on")
-    sedan = RunConfig(friction="estimate", keep="metrics")
+    sedan = RunConfig(keep="metrics")
     with TemporaryDirectory() as folder:
         log = Path(folder) / "drive.mcap"
         write_drive(simulate_drive("banked-road"), log)

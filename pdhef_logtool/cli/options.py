@@ -78,9 +78,7 @@ _OPTIONS: dict[str, Any] = {
     "estimators": _option(
         _Text, ESTIMATION, "Comma-separated names, all or peers. Default: pd-hef, physics, zero.", "--estimators", "-e"
     ),
-    "friction": _option(
-        _Text, ESTIMATION, "auto (from the log, else the car, else estimated), file, estimate, or a number."
-    ),
+    "friction": _option(_Text, ESTIMATION, "auto (from the log, else the car, else 1), file, or a number."),
     "network": _option(_File, ESTIMATION, "Network folder, default or none. Default: the car's."),
     "model": _option(
         _File,

@@ -84,6 +84,23 @@ def frames_alone(placed: Placement, believed: str) -> Check:
     return Check("imu.frames", "ay_m_s2", "undecided", evidence, _REMEDY)
 
 
+def upright_check(named: FloatArray, force: FloatArray) -> Check | None:
+    """Report that gravity, the mean acceleration [3], is not upward in the axes that a mapping names.
+
+    ``named``: rows [3, 3] of forward, left and the yaw axis in the sensor's axes. The result is None without forward or
+    left, and if the sensor subtracts gravity.
+    """
+    up, size = np.cross(named[0], named[1]), float(np.linalg.norm(force))
+    least = math.cos(math.radians(2.0 * TILT_DEG)) * size
+    if not up.any() or not IS_GRAVITY_M_S2[0] < size < IS_GRAVITY_M_S2[1] or up @ force > least:
+        return None
+    along = int(np.argmax(np.abs(force)))
+    axis = f"{'-' if force[along] < 0.0 else '+'}{'xyz'[along]}"
+    evidence = f"gravity is along {axis} of the accelerometer, not along its vertical: its axes are not the car's"
+    remedy = 'turn them in a mapping file, or --waive "imu.mounting"'
+    return Check("imu.mounting", "ay_m_s2", "undecided", evidence, remedy)
+
+
 def _tilt_deg(placed: Placement, force: FloatArray) -> float | None:
     """Return the angle between the frames' vertical and gravity; None if the sensor subtracts gravity."""
     size = float(np.linalg.norm(force))

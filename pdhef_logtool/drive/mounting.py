@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from collections.abc import Mapping as Mapped
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeAlias
 
@@ -31,6 +31,7 @@ from pdhef_logtool.drive.frames import (
     nearest_step,
     placed_rotation,
     rotation_text,
+    upright_check,
 )
 from pdhef_logtool.drive.measured import Measured, measure
 from pdhef_logtool.drive.other_fields import with_other_fields
@@ -130,10 +131,11 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     ups = _ups(f, w, named)
     if len(ups) > 1 and not references:  # gravity does not show which way is up
         references = steering_references(columns, speed_name)
-    turns = [m for h in (1.0, -1.0) for up in ups if (m := _turned(f, h * w, speed, up, references)) is not None]
-    hands = [1.0] * (len(turns) // 2) + [-1.0] * (len(turns) // 2)
     # A sensor is left-handed only if another measurement of the yaw rate confirms it.
-    fitting = [(m, h) for m, h in zip(turns, hands, strict=True) if m.fits and h * HAND_CORRELATION > -m.sign]
+    fitting = [
+        (turn, h) for h in (1.0, -1.0) for up in ups
+        if (turn := _turned(f, h * w, speed, up, references)) and turn.fits and h * HAND_CORRELATION > -turn.sign
+    ]  # fmt: skip
     if not fitting:
         return None
     best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
@@ -153,12 +155,12 @@ def _parts_agree(whole: _Turn, parts: Sequence[_Turn | None]) -> bool:
     return agree and (len(fitted) == len(parts) or whole.correlation >= ASKEW_CORRELATION)
 
 
-def _named_rows(mapping: Mapping, accelerations: Triad, rates: Triad) -> FloatArray:
+def _named_rows(mapping: Mapping, accelerations: Triad | None, rates: Triad | None) -> FloatArray:
     """Return the rows [3, 3] of the sensor's axes that a mapping reads, 0 where it lacks one."""
     named = np.zeros((3, 3))
-    for i, name in enumerate(MOUNTED):
-        if name in mapping.signals:
-            named[i] = (rates if i == 2 else accelerations).row(mapping.signals[name])
+    for i, (name, triad) in enumerate(zip(MOUNTED, (accelerations, accelerations, rates), strict=True)):
+        if name in mapping.signals and triad is not None:
+            named[i] = triad.row(mapping.signals[name])
     return named
 
 
@@ -356,16 +358,17 @@ class Survey:
     triads: tuple[Triad | None, Triad | None] = (None, None)
     mounting: Mounting | None = None
     framed: Check | None = None
+    force: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
     corrected: tuple[Check, ...] = ()
     reread: Callable[[tuple[Check, ...]], tuple[Check, ...]] | None = None
 
     @property
     def mounted(self) -> tuple[Check, ...]:
         """Checks of the axes that the IMU's signals are read from, by the drive and by recorded frames."""
-        framed = () if self.framed is None else (self.framed,)
-        if self.mounting is None:
-            return framed
-        return (*mounting_checks(self.mapping, self.mounting, self.triads), *framed)
+        by_drive = [] if self.mounting is None else mounting_checks(self.mapping, self.mounting, self.triads)
+        is_open = self.mapping.origin == "auto" and not (self.mounting is not None and self.mounting.confident)
+        upright = upright_check(_named_rows(self.mapping, *self.triads), self.force) if is_open else None
+        return tuple(c for c in (*by_drive, self.framed, upright) if c is not None)
 
     @property
     def is_mounted(self) -> bool:
@@ -431,8 +434,6 @@ class Survey:
         doubted = {c.name.removesuffix(".candidate") for c in doubts}
         for check in self.mapping.checks:
             signal = check.name.removesuffix(".candidate")
-            if check.name == "imu.mounting" and self.mounting is not None and self.mounting.confident:
-                continue
             # Without a known radius, rim speeds in m/s and in rad/s look alike. v_y has the unit of its v_x.
             unit = f"{signal.replace('truth.vy', 'truth.vx')}.unit"
             is_resolved = unit in passed and not signal.startswith("wheel") and "a share" not in check.evidence
@@ -473,7 +474,8 @@ def survey_log(
     blind = mounting is not None and mounting.confident
     if not blind and truth is not None:
         mounting = find_mounting(measured, triads, mapping)
-    framed, by_frames = _by_frames(log, mapping, channels, triads, mounting)
+    force = _mean_force(channels)
+    framed, by_frames = _by_frames(log, mapping, force, triads, mounting)
     mounting = by_frames or mounting
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
     measured = measured.without(extra)
@@ -490,7 +492,7 @@ def survey_log(
         measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     latency = truth_latency(channels, truth)
     survey = Survey(
-        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, framed,
+        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, framed, force,
         tuple(corrected),
     )  # fmt: skip
     if not rescale:
@@ -510,10 +512,16 @@ def survey_log(
     return replace(survey, reread=lambda checks: with_other_fields(checks, mapping, checks_of, recognise))
 
 
+def _mean_force(channels: MappedChannels) -> FloatArray:
+    """Return the mean acceleration [3] in the sensor's axes; NaN without a component."""
+    components = [channels.signals.get(n) for n in ACCELERATIONS]
+    return np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
+
+
 def _by_frames(
     log: DriveLog,
     mapping: Mapping,
-    channels: MappedChannels,
+    force: FloatArray,
     triads: tuple[Triad | None, Triad | None],
     by_drive: Mounting | None,
 ) -> tuple[Check | None, Mounting | None]:
@@ -522,8 +530,6 @@ def _by_frames(
     placed = None if accelerations is None else placement_of(log, accelerations.source.topic)
     if placed is None or accelerations is None or rates is None:
         return None, None
-    components = [channels.signals.get(n) for n in ACCELERATIONS]
-    force = np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
     sure = by_drive if by_drive is not None and by_drive.confident else None
     shown, evidence = (None, "") if sure is None else (sure.rotation, sure.evidence)
     check = frames_check(placed, shown, evidence, force)

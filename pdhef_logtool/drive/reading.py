@@ -190,23 +190,17 @@ class Drive:
         self.notes.append(text)
         self._tell(f"{self.name}: {text}")
 
-    def whole(self, *, fill_friction: bool = True) -> WholeDrive:
-        """Return the whole drive; it is read once per plan.
-
-        Parameters
-        ----------
-        fill_friction : False keeps the friction of the log.
+    def whole(self) -> WholeDrive:
+        """Return the whole drive with its friction; it is read once per plan.
 
         Raises
         ------
         EstimatorError : The slice contains no stamp.
         """
         recorded = self.recorded()
-        signals, truth = recorded.signals, recorded.truth
-        if not len(signals):
+        if not len(recorded.signals):
             raise no_samples(self.path)
-        if fill_friction:
-            signals = self.friction.fill(signals, truth)
+        signals, truth = self.friction.fill(recorded.signals, recorded.truth), recorded.truth
         return WholeDrive(self.name, self.plan, signals, truth, self.log.start_ns, recorded.changes)
 
     def recorded(self) -> Recorded:
@@ -289,7 +283,7 @@ def read_drive(
         chosen = choose_mapping(opened, mapping, prefer_truth=prefer, require_signals=require_sensors)
         for ambiguity in chosen.ambiguities:
             told(str(ambiguity))
-        remarks += chosen.remarks
+        remarks += chosen.mapping.notes
         used = chosen.mapping
         if adjust is not None:
             used = adjust(opened, used, told)
@@ -307,7 +301,7 @@ def read_drive(
         for note in plan.mapping.notes[len(used.notes) :]:
             told(note)
         _tell_doubts(plan, options, told)
-        friction = friction_of(plan, car.vehicle, options, validated=car.has_evidence)
+        friction = friction_of(plan, car.vehicle, options)
         if friction.note:
             remarks.append(friction.note)
     except BaseException as error:
@@ -400,7 +394,6 @@ def friction_of(
     vehicle: VehicleParameters,
     options: ReadOptions,
     *,
-    validated: bool,
     of_truth: bool = False,
 ) -> FrictionSource:
     """Return the friction source of a drive by its options.
@@ -413,5 +406,4 @@ def friction_of(
     topic = "" if source is None else source.label
     if options.friction is None:
         return FrictionSource(f"topic {topic}" if topic else "none")
-    available, use_speed = plan.alignment.available, options.use_speed
-    return friction_source(options.friction, vehicle, available, topic, use_speed=use_speed, validated=validated)
+    return friction_source(options.friction, vehicle, plan.alignment.available, topic)

@@ -308,7 +308,8 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
     """Relate wheel speeds and ground-truth speeds to the speed: their ratio needs no manoeuvre."""
     wanted = {f"wheel_speed_{w}_m_s": WHEEL_RANGE for w in WHEELS}
     wanted |= {f"wheel_speed_{w}_rad_s": WHEEL_PER_RADIAN_RANGE for w in WHEELS}
-    wanted |= {"truth.vx_m_s": SAME_RANGE, "truth.position_speed_m_s": SAME_RANGE}
+    of_paths = ("truth.position_speed_m_s", GNSS_PATH[1])
+    wanted |= dict.fromkeys(("truth.vx_m_s", *of_paths), SAME_RANGE)
     relations = []
     moving = _moving(columns, speed)
     # Near the limit, wheel speeds differ from the speed of the car.
@@ -326,17 +327,11 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
         if samples < MIN_SAMPLES:
             continue
         ratios = column[use] / speed[use]
-        relation = Relation(
-            f"{name} over {speed_name}", {name: 1, speed_name: -1}, 1.0, float(np.median(ratios)), expected, samples,
-            blocks=tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS)),
-        )  # fmt: skip
-        relations.append(replace(relation, signless=name == "truth.position_speed_m_s"))
-    if (path := columns.get(GNSS_PATH[1])) is not None and (use := moving & np.isfinite(path)).any():
-        ratios = speed[use] / path[use]
-        text, samples = f"{speed_name} over the speed of the GNSS positions", independent_samples(ratios.size)
+        powers = {speed_name: -1} | ({} if name == GNSS_PATH[1] else {name: 1})
         blocks = tuple(float(np.median(b)) for b in np.array_split(ratios, BLOCKS) if b.size)
-        ratio = float(np.median(ratios))
-        relations.append(Relation(text, {speed_name: 1}, 1.0, ratio, SAME_RANGE, samples, signless=True, blocks=blocks))
+        gain, signless = float(np.median(ratios)), name in of_paths
+        text = f"{name} over {speed_name}"
+        relations.append(Relation(text, powers, 1.0, gain, expected, samples, signless=signless, blocks=blocks))
     of_wheels = any(n.startswith("wheel") and n.endswith("_rad_s") for n in columns) and speed_name == "wheel_speeds"
     fast = speed[np.abs(speed) > REVERSE_M_S * (3.0 if of_wheels else 1.0)]
     if (samples := independent_samples(fast.size)) >= 2.0 * MIN_SAMPLES:

@@ -34,8 +34,6 @@ class DriveSignals:
 
 def calibrated_signals(signals: Signals, car: Car) -> Signals:
     """Return signals [N] that were read with a car's file as its calibrated or identified vehicle corrects them."""
-    if car.self_calibrated is not None:
-        signals = car.self_calibrated.without_estimated_friction(signals)
     return corrected_anew(signals, car.vehicle, car.calibrated_car.physics_vehicle)
 
 

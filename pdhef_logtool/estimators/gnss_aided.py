@@ -29,13 +29,12 @@ from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators import kinematic_filter as f
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import notes_of, predict_track
-from pdhef_logtool.estimators.intervals import scaled_covariance
 from pdhef_logtool.estimators.reference.gnss import LEAST_COURSE_SPEED_M_S
 from pdhef_logtool.estimators.reference.inputs import RATE_HZ, ROLL_PER_AY_RAD_S2_M, SLOW_S
 from pdhef_logtool.estimators.vehicle_ukf import LIMIT_TIME_S, LINEAR_SHARE, sideslip_std
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, ExtendedSteps, Extrapolation, last_stamp_ns, step_durations_s
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.tracks import StateTrack, scaled_covariance
 
 #: Columns of a queued row after those of the kinematic filter: v_y of the wrapped filter, time of the row, arrival of
 #: its GNSS velocity, and whether that was used.
@@ -282,11 +281,6 @@ class GnssAided:
     def notes(self) -> tuple[str, ...]:
         """Notes for the report."""
         return (*notes_of(self.estimator), "GNSS velocity corrects v_y")
-
-    @property
-    def calibrated_as(self) -> AdaptivePhysics:
-        """Estimator that provides the intervals if this one has no calibrated intervals."""
-        return self.estimator
 
     def run(self, signals: Signals, state: AidedState | None) -> tuple[AidedSteps, AidedState]:
         """Process one window (see :class:`~.base.Estimator`)."""

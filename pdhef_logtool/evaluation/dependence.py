@@ -64,7 +64,7 @@ class Dependence:
 
 def deviate(share: float, freedom: float) -> float:
     """Return a quantile of Student's t, or of the normal distribution with infinite degrees of freedom."""
-    if math.isinf(freedom) or float(freedom).is_integer():
+    if math.isinf(freedom) or (freedom < 10_000 and float(freedom).is_integer()):  # one step for each two of them
         return student_quantile(share, freedom)
     from scipy.special import stdtrit
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel
-from pdhef_logtool.car.names import MODEL_FILE, NO_INTERVALS
+from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.store import check_output, update_car
 from pdhef_logtool.drive.model_file import Sensors
 from pdhef_logtool.drive.reading import read_drive
@@ -84,7 +84,7 @@ def learn(arguments: Logs, output: Path | str, settings: LearnSettings, *, repor
         raise UsageError(
             expected="a car's folder", got=output.name, where="--output", remedy="a car has more than a file contains"
         )
-    source = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
+    source = Car.load(config.car, network=NO_MODEL)
     if config.car is None:
         reporter.warn(f"no --car: mass, geometry and priors come from the default {source.datasheet.name}")
     check_output(source, output)
@@ -117,8 +117,12 @@ def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[s
     def read(log: LogInput) -> tuple[DriveRecord, _Read]:
         with read_drive(log, car, drives.mapping, config.read_options) as drive:
             record, opened = open_drive(drive, config)
-            driving = None if lacking(drive) else read_driving(drive) if opened is None else opened.taught.driving
-            return record, _Read(driving, drive.plan.sensors, opened)
+            if opened is not None:
+                return record, _Read(opened.taught.driving, drive.plan.sensors, opened)
+            start_s, end_s = ((t - drive.log.start_ns) * 1e-9 for t in (drive.plan.start_ns, drive.plan.end_ns))
+            driving = None if lacking(drive) else read_driving(drive)
+            record = replace(record, seconds=end_s - start_s, span_s=(start_s, end_s))
+            return record, _Read(driving, drive.plan.sensors, None)
 
     records, content = drives.read(read, 0.3)
     teachers = [r.opened for r in content if r.opened is not None]
@@ -142,5 +146,5 @@ def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[s
 def _check(got: str, expected: str) -> None:
     """Raise EstimatorError if the drives lack something."""
     if got:
-        remedy = "give more drives; ground truth is v_y, sideslip, or position and heading of a reference"
+        remedy = "give more drives of this car, or map v_y, sideslip, or position and heading as ground truth"
         raise EstimatorError(expected=expected, got=got, where="learn", remedy=remedy)

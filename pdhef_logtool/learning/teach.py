@@ -122,7 +122,7 @@ def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDriv
     truth_at, lacks = (None, f"the log has no {', '.join(missing)}") if missing else teaching_reference(drive, config)
     if lacks:
         return record_of(drive, left_out=lacks), None
-    whole = drive.whole(fill_friction=drive.friction.bank is None)
+    whole = drive.whole()
     if truth_at is not None:
         whole = replace(whole, truth=truth_at(whole.signals.stamps_ns))
     assert whole.truth is not None

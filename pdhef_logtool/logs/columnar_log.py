@@ -128,17 +128,13 @@ class ColumnarLog(DriveLog):
         """When the log was recorded; determined at the first access."""
         return survey(self.containers, self._times, str(self.path))
 
-    def _times(self, c: int, span: Span) -> tuple[IntArray, IntArray] | None:
-        """Return channels and log times of a span's messages on known channels [N]; None if they cannot be read."""
+    def _times(self, c: int, span: Span) -> Mapping[int, IntArray] | None:
+        """Return the log times [N] of a span's messages by known channel; None if they cannot be read."""
         container = self.containers[c]
         try:
             container.meter.check()
             with container.meter.running():
-                channel, log_time = container.times(span)
-            if container.by_index:
-                return channel, log_time
-            declared = np.isin(channel, list(container.channels))
-            return channel[declared], log_time[declared]
+                return {id_: times for id_, times in container.times(span).items() if id_ in container.channels}
         except SourceError:
             raise
         except Exception:  # noqa: BLE001 (a read of the span reports the damage)
@@ -157,10 +153,18 @@ class ColumnarLog(DriveLog):
                 losses.append(_out_of_time(container, list(self._late[c].values())))
             losses.extend(self._undecodable_losses(c, container))
             for (of, channel), schema in schemas:
-                wanted = of == c and (of, channel) in self._asked
-                if wanted and isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
-                    what = f"its messages cannot be decoded: {schema}"
-                    losses.append(Loss("bad-schema", what, container.channels[channel].topic))
+                if of != c:
+                    continue
+                topic = container.channels[channel].topic
+                is_bad = isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError)
+                if is_bad and (c, channel) in self._asked:
+                    losses.append(Loss("bad-schema", f"its messages cannot be decoded: {schema}", topic))
+                if (c, channel) in self._wanted and isinstance(schema, MessageSchema) and schema.borrowed:
+                    what = (
+                        f"read by {', '.join(map(str, schema.borrowed))} of this machine, as the log does not define "
+                    )
+                    what += "its type: correct only if they match the recorded version"
+                    losses.append(Loss("borrowed-definition", what, topic, severity="note"))
         return tuple(losses)
 
     def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
@@ -246,13 +250,9 @@ class ColumnarLog(DriveLog):
         for c, container in enumerate(self.containers):
             for span in container.spans:
                 stamps = self._times(c, span) if span.overlaps(start_ns, end_ns) else None
-                if stamps is None:
-                    continue
-                channel, times = stamps
-                keep = in_window(times, start_ns, end_ns)
-                channel, times = (channel, times) if keep is None else (channel[keep], times[keep])
-                for id_ in span.counts:
-                    parts[container.channels[id_].topic].append(times[channel == id_])
+                for id_, times in (stamps or {}).items():
+                    keep = in_window(times, start_ns, end_ns)
+                    parts[container.channels[id_].topic].append(times if keep is None else times[keep])
         return {topic: np.sort(np.concatenate(part)) for topic, part in parts.items() if part}
 
     def covered_topics(self, topics: Collection[str]) -> frozenset[str]:
@@ -301,11 +301,6 @@ class ColumnarLog(DriveLog):
             else:
                 reasons.append(str(schema))
         return reasons[0] if reasons else ""
-
-    def borrowed(self, topic: str) -> tuple[Path, ...]:
-        """Return the files of an installed ROS that define a topic's type."""
-        schemas = (self.schema_of(c, channel) for c, channel in self._by_topic.get(topic, ()))
-        return tuple(dict.fromkeys(f for s in schemas if isinstance(s, MessageSchema) for f in s.borrowed))
 
     def first_messages(self, topic: str, most: int) -> list[object]:
         """Return the first messages of a topic, decoded; messages that do not decode are left out."""

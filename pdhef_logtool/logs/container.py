@@ -278,15 +278,15 @@ class Container(ABC):
     def extent(self, span: Span) -> tuple[int, int]:
         """Return the bytes [start, end) of a span."""
 
-    def times(self, span: Span) -> tuple[IntArray, IntArray]:
-        """Return channels and log times of a span's messages [N], each channel's in file order.
+    def times(self, span: Span) -> dict[int, IntArray]:
+        """Return the log times [N] of a span's messages by channel, in file order.
 
         Raises
         ------
         SpanDamageError : they cannot be read.
         """
         block = self.load(span)
-        return block.channel, block.log_time_ns
+        return {id_: block.log_time_ns[rows] for id_, rows in block.rows.items()}
 
     def raw_chunk(self, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
         """Return the chunk that a block was read from, to be written to another file as it is.

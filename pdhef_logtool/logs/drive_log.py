@@ -186,11 +186,6 @@ class DriveLog(ABC):
         del topic
         return ""
 
-    def borrowed(self, topic: str) -> tuple[Path, ...]:
-        """Return the files of an installed ROS that define a topic's type, if the log does not define it."""
-        del topic
-        return ()
-
     def first_messages(self, topic: str, most: int) -> list[object]:
         """Return the first messages of a topic, decoded with texts; messages that do not decode are left out.
 

@@ -582,15 +582,14 @@ class McapContainer(FileContainer):
             return False
         return True
 
-    def times(self, span: Span) -> tuple[IntArray, IntArray]:
-        """Return a span's channels and log times; of a chunk, read its message indexes if they agree with the span."""
-        extent = self.chunks[span.index]
-        indexes = self._indexes(extent)
-        if indexes and {id_: len(times) for id_, times, _ in indexes if len(times)} == span.counts:
-            channel = np.concatenate([np.full(len(times), id_, dtype=np.int64) for id_, times, _ in indexes])
-            log_time = _held_times(np.concatenate([times for _, times, _ in indexes]))
-            if (log_time.min(), log_time.max() + 1) == (span.start_ns, span.end_ns):
-                return channel, log_time
+    def times(self, span: Span) -> dict[int, IntArray]:
+        """Return a span's log times by channel; of a chunk, by its message indexes if they agree with the span."""
+        indexes = self._indexes(self.chunks[span.index]) or ()
+        times = {id_: _held_times(its) for id_, its, _ in indexes if len(its)}
+        if times and {id_: len(its) for id_, its in times.items()} == span.counts:
+            bounds = min(int(its.min()) for its in times.values()), max(int(its.max()) + 1 for its in times.values())
+            if bounds == (span.start_ns, span.end_ns):
+                return times
         return super().times(span)
 
     def attachments(self) -> Iterator[Attachment]:

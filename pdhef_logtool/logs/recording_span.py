@@ -47,9 +47,8 @@ _WHAT = {
     TIME_JUMP: "messages are left out: the recorder's clock stepped back, and their times were recorded before",
 }
 
-#: Channels and log times of a span's messages on known channels, [N] each, a channel's in file order; None if the
-#: span is damaged.
-SpanTimes = Callable[[int, Span], tuple[IntArray, IntArray] | None]
+#: Log times [N] of a span's messages by known channel, in file order; None if the span is damaged.
+SpanTimes = Callable[[int, Span], Mapping[int, IntArray] | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,8 +171,7 @@ def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> Rec
         place = (c, span.index)
         if not any(place >= cut.place[:2] and _touches(span, cut) for cut in cuts):
             continue
-        stamps = times(c, span)
-        for id_, channel_times in _by_channel(stamps) if stamps is not None else ():
+        for id_, channel_times in (times(c, span) or {}).items():
             topic = containers[c].channels[id_].topic
             again = channel_times[_inside(channel_times, intervals) & _cut_out(channel_times, topic, place, cuts)]
             if again.size:
@@ -188,7 +186,7 @@ def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> Rec
 def survey_stamps(stamps_ns: Mapping[str, IntArray], where: str) -> RecordingSpan:
     """Find the times of a log from all log times [N] of each topic; ``where`` as for :func:`survey`."""
     none = Span(0, 0, 0, {})
-    look = [_Looked(0, none, {0: t}, (np.zeros(len(s), np.int64), s)) for t, s in stamps_ns.items() if len(s)]
+    look = [_Looked(0, none, {0: t}, {0: s}) for t, s in stamps_ns.items() if len(s)]
     intervals, left_out, losses, _ = _kept_epoch(look, where)
     return RecordingSpan(tuple(intervals), left_out=left_out, losses=tuple(losses))
 
@@ -218,12 +216,12 @@ def _kept_epoch(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Looked:
-    """A span, with its channels and times if these were read because the bounds of the span are not enough."""
+    """A span, with its times by channel if these were read because the bounds of the span are not enough."""
 
     c: int
     span: Span
     topics: Mapping[int, str]
-    stamps: tuple[IntArray, IntArray] | None = None
+    stamps: Mapping[int, IntArray] | None = None
 
     def pieces(self) -> Iterator[tuple[int, int, int, Mapping[str, int]]]:
         """Yield start, end, messages, and messages by topic; one piece a stretch."""
@@ -233,7 +231,8 @@ class _Looked:
                 counts[self.topics[id_]] += messages
             yield self.span.start_ns, self.span.end_ns, sum(counts.values()), counts
             return
-        channel, times = self.stamps
+        times = np.concatenate([*self.stamps.values()])
+        channel = np.repeat([*self.stamps], [len(its) for its in self.stamps.values()])
         order = np.argsort(times, kind="stable")
         stretch = _groups(times[order], times[order], SILENCE_NS)
         for rows in np.split(order, np.flatnonzero(np.diff(stretch)) + 1):
@@ -251,8 +250,7 @@ class _Looked:
         """Return the times of a channel in file order; of an ordered span its bounds."""
         if self.stamps is None:
             return np.array([self.span.start_ns, self.span.end_ns - 1])
-        channel, times = self.stamps
-        return np.asarray(times[channel == id_], dtype=np.int64)
+        return self.stamps.get(id_, np.empty(0, np.int64))
 
 
 def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
@@ -271,8 +269,8 @@ def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
                 stamps = times(c, span)
                 if stamps is None:
                     continue  # damaged: nothing of it can be read
-                disorder = any((np.diff(times_ns) < -STEP_BACK_NS).any() for _, times_ns in _by_channel(stamps))
-                if stamps[0].size and (lasts <= 0 or lasts > SILENCE_NS or behind or disorder):
+                disorder = any((np.diff(times_ns) < -STEP_BACK_NS).any() for times_ns in stamps.values())
+                if stamps and (lasts <= 0 or lasts > SILENCE_NS or behind or disorder):
                     of = _Looked(c, span, topics, stamps)
             for id_ in span.counts:
                 newest[topics[id_]] = max(newest.get(topics[id_], 0), of.last_ns(id_))
@@ -337,11 +335,6 @@ def _cut_out(times_ns: IntArray, topic: str, place: tuple[int, int], cuts: Itera
             later = times_ns[first:]
             left_out[first:] |= (later >= cut.low_ns) & (later <= cut.high_ns)
     return left_out
-
-
-def _by_channel(stamps: tuple[IntArray, IntArray]) -> Iterable[tuple[int, IntArray]]:
-    channel, times = stamps
-    return ((int(id_), times[channel == id_]) for id_ in np.unique(channel))
 
 
 def _touches(span: Span, cut: Cut) -> bool:

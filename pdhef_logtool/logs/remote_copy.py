@@ -22,6 +22,7 @@ from pdhef_logtool.storage.files import scratch_folder
 
 #: Size of all copies together; least recently used ones are removed.
 CACHE_BYTES = 4 << 30
+_STEP_BYTES = 1 << 20
 
 
 class RemoteCopy:
@@ -76,8 +77,11 @@ class RemoteCopy:
         self._index.seek(0)
         for line in self._index.readlines():
             with suppress(ValueError):  # a line that was cut off
-                start, end, crc = map(int, line.split())
-                if crc32(self.read(start, end - start)) == crc:
+                start, end, stated = map(int, line.split())
+                crc = 0
+                for offset in range(start, end, _STEP_BYTES):
+                    crc = crc32(self.read(offset, min(_STEP_BYTES, end - offset)), crc)
+                if crc == stated:
                     yield start, end
 
 

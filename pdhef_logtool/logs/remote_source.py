@@ -12,6 +12,7 @@ import re
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping
 from concurrent.futures import Future
 from contextlib import asynccontextmanager
+from functools import cached_property
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -48,13 +49,16 @@ class RemoteSource(ByteSource):
         self._place, self._system = place, _file_system(place)
         self._size: int | None = None
         self._version = ""
-        self._blocks: dict[int, Future[None]] = {}  # by number, the request that fetches a block
+        self._requests: list[Future[None]] = []
         self._lock = Lock()
         self._at_once = asyncio.Semaphore(AT_ONCE)
         self._start(self._get, 0, 1).result()
         super().__init__(self._size or 0)
-        for start, end in self._copy.extents():
-            self._blocks |= dict.fromkeys(_blocks(start, end), _DONE)
+
+    @cached_property
+    def _blocks(self) -> dict[int, Future[None]]:
+        """Requests by the number of the block that they fetch."""
+        return {n: _DONE for start, end in self._copy.extents() for n in _numbers(start, end)}
 
     @property
     def path(self) -> Path:
@@ -89,13 +93,13 @@ class RemoteSource(ByteSource):
 
     def close(self) -> None:
         """Stop all requests and release the copy."""
-        for request in set(self._blocks.values()):
+        for request in self._requests:
             request.cancel()
         self._copy.close()
 
     def _order(self, extents: Iterable[tuple[int, int]]) -> Collection[Future[None]]:
         """Start to fetch the missing blocks of some extents; return the requests that bring all blocks of them."""
-        wanted = sorted({n for start, end in extents if end > start for n in _blocks(start, end)})
+        wanted = sorted({n for start, end in extents if end > start for n in _numbers(start, end)})
         with self._lock:
             runs: list[range] = []
             for n in (n for n in wanted if n not in self._blocks):
@@ -105,7 +109,8 @@ class RemoteSource(ByteSource):
                     runs.append(range(n, n + 1))
             for run in runs:
                 request = self._start(self._get, run.start * BLOCK_BYTES, min(run.stop * BLOCK_BYTES, self.size))
-                self._blocks |= dict.fromkeys(run, request)
+                self._requests.append(request)
+                self._blocks.update(dict.fromkeys(run, request))
             return dict.fromkeys(self._blocks[n] for n in wanted)
 
     def _wait(self, start: int, end: int) -> None:
@@ -263,7 +268,7 @@ def _file_system(place: RemotePlace) -> Any:
     return fsspec.filesystem("http", client_kwargs=client, encoded=encoded, **options)
 
 
-def _blocks(start: int, end: int) -> range:
+def _numbers(start: int, end: int) -> range:
     """Return the numbers of the blocks with bytes [start, end)."""
     return range(start // BLOCK_BYTES, -(-end // BLOCK_BYTES))
 

@@ -202,15 +202,17 @@ class SqliteContainer(Container):
         offsets = [0, *accumulate(lengths)][:-1]
         return block_from_lists(b"".join(payloads), channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
 
-    def times(self, span: Span) -> tuple[IntArray, IntArray]:
-        """Return channels and log times of one page."""
+    def times(self, span: Span) -> dict[int, IntArray]:
+        """Return the log times of one page by channel."""
         query = "SELECT topic_id, timestamp FROM messages WHERE id BETWEEN ? AND ? ORDER BY id"
         try:
-            cursor = self._db.execute(query, self._pages[span.index])
-            rows = [(t, min(ns, MAX_TIME_NS)) for t, ns in cursor if isinstance(ns, int)]
+            times: dict[int, list[int]] = {}
+            for topic, ns in self._db.execute(query, self._pages[span.index]):
+                if isinstance(ns, int):
+                    times.setdefault(topic, []).append(min(ns, MAX_TIME_NS))
         except sqlite3.Error as error:
             raise SpanDamageError(str(error)) from error
-        return np.array([t for t, _ in rows], dtype=np.int64), np.array([ns for _, ns in rows], dtype=np.int64)
+        return {topic: np.array(its, dtype=np.int64) for topic, its in times.items()}
 
 
 def _text(stored: bytes) -> str:

@@ -237,11 +237,6 @@ class CanSignalLog(DriveLog):
         view = self._views.get(topic)
         return self._log.unreadable(topic if view is None else view.topic)
 
-    def borrowed(self, topic: str) -> tuple[Path, ...]:
-        """Return the files of an installed ROS that a topic's type is read by."""
-        view = self._views.get(topic)
-        return self._log.borrowed(topic if view is None else view.topic)
-
     def first_messages(self, topic: str, most: int) -> list[object]:
         """Return the first messages of a topic whole."""
         view = self._views.get(topic)

@@ -137,6 +137,11 @@ class Field:
         return np.asarray(self.seen.cells * self.scale + self.offset)
 
     @property
+    def units(self) -> tuple[tuple[str, float], ...]:
+        """Units that are still possible."""
+        return self.factors[:1] if self.unit_known or self.fixed else self.factors
+
+    @property
     def unit_doubt(self) -> list[str]:
         """Doubt about a unit that neither the name nor the drive determines."""
         if self.unit_known or self.fixed:

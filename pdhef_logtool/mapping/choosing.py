@@ -20,13 +20,12 @@ class ChosenMapping:
 
     Attributes
     ----------
-    missing : signals without a source. ambiguities : possible errors. remarks : further information.
+    missing : signals without a source. ambiguities : possible errors.
     """
 
     mapping: Mapping
     missing: tuple[str, ...]
     ambiguities: tuple[Ambiguity, ...] = ()
-    remarks: tuple[str, ...] = ()
 
 
 def choose_mapping(
@@ -44,7 +43,7 @@ def choose_mapping(
             mapping = _filled(mapping, auto_map(log, prefer_truth=prefer_truth).mapping)
         check_mapping(mapping, log)
         missing = tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
-        return ChosenMapping(mapping, missing, (), (*mapping.notes, *_borrowed(log, mapping)))
+        return ChosenMapping(mapping, missing)
     auto = auto_map(log, prefer_truth=prefer_truth)
     if runs := next((a.candidates for a in auto.ambiguities if a.subject == RUN), ()):
         raise MappingError(
@@ -60,8 +59,7 @@ def choose_mapping(
             where=str(log.path),
             remedy="pdhef inspect LOG --fields shows every number, pdhef map LOG helps to write a mapping.toml",
         )
-    remarks = (*auto.mapping.notes, *_borrowed(log, auto.mapping))
-    return ChosenMapping(auto.mapping, auto.missing, auto.ambiguities, remarks)
+    return ChosenMapping(auto.mapping, auto.missing, auto.ambiguities)
 
 
 def tables_for(mapping: Mapping | None, settings: TableSettings) -> TableSettings:
@@ -123,17 +121,6 @@ def _filled(mapping: Mapping, auto: Mapping) -> Mapping:
         notes=(*mapping.notes, *auto.notes),
         checks=tuple(c for c in auto.checks if c.subject not in mapping.signals),
     )
-
-
-def _borrowed(log: DriveLog, mapping: Mapping) -> list[str]:
-    """Return notes on topics read with definitions of this machine, which may differ from the recorder's version."""
-    files = {source.topic: log.borrowed(source.topic) for source in mapping.sources()}
-    return [
-        f"{topic} is read by {', '.join(map(str, paths))} of this machine, as the log does not define its type: "
-        "correct only if they match the recorded version"
-        for topic, paths in files.items()
-        if paths
-    ]
 
 
 def _topics_there_are(log: DriveLog) -> str:

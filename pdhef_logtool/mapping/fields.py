@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from pdhef_logtool.mapping.candidates import Field
 from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, spread
-from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
 #: Smallest correlation that counts as a relation.
@@ -26,7 +25,6 @@ class Fields:
     anchors: dict[str, Field]
     candidates: list[Field]
     positions: list[Field]
-    checks: list[Check] = field(default_factory=list)
 
     def all(self, quantity: str, part: str | None = None) -> list[Field]:
         """Return anchors and candidates of a quantity, the surest first."""
@@ -56,15 +54,6 @@ class Fields:
         if not spread(expected) > EXCITED_A_M_S2:
             return None
         return fit(self.pieces.smooth(ay), self.pieces.smooth(expected))
-
-    def settle(self, item: Field, slope: float, by: str, tolerance: float) -> None:
-        """Select the one unit that matches a slope within the tolerance, if any."""
-        if item.unit_known or item.fixed:
-            return
-        near = [u for u, s in item.factors if abs(slope / s - 1.0) < tolerance]
-        if len(near) == 1:
-            item.use(near[0])
-            item.reasons.append(f"unit {near[0]} by {by}")
 
 
 def agree(a: FloatArray, b: FloatArray) -> bool:

@@ -21,10 +21,8 @@ from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import G_M_S2, VOCABULARY, is_command
 from pdhef_logtool.mapping.navigation import named_gnss, navigation_truth
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
-from pdhef_logtool.mapping.units import mounting_checks
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighed, weigh
-from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray, has_gnss
 
 _TOPICS = {name: frozenset(words.split()) for name, words in VOCABULARY["topics"].items()}
@@ -44,8 +42,6 @@ PROBE_NS = 2_000_000_000
 PROBE_AT = (0.0, 0.25, 0.5, 0.75, 1.0)
 #: Largest difference of the mean acceleration from 1 for accelerations in g.
 NEAR_1_G = 0.08
-#: Share of gravity in a mean acceleration that shows the vertical; largest mean acceleration in g.
-GRAVITY_SHARE, MOST_IN_G = 0.75, 3.0
 
 #: Types with velocities in the body frame by convention.
 BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove.Odometry"})
@@ -114,7 +110,7 @@ class _Draft:
     quality: QualityGate | None = None
     ambiguities: list[Ambiguity] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    checks: list[Check] = field(default_factory=list)
+    axes: dict[str, Axes] = field(default_factory=dict)
 
     def values(self, topic: str, path: str) -> FloatArray:
         return self.samples.get(topic, {}).get(path, np.empty(0))
@@ -202,7 +198,7 @@ def auto_map(
     _map_gnss(draft, topics, vendors)
     _speed_of_receiver(draft)
     mapping = Mapping(draft.signals, draft.truth, draft.quality, "auto", tuple(draft.notes))
-    mapping = replace(mapping, checks=(*draft.checks, *weighed.checks), open_signs=weighed.open_signs)
+    mapping = replace(mapping, checks=weighed.checks, open_signs=weighed.open_signs)
     candidates = weighed.candidates
     if decoded is not None:
         mapping = decoded.as_mapped(mapping)
@@ -394,7 +390,13 @@ def _map_twist(draft: _Draft, topics: list[TopicInfo]) -> None:
 
 
 def _axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> Axes:
-    """Return the axes of a twist by the path of its pose or of a fix, and by the yaw rate."""
+    """Return the axes of a twist by the path of its pose or of a fix, and by the yaw rate; each is read once."""
+    if twist.name not in draft.axes:
+        draft.axes[twist.name] = _read_axes(draft, twist, topics)
+    return draft.axes[twist.name]
+
+
+def _read_axes(draft: _Draft, twist: TopicInfo, topics: list[TopicInfo]) -> Axes:
     x, y = (_twist(twist, "linear", axis) for axis in "xy")
     if not (draft.is_given(twist.name, x) and draft.is_given(twist.name, y)):
         return ""
@@ -586,9 +588,6 @@ def _map_imu(draft: _Draft, topics: list[TopicInfo]) -> None:
         draft.notes.append(f"{imu.name} provides no acceleration (covariance -1)")
     else:
         means = [_mean(draft.values(imu.name, path)) for path in _GRAVITY_PATHS]
-        size = float(np.linalg.norm(means))
-        if size > GRAVITY_SHARE * (1.0 if size < MOST_IN_G else G_M_S2):
-            draft.checks += mounting_checks(np.array(means) / size, f"{imu.name}.linear_acceleration")
         in_g = abs(abs(means[2]) - 1.0) < NEAR_1_G and np.hypot(means[0], means[1]) < 0.5 * abs(means[2])
         if in_g:
             fast = np.abs(draft.values(imu.name, "angular_velocity.z"))

@@ -1,10 +1,11 @@
-"""Determine units that no name gives: by gravity, by other speeds and by a_y ≈ v r."""
+"""Units that no name gives: their posterior, given gravity, other speeds, a_x ≈ v̇ and a_y ≈ v r."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,19 +14,76 @@ from pdhef_logtool.mapping.evidence import fit, ratio
 from pdhef_logtool.mapping.fields import CLEAR, Fields
 from pdhef_logtool.mapping.naming import G_M_S2
 from pdhef_logtool.mapping.path import path_speed
-from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
-#: Accepted range of the slope of a_y over v r.
-SLOPES = (0.7, 1.4)
-#: Radii of wheels, of model cars to lorries.
-RADII_M = (0.02, 0.7)
+#: 1-sigma of the logarithm of a gain: of one quantity measured twice, and by accelerations with roll, grade and slip.
+SAME, BY_DRIVING = 0.03, 0.15
+#: Probability at which a unit counts as known.
+CERTAIN = 0.9
+#: Energies of rare units.
+RARE = {"mph": 1.5, "mg": 1.5}
 #: Smaller raw speeds give no information on the unit.
 SLOWEST = 1.0
-#: Minimum share of gravity along +z of an upright sensor.
-MOST_TILTED = 0.9
 #: Words in names of filtered or derived copies of a sensor.
 _SECOND_CHOICE = ("raw", "uncomp", "delta", "error", "offset", "relative")
+
+
+class Unit(NamedTuple):
+    """A unit of a field. ``factor`` to SI, with the 1-sigma ``spread`` of its logarithm; ``energy``: -ln prior odds."""
+
+    name: str
+    factor: float
+    quantity: str = ""
+    spread: float = 0.0
+    energy: float = 0.0
+
+
+class Gain(NamedTuple):
+    """A measured gain that is 1, but for a factor of 1-sigma ``sigma``, in the right units of some fields.
+
+    ``powers``: exponents of the fields' factors in the gain. ``broken``: probability that the relation does not apply.
+    """
+
+    powers: tuple[int, ...]
+    gain: float
+    sigma: float
+    broken: float = 0.01
+
+
+def posterior(units: Sequence[Sequence[Unit]], gains: Sequence[Gain]) -> FloatArray:
+    """Return the probabilities [K_1, K_2, ...] of the combinations of the K_i units of each field i.
+
+    The logarithm of a gain is normal; if its relation does not apply, it is uniform over a range of four. The
+    probabilities are those of all relations with these units; the rest is that a relation does not apply.
+    """
+    grids = np.meshgrid(*(range(len(ways)) for ways in units), indexing="ij")
+    factors, spreads, energies = (
+        [np.array([getattr(u, name) for u in ways])[grid] for ways, grid in zip(units, grids, strict=True)]
+        for name in ("factor", "spread", "energy")
+    )
+    applies = total = np.exp(-np.sum(energies, axis=0))
+    for gain in gains:
+        off, variance = math.log(abs(gain.gain)), gain.sigma**2
+        for factor, spread, power in zip(factors, spreads, gain.powers, strict=True):
+            off, variance = off + power * np.log(factor), variance + (power * spread) ** 2
+        density = (1.0 - gain.broken) * np.exp(-(off**2) / (2.0 * variance)) / np.sqrt(2.0 * np.pi * variance)
+        applies, total = applies * density, total * (density + 0.25 * gain.broken)
+    return np.asarray(applies / total.sum())
+
+
+def settle(items: Sequence[Field], gains: Sequence[Gain], by: str, bonus: float = 0.0) -> None:
+    """Select the units that are certain given these gains; fields with an uncertain name gain the score ``bonus``."""
+    if not gains:
+        return
+    joint = posterior([[Unit(*u, energy=RARE.get(u[0], 0.0)) for u in f.units] for f in items], gains)
+    for axis, item in enumerate(items):
+        share = joint.sum(axis=tuple(i for i in range(joint.ndim) if i != axis))
+        if share.max() < CERTAIN or item.fixed:
+            continue
+        if not item.unit_known:
+            item.use(item.units[int(share.argmax())][0])
+            item.reasons.append(f"unit {item.factors[0][0]} by {by}")
+        item.bonus += bonus if item.score < LEAST_SCORE else 0.0
 
 
 def decide_units(fields: Fields) -> None:
@@ -44,40 +102,12 @@ def _by_gravity(fields: Fields) -> None:
         if item.meaning.quantity == "acceleration" and item.is_axis:
             groups.setdefault(triad_of(item), {})[item.meaning.part] = item
         elif item.meaning.quantity == "acceleration" and item.meaning.part == "z":  # named vertical, without a triad
-            _use_gravity(item, float(np.nanmean(item.seen.values)), [item])
+            groups[f"{triad_of(item)}.{item.path}"] = {"z": item}
     for axes in groups.values():
-        if set(axes) != set("xyz"):
-            continue
-        means = np.array([np.nanmean(axes[a].seen.values) for a in "xyz"])
-        size = float(np.linalg.norm(means))
-        _say_mounting(fields, axes["z"], means / size if size > 0.0 else means)
-        _use_gravity(axes["z"], size, [*axes.values()])
-
-
-def _use_gravity(z: Field, size: float, axes: Sequence[Field]) -> None:
-    """Select the unit of accelerations in which their mean of this size is gravity."""
-    for item in axes:
-        near = [u for u, s in item.factors if abs(abs(size) * s / G_M_S2 - 1.0) < 0.08]
-        if near and not (item.unit_known or item.fixed):
-            item.use(near[0])
-            item.reasons.append(f"gravity: the mean of {triad_of(z)} is {size:.4g}, so it is in {near[0]}")
-
-
-def _say_mounting(fields: Fields, z: Field, gravity: FloatArray) -> None:
-    """Report an accelerometer with named axes and gravity not along +z: its axes differ from the car's."""
-    if not z.fixed and z.role not in ("command", "estimate", "truth"):
-        fields.checks += mounting_checks(gravity, triad_of(z))
-
-
-def mounting_checks(gravity: FloatArray, where: str) -> list[Check]:
-    """Return the check of a sensor with gravity [3], a unit vector, elsewhere than along its +z; empty for others."""
-    along = int(np.argmax(np.abs(gravity)))
-    if gravity[2] > MOST_TILTED or not np.abs(gravity[along]) > 0.0:
-        return []
-    sense = "-" if gravity[along] < 0.0 else "+"
-    evidence = f"gravity is along {sense}{'xyz'[along]} of {where}, not along +z: its axes are not the car's"
-    remedy = 'turn them in a mapping file, or --waive "imu.mounting"'
-    return [Check("imu.mounting", "ay_m_s2", "undecided", evidence, remedy)]
+        if set(axes) in ({"z"}, set("xyz")):
+            size = float(np.linalg.norm([np.nanmean(f.seen.values) for f in axes.values()]))
+            for item in axes.values() if size > 0.0 else ():
+                settle((item,), [Gain((1,), size / G_M_S2, SAME)], f"gravity, of which {size:.4g} is the mean")
 
 
 def _rank(fields: Fields) -> None:
@@ -93,60 +123,36 @@ def _rank(fields: Fields) -> None:
 
 
 def _speeds(fields: Fields) -> None:
-    """Determine the units of speeds by a known speed, by positions, then by a_x."""
+    """Determine the units of speeds by a known speed and by positions."""
     settled = [f for f in fields.all("speed") if f.unit_known or f.fixed]
     reference = max(settled, key=lambda f: f.score, default=None)
     path = path_speed(fields)
     for item in fields.all("speed"):
-        if reference is not None and item is not reference:
-            times = ratio(reference.si, item.seen.cells, SLOWEST)
-            fields.settle(item, times or 0.0, f"{reference.path} of {reference.topic.name}", 0.08)
-        if path is not None:
-            fields.settle(item, ratio(path, item.seen.cells, SLOWEST) or 0.0, "the positions' speed", 0.12)
+        others = [path, None if reference is None or reference is item else reference.si]
+        times = [ratio(other, item.seen.cells, SLOWEST) for other in others if other is not None]
+        settle((item,), [Gain((1,), 1.0 / x, SAME) for x in times if x is not None and x > 0.0], "other speeds")
 
 
 def _by_speeding_up(fields: Fields) -> None:
-    """Determine the units of speeds and of a_x by a_x ≈ v̇, if exactly one combination fits."""
+    """Determine the units of speeds and of a_x by a_x ≈ v̇."""
     for speed, ax in itertools.product(fields.open("speed"), fields.open("acceleration", "x")):
-        factors = [f.factors[:1] if f.unit_known or f.fixed else f.factors for f in (ax, speed)]
         # With two unknown units, x of a vector is ambiguous: it may be in the world frame.
-        if len(factors[0]) > 1 < len(factors[1]) and speed.is_axis and speed.meaning.part == "x":
+        if len(ax.units) > 1 < len(speed.units) and speed.is_axis and speed.meaning.part == "x":
             continue
         relation = fit(fields.pieces.smooth(ax.seen.cells), fields.pieces.rate_of(speed.seen.cells))
-        if relation is None or relation.correlation < CLEAR:
-            continue
-        near = [u for u in itertools.product(*factors) if abs(relation.slope * u[0][1] / u[1][1] - 1.0) < 0.25]
-        for item, (unit, _) in zip((ax, speed), near[0], strict=True) if len(near) == 1 else ():
-            if not (item.unit_known or item.fixed):
-                item.use(unit)
-                item.reasons.append(f"unit {unit} by a_x ≈ v̇")
+        if relation is not None and relation.correlation >= CLEAR:
+            settle((ax, speed), [Gain((1, -1), relation.slope, BY_DRIVING)], "a_x ≈ v̇", bonus=0.3)
 
 
 def _by_turning(fields: Fields) -> None:
-    """Determine the units of a_y, yaw rate and speed by a_y ≈ v r, if exactly one combination fits."""
+    """Determine the units of a_y, yaw rate and speed by a_y ≈ v r."""
     speed = fields.best("speed") or fields.wheel_mean()
     if speed is None:
         return
-    for rate in fields.open("rate", "z")[:4]:
-        for ay in fields.open("acceleration", "y")[:4]:
-            trio = (ay, rate, speed)
-            units = () if all(f.unit_known for f in trio) else _units_of_turning(fields, trio)
-            for item, unit in zip(trio, units, strict=False):
-                if not item.unit_known and not item.fixed:
-                    item.use(unit)
-                    item.reasons.append(f"unit {unit} by a_y ≈ v r")
-                    item.bonus += 0.3 if item.score < LEAST_SCORE else 0.0
-
-
-def _units_of_turning(fields: Fields, trio: tuple[Field, Field, Field]) -> tuple[str, ...]:
-    """Return the units of a_y, yaw rate and speed with a slope near 1; empty unless they are unique."""
-    fits = []
-    for units in itertools.product(*(f.factors[:1] if f.unit_known or f.fixed else f.factors for f in trio)):
-        relation = fields.turning(*(f.seen.cells * factor for f, (_, factor) in zip(trio, units, strict=True)))
-        if relation is not None and abs(relation.correlation) > CLEAR and SLOPES[0] < abs(relation.slope) < SLOPES[1]:
-            fits.append(units)
-    # Combinations that differ only in the unit of a_y: the conventional unit is first.
-    return tuple(unit for unit, _ in fits[0]) if fits and all(f[1:] == fits[0][1:] for f in fits) else ()
+    for rate, ay in itertools.product(fields.open("rate", "z")[:4], fields.open("acceleration", "y")[:4]):
+        relation = fields.turning(*(f.seen.cells for f in (ay, rate, speed)))
+        if relation is not None and abs(relation.correlation) > CLEAR:
+            settle((ay, rate, speed), [Gain((1, -1, -1), relation.slope, BY_DRIVING)], "a_y ≈ v r", bonus=0.3)
 
 
 def _by_siblings(fields: Fields) -> None:

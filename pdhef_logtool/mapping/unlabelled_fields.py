@@ -18,8 +18,9 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import ANGLES, HYPOTHESES, MOST_FIELDS, Field, Role, stamp_of
 from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, is_of_both_signs, ratio, spread
 from pdhef_logtool.mapping.fields import EXCITED_A_M_S2, Fields
-from pdhef_logtool.mapping.naming import G_M_S2, Meaning, is_command, is_unlabelled, meaning_of
+from pdhef_logtool.mapping.naming import Meaning, is_command, is_unlabelled, meaning_of
 from pdhef_logtool.mapping.path import path_speed
+from pdhef_logtool.mapping.units import CERTAIN, Gain, Unit, posterior
 from pdhef_logtool.records.signals import FloatArray
 
 #: Maximum number of columns to examine, in total and per array.
@@ -35,8 +36,9 @@ CLEARER = 0.05
 BY_SPEED, BY_ROOT = 0.6, 0.85
 #: Minimum lead of a_y over v r, as the sideslip of a car grows first; a yaw rate lags the steering.
 AHEAD_S = 0.05
-#: Tolerance factors of a slope: accelerations include roll and grade.
-SLOPE, LOOSE_SLOPE = 1.25, 1.6
+#: 1-sigma of the logarithm of a slope: accelerations include roll and grade. Least probability of the units of a
+#: competing choice.
+SLOPE, PLAUSIBLE = 0.08, 1e-4
 #: Smallest standard deviation of an acceleration; a yaw rate in rad/s is smaller.
 LEAST_AY_M_S2 = 0.4
 #: Minimum correlation between copies of a quantity.
@@ -47,31 +49,22 @@ ITSELF = 0.999
 BY_LETTER = 0.6
 #: Minimum correlation of a steering angle with the path's curvature.
 STEERS = 0.9
-_UNITS = HYPOTHESES | {"acceleration": (("m/s²", 1.0), ("g", G_M_S2))}
 
 
 @dataclass(frozen=True, slots=True)
 class _Choice:
     """Columns chosen as speed, yaw rate, a_y and a_x, their relations, and the units of the first three.
 
-    ``is_strict``: both relations fit well enough, with plausible slopes and a large enough a_y, to be accepted unless
+    ``is_strict``: both relations fit well enough, with certain units and a large enough a_y, to be accepted unless
     another choice fits almost as well. ``ahead_s``: lead of a_y over v r.
     """
 
-    v: Field
-    r: Field
-    y: Field
-    x: Field
+    columns: tuple[Field, Field, Field, Field]
     turning: Fit
     speeding: Fit
-    units: tuple[tuple[str, float], tuple[str, float], tuple[str, float]]
+    units: tuple[tuple[str, float], ...]
     is_strict: bool
     ahead_s: float
-
-    @property
-    def columns(self) -> tuple[Field, ...]:
-        """The four columns."""
-        return (self.v, self.r, self.y, self.x)
 
     @property
     def score(self) -> float:
@@ -81,8 +74,9 @@ class _Choice:
     @property
     def evidence(self) -> str:
         """Description of the relations."""
-        first = f"{self.y.path} follows {self.v.path} times {self.r.path} ({self.turning.correlation:.2f})"
-        second = f"{self.x.path} the rate of change of {self.v.path} ({self.speeding.correlation:.2f})"
+        v, r, y, x = (f.path for f in self.columns)
+        first = f"{y} follows {v} times {r} ({self.turning.correlation:.2f})"
+        second = f"{x} the rate of change of {v} ({self.speeding.correlation:.2f})"
         return f"{first} and {second}, and units explain both slopes"
 
 
@@ -133,119 +127,93 @@ def identified(fields: Fields, unlabelled: Sequence[Field]) -> tuple[list[Field]
 
 def _as_chosen(fields: Fields, unlabelled: Sequence[Field], choice: _Choice, why: str) -> list[Field]:
     """Return the columns of a choice with their quantities, and the steering column."""
-    speed_unit, rate_unit, unit = choice.units
-    speed_is_sure = _speed_is_sure(fields, choice.v, speed_unit)
-    speed_why = why if speed_is_sure else f"{why}; a wheel that turns in rad/s may look the same"
-    signs = [math.copysign(1.0, relation.slope) for relation in (choice.turning, choice.speeding)]
-    meanings = [
-        (choice.v, Meaning("speed", "x", 1.0, *speed_unit, speed_why), 1.0),
-        (choice.r, Meaning("rate", "z", 1.0, *rate_unit, why), 1.0),
-        (choice.y, Meaning("acceleration", "y", 1.0, *unit, why), signs[0]),
-        (choice.x, Meaning("acceleration", "x", 1.0, *unit, why), signs[1]),
-    ]
-    results = [_named(f, m, sign, sure=f is not choice.v or speed_is_sure) for f, m, sign in meanings if _open(f)]
-    for item, meaning, _ in meanings:
-        if not _open(item) and _is_raw(item) and (item is not choice.v or speed_is_sure):
-            item.use(meaning.unit)
-            item.reasons.append(f"unit {meaning.unit}, as {why}")
+    speed, rate = (f.seen.cells * unit[1] for f, unit in zip(choice.columns[:2], choice.units, strict=False))
+    path = path_speed(fields)
+    times = None if path is None else ratio(path, speed, 1.0)
+    # A wheel speed in rad/s may look like a speed.
+    is_speed = choice.units[0][0] == "m/s" if times is None else abs(times - 1.0) < 0.08
+    results: list[Field] = []
+    kinds = (("speed", "x"), ("rate", "z"), ("acceleration", "y"), ("acceleration", "x"))
+    signs = (1.0, 1.0, *(math.copysign(1.0, relation.slope) for relation in (choice.turning, choice.speeding)))
+    units = (*choice.units, choice.units[2])
+    for item, kind, (unit, factor), sign in zip(choice.columns, kinds, units, signs, strict=True):
+        is_sure = is_speed or item is not choice.columns[0]
+        said = why if is_sure else f"{why}; a wheel that turns in rad/s may look the same"
+        if _is_open(item):
+            meaning = Meaning(*kind, 1.0, unit, factor, said)
+            doubts = [] if is_sure else ["its name gives no quantity, and its values do not decide"]
+            named = replace(item, meaning=meaning, factors=((unit, factor),), sign=sign, unit_known=is_sure, reasons=[])
+            results.append(replace(named, doubts=doubts, is_weak=item.is_weak or not is_sure))
+        elif is_sure and not (item.unit_known or item.fixed):
+            item.use(unit)
+            item.reasons.append(f"unit {unit}, as {said}")
     rest = [f for f in unlabelled if not any(f is c for c in choice.columns)]
-    return results + _steering(fields, rest, _values(choice.v) * speed_unit[1], _values(choice.r) * rate_unit[1])
+    return results + _steering(fields, rest, speed, rate)
 
 
 def _choices(fields: Fields, unlabelled: Sequence[Field]) -> Iterator[_Choice]:
     """Yield the choices that satisfy the relations with plausible slopes."""
     signed = [f for f in unlabelled if is_of_both_signs(f.seen.values)]
-    forward = [f for f in unlabelled if _is_forward(f)]
-    others = {"speed": forward, "rate": signed, "ay": signed, "ax": list(unlabelled)}
-    speeds, rates, ays, axs = (_known(fields, n) or columns for n, columns in others.items())
-    smooth = {id(f): fields.pieces.smooth(_values(f)) for f in {id(f): f for f in (*ays, *axs)}.values()}
+    others = (("speed", None, [f for f in unlabelled if _is_forward(f)]), ("rate", "z", signed),
+              ("acceleration", "y", signed), ("acceleration", "x", unlabelled))  # fmt: skip
+    speeds, rates, ays, axs = (_known(fields, name, part) or columns for name, part, columns in others)
+    smooth = {id(f): fields.pieces.smooth(f.seen.cells) for f in (*ays, *axs)}
     for v in speeds:
-        change = fields.pieces.rate_of(_values(v))
+        change = fields.pieces.rate_of(v.seen.cells)
         fits = [(x, fit(change, smooth[id(x)])) for x in axs if x is not v]
-        # Regress in the direction in which grade and noise of a_x do not reduce the slope.
-        ways = [
-            (x, replace(relation, slope=relation.correlation**2 / relation.slope))
-            for x, relation in fits
-            if relation is not None and abs(relation.correlation) > LOOSE_SPEEDS_UP
-        ]
+        ways = [(x, f) for x, f in fits if f is not None and abs(f.correlation) > LOOSE_SPEEDS_UP]
         for r, y in itertools.product(rates, ays):
-            if r is not y and v is not r and v is not y:
-                yield from _choices_of(
-                    fields, (v, r, y), smooth[id(y)], [w for w in ways if w[0] is not r and w[0] is not y]
-                )
-
-
-def _choices_of(
-    fields: Fields, columns: tuple[Field, Field, Field], ay: FloatArray, ways: Sequence[tuple[Field, Fit]]
-) -> Iterator[_Choice]:
-    """Yield the choices with a given speed, yaw rate and a_y."""
-    turning, by_speed, ahead_s = _turning(fields, *columns[:2], ay)
-    for x, speeding in ways if turning is not None else ():
-        explained = None if turning is None else _explained((*columns, x), turning, speeding)
-        if turning is not None and explained is not None:
-            units, off = explained
-            fits = by_speed and abs(speeding.correlation) > SPEEDS_UP
-            strict = fits and off < math.log(SLOPE) and spread(ay) * units[2][1] > LEAST_AY_M_S2
-            yield _Choice(*columns, x, turning, speeding, units, strict, ahead_s)
+            turning, by_speed, ahead_s = _turning(fields, v, r, smooth[id(y)])
+            for x, speeding in ways:
+                if turning is None:
+                    break
+                columns = (v, r, y, x)
+                units, share = _explained(columns, turning, speeding)
+                if share < PLAUSIBLE or len({*map(id, columns)}) < len(columns):
+                    continue
+                is_strict = by_speed and abs(speeding.correlation) > SPEEDS_UP and share > CERTAIN
+                is_strict &= spread(smooth[id(y)]) * units[2][1] > LEAST_AY_M_S2
+                yield _Choice(columns, turning, speeding, units, is_strict, ahead_s)
 
 
 def _turning(fields: Fields, v: Field, r: Field, ay: FloatArray) -> tuple[Fit | None, bool, float]:
     """Fit a_y to v r; return the fit, whether other powers of the speed fit worse, and the lead of a_y in s."""
-    smooth, speed = fields.pieces.smooth, _values(v)
-    with np.errstate(invalid="ignore"):
-        relation, root, alone = (fit(ay, smooth(np.maximum(speed, 0.0) ** p * _values(r))) for p in (1.0, 0.5, 0.0))
+    smooth, speed, rate = fields.pieces.smooth, np.maximum(v.seen.cells, 0.0), r.seen.cells
+    relation, root, alone = (fit(ay, smooth(speed**p * rate)) for p in (1.0, 0.5, 0.0))
     if relation is None or root is None or alone is None or abs(relation.correlation) < LOOSE_TURNS:
         return None, False, 0.0
     if abs(alone.correlation) > ITSELF:
         return None, False, 0.0
     left, of_root, of_alone = (1.0 - f.correlation**2 for f in (relation, root, alone))
     strict = abs(relation.correlation) > TURNS and left < BY_SPEED * of_alone and left < BY_ROOT * of_root
-    ahead_s = fields.pieces.ahead_s(ay, smooth(speed * _values(r)))
+    ahead_s = fields.pieces.ahead_s(ay, smooth(v.seen.cells * rate))
     return relation, strict and ahead_s > AHEAD_S, ahead_s
 
 
 def _explained(
     columns: tuple[Field, Field, Field, Field], turning: Fit, speeding: Fit
-) -> tuple[tuple[tuple[str, float], tuple[str, float], tuple[str, float]], float] | None:
-    """Return the units of speed, yaw rate and accelerations that explain the slopes, and the log error of the slopes.
-
-    Return None if no units do.
-    """
+) -> tuple[tuple[tuple[str, float], ...], float]:
+    """Return the likeliest units of speed, yaw rate and accelerations by both slopes, and their probability."""
     v, r, y, x = columns
-    ways = []
-    for speed, rate, unit in itertools.product(_units(v, "speed"), _units(r, "rate"), _units(y, "acceleration")):
-        slopes = abs(turning.slope) * unit[1] / rate[1], abs(speeding.slope) * (unit[1] if _is_raw(x) else 1.0)
-        off = [abs(math.log(slope / speed[1])) for slope in slopes]
-        if max(off) < math.log(LOOSE_SLOPE):
-            ways.append((sum(off), (speed, rate, unit), max(off)))
-    return min(ways)[1:] if ways else None
+    units = [HYPOTHESES[q] if _is_open(f) else f.units for f, q in ((v, "speed"), (r, "rate"), (y, "acceleration"))]
+    # Regress in the direction in which grade and noise of a_x do not reduce the slope.
+    gain = speeding.correlation**2 / speeding.slope * (1.0 if len(x.units) > 1 or _is_open(x) else x.factors[0][1])
+    powers = (-1, 0, 1 if len(x.units) > 1 or _is_open(x) else 0)
+    joint = posterior([[Unit(*u) for u in ways] for ways in units], [
+        Gain((-1, -1, 1), turning.slope, SLOPE), Gain(powers, gain, SLOPE)])  # fmt: skip
+    best = np.unravel_index(int(joint.argmax()), joint.shape)
+    return tuple(ways[i] for ways, i in zip(units, best, strict=True)), float(joint.max())
 
 
-def _units(item: Field, quantity: str) -> tuple[tuple[str, float], ...]:
-    if not _is_raw(item):
-        return (("", 1.0),)
-    return _UNITS[quantity] if _open(item) else tuple(u for u in _UNITS[quantity] if u in item.factors)
-
-
-def _open(item: Field) -> bool:
+def _is_open(item: Field) -> bool:
     """Return whether a column has no name."""
     return not item.meaning.quantity
 
 
-def _is_raw(item: Field) -> bool:
-    """Return whether a column has no name, or a name without a unit."""
-    return _open(item) or not (item.unit_known or item.fixed)
-
-
-def _values(item: Field) -> FloatArray:
-    return item.seen.cells if _is_raw(item) else item.si
-
-
-def _known(fields: Fields, what: str) -> list[Field]:
+def _known(fields: Fields, quantity: str, part: str | None) -> list[Field]:
     """Return the surest named field of a quantity, with a known unit first, as a list of at most one."""
-    kind = {"speed": ("speed", None), "rate": ("rate", "z"), "ay": ("acceleration", "y"), "ax": ("acceleration", "x")}
-    every = [f for f in fields.all(*kind[what]) if f.seen.changes and (f.meaning.strength > BY_LETTER or f.fixed)]
-    return sorted(every, key=_is_raw)[:1]
+    every = [f for f in fields.open(quantity, part) if f.meaning.strength > BY_LETTER or f.fixed]
+    return sorted(every, key=lambda f: not (f.unit_known or f.fixed))[:1]
 
 
 def _is_forward(item: Field) -> bool:
@@ -259,28 +227,7 @@ def _is_forward(item: Field) -> bool:
 
 def _same(a: _Choice, b: _Choice) -> bool:
     """Return whether two choices use the same columns or copies of them."""
-    for item, other in zip(a.columns, b.columns, strict=True):
-        relation = None if item is other else fit(_values(item), _values(other))
-        if item is not other and (relation is None or abs(relation.correlation) < COPY):
-            return False
-    return True
-
-
-def _speed_is_sure(fields: Fields, speed: Field, unit: tuple[str, float]) -> bool:
-    """Return whether no wheel speed in rad/s can be mistaken for the speed."""
-    path = path_speed(fields)
-    times = None if path is None else ratio(path, _values(speed) * unit[1], 1.0)
-    return unit[0] == "m/s" if times is None else abs(times - 1.0) < 0.08
-
-
-def _named(item: Field, meaning: Meaning, sign: float, *, sure: bool) -> Field:
-    """Return a column with its quantity, marked as weak if it is uncertain."""
-    factors = ((meaning.unit, meaning.scale or 1.0),)
-    named = replace(item, meaning=meaning, factors=factors, sign=sign, unit_known=sure, reasons=[], doubts=[])
-    if not sure:
-        named.is_weak = True
-        named.doubts.append("its name gives no quantity, and its values do not decide")
-    return named
+    return all(item is other or _is_copy(item, other) for item, other in zip(a.columns, b.columns, strict=True))
 
 
 def _steering(fields: Fields, columns: Sequence[Field], speed: FloatArray, rate: FloatArray) -> list[Field]:

@@ -14,8 +14,8 @@ import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import (
+    HYPOTHESES,
     LEAST_SCORE,
-    SPEEDS,
     Candidate,
     Field,
     Role,
@@ -32,7 +32,7 @@ from pdhef_logtool.mapping.ground_speed import axes_of
 from pdhef_logtool.mapping.naming import words_of
 from pdhef_logtool.mapping.path import path_velocity
 from pdhef_logtool.mapping.records import SignalSource
-from pdhef_logtool.mapping.units import RADII_M, decide_units
+from pdhef_logtool.mapping.units import BY_DRIVING, Gain, Unit, decide_units, posterior
 from pdhef_logtool.mapping.unlabelled_fields import identified, needs_unlabelled, unlabelled_columns
 from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check
@@ -53,8 +53,6 @@ _SENSORS = (
 EXCITED_CURVATURE_1_M = 0.0001
 #: Least correlation of a yaw rate about the right axis.
 FOLLOWS = 0.5
-#: Relative tolerance between wheel speeds in a unit of speed and the speed; beyond, the wheel speeds are rotational.
-WHEEL_UNIT = 0.04
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
@@ -62,9 +60,17 @@ _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
 #: length of a steering angle and a usual length if the signal could also be a share of the largest angle.
 _SIGNED = ("steer_rad", "steering_wheel_rad", "yaw_rate_rad_s", "ay_m_s2")
 SLOW_M_S, USUAL = 1.0, 0.6
-#: Units of rotational speeds, and the usual radius of a wheel.
-TURNING = (("rad/s", 1.0), ("rpm", 2.0 * math.pi / 60.0))
-USUAL_RADIUS_M = 0.3
+#: Usual lengths. Units of wheel speeds, which are mostly named as speeds; their energies where the rest is in SI units.
+USUAL_LENGTH_M = {"steer_rad": 2.7, "steering_wheel_rad": 43.0}
+#: Usual radius of a wheel, and 1-sigma of the logarithm of a radius that a car assumes for its wheel speeds.
+USUAL_RADIUS_M, WHEEL_RADIUS = 0.3, 0.015
+WHEEL_UNITS = (
+    *(Unit(*u, "wheel speed") for u in HYPOTHESES["wheel speed"]),
+    *(Unit(n, f * USUAL_RADIUS_M, "wheel rate", 0.4) for n, f in HYPOTHESES["wheel rate"]),
+)
+IN_SI = {"m/s": 0.0, "km/h": 3.0, "mph": 3.0, "rad/s": 0.0, "rpm": 3.0}
+#: Probability, relative to that of the best unit, of another unit that is a doubt: of wheels, and of a steering angle.
+POSSIBLE, LIKELY = 0.05, 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,9 +222,6 @@ class _Weighing:
         self.checks.append(Check("mapping.names", "mapping", "undecided", evidence, remedy))
 
     def _take(self, name: str, candidates: Sequence[Field]) -> None:
-        if name == "speed_m_s":
-            for item in candidates:
-                self._follows_ax(item)
         ordered = sorted(candidates, key=lambda f: (-f.score, -f.topic.messages, f.topic.name, f.path))
         good = [f for f in ordered if f.score >= LEAST_SCORE]
         if not good:
@@ -233,18 +236,6 @@ class _Weighing:
         self.taken[name] = best
         if rivals:
             self.rivals.append((name, tuple(f"{f.topic.name}.{f.path}" for f in (best, *rivals))))
-
-    def _follows_ax(self, item: Field) -> None:
-        """Raise the score of a speed with a weak name if its rate of change follows a_x."""
-        if item.score >= LEAST_SCORE or item.meaning.strength >= 0.7:
-            return
-        for ax in self.fields.all("acceleration", "x")[:2]:
-            relation = fit(self.fields.pieces.smooth(ax.si), self.fields.pieces.rate_of(item.seen.cells))
-            if relation is not None and relation.correlation > 0.6:
-                item.bonus += 0.3
-                item.reasons.append(f"its rate of change follows a_x (correlation {relation.correlation:.2f})")
-                self.fields.settle(item, relation.slope, "its rate of change against a_x", 0.4)
-                return
 
     def _turn_about(self) -> None:
         """Select the yaw rate's axis by a_y ≈ v r if a_y names the car's axis and the yaw rate a device's."""
@@ -263,41 +254,36 @@ class _Weighing:
         wheels = _wheel_set(usable)
         if len(wheels) < 2:
             return
-        reference = self._chosen("speed_m_s")
-        mean = mean_of([f.seen.cells for f in wheels.values()])
-        first = next(iter(wheels.values()))
-        kind, doubt, reason = first.meaning.quantity, "", ""
-        if not (first.unit_known or first.fixed):
-            times = None if reference is None else ratio(mean, reference.si, SLOW_M_S)
-            if times is None and reference is None:
-                kind, unit, reason, doubt = self._wheel_unit_by_turning(mean)
-            else:
-                beside = [f for f in self.taken.values() if f.topic is first.topic and not (f.meaning.unit or f.fixed)]
-                in_si = len(beside) > 2 and all(f.factors[0][1] == 1.0 for f in beside)
-                kind, unit, reason, doubt = _wheel_unit(times, reference, in_si=in_si)
-            for item in wheels.values():
-                item.factors = ((unit[0], unit[1]),)
-                item.unit_known = not doubt
+        kind = self._wheel_unit([*wheels.values()])
         for corner, item in wheels.items():
-            item.reasons += [reason] if reason else []
-            item.doubts += [doubt] if doubt else []
             self.taken[f"wheel_speed_{corner}_{'rad_s' if kind == 'wheel rate' else 'm_s'}"] = item
 
-    def _wheel_unit_by_turning(self, mean: FloatArray) -> tuple[str, tuple[str, float], str, str]:
-        """Return :func:`_wheel_unit` by a_y ≈ v r, which is less accurate because a_y includes roll."""
+    def _wheel_unit(self, wheels: Sequence[Field]) -> str:
+        """Select the unit of wheel speeds by the speed, without one by a_y ≈ v r; return their quantity."""
+        first, speed = wheels[0], self._chosen("speed_m_s")
+        if first.unit_known or first.fixed:
+            return first.meaning.quantity
+        mean = mean_of([f.seen.cells for f in wheels])
+        times, sigma = self._per_turning(mean), BY_DRIVING
+        if speed is not None:
+            times, sigma = ratio(mean, speed.si, SLOW_M_S), WHEEL_RADIUS
+        beside = [f for f in self.taken.values() if f.topic is first.topic and not (f.meaning.unit or f.fixed)]
+        in_si = speed is not None and len(beside) > 2 and all(f.factors[0][1] == 1.0 for f in beside)
+        best, reason, doubt = _likeliest_unit(times, sigma, "a_y ≈ v r" if speed is None else "the speed", in_si=in_si)
+        if times is not None and not (doubt or speed is None or speed.unit_known):
+            doubt = "the unit of the speed that they are compared with is unsure"
+        for item in wheels:
+            item.factors = ((best.name, best.factor / (USUAL_RADIUS_M if best.spread else 1.0)),)
+            item.unit_known = not doubt
+            item.reasons += [reason] if reason else []
+            item.doubts += [doubt] if doubt else []
+        return best.quantity
+
+    def _per_turning(self, speed: FloatArray) -> float | None:
+        """Return how much of a speed [M] in another unit is 1 m/s by a_y ≈ v r; None if the drive does not show it."""
         rate, ay = self._chosen("yaw_rate_rad_s"), self._chosen("ay_m_s2")
-        relation = None if rate is None or ay is None else self.fields.turning(ay.si, rate.si, mean)
-        if relation is None or abs(relation.correlation) < CLEAR:
-            return _wheel_unit(None, None)
-        metres = abs(relation.slope)
-        ways = [(abs(math.log(metres / unit[1])) / math.log(1.3), "wheel speed", unit) for unit in SPEEDS]
-        for turning in TURNING:  # speeds have priority if the name is that of a speed
-            off = abs(math.log(metres / turning[1] / USUAL_RADIUS_M)) / math.log(1.3)
-            ways.append((1.0 + off, "wheel rate", turning))
-        (_, kind, taken), (_, _, other) = sorted(ways)[:2]
-        said = f"{1.0 / metres:.4g} of it is 1 m/s by a_y ≈ v r"
-        doubt = f"the unit of the wheel speeds is not given: by a_y ≈ v r {taken[0]} is most likely, then {other[0]}"
-        return kind, taken, said, doubt
+        relation = None if rate is None or ay is None else self.fields.turning(ay.si, rate.si, speed)
+        return None if relation is None or abs(relation.correlation) < CLEAR else 1.0 / abs(relation.slope)
 
     # --------------------------------------------------------------------------------------------- steering
 
@@ -335,21 +321,22 @@ class _Weighing:
         kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(item.meaning.part, tuple(_STEERING_M))
         if relation is None or abs(relation.correlation) < CLEAR:
             return _steering_by_range(item, kinds, relation)
-        length = abs(relation.slope)
-        units = item.factors[:1] if item.unit_known or item.fixed else item.factors
-        fits = [(k, u) for k in kinds for u in units if _STEERING_M[k][0] <= length * u[1] <= _STEERING_M[k][1]]
-        if not fits:
-            metres = length * item.factors[0][1]
-            item.doubts.append(f"its ratio to the path's curvature is {metres:.3g} m, which no car has in this unit")
+        metres = abs(relation.slope)
+        ways = [Unit(u, f / USUAL_LENGTH_M[k], k, 0.7) for k in kinds for u, f in item.units]
+        shares = posterior([ways], [Gain((1,), metres, BY_DRIVING, 1e-3)])
+        likely = [ways[i] for i in np.argsort(-shares) if shares[i] >= LIKELY * shares.max()]
+        name, unit = likely[0].quantity, likely[0].name
+        usual = metres * likely[0].factor
+        low, high = _STEERING_M[name]
+        if not low <= (length := usual * USUAL_LENGTH_M[name]) <= high:
+            item.doubts.append(f"its ratio to the path's curvature is {length:.3g} m, which no car has in this unit")
             return kinds[0], None
-        name, (unit, factor) = min(fits, key=lambda f: _unlikely(f[0], length * f[1][1]))
         item.use(unit)
-        item.reasons.append(f"ratio to the path's curvature {length * factor:.3g} m: {name} in {unit}")
-        if _unlikely(name, length * factor) < USUAL:
+        item.reasons.append(f"ratio to the path's curvature {length:.3g} m: {name} in {unit}")
+        if abs(math.log(usual)) < USUAL:
             item.doubts = [d for d in item.doubts if "a share" not in d]
-        rest = [f for f in fits if f != (name, (unit, factor)) and _unlikely(f[0], length * f[1][1]) < 1.0]
-        if rest and not item.fixed:
-            item.doubts.append(f"it could be {rest[0][0]} in {rest[0][1][0]} as well")
+        if likely[1:] and not item.fixed:
+            item.doubts.append(f"it could be {likely[1].quantity} in {likely[1].name} as well")
         return name, True
 
     def _open_signs(self) -> tuple[tuple[str, ...], ...]:
@@ -362,11 +349,6 @@ class _Weighing:
         if lateral is not None and across is not None and _share_axis(lateral, across):
             groups[groups.index(("ay_m_s2",))] = ("ay_m_s2", "truth.vy_m_s")
         return tuple(groups)
-
-    def _is_of_ours(self, check: Check) -> bool:
-        """Return whether a check concerns a selected accelerometer."""
-        item = self.taken.get(check.subject)
-        return item is not None and f" of {triad_of(item)}, " in check.evidence
 
     def _speed(self) -> Field | None:
         """Return the best speed to compare other signals with, selected or not."""
@@ -446,7 +428,7 @@ class _Weighing:
             candidates=tuple(sorted(candidates, key=lambda c: (not c.taken, -c.score))),
             notes=tuple(self.notes),
             rivals=tuple(self.rivals),
-            checks=(*(c for c in self.fields.checks if self._is_of_ours(c)), *self.checks),
+            checks=tuple(self.checks),
             open_signs=self._open_signs(),
         )
 
@@ -543,40 +525,16 @@ def _curvature(speed: Field | None, rate: Field | None, ay: Field | None) -> Flo
     return curve if spread(curve) > EXCITED_CURVATURE_1_M else None
 
 
-def _unlikely(name: str, metres: float) -> float:
-    """Return the log ratio of a length to the usual one: 2.7 m, times 16 for a steering wheel."""
-    return abs(math.log(metres / (2.7 if name == "steer_rad" else 43.0)))
-
-
-def _wheel_unit(
-    times: float | None, reference: Field | None, *, in_si: bool = False
-) -> tuple[str, tuple[str, float], str, str]:
-    """Return quantity, unit, reason and doubt of wheel speeds without a unit in their name.
-
-    Parameters
-    ----------
-    times : raw value per 1 m/s of the reference speed; None without a reference or a constant ratio.
-    in_si : the other signals of the topic are in SI units, although no name contains a unit.
-    """
-    if times is None or reference is None:
+def _likeliest_unit(times: float | None, sigma: float, by: str, *, in_si: bool) -> tuple[Unit, str, str]:
+    """Return the likeliest unit of wheel speeds if ``times`` of it are 1 m/s, the reason and the doubt."""
+    if times is None or not times > 0.0:
         doubt = "the unit of the wheel speeds is not given, and no speed to compare with; taken as m/s"
-        return "wheel speed", ("m/s", 1.0), "", doubt
-    unsure = "" if reference.unit_known else "the unit of the speed that they are compared with is unsure"
-    said = f"{times:.4g} of it is 1 m/s of speed"
-    for unit, factor in SPEEDS:
-        off = abs(times * factor - 1.0)
-        if off < WHEEL_UNIT:
-            also = (
-                f"it could be rad/s with a radius of {1 / times:.3f} m as well" if factor < 1.0 and off > 0.01 else ""
-            )
-            if in_si and also:
-                doubt = f"it could be {unit} as well; taken as rad/s, as the rest is in SI units"
-                return "wheel rate", ("rad/s", 1.0), f"{said}: a radius of {1 / times:.3f} m", doubt
-            return "wheel speed", (unit, factor), said, unsure or also
-    for unit, factor in TURNING:
-        if RADII_M[0] < (radius_m := 1.0 / (times * factor)) < RADII_M[1]:
-            return "wheel rate", (unit, factor), f"{said}: a radius of {radius_m:.3f} m in {unit}", unsure
-    return "wheel speed", ("m/s", 1.0), "", f"{said}, which is no unit of wheel speeds; taken as m/s"
+        return WHEEL_UNITS[0], "", doubt
+    units = [u._replace(energy=IN_SI[u.name]) if in_si else u for u in WHEEL_UNITS]
+    shares = posterior([units], [Gain((1,), times, sigma)])
+    best, *others = (units[i] for i in np.argsort(-shares) if shares[i] >= POSSIBLE * shares.max())
+    doubt = f"it could be {' or '.join(u.name for u in others)} as well" if others else ""
+    return best, f"{times:.4g} of it is 1 m/s by {by}", doubt
 
 
 def _truth_name(item: Field) -> str:

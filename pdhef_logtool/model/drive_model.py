@@ -11,14 +11,11 @@ from typing import TYPE_CHECKING, Any
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.model import CarModel, TaughtParameter
 from pdhef_logtool.car.parts import physics_sha256
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.drive.model_file import Sensors
 from pdhef_logtool.drive.options import AUTO
 from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.estimators.drive_signals import DriveSignals
-from pdhef_logtool.estimators.latency_compensation import run_estimator
-from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.evaluation.metrics.metric import SensorErrors
+from pdhef_logtool.estimators.drive_signals import DriveSignals, calibrated_signals
+from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.signals import Signals
 
@@ -38,14 +35,12 @@ class DriveModel:
     Attributes
     ----------
     reading : field, unit, sign and axes of every signal.
-    sensors : clocks, delays and alignment. errors : biases, gain and position of the IMU.
-    car : the car with the vehicle of the posterior.
+    sensors : clocks, delays and alignment. car : the car with the vehicle of the posterior.
     posterior : of the car's parameters; None: the vehicle file is used unchanged.
     """
 
     reading: Mapping
     sensors: Sensors
-    errors: SensorErrors
     car: Car
     posterior: SelfCalibration | None = None
 
@@ -65,7 +60,7 @@ class DriveModel:
         if drive.options.model != AUTO or lacking(drive):
             return cls.of(drive, prior_calibration(car.vehicle, taught))
         posterior = self_calibrate([read_driving(drive)], car.vehicle, taught=taught)
-        return cls.of(drive, posterior if posterior.refused else _with_consistency(drive, posterior))
+        return cls.of(drive, posterior)
 
     @classmethod
     def of(cls, drive: Drive, posterior: SelfCalibration | None = None) -> DriveModel:
@@ -73,11 +68,18 @@ class DriveModel:
         car = drive.car
         if posterior is not None and not posterior.refused:
             car = replace(car, self_calibrated=_without_truth(drive, posterior))
-        return cls(drive.mapping, drive.plan.sensors, _errors(drive, posterior), car, posterior)
+        return cls(drive.mapping, drive.plan.sensors, car, posterior)
 
     def apply(self, signals: Signals) -> DriveSignals:
         """Return the signals [N] of the drive, corrected for the vehicle file and for the vehicle of the posterior."""
         return DriveSignals.of(signals, self.car)
+
+    def calibrated(self, signals: Signals) -> CalibratedSignals:
+        """Return the signals [N] of the drive, corrected for the vehicle of the posterior."""
+        posterior = self.posterior
+        delay_s = 0.0 if posterior is None or posterior.refused else posterior.steer_delay_s
+        vehicle = self.car.calibrated_car.physics_vehicle
+        return CalibratedSignals(calibrated_signals(signals, self.car), vehicle, delay_s)
 
     @property
     def file(self) -> CarModel:
@@ -131,24 +133,7 @@ def read_driving(drive: Drive) -> Driving:
     """
     from pdhef_logtool.estimators.calibration.driving import driving_of
 
-    return driving_of(drive.friction.known(drive.whole(fill_friction=False).signals), drive.car.vehicle)
-
-
-def file_errors(vehicle: VehicleParameters) -> SensorErrors:
-    """Return the sensor errors of signals that were read with a vehicle file: only those that its entries describe."""
-    gain = 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
-    return SensorErrors(ay_gain=gain, lever_m=vehicle.imu_position_m[0], vehicle=vehicle)
-
-
-def _with_consistency(drive: Drive, posterior: SelfCalibration) -> SelfCalibration:
-    """Return a posterior with the part of ``d2`` of ``physics`` on it that correlates with the driving."""
-    from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency, driving_products
-
-    signals, model = drive.whole().signals, DriveModel.of(drive, posterior)
-    track = run_estimator(make_estimator("physics", model.car), model.apply(signals).calibrated)
-    slow = model.car.vehicle.low_speed_blend_m_s
-    products = driving_products(track, signals, low_speed_m_s=slow, sensors=model.errors)
-    return replace(posterior, driven_d2_m_s=driven_consistency(*products))
+    return driving_of(drive.whole().signals, drive.car.vehicle)
 
 
 def _without_truth(drive: Drive, posterior: SelfCalibration) -> WithoutTruth:
@@ -158,30 +143,8 @@ def _without_truth(drive: Drive, posterior: SelfCalibration) -> WithoutTruth:
     return WithoutTruth(
         posterior.vehicle,
         posterior.noise,
-        told_friction=drive.friction.bank is None,
         note=_text(posterior, drive.car) if causal else note,
         varied=posterior.varied,
-        driven_d2_m_s=posterior.driven_d2_m_s,
-        cg_std_m=drive.car.cg_std_m,
         causal=causal,
         error_scale=max(posterior.error_scale, _EARLIER_ERROR_SCALE if causal else 0.0),
-    )
-
-
-def _errors(drive: Drive, posterior: SelfCalibration | None) -> SensorErrors:
-    """Return the sensor errors of a drive; a posterior with refused tyres is still valid for sensors."""
-    from pdhef_logtool.estimators.calibration.joint import STEER_DELAY
-
-    vehicle = drive.car.vehicle
-    if posterior is None:
-        return file_errors(vehicle)
-    fitted, values = posterior.vehicle, {p.name: p.value for p in posterior.parameters}
-    return replace(
-        file_errors(fitted),
-        ay_bias_m_s2=fitted.sensors.ay_bias_m_s2 - vehicle.sensors.ay_bias_m_s2,
-        yaw_rate_bias_rad_s=fitted.sensors.yaw_rate_bias_rad_s - vehicle.sensors.yaw_rate_bias_rad_s,
-        vehicle=vehicle if posterior.refused else fitted,
-        read_with=vehicle,
-        steer_delay_s=0.0 if posterior.refused else values.get(STEER_DELAY, 0.0),
-        friction=None if drive.friction.bank is None else fitted.assumed_friction,
     )

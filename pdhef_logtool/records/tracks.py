@@ -192,3 +192,12 @@ def concatenate(tracks: list[StateTrack]) -> StateTrack:
     columns = {f.name: [getattr(t, f.name) for t in tracks] for f in fields(StateTrack) if f.name != "name"}
     tracks.clear()
     return StateTrack(name=name, **{column: np.concatenate(columns.pop(column)) for column in [*columns]})
+
+
+def scaled_covariance(covariance: FloatArray, of_vy: FloatArray) -> FloatArray:
+    """Return covariances [N, 3, 3] with factors [N] on the 1-sigma of v_y; correlations stay."""
+    scale = np.ones(covariance.shape[:2])
+    scale[:, 1] = of_vy
+    scaled: FloatArray = covariance * scale[:, :, None]
+    scaled *= scale[:, None, :]
+    return scaled

@@ -348,14 +348,13 @@ def _why_unscored(report: Mapping[str, Any], verdict: Mapping[str, Any]) -> str:
 
 def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str]:
     """Return the keys for grouping of a drive: metadata of its log, and of the run."""
-    friction = report.get("friction") or {}
     car = log.entry.get("car") or {}
-    source = str(friction.get("source", ""))
+    source = str((report.get("friction") or {}).get("source", ""))
     from_log = {
         "car": car.get("name") or report["vehicle"]["name"],
         "log format": report["log"]["kind"],
         "answer": main,
-        "friction source": "estimated" if friction.get("estimated") else source.partition(",")[0],
+        "friction source": source.partition(",")[0],
         "length": _length(float(report["log"]["duration_s"])),
         "sensor faults": _fault_text(report),
         "month": (factors_of(log.entry, report)["day"] or "")[:7],

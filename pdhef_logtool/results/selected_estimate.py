@@ -35,8 +35,6 @@ NO_SIDESLIP_RAD = 1e-5
 _LESS = 0.8
 #: Range of the NIS per degree of freedom (expected value 1) that is reported as consistent.
 _NIS_RANGE = (0.5, 2.0)
-#: Share of the drive in which friction must be observable for its estimate to count.
-_FRICTION_SHOWN = 0.1
 _MOST_STEPS = 2
 
 
@@ -133,7 +131,8 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
         if calibration["understeer"] is not None and calibration["understeer"]["contradicts"]:
             said.append("the understeer gradient of the drive contradicts the file")
     if friction is not None and modelled:
-        said.append(f"friction {_friction(friction)}")
+        source: str = friction["source"]
+        said.append(f"friction {source if source.startswith('assumed') else f'given ({source})'}")
     if main.distrusted:
         said.append(main.why)
     algorithm = estimator["algorithm"] or {"options": {}}
@@ -157,13 +156,6 @@ def _model(report: Report, causal: bool) -> list[str]:
     return [f"{_car(vehicle)}{taught or f', {proven}'}"]
 
 
-def _friction(friction: Mapping[str, Any]) -> str:
-    source: str = friction["source"]
-    if friction["estimated"]:
-        return f"estimated ({friction['summary']})"
-    return source if source.startswith("assumed") else f"given ({source})"
-
-
 def _car(vehicle: Mapping[str, Any]) -> str:
     return "default sedan (no car given)" if vehicle["file"] is None else f"car {vehicle['file']}"
 
@@ -182,7 +174,7 @@ def _next_steps(report: Report, main: MainFacts) -> list[str]:
     if vehicle["file"] is not None and not (vehicle["proven"] or vehicle.get("taught")):
         steps.append(f"learn the car from its drives: pdhef learn LOGS --car {vehicle['file']} -o mycar")
     friction = report["friction"]
-    if friction is not None and friction["estimated"] and (friction["observable_share"] or 0.0) < _FRICTION_SHOWN:
+    if friction is not None and friction["source"].startswith("assumed"):
         steps.append("give the friction if it is known: --friction 0.8")
     return steps
 

@@ -100,9 +100,7 @@ class RunCars:
     def read(self, path: Path | None) -> Car:
         """Return a car, read when it is first asked for; raises VehicleError or ModelError."""
         if path not in self._read:
-            car = Car.load(
-                path, network=self.config.network, intervals=self.config.intervals, sensors=self.config.sensor_profile
-            )
+            car = Car.load(path, network=self.config.network, sensors=self.config.sensor_profile)
             for note in car.notes:
                 self.warn(note if self.table is None else f"{car.file_name}: {note}")
             self._read[path] = car
@@ -179,7 +177,6 @@ def car_record(car: Car) -> dict[str, Any]:
         "the car's model": _plain(car.model),
         "the network": network,
         "the residual gain": car.network_gain,
-        "the car's intervals": _plain(car.intervals),
     }
     return {"name": car.file_name or "", "network": network, "parts": {k: digest_of(v) for k, v in parts.items()}}
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from pdhef_logtool.car.names import NO_INTERVALS, SHIPPED_CARS
+from pdhef_logtool.car.names import SHIPPED_CARS
 from pdhef_logtool.car.vehicle import SENSOR_PROFILES
 from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.drive.options import AUTO, OFF, ReadOptions, parse_time
@@ -24,14 +24,13 @@ from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
 from pdhef_logtool.residual_model.interface import plug_in_names
 from pdhef_logtool.storage.documents import read_toml, validated
 
-_FILES = ("car", "cars", "mapping", "msgs", "plan", "network", "intervals", "model", "sensor_profile")
+_FILES = ("car", "cars", "mapping", "msgs", "plan", "network", "model", "sensor_profile")
 #: Settings that change no result.
 _NO_RESULT = ("allow_private_redirects", "log_timeout_s", "max_memory_mb", "full_worst")
 #: Values that replace a file.
 _KEYWORDS = {
     "car": tuple(SHIPPED_CARS),
     "network": (*SHIPPED_FOLDERS, NO_MODEL),
-    "intervals": (NO_INTERVALS,),
     "sensor_profile": tuple(SENSOR_PROFILES),
     "model": (str(AUTO), str(OFF)),
 }
@@ -74,8 +73,8 @@ class RunConfig:
     sensors : ``full``, or ``esp`` (sensor set of the paper: the speed sensor only initialises the filters).
     sensor_profile : TOML file with ``[sensors]`` (noise, rates and limits of the sensors), or ``production``, in place
         of the car's entries, for ``run`` and ``metrics``; None = those of the car.
-    friction : ``auto`` (from the log, else the car, else estimated; for ``extract`` first from the ground truth),
-        ``file``, ``estimate``, or a number.
+    friction : ``auto`` (from the log, else the car, else 1; for ``extract`` first from the ground truth), ``file``, or
+        a number.
     prefer_truth : ground truth of a simulated log that has both: ``perfect`` or ``rtk``.
     budget : factor on the limits of memory and time for reading a log.
     msgs : folder, zip file or wheel with .msg files of types that a log does not define; or a DBC file, or a folder of
@@ -86,7 +85,6 @@ class RunConfig:
         times and different columns are one recording.
     plan : validation plan (plan.toml); None = the default plan, which decides no exit code.
     network : network folder, ``default``, ``none`` or the name of an installed residual model; None = the car's.
-    intervals : intervals file, or ``none``; None = the car's.
     model : ``auto`` (sensors, and a car without validation data, are fitted to the whole log without ground truth; not
         causal), ``off`` (the car is not fitted, only its prior is used), or the model.toml of an earlier run or of
         ``learn``, for sensors and car of earlier drives (causal).
@@ -113,7 +111,7 @@ class RunConfig:
     keep: Keep | None = None
     sensors: Literal["full", "esp"] = "full"
     sensor_profile: File | None = None
-    friction: Literal["auto", "file", "estimate"] | Friction = "auto"
+    friction: Literal["auto", "file"] | Friction = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
     budget: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     msgs: File | None = None
@@ -122,7 +120,6 @@ class RunConfig:
     folder: Literal["auto", "recording", "drives"] = "auto"
     plan: File | None = None
     network: File | None = None
-    intervals: File | None = None
     model: File = AUTO
     reference: Literal["auto", "on", "off"] = "auto"
     gnss: Literal["auto", "off"] = "auto"

@@ -10,7 +10,6 @@ import numpy as np
 
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
 from pdhef_logtool.car.parts import PHYSICS
-from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, lost_texts
 from pdhef_logtool.estimators.algorithm import resolve
@@ -60,7 +59,7 @@ def report_drive(
         "estimators": [*_estimator_entries(run, scored)],
         "metrics": scored.rows,
         "segments": scored.events,
-        "friction": _friction(drive.friction),
+        "friction": {"source": drive.friction.label},
         "self_calibration": run.model.document,
         "reference": None if run.reference is None else run.reference.document,
         "largest_errors": [] if selected is None else largest_errors(selected, truth, others, slow),
@@ -243,17 +242,6 @@ def _truth_notes(plan: DrivePlan) -> list[str]:
     if plan.truth is not None and not plan.has_truth_pose:
         notes.append("no true position: the drawn ground truth trajectory is its velocity dead-reckoned")
     return notes
-
-
-def _friction(friction: FrictionSource) -> dict[str, Any]:
-    """Return the friction that the estimators used, after they ran; figures are NaN where none was estimated."""
-    return {
-        "source": friction.label,
-        "estimated": friction.bank is not None,
-        "observable_share": friction.observable_share,
-        "observable_std": friction.observable_std,
-        "summary": friction.summary,
-    }
 
 
 def car_entry(car: Car) -> dict[str, Any]:

@@ -8,25 +8,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.drive.sensor_changes import SensorChange, shifted
 from pdhef_logtool.drive.truth import valid_as_a_whole
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.calibrated_band import CalibratedBand, widened
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.drive_signals import DriveSignals
-from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.plug_ins import package_of
-from pdhef_logtool.estimators.presets import SELF_CALIBRATED, preset_of, uses_calibration
+from pdhef_logtool.model.intervals import DriveIntervals, widened
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import dead_reckon
 from pdhef_logtool.records.readings import without_impossible_states
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 from pdhef_logtool.results.sink import TRUTH
 
 
@@ -55,7 +51,7 @@ def estimate_drive(
     *,
     watched: bool = True,
     drawn: bool = True,
-    intervals: TrackCalibrator | None = None,
+    intervals: DriveIntervals | None = None,
     causality: CausalityCheck | None = None,
     progress: Callable[[float], None] = lambda _share: None,
 ) -> Estimated:
@@ -65,7 +61,7 @@ def estimate_drive(
     ----------
     corrected : signals of the drive for the two vehicles of its car, whose estimators these are.
     watched : complete ``diverged`` by the monitor of wrong branches. drawn : dead-reckon poses.
-    intervals : calibrates them; None leaves them as the estimators give them.
+    intervals : None leaves them as the estimators give them.
     causality : collects the estimators that fail, or declare themselves causal and look ahead: they have no track.
         None does not check, and a failure is raised.
     progress : called with the share of the estimators that is done.
@@ -105,7 +101,7 @@ def estimate_drive(
         track = track if intervals is None else intervals.apply(track, signals)
         if varied:
             none = np.zeros(len(track))
-            track = widened(track, compared, none, vehicle.low_speed_blend_m_s, own_share=1.0)
+            track = widened(track, compared, none, vehicle.low_speed_blend_m_s, 1.0)
         track = track.without_sideslip_below(vehicle.standstill_m_s)
         tracks[track.name] = dead_reckoned(track, start) if drawn else track
     return Estimated(signals, truth, drawn_truth, tracks)
@@ -121,32 +117,6 @@ def _varied(estimator: Estimator, given: Signals, changes: Sequence[SensorChange
     varied = (c for c in changes if math.isfinite(c.std))
     away = (shifted(given, c.sensor, c.std, c.known_ns, c.end_ns) for c in varied)
     return [run_estimator(estimator, signals).vy_m_s for signals in away]
-
-
-def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
-    """Return a calibrator with the car's intervals for the resolved algorithms of estimators.
-
-    Other algorithms get an interval from the uncertainty of the car's identified parameters.
-    """
-    from pdhef_logtool.estimators.posterior_band import posterior_band
-
-    algorithms, fixed_notes, posterior = {}, {}, {}
-    band = posterior_band(car, use_speed=all(resolve(e).use_speed for e in estimators))
-    banded = SELF_CALIBRATED | (set() if car.fitted_physics else {NOMINAL_MODEL})
-    of_log = None if car.self_calibrated is None else CalibratedBand(car.self_calibrated, car.vehicle)
-    for estimator in estimators:
-        if note := getattr(estimator, "intervals_note", ""):
-            fixed_notes[estimator.name] = note
-            continue
-        if of_log is not None and uses_calibration(estimator.name):
-            fixed_notes[estimator.name], posterior[estimator.name] = of_log.note, of_log.widen
-            continue
-        other = getattr(estimator, "calibrated_as", None)
-        algorithms[estimator.name] = [resolve(e) for e in (estimator, other) if e is not None]
-        if band is not None and preset_of(estimator.name) in banded:
-            posterior[estimator.name] = band.widen
-    of_car = car.intervals is not None and car.intervals.physics_sha256 == car.physics_sha256
-    return TrackCalibrator(car.intervals, algorithms, fixed_notes, posterior, of_car=of_car)
 
 
 def dead_reckoned(track: StateTrack, start: tuple[float, float, float]) -> StateTrack:

@@ -12,10 +12,11 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.table import Options, Skipped, runnable
 from pdhef_logtool.model.drive_model import DriveModel
+from pdhef_logtool.model.intervals import drive_intervals
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH
-from pdhef_logtool.runs.estimating import calibrator, estimate_drive
+from pdhef_logtool.runs.estimating import estimate_drive
 from pdhef_logtool.runs.selection import default_names
 
 if TYPE_CHECKING:
@@ -75,12 +76,9 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     (['truth', 'zero', 'phy-ukf'], 'vehicle-ukf', 2853)
     """
     estimators, skipped = choose(drive, names)
-    intervals = calibrator(drive.car, estimators)
-    if intervals.warning and intervals.warning not in drive.notes:
-        drive.tell(intervals.warning)
     whole = drive.whole()
     corrected = DriveModel.of(drive).apply(whole.signals)
-    estimated = estimate_drive(whole, corrected, estimators, intervals=intervals)
+    estimated = estimate_drive(whole, corrected, estimators, intervals=drive_intervals(drive.car, estimators))
     truth = {} if estimated.drawn_truth is None else {TRUTH: estimated.drawn_truth}
     algorithms = {e.name: resolve(e) for e in estimators}
     return Estimates(drive, truth | estimated.tracks, estimated.signals, algorithms, tuple(skipped))
@@ -105,6 +103,7 @@ def score(estimates: Estimates) -> pl.DataFrame:
         return replace(track, valid=track.something_known) if track is not None and name == TRUTH else track
 
     names = [name for name in estimates.tracks if name != TRUTH]
-    rows = evaluate(estimates.drive, names, read, estimates.signals, DriveModel.of(estimates.drive).errors).rows
+    calibrated = DriveModel.of(estimates.drive).calibrated(estimates.signals)
+    rows = evaluate(estimates.drive, names, read, estimates.signals, calibrated).rows
     columns = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
     return pl.DataFrame([[getattr(r, c) for c in columns] for r in rows], schema=columns, orient="row")

@@ -33,7 +33,6 @@ _NO_SETTING = frozenset(
         "car",
         "cars",
         "network",
-        "intervals",
     }
 )
 _FILES = ("mapping", "msgs", "plan", "cars", "model", "sensor_profile")

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.intervals import TrackCalibrator
 from pdhef_logtool.estimators.table import Options, Skipped, runnable
 from pdhef_logtool.model.drive_model import DriveModel
+from pdhef_logtool.model.intervals import DriveIntervals, drive_intervals
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.runs.referencing import DriveReference, reference_of
 from pdhef_logtool.runs.selection import default_names
 
@@ -36,7 +35,7 @@ class PreparedDrive:
     estimators: Sequence[Estimator]
     skipped: Sequence[Skipped]
     requested: frozenset[str]
-    intervals: TrackCalibrator
+    intervals: DriveIntervals
     failed: Mapping[str, str]
 
     @property
@@ -61,7 +60,7 @@ def prepare(drive: Drive, config: RunConfig) -> PreparedDrive:
     reference = reference_of(drive, model, config)
     if reference is not None and reference.estimator is not None:
         estimators, requested = [*estimators, reference.estimator], requested | {REFERENCE}
-    intervals, failed = calibrator(car, estimators), {s.name: s.reason for s in skipped if s.is_error}
+    intervals, failed = drive_intervals(car, estimators), {s.name: s.reason for s in skipped if s.is_error}
     return PreparedDrive(drive, config, model, reference, estimators, skipped, requested, intervals, failed)
 
 

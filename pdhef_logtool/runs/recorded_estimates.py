@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.names import NO_INTERVALS
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
@@ -110,7 +109,7 @@ def score_log(
     PdhefError : There is no estimate or no ground truth, or the log cannot be used.
     """
     log_input = one_log(argument, config.read_options)
-    car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS, sensors=config.sensor_profile)
+    car = Car.load(config.car, network=NO_MODEL, sensors=config.sensor_profile)
     mapping = mapping_of(config.mapping)
     if mapping is not None and mapping.recorders:
         reading = config.read_options

@@ -63,7 +63,7 @@ def prior_of(model: DriveModel) -> ReferencePrior:
 
     Without calibration or ground truth, the position of the accelerometer is not verified if no file gives one.
     """
-    from pdhef_logtool.estimators.calibration.joint import AY_GAIN, IMU_X, IMU_X_REACH
+    from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, IMU_X_REACH, RATE_BIAS
     from pdhef_logtool.estimators.reference.drive import ReferencePrior
 
     car, calibration = model.car, model.posterior
@@ -81,8 +81,8 @@ def prior_of(model: DriveModel) -> ReferencePrior:
         prior |= {
             "ay_gain": fitted[AY_GAIN].value,
             "ay_gain_std": max(_LEAST_GAIN_STD, fitted[AY_GAIN].sd),
-            "ay_bias_m_s2": model.errors.ay_bias_m_s2,
-            "yaw_rate_bias_rad_s": model.errors.yaw_rate_bias_rad_s,
+            "ay_bias_m_s2": fitted[AY_BIAS].value - vehicle.sensors.ay_bias_m_s2,
+            "yaw_rate_bias_rad_s": fitted[RATE_BIAS].value - vehicle.sensors.yaw_rate_bias_rad_s,
         }
         if not calibration.refused:
             prior["friction"] = calibration.vehicle.assumed_friction
@@ -98,7 +98,7 @@ def _spans(drive: Drive, prior: ReferencePrior, *, use_gnss: bool) -> Iterator[S
     """Yield the reference of a drive span by span; of two that overlap the earlier one ends in the middle."""
     from pdhef_logtool.estimators.reference.drive import refer
 
-    signals = drive.whole(fill_friction=False).signals
+    signals = drive.whole().signals
     starts_ns = np.arange(signals.stamps_ns[0], signals.stamps_ns[-1] + 1, round(SPAN_S * 1e9))
     edges = [*np.searchsorted(signals.stamps_ns, starts_ns).tolist(), len(signals)]
     margin_ns = round(MARGIN_S * 1e9)

@@ -14,7 +14,6 @@ from pdhef_logtool.estimators.plug_ins import package_of
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive
 from pdhef_logtool.evaluation.operating_space import operating_space
 from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS
-from pdhef_logtool.evaluation.segments import find_intervals
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import merge_losses
@@ -22,7 +21,6 @@ from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.tracks import REFERENCE
-from pdhef_logtool.results.sink import Event
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.drive_outputs import STALE_FILES, DriveOutputs, files_of, log_place
 from pdhef_logtool.runs.drive_report import car_entry, outcome_of, report_drive
@@ -31,7 +29,7 @@ from pdhef_logtool.runs.judging import BRIEF_BLOCKS, drive_blocks, judge_drive
 from pdhef_logtool.runs.preparing import PreparedDrive, prepare
 from pdhef_logtool.runs.reference_audit import audit_truth
 from pdhef_logtool.runs.run_result import LogResult
-from pdhef_logtool.runs.scoring import Evaluation, evaluate, in_time
+from pdhef_logtool.runs.scoring import Evaluation, evaluate
 from pdhef_logtool.runs.selection import choose_main, contradiction
 from pdhef_logtool.storage.outputs import OutputFolder
 
@@ -125,13 +123,9 @@ def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter)
 
 
 def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
-    """Score the tracks; add the events of an estimated friction, and contradictions as notes of the drive."""
+    """Score the tracks; add contradictions as notes of the drive."""
     drive, signals = run.drive, estimated.signals
-    scored = evaluate(drive, run.names, estimated.read, signals, run.model.errors)
-    if drive.friction.bank is not None:
-        observable = find_intervals(signals, {"friction observable": drive.friction.observable})
-        events = [Event(s.name, s.start_ns, s.end_ns, "the estimate of friction can be relied on") for s in observable]
-        scored = replace(scored, events=sorted([*scored.events, *events], key=in_time))
+    scored = evaluate(drive, run.names, estimated.read, signals, run.model.calibrated(signals))
     truth, reference = estimated.truth, estimated.read(REFERENCE)
     if truth is not None and reference is not None and run.reference is not None:
         contradictions = audit_truth(truth, reference, drive.car.vehicle.low_speed_blend_m_s)
@@ -140,8 +134,6 @@ def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
             drive.tell(text)
     if against := contradiction(scored.rows):
         drive.notes.append(f"WARNING: {against.text}")  # the text of the selected estimate gives the consequence
-    if run.intervals.warning:
-        drive.tell(run.intervals.warning)
     if not scored.moves:
         drive.tell(_NEVER_MOVES.format(run.car.vehicle.low_speed_blend_m_s))
     return scored

@@ -14,7 +14,7 @@ from pdhef_logtool.results.sink import TRUTH, Event, ManoeuvreEvent
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
     from pdhef_logtool.evaluation.metrics import MetricRow
-    from pdhef_logtool.evaluation.metrics.metric import SensorErrors
+    from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
     from pdhef_logtool.evaluation.reasons import ReasonFacts
 
 
@@ -42,14 +42,14 @@ def evaluate(
     names: Sequence[str],
     read: Callable[[str], StateTrack | None],
     signals: Signals,
-    sensors: SensorErrors,
+    calibrated: CalibratedSignals,
 ) -> Evaluation:
     """Score the tracks of a drive.
 
     Parameters
     ----------
     names : of the estimators. read : returns the track of a name (also ``truth``), or None.
-    signals : input of the estimators. sensors : as the model of the drive has them.
+    signals : as read with the vehicle file. calibrated : as the vehicle of the drive's model corrects them.
     """
     from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
     from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
@@ -62,7 +62,7 @@ def evaluate(
     moving = moving_mask(signals, truth, vehicle)
     tracks = {name: track for name in names if (track := read(name)) is not None}
     slow, dependent = vehicle.low_speed_blend_m_s, drive.plan.dependent
-    rows = evaluate_drive(EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, sensors, dependent))
+    rows = evaluate_drive(EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, calibrated, dependent))
     events = drive_events(signals, masks, manoeuvres, [*tracks.values()])
     moves = bool(moving.any())
     silent = [n for n, track in tracks.items() if moves and not (moving & track.valid & track.something_known).any()]

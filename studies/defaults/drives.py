@@ -26,7 +26,6 @@ def load_drive(
     task: DriveSet,
     *,
     needs: frozenset[str] = frozenset(),
-    fill_friction: bool = True,
     least_scored: int = 1,
 ) -> tuple[DriveRecord, WholeDrive | None]:
     """Read a drive with a true sideslip into memory; None with the reason in the record if it cannot be used.
@@ -38,7 +37,7 @@ def load_drive(
         missing = ", ".join(sorted(needs - drive.available))
         if left_out := no_true_sideslip(drive.plan) or (f"the log has no {missing}" if missing else ""):
             return record_of(drive, left_out=left_out), None
-        whole = drive.whole(fill_friction=fill_friction)
+        whole = drive.whole()
         slow = task.car.vehicle.low_speed_blend_m_s
         assert whole.truth is not None
         scored = int(np.count_nonzero(scorable_stamps(whole.truth, slow)))

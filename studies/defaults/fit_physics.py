@@ -13,7 +13,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from pdhef_logtool.car.car import FIT_FILE, NO_INTERVALS, SHIPPED_CARS, Car
+from pdhef_logtool.car.car import FIT_FILE, SHIPPED_CARS, Car
 from pdhef_logtool.car.parts import Fit, FittedValues, LearntOn, physics_sha256
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.residual_model.bundle import NO_MODEL
@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     simulate = ("simulate", "suite", "--count", str(DRIVES), "--seed", str(SEED), "--jobs", str(given.jobs))
     subprocess.run([sys.executable, "-m", "pdhef_logtool", *simulate, "-o", str(given.work)], check=True)
-    car = Car.load(given.output, network=NO_MODEL, intervals=NO_INTERVALS)
+    car = Car.load(given.output, network=NO_MODEL)
     drawn = json.loads((given.work / "manifest.json").read_text(encoding="utf-8"))["drives"]
     drives, learnt_on = [], []
     for entry in drawn:

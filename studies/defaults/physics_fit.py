@@ -25,8 +25,6 @@ import numpy as np
 from pdhef_logtool.car.descent import descend
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
-from pdhef_logtool.estimators.calibration.calibration import VARIED
-from pdhef_logtool.estimators.calibration.joint import varied_parameters
 from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD, PosteriorSteps, physics_filter
 from pdhef_logtool.records.signals import FloatArray
 from studies.defaults.axle_forces import (
@@ -267,27 +265,6 @@ def fit_physics(
     return PhysicsFit(vehicle, noise, priors, theta, covariance, value, rms)
 
 
-def varied_vehicles(
-    drives: Sequence[FitDrive], start: VehicleParameters, fit: PhysicsFit
-) -> tuple[VehicleParameters, ...]:
-    """Return a fitted vehicle 1-sigma away along the directions of its posterior that move the sideslip most.
-
-    The variations are uncorrelated in the posterior and in their effect on sideslip. The noise is unchanged.
-    """
-    held = np.array([p.tuning for p in fit.priors])
-    free = np.flatnonzero(~held)
-    root = np.zeros((held.size, free.size))
-    root[free] = np.linalg.cholesky(fit.covariance[np.ix_(free, free)])
-
-    def vehicle(theta: FloatArray, digits: int = 17) -> VehicleParameters:
-        return build_car(start, fit.vehicle.physics, fit.priors, theta, digits=digits)[0]
-
-    def errors(theta: FloatArray) -> FloatArray:
-        return np.concatenate([d.error for d in drive_errors(drives, start, vehicle(theta), fit.noise)])
-
-    return tuple(vehicle(theta, digits=6) for theta in varied_parameters(fit.theta, root, errors, VARIED))
-
-
 def fit_cost(errors: Sequence[DriveError], theta: FloatArray) -> float:
     """Return the cost of the head of this file."""
     fit = sum(d.seconds / CORRELATION_S * math.log(_robust_square(d) + FLOOR_RAD**2) for d in errors)
@@ -404,12 +381,6 @@ def choose_parts(
     return parts, tuple(tried)
 
 
-def _changed(values: FittedValues, varied: FittedValues) -> FittedValues:
-    """Return the entries of ``varied`` that differ from ``values``."""
-    same = {k: None for k in FittedValues.model_fields if getattr(varied, k) == getattr(values, k)}
-    return varied.model_copy(update=same)
-
-
 def find_physics(
     drives: Sequence[FitDrive],
     start: VehicleParameters,
@@ -432,5 +403,4 @@ def find_physics(
     progress("fitting the physics filter's sideslip to the ground truth", 0.7)
     result = fit_physics(drives, start, parts)
     values = FittedValues.of(result.vehicle)
-    varied = tuple(_changed(values, FittedValues.of(v)) for v in varied_vehicles(drives, start, result))
-    return result, FittedPhysics(values=values, noise=result.noise, varied=varied, tried=tried)
+    return result, FittedPhysics(values=values, noise=result.noise, tried=tried)

@@ -1,4 +1,4 @@
-"""Regenerate the shipped car: simulate, fit, extract, train, tune, calibrate.
+"""Regenerate the shipped car: simulate, fit, extract, train, tune.
 
     python -m studies.defaults.train_default [--seed 0] [-o FOLDER] [--work out/train-default] [--steps STEP ...]
 
@@ -26,7 +26,6 @@ import torch
 
 from pdhef_logtool.car.car import (
     FIT_FILE,
-    INTERVALS_FILE,
     NETWORK_FOLDER,
     SHIPPED_CARS,
     VEHICLE_FILE,
@@ -40,10 +39,8 @@ from pdhef_logtool.learning.network.train_command import dataset_for, train_on
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.bundle import MODELS, NOMINAL_MODEL, PAPER_FOLDER, PHYSICS_MODEL
-from pdhef_logtool.results.run_report import write_json
 from pdhef_logtool.runs.config import RunConfig
 from studies.defaults import fit_physics, paper_drives
-from studies.defaults.intervals import fit_intervals
 from studies.defaults.noise import tune
 from studies.pages import SAMPLE_VEHICLE, options
 
@@ -58,8 +55,6 @@ PAPER_DRIVES, PAPER_RESIDUALS = "paper", "paper-residuals"
 #: An epoch of the paper's network is one batch of windows of 6.4 s, so that 200 epochs take less than half an hour.
 PAPER_WINDOWS: dict[str, Any] = {"piece_steps": 640, "pieces_per_epoch": 64, "chunk_steps": 25}
 TRIALS = 64
-#: Relative errors of friction and vehicle files that the intervals allow for; load alone causes such errors.
-SPREAD = 0.08
 MAPPING = """# Recognised types, and the friction that the simulator drove on.
 fill_recognised = true
 
@@ -155,17 +150,11 @@ def paper(t: Training) -> None:
     )  # fmt: skip
 
 
-def intervals(t: Training) -> None:
-    """Calibrate the intervals."""
-    fitted = fit_intervals(t.validation_task(), SPREAD)
-    write_json(t.car / INTERVALS_FILE, fitted.model_dump(mode="json"))
-
-
 STEPS: dict[str, Callable[[Training], None]] = {
-    step.__name__: step for step in (simulate, fit, noise, extract, train, paper, intervals)
+    step.__name__: step for step in (simulate, fit, noise, extract, train, paper)
 }
 #: Seeds other than 0 take these parts from the shipped car.
-ONLY_OF_SEED_0 = ("fit", "noise", "intervals")
+ONLY_OF_SEED_0 = ("fit", "noise")
 
 
 def main(arguments: list[str] | None = None) -> int:

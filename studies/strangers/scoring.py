@@ -129,7 +129,7 @@ def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]
     error = ""
     try:
         chosen = choose_mapping(log, None, prefer_truth="perfect")
-        said += [*map(str, chosen.ambiguities), *chosen.remarks]
+        said += [*map(str, chosen.ambiguities), *chosen.mapping.notes]
     except PdhefError as refused:
         error = str(refused)
     inspection = inspect_drive_log(log)

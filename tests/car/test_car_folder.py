@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import tomllib
@@ -17,7 +16,6 @@ from pdhef_logtool.car import store
 from pdhef_logtool.car.assumed_values import completed
 from pdhef_logtool.car.car import (
     FIT_FILE,
-    INTERVALS_FILE,
     NETWORK_FOLDER,
     SHIPPED_CARS,
     VEHICLE_FILE,
@@ -76,7 +74,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def load(path: Path, network: str = "none") -> Car:
-    return Car.load(path, network=network, intervals="none")
+    return Car.load(path, network=network)
 
 
 def write_part(path: Path, part: Record) -> None:
@@ -113,7 +111,7 @@ def test_a_folder_with_a_persons_file_alone_is_a_car(folder: Path) -> None:
 def test_the_shipped_car_is_found_by_name_and_none_is_the_default_sedan() -> None:
     saloon = Car.load("saloon")
     assert (saloon.vehicle.name, saloon.source) == ("truthsim saloon", SHIPPED_CARS["saloon"])
-    assert saloon.network is not None and saloon.intervals is not None
+    assert saloon.network is not None
     assert Car.load(SHIPPED_CARS["saloon"]).physics_sha256 == saloon.physics_sha256
     default = Car.load()
     assert (default.vehicle, default.source) == (default_vehicle(), None)
@@ -241,15 +239,6 @@ def test_an_entry_that_a_later_version_adds_makes_no_car_stale(tmp_path: Path) -
     assert load(tmp_path / "mine.toml").physics_sha256 == digest(said)
 
 
-def test_intervals_are_of_the_physics_of_a_car(folder: Path) -> None:
-    intervals = json.loads((SHIPPED_CARS["saloon"] / INTERVALS_FILE).read_text())
-    (folder / INTERVALS_FILE).write_text(json.dumps(intervals | {"physics_sha256": load(folder).physics_sha256}))
-    assert Car.load(folder).notes == ()
-    edit(folder, "mass_kg = 1440.0 ", "mass_kg = 1450.0 ")
-    assert "intervals.json was made with other physics" in Car.load(folder).notes
-    assert not any("intervals" in note for note in load(folder).notes)  # they are not in force
-
-
 # --- rejected inputs -------------------------------------------------------------------------------------------------
 
 
@@ -283,16 +272,8 @@ MODEL = FIT.replace("fit", "model")
         (FIT_FILE, NOISE + "q_std = [0.02, -0.006, 0.002]\n", "greater than or equal to 0"),
         (FIT_FILE, NOISE + f"q_std = {[0.1] * 6}\n", "6 are physics's"),
         (FIT_FILE, MODEL, "format: should be 'pdhef-fit'"),
-        (MODEL_FILE, MODEL + "parameters = [{name = 'x', value = 1.0, std = -1.0}]\n", "parameters[1].std"),
+        (MODEL_FILE, MODEL + "parameters = [{name = 'x', value = 1.0, std = -1.0}]\n", "std: should be greater than 0"),
         (MODEL_FILE, MODEL + "parameter = []\n", "parameter: unknown, did you mean parameters?"),
-        (INTERVALS_FILE, '{"entris": []}', "entris: unknown, did you mean entries?"),
-        (INTERVALS_FILE, '{"entries": {}, "version": 2}', "entries: should be a list"),
-        (INTERVALS_FILE, '{"entries": [{"inflation": {"vy_factor": -1.0}}]}', "inflation.vy_factor"),
-        (
-            INTERVALS_FILE,
-            '{"format": "pdhef-calibration", "estimators": {}}',
-            "should be 'pdhef-intervals', got 'pdhef-calibration'",
-        ),
     ],
 )
 def test_wrong_entries_of_every_part_are_told_in_one_line(folder: Path, name: str, text: str, said: str) -> None:

@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 
 from pdhef_logtool.car.car import SHIPPED_CARS
-from pdhef_logtool.car.parts import FilterNoise, Fit, FittedSensors, FittedValues, Intervals, LearntOn
+from pdhef_logtool.car.parts import FilterNoise, Fit, FittedSensors, FittedValues, LearntOn
 from pdhef_logtool.car.toml_files import VehicleEntries, part_toml
 from pdhef_logtool.car.vehicle import Record, default_vehicle
 from pdhef_logtool.results.arrow_schema import load_schema
@@ -22,7 +22,6 @@ FOLDER = Path(__file__).parents[2] / "schemas"
 MODELS: dict[str, type[Record]] = {
     "vehicle": VehicleEntries,
     "fit": Fit,
-    "intervals": Intervals,
 }
 every_part = pytest.mark.parametrize("part", MODELS)
 FIT = Fit(
@@ -76,10 +75,10 @@ def test_what_pdhef_wrote_is_valid_and_what_it_refuses_is_not(part: str) -> None
 
 
 def test_misspelt_filters_and_measurements_are_seen_by_an_editor() -> None:
-    noise = document("noise")
-    (name, one), *_ = noise["filter"].items()
-    assert not valid("noise", noise | {"filter": {name.replace("-", "_"): one}})
-    assert not valid("noise", noise | {"filter": {name: one | {"r_std": {"ay": 1.0}}}})
+    fit = document("fit")
+    (name, one), *_ = fit["filter"].items()
+    assert not valid("fit", fit | {"filter": {name.replace("-", "_"): one}})
+    assert not valid("fit", fit | {"filter": {name: one | {"r_std": {"ay": 1.0}}}})
     assert not valid("vehicle", document("vehicle") | {"mass_kg": 1e6})
     assert valid("vehicle", {"mass_kg": 1440.0, "wheelbase_m": 2.87, "front_weight_share": 0.6})
     assert not valid("vehicle", {"mass_kg": 1440.0, "wheelbase_m": 2.87, "front_weight_share": 60})

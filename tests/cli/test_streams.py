@@ -67,10 +67,7 @@ main()
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "way", "code", "said"),
-    [
-        ("SIGINT", "changed", 130, "interrupted"),
-        ("SIGTERM", "swallowed", 143, "terminated"),
-    ],
+    [("SIGINT", "changed", 130, "interrupted"), ("SIGTERM", "swallowed", 143, "terminated")],
 )
 def test_a_request_to_end_is_one_line_whatever_becomes_of_it(name: str, way: str, code: int, said: str) -> None:
     script = STOP.format(name=name, way=way)

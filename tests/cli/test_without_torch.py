@@ -35,7 +35,6 @@ for line in sys.stdin.read().splitlines():
         code = ended.code or 0
     print("ended:", line.split("|")[0], code, " ".join(said.getvalue().split()), flush=True)
 """
-RUN = ("run", "sample_logs/dlc.mcap", "--car", "saloon", "--end", "2", "-e", "pd-hef,physics", "--annotate", "none")
 
 
 def ended_without_torch(folder: Path, *commands: tuple[object, ...]) -> list[str]:
@@ -54,28 +53,19 @@ def ended_without_torch(folder: Path, *commands: tuple[object, ...]) -> list[str
 
 
 @pytest.mark.slow
-def test_what_trains_no_network_works_without_it(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    ended = ended_without_torch(
-        tmp_path,
-        (*RUN, "-o", out),
-        (*RUN, "-o", tmp_path / "other", "--no-report"),
-        ("compare", out, tmp_path / "other"),
-        ("inspect", "sample_logs/dlc.mcap"),
-        ("simulate", "step-steer", "-o", tmp_path / "step.mcap"),
-        ("extract", "sample_logs/dlc.mcap", "--car", "saloon", "--end", "3", "-o", tmp_path / "residuals"),
-    )
-    assert [line.split()[:2] for line in ended] == [
-        [name, "0"] for name in ("run", "run", "compare", "inspect", "simulate", "extract")
-    ], ended
-    assert (out / "logs/dlc/report.html").is_file()
-
-
-@pytest.mark.slow
-def test_what_trains_one_ends_with_one_line(tmp_path: Path) -> None:
+def test_what_trains_no_network_works_without_it_and_what_trains_one_ends_with_one_line(tmp_path: Path) -> None:
+    drive = ("sample_logs/dlc.mcap", "--car", "saloon", "--end", "3")
     trained = ("train", tmp_path, "-o", tmp_path / "network")
-    ended = ended_without_torch(tmp_path, trained, (*trained, "--baselines"))
+    ran, extracted, *refused = ended_without_torch(
+        tmp_path,
+        ("run", *drive, "-e", "pd-hef,physics", "--annotate", "none", "-o", tmp_path / "out"),
+        ("extract", *drive, "-o", tmp_path / "residuals"),
+        trained,
+        (*trained, "--baselines"),
+    )
+    assert ran.startswith("run 0") and extracted.startswith("extract 0")
+    assert (tmp_path / "out/logs/dlc/report.html").is_file()
     remedy = "got an installation without it; pip install 'pdhef-logtool[train]'"
-    for line in ended:
+    for line in refused:
         assert line.startswith("train 2 ") and remedy in line, line
     assert not (tmp_path / "network").exists()

@@ -198,11 +198,7 @@ def test_the_code_of_other_sources_of_this_installation_is_removed_and_no_other(
 
 def test_what_compiled_code_is_made_of() -> None:
     names = {p.relative_to(_ROOT).as_posix() for p in sources.compiled_sources()}
-    assert {
-        "pdhef_logtool/estimators/vehicle_ukf.py",
-        "truthsim/motion.py",
-        "truthsim/tyres.py",
-    } <= names
+    assert {"pdhef_logtool/estimators/vehicle_ukf.py", "truthsim/motion.py", "truthsim/tyres.py"} <= names
     assert "pdhef_logtool/records/signals.py" in names  # constants
     assert "pdhef_logtool/compiled/cache.py" in names
     assert not names & {"pdhef_logtool/cli/app.py", "pdhef_logtool/workers/supervisor.py"}

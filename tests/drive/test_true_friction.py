@@ -21,9 +21,7 @@ def test_a_dataset_takes_the_friction_of_the_ground_truth(sample_logs_dir: Path)
     with _read(sample_logs_dir) as drive:
         frictions = []
         for of_truth in (True, False):
-            drive.friction = friction_of(
-                drive.plan, drive.car.vehicle, drive.options, validated=True, of_truth=of_truth
-            )
+            drive.friction = friction_of(drive.plan, drive.car.vehicle, drive.options, of_truth=of_truth)
             frictions.append(drive.whole().signals.friction)
         known = np.isfinite(frictions[0])
         np.testing.assert_allclose(frictions[0][known], 0.3, atol=1e-6)
@@ -37,7 +35,7 @@ def test_a_friction_of_the_options_and_another_ground_truth_go_before(
     sample_logs_dir: Path, options: dict[str, object]
 ) -> None:
     with _read(sample_logs_dir, **options) as drive:
-        source = friction_of(drive.plan, drive.car.vehicle, drive.options, validated=True, of_truth=True)
+        source = friction_of(drive.plan, drive.car.vehicle, drive.options, of_truth=True)
         assert not source.of_truth
 
 

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import io
-import json
-import os
 import re
-import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,8 +24,8 @@ from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from tests.command_line import called
 
-ROOT = Path(__file__).resolve().parents[2]
 NEEDS = frozenset({"speed_m_s", "yaw_rate_rad_s"})
 
 
@@ -160,9 +156,9 @@ def plugged(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     yield
 
 
-def _run(tmp_path: Path, sample_logs_dir: Path, *names: str, annotate: str = "none") -> Any:
-    config = RunConfig(car=Path("saloon"), estimators=names, annotate=annotate)  # type: ignore[arg-type]
-    return run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path, config)
+def _run(tmp_path: Path, sample_logs_dir: Path, *names: str) -> Any:
+    config = RunConfig(car=Path("saloon"), estimators=names, keep="estimates", model="off", reference="off")
+    return run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path, config, report=False)
 
 
 @pytest.mark.slow
@@ -197,29 +193,37 @@ def test_a_run_of_nothing_else_selects_a_candidate(plugged: None, tmp_path: Path
 # --- estimators of other packages ------------------------------------------------------------------------------------
 
 
-def _python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}", "OMP_NUM_THREADS": "1"}
-    return subprocess.run(
-        [sys.executable, *arguments], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
-    )
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+    """Return a function that installs a package with an estimator for this test."""
+    names: list[str] = []
+
+    def add(code: str, name: str = "half_slip") -> None:
+        names.append(name)
+        monkeypatch.syspath_prepend(str(install(tmp_path, code, name)))
+        table.all_specs.cache_clear()
+
+    yield add
+    for name in names:
+        sys.modules.pop(name, None)
+    monkeypatch.undo()
+    table.all_specs.cache_clear()
 
 
 @pytest.mark.slow
-def test_an_estimator_of_another_package_runs_under_its_name(tmp_path: Path, sample_logs_dir: Path) -> None:
-    install(tmp_path, example_code())
-    out = tmp_path / "out"
-    done = _python(tmp_path, "-m", "pdhef_logtool", "run", str(sample_logs_dir / "dlc.mcap"), "-o", str(out),
-                   "--car", "saloon", "--estimators", "zero,half-slip", "--no-report")  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    report = json.loads((out / "logs/dlc/report.json").read_text(encoding="utf-8"))
-    algorithms = {e["name"]: e["algorithm"]["algorithm"] for e in report["estimators"]}
+def test_an_estimator_of_another_package_runs_under_its_name(
+    installed: Callable[..., None], tmp_path: Path, sample_logs_dir: Path
+) -> None:
+    installed(example_code())
+    result = _run(tmp_path / "out", sample_logs_dir, "zero", "half-slip")
+    assert result.exit_code == EXIT_OK
+    algorithms = {e["name"]: e["algorithm"]["algorithm"] for e in result.results[0].report["estimators"]}
     assert algorithms == {"zero": "pass-through", "half-slip": "half-slip", "pd-hef": "adaptive-physics"}
-    rows = pl.read_parquet(out / "logs/dlc/estimates.parquet").filter(pl.col("estimator") == "half-slip")
+    rows = pl.read_parquet(tmp_path / "out/logs/dlc/estimates.parquet").filter(pl.col("estimator") == "half-slip")
     valid = rows.filter("valid")
     assert len(valid) > 900
     assert np.abs(valid["vy_m_s"].to_numpy()).max() > 0.05
-    listed = _python(tmp_path, "-m", "pdhef_logtool", "run", "--list-estimators")
-    assert "half-slip" in listed.stdout
+    assert "half-slip" in called("run", "--list-estimators").stdout
 
 
 @pytest.mark.parametrize(
@@ -231,17 +235,11 @@ def test_an_estimator_of_another_package_runs_under_its_name(tmp_path: Path, sam
     ],
 )
 def test_a_package_that_cannot_be_used_is_named_and_left_out(
-    code: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    code: str, why: str, installed: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.syspath_prepend(str(install(tmp_path, code, "broken_plugin")))
-    monkeypatch.setattr(sys, "stderr", io.StringIO())
-    table.all_specs.cache_clear()
-    try:
-        assert table.all_specs() == table.SPECS
-    finally:
-        sys.modules.pop("broken_plugin", None)
-        table.all_specs.cache_clear()
-    told = sys.stderr.getvalue()  # type: ignore[attr-defined]
+    installed(code, "broken_plugin")
+    assert table.all_specs() == table.SPECS
+    told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert "broken_plugin" in told
     assert why in told

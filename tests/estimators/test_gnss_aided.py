@@ -143,5 +143,4 @@ def test_identity_is_another_one_only_where_gnss_acts(bare):
     assert resolve(off) == resolve(without) == plain
     assert resolve(aided).algorithm == "gnss-aided"
     assert resolve(aided).options["estimator"] == plain.algorithm
-    assert resolve(aided.calibrated_as) == plain
     assert resolve(smoothed).algorithm != "gnss-aided"

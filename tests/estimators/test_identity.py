@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pdhef_logtool.car.car import INTERVALS_FILE, SHIPPED_CARS, Car, load_intervals
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.errors import UsageError
-from tests.command_line import pdhef
 
 _HYBRID = "adaptive-physics 1 (physics=vehicle-ukf, trust=0.75)"
 #: Identity and digest of the presets on the shipped car. The digest covers noise, physics and network as well.
@@ -52,13 +48,6 @@ def test_the_identities_of_the_shipped_presets_are_frozen(saloon: Car) -> None:
     assert {name: (a.identity, a.sha256[:12]) for name, a in found.items()} == SHIPPED
 
 
-def test_the_shipped_intervals_are_those_of_the_shipped_estimators(saloon: Car) -> None:
-    entries = load_intervals(SHIPPED_CARS["saloon"]).entries
-    assert {e.estimator for e in entries} >= {"phy-ukf", "physics", "pd-hef", "pd-hef-smoothed"}
-    for entry in entries:
-        assert entry.algorithm == resolve(make_estimator(entry.estimator, saloon)), entry.estimator
-
-
 def test_a_new_option_at_its_default_changes_no_identity(saloon: Car) -> None:
     estimator = make_estimator("pd-hef", saloon)
     assert isinstance(estimator, AdaptivePhysics)
@@ -92,27 +81,3 @@ def test_a_class_without_an_identity_is_refused() -> None:
 
     with pytest.raises(UsageError, match="version = 1 in class Nameless"):
         resolve(Nameless())  # type: ignore[arg-type]
-
-
-@pytest.mark.slow
-def test_intervals_that_do_not_apply_are_named_on_stderr_and_in_the_report(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    car = Path(shutil.copytree(SHIPPED_CARS["saloon"], tmp_path / "car"))
-    document = json.loads((car / INTERVALS_FILE).read_text())
-    (entry,) = (e for e in document["entries"] if e["estimator"] == "phy-ukf")
-    entry["algorithm"]["options"]["limit_gain"] = 1.0
-    (car / INTERVALS_FILE).write_text(json.dumps(document))
-    log = Path(__file__).parents[2] / "sample_logs/dlc.mcap"
-    arguments = ("--car", car, "-e", "phy-ukf,zero", "--annotate", "none", "--no-report", "--start", "2", "--end", "4")
-    pdhef("run", log, "-o", tmp_path / "out", *arguments)
-    message = (
-        "the calibrated intervals of phy-ukf are not applied: "
-        "expected vehicle-ukf 1 (equations=nominal, limit_gain=1.0), got vehicle-ukf 1 (equations=nominal)"
-    )
-    assert "".join(capsys.readouterr().err.split()).count("".join(message.split())) == 1
-    report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())
-    (told,) = (e for e in report["estimators"] if e["name"] == "phy-ukf")
-    assert told["intervals"] == ["intervals not calibrated", message]
-    assert (told["algorithm"]["algorithm"], told["algorithm"]["version"]) == ("vehicle-ukf", 1)
-    assert message in report["warnings"]

@@ -109,7 +109,7 @@ def test_two_seconds_after_the_taught_region_it_is_physics_again(signals: Signal
 
 
 def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(signals: Signals) -> None:
-    calibration = WithoutTruth(SEDAN, FilterNoise(r_std={"ay_m_s2": 1.0}), True, "calibrated")
+    calibration = WithoutTruth(SEDAN, FilterNoise(r_std={"ay_m_s2": 1.0}), "calibrated")
     for calibrated in (False, True):
         car = taught_car(linear_residual(), calibrated=calibrated)
         plain, of_log = (make_estimator("pd-hef", c) for c in (car, replace(car, self_calibrated=calibration)))

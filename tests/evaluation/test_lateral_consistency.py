@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from reference_car import signals_at
 
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, default_vehicle
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow, evaluate_drive
-from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency, driving_products
-from pdhef_logtool.evaluation.metrics.metric import SensorErrors
+from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency
+from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.runs.selection import FACTOR, contradiction
@@ -19,56 +20,49 @@ T = np.arange(0, 60, 0.01)
 STAMPS = 1_700_000_000_000_000_000 + np.round(T * 1e9).astype(np.int64)
 SPEED, RATE, VY = 20.0 + 0.0 * T, 0.1 * np.sin(0.5 * T), 0.4 * np.sin(0.8 * T)
 VY_RATE, YAW_ACCELERATION = 0.32 * np.cos(0.8 * T), 0.05 * np.cos(0.5 * T)
-SENSORS = SensorErrors(ay_bias_m_s2=0.2, yaw_rate_bias_rad_s=0.003, ay_gain=1.08, lever_m=0.7)
+VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.008, "imu_position_m": (0.7, 0.0, 0.0)})
 
 
-def signals(sensors: SensorErrors) -> Signals:
-    """Return the readings of such sensors for the motion above."""
+def signals() -> Signals:
+    """Return the readings of the vehicle's sensors for the motion above."""
     felt = VY_RATE + SPEED * RATE
-    ay = sensors.ay_gain * felt + sensors.lever_m * YAW_ACCELERATION + sensors.ay_bias_m_s2
-    speed, rate = np.where(np.arange(T.size) % 5 == 0, SPEED, np.nan), RATE + sensors.yaw_rate_bias_rad_s
-    return signals_at(STAMPS, steer_rad=0.0, ax_m_s2=0.0, ay_m_s2=ay, yaw_rate_rad_s=rate, speed_m_s=speed)
+    ay = (1.0 + GRAVITY_M_S2 * 0.008) * felt + 0.7 * YAW_ACCELERATION
+    speed = np.where(np.arange(T.size) % 5 == 0, SPEED, np.nan)
+    return signals_at(STAMPS, steer_rad=0.0, ax_m_s2=0.0, ay_m_s2=ay, yaw_rate_rad_s=RATE, speed_m_s=speed)
 
 
 def track(vy: np.ndarray) -> StateTrack:
     return make_track("e", STAMPS, vx_m_s=SPEED, vy_m_s=vy, valid=np.ones(T.size, bool))
 
 
-def figures(of: Signals, vy: np.ndarray, sensors: SensorErrors, low_speed_m_s: float = 3.0) -> list[MetricRow]:
-    return evaluate_drive(EvaluatedDrive("drive", {"e": track(vy)}, None, of, {}, low_speed_m_s, sensors), ("d2",))
-
-
-def d2(of: Signals, vy: np.ndarray, sensors: SensorErrors) -> MetricRow:
-    (row,) = figures(of, vy, sensors)
+def d2(of: Signals, vy: np.ndarray) -> MetricRow:
+    read = CalibratedSignals(of, VEHICLE)
+    (row,) = evaluate_drive(EvaluatedDrive("drive", {"e": track(vy)}, None, of, {}, 3.0, read), ("d2",))
     return row
 
 
-def driven(of: Signals, vy: np.ndarray, *ends: int) -> float:
-    """Return the part of the consistency residual that correlates with the driving, of windows that end there."""
-    total, seconds = np.zeros((4, 4)), 0.0
-    for a, b in zip((0, *ends), (*ends, T.size), strict=True):
-        part, estimate = of.rows(a, b), track(vy).rows(a, b)
-        products, lasted = driving_products(estimate, part, low_speed_m_s=3.0, sensors=SENSORS)
-        total, seconds = total + products, seconds + lasted
-    return driven_consistency(total, seconds)
+def driven(of: Signals, vy: np.ndarray) -> float:
+    """Return the part of the consistency residual that correlates with the driving."""
+    return driven_consistency(track(vy), CalibratedSignals(of, VEHICLE), 3.0)
 
 
 def test_what_a_wrong_model_does_goes_with_the_driving_and_a_rough_road_does_not() -> None:
     wrong = VY + 0.02 * SPEED * RATE
-    assert driven(signals(SENSORS), VY) < 2e-3
-    assert driven(signals(SENSORS), wrong) == pytest.approx(d2(signals(SENSORS), wrong, SENSORS).value, rel=0.02)
-    road = replace(signals(SENSORS), ay_m_s2=signals(SENSORS).ay_m_s2 + 0.3 * np.sin(2.3 * T))
-    assert d2(road, VY, SENSORS).value > 0.1
-    assert driven(road, VY) < 0.1 * d2(road, VY, SENSORS).value
+    assert driven(signals(), VY) < 2e-3
+    assert driven(signals(), wrong) == pytest.approx(d2(signals(), wrong).value, rel=0.02)
+    road = replace(signals(), ay_m_s2=signals().ay_m_s2 + 0.3 * np.sin(2.3 * T))
+    assert d2(road, VY).value > 0.1
+    assert driven(road, VY) < 0.1 * d2(road, VY).value
 
 
 def test_it_is_not_told_of_too_little_driving() -> None:
-    assert np.isnan(driven_consistency(np.eye(4), 9.0))
-    assert np.isnan(driven(signals(SENSORS), np.full(T.size, np.nan)))
+    short = CalibratedSignals(signals().rows(0, 900), VEHICLE)
+    assert np.isnan(driven_consistency(track(VY).rows(0, 900), short, 3.0))
+    assert np.isnan(driven(signals(), np.full(T.size, np.nan)))
 
 
 def test_the_true_lateral_velocity_contradicts_nothing_once_the_sensors_are_known() -> None:
-    row = d2(signals(SENSORS), VY, SENSORS)
+    row = d2(signals(), VY)
     assert (row.signal, row.metric, row.unit, row.segment) == ("vy_m_s", "d2", "m/s", "all")
     assert row.value < 2e-3
     assert row.n == T.size - 200 - 4  # two seconds before the first, and no speed behind the last sample
@@ -77,9 +71,9 @@ def test_the_true_lateral_velocity_contradicts_nothing_once_the_sensors_are_know
 def test_it_is_the_change_of_the_error_over_two_seconds() -> None:
     error = 0.3 * np.sin(0.4 * T)
     change = error[200:] - error[:-200]
-    found = d2(signals(SENSORS), VY + error, SENSORS).value
+    found = d2(signals(), VY + error).value
     assert found == pytest.approx(float(np.sqrt(np.mean(change**2))), rel=0.01)
-    assert d2(signals(SENSORS), VY + 5.0, SENSORS).value < 2e-3  # a constant is not seen
+    assert d2(signals(), VY + 5.0).value < 2e-3  # a constant is not seen
 
 
 def rows(yaw: dict[str, float], **values: float) -> list[MetricRow]:

@@ -44,7 +44,7 @@ def by_hand(stamps_ns: np.ndarray, reason: np.ndarray, bit: int) -> list[Interva
 
 
 @pytest.mark.slow
-@settings(max_examples=200, derandomize=True, deadline=None)
+@settings(max_examples=100, derandomize=True, deadline=None)
 @given(st.lists(st.tuples(st.integers(1, 40), st.integers(0, 15)), min_size=1, max_size=60))
 def test_intervals_are_those_found_by_hand(samples: list[tuple[int, int]]) -> None:
     # Steps of 20 to 800 ms, masks of the first four bits.

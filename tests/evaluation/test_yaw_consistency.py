@@ -1,4 +1,4 @@
-"""The yaw rate that tyres cause at a v_y: small for the true one, large for others, without vehicle unknown."""
+"""The yaw rate that tyres cause at a v_y: small for the true one, large for others."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 
 from pdhef_logtool import Car, read_drive
+from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
-from pdhef_logtool.evaluation.metrics.metric import SensorErrors
+from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
 from pdhef_logtool.records.tracks import StateTrack
 
 SALOON = Car.load("saloon")
-SENSORS = SensorErrors(vehicle=SALOON.physics_vehicle, read_with=SALOON.vehicle)
+VEHICLE = SALOON.physics_vehicle
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +27,12 @@ def lane_change(sample_logs_dir: Path) -> WholeDrive:
         return drive.whole()
 
 
-def figure(tracks: list[StateTrack], drive: WholeDrive, sensors: SensorErrors = SENSORS) -> list[float]:
+def figure(
+    tracks: list[StateTrack], drive: WholeDrive, vehicle: VehicleParameters = VEHICLE, delay_s: float = 0.0
+) -> list[float]:
     named = {str(i): track for i, track in enumerate(tracks)}
-    evaluated = EvaluatedDrive("", named, None, drive.signals, {}, 3.0, sensors)
+    calibrated = CalibratedSignals(corrected_anew(drive.signals, SALOON.vehicle, vehicle), vehicle, delay_s)
+    evaluated = EvaluatedDrive("", named, None, drive.signals, {}, 3.0, calibrated)
     return [row.value for row in evaluate_drive(evaluated, ("yaw_consistency",))]
 
 
@@ -49,21 +53,21 @@ def test_a_gyro_bias_and_a_steering_delay_that_the_log_calibrated_are_taken_off(
     signals, delay = lane_change.signals, 5
     late = np.concatenate([np.full(delay, signals.steer_rad[0]), signals.steer_rad[:-delay]])
     spoilt = replace(signals, steer_rad=late, yaw_rate_rad_s=signals.yaw_rate_rad_s + 0.02)
-    biased = SENSORS.vehicle.sensors.model_copy(  # type: ignore[union-attr]
-        update={"yaw_rate_bias_rad_s": SALOON.vehicle.sensors.yaw_rate_bias_rad_s + 0.02}
-    )
-    vehicle = SENSORS.vehicle.model_copy(update={"sensors": biased})  # type: ignore[union-attr]
+    bias = SALOON.vehicle.sensors.yaw_rate_bias_rad_s + 0.02
+    sensors = VEHICLE.sensors.model_copy(update={"yaw_rate_bias_rad_s": bias})
+    vehicle = VEHICLE.model_copy(update={"sensors": sensors})
     step_s = float(np.median(np.diff(signals.stamps_ns))) * 1e-9
-    known = replace(SENSORS, vehicle=vehicle, steer_delay_s=-delay * step_s)
     drive = replace(lane_change, signals=spoilt)
-    (clean,), (corrected,) = figure([lane_change.truth], lane_change), figure([lane_change.truth], drive, known)
+    (clean,), (corrected,) = (
+        figure([lane_change.truth], lane_change),
+        figure([lane_change.truth], drive, vehicle, -delay * step_s),
+    )
     (ignored,) = figure([lane_change.truth], drive)
     assert corrected < 1.3 * clean < ignored
 
 
-def test_there_is_no_figure_without_vehicle_steering_or_speed(lane_change: WholeDrive) -> None:
+def test_there_is_no_figure_without_steering_or_speed(lane_change: WholeDrive) -> None:
     assert lane_change.truth is not None
-    assert figure([lane_change.truth], lane_change, SensorErrors()) == []
     nothing = np.full(len(lane_change.signals), np.nan)
     for name in ("steer_rad", "speed_m_s"):
         blind = replace(lane_change.signals, **{name: nothing})

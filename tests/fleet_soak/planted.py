@@ -46,7 +46,7 @@ def rss_bytes() -> int:
 
 
 def measured_drive(task: DriveTask, tell: Tell) -> DriveEnd:
-    """Work on a drive and note process, processor seconds and memory."""
+    """Work on a drive and note the memory of the process."""
     return _measured(planted_drive(task, tell), task)
 
 
@@ -56,7 +56,7 @@ def measured_stub(task: DriveTask, tell: Tell) -> DriveEnd:
 
 
 def _measured(end: DriveEnd, task: DriveTask) -> DriveEnd:
-    line = json.dumps([os.getpid(), time.process_time(), rss_bytes(), task.log.path.name])
+    line = json.dumps([rss_bytes(), task.log.path.name])
     with Path(os.environ[MEASURES]).open("a") as file:
         file.write(line + "\n")
     return end

@@ -1,7 +1,4 @@
-"""A fleet through all that befalls one: damage, no truth, planted trouble, kills, growth. ``make fleet`` runs it.
-
-What was measured stands in out/fleet/figures.json; docs/fleet.md tells of it.
-"""
+"""A fleet through all that befalls one: damage, no truth, planted trouble, kills, growth. ``make fleet`` runs it."""
 
 from __future__ import annotations
 
@@ -108,21 +105,14 @@ def contents(output: Path) -> dict[str, bytes]:
     return {p.relative_to(output).as_posix(): p.read_bytes() for p in found}
 
 
-def note(**figures: Any) -> None:
-    """Keep what was measured."""
-    path = KEPT / "figures.json"
-    known = json.loads(path.read_text()) if path.is_file() else {}
-    path.write_text(json.dumps({**known, **figures}, indent=2, sort_keys=True) + "\n")
-
-
 @pytest.fixture(scope="session")
 def undisturbed(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     output = tmp_path_factory.mktemp("undisturbed") / "out"
     return output, finished(arguments(logs), output)
 
 
-def measures(output: Path) -> list[tuple[int, float, int, str]]:
-    """Return process, processor seconds and memory behind each drive, in the order of ending."""
+def measures(output: Path) -> list[tuple[int, str]]:
+    """Return the memory of the process behind each drive and the log's name, in the order of ending."""
     return [tuple(json.loads(line)) for line in output.with_suffix(".jsonl").read_text().splitlines()]
 
 
@@ -144,9 +134,7 @@ def test_exactly_the_planted_ones_are_given_up(undisturbed: tuple[Path, dict[str
     assert sum(log.file("recording.rrd") is not None for log in run.logs) == 5
     sizes = [p.stat().st_size for log in run.logs if (p := log.file("report.json")) is not None]
     assert "figures and a short report of each are kept" in found["said"][0]
-    largest = sorted(sizes)[-6]  # the five worst are kept in full
-    note(logs=len(run.logs), largest_short_report_bytes=largest)
-    assert largest <= 20_000
+    assert sorted(sizes)[-6] <= 20_000  # the five worst are kept in full
 
 
 def test_killed_twice_and_resumed_is_undisturbed(
@@ -172,11 +160,9 @@ def test_killed_twice_and_resumed_is_undisturbed(
 
 
 def test_a_worker_takes_no_more_memory_after_300_drives_than_after_30(undisturbed: tuple[Path, dict[str, Any]]) -> None:
-    simulated = [m for m in measures(undisturbed[0]) if m[3].startswith("drive_")]
-    early = statistics.median(rss for _, _, rss, _ in simulated[20:40])
-    late = statistics.median(rss for _, _, rss, _ in simulated[-20:])
+    simulated = [rss for rss, name in measures(undisturbed[0]) if name.startswith("drive_")]
+    early, late = statistics.median(simulated[20:40]), statistics.median(simulated[-20:])
     parent = undisturbed[1]["rss_bytes"]
-    note(worker_rss_30=early, worker_rss_300=late, parent_rss_30=parent[len(parent) // 10], parent_rss_300=parent[-1])
     assert late < 1.15 * early
     assert parent[-1] - parent[len(parent) // 10] < 100e6
 
@@ -189,6 +175,5 @@ def test_the_parents_memory_is_flat_to_3000_logs(tmp_path: Path) -> None:
     output = tmp_path / "out"
     found = finished([str(folder)], output, "--stub")
     memory = found["rss_bytes"]
-    note(stub_rss_300=memory[len(memory) // 10], stub_rss_3000=memory[-1], stub_peak=found["peak_bytes"])
     assert len(open_run(output).logs) == 3000
     assert memory[-1] - memory[len(memory) // 10] < 30e6

@@ -119,7 +119,7 @@ def _expected(message: Any, path: str) -> Any:
 
 
 # Without shrinking, which takes minutes through files; the failing type is printed whole.
-@settings(max_examples=60, deadline=None, derandomize=True, report_multiple_bugs=False, phases=[Phase.generate])
+@settings(max_examples=25, deadline=None, derandomize=True, report_multiple_bugs=False, phases=[Phase.generate])
 @given(root=_struct(2), seed=st.integers(0, 2**32 - 1), change=st.sampled_from(["never", "once", "always"]))
 def test_columns_equal_the_independent_deserialiser(
     tmp_path_factory: pytest.TempPathFactory, root: list[Any], seed: int, change: str

@@ -119,7 +119,7 @@ def _read_everything(path: Path) -> tuple[int, bool]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(_SOURCES))
-@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_no_damage_escapes_as_another_error(
     good: dict[str, bytes], tmp_path: Path, kind: str, data: st.DataObject
@@ -139,7 +139,7 @@ def test_no_damage_escapes_as_another_error(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(_SOURCES))
-@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_every_byte_ends_somewhere_and_no_message_is_missing_in_silence(
     good: dict[str, bytes], tmp_path: Path, kind: str, data: st.DataObject

@@ -130,7 +130,8 @@ def test_definitions_of_a_zip_file_or_a_wheel(tmp_path: Path, name: str) -> None
         archive.writestr("source-1.0/other_msgs/msg/Steer.msg", "float64 of_another\n")
     log = open_log(path, msgs=tmp_path / name)
     assert [f.path for f in log.fields("/steer")] == ["steering_wheel_angle"]
-    assert log.borrowed("/steer") == ()
+    log.read({"/steer": ["steering_wheel_angle"]})
+    assert log.lost == ()
 
 
 @pytest.mark.parametrize("variable", ["AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH"])
@@ -144,9 +145,10 @@ def test_an_installed_ros_is_looked_in_and_named(
     monkeypatch.setenv(variable, f"{tmp_path / 'nowhere'}{os.pathsep}{tmp_path / 'ros'}")
     log = open_log(path)
     assert [f.path for f in log.fields("/steer")] == ["steering_wheel_angle"]
-    assert log.borrowed("/steer") == (folder / "Steer.msg",)
-    said = choose_mapping(log, None, prefer_truth="perfect").remarks
-    assert any("Steer.msg of this machine, as the log does not define its type" in text for text in said)
+    log.read({"/steer": ["steering_wheel_angle"]})
+    (note,) = log.lost
+    assert (note.severity, note.where) == ("note", "/steer")
+    assert f"read by {folder / 'Steer.msg'} of this machine, as the log does not define its type" in note.what
 
 
 def test_first_messages_come_whole(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -259,6 +259,7 @@ ORACLES: Mapping[tuple[int, int], tuple[dict[str, Any], Callable[[float], float]
 
 
 @pytest.mark.parametrize(("version", "kind"), ORACLES)
+@settings(max_examples=20, deadline=None)
 @given(raw=st.lists(st.floats(-100.0, 100.0), min_size=1))
 def test_a_conversion_is_that_of_the_standard(version: int, kind: int, raw: list[float]) -> None:
     parameters, oracle = ORACLES[version, kind]

@@ -53,7 +53,7 @@ def test_the_epoch_with_most_messages_is_kept_and_a_pause_is_no_epoch() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(
     pieces=st.lists(
         st.tuples(st.integers(0, LATEST), st.integers(1, 10_000 * S), st.integers(1, 50)), min_size=1, max_size=12

@@ -122,7 +122,10 @@ def test_an_option_allows_it(server: CountingServer, tmp_path: Path, monkeypatch
 
 
 @pytest.mark.slow
-def test_the_option_reaches_the_processes_of_a_fleet(server: CountingServer, tmp_path: Path) -> None:
+def test_the_option_reaches_the_processes_of_a_fleet(
+    server: CountingServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pdhef_logtool.runs.fleet._PRELOAD", ("pdhef_logtool.runs.*",))  # no compiled code
     server.fault = _redirecting(server.place("dlc.mcap").replace("127.0.0.1", "localhost"))
     urls = [server.place("away.mcap"), server.place("dlc.mcap")]
     config = RunConfig(estimators=("zero",), annotate="none", keep="metrics", allow_private_redirects=True)

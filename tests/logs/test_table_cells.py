@@ -114,7 +114,7 @@ _SPELLINGS: dict[str, Callable[[float], str]] = {
 }
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     numbers=st.lists(st.floats(-1e9, 1e9).map(lambda v: round(v, 2)), min_size=1, max_size=20),
     spelling=st.sampled_from([*_SPELLINGS]),

@@ -72,7 +72,7 @@ def test_dates_come_back_whatever_their_unit(factor: int, rate_hz: float, start_
     assert all("GPS" in note or (stated and factor < 10**9) for note in clock.notes)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     rate_hz=st.sampled_from([1.0, 20.0, 100.0, 500.0]),
     start=st.datetimes(dt.datetime(2001, 1, 1), dt.datetime(2030, 1, 1)),

@@ -27,7 +27,7 @@ _floats = st.floats(allow_nan=True, allow_infinity=True, width=64)
 _texts = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9)
 _stamps = st.integers(0, 2**31 * 10**9 - 1)
 _settings = settings(
-    max_examples=40, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=20, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 
 

@@ -71,7 +71,7 @@ def _signals(draw: st.DrawFn) -> tuple[Signal, int]:
 
 
 @pytest.mark.slow
-@settings(max_examples=300, derandomize=True, deadline=None)
+@settings(max_examples=100, derandomize=True, deadline=None)
 @given(layout=_signals(), frames=st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=5))
 def test_any_layout_decodes_as_cantools_decodes_it(layout: tuple[Signal, int], frames: list[bytes]) -> None:
     signal, size = layout
@@ -215,7 +215,7 @@ _FRAMES = st.lists(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", ["ros", "json", "hex", "base64", "protobuf"])
-@settings(max_examples=15, derandomize=True, deadline=None)
+@settings(max_examples=8, derandomize=True, deadline=None)
 @given(frames=_FRAMES)
 def test_frames_of_every_encoding_decode_as_cantools_decodes_them(
     tmp_path_factory: pytest.TempPathFactory, form: str, frames: list[Frame]

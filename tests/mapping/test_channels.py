@@ -187,7 +187,7 @@ def messy_samples(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return stamps.astype(np.int64), arrival.astype(np.int64), values
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(samples=messy_samples())
 def test_cleaning_agrees_with_a_dictionary(samples: tuple[np.ndarray, ...]) -> None:
     stamps, arrival, values = samples

@@ -103,7 +103,7 @@ def test_a_file_may_name_one_signal_and_leave_the_rest_to_recognised_types(tmp_p
         (tmp_path / "mapping.toml").write_text(("fill_recognised = true\n" if filled else "") + text)
         chosen = choose_mapping(log, load_mapping(tmp_path / "mapping.toml"), prefer_truth="perfect")
         mapping, missing = chosen.mapping, chosen.missing
-        assert len(chosen.remarks) == filled  # which truth it is
+        assert len(chosen.mapping.notes) == filled  # which truth it is
         assert chosen.ambiguities == ()
         assert mapping.signals["friction"].topic == "/truth/perfect/state"
         others = {n: s for n, s in mapping.signals.items() if n != "friction"}

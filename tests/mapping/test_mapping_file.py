@@ -183,7 +183,7 @@ def mappings(draw: st.DrawFn) -> Mapping:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(mapping=mappings(), comment=texts)
 def test_what_is_written_loads_back(tmp_path_factory: pytest.TempPathFactory, mapping: Mapping, comment: str) -> None:
     clean = {

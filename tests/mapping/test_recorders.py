@@ -37,7 +37,7 @@ def folder_of(tmp_path: Path, **files: str) -> Path:
 
 def chosen(log: FakeLog, folder: Path) -> str:
     found = choose_mapping(log, load_mapping(folder), prefer_truth="perfect")
-    assert found.remarks == (f"mapping {found.mapping.file}: it is for this recorder",)
+    assert found.mapping.notes == (f"mapping {found.mapping.file}: it is for this recorder",)
     return found.mapping.file
 
 

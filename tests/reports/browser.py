@@ -62,8 +62,7 @@ class Browser:
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
-        self.call("Performance.enable", timeDomain="threadTicks")  # other load of the machine is not counted
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.show(width, height)
 
     def __enter__(self) -> Browser:
         return self
@@ -127,8 +126,15 @@ class Browser:
         elif event == "Page.loadEventFired":
             self._loaded = True
 
+    def show(self, width: int = 1280, height: int = 900, scheme: str = "light") -> None:
+        """Set the size of the window and the colour scheme of the user."""
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+
     def open(self, path: Path | str, wait_s: float = 180.0) -> None:
         """Open a file or an address and wait until all of its figures are drawn."""
+        self.messages.clear()
+        self.requests.clear()
         self._loaded = False
         end = time.monotonic() + wait_s
         self.call("Page.navigate", url=path if isinstance(path, str) else path.resolve().as_uri())
@@ -156,22 +162,12 @@ class Browser:
             raise RuntimeError(str(answer["exceptionDetails"]))
         return answer["result"].get("value")
 
-    def busy_s(self) -> float:
-        """Seconds of processor time that the main thread has worked for this page."""
-        metrics = {m["name"]: m["value"] for m in self.call("Performance.getMetrics")["metrics"]}
-        return metrics["TaskDuration"]
-
     def screenshot(self, path: Path, *, height: float | None = None) -> None:
         """Take a picture of the whole page, or of its first ``height`` points."""
         size = self.call("Page.getLayoutMetrics")["cssContentSize"]
         tall = size["height"] if height is None else min(height, size["height"])
         clip = {"x": 0, "y": 0, "width": size["width"], "height": tall, "scale": 1}
         made = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)
-        path.write_bytes(base64.b64decode(made["data"]))
-
-    def pdf(self, path: Path) -> None:
-        """Print on A4 as the page asks for."""
-        made = self.call("Page.printToPDF", preferCSSPageSize=True, printBackground=False)
         path.write_bytes(base64.b64decode(made["data"]))
 
     def drag(self, selector: str, start: float, end: float) -> None:

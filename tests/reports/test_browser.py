@@ -15,14 +15,16 @@ sys.path.insert(0, str(Path(__file__).parent))
 from browser import AXE, CHROMIUM, WHY_NOT, Browser, serious
 from made_runs import NAMES, drive_tracks, write_run
 from test_drive import hostile_run, plan_of
-from test_fleet_page import run_of
+from test_fleet_page import HOSTILE, run_of
 
+from pdhef_logtool.reports.comparison import comparison_page
 from pdhef_logtool.reports.pages import write_pages
+from pdhef_logtool.results.comparing import compare_runs
+from pdhef_logtool.results.gate import Figure, Gate
 from pdhef_logtool.results.opened_run import open_run
+from tests.results import made_run
 
 pytestmark = [pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT), pytest.mark.slow]
-#: Processor time of the main thread.
-FIRST_PICTURE_S, ZOOM_S = 2.0, 0.1
 #: A picture of one point.
 _DOT = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
@@ -42,10 +44,13 @@ def page_of(folder: Path) -> Path:
     return file
 
 
+@pytest.fixture(autouse=True)
+def _usual_window(browser: Browser) -> None:
+    browser.show()
+
+
 def opened(browser: Browser, file: Path) -> None:
     """Open a page and assert that it requests only its file and prints no message."""
-    browser.messages.clear()
-    browser.requests.clear()
     browser.open(file)
     assert browser.messages == []
     assert browser.requests == [file.resolve().as_uri()]
@@ -150,9 +155,7 @@ def test_the_keyboard_zooms(browser, tmp_path):
 
 
 @pytest.mark.skipif(AXE is None, reason="axe-core is not installed (pip install axe-core-python)")
-@pytest.mark.parametrize(("scheme", "width"), [("dark", 390), ("light", 1280)])
-def test_axe_finds_nothing_serious_and_nothing_is_wider_than_the_screen(tmp_path, scheme, width):
-    ground = {"dark": "rgb(20, 24, 29)", "light": "rgb(255, 255, 255)"}[scheme]
+def test_axe_finds_nothing_serious_and_nothing_is_wider_than_the_screen(browser, tmp_path):
     run = open_run(write_run(tmp_path / "made", drive_tracks(3.0), plan=plan_of("PASS", "FAIL", "INCONCLUSIVE")))
     cells = [
         {"speed": i % 3, "ay": i // 3, "seconds": 3.0**i, "scored": 9, "sideslip_mse_rad2": 1e-4} for i in range(9)
@@ -161,14 +164,28 @@ def test_axe_finds_nothing_serious_and_nothing_is_wider_than_the_screen(tmp_path
     drives = {f"d{i}": {"errors": (0.001 * (1 + i), 0.0015), "operating_space": space} for i in range(12)}
     fleet = open_run(run_of(tmp_path / "fleet", drives, {"bad": "/x/bad.mcap: expected a log, got 3 bytes"}))
     write_pages(fleet)
-    with Browser(width, 900) as browser:
-        browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
-        for page in (
-            write_pages(run).pages[0].file,
-            fleet.folder / "report.html",
-            fleet.folder / "logs/bad/report.html",
-        ):
+    drive = write_pages(run).pages[0].file
+    for scheme, width, ground in (("dark", 390, "rgb(20, 24, 29)"), ("light", 1280, "rgb(255, 255, 255)")):
+        browser.show(width, scheme=scheme)
+        for page in (drive, fleet.folder / "report.html", fleet.folder / "logs/bad/report.html"):
             browser.open(page)
             assert browser.value("getComputedStyle(document.body).backgroundColor") == ground
             assert serious(browser) == []
             assert browser.value("document.documentElement.scrollWidth") <= width
+
+
+def test_the_page_of_a_run_draws_its_figures(browser, tmp_path):
+    drives = {f"d{i}": {"errors": (0.001 * (1 + i), 0.002), "metadata": {HOSTILE: HOSTILE[: 20 + i % 2]}}
+              for i in range(9)}  # fmt: skip
+    folder = run_of(tmp_path, drives, {"bad": HOSTILE})
+    write_pages(open_run(folder))
+    opened(browser, folder / "report.html")
+    assert browser.value("document.querySelectorAll('[data-figure] canvas').length") >= 3
+
+
+def test_the_page_of_a_comparison_draws_both_figures(browser, tmp_path):
+    a, b = (made_run.write_run(tmp_path / str(x), {f"d{i}": 0.001 * x * (1 + i) for i in range(10)}) for x in (1, 2))
+    file = tmp_path / "page.html"
+    file.write_bytes(comparison_page(compare_runs(open_run(a), open_run(b), Gate((Figure(limit=0.05),)))))
+    opened(browser, file)
+    assert browser.value("document.querySelectorAll('.canvas canvas').length") == 2

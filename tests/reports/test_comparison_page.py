@@ -5,13 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import pytest
-
 from pdhef_logtool.reports.comparison import comparison_page
 from pdhef_logtool.results.comparing import compare_runs
 from pdhef_logtool.results.gate import Figure, Gate
 from pdhef_logtool.results.opened_run import open_run
-from tests.reports.browser import CHROMIUM, WHY_NOT, Browser
 from tests.results.made_run import entry, write_run
 
 TEN = {f"d{i}": 0.001 * (1 + i) for i in range(10)}
@@ -53,17 +50,3 @@ def test_names_that_are_markup_stay_texts_and_a_run_without_truth_has_a_page(tmp
     assert "<img" not in page
     assert "no drive has the figure on both sides (is there ground truth?): sideslip_rad rmse (all)" in _text(page)
     assert "No drive has the figure on both sides." in _text(page)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT)
-def test_a_browser_draws_both_figures_asks_for_nothing_and_says_nothing(tmp_path: Path) -> None:
-    a = write_run(tmp_path / "a", TEN)
-    b = write_run(tmp_path / "b", {label: value * (1.1 + 0.01 * i) for i, (label, value) in enumerate(TEN.items())})
-    file = tmp_path / "page.html"
-    file.write_text(_page(a, b), encoding="utf-8")
-    with Browser() as browser:
-        browser.open(file)
-        assert browser.messages == []
-        assert browser.requests == [file.resolve().as_uri()]
-        assert browser.value("document.querySelectorAll('.canvas canvas').length") == 2

@@ -146,5 +146,5 @@ def test_pages_of_sample_logs(sample_logs_dir: Path, tmp_path: Path) -> None:
     cut.write_bytes((sample_logs_dir / "dlc.mcap").read_bytes()[:2000])
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "no_truth", "faults")]
     out = tmp_path / "out"
-    run_logs([*logs, str(cut)], out, RunConfig(car=sample_logs_dir / "vehicle.toml", annotate="none"))
+    run_logs([*logs, str(cut)], out, RunConfig(car=sample_logs_dir / "vehicle.toml", annotate="none", end="10"))
     assert check(out) == 5

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from browser import CHROMIUM, WHY_NOT, Browser
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.reports.fleet import fleet_page
@@ -105,20 +101,3 @@ def test_a_damaged_table_is_told_and_stops_no_other_page(tmp_path: Path) -> None
     assert written.fleet.file is None and written.exit_code == 3
     assert any("no page of the run" in line for line in written.wrong)
     assert written.pages[1].file is not None
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT)
-def test_in_a_browser_the_page_draws_its_figures_asks_for_nothing_and_runs_nothing(tmp_path: Path) -> None:
-    drives = {
-        f"d{i}": {"errors": (0.001 * (1 + i), 0.002), "metadata": {HOSTILE: HOSTILE[: 20 + i % 2]}} for i in range(9)
-    }
-    folder = run_of(tmp_path, drives, {"bad": HOSTILE})
-    write_pages(open_run(folder))
-    page = folder / "report.html"
-    with Browser() as browser:
-        browser.open(page)
-        assert browser.value("document.querySelectorAll('[data-figure] canvas').length") >= 3
-        assert browser.messages == [] and browser.requests == [page.resolve().as_uri()]
-        overflow = browser.value("document.documentElement.scrollWidth - document.documentElement.clientWidth")
-        assert overflow <= 0

@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.car.car import NO_INTERVALS, Car
-from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.table import all_names, make_estimator
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, model_folder, open_model
 from pdhef_logtool.residual_model.features import FEATURES
@@ -37,17 +35,3 @@ def test_noise_evidence_and_calibration_are_of_the_shipped_network() -> None:
     assert (car.residual_gain, model.physics_sha256) == (0.75, car.physics_of("physics"))
     assert car.notes == ()
     assert {"phy-ukf:tuned", "physics"} == set(car.noise)
-    assert car.intervals is not None
-    by_name = {e.estimator: e.algorithm for e in car.intervals.entries}
-    assert by_name["pd-hef"].network_sha256 == model.sha256
-    assert by_name["pd-hef"].physics_sha256 == car.physics_of("physics")
-    assert car.intervals.physics_sha256 == car.physics_sha256
-    assert Car.load("saloon", intervals=NO_INTERVALS).intervals is None
-
-
-def test_every_shipped_interval_is_of_what_runs_on_the_shipped_car() -> None:
-    car = Car.load("saloon")
-    assert car.intervals is not None
-    ran = {name: resolve(make_estimator(name, car)) for name in all_names(car)}
-    for entry in car.intervals.entries:
-        assert entry.algorithm == ran[entry.estimator], entry.estimator

@@ -147,7 +147,7 @@ def made(
     return tuple({f"d{i:03d}": float(v) for i, v in enumerate(x)} for x in (a, worse * a * np.exp(change)))  # type: ignore[return-value]
 
 
-@pytest.mark.parametrize(("of_level", "of_change", "least"), [(0.0, 0.0, 38), (0.4, 0.0, 38), (0.4, 0.2, 15)])
+@pytest.mark.parametrize(("of_level", "of_change", "least"), [(0.0, 0.0, 38), (0.4, 0.2, 15)])
 def test_a_planted_regression_of_ten_percent_fails_and_equal_runs_seldom_do(
     of_level: float, of_change: float, least: int
 ) -> None:

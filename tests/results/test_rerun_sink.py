@@ -262,7 +262,7 @@ def test_a_disk_that_is_full_is_told(tmp_path, circle, circle_signals, monkeypat
         write(tmp_path / "recording.rrd", circle, circle_signals)
 
 
-@settings(max_examples=30, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=6, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 1500)), min_size=1, max_size=40))
 def test_a_sparse_line_goes_on_over_a_second_of_unknown_values(tmp_path, samples):
     known, steps = map(np.array, zip(*samples, strict=True))

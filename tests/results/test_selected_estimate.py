@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from run_report import GNSS, MAIN, TRUTH, errors_deg, figures, friction, ran, report, truth
+from run_report import GNSS, MAIN, TRUTH, errors_deg, figures, ran, report, truth
 
 from pdhef_logtool.results.selected_estimate import MainFacts
 
@@ -62,7 +62,7 @@ def test_a_truth_that_is_an_input_is_no_independent_check() -> None:
 def test_whether_the_band_holds(share: float, said: str) -> None:
     band = texts(metrics=[*errors_deg(pd_hef=0.1), *figures(("pd-hef", "sideslip_rad", "coverage95", share))])["band"]
     assert band.startswith(f"coverage {100 * share:.0f} % {said}")
-    assert band.endswith("(intervals calibrated on x)")
+    assert band.endswith("(intervals: own, parameters and sensors)")
 
 
 def test_a_truth_of_gnss_alone_says_why_there_is_no_figure() -> None:
@@ -93,10 +93,9 @@ def test_what_was_assumed_of_car_friction_and_network() -> None:
     unknown = texts(vehicle=UNKNOWN)
     assert unknown["assumed"].startswith("default sedan (no car given)")
     assert unknown["next"].startswith("give your car")
-    estimated = friction("estimate", estimated=True, observable_share=0.01, summary="observable 1 % of the time")
-    assert "friction estimated (observable 1 %" in texts(friction=estimated)["assumed"]
-    assert "--friction" in texts(friction=estimated)["next"]
-    assert "friction assumed, 1;" in texts(friction=friction("assumed, 1"))["assumed"]
+    assumed = texts(friction={"source": "assumed, 1"})
+    assert "friction assumed, 1;" in assumed["assumed"]
+    assert "--friction" in assumed["next"]
     assert texts(replace(MAIN, name="zero"))["assumed"] == "no vehicle model (zero needs none)"
 
 

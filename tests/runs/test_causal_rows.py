@@ -13,8 +13,8 @@ from pdhef_logtool.runs.fleet import run_logs
 
 
 def rows(sample_logs_dir: Path, out: Path, **options: Any) -> pl.DataFrame:
-    config = RunConfig(car="saloon", annotate="none", estimators=("zero", "pd-hef-smoothed"), **options)
-    run_logs([str(sample_logs_dir / "dlc.mcap")], out, config)
+    config = RunConfig(car="saloon", keep="estimates", estimators=("zero", "pd-hef-smoothed"), **options)
+    run_logs([str(sample_logs_dir / "dlc.mcap")], out, config, report=False)
     table = pl.read_parquet(out / "logs/dlc/estimates.parquet").with_columns(pl.col("estimator").cast(pl.String))
     return table.with_columns(after_s=(pl.col("stamp_ns") - pl.col("stamp_ns").min()) * 1e-9)
 

@@ -121,11 +121,10 @@ def test_a_wrong_option_is_no_fault_of_the_file(tmp_path: Path) -> None:
         ("end = 2026-01-31T12:00:00Z", "end", "2026-01-31 12:00:00+00:00"),
         ('estimators = "zero, pd-hef:gain=0.5,fixed-r"', "estimators", ("zero", "pd-hef:gain=0.5,fixed-r")),
         ('network = "none"', "network", Path("none")),
-        ('intervals = "none"', "intervals", Path("none")),
         ('car = "saloon"', "car", Path("saloon")),
         ('waived = ["ay_m_s2.unit"]', "waived", ("ay_m_s2.unit",)),
         ("friction = 0.4", "friction", 0.4),
-        ('friction = "estimate"', "friction", "estimate"),
+        ('friction = "file"', "friction", "file"),
     ],
 )
 def test_entries_as_users_write_them(

@@ -16,8 +16,8 @@ pytestmark = pytest.mark.slow
 
 
 def run(log: str, sample_logs_dir: Path, out: Path, **changes: Any) -> dict[str, Any]:
-    config = RunConfig(car=Path("saloon"), annotate="none", **changes)
-    run_logs([str(sample_logs_dir / f"{log}.mcap")], out, config)
+    config = RunConfig(car=Path("saloon"), keep="estimates", **changes)
+    run_logs([str(sample_logs_dir / f"{log}.mcap")], out, config, report=False)
     report = json.loads((out / "logs" / log / "report.json").read_text())
     follows(report)
     return report

@@ -249,8 +249,8 @@ def test_two_jobs_that_are_killed_and_go_on_leave_what_one_job_leaves(
         if share > 0.5:
             raise KeyboardInterrupt
 
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(fleet, "_PRELOAD", ("pdhef_logtool.runs.*",))  # compiled code is for those that get on
+    monkeypatch.setattr(fleet, "_PRELOAD", ("pdhef_logtool.runs.*",))  # no compiled code
+    with pytest.raises(KeyboardInterrupt):
         run_logs(logs, two, config, schedule=Schedule(jobs=2), reporter=Reporter(killed))
     assert run_logs(logs, two, config, schedule=Schedule(jobs=2, resume=True)).exit_code == 0
     assert contents(one) == contents(two)

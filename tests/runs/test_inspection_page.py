@@ -132,9 +132,9 @@ def test_hostile_names_run_nothing_and_a_narrow_dark_page_is_readable(tmp_path: 
     log = write_log(tmp_path / "hostile.mcap", {HOSTILE: car(), "/car": {"<img src=x>": np.arange(300.0)}})
     file = tmp_path / "page.html"
     file.write_text(_page(log))
-    for width, scheme in ((390, "dark"), (1280, "light")):
-        with Browser(width, 900) as browser:
-            browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+    with Browser() as browser:
+        for width, scheme in ((390, "dark"), (1280, "light")):
+            browser.show(width, scheme=scheme)
             browser.open(file)
             browser.value("document.querySelectorAll('details').forEach(n => { n.open = true })")
             assert browser.value("document.documentElement.scrollWidth") <= width

@@ -52,8 +52,8 @@ def silenced(monkeypatch: pytest.MonkeyPatch) -> None:
 def _run(change: Callable[[Drive], Drive], folder: Path, sample_logs_dir: Path, *estimators: str) -> RunResult:
     log = folder / "odd.mcap"
     write_samples(log, [change(read_samples(sample_logs_dir / "step.mcap"))])
-    config = RunConfig(estimators=estimators, car=Path("saloon"), annotate="none", network=Path("none"))
-    return run_logs([str(log)], folder / "out", config)
+    config = RunConfig(estimators=estimators, car=Path("saloon"), keep="estimates", network=Path("none"))
+    return run_logs([str(log)], folder / "out", config, report=False)
 
 
 def test_standstill_alone_is_no_failure_and_is_said(tmp_path: Path, sample_logs_dir: Path) -> None:

@@ -46,9 +46,11 @@ def stuck_run(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -
         car=sample_logs_dir / "vehicle.toml",
         network=folder / "model",
         estimators=("phy-ukf", "pd-hef"),
-        annotate="none",
+        keep="estimates",
     )
-    return run_logs([str(folder / "stuck.mcap")], folder / "out", config), folder / "out" / "logs" / "stuck"
+    return run_logs(
+        [str(folder / "stuck.mcap")], folder / "out", config, report=False
+    ), folder / "out" / "logs" / "stuck"
 
 
 def told(text: str) -> tuple[float, float]:

@@ -19,7 +19,7 @@ REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 
 def _run(log: Path, out: Path) -> tuple[pl.DataFrame, int]:
     mapping, car = (REFERENCE / folder / "revs_250lm.toml" for folder in ("mappings", "vehicles"))
-    config = RunConfig(mapping=mapping, car=car, estimators=("phy-ukf",), annotate="none")
+    config = RunConfig(mapping=mapping, car=car, estimators=("phy-ukf",), keep="estimates", model="off", end="200")
     result = run_logs([str(log)], out, config, report=False)
     folder = out / "logs" / result.results[0].outcome.log
     return pl.read_parquet(folder / "estimates.parquet"), result.exit_code
@@ -35,7 +35,6 @@ SILENT = "revs_250lm_a_disorder.mcap"
 #: File, exit code, first loss and end of the last gap, s from the first stamp (README of the faulty drives).
 FAULTY = [
     ("revs_250lm_a_flipped_byte.mcap", 3, 146.2, 154.8),
-    ("revs_250lm_a_flipped_byte_crc_only.mcap", 3, 94.5, 103.2),
     ("revs_250lm_a_truncated60.mcap", 3, 180.5, None),
     ("revs_250lm_a_split", 0, None, None),
     (SILENT, 3, 9.2, 165.0),
@@ -71,11 +70,11 @@ def test_damage_costs_what_it_hit_and_nothing_else(
     before = 400.0 if first_loss_s is None else first_loss_s - 0.05
     assert part(hurt, 0.0, before).equals(part(whole, 0.0, before), null_equal=True)
     if last_gap_s is not None:
-        both = part(hurt, last_gap_s + 5.0, 280.0).join(part(whole, last_gap_s + 5.0, 280.0), on="stamp_ns")
+        both = part(hurt, last_gap_s + 5.0, 200.0).join(part(whole, last_gap_s + 5.0, 200.0), on="stamp_ns")
         elapsed = (pl.col("stamp_ns") - start) / 1e9
         for lost_s in _single_losses_s(shared_dir, name):
             both = both.filter((elapsed < lost_s) | (elapsed >= lost_s + 5.0))
-        assert both.height > 7_000
+        assert both.height > 2_000
         difference_deg = np.degrees(np.abs((both["sideslip_rad"] - both["sideslip_rad_right"]).to_numpy()))
         # A sample at the very edge of the 6-sigma gate may be taken in one run and refused in the other: a tail that
         # is 1e-4 degrees long by then decides it, and some hundredths of a second show it.

@@ -42,8 +42,8 @@ def wrong_car(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -
 
 
 def run(log: Path, car: Path, out: Path, **changes: Any) -> dict[str, Any]:
-    values: dict[str, Any] = {"car": car, "annotate": "none", "estimators": NAMES, "end": END, **changes}
-    run_logs([str(log)], out, RunConfig(**values))
+    values: dict[str, Any] = {"car": car, "keep": "estimates", "estimators": NAMES, "end": END, **changes}
+    run_logs([str(log)], out, RunConfig(**values), report=False)
     return json.loads((out / "logs" / log.stem / "report.json").read_text())
 
 
@@ -72,7 +72,7 @@ def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the
     assert report["self_calibration"]["understeer"]["contradicts"]
     assert "calibrated on this log without ground truth" in report["answer"]["texts"]["assumed"]
     assert "the understeer gradient of the drive contradicts" in report["answer"]["texts"]["assumed"]
-    assert told["physics"]["intervals"] == ["intervals: own, parameters and d2"]
+    assert told["physics"]["intervals"] == ["intervals: own, parameters and sensors"]
     assert told["open-loop:calibrated"]["intervals"] == []
 
 

@@ -122,8 +122,8 @@ def test_the_truth_of_a_log_never_chooses(
     answers, best = [], set()
     for name, text in (("right", TRUTH), ("shuffled", SHUFFLED)):
         (tmp_path / f"{name}.toml").write_text(text)
-        config = RunConfig(mapping=tmp_path / f"{name}.toml", annotate="none", model=model, end="+4s")
-        result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config).results[0]
+        config = RunConfig(mapping=tmp_path / f"{name}.toml", keep="estimates", model=model, end="+4s")
+        result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config, report=False).results[0]
         assert result.report is not None
         answer = result.report["answer"]
         assert answer["best_in_hindsight"] is not None

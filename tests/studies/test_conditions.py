@@ -1,56 +1,15 @@
-"""The condition table from simulation to page on a tiny row."""
+"""The fitted files of the cars of the condition table, and the stored page."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
-import polars as pl
 import pytest
 
 from pdhef_logtool import Car
 from studies import conditions
 from studies.drawn_cars import fit_vehicle
 from truthsim.vehicle_choice import choose_vehicle
-
-ROWS = ("in-domain", "friction-plus-20")
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    work = tmp_path_factory.mktemp("conditions")
-    arguments = ["--drives", "2", "--rows", ",".join(ROWS), "--jobs", "1", "--estimators", "zero,phy-ukf"]
-    arguments += ["--work", str(work / "work"), "--out", str(work / "docs"), "--results", str(work / "results")]
-    assert conditions.main(arguments) == 0
-    return work
-
-
-@pytest.mark.fleet
-@pytest.mark.slow
-def test_the_page_has_every_row_and_its_pooled_figure_is_that_of_the_samples(made: Path) -> None:
-    page = (made / "docs" / "conditions.md").read_text(encoding="utf-8")
-    assert all(f"| {row} |" in page for row in ROWS)
-    assert "nan" not in page
-    rmse = _rmse(made, "in-domain", "zero")
-    pooled = math.sqrt(float((rmse["value"] ** 2 * rmse["n"]).sum() / rmse["n"].sum()))
-    tables = (made / "results" / "tables.md").read_text(encoding="utf-8")
-    tables = tables[tables.index("pooled over all samples") :]
-    line = next(text for text in tables.splitlines() if text.startswith("| in-domain |"))
-    assert line.split("|")[2].strip() == f"{math.degrees(pooled):.3f}"
-
-
-@pytest.mark.fleet
-@pytest.mark.slow
-def test_wrong_friction_reaches_the_model_and_nothing_else(made: Path) -> None:
-    for estimator, is_equal in (("zero", True), ("phy-ukf", False)):
-        right, wrong = (_rmse(made, row, estimator)["value"] for row in ROWS)
-        assert (right == wrong).all() == is_equal
-
-
-def _rmse(made: Path, row: str, estimator: str) -> pl.DataFrame:
-    metrics = pl.read_parquet(made / "results" / "metrics.parquet")
-    chosen = {"row": row, "estimator": estimator, "signal": "sideslip_rad", "segment": "all", "metric": "rmse"}
-    return metrics.filter(**chosen).sort("drive")
 
 
 def test_a_fitted_file_has_the_mass_and_the_stiffness_of_the_car(sample_logs_dir: Path) -> None:

@@ -14,7 +14,7 @@ from studies.peers import __main__ as peers
 from studies.peers.drives import FULL_SIZE, OFFSET, PEER_DRIVES, PeerDrive, beside_mapping, beside_vehicle
 from studies.peers.page import page
 from studies.peers.parameters import pairs_table
-from studies.peers.scoring import DriveErrors, car_means, score
+from studies.peers.scoring import DriveErrors, score
 
 
 def track(sideslip: np.ndarray, speed: float = 10.0):
@@ -39,12 +39,6 @@ def test_slow_stamps_are_not_scored_and_an_offset_is_removed_where_it_is_declare
     offset = score(PeerDrive("log", "car", OFFSET), {"zero": np.zeros(4)}, truth)
     assert offset.offset_deg == pytest.approx(2.0)
     assert offset.rmse_deg["zero"] == pytest.approx(1.5)
-
-
-def test_logs_of_a_drive_share_its_weight_and_drives_of_a_car_its_vote():
-    drives = PeerDrive("a", "x"), PeerDrive("b", "x", same_as="a"), PeerDrive("c", "x"), PeerDrive("d", "y")
-    errors = [DriveErrors(d, 1, 0.0, {"e": value}) for d, value in zip(drives, (1.0, 4.0, 8.0, 3.0), strict=True)]
-    assert car_means(errors, "e") == pytest.approx({"x": 4.0, "y": 3.0})
 
 
 def test_files_beside_a_drive_become_mapping_and_vehicle():

@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 
 from studies import teaching
-from studies.gates.tool import Tool
-from studies.pages import ROOT
 from studies.teaching import CARS, PairResult, Score
 
 
@@ -40,14 +38,3 @@ def test_the_stored_results_have_every_pair_and_none_is_worse_than_untaught() ->
     for r in stored:
         before, after = r["untaught"]["rmse_deg"], r["hybrid"]["rmse_deg"]
         assert after <= max(1.05 * before, before + 0.03), (r["taught"], r["scored"])
-
-
-@pytest.mark.fleet
-@pytest.mark.slow
-@pytest.mark.usefixtures("shared_dir")
-def test_a_car_that_was_taught_on_one_drive_is_better_on_the_other(tmp_path: Path) -> None:
-    car = next(c for c in CARS if c.name == "V40")
-    results = list(teaching.pairs_of(Tool(ROOT, tmp_path), car))
-    assert [(r.taught, r.scored) for r in results] == [("v40_slalom", "v40_swd_gnss"), ("v40_swd_gnss", "v40_slalom")]
-    assert not any(r.worse for r in results)
-    assert any(r.prior.rmse_deg < r.untaught.rmse_deg for r in results)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
-import sys
 import time
 import zlib
 from functools import partial
@@ -14,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from studies.pages import ROOT
 from studies.torture import outside
 from studies.torture.bombs import BOMBS, Bomb, judge_bomb
 from studies.torture.formats import format_judge
@@ -26,26 +23,9 @@ from studies.torture.table_seeds import FORMATS, table_seeds
 from studies.torture.workers import Ended, Verdict, judge, read_journal, run_cases
 from tests.command_line import called
 
-LOGS, CONFIGS = 40, 12
-
 
 def _quiet(_text: str) -> None:
     """Print no progress."""
-
-
-@pytest.mark.fleet
-@pytest.mark.slow
-def test_mutants_do_no_harm(tmp_path: Path) -> None:
-    """Run in a separate process: memory used by the tests must not count for the mutants."""
-    options = ["--seed", "2", "--logs", str(LOGS), "--configs", str(CONFIGS), "--jobs", "1", "--only", "mutations"]
-    places = ["--work", str(tmp_path), "--out", str(tmp_path / "none.md")]
-    call = [sys.executable, "-m", "studies.torture", *options, *places]
-    done = subprocess.run(call, capture_output=True, text=True, cwd=ROOT, check=False)
-    found = json.loads((tmp_path / "mutations.json").read_text())
-    assert [p for part in found.values() for p in part["problems"]] == []
-    assert done.returncode == 0, done.stderr
-    assert [part["count"] for part in found.values()] == [LOGS, CONFIGS]
-    assert {"exit 0", "exit 1", "exit 3"} <= found["logs"]["ends"].keys()  # neither harmless nor all refused
 
 
 @pytest.mark.slow
@@ -76,14 +56,6 @@ def test_the_same_number_gives_the_same_mutant_and_most_differ_from_the_seed(tmp
         made = [mutant(name, seeds[name], 3, n) for n in range(20)]
         assert made == [mutant(name, seeds[name], 3, n) for n in range(20)]
         assert sum(content != seeds[name] for _, content in made) > 15
-
-
-@pytest.mark.fleet
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FORMATS)
-def test_mutants_of_tables_do_no_harm(name: str, tmp_path: Path) -> None:
-    judge_number = format_judge(tmp_path, name, 2)
-    assert {n: problem for n in range(12) if (problem := judge_number(n).problem)} == {}
 
 
 @pytest.mark.slow

@@ -8,13 +8,7 @@ from scipy import stats
 
 from truthsim.manoeuvres import MANOEUVRES, Plan, Request
 from truthsim.motion import Motion, simulate_motion
-from truthsim.sensors import (
-    IMU_PERIOD_S,
-    STEER_PHASE_S,
-    WHEEL_PHASE_S,
-    SensorNoise,
-    sense,
-)
+from truthsim.sensors import IMU_PERIOD_S, STEER_PHASE_S, WHEEL_PHASE_S, SensorNoise, sense
 from truthsim.vehicle import Vehicle
 
 G = 9.80665

@@ -9,13 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from truthsim.tyres import (
-    Tyre,
-    cornering_stiffness_n_per_rad,
-    forces_n,
-    lateral_relaxation_length_m,
-    slip_rates,
-)
+from truthsim.tyres import Tyre, cornering_stiffness_n_per_rad, forces_n, lateral_relaxation_length_m, slip_rates
 
 TYRE = Tyre()
 

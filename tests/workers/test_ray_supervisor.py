@@ -10,6 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,11 @@ from tests.conftest import ROOT
 from tests.workers.planted_work import Item, planted
 from tests.workers.ray_nodes import START_S, cluster_of_one, grow, processes_of
 
-ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'pdhef-logtool[ray]'")
-pytestmark = pytest.mark.fleet
+#: Ray is not imported here: its import takes seconds, and most runs of the tests leave these out.
+pytestmark = [
+    pytest.mark.fleet,
+    pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed: pip install 'pdhef-logtool[ray]'"),
+]
 PRELOAD = ["tests.workers.planted_work"]
 
 

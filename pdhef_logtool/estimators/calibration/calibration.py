@@ -25,6 +25,7 @@ from pdhef_logtool.estimators.calibration.joint import (
     FRONT_STIFFNESS,
     RATIO,
     REAR_STIFFNESS,
+    STEER_DELAY,
     JointProblem,
     Parameter,
     driven,
@@ -108,7 +109,6 @@ class SelfCalibration:
     rms : RMS error of yaw rate in rad/s and of a_y in m/s²; of_file : the same of the vehicle file.
     seconds : used driving. logs : number of logs in the pool.
     varied : vehicles one posterior 1-sigma away, one per direction with a large effect on the sideslip.
-    driven_d2_m_s : part of the v̇_y residual of ``physics`` that correlates with the driving, NaN without a run.
     """
 
     vehicle_file: VehicleParameters
@@ -121,7 +121,11 @@ class SelfCalibration:
     seconds: float
     logs: int
     varied: tuple[VehicleParameters, ...] = ()
-    driven_d2_m_s: float = math.nan
+
+    @property
+    def steer_delay_s(self) -> float:
+        """Delay of the steering angle; 0 if it was not fitted."""
+        return next((p.value for p in self.parameters if p.name == STEER_DELAY), 0.0)
 
     @property
     def noise(self) -> FilterNoise:
@@ -194,7 +198,7 @@ def self_calibrate(
     taught : prior from drives with ground truth. It cannot make a rejected calibration acceptable, as the model
         explains such driving with no parameters. It is omitted if the fit is rejected only with it.
     """
-    drives = [d for d in drives if len(d.stretches)]
+    drives = [d.informative() for d in drives if len(d.stretches)]
     seconds = sum(d.seconds for d in drives)
     if seconds < LEAST_S:
         why = f"{seconds:.0f} s above {vehicle_file.low_speed_blend_m_s:g} m/s, {LEAST_S:g} are needed"
@@ -214,7 +218,7 @@ def self_calibrate(
     varied = varied_parameters(theta, root, problem.sideslip, VARIED)
     return SelfCalibration(
         vehicle_file,
-        problem.vehicle(theta, digits=6),
+        problem.vehicle(theta),
         parameters,
         _understeer(problem, theta, covariance, vehicle_file),
         refused,
@@ -222,7 +226,7 @@ def self_calibrate(
         problem.rms(None),
         seconds,
         len(drives),
-        tuple(problem.vehicle(to, digits=6) for to in varied),
+        tuple(problem.vehicle(to) for to in varied),
     )
 
 

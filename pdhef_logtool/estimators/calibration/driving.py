@@ -12,12 +12,14 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.calibration.single_track import AY, FRICTION, SPEED, STEER, YAW_RATE
 from pdhef_logtool.estimators.speed_slip import believable
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 
 #: Step of the grid. The model is valid to 4 Hz; the integration is exact for tyre lags (12 ms at 40 m/s).
 STEP_S = 0.02
 #: Minimum length of a stretch; longest gap to interpolate, in general and for the speed, which varies slowly.
 LEAST_STRETCH_S, BRIDGED_S, SPEED_BRIDGED_S = 2.0, 0.3, 0.6
+#: Longest driving of one log in a fit, and length of the pieces from which it is selected.
+MOST_S, PIECE_S = 300.0, 10.0
 
 _COLUMNS = 5
 _PAUSE_CELLS = 100
@@ -29,7 +31,7 @@ class Driving:
 
     Attributes
     ----------
-    columns : float64 [5, N], steering, speed, yaw rate, a_y and friction on the grid, as ``read_with`` reads them.
+    columns : float64 [5, N], steering, speed, yaw rate, a_y and friction on the grid.
     stamps_ns : int64 [N], end of each cell of the grid.
     stretches : int64 [k, 2], [first, last) of each stretch without a gap above the vehicle's low-speed limit.
     has_ay : whether a_y was measured; if not, the column contains v_x r, which is not compared with the model.
@@ -38,13 +40,23 @@ class Driving:
     columns: FloatArray
     stamps_ns: IntArray
     stretches: IntArray
-    read_with: VehicleParameters
     has_ay: bool = True
 
     @property
     def seconds(self) -> float:
         """Driving in all stretches."""
         return float(np.sum(np.diff(self.stretches, axis=1))) * STEP_S
+
+    def informative(self) -> Driving:
+        """Return the same grid with at most :data:`MOST_S` of driving: the pieces in which a_y varies most."""
+        if self.seconds <= MOST_S:
+            return self
+        size, ay = round(PIECE_S / STEP_S), self.columns[AY]
+        pieces = [slice(k, min(k + size, last)) for first, last in self.stretches for k in range(first, last, size)]
+        inside = np.zeros(ay.size, dtype=np.bool_)
+        for piece in sorted(pieces, key=lambda p: -float(np.var(ay[p])))[: round(MOST_S / PIECE_S)]:
+            inside[piece] = True
+        return replace(self, stretches=_long(_spans(inside)))
 
     def between(self, first: int, last: int) -> Driving:
         """Return the same grid with the stretches between two cells alone."""
@@ -55,7 +67,7 @@ def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
     """Thin the signals of a drive [N] to a grid of cell means."""
     if not len(signals):
         none = np.empty(0, dtype=np.int64)
-        return Driving(np.empty((_COLUMNS, 0)), none, none.reshape(0, 2), vehicle)
+        return Driving(np.empty((_COLUMNS, 0)), none, none.reshape(0, 2))
     signals, _ = believable(signals, vehicle.sensors, None, None)
     start_ns = int(signals.stamps_ns[0])
     cell = (signals.stamps_ns - start_ns) // round(STEP_S * 1e9)
@@ -87,7 +99,7 @@ def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:
     if not (has_ay := bool(np.isfinite(columns[AY]).any())):
         columns[AY] = columns[SPEED] * columns[YAW_RATE]
     stretches = _stretches(columns, vehicle.low_speed_blend_m_s)
-    return Driving(columns, stamps_ns, stretches, vehicle, has_ay)
+    return Driving(columns, stamps_ns, stretches, has_ay)
 
 
 def _bridged(values: FloatArray, most: int) -> FloatArray:
@@ -105,8 +117,13 @@ def _bridged(values: FloatArray, most: int) -> FloatArray:
 def _stretches(columns: FloatArray, least_speed_m_s: float) -> IntArray:
     """Return [first, last) of each stretch that is complete, fast and long enough."""
     good = np.isfinite(columns).all(axis=0) & (columns[SPEED] > least_speed_m_s)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
-    return _long(edges.reshape(-1, 2).astype(np.int64))
+    return _long(_spans(good))
+
+
+def _spans(mask: BoolArray) -> IntArray:
+    """Return [first, last) of each run of true values in a mask [N]."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return edges.reshape(-1, 2).astype(np.int64)
 
 
 def _long(spans: IntArray) -> IntArray:

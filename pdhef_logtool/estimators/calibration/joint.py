@@ -313,17 +313,16 @@ class JointProblem:
 
     def errors_of(self, theta: FloatArray) -> FloatArray:
         """Return errors over ``ERROR_STD`` [2, K]."""
-        return self._errors(self._track(theta))
+        return self._errors(self.values(theta))
 
     def rms(self, theta: FloatArray | None) -> tuple[float, float]:
         """Return the RMS error of yaw rate and a_y for θ, or for the vehicle file if θ is None."""
-        file = self.vehicle_file
-        rms = self._rms(self._errors(track_of(file, file)) if theta is None else self.errors_of(theta))
+        rms = self._rms(self._errors(_file_values(self.vehicle_file)) if theta is None else self.errors_of(theta))
         return float(rms[OF_RATE]), float(rms[OF_AY])
 
     def sideslip(self, theta: FloatArray) -> FloatArray:
         """Return the model's v_y / v_x of all used samples [K]."""
-        self._errors(self._track(theta))
+        self._errors(self.values(theta))
         parts = zip(self._drives, self._out, self._kept, strict=True)
         return np.concatenate([out[2, k] / d.columns[SPEED, k] for d, out, k in parts])
 
@@ -337,20 +336,16 @@ class JointProblem:
         """Return the parameters by name."""
         return {p.name: p.value(t) for p, t in zip(self.parameters, theta.tolist(), strict=True)}
 
-    def vehicle(self, theta: FloatArray, *, digits: int = 17) -> VehicleParameters:
+    def vehicle(self, theta: FloatArray) -> VehicleParameters:
         """Return the vehicle file with the parameters; friction is the file's, the peak force includes its error."""
-        values = {name: float(f"{value:.{digits}g}") for name, value in self.values(theta).items()}
-        return _vehicle_with(self.vehicle_file, values, digits)
+        return _vehicle_with(self.vehicle_file, self.values(theta))
 
     def theta_of(self, values: Mapping[str, float]) -> FloatArray:
         """Return the normalised parameters of values by name."""
         return np.array([p.theta(values[p.name]) for p in self.parameters])
 
-    def _track(self, theta: FloatArray) -> TrackParameters:
-        values = self.values(theta)
-        return track_of(_vehicle_with(self.vehicle_file, values, 17), self.vehicle_file, values[STEER_DELAY])
-
-    def _errors(self, p: TrackParameters) -> FloatArray:
+    def _errors(self, values: Mapping[str, float]) -> FloatArray:
+        p = _track_of(values, self.vehicle_file)
         for d, columns, out, differences in zip(self._drives, self._columns, self._out, self._differences, strict=True):
             errors(columns, d.stretches, STEP_S, p, self._filter, out, differences)
             if not d.has_ay:
@@ -437,16 +432,17 @@ def driven(drives: Sequence[Driving], column: int) -> FloatArray:
     return np.concatenate([d.columns[column, counted(d)] for d in drives])
 
 
-def _vehicle_with(vehicle_file: VehicleParameters, values: Mapping[str, float], digits: int) -> VehicleParameters:
-    def rounded(value: float) -> float:
-        return float(f"{value:.{digits}g}")
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
 
-    mu = vehicle_file.assumed_friction
+
+def _vehicle_with(vehicle_file: VehicleParameters, values: Mapping[str, float]) -> VehicleParameters:
+    values, mu = {name: _rounded(value) for name, value in values.items()}, vehicle_file.assumed_friction
 
     def tyre(front: bool, stiffness: float) -> AxleTyre:
         peak = values[PEAK] * vehicle_file.magic_formula(front, mu)[2]
-        b = rounded(stiffness / (STIFFNESS_TYRE_SHAPE * peak))
-        return AxleTyre(B=b, C=STIFFNESS_TYRE_SHAPE, D_n=rounded(peak / mu), E=0.0, reference_friction=mu)
+        b = _rounded(stiffness / (STIFFNESS_TYRE_SHAPE * peak))
+        return AxleTyre(B=b, C=STIFFNESS_TYRE_SHAPE, D_n=_rounded(peak / mu), E=0.0, reference_friction=mu)
 
     rear = values[REAR_STIFFNESS]
     front = front_stiffness(vehicle_file, values[RATIO], rear)
@@ -457,7 +453,7 @@ def _vehicle_with(vehicle_file: VehicleParameters, values: Mapping[str, float], 
             "yaw_inertia_kg_m2": values[INERTIA],
             "steer_offset_rad": values[STEER_OFFSET],
             "steering_ratio": values[STEER_RATIO],
-            "roll_gradient_rad_per_m_s2": rounded((values[AY_GAIN] - 1.0) / GRAVITY_M_S2),
+            "roll_gradient_rad_per_m_s2": _rounded((values[AY_GAIN] - 1.0) / GRAVITY_M_S2),
             "friction": mu,
             "sensors": vehicle_file.sensors.model_copy(update=biases),
             "imu_position_m": (values[IMU_X], *vehicle_file.imu_position_m[1:]),
@@ -469,19 +465,19 @@ def _vehicle_with(vehicle_file: VehicleParameters, values: Mapping[str, float], 
 
 def prior_vehicle(vehicle_file: VehicleParameters, taught: Sequence[TaughtParameter] = ()) -> VehicleParameters:
     """Return the vehicle file with every parameter at its prior mean."""
-    return _vehicle_with(vehicle_file, {p.name: p.mean for p in prior_of(vehicle_file, taught)}, 6)
+    return _vehicle_with(vehicle_file, {p.name: p.mean for p in prior_of(vehicle_file, taught)})
 
 
 def prior_variations(
-    vehicle: VehicleParameters, priors: Sequence[Parameter] | None = None
+    vehicle: VehicleParameters, priors: Sequence[Parameter] | None = None, share: float = 1.0
 ) -> tuple[VehicleParameters, ...]:
     """Return vehicles with a prior 1-sigma error in one parameter each, those with the most effect on the sideslip.
 
     Stiffness of the axles, friction in place of peak force, steering ratio and offset, position of the accelerometer.
-    Without ``priors``, ``vehicle`` is a vehicle file.
+    Without ``priors``, ``vehicle`` is a vehicle file. ``share`` : factor on the standard deviations.
     """
-    std, (x, y, z) = {p.name: p.std for p in priors or parameters_of(vehicle)}, vehicle.imu_position_m
-    front, rear = (std[RATIO], std[REAR_STIFFNESS]) if priors else (FILE_TYRE_STD, FILE_TYRE_STD)
+    std, (x, y, z) = {p.name: share * p.std for p in priors or parameters_of(vehicle)}, vehicle.imu_position_m
+    front, rear = (std[RATIO], std[REAR_STIFFNESS]) if priors else (share * FILE_TYRE_STD, share * FILE_TYRE_STD)
     return (
         vehicle.with_stiffness(math.exp(front), 1.0),
         vehicle.with_stiffness(math.exp(rear) if priors else 1.0, math.exp(rear)),
@@ -492,30 +488,36 @@ def prior_variations(
     )
 
 
-def track_of(
-    vehicle: VehicleParameters, vehicle_file: VehicleParameters, steer_delay_s: float = 0.0
-) -> TrackParameters:
-    """Return the model of a vehicle for signals that were read with ``vehicle_file``."""
-    mu, mass = vehicle.assumed_friction, vehicle.mass_kg
-    gain = vehicle_file.steering_ratio / vehicle.steering_ratio
+def _file_values(file: VehicleParameters) -> dict[str, float]:
+    """Return the parameters of a vehicle file by name."""
+    front, rear = coefficients(file)
+    tyres = {RATIO: front / rear, REAR_STIFFNESS: rear * file.axle_load_n(False)}
+    return {p.name: p.mean for p in parameters_of(file)} | tyres
+
+
+def _track_of(values: Mapping[str, float], file: VehicleParameters) -> TrackParameters:
+    """Return the model of parameters for signals that were read with a vehicle file."""
+    mu, mass, rear = file.assumed_friction, file.mass_kg, values[REAR_STIFFNESS]
+    front_peak, rear_peak = (values[PEAK] * file.magic_formula(front, mu)[2] / mass for front in (True, False))
+    gain = file.steering_ratio / values[STEER_RATIO]
     return TrackParameters(
-        front_m=vehicle.cg_to_front_axle_m,
-        rear_m=vehicle.cg_to_rear_axle_m,
-        mass_over_inertia=mass / vehicle.yaw_inertia_kg_m2,
-        front_stiffness=vehicle.cornering_stiffness_n_per_rad(True, mu) / mass,
-        rear_stiffness=vehicle.cornering_stiffness_n_per_rad(False, mu) / mass,
-        front_peak=vehicle.magic_formula(True, mu)[2] / mass,
-        rear_peak=vehicle.magic_formula(False, mu)[2] / mass,
+        front_m=file.cg_to_front_axle_m,
+        rear_m=file.cg_to_rear_axle_m,
+        mass_over_inertia=mass / values[INERTIA],
+        front_stiffness=front_stiffness(file, values[RATIO], rear) / mass,
+        rear_stiffness=rear / mass,
+        front_peak=front_peak,
+        rear_peak=rear_peak,
         shape=STIFFNESS_TYRE_SHAPE,
         friction=mu,
-        relaxation_m=max(vehicle.relaxation_length_m, 0.01),
-        ay_gain=1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2,
-        imu_x_m=vehicle.imu_position_m[0],
-        ay_bias=vehicle.sensors.ay_bias_m_s2 - vehicle_file.sensors.ay_bias_m_s2,
-        rate_bias=vehicle.sensors.yaw_rate_bias_rad_s - vehicle_file.sensors.yaw_rate_bias_rad_s,
+        relaxation_m=values[RELAXATION],
+        ay_gain=values[AY_GAIN],
+        imu_x_m=values[IMU_X],
+        ay_bias=values[AY_BIAS] - file.sensors.ay_bias_m_s2,
+        rate_bias=values[RATE_BIAS] - file.sensors.yaw_rate_bias_rad_s,
         steer_gain=gain,
-        steer_added=gain * vehicle_file.steer_offset_rad - vehicle.steer_offset_rad,
-        steer_delay=steer_delay_s / STEP_S,
+        steer_added=gain * file.steer_offset_rad - values[STEER_OFFSET],
+        steer_delay=values[STEER_DELAY] / STEP_S,
     )
 
 

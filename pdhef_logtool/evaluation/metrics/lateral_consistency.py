@@ -6,48 +6,38 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric, SensorErrors, rms
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
+from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals, Columns, EvaluatedDrive, Metric, rms
 from pdhef_logtool.evaluation.metrics.sensors import MAX_STEP_S, carried_speed
-from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
 SPAN_S = 2.0
 
 
 def _columns(drive: EvaluatedDrive) -> Iterator[Columns]:
-    if drive.signals is not None:
-        driven = _Driven(drive.signals, drive.low_speed_m_s, drive.sensors)
+    if drive.calibrated is not None:
+        driven = _Driven(drive.calibrated, drive.low_speed_m_s)
         for track in drive.tracks.values():
             yield Columns(track.name, "vy_m_s", {"d2": driven.residual(track)})
 
 
-def driving_products(
-    track: StateTrack, signals: Signals, *, low_speed_m_s: float, sensors: SensorErrors
-) -> tuple[FloatArray, float]:
-    """Return the inputs of :func:`driven_consistency` from a window; sums over windows are allowed.
-
-    Returns
-    -------
-    integrals over time [4, 4] of the products of four columns: the changes over 2 s of v_y, v_x r and a_y, and the
-    residual; and the duration in s.
-    """
-    driven = _Driven(signals, low_speed_m_s, sensors)
-    vy = driven.carried_vy(track)
-    rows = np.stack([*map(driven.change, (vy, driven.turn, signals.ay_m_s2)), driven.residual(track)])
-    step_s = np.minimum(np.diff(signals.stamps_ns, prepend=signals.stamps_ns[:1]) * 1e-9, MAX_STEP_S)
-    finite = np.isfinite(rows).all(axis=0)
-    rows, step_s = rows[:, finite], step_s[finite]
-    return np.stack([(rows * row * step_s).sum(axis=1) for row in rows]), float(step_s.sum())
-
-
-def driven_consistency(products: FloatArray, seconds: float) -> float:
+def driven_consistency(track: StateTrack, signals: CalibratedSignals, low_speed_m_s: float) -> float:
     """Return the part of the residual in m/s that correlates with v_y, v_x r and a_y: the error of the model in turns.
 
     The remaining part comes from the road: a bank changes a_y and is not an error of the estimate. The share that the
     remaining part explains by chance, with 2 s as one sample, is subtracted. NaN below five samples.
     """
-    if seconds < 5.0 * SPAN_S:
+    driven = _Driven(signals, low_speed_m_s)
+    vy, residual = driven.carried_vy(track), driven.residual(track)
+    rows = np.stack([*map(driven.change, (vy, driven.turn, signals.signals.ay_m_s2)), residual])
+    stamps_ns = signals.signals.stamps_ns
+    step_s = np.minimum(np.diff(stamps_ns, prepend=stamps_ns[:1]) * 1e-9, MAX_STEP_S)
+    step_s = np.where(np.isfinite(rows).all(axis=0), step_s, 0.0)
+    if (seconds := float(step_s.sum())) < 5.0 * SPAN_S:
         return float("nan")
+    rows = np.where(step_s > 0.0, rows, 0.0)
+    products = (rows * step_s) @ rows.T
     of_residual = products[:-1, -1]
     fit = float(of_residual @ np.linalg.pinv(products[:-1, :-1], hermitian=True) @ of_residual)
     explained = min(max(fit, 0.0), float(products[-1, -1]))
@@ -64,14 +54,14 @@ class _Driven:
     turn : v_x r, [N] in m/s².
     """
 
-    def __init__(self, signals: Signals, low_speed_m_s: float, sensors: SensorErrors) -> None:
-        t = signals.stamps_ns
-        speed = carried_speed(signals)
-        rate = signals.yaw_rate_rad_s - sensors.yaw_rate_bias_rad_s
+    def __init__(self, calibrated: CalibratedSignals, low_speed_m_s: float) -> None:
+        signals, vehicle, _ = calibrated
+        t, speed, rate = signals.stamps_ns, carried_speed(signals), signals.yaw_rate_rad_s
+        ay_gain = 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
         self.turn = speed * rate
-        rising = (signals.ay_m_s2 - sensors.ay_bias_m_s2) / sensors.ay_gain - self.turn
+        rising = signals.ay_m_s2 / ay_gain - self.turn
         self._fast = speed > low_speed_m_s
-        self._of_lever = sensors.lever_m / sensors.ay_gain * rate
+        self._of_lever = vehicle.imu_position_m[0] / ay_gain * rate
         gained, breaks, steps = np.zeros(len(t)), np.zeros(len(t)), np.diff(t) * 1e-9
         broken = ~np.isfinite(rising[1:] + rising[:-1]) | (steps > MAX_STEP_S)
         gained[1:] = np.cumsum(np.where(broken, 0.0, 0.5 * (rising[1:] + rising[:-1]) * steps))
@@ -99,7 +89,7 @@ METRICS = (
         "d2",
         "consistency",
         "signal `vy_m_s`: RMS of the change of the estimated v_y over 2 s minus the integral of a_y − v_x r, above the "
-        "low-speed blend; a_y without bias, roll gain and lever arm as the log has them; large with a wrong "
+        "low-speed blend; a_y without bias, roll gain and lever arm of the calibrated vehicle; large with a wrong "
         "model. Not meaningful for `kinematic`, which integrates the same quantities",
         columns=_columns,
         formula=rms,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,26 +39,15 @@ class MetricRow:
     algorithm: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class SensorErrors:
-    """Errors of a log's sensors, relative to the vehicle that its signals were read with.
+class CalibratedSignals(NamedTuple):
+    """Signals [N] as the vehicle of a drive's model corrects them, for the metrics without ground truth.
 
-    Attributes
-    ----------
-    ay_bias_m_s2, yaw_rate_bias_rad_s : reading minus true value. ay_gain : of a_y, by body roll. lever_m : position of
-        the accelerometer ahead of the centre of gravity.
-    vehicle, read_with : calibrated vehicle, and the vehicle that the signals were read with; None if unknown.
-    steer_delay_s : of the steering angle. friction : of the road; None uses the friction of the signals.
+    ``steer_delay_s`` : delay of the steering angle in them.
     """
 
-    ay_bias_m_s2: float = 0.0
-    yaw_rate_bias_rad_s: float = 0.0
-    ay_gain: float = 1.0
-    lever_m: float = 0.0
-    vehicle: VehicleParameters | None = None
-    read_with: VehicleParameters | None = None
+    signals: Signals
+    vehicle: VehicleParameters
     steer_delay_s: float = 0.0
-    friction: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +57,7 @@ class EvaluatedDrive:
     Attributes
     ----------
     masks : bool [N] by segment. truth, signals : None omits the metrics that need them.
-    low_speed_m_s : sideslip is scored above this ground-truth speed. sensors : errors of the sensors.
+    low_speed_m_s : sideslip is scored above this ground-truth speed. calibrated : None omits the consistencies.
     dependent : signals with an estimator input as their ground truth.
     """
 
@@ -78,7 +67,7 @@ class EvaluatedDrive:
     signals: Signals | None
     masks: Mapping[str, BoolArray]
     low_speed_m_s: float
-    sensors: SensorErrors = field(default_factory=SensorErrors)
+    calibrated: CalibratedSignals | None = None
     dependent: Collection[str] = ()
 
     def __post_init__(self) -> None:

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.compiled.cache import njit
-from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric, SensorErrors, rms
+from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals, Columns, EvaluatedDrive, Metric, rms
 from pdhef_logtool.evaluation.metrics.sensors import MAX_STEP_S, carried_speed
-from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Longest step of its integration: the yaw motion of any car has time constants above 20 ms at 3 m/s and more.
@@ -20,27 +20,24 @@ _STEP_S = 0.004
 
 
 def _columns(drive: EvaluatedDrive) -> Iterator[Columns]:
-    if drive.signals is not None and drive.sensors.vehicle is not None:
-        yaw = YawModel(drive.signals, drive.sensors.vehicle, drive.sensors)
+    if drive.calibrated is not None:
+        yaw = YawModel(drive.calibrated)
         for track in drive.tracks.values():
             yield Columns(track.name, "yaw_rate_rad_s", {"yaw_consistency": yaw.residual(track)})
 
 
 class YawModel:
-    """The inputs of the yaw model that do not depend on the estimate, for signals [N].
+    """The inputs of the yaw model that do not depend on the estimate, for signals [N]."""
 
-    Steering, its delay, gyro bias and tyres are from the calibrated ``vehicle``.
-    """
-
-    def __init__(self, signals: Signals, vehicle: VehicleParameters, sensors: SensorErrors) -> None:
-        friction = signals.friction if sensors.friction is None else np.full(len(signals), sensors.friction)
-        read, t = corrected_anew(signals, sensors.read_with or vehicle, vehicle), signals.stamps_ns
-        steer = np.interp(t - round(sensors.steer_delay_s * 1e9), t, read.steer_rad)
-        friction = np.where(np.isfinite(friction), friction, vehicle.assumed_friction)
+    def __init__(self, calibrated: CalibratedSignals) -> None:
+        signals, vehicle, delay_s = calibrated
+        t = signals.stamps_ns
+        steer = np.interp(t - round(delay_s * 1e9), t, signals.steer_rad)
+        friction = np.where(np.isfinite(signals.friction), signals.friction, vehicle.assumed_friction)
         dt = np.diff(t, prepend=t[:1]) * 1e-9
         dt[dt > MAX_STEP_S] = np.nan
-        self._tyres, self._measured = _tyres_of(vehicle), read.yaw_rate_rad_s
-        self._inputs = dt, carried_speed(signals), steer, friction, read.yaw_rate_rad_s
+        self._tyres, self._measured = _tyres_of(vehicle), signals.yaw_rate_rad_s
+        self._inputs = dt, carried_speed(signals), steer, friction, signals.yaw_rate_rad_s
 
     def residual(self, track: StateTrack) -> FloatArray:
         """Return the modelled minus the measured yaw rate [N]; NaN across gaps, at low speed, and without steering."""

@@ -16,7 +16,6 @@ import numpy as np
 
 from pdhef_logtool.car.car import VEHICLE_FILE, Car
 from pdhef_logtool.car.model import ESTIMATED
-from pdhef_logtool.car.names import NO_INTERVALS
 from pdhef_logtool.car.parts import physics_sha256
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
@@ -356,7 +355,7 @@ def _plan_jobs(
 
 
 def _car(path: Path | None) -> Car:
-    return Car.load(path, network=NO_MODEL, intervals=NO_INTERVALS)
+    return Car.load(path, network=NO_MODEL)
 
 
 def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[DriveResult, ...]:
@@ -414,14 +413,12 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         truth = _truth_facts(plan, smoothing, estimated=reference is not None)
         model, calibration = _in_service(drive, job)
         physics = filter_of(model.car.calibrated_car, settings.model, use_speed=drive.options.use_speed)
-        validated = drive.car.has_evidence
-        drive.friction = friction_of(plan, physics.vehicle, drive.options, validated=validated, of_truth=True)
+        drive.friction = friction_of(plan, physics.vehicle, drive.options, of_truth=True)
         rows = _residuals(drive, physics, smoothing, model, reference)
         if not len(rows):
             raise no_samples(job.log_input.path)
         chosen = _chosen(rows, settings.where)
         progress(1.0)
-        friction = drive.friction
         entry = {
             "name": job.name,
             "log": job.log_input.stem,
@@ -437,7 +434,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             "period_s": plan.alignment.grid_period_s,
             **_counts(rows, drive.log.start_ns),
             "truth": truth,
-            "friction_from": friction.label + (f", {friction.summary}" if friction.summary else ""),
+            "friction_from": drive.friction.label,
             "losses": [asdict(x) for x in drive.losses],
         }
         write_drive(target, rows, chosen, entry, truth_source=truth["kind"])

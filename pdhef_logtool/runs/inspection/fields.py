@@ -139,8 +139,9 @@ def render_fields(report: FieldsOfLog, console: Console) -> None:
     console.print(f"Values over {part} of the log, {report.seconds:.0f} s, in recorded units.")
     for topic in report.topics:
         title = f"{topic.name} ({topic.type}), {number_text(topic.rate_hz)} Hz"
-        numbers = [[number_text(v) for v in (row.minimum, row.mean, row.maximum)] for row in topic.fields]
-        rows = ((Text(row.path), row.type, *texts) for row, texts in zip(topic.fields, numbers, strict=True))
+        rows = [
+            (Text(row.path), row.type, *map(number_text, (row.minimum, row.mean, row.maximum))) for row in topic.fields
+        ]
         if topic.fields and not topic.reason:
             console.print(table_of(title, ("field", "type", "min", "mean", "max"), rows, words=2))
         else:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,11 +15,12 @@ from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.mapping.channels import si_of
 from pdhef_logtool.mapping.evidence import Pieces, Seen
 from pdhef_logtool.mapping.records import SignalSource
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, FloatArray
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.runs.inspection.rendering import findings_of
-from pdhef_logtool.runs.inspection.report import Inspection, SignalReport, mapping_text
+from pdhef_logtool.runs.inspection.report import Inspection, mapping_text
 from pdhef_logtool.runs.inspection.step_statistics import number_text
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.outputs import check_no_input
@@ -29,29 +29,20 @@ from pdhef_logtool.storage.outputs import check_no_input
 _HEIGHT = 60
 #: Parts of the shown pieces of the log with their extremes, and alternatives of one signal.
 _PARTS, _ALTERNATIVES = 100, 6
-_LABEL_SIGNS = 160
 
 
 @dataclass(frozen=True, slots=True)
 class _Card:
-    """A field: its place, its sketch, figures with units, and the reason for or against it."""
+    """A field with its picture, range and rate, the candidate that it was, and the checks that it does not pass."""
 
-    label: str
-    chip: str
-    sketch: Markup
-    figures: tuple[tuple[str, str], ...]
-    why: str = ""
-    doubt: str = ""
+    source: SignalSource
+    candidate: Candidate | None
+    picture: Markup
+    low: float
+    high: float
+    rate_hz: float
     taken: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class _Subject:
-    """A signal or ground truth quantity with its cards, the selected one first."""
-
-    name: str
-    unit: str
-    cards: list[_Card] = field(default_factory=list)
+    checks: Sequence[Check] = ()
 
 
 def inspection_page(inspection: Inspection, log: DriveLog) -> bytes:
@@ -64,10 +55,10 @@ def inspection_page(inspection: Inspection, log: DriveLog) -> bytes:
         "inspection.html",
         inspection=inspection,
         name=Path(inspection.path).name,
-        messages=sum(t.messages for t in inspection.topics),
-        subjects=[
-            ("Signals", _subjects(inspection, "signals", samples)),
-            ("Ground truth", _subjects(inspection, "truth", samples)),
+        types={t.name: t.type.replace("/msg/", "/") for t in inspection.topics},
+        sections=[
+            ("Signals", SIGNAL_UNITS, _cards(inspection, "signals", samples)),
+            ("Ground truth", TRUTH_UNITS, _cards(inspection, "truth", samples)),
         ],
         findings=findings_of(inspection),
         # As it is, for it is pasted: render() would cut it and join its lines.
@@ -78,80 +69,35 @@ def inspection_page(inspection: Inspection, log: DriveLog) -> bytes:
     )
 
 
-def _subjects(inspection: Inspection, section: str, samples: dict[tuple[str, str], Seen]) -> list[_Subject]:
-    """Return the mapped signals, and unmapped signals with candidates."""
-    reports = inspection.signals if section == "signals" else inspection.truth
-    units = SIGNAL_UNITS if section == "signals" else TRUTH_UNITS
-    subjects = []
-    for name, unit in units.items():
-        mine = [c for c in inspection.candidates if c.section == section and c.source.name == name]
-        cards = [] if name not in reports else [_taken(inspection, section, reports[name], mine, samples)]
-        best = sorted((c for c in mine if not c.taken), key=lambda c: -c.score)[:_ALTERNATIVES]
-        cards += [card for c in best for card in _alternative(c, unit, samples)]
-        if cards:
-            subjects.append(_Subject(name, unit, cards))
-    return subjects
+def _cards(inspection: Inspection, section: str, samples: Mapping[tuple[str, str], Seen]) -> dict[str, list[_Card]]:
+    """Return the fields of each quantity: the mapped one first, then its best alternatives."""
+    cards: dict[str, list[_Card]] = {}
+    prefix = "" if section == "signals" else "truth."
+    candidates = sorted((c for c in inspection.candidates if c.section == section), key=lambda c: -c.score)
+    for name, source in getattr(inspection.mapping, section).items():
+        report = getattr(inspection, section)[name]
+        chosen = next((c for c in candidates if c.taken and c.source.name == name), None)
+        bad = [c for c in inspection.checks if c.subject == f"{prefix}{name}" and c.verdict != "passed"]
+        picture, low, high = sparkline(_cells(source, samples)), report.minimum, report.maximum
+        cards[name] = [_Card(source, chosen, picture, low, high, report.rate_hz, taken=True, checks=bad)]
+    for candidate in candidates:
+        source, cells = candidate.source, _cells(candidate.source, samples)
+        others = sum(not card.taken for card in cards.get(source.name, ()))
+        if not candidate.taken and cells.size and others < _ALTERNATIVES:
+            low, high = float(np.nanmin(cells, initial=np.inf)), float(np.nanmax(cells, initial=-np.inf))
+            rate_hz = samples[source.topic, source.paths[0]].rate_hz
+            card = _Card(source, candidate, sparkline(cells), low, high, rate_hz)
+            cards.setdefault(source.name, []).append(card)
+    return cards
 
 
-def _taken(
-    inspection: Inspection,
-    section: str,
-    report: SignalReport,
-    candidates: Sequence[Candidate],
-    samples: dict[tuple[str, str], Seen],
-) -> _Card:
-    sources = inspection.mapping.signals if section == "signals" else inspection.mapping.truth
-    source, candidate = sources[report.name], next((c for c in candidates if c.taken), None)
-    kind = next((t.type for t in inspection.topics if t.name == source.topic), "")
-    if inspection.mapping.origin == "file":
-        why = "named by the mapping file"
-    else:
-        why = f"recognised type {kind.replace('/msg/', '/')}" if candidate is None else candidate.reason
-    doubts = [] if candidate is None or not candidate.doubt else [candidate.doubt]
-    if candidate is not None and candidate.source.paths != source.paths:  # the mounting gives another axis
-        why, doubts = f"in place of {_label(candidate.source)}, which is {candidate.reason}", []
-    subject = report.name if section == "signals" else f"truth.{report.name}"
-    bad = [c for c in inspection.checks if c.subject == subject and c.verdict != "passed"]
-    doubts += [f"{c.name} {c.verdict}: {c.evidence}" for c in bad if not (doubts and c.name.endswith(".candidate"))]
-    figures = _figures(report.minimum, report.maximum, report.unit, report.rate_hz, source)
-    chip = "taken" if candidate is None else f"taken {candidate.score:.2f}"
-    cells = _cells(source, samples)
-    return _Card(_label(source), chip, sparkline(cells), figures, why, "; ".join(doubts), taken=True)
-
-
-def _cells(source: SignalSource, samples: dict[tuple[str, str], Seen]) -> FloatArray:
+def _cells(source: SignalSource, samples: Mapping[tuple[str, str], Seen]) -> FloatArray:
     """Return the values of a source on the grid of the pieces [M], of a vector its length; empty if not sampled."""
     parts = [samples[key].cells for path in source.paths if (key := (source.topic, path)) in samples]
     if len(parts) < len(source.paths):
         return np.empty(0)
     cells = si_of(source, parts)
     return cells if cells.ndim == 1 else np.linalg.norm(cells, axis=1)
-
-
-def _alternative(candidate: Candidate, unit: str, samples: dict[tuple[str, str], Seen]) -> Iterator[_Card]:
-    source, cells = candidate.source, _cells(candidate.source, samples)
-    if cells.size:
-        low, high = float(np.nanmin(cells, initial=np.inf)), float(np.nanmax(cells, initial=-np.inf))
-        figures = _figures(low, high, unit, samples[source.topic, source.paths[0]].rate_hz, source)
-        chip = f"{candidate.score:.2f}"
-        yield _Card(_label(source), chip, sparkline(cells), figures, candidate.reason, candidate.doubt)
-
-
-def _label(source: SignalSource) -> str:
-    return printable(source.label, _LABEL_SIGNS)
-
-
-def _figures(low: float, high: float, unit: str, rate_hz: float, source: SignalSource) -> tuple[tuple[str, str], ...]:
-    """Return range with unit, rate, and the conversion of raw values to SI."""
-    shown = "" if unit == "1" else unit.replace("^2", "²")
-    text = f"{number_text(low)} to {number_text(high)} {shown}".strip() if math.isfinite(low) else "no value"
-    figures = [("range", text), ("rate", f"{number_text(rate_hz)} Hz")]
-    if source.scale != 1.0:
-        scales = source.scale if isinstance(source.scale, tuple) else (source.scale,)
-        figures.append(("scale", ", ".join(f"{s:.6g}" for s in scales)))
-    if source.offset != 0.0:
-        figures.append(("offset", str(source.offset)))
-    return tuple(figures)
 
 
 def sparkline(cells: FloatArray) -> Markup:

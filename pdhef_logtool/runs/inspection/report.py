@@ -27,7 +27,6 @@ from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import (
     Ambiguity,
     ClockModel,
-    MappedChannels,
     Mapping,
     QualityGate,
     SignalSource,
@@ -279,13 +278,18 @@ def inspect_drive_log(
         mapping = choose_mapping(log, given, prefer_truth=prefer_truth, require_signals=False).mapping
     mapping = resolve_mapping(log, mapping)
     head = (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS))
-    whole = _Look(((log.start_ns, log.end_ns),), tuple(t.name for t in log.topics))
-    look = whole if index is None else _sample_look(log, index, mapping, head)
-    log.expect(dict.fromkeys(look.stamps, ()))
+    windows, timed = [(log.start_ns, log.end_ns)], tuple(t.name for t in log.topics)
+    if index is not None:
+        # The windows of the clock fits, evenly over the log; they are expected together with the checked head.
+        mapped = {source.topic for source in mapping.sources()}
+        windows = [*survey_windows(log.start_ns, log.end_ns)] if log.end_ns > head[1] else [head]
+        index.prefetch(mapped, [head, *windows])
+        timed = tuple(sorted(index.covered_topics(mapped)))
+    log.expect(dict.fromkeys(timed, ()))
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     looked_at = survey_log(log, mapping, clocks, head)
     mapping = looked_at.mapping
-    parts = [read_signals(log, mapping, clocks, start, end, stamps=look.stamps) for start, end in look.windows]
+    parts = [read_signals(log, mapping, clocks, start, end, stamps=timed) for start, end in windows]
     losses = merge_losses(part.losses for part in parts)
     signals, truth = (
         {n: _signal_report(s, section, [getattr(part, section)[n] for part in parts], clocks[clock_key(s)], losses, log,
@@ -298,7 +302,7 @@ def inspect_drive_log(
         kind=log.kind,
         start_ns=log.start_ns,
         end_ns=log.end_ns,
-        topics=_topic_reports(log, look, parts),
+        topics=_topic_reports(log, index, {topic: [part.stamps[topic] for part in parts] for topic in timed}),
         clocks=tuple(_clock_report(s, clocks[key]) for key, s in sources_by_clock(mapping).items()),
         mapping=mapping,
         signals=signals,
@@ -311,40 +315,9 @@ def inspect_drive_log(
         # Last, since a log has all its losses only after it was read through.
         lost=merge_losses([log.lost, losses]),
         candidates=candidates,
-        sample=None if look.sample is None else look.sample(),
+        sample=None if index is None else Sample(*index.chunks_read, "sample" if index.is_remote else "index"),
         refused=looked_at.refused(),
     )
-
-
-# ------------------------------------------------------------------------------------------------ what is read
-
-
-@dataclass(frozen=True, slots=True)
-class _Look:
-    """The part of a log that is read.
-
-    Attributes
-    ----------
-    windows : [start, end) that are read. stamps : topics with times to read there.
-    by_index : the index with the times of all topics; None: times are read.
-    sample : description of the part that was read; None: all.
-    """
-
-    windows: Sequence[tuple[int, int]]
-    stamps: tuple[str, ...]
-    by_index: ColumnarLog | None = None
-    sample: Callable[[], Sample] | None = None
-
-
-def _sample_look(log: DriveLog, index: ColumnarLog, mapping: Mapping, head: tuple[int, int]) -> _Look:
-    """Read the windows for the clock fits, evenly over the log. They are expected together with the checked head."""
-    mapped = {source.topic for source in mapping.sources()}
-    spread = survey_windows(log.start_ns, log.end_ns) if log.end_ns > head[1] else [head]
-    index.prefetch(mapped, [head, *spread])
-
-    times: Literal["sample", "index"] = "sample" if index.is_remote else "index"
-    covered = tuple(sorted(index.covered_topics(mapped)))
-    return _Look(spread, covered, None if index.is_remote else index, lambda: Sample(*index.chunks_read, times=times))
 
 
 # ------------------------------------------------------------------------------------------------ reports
@@ -362,11 +335,13 @@ def collapsed(fields: Sequence[FieldInfo]) -> list[tuple[str, str, list[str]]]:
     return [(name, kind, paths) for name, (kind, paths) in lines.items()]
 
 
-def _topic_reports(log: DriveLog, look: _Look, parts: Sequence[MappedChannels]) -> tuple[TopicReport, ...]:
-    stamps = {topic: [part.stamps[topic] for part in parts] for topic in look.stamps}
+def _topic_reports(
+    log: DriveLog, index: ColumnarLog | None, stamps: MappingABC[str, Sequence[Columns]]
+) -> tuple[TopicReport, ...]:
+    """Return the reports of all topics; times are those of a local ``index``, else the ``stamps`` that were read."""
     steps = {topic: Steps.of([c.log_time_ns for c in columns]) for topic, columns in stamps.items()}
-    if look.by_index is not None:
-        steps |= {n: Steps.of([times]) for n, times in look.by_index.index_times(log.start_ns, log.end_ns).items()}
+    if index is not None and not index.is_remote:
+        steps |= {n: Steps.of([times]) for n, times in index.index_times(log.start_ns, log.end_ns).items()}
     none = Steps.of([])
     return tuple(_topic_report(t, steps.get(t.name, none), stamps.get(t.name, ()), log) for t in log.topics)
 
@@ -448,15 +423,9 @@ def _clock_report(source: SignalSource, clock: ClockModel) -> ClockReport:
 
 
 def _clock_notes(mapping: Mapping, clocks: dict[str, ClockModel]) -> list[str]:
-    notes = []
-    for key, source in sources_by_clock(mapping).items():
-        residual_s = clocks[key].residual_s
-        if source.clock == "device" and residual_s > CLOCK_RESIDUAL_S:
-            notes.append(
-                f"the clock of {key} leaves its fitted line by {residual_s * 1e3:.0f} ms: "
-                "it stepped, or its drift changed"
-            )
-    return notes
+    text = "the clock of {} leaves its fitted line by {:.0f} ms: it stepped, or its drift changed"
+    devices = (key for key, source in sources_by_clock(mapping).items() if source.clock == "device")
+    return [text.format(k, r * 1e3) for k in devices if (r := clocks[k].residual_s) > CLOCK_RESIDUAL_S]
 
 
 # ------------------------------------------------------------------------------------------------ mapping

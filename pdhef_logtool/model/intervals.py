@@ -1,0 +1,228 @@
+"""95 % confidence intervals of the estimators of a drive (docs/method.md#intervals).
+
+The variance of sideslip has three sources: the estimator's own, the uncertainty of the parameters, and contradictions
+between the sensors:
+
+    s² = χ² (s_own² + s_car²) + (Σ_i (v_y,i − v_y)² + c² + (s_l r)²) / v_x²,
+
+where v_y,i is the lateral velocity of the physics filter on the vehicle one 1-sigma away in direction i of the
+posterior, or of the prior without a fit to the log. s_l is the uncertainty of the distance from the rear axle to the
+centre of gravity if no file contains it: the lateral velocity is determined at the rear axle. On a vehicle of the
+drive's posterior, s_car is the model error of a single track, which is nearly constant within a drive, and χ ≥ 1 is the
+RMS error of the fit over the assumed one (Birge 1932). c is the lateral kinematic consistency, as far as it correlates
+with the driving: of the whole drive if the vehicle was fitted to it, otherwise as available online
+(:func:`running_consistency`). The variance of v_y is the same sum as a velocity. Estimates are unchanged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pdhef_logtool.car.car import Car, WithoutTruth
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
+from pdhef_logtool.compiled.cache import njit
+from pdhef_logtool.estimators.adaptive_physics import CURES
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.calibration.joint import prior_variations
+from pdhef_logtool.estimators.latency_compensation import run_estimator
+from pdhef_logtool.estimators.presets import preset_of, uses_calibration
+from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, of_car, physics_filter
+from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency
+from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
+from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
+from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.steps import RESTART_GAP_S, release, step_durations_s
+from pdhef_logtool.records.tracks import StateTrack, scaled_covariance
+from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
+
+#: Factor of the consistency of a whole drive, and s_car; from seven simulated cars and real drives of four cars.
+DRIVE_SHARE, CAR_STD_RAD = 0.7, math.radians(0.15)
+#: χ without a posterior of the drive, where the noise of a filter includes the model error of a_y; tuned on 8 simulated
+#: cars, each identified on one drive and evaluated on drives of other manoeuvres.
+OWN_SHARE = 0.5
+#: Standard deviations of the parameters of an identified car over those of a vehicle file: 8 % of the stiffness of an
+#: axle, which changes of the load cause.
+IDENTIFIED_SHARE = 0.16
+#: Largest standard deviation of sideslip.
+MAX_SIDESLIP_STD_RAD = 1.0
+#: Time constants of the running consistency: leak of the integral, slow mean (bias and bank), and mean of squares.
+INTEGRAL_S, SLOW_MEAN_S, MEMORY_S = 0.3, 3.0, 1.0
+#: Reason bits of a_y; the bits of the yaw rate are shifted left by one.
+_AY_BITS = BURST_AY | SPIKE_AY | STUCK_AY | DEAD_AY | MISSING_AY
+
+
+@dataclass(slots=True)
+class Interval:
+    """The interval above for estimators of one car over one drive; all tracks share the runs of its filters.
+
+    Attributes
+    ----------
+    filters : the physics filter on the vehicle, then on the vehicles one 1-sigma away.
+    read_with : vehicle that the signals were read with.
+    scale : χ. car_std_rad : s_car. cg_std_m : s_l.
+    whole_drive : whether c is of the whole drive.
+    """
+
+    filters: tuple[VehicleUkf, ...]
+    read_with: VehicleParameters
+    scale: float = OWN_SHARE
+    car_std_rad: float = 0.0
+    cg_std_m: float = 0.0
+    whole_drive: bool = False
+    _signals: Signals | None = None
+    _vy: list[FloatArray] = field(default_factory=list)
+
+    def widen(self, track: StateTrack, signals: Signals) -> StateTrack:
+        """Return a track [N] with wider 1-sigmas of sideslip and v_y."""
+        if not len(signals):
+            return track
+        if signals is not self._signals:
+            self._signals, self._vy = signals, [self._lateral_velocity(f, signals) for f in self.filters]
+        vehicle = self.filters[0].vehicle
+        slow_m_s = vehicle.low_speed_blend_m_s
+        if self.whole_drive:
+            calibrated = CalibratedSignals(corrected_anew(signals, self.read_with, vehicle), vehicle)
+            added: FloatArray | float = DRIVE_SHARE * driven_consistency(track, calibrated, slow_m_s)
+        else:
+            added = running_consistency(track, signals, vehicle.roll_gradient_rad_per_m_s2)
+        added = np.hypot(np.nan_to_num(added), self.scale * self.car_std_rad * track.vx_m_s)
+        added = np.hypot(added, self.cg_std_m * track.yaw_rate_rad_s)
+        return widened(track, self._vy, added, slow_m_s, self.scale)
+
+    def _lateral_velocity(self, physics: VehicleUkf, signals: Signals) -> FloatArray:
+        """Return v_y [N] of a filter, on signals as its vehicle corrects them; a friction of the log is relative."""
+        friction = physics.vehicle.assumed_friction / self.filters[0].vehicle.assumed_friction
+        read = corrected_anew(signals, self.read_with, physics.vehicle)
+        return run_estimator(physics, replace(read, friction=friction * read.friction)).vy_m_s
+
+
+@dataclass(slots=True)
+class DriveIntervals:
+    """Intervals of the estimators of a drive by name; ``notes_of_own`` : of estimators that state their own."""
+
+    by_name: dict[str, Interval]
+    notes_of_own: dict[str, str]
+    _has_interval: set[str] = field(default_factory=set)
+
+    def apply(self, track: StateTrack, signals: Signals) -> StateTrack:
+        """Return a track [N] with its interval; ``signals`` : as read with the vehicle file."""
+        if np.isfinite(track.sideslip_std_rad).any():
+            self._has_interval.add(track.name)
+        interval = self.by_name.get(track.name)
+        return track if interval is None else interval.widen(track, signals)
+
+    def notes(self, name: str) -> tuple[str, ...]:
+        """Return the report's notes on an estimator's intervals; empty without intervals."""
+        if name not in self._has_interval:
+            return ()
+        summed = "intervals: own, parameters and sensors"
+        return (summed if name in self.by_name else self.notes_of_own.get(name, "intervals not calibrated"),)
+
+
+def drive_intervals(car: Car, estimators: Sequence[Estimator]) -> DriveIntervals:
+    """Return the intervals of estimators that are on a car; filters of other models and peers keep their own."""
+    notes = {e.name: note for e in estimators if (note := getattr(e, "intervals_note", ""))}
+    use_speed = all(resolve(e).use_speed for e in estimators)
+    of_file = _of_file(car, 1.0, use_speed=use_speed)
+    calibrated = of_file if car.fitted_physics is None else _of_file(car, IDENTIFIED_SHARE, use_speed=use_speed)
+    if car.self_calibrated is not None:
+        calibrated = _of_drive(car, car.self_calibrated)
+    names = [e.name for e in estimators if e.name not in notes]
+    by_name = {name: calibrated for name in names if uses_calibration(name)}
+    return DriveIntervals(by_name | {name: of_file for name in names if preset_of(name) == NOMINAL_MODEL}, notes)
+
+
+def _of_drive(car: Car, calibration: WithoutTruth) -> Interval:
+    """Return the interval on the vehicle of the drive's posterior."""
+    filters = tuple(physics_filter(v, calibration.noise) for v in (calibration.vehicle, *calibration.varied))
+    whole_drive = not calibration.causal
+    return Interval(filters, car.vehicle, calibration.error_scale, CAR_STD_RAD, car.cg_std_m, whole_drive)
+
+
+def _of_file(car: Car, share: float, *, use_speed: bool) -> Interval:
+    """Return the interval on a vehicle file or an identified vehicle.
+
+    ``share`` : of the standard deviations of a file. The filters lack the states that would compensate an error.
+    """
+    physics = of_car(car, use_speed=use_speed)
+    vehicles = (physics.vehicle, *prior_variations(physics.vehicle, share=share))
+    bare = physics.vehicle.physics.model_copy(update=dict.fromkeys(CURES, False))
+    filters = tuple(replace(physics, vehicle=v.model_copy(update={"physics": bare})) for v in vehicles)
+    return Interval(filters, car.vehicle)
+
+
+def widened(
+    track: StateTrack, compared: Sequence[FloatArray], added_m_s: FloatArray, slow_m_s: float, own_share: float
+) -> StateTrack:
+    """Return a track [N] with wider 1-sigmas of sideslip and v_y; NaN stays NaN.
+
+    Parameters
+    ----------
+    compared : v_y of the physics filter [N], first on the vehicle, then on those away from it.
+    added_m_s : further standard deviation of v_y [N].
+    slow_m_s : lower limit of the speed in the conversion of velocities to angles.
+    own_share : factor on the track's own 1-sigma.
+    """
+    added = np.where(np.isfinite(added_m_s), added_m_s, 0.0)
+    for vy in compared[1:]:
+        away = vy - compared[0]
+        added = np.hypot(added, np.where(np.isfinite(away), away, 0.0))
+    speed = np.abs(track.vx_m_s)
+    added = np.minimum(added / np.maximum(speed, slow_m_s), MAX_SIDESLIP_STD_RAD)
+    std = np.minimum(np.hypot(own_share * track.sideslip_std_rad, added), MAX_SIDESLIP_STD_RAD)
+    covariance = track.covariance
+    if covariance.shape[0]:
+        variance = covariance[:, 1, 1]
+        rest = np.full(len(track), 1.0 - own_share**2)
+        more = np.divide((added * speed) ** 2, variance, out=rest, where=variance > 0.0)
+        covariance = scaled_covariance(covariance, np.sqrt(own_share**2 + more))
+    return replace(track, sideslip_std_rad=std, covariance=covariance)
+
+
+def running_consistency(track: StateTrack, signals: Signals, roll_gradient_rad_per_m_s2: float) -> FloatArray:
+    """Return the disagreement of a_y and yaw rate with the changes of an estimated v_y, m/s [N]; 0 before the first.
+
+    It is computed at measurement time; a stamp has the value of the newest sample that has arrived. Samples that the
+    estimator reports as faulty are ignored.
+    """
+    read, none = without_impossible(signals), np.zeros(len(track), dtype=np.int64)
+    reason = track.reason if len(track.reason) == len(track) else none
+    ay, rate = (
+        np.where(np.bitwise_and(reason, bits) == 0, values, np.nan)
+        for bits, values in ((_AY_BITS, read.ay_m_s2), (_AY_BITS << 1, read.yaw_rate_rad_s))
+    )
+    rising = ay / (1.0 + GRAVITY_M_S2 * roll_gradient_rad_per_m_s2) - track.vx_m_s * rate
+    running = np.empty(len(track))
+    _run(step_durations_s(read.stamps_ns, None), rising, track.vy_m_s, running)
+    released = release(read.ready_ns, read.stamps_ns)
+    return np.where(released.arrived, running[released.row], 0.0)
+
+
+@njit(cache=True)
+def _run(dt, rising, vy, out):  # type: ignore[no-untyped-def]
+    """Write the RMS over a second of ∫ v̇_y of the sensors minus v_y, both high-passed and without the slow mean."""
+    measured = slow = mean = square = 0.0
+    started = False
+    for k in range(dt.shape[0]):
+        step = dt[k]
+        if not step <= RESTART_GAP_S:
+            measured = mean = square = step = 0.0
+            started = False
+        if math.isfinite(rising[k]) and math.isfinite(vy[k]):
+            if not started:
+                slow = vy[k]
+                started = True
+            gain = 1.0 - math.exp(-step / INTEGRAL_S)
+            measured += gain * (rising[k] - measured)
+            slow += gain * (vy[k] - slow)
+            w = INTEGRAL_S * measured - (vy[k] - slow)
+            mean += (1.0 - math.exp(-step / SLOW_MEAN_S)) * (w - mean)
+            keep = math.exp(-step / MEMORY_S)
+            square = keep * square + (1.0 - keep) * (w - mean) ** 2
+        out[k] = math.sqrt(square)
