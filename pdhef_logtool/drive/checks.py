@@ -24,7 +24,6 @@ from pdhef_logtool.drive.columns import (
     derivative,
     earlier,
     fit,
-    halves,
     independent_samples,
     median_known,
     moving_at,
@@ -59,8 +58,6 @@ AY_BIAS_M_S2 = 0.1
 MOST_LEVER_M = 5.0
 #: Crossfall alone moves an accelerometer by half a metre per second squared.
 LEAST_LATERAL_M_S2 = 0.7
-#: Largest standard error of a delay that is reported.
-DELAY_KNOWN_S = 0.03
 #: 1-sigma of the gain of a gyro by two filters (studies/plus_minus.py).
 RESAMPLED_GAIN = 0.0015
 #: Steps to find the delay of a_y, the largest last step, and the largest delay.
@@ -116,13 +113,10 @@ class CheckedDrive:
         name = self.measured.speed_name
         return None if name is None or name in self.wrong else self.columns[name]
 
-    def errors_of(self, name: str) -> SensorErrors | None:
-        """Return the errors of the sensors by ground truth; None without it, or if a signal of them is wrong."""
-        return None if not self.has_truth or self.wrong & {name, *_TRUTH} else self._errors
-
     @cached_property
-    def _errors(self) -> SensorErrors:
-        return sensor_errors(self.columns)
+    def errors(self) -> SensorErrors:
+        """The errors of the sensors by ground truth; unknown without it, or if it is wrong."""
+        return sensor_errors(self.columns) if self.has_truth and not self.wrong & _TRUTH else SensorErrors()
 
 
 # ------------------------------------------------------------------------------------------------ IMU
@@ -246,8 +240,8 @@ def ay_delay(errors: SensorErrors, latency: LatencyEstimate | None) -> Figure | 
 
 def _accelerometer(drive: CheckedDrive) -> Iterator[Check]:
     """Compare position, gain and delay of the accelerometer with vehicle file and ground truth."""
-    errors = drive.errors_of("ay_m_s2")
-    if errors is None or math.isnan(errors.place_m[0]):
+    errors = drive.errors
+    if math.isnan(errors.place_m[0]) or "ay_m_s2" in drive.wrong:
         return
     (place, std), file = errors.place_m, drive.vehicle.imu_position_m[0]
     is_outside = abs(place - file) > max(MOST_LEVER_M, FAILS_STD * std)
@@ -258,20 +252,18 @@ def _accelerometer(drive: CheckedDrive) -> Iterator[Check]:
         is_other = not GAIN_RANGE[0] < errors.ay_gain[0] < GAIN_RANGE[1]
         yield judge("ay_m_s2.gain", *errors.ay_gain, doubt="ground_truth" if is_other and unit_is_right else "")
     delay = ay_delay(errors, drive.latency)
-    if delay is not None and delay[1] <= DELAY_KNOWN_S:
+    if delay is not None and 1e3 * delay[1] <= TABLE["ay_m_s2.delay"]["limits"][1]:
         yield judge("ay_m_s2.delay", 1e3 * delay[0], 1e3 * delay[1], delay_s=delay[0])
 
 
 def _gyro(drive: CheckedDrive) -> Iterator[Check]:
     """Compare gain and delay of the gyro with vehicle file and ground truth."""
-    errors, latency, file = drive.errors_of("yaw_rate_rad_s"), drive.latency, drive.vehicle.sensors.yaw_rate_gain
-    if errors is not None and not math.isnan(errors.gyro_gain[0]):
-        gain, std = errors.gyro_gain
+    (gain, std), latency, file = drive.errors.gyro_gain, drive.latency, drive.vehicle.sensors.yaw_rate_gain
+    if not math.isnan(gain) and "yaw_rate_rad_s" not in drive.wrong:
         yield judge("yaw_rate_rad_s.gain", gain / file, std, gain=gain)
     if drive.has_truth and latency is not None and latency.reliable and not latency.identical:
-        delay_s, std_ms = latency.gyro_delay_s, 1e3 * latency.std_error_s
-        late_ms = 1e3 * (delay_s - latency.latency_s)
-        yield judge("yaw_rate_rad_s.delay", 1e3 * delay_s, late_ms=late_ms, std_ms=std_ms, delay_s=delay_s)
+        late_s, error_s, delay_s = latency.gyro_delay_s - latency.latency_s, latency.std_error_s, latency.gyro_delay_s
+        yield judge("yaw_rate_rad_s.delay", 1e3 * delay_s, late_ms=1e3 * late_s, std_ms=1e3 * error_s, delay_s=delay_s)
 
 
 def delay_checks(late: Iterable[LateSensor]) -> list[Check]:
@@ -355,13 +347,7 @@ def sideslip_offset(columns: Mapping[str, FloatArray]) -> Figure:
 def offset_check(columns: Mapping[str, FloatArray]) -> Check:
     """Return the check of the ground-truth sideslip on straights."""
     offset, std = map(math.degrees, sideslip_offset(columns))
-    by_part, parts = [math.nan], ""
-    if math.isfinite(std):
-        is_in = halves(len(columns["ay_m_s2"]))
-        by_part = [sideslip_offset({n: np.where(use, c, np.nan) for n, c in columns.items()})[0] for use in is_in]
-    if np.isfinite(by_part).all():
-        parts = TEXTS["parts"].format(*np.degrees(by_part))
-    return judge("truth.sideslip_rad.offset", offset, std, parts=parts)
+    return judge("truth.sideslip_rad.offset", offset, std)
 
 
 def _scales_of_positions(drive: CheckedDrive) -> Iterator[Check]:
@@ -383,9 +369,8 @@ def _radius(drive: CheckedDrive) -> Iterator[Check]:
     columns, speed, file = drive.columns, drive.speed, drive.vehicle.wheel_radius_m
     if not drive.has_file or speed is None or "speed_m_s" not in columns:
         return
-    moving = moving_at(speed)
     wheels = [columns[n] for w in WHEELS if (n := f"wheel_speed_{w}_rad_s") in columns]
-    turning = [(w, moving & np.isfinite(w) & (w != 0.0)) for w in wheels]
+    turning = [(w, moving_at(speed) & np.isfinite(w) & (w != 0.0)) for w in wheels]
     if ratios := [float(np.median(speed[k] / w[k])) for w, k in turning if k.any()]:
         radius = float(np.median(ratios))
         yield judge("vehicle.wheel_radius", radius / file, radius=radius, file=file)

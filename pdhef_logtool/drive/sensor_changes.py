@@ -15,8 +15,8 @@ it, in units of the same statistic in the drive so far:
   motion; or it does not decide, and of the samples of both sensors only those of a_y have the step. A slide moves the
   steering residual too; a banked road begins slowly.
 * frozen: a value repeats for longer than the share of repetitions so far explains by chance (probability
-  ``CHANCE``), and either the other sensors show that it changes (the steering relation, or a_x for the speed), or it
-  repeats ``LONGER`` times as long as any value before.
+  ``CHANCE``), and either the other sensors show that it changes (the steering relation, or a_x for the speed), or
+  the steering repeats ``LONGER`` times as long as any value before.
 
 The decision is made ``DECIDED_CELLS`` after the change, from samples up to then, and corrections begin then, so that
 causal estimators stay causal.
@@ -353,7 +353,7 @@ def _without_stuck(signals: Signals, cells: _Cells, names: Sequence[str]) -> tup
     travelled = np.cumsum(np.nan_to_num(cells.ax)) * CELL_S
     columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in names}
     for name, column in columns.items():
-        for start, end, certain, unseen in _long_runs(column, cells):
+        for start, end, sure, unseen in _long_runs(column, cells):
             k0, k = cell[start], np.arange(cell[start], cell[end - 1] + 1)
             if name == "steer_rad":
                 expected = steering.table[k, 1:] @ steering.fit[k0]
@@ -363,8 +363,10 @@ def _without_stuck(signals: Signals, cells: _Cells, names: Sequence[str]) -> tup
                 grade = (travelled[k0] - travelled[before]) / max(k0 - before, 1)
                 expected = travelled[k] - travelled[k0] - grade * (k - k0)
                 change, limit, std, expected = expected, LEAST_SPEED_CHANGE_M_S, math.nan, np.full(len(k), np.nan)
-            is_stuck = (np.abs(change) > limit) | (k - k0 >= unseen)
-            missed = certain + np.flatnonzero(is_stuck[certain:])
+            is_stuck = np.abs(change) > limit
+            if name == "steer_rad":  # a cruising car has one speed
+                is_stuck |= k - k0 >= unseen
+            missed = sure + np.flatnonzero(is_stuck[sure:])
             if not len(missed):
                 continue
             known_ns = cells.time_of(k[missed[0]] + 1)
@@ -388,23 +390,11 @@ def _without_repeats(signals: Signals, cells: _Cells) -> Signals:
     return replace(signals, **columns)
 
 
-class _Run(NamedTuple):
-    """Rows [start, end) of a value that repeats beyond chance.
+def _long_runs(column: FloatArray, cells: _Cells, share: float = 0.0) -> list[list[int]]:
+    """Return the repetitions of a column [N] beyond chance, while the car moves.
 
-    ``certain``: cells until chance is excluded. ``unseen``: cells until it repeats ``LONGER`` times longer than any
-    value before it.
-    """
-
-    start: int
-    end: int
-    certain: int
-    unseen: int
-
-
-def _long_runs(column: FloatArray, cells: _Cells, share: float = 0.0) -> list[_Run]:
-    """Return the long repetitions of a column [N] while the car moves.
-
-    A value repeats if its step is at most a share of the RMS of the steps so far.
+    Each has its first row, the row behind its last, and the cells until chance is excluded and until it is ``LONGER``
+    times as long as any before. A value repeats if its step is at most a share of the RMS of the steps so far.
     """
     rows = np.flatnonzero(np.isfinite(column) & (np.nan_to_num(cells.speed)[cells.of_stamp] > LEAST_SPEED_M_S))
     cell, step = cells.of_stamp[rows], np.abs(np.diff(column[rows], prepend=math.nan))
@@ -420,7 +410,7 @@ def _long_runs(column: FloatArray, cells: _Cells, share: float = 0.0) -> list[_R
         passed = cell[np.minimum(starts + count, len(rows) - 1)] - cell[starts]
         return np.where(count < lengths, np.maximum(passed, round(LEAST_STUCK_S / CELL_S)), len(cells.speed))
 
-    unseen = np.where(cell[starts] > round(SEEN_S / CELL_S), until(longer), len(cells.speed))
-    ends = rows[starts + lengths - 1] + 1
-    runs = np.stack([rows[starts], ends, until(needed), unseen], axis=1)
-    return [_Run(*map(int, run)) for run in runs[(lengths > needed) & (starts > 0)]]
+    driven_s = CELL_S * np.cumsum(np.diff(cell, prepend=-1) > 0)
+    unseen = np.where(driven_s[starts] > SEEN_S, until(longer), len(cells.speed))
+    runs = np.stack([rows[starts], rows[starts + lengths - 1] + 1, until(needed), unseen], axis=1)
+    return [list(map(int, run)) for run in runs[(lengths > needed) & (starts > 0)]]
