@@ -42,16 +42,16 @@ def test_help_names_every_command_with_a_whole_sentence() -> None:
 _HELPS = """
 import contextlib, io, json, os, sys
 from pdhef_logtool.cli.app import main
-told = {}
+helps = {}
 for command in ["", *sys.argv[1:]]:
-    told[command] = {}
+    helps[command] = {}
     for width in ("80", "120"):
         os.environ["COLUMNS"] = width
         sys.argv = ["pdhef", *command.split(), "--help"]
         with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
             main()
-        told[command][width] = out.getvalue()
-print(json.dumps(told))
+        helps[command][width] = out.getvalue()
+print(json.dumps(helps))
 """
 
 

@@ -1,4 +1,4 @@
-"""Logs that take their worker along, by their name: the work on a drive, with that planted before it."""
+"""The work on a drive, preceded by a fault that the name of the log selects."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from pdhef_logtool.runs.working import DriveEnd, DriveTask, run_drive
 from pdhef_logtool.workers.supervisor import Tell
 from tests.runs.stub_drives import stub_drive
 
-#: Where workers write what a drive cost; they have it from the process that started them.
+#: Environment variable with the file in which workers write the memory after each drive.
 MEASURES = "PDHEF_SOAK_MEASURES"
 
 
 def planted_drive(task: DriveTask, tell: Tell, work: Callable[[DriveTask, Tell], DriveEnd] = run_drive) -> DriveEnd:
-    """Hang, take 8 GB or be killed where the log's name says so, else do the work."""
+    """Hang, take 8 GB or be killed if the log has that name, else do the work."""
     name = task.log.path.name.partition(".")[0]
     if name == "hangs":
         tell("before it hangs", 0.1)
@@ -51,7 +51,7 @@ def measured_drive(task: DriveTask, tell: Tell) -> DriveEnd:
 
 
 def measured_stub(task: DriveTask, tell: Tell) -> DriveEnd:
-    """Return a stub's end, as fast as it goes."""
+    """Do the same with a stub's work."""
     return _measured(stub_drive(task, tell), task)
 
 

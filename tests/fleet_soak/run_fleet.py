@@ -1,6 +1,6 @@
-"""``python -m tests.fleet_soak.run_fleet LOGS OUT MEASURES``: a run with trouble planted, in a process of its own.
+"""``python -m tests.fleet_soak.run_fleet LOGS --output OUT --measures FILE``: a run with planted faults, as a process.
 
-It is what a person starts, but for its work on a drive, which plants trouble and writes down what a drive cost.
+Its work on a drive plants the faults and writes the memory after each drive to the file.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tests.fleet_soak.planted import MEASURES, measured_drive, measured_stub, rs
 
 
 def main() -> int:
-    """Run a fleet; print the parent's memory over the run and what it said."""
+    """Run a fleet; print its exit code, the parent's memory over the run and the notes."""
     parser = argparse.ArgumentParser()
     parser.add_argument("logs", nargs="+")
     parser.add_argument("--output", type=Path, required=True)

@@ -1,4 +1,4 @@
-"""A fleet through all that befalls one: damage, no truth, planted trouble, kills, growth. ``make fleet`` runs it."""
+"""A fleet with damage, missing ground truth, planted faults, kills and growing memory. ``make fleet`` runs it."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def logs(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def arguments(logs: Path) -> list[str]:
-    """Return what the fleet is named by."""
+    """Return the arguments that name all logs of the fleet."""
     real = SHARED / "data" / "drives"
     return [*(str(p) for p in sorted(logs.iterdir())), *([str(real)] if real.is_dir() else [])]
 
@@ -85,7 +85,7 @@ def start(logs: Sequence[str], output: Path, *options: str) -> subprocess.Popen[
 
 
 def finished(logs: Sequence[str], output: Path, *options: str) -> dict[str, Any]:
-    """Run to the end; return what the run found of itself."""
+    """Run to the end; return the document that the run prints."""
     process = start(logs, output, *options)
     said = process.communicate(timeout=7200.0)[0]
     assert process.returncode in (0, 3), said
@@ -100,7 +100,7 @@ def drives_of(output: Path) -> list[dict[str, Any]]:
 
 
 def contents(output: Path) -> dict[str, bytes]:
-    """Return what a run leaves, but for its journal and the recordings, which hold times."""
+    """Return the files of a run without its journal and recordings, which contain times."""
     found = (p for p in output.rglob("*") if p.is_file() and p.name != JOURNAL_FILE and p.suffix != ".rrd")
     return {p.relative_to(output).as_posix(): p.read_bytes() for p in found}
 
@@ -152,7 +152,7 @@ def test_killed_twice_and_resumed_is_undisturbed(
     before = len(drives_of(output))
     finished(arguments(logs), output, "--resume")
     assert len({d["label"] for d in drives_of(output)}) == total
-    assert len(drives_of(output)) <= total + 5 + 2 * 2  # the worst once more, and at most what was in flight
+    assert len(drives_of(output)) <= total + 5 + 2 * 2  # the worst once more, and at most the drives in flight
     assert before < total
     alike, killed = contents(undisturbed[0]), contents(output)
     assert set(alike) == set(killed)
