@@ -47,6 +47,7 @@ class FrictionSource:
     label : source of the friction, for the report.
     note : warning to the user before the run; empty without one.
     constant : friction for all estimators; None uses the signals' friction, or else the vehicle file's.
+    assumed : neither option, log nor vehicle file gives a friction.
     of_truth : uses the friction of the ground truth, for datasets only; estimators of a run never receive it.
     """
 
@@ -54,6 +55,7 @@ class FrictionSource:
     note: str = ""
     constant: float | None = None
     of_truth: bool = False
+    assumed: bool = False
 
     def fill(self, signals: Signals, truth: StateTrack | None = None) -> Signals:
         """Return the signals of a drive [N] with their friction."""
@@ -94,6 +96,5 @@ def friction_source(
             remedy="write friction = ... into the file, or give --friction VALUE",
         )
     assumed = f"assumed, {vehicle.assumed_friction:g}"
-    return FrictionSource(
-        assumed, f"friction is {assumed}: neither log nor vehicle file has one; give --friction VALUE"
-    )
+    note = f"friction is {assumed}: neither log nor vehicle file has one; give --friction VALUE"
+    return FrictionSource(assumed, note, assumed=True)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.model import CarModel, TaughtParameter
 from pdhef_logtool.car.parts import physics_sha256
+from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.model_file import Sensors
 from pdhef_logtool.drive.options import AUTO
 from pdhef_logtool.drive.reading import Drive
@@ -68,6 +69,9 @@ class DriveModel:
         car = drive.car
         if posterior is not None and not posterior.refused:
             car = replace(car, self_calibrated=_without_truth(drive, posterior))
+        elif posterior is not None and posterior.sliding_friction is not None and drive.friction.assumed:
+            car = replace(car, self_calibrated=_sliding(posterior, posterior.sliding_friction))
+            drive.friction = FrictionSource(f"largest lateral acceleration, {posterior.sliding_friction:.2f}")
         return cls(drive.mapping, drive.plan.sensors, car, posterior)
 
     def apply(self, signals: Signals) -> DriveSignals:
@@ -134,6 +138,13 @@ def read_driving(drive: Drive) -> Driving:
     from pdhef_logtool.estimators.calibration.driving import driving_of
 
     return driving_of(drive.whole().signals, drive.car.vehicle)
+
+
+def _sliding(posterior: SelfCalibration, friction: float) -> WithoutTruth:
+    """Return the vehicle file with the friction that a sliding car reaches, where nothing else gives a friction."""
+    vehicle = posterior.vehicle_file.model_copy(update={"friction": friction})
+    note = f"not causal: friction {friction:.2f} from the largest lateral acceleration of the log, as the car slides"
+    return WithoutTruth(vehicle, posterior.noise, note=note, error_scale=posterior.error_scale)
 
 
 def _without_truth(drive: Drive, posterior: SelfCalibration) -> WithoutTruth:

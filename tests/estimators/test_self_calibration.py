@@ -154,7 +154,10 @@ def test_a_right_file_decides_what_gentle_driving_cannot_and_a_wrong_one_does_no
 
 def test_a_car_that_slides_all_the_time_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rules, "SLIDING_RAD", 0.001)
-    assert "the rear axle slides in" in found(wide().signals, RIGHT).refused
+    signals = wide().signals
+    slides = found(signals, RIGHT)
+    assert "the rear axle slides in" in slides.refused
+    assert slides.sliding_friction == pytest.approx(np.abs(signals.ay_m_s2).max() / 9.81, rel=0.1)
 
 
 def test_a_taught_prior_that_the_driving_contradicts_is_not_used() -> None:

@@ -15,6 +15,7 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell, read_drive
+from pdhef_logtool.estimators.calibration import calibration
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.model.drive_model import DriveModel, read_driving
@@ -124,6 +125,21 @@ def test_a_short_log_is_refused_and_the_file_stays(sample_logs_dir: Path, wrong_
     told = {e["name"]: e for e in report["estimators"]}
     assert told["open-loop:calibrated"]["outcome"] == "skipped"
     assert "not calibrated on this log" in report["answer"]["texts"]["assumed"]
+
+
+@pytest.mark.parametrize("given", [None, 0.8])
+def test_a_car_that_slides_has_the_friction_that_it_reaches_if_none_is_given(
+    sample_logs_dir: Path, wrong_car: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: float | None
+) -> None:
+    monkeypatch.setattr(calibration, "SLIDING_RAD", 0.001)
+    car = tmp_path / "vehicle.toml"
+    car.write_text("\n".join(x for x in wrong_car.read_text().splitlines() if not x.startswith("friction =")))
+    friction = {} if given is None else {"friction": given}
+    report = run(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("phy-ukf", "physics"), **friction)
+    assert "slides" in report["self_calibration"]["refused"]
+    causal = {e["name"]: e["causal"] for e in report["estimators"]}
+    assert (causal["phy-ukf"], causal["physics"]) == (True, given is not None)
+    assert report["friction"]["source"].startswith("largest lateral" if given is None else "option, 0.8")
 
 
 def test_a_car_with_evidence_is_not_calibrated(sample_logs_dir: Path) -> None:

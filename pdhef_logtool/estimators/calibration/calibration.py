@@ -30,6 +30,7 @@ from pdhef_logtool.estimators.calibration.joint import (
     Parameter,
     driven,
     front_stiffness,
+    peak_reached,
     prior_of,
     prior_variations,
     prior_vehicle,
@@ -109,6 +110,7 @@ class SelfCalibration:
     rms : RMS error of yaw rate in rad/s and of a_y in m/s²; of_file : the same of the vehicle file.
     seconds : used driving. logs : number of logs in the pool.
     varied : vehicles one posterior 1-sigma away, one per direction with a large effect on the sideslip.
+    sliding_friction : the friction that a_y reaches, if the fit is rejected because the car slides; None otherwise.
     """
 
     vehicle_file: VehicleParameters
@@ -121,6 +123,7 @@ class SelfCalibration:
     seconds: float
     logs: int
     varied: tuple[VehicleParameters, ...] = ()
+    sliding_friction: float | None = None
 
     @property
     def steer_delay_s(self) -> float:
@@ -205,12 +208,12 @@ def self_calibrate(
         return _without_fit(vehicle_file, vehicle_file, why, seconds, len(drives))
     problem = JointProblem(drives, vehicle_file)
     theta = problem.solve()
-    refused = _refusal(problem, theta, drives)
+    refused, slides = _refusal(problem, theta, drives)
     prior = prior_of(vehicle_file)
     if taught and not refused:
         with_prior = problem.taught(taught)
         place = with_prior.solve()
-        if not _refusal(with_prior, place, drives):
+        if not _refusal(with_prior, place, drives)[0]:
             problem, theta, prior = with_prior, place, with_prior.parameters
     theta, covariance = problem.posterior(theta)
     parameters = posterior_of(problem, theta, covariance, prior)
@@ -227,6 +230,7 @@ def self_calibrate(
         seconds,
         len(drives),
         tuple(problem.vehicle(to) for to in varied),
+        peak_reached(drives, vehicle_file) * vehicle_file.assumed_friction if slides else None,
     )
 
 
@@ -300,15 +304,15 @@ def _understeer(
     return Understeer(file, centre, math.sqrt(float(slope @ covariance @ slope)))
 
 
-def _refusal(problem: JointProblem, theta: FloatArray, drives: Sequence[Driving]) -> str:
-    """Return why a fit is rejected: its error is too large, or the car slides."""
+def _refusal(problem: JointProblem, theta: FloatArray, drives: Sequence[Driving]) -> tuple[str, bool]:
+    """Return why a fit is rejected, its error is too large or the car slides, and whether it slides."""
     rms = problem.rms(theta)
     for name, column, row in (("yaw rate", YAW_RATE, OF_RATE), ("lateral acceleration", AY, OF_AY)):
         measured = driven(drives, column)
         share = rms[row] / max(float(np.sqrt(np.mean(measured**2))), 1e-9)
         if share > LARGEST_SHARE and rms[row] > LARGEST_ERROR * ERROR_STD[row]:
-            return f"the model leaves {share:.0%} of the {name}, at most {LARGEST_SHARE:.0%} is plausible"
+            return f"the model leaves {share:.0%} of the {name}, at most {LARGEST_SHARE:.0%} is plausible", False
     sliding = float(np.mean(np.abs(problem.rear_slip(theta)) > SLIDING_RAD))
     if sliding > SLIDING_SHARE and sliding * sum(d.seconds for d in drives) > SLIDING_S:
-        return f"the rear axle slides in {sliding:.0%} of the driving"
-    return ""
+        return f"the rear axle slides in {sliding:.0%} of the driving", True
+    return "", False
