@@ -14,6 +14,7 @@ setup(
             "models/*/*/*/*/*",
             "car/*.toml",
             "cli/*.toml",
+            "drive/*.toml",
             "evaluation/*.toml",
             "logs/*.toml",
             "mapping/*.toml",
