@@ -29,7 +29,7 @@ def _losses_by_command(log: Path, out: Path, config: RunConfig) -> dict[str, tup
     physics = replace(config, network=Path("none"), estimators=("phy-ukf",))
     commands = {
         "extract": lambda tell: extract(logs, out / "2", ExtractSettings(physics), reporter=Reporter(warn=tell)),
-        "teach": lambda tell: learn(logs, out / "4", LearnSettings(config), reporter=Reporter(warn=tell)),
+        "teach": lambda tell: learn(logs, out / "4", LearnSettings(config=config), reporter=Reporter(warn=tell)),
         "run": lambda tell: run_logs(logs, out / "6", replace(physics, annotate="none"), reporter=Reporter(warn=tell)),
     }
     for name, command in commands.items():
