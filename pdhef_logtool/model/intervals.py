@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consiste
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
-from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.signals import SIGNAL_COLUMNS, FloatArray, IntArray, Signals
 from pdhef_logtool.records.steps import RESTART_GAP_S, release, step_durations_s
 from pdhef_logtool.records.tracks import StateTrack, scaled_covariance
 
@@ -48,6 +49,8 @@ OWN_SHARE = 0.5
 #: Standard deviations of the parameters of an identified car over those of a vehicle file: 8 % of the stiffness of an
 #: axle, which changes of the load cause.
 IDENTIFIED_SHARE = 0.16
+#: Longest step of the filters whose differences count: parameters act slowly.
+SLOW_STEP_S = 0.04
 #: Largest standard deviation of sideslip.
 MAX_SIDESLIP_STD_RAD = 1.0
 #: Time constants of the running consistency: leak of the integral, slow mean (bias and bank), and mean of squares.
@@ -82,7 +85,9 @@ class Interval:
         if not len(signals):
             return track
         if signals is not self._signals:
-            self._signals, self._vy = signals, [self._lateral_velocity(f, signals) for f in self.filters]
+            slow, number, block = _in_blocks(signals)
+            of_blocks = [self._lateral_velocity(f, slow, number) for f in self.filters]
+            self._signals, self._vy = signals, [np.append(vy, np.nan)[block] for vy in of_blocks]
         vehicle = self.filters[0].vehicle
         slow_m_s = vehicle.low_speed_blend_m_s
         if self.whole_drive:
@@ -94,8 +99,12 @@ class Interval:
         added = np.hypot(added, self.cg_std_m * track.yaw_rate_rad_s)
         return widened(track, self._vy, added, slow_m_s, self.scale)
 
-    def _lateral_velocity(self, physics: VehicleUkf, signals: Signals) -> FloatArray:
-        """Return v_y [N] of a filter, on signals as its vehicle corrects them; a friction of the log is relative."""
+    def _lateral_velocity(self, physics: VehicleUkf, signals: Signals, number: int) -> FloatArray:
+        """Return v_y [N] of a filter, on means of ``number`` samples as its vehicle corrects them.
+
+        A friction of the log is relative.
+        """
+        physics = replace(physics, r_std=tuple(physics.measurement_std / math.sqrt(number)))
         friction = physics.vehicle.assumed_friction / self.filters[0].vehicle.assumed_friction
         read = corrected_anew(signals, self.read_with, physics.vehicle)
         return run_estimator(physics, replace(read, friction=friction * read.friction)).vy_m_s
@@ -154,6 +163,25 @@ def _of_file(car: Car, share: float, *, use_speed: bool) -> Interval:
     bare = physics.vehicle.physics.model_copy(update=dict.fromkeys(CURES, False))
     filters = tuple(replace(physics, vehicle=v.model_copy(update={"physics": bare})) for v in vehicles)
     return Interval(filters, car.vehicle)
+
+
+def _in_blocks(signals: Signals) -> tuple[Signals, int, IntArray]:
+    """Return means over blocks of samples, their number of samples, and by stamp [N] the last complete block, or -1."""
+    period_s = float(np.median(np.diff(signals.stamps_ns))) * 1e-9 if len(signals) > 1 else SLOW_STEP_S
+    number = max(1, int(SLOW_STEP_S / period_s))
+    count = len(signals) // number
+
+    def blocks(name: str) -> Any:
+        column = getattr(signals, name)[: count * number]
+        column = column.reshape(count, number, *column.shape[1:])
+        if column.dtype.kind != "f":
+            return column[:, -1]
+        known = np.isfinite(column)
+        total = np.where(known, column, 0.0).sum(axis=1)
+        return np.divide(total, known.sum(axis=1), out=np.full(total.shape, np.nan), where=known.any(axis=1))
+
+    columns = {name: blocks(name) for name in SIGNAL_COLUMNS}
+    return Signals(**columns, available=signals.available), number, (np.arange(len(signals)) + 1) // number - 1
 
 
 def widened(

@@ -79,6 +79,13 @@ def spread(vehicles: tuple[VehicleParameters, ...], noise: FilterNoise, signals:
     return np.asarray(sum((vy - middle) ** 2 for vy in others))
 
 
+def assert_alike(got: np.ndarray, expected: np.ndarray) -> None:
+    """The filters of the variations run on means of samples: 2 % in the median, 15 % of the median anywhere."""
+    median = np.median(expected)
+    assert np.median(got) == pytest.approx(median, rel=0.02)
+    np.testing.assert_allclose(got, expected, atol=0.15 * median)
+
+
 def test_an_interval_changes_no_estimate(signals: Signals) -> None:
     plain, wide = tracks_of("physics", calibrated(VARIED), signals)
     for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "nis", "yaw_rate_std_rad_s"):
@@ -86,16 +93,21 @@ def test_an_interval_changes_no_estimate(signals: Signals) -> None:
     assert (np.linalg.eigvalsh(wide.covariance[10:]) > 0.0).all()
 
 
-def test_on_a_car_that_was_fitted_to_the_drive_it_is_the_sum_of_its_parts(signals: Signals) -> None:
-    car = calibrated(VARIED, 2.0)
-    plain, wide = tracks_of("physics", car, signals)
+@pytest.mark.parametrize("varied", [(), VARIED])
+def test_on_a_car_that_was_fitted_to_the_drive_it_is_the_sum_of_its_parts(
+    signals: Signals, varied: tuple[VehicleParameters, ...]
+) -> None:
+    plain, wide = tracks_of("physics", calibrated(varied, 2.0), signals)
     read = CalibratedSignals(corrected_anew(signals, OWN, FOUND), FOUND)
     consistency = DRIVE_SHARE * driven_consistency(plain, read, FOUND.low_speed_blend_m_s)
     assert consistency > 0.0
-    own = 4.0 * (plain.vy_std_m_s**2 + (CAR_STD_RAD * plain.vx_m_s) ** 2)
-    expected = own + spread((FOUND, *VARIED), NOISE, signals) + consistency**2
+    expected = 4.0 * (plain.vy_std_m_s**2 + (CAR_STD_RAD * plain.vx_m_s) ** 2) + consistency**2
     fast = plain.vx_m_s > OWN.low_speed_blend_m_s
-    np.testing.assert_allclose(wide.vy_std_m_s[fast] ** 2, expected[fast], rtol=1e-9)
+    if varied:
+        expected = expected + spread((FOUND, *varied), NOISE, signals)
+        assert_alike(wide.vy_std_m_s[fast], np.sqrt(expected[fast]))
+    else:
+        np.testing.assert_allclose(wide.vy_std_m_s[fast] ** 2, expected[fast], rtol=1e-9)
 
 
 def test_on_an_identified_car_it_is_the_sum_of_its_parts(signals: Signals) -> None:
@@ -109,7 +121,7 @@ def test_on_an_identified_car_it_is_the_sum_of_its_parts(signals: Signals) -> No
     running = running_consistency(plain, signals, car.physics_vehicle.roll_gradient_rad_per_m_s2)
     expected = (OWN_SHARE * plain.vy_std_m_s) ** 2 + running**2 + spread(vehicles, NOISE, unknown)
     fast = plain.vx_m_s > OWN.low_speed_blend_m_s
-    np.testing.assert_allclose(wide.vy_std_m_s[fast] ** 2, expected[fast], rtol=1e-9)
+    assert_alike(wide.vy_std_m_s[fast], np.sqrt(expected[fast]))
 
 
 def test_a_file_that_no_drive_has_shown_to_be_right_has_the_interval_of_its_prior() -> None:
