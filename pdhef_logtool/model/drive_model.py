@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.model import CarModel, TaughtParameter
 from pdhef_logtool.car.parts import physics_sha256
-from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.model_file import Sensors
 from pdhef_logtool.drive.options import AUTO
 from pdhef_logtool.drive.reading import Drive
@@ -37,12 +36,14 @@ class DriveModel:
     ----------
     reading : field, unit, sign and axes of every signal.
     sensors : clocks, delays and alignment. car : the car with the vehicle of the posterior.
+    friction : its source, for the report.
     posterior : of the car's parameters; None: the vehicle file is used unchanged.
     """
 
     reading: Mapping
     sensors: Sensors
     car: Car
+    friction: str
     posterior: SelfCalibration | None = None
 
     @classmethod
@@ -66,13 +67,13 @@ class DriveModel:
     @classmethod
     def of(cls, drive: Drive, posterior: SelfCalibration | None = None) -> DriveModel:
         """Return the model of a drive with a posterior of its car."""
-        car = drive.car
+        car, friction = drive.car, drive.friction.label
         if posterior is not None and not posterior.refused:
             car = replace(car, self_calibrated=_without_truth(drive, posterior))
         elif posterior is not None and posterior.sliding_friction is not None and drive.friction.assumed:
             car = replace(car, self_calibrated=_sliding(posterior, posterior.sliding_friction))
-            drive.friction = FrictionSource(f"largest lateral acceleration, {posterior.sliding_friction:.2f}")
-        return cls(drive.mapping, drive.plan.sensors, car, posterior)
+            friction = f"largest lateral acceleration, {posterior.sliding_friction:.2f}"
+        return cls(drive.mapping, drive.plan.sensors, car, friction, posterior)
 
     def apply(self, signals: Signals) -> DriveSignals:
         """Return the signals [N] of the drive, corrected for the vehicle file and for the vehicle of the posterior."""

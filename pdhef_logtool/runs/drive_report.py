@@ -59,7 +59,7 @@ def report_drive(
         "estimators": [*_estimator_entries(run, scored)],
         "metrics": scored.rows,
         "segments": scored.events,
-        "friction": {"source": drive.friction.label},
+        "friction": {"source": run.model.friction},
         "self_calibration": run.model.document,
         "reference": None if run.reference is None else run.reference.document,
         "largest_errors": [] if selected is None else largest_errors(selected, truth, others, slow),

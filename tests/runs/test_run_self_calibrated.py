@@ -140,6 +140,11 @@ def test_a_car_that_slides_has_the_friction_that_it_reaches_if_none_is_given(
     causal = {e["name"]: e["causal"] for e in report["estimators"]}
     assert (causal["phy-ukf"], causal["physics"]) == (True, given is not None)
     assert report["friction"]["source"].startswith("largest lateral" if given is None else "option, 0.8")
+    if given is None:  # a drive has one model, however often it is fitted
+        with read_drive(sample_logs_dir / "sweep.mcap", Car.load(car), options=ReadOptions(end=END)) as drive:
+            first, again = DriveModel.fit(drive), DriveModel.fit(drive)
+        assert first.friction == again.friction == report["friction"]["source"]
+        assert first.car.self_calibrated is not None and again.car.self_calibrated is not None
 
 
 def test_a_car_with_evidence_is_not_calibrated(sample_logs_dir: Path) -> None:
