@@ -13,6 +13,7 @@ from pdhef_logtool.evaluation.requirement_verdicts import joint_notes, next_step
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.records.printable import listed, printable
+from pdhef_logtool.results.selected_estimate import friction_text
 
 #: Class of the style by outcome.
 _KINDS = {"PASS": "pass", "FAIL": "fail", "INCONCLUSIVE": "unknown"}
@@ -141,7 +142,7 @@ def _road(report: Mapping[str, Any]) -> str:
             f"lateral acceleration up to {_upper(ays, lateral)} m/s²",
         ]
     if friction.get("source"):
-        parts.append(f"friction: {friction['source']}")
+        parts.append(f"friction: {friction_text(friction)}")
     return ", ".join(parts)
 
 
