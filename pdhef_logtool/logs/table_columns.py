@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.clock_evidence import decades_too_short
+from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.table_clocks import (
     NAMED_UNITS,
     NO_TIME,
@@ -53,9 +54,13 @@ _UNITS = frozenset(
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
 _LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"})
 
+#: Words of titles in other alphabets, and their English.
+_TRANSLATIONS: dict[str, str] = CONSTANTS["translations"]
+_OTHER_ALPHABET = re.compile("|".join(_TRANSLATIONS))
+
 _TIME = re.compile(
     r"(?:(?:time|t|timestamp|time_?stamps?|stamp|utc|utc_time|gps_time|date_?time|datetime|zeit(?:stempel)?|log_time|rel(?:ative)?_time|"
-    rf"elapsed(?:_time)?|time_of_day)(?:_(?:{'|'.join(TIME_UNITS_NS)}))?|seconds|milli(?:s|seconds)|micros|time_utc|epoch)"
+    rf"elapsed(?:_time)?|time_of_day|[cp]?ts|ticks?|secs?)(?:_(?:{'|'.join(TIME_UNITS_NS)}))?|seconds|milli(?:s|seconds)|micros|time_utc|epoch)"
 )
 _TIME_LIKE = re.compile(r"time|zeit|clock|stamp")
 _WEEK = re.compile(r"(?:gps|gnss)?_?week(?:_?(?:number|no|nr))?")
@@ -72,6 +77,7 @@ _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
 
 def field_name(text: str) -> str:
     """Return the name of a column as every format of messages takes it: ASCII letters, digits and ``_``."""
+    text = _OTHER_ALPHABET.sub(lambda match: f" {_TRANSLATIONS[match[0]]} ", text)
     text = unicodedata.normalize("NFKD", text.partition("\\")[0].translate(_LATIN)).encode("ascii", "ignore").decode()
     name = re.sub(r"[\W_]+", "_", text).strip("_") or "column"
     return f"n_{name}" if name[0].isdigit() else name

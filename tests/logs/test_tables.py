@@ -555,3 +555,12 @@ def test_texts_that_name_no_signals_make_no_columns(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("\n".join(["time,name,value", *rows, ""]))
     with closing(open_log(tmp_path / "a.csv")) as log:
         assert [f.path for t in log.topics for f in log.fields(t.name)] == ["value"]
+
+
+def test_titles_in_other_alphabets_and_short_names_of_a_clock(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("ts,车速 [km/h],横摆角速度(deg/s),左前轮速\n0.00,36,1,10\n0.01,36,2,10\n0.02,37,3,10\n")
+    with closing(open_log(path)) as log:
+        assert {f.path for t in log.topics for f in log.fields(t.name)} == {
+            "vehicle_speed", "yaw_rate", "front_left_wheel_speed"
+        }  # fmt: skip
