@@ -23,8 +23,10 @@ from pdhef_logtool.logs.table_clocks import (
     number_clock,
     rate_clock,
     rescaled,
+    spread,
     text_clock,
     week_clock,
+    with_fractions,
 )
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
@@ -67,6 +69,7 @@ _WEEK = re.compile(r"(?:gps|gnss)?_?week(?:_?(?:number|no|nr))?")
 _WEEK_TIME = re.compile(
     r"(?:(?:gps|gnss)_)?(?:i?tow|sow|time_of_week|seconds_of_week|week_seconds|seconds|time)(?:_m?s)?"
 )
+_SECOND_NS = TIME_UNITS_NS["seconds"]
 #: Columns of a table in long form, with a row for each value.
 _SIGNAL = re.compile(
     r"(?:signal|channel|variable|parameter|sensor|tag|key|telemetry|metric|pid|name)(?:_?(?:name|id))?"
@@ -156,6 +159,11 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
         )
     certain = [clock for name, clock in clocks.items() if name != chosen and clock.is_certain]
     clock = _read_clock(sheet, chosen, (*others, *certain), rate_hz) if certain else clocks[chosen]
+    if rest := re.fullmatch(r"(.*?)_?(?:s|sec|secs|seconds)", snake(chosen)):
+        of_unit = {f"{rest[1]}_{unit}".strip("_"): ns for unit, ns in TIME_UNITS_NS.items()}
+        within = next((n for n in names if of_unit.get(n, _SECOND_NS) < _SECOND_NS), None)
+        if within is not None:
+            clock = with_fractions(clock, _numbers(sheet.columns[names[within]]), of_unit[within], names[within])
     if clock.notes and not (clock.is_certain or certain or others):
         clock = _as_motion_shows(clock, sheet, chosen)
     apart = [n for n in rivals if abs(clocks[n].length_s - clock.length_s) > _ALIKE * clock.length_s]
@@ -184,7 +192,7 @@ def _grade(sheet: Sheet, name: str) -> int | None:
     column, text = sheet.columns[name], snake(name)
     is_time = _TIME.fullmatch(text) is not None
     if not isinstance(column, np.ndarray):
-        if not is_time and not _DATE.fullmatch(text):
+        if not (is_time or _TIME_LIKE.search(text) or _DATE.fullmatch(text)):
             return None
         times = {*text_clock(column.drop_nulls().head(20)).stamps_ns.tolist()} - {NO_TIME}
         return (0 if is_time else 1) if len(times) > (not is_time) else None
@@ -232,6 +240,7 @@ def tables_of(
     if stamps is None:
         named_values = _named_values(sheet)
         clock = find_clock(sheet, where, rate_hz=None if named_values else rate_hz)
+        clock = clock if named_values else spread(clock)
         stamps, used = clock.stamps_ns, clock.columns
         losses.extend(clock_notes(clock, where))
         if named_values and (long := list(_of_long_form(sheet, stamps, *named_values))):
