@@ -47,7 +47,7 @@ def without_faulty_samples(
     if not has_imu(signals):
         return sound, {}
     plan = plan_alignment(signals, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m)
-    aligned = align(signals, plan, middle - reach, middle + reach)
+    aligned, _ = align(signals, plan)
     faults, _ = find_faults(aligned, vehicle, None)
     shares: dict[str, float] = {}
     for i, (name, other) in enumerate(_OTHER.items()):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import correct_signals
-from pdhef_logtool.drive.alignment import align, count_late
+from pdhef_logtool.drive.alignment import align
 from pdhef_logtool.drive.channel_hash import channels_sha256
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.sensor_changes import SensorChange, find_changes
@@ -63,14 +63,15 @@ def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (
     samples: Counter[str] = Counter()
     for channel in channels:
         samples[channel.source] += len(channel)
-    stamps = [c.stamps_ns for c in part.signals.values() if len(c)]
-    start_ns, end_ns = (min(int(s[0]) for s in stamps), max(int(s[-1]) for s in stamps) + 1) if stamps else (0, 0)
-    aligned = correct_signals(align(part.signals, plan.alignment, start_ns, end_ns), plan.vehicle)
+    aligned, late_counts = align(part.signals, plan.alignment)
+    aligned = correct_signals(aligned, plan.vehicle)
     signals, changes = find_changes(aligned, unchanged)
     late = []
-    for name, count in count_late(part.signals, plan.alignment, start_ns, end_ns).items():
-        part.counts["signal", name]["late"] += count
-        late.append(Loss("late", _LATE, part.signals[name].source, start_ns, end_ns, count, "note"))
+    for name in sorted(late_counts.keys() & part.signals.keys()):
+        part.counts["signal", name]["late"] += late_counts[name]
+        channel = part.signals[name]
+        start_ns, end_ns = int(channel.stamps_ns[0]), int(channel.stamps_ns[-1]) + 1
+        late.append(Loss("late", _LATE, channel.source, start_ns, end_ns, late_counts[name], "note"))
     losses = merge_losses([part.losses, *map(_gaps, channels), late, _impossible(signals)])
     truth = None
     if plan.truth is not None:

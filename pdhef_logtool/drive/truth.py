@@ -57,7 +57,6 @@ _COLUMNS = {
 _FRICTION = "friction"
 _AY_DERIVED = "smoothing derivative of v_y plus v_x times yaw rate plus g sin(roll), without body roll"
 _AY_UNKNOWN = "not scored: needs a mapped a_y, or an attitude with roll and the car's roll gradient"
-_SURVEY_NS = 600_000_000_000
 _CHUNK = 16384
 _ANGLES = frozenset({"yaw_rad", "course_rad", "sideslip_rad"})
 _NED_TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -157,7 +156,7 @@ def plan_truth(
     max_gap_s: float | None = None,
     roll_gradient_rad_per_m_s2: float = 0.0,
 ) -> TruthPlan | None:
-    """Decide clock, derivation, local frame and the convention of the quaternion from the first 600 s.
+    """Decide clock, derivation, local frame and the convention of the quaternion.
 
     Parameters
     ----------
@@ -169,7 +168,7 @@ def plan_truth(
     -------
     TruthPlan, or None when no channel has two samples.
     """
-    survey = _survey(channels)
+    survey = {name: c for name, c in channels.items() if len(c) > 1}
     if not survey.keys() - {_FRICTION}:
         return None
     has = frozenset(survey)
@@ -408,16 +407,6 @@ def dependent_signals(
 
 
 # ---- planning ----
-
-
-def _survey(channels: Mapping[str, Channel]) -> dict[str, Channel]:
-    starts = [int(c.stamps_ns[0]) for c in channels.values() if len(c)]
-    survey = {}
-    for name, c in channels.items():
-        n = int(np.searchsorted(c.stamps_ns, min(starts) + _SURVEY_NS)) if starts else 0
-        if n >= 2:
-            survey[name] = c.take(slice(n))
-    return survey
 
 
 def _first(has: frozenset[str], *names: str) -> str | None:
