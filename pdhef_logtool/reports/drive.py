@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pdhef_logtool.evaluation.units import AY_NOTE, LABELS
+from pdhef_logtool.evaluation.units import AY_NOTE
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.reports.drive_figures import DriveFigures, Roles, drive_figures
@@ -22,29 +22,10 @@ _PHYSICS = "physics"
 #: Minimum duration of a drive for conclusions, in s.
 _SHORT_S = 10.0
 #: Keys of the figures, in the order of the page.
-OVER_TIME = ("sideslip", "error", "trust", "r_scale", "nis", "speed", "ay", "strip")
-IN_PLANE = ("path", "ay_sideslip", "phase")
+OVER_TIME = ("sideslip", "error", "yaw_rate", "ay", "speed", "strip")
+IN_PLANE = ("path", "ay_sideslip")
 #: Maximum number of rows of tables that grow with the length of the log.
 _MOST_ROWS = 200
-#: Word and style class of each outcome.
-OUTCOMES = {
-    "better": ("better", "good"),
-    "same": ("as good", ""),
-    "worse": ("worse", "bad"),
-    "undecided": ("inconclusive", ""),
-    "alone": ("alone", ""),
-    "none": ("no verdict", ""),
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """A sentence on one signal, and its summary in a word; ``kind``: class of the style."""
-
-    signal: str
-    word: str
-    text: str
-    kind: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +74,6 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         tested=tested_drive(report, log.outcome),
         steps=steps_of(report),
         identical=[] if roles is None else identical_to(report, roles.main),
-        verdicts=verdicts_of(report),
         drawn=figures,
         why_none=why_none,
         notices=_notices(report, figures),
@@ -117,16 +97,15 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
 
 
 def roles_of(report: Mapping[str, Any]) -> Roles | None:
-    """Return the names to draw: the selected estimate, its rival in the verdict on sideslip (else physics), others."""
+    """Return the names to draw: the selected estimate, physics (else the first other filter), others."""
     names: list[str] = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
     if not names:
         return None
     answer = report.get("answer") or {}
     main: str = answer["main"] if answer.get("main") in names else names[0]
-    rival_of_verdict = next((str(v.get("rival")) for v in _told(report) if v.get("signal") == "sideslip_rad"), "")
     identical = identical_to(report, main)
     others = [n for n in names if n not in identical]
-    rival = next((n for n in (rival_of_verdict, _PHYSICS, *others) if n in others and n != main), "")
+    rival = next((n for n in (_PHYSICS, *others) if n in others and n != main), "")
     return Roles(main, rival, tuple(n for n in names if n not in (main, rival)))
 
 
@@ -141,24 +120,6 @@ def identical_to(report: Mapping[str, Any], main: str) -> list[str]:
     apart = [m["estimator"] for m in report["metrics"] if m["metric"] == "disagreement_rms" and m["value"] == 0.0]
     pairs = [n for pair in apart if main in (names := pair.split("~")) for n in names if n != main]
     return [*dict.fromkeys([*same, *pairs])]
-
-
-def _told(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    return [v for v in report.get("verdicts") or () if isinstance(v, Mapping)]
-
-
-def verdicts_of(report: Mapping[str, Any]) -> list[Verdict]:
-    """Return the sentences at the head of a page; without verdicts, the text of the selected estimate."""
-    signals: dict[tuple[str, str, str], list[str]] = {}
-    for v in _told(report):
-        word, kind = OUTCOMES.get(str(v.get("outcome")), (str(v.get("outcome")), ""))
-        text = str(v.get("text", "")).removeprefix(f"{word}: ")
-        signals.setdefault((word, text, kind), []).append(LABELS.get(str(v.get("signal")), ""))
-    verdicts = [Verdict(", ".join(names), *of) for of, names in signals.items()]
-    answer = report.get("answer")
-    if verdicts or answer is None:
-        return verdicts
-    return [Verdict("sideslip", "result", str(answer["texts"]["result"]))]
 
 
 def _notices(report: Mapping[str, Any], figures: DriveFigures | None) -> list[str]:

@@ -131,22 +131,13 @@ def _day(stamp_ns: int) -> str:
 
 def _road(report: Mapping[str, Any]) -> str:
     space, friction = report.get("operating_space") or {}, report.get("friction") or {}
-    cells = [c for c in space.get("cells") or () if c["seconds"] >= 0.5]
-    parts = []
-    if cells:
-        speeds, ays = space["speed_edges_m_s"], space["ay_edges_m_s2"]
-        fast, lateral = max(c["speed"] for c in cells), max(c["ay"] for c in cells)
-        parts = [
-            f"speed up to {_upper(speeds, fast)} m/s",
-            f"lateral acceleration up to {_upper(ays, lateral)} m/s²",
-        ]
-    if friction.get("source"):
-        parts.append(f"friction: {friction['source']}")
-    return ", ".join(parts)
-
-
-def _upper(edges: Sequence[float], index: int) -> str:
-    return f"{edges[index + 1]:g}" if index + 1 < len(edges) else f"more than {edges[-1]:g}"
+    speed, ay = space.get("speed_max_m_s"), space.get("ay_max_m_s2")
+    parts = [
+        "" if speed is None else f"speed up to {speed:.1f} m/s",
+        "" if ay is None else f"lateral acceleration up to {ay:.1f} m/s²",
+        f"friction: {friction['source']}" if friction.get("source") else "",
+    ]
+    return ", ".join(filter(None, parts))
 
 
 def _sensors(report: Mapping[str, Any]) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +14,6 @@ from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.charts import BarsFigure, Charts, Cloud, Interval, IntervalsFigure, PointsFigure
 from pdhef_logtool.reports.colours import INK, PLAIN, colour
-from pdhef_logtool.reports.drive import OUTCOMES
 from pdhef_logtool.reports.first_screen import plan_head, tested_run
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.breakdown import LEAST_DRIVES
@@ -77,7 +75,6 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         "tested": tested_run(run.document, sum(d.seconds for d in fleet.drives) / 3600.0),
         "steps": next_steps(run.document.get("plan"), ["repair the failed logs: causes below"] if fleet.failed else ()),
         "worst": _worst(fleet, charts),
-        "verdicts": Counter(d.verdict for d in fleet.scored if d.verdict),
         "answer": next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),
         "rows": _rows(_told(fleet)),
         "mains": {ANSWER} if len(mains) > 1 else mains,
@@ -89,7 +86,6 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         "idle_keys": [b.key for b in fleet.breakdowns if b not in shown],
         "space": None if fleet.space is None else _space_rows(fleet.space),
         "held": sorted(fleet.drives, key=lambda d: d.label)[:MOST_ROWS],
-        "words": {outcome: word for outcome, (word, _) in OUTCOMES.items()},
         "most_rows": MOST_ROWS,
         "least": LEAST_DRIVES,
     }

@@ -65,7 +65,7 @@ class FleetDrive:
     truth : whether its sideslip is scored against an independent ground truth. unscored : why not, else empty.
     errors : RMSE by estimator and signal, where the ground truth is independent of both.
     nis, d2, naive_d2 : without ground truth: NIS and v̇_y residual of the selected estimate, v̇_y residual of sideslip 0.
-    verdict : of sideslip: ``better``, ``worse`` and so on. coverage : of the 95 % confidence interval.
+    coverage : of the 95 % confidence interval.
     failed_checks : that count. lost : data that could not be used. keys : for grouping.
     factors : day, car and route, None where not stated.
     """
@@ -80,7 +80,6 @@ class FleetDrive:
     nis: float
     d2: float
     naive_d2: float
-    verdict: str
     failed_checks: int
     lost: str
     keys: Mapping[str, str]
@@ -317,20 +316,18 @@ def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str
     }
     dof = figures.get((main, "state", "nis_dof"), math.nan)
     nis = figures.get((main, "state", "nis"), math.nan)
-    verdicts = {v["signal"]: v for v in report.get("verdicts") or ()}
     kind, _, reason = log.outcome.partition(": ")
     return FleetDrive(
         label=log.label,
         seconds=float(report["log"]["duration_s"]),
         main=main,
         truth=(main, JUDGED) in errors,
-        unscored="" if (main, JUDGED) in errors else _why_unscored(report, verdicts.get(JUDGED, {})),
+        unscored="" if (main, JUDGED) in errors else _why_unscored(report),
         errors=errors,
         coverage=figures.get((main, JUDGED, "coverage95"), math.nan),
         nis=nis / dof if dof and dof > 0.0 else math.nan,
         d2=figures.get((main, "vy_m_s", "d2"), math.nan),
         naive_d2=figures.get((answer.get("naive") or "", "vy_m_s", "d2"), math.nan),
-        verdict=verdicts.get(JUDGED, {}).get("outcome", ""),
         failed_checks=sum(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks", ())),
         lost=reason if kind == "lost" else "",
         keys=_keys(log, report, main),
@@ -338,12 +335,13 @@ def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str
     )
 
 
-def _why_unscored(report: Mapping[str, Any], verdict: Mapping[str, Any]) -> str:
+def _why_unscored(report: Mapping[str, Any]) -> str:
     if not report["truth"]["available"]:
         return "the log has no ground truth"
     if JUDGED in report["truth"]["not_independent"]:
         return "its ground truth is not independent"
-    return str(verdict.get("text", "no figure of it is scored")).partition(": ")[2] or "no figure of it is scored"
+    texts = (report.get("answer") or {}).get("texts") or {}
+    return str(texts.get("result", "")).partition(" is not scored: ")[2] or "no figure of it is scored"
 
 
 def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str]:

@@ -11,6 +11,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
+import numpy as np
+
+from pdhef_logtool.evaluation.requirement_blocks import from_document
+from pdhef_logtool.evaluation.requirement_bounds import LEAST_BLOCKS, pooled
+from pdhef_logtool.evaluation.validation_plan import SIDESLIP
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.storage.templates import one_line, template
@@ -70,8 +75,9 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
 
     words = _words()
     intervals = next((e["intervals"] for e in report["estimators"] if e["name"] == main.name), ())
+    interval = _interval(report)
     texts = {
-        "result": words.result(report, main, value),
+        "result": words.result(report, main, value, interval),
         "consistency": "" if report["truth"]["available"] else words.consistency(main, value),
         "band": words.band(main, intervals, value(main.name, "coverage95")),
         "assumed": "; ".join(_assumed(report, main)),
@@ -80,7 +86,19 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
     texts = {key: one_line(text) for key, text in texts.items()}
     best = _best_in_hindsight(report, main, figures)
     chosen = {"main" if key == "name" else key: value for key, value in asdict(main).items()}
-    return {**chosen, "shown": list(main.shown), "best_in_hindsight": best, "texts": texts}
+    shown = {"shown": list(main.shown), "sideslip_rmse_ci_rad": interval}
+    return {**chosen, **shown, "best_in_hindsight": best, "texts": texts}
+
+
+def _interval(report: Report) -> list[float] | None:
+    """Return the 95 % CI of the sideslip RMSE of the selected estimate in rad, None with too few blocks of time."""
+    blocks = from_document(report.get("requirement_blocks") or ())
+    of = next((b for b in blocks if b.of == SIDESLIP.measured and not b.estimated and len(b.n) >= LEAST_BLOCKS), None)
+    if of is None:
+        return None
+    counts, values = np.array(of.n, dtype=np.float64), np.array(of.value)
+    bounded = pooled(counts, values, None, squares=True, positive=True, level=0.95)
+    return [bounded.low, bounded.high]
 
 
 @cache

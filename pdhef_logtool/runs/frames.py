@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING
 from pdhef_logtool.car.parts import Algorithm
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.table import Options, Skipped, runnable
+from pdhef_logtool.estimators.table import Skipped
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.intervals import drive_intervals
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.runs.estimating import estimate_drive
-from pdhef_logtool.runs.selection import default_names
+from pdhef_logtool.runs.preparing import choose
 
 if TYPE_CHECKING:
     import polars as pl
@@ -47,13 +46,6 @@ class Estimates:
 
         frames = (pl.DataFrame(track_table(track)) for track in self.tracks.values())
         return pl.concat(f.with_columns(pl.col("estimator").cast(pl.String)) for f in frames)
-
-
-def choose(drive: Drive, names: Sequence[str] | None = None) -> tuple[list[Estimator], list[Skipped]]:
-    """Return the estimators that a drive and its car let run, and those that they do not; ``names`` as for estimate."""
-    names = default_names(drive.car, drive.available) if names is None else names
-    options = Options(drive.options.use_speed, gnss=True)
-    return runnable(names, drive.car, drive.available, options, drive.plan.refused)
 
 
 def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:

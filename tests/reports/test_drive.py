@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from made_runs import START_NS, drive_tracks, write_run
 
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
-from pdhef_logtool.reports.drive import drive_page, roles_of
+from pdhef_logtool.reports.drive import drive_page
 from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.storage.documents import seal
@@ -40,9 +40,7 @@ def figures(page: str) -> dict:
 
 def test_a_page_has_its_figures_and_needs_nothing_else(tmp_path):
     page = page_of(write_run(tmp_path, drive_tracks()))
-    assert {"sideslip", "error", "trust", "r_scale", "nis", "speed", "ay", "strip", "path", "phase"} <= set(
-        figures(page)
-    )
+    assert {"sideslip", "error", "yaw_rate", "speed", "ay", "strip", "path", "ay_sideslip"} <= set(figures(page))
     assert page.count("<script") == page.count("</script>")
     assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page) == ['href="../../report.html"']
     assert " style=" not in page
@@ -111,15 +109,6 @@ def test_a_damaged_report_stops_no_other_page(tmp_path):
     result = write_pages(open_run(folder))
     assert result.exit_code in (0, 3)
     assert result.pages[1].file.is_file()
-
-
-@pytest.mark.parametrize("outcome", ["better", "worse", "same", "undecided", "none"])
-def test_the_comparison_with_physics_follows_the_first_screen(tmp_path, outcome):
-    verdict = {"signal": "sideslip_rad", "outcome": outcome, "text": "a sentence", "rival": "zero"}
-    folder = write_run(tmp_path, drive_tracks(), verdicts=[verdict])
-    page = page_of(folder)
-    assert "Comparison with physics sideslip: " in words(page) and "a sentence" in words(page)
-    assert roles_of(open_run(folder).logs[0].report()).rival == "zero"
 
 
 def plan_of(*outcomes: str) -> dict:
@@ -209,7 +198,6 @@ def hostile_run(folder: Path) -> Path:
             {"name": h, "subject": h, "verdict": "failed", "evidence": h, "remedy": h, "waived": False} for h in HOSTILE
         ],
         versions=dict.fromkeys(HOSTILE, all_of_it),
-        verdicts=[{"signal": h, "outcome": h, "text": h, "rival": h} for h in HOSTILE],
         metadata=dict(zip(HOSTILE, HOSTILE, strict=True)),
         vehicle={"name": all_of_it, "file": all_of_it, "sha256": "0", "proven": False, "low_speed_blend_m_s": 3.0},
     )

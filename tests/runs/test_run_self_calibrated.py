@@ -160,14 +160,13 @@ def test_an_estimate_that_contradicts_the_sensors_is_not_selected_and_keeps_its_
     if Car.load().network is None:
         pytest.skip("no network is shipped, without which there is no pd-hef")
     monkeypatch.setattr(selection, "FACTOR", 0.0)
-    report = run(
-        sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, estimators=("zero", "phy-ukf", "pd-hef"), end=None
-    )
+    names = ("zero", "phy-ukf", "pd-hef", "physics")
+    report = run(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, estimators=names, end=None)
     follows(report)
     assert any(w.startswith("WARNING: pd-hef contradicts the sensors") for w in report["warnings"])
     assert report["selected_estimate"] == report["answer"]["main"] == "physics"
     file = tmp_path / "logs" / "sweep" / "estimates.parquet"
-    assert list_estimators(file) == ("truth", "zero", "phy-ukf", "pd-hef", "physics")
+    assert list_estimators(file) == ("truth", *names)
     selected, named, other = (read_track(file, name) for name in ("selected", "physics", "pd-hef"))
     np.testing.assert_array_equal(selected.sideslip_rad, named.sideslip_rad)
     assert (selected.sideslip_rad != other.sideslip_rad).any()
