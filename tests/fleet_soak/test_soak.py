@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -99,12 +97,6 @@ def drives_of(output: Path) -> list[dict[str, Any]]:
     return [d for d in documents if "outcome" in d]
 
 
-def contents(output: Path) -> dict[str, bytes]:
-    """Return the files of a run without its journal and recordings, which contain times."""
-    found = (p for p in output.rglob("*") if p.is_file() and p.name != JOURNAL_FILE and p.suffix != ".rrd")
-    return {p.relative_to(output).as_posix(): p.read_bytes() for p in found}
-
-
 @pytest.fixture(scope="session")
 def undisturbed(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     output = tmp_path_factory.mktemp("undisturbed") / "out"
@@ -135,28 +127,6 @@ def test_exactly_the_planted_ones_are_given_up(undisturbed: tuple[Path, dict[str
     sizes = [p.stat().st_size for log in run.logs if (p := log.file("report.json")) is not None]
     assert "figures and a short report of each are kept" in found["said"][0]
     assert sorted(sizes)[-6] <= 20_000  # the five worst are kept in full
-
-
-def test_killed_twice_and_resumed_is_undisturbed(
-    undisturbed: tuple[Path, dict[str, Any]], logs: Path, tmp_path: Path
-) -> None:
-    output = tmp_path / "out"
-    total = len(open_run(undisturbed[0]).logs)
-    for share in (0.3, 0.7):
-        process = start(arguments(logs), output, "--resume")
-        while len(drives_of(output)) < share * total and process.poll() is None:
-            time.sleep(0.2)
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-        assert process.returncode == -signal.SIGKILL
-    before = len(drives_of(output))
-    finished(arguments(logs), output, "--resume")
-    assert len({d["label"] for d in drives_of(output)}) == total
-    assert len(drives_of(output)) <= total + 5 + 2 * 2  # the worst once more, and at most the drives in flight
-    assert before < total
-    alike, killed = contents(undisturbed[0]), contents(output)
-    assert set(alike) == set(killed)
-    assert [name for name, data in alike.items() if killed[name] != data] == []
 
 
 def test_a_worker_takes_no_more_memory_after_300_drives_than_after_30(undisturbed: tuple[Path, dict[str, Any]]) -> None:
