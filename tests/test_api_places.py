@@ -75,13 +75,6 @@ def _ends(call: Callable[[], Any]) -> str:
     return str(ended.value)
 
 
-@pytest.mark.parametrize("name", ["learn", "extract"])
-def test_a_url_is_no_place_for_a_car_or_a_dataset(name: str, dlc: Path) -> None:
-    config = pdhef.RunConfig(car=Path("saloon"))
-    ends = _ends(lambda: getattr(pdhef, name)([dlc], "s3://bucket/car", _settings(name, config)))
-    assert "expected a place on this machine, got s3://bucket/car" in ends
-
-
 @pytest.mark.parametrize("kind", [str, Path])
 def test_what_learns_takes_texts_and_paths(kind: Callable[[object], Any], tmp_path: Path) -> None:
     log, out = tmp_path / "none.mcap", kind(tmp_path / "out")

@@ -16,7 +16,7 @@ def loaded(*heavy):
     print("loaded:", *(name for name in heavy if name in sys.modules))
 import pdhef_logtool
 loaded("numpy", "pydantic")
-import pdhef_logtool.cli.inspecting, pdhef_logtool.runs.config, pdhef_logtool.runs.inspection
+import pdhef_logtool.cli.inspecting, pdhef_logtool.runs.config, pdhef_logtool.runs.inspection, truthsim.manoeuvres
 loaded("numba", "torch", "scipy", "rerun", "polars", "pyarrow")
 from pdhef_logtool.cli.app import main
 sys.argv = ["pdhef", *sys.argv[1:]]

@@ -12,7 +12,7 @@ from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.logs import byte_source
 from pdhef_logtool.logs.byte_source import ChangedError
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.runs import working
+from pdhef_logtool.runs import fleet, working
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, run_drive
 from pdhef_logtool.storage.files import write_bytes
@@ -110,7 +110,10 @@ def full_disk(task: DriveTask, tell: Tell) -> DriveEnd | OutputError:
 
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_full_disk_ends_the_run_at_once_and_quarantines_nothing(tmp_path: Path, jobs: int) -> None:
+def test_a_full_disk_ends_the_run_at_once_and_quarantines_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int
+) -> None:
+    monkeypatch.setattr(fleet, "_PRELOAD", (__name__,))  # no compiled code
     folder, out = named_logs(tmp_path / "logs", "a", "b", "c", "d"), tmp_path / "out"
     run(folder, tmp_path / "undisturbed")
     work = Counted(full_disk) if jobs == 1 else full_disk

@@ -243,7 +243,7 @@ def test_two_jobs_that_are_killed_and_go_on_leave_what_one_job_leaves(
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")]
     config = RunConfig(car=Path("saloon"), estimators=("zero", "kinematic"), keep="estimates", end="1.5")
     one, two = tmp_path / "one", tmp_path / "two"
-    assert run_logs(logs, one, config).exit_code == 0
+    assert run_logs(logs, one, config, report=False).exit_code == 0
 
     def killed(line: str, share: float) -> None:
         if share > 0.5:
@@ -251,8 +251,8 @@ def test_two_jobs_that_are_killed_and_go_on_leave_what_one_job_leaves(
 
     monkeypatch.setattr(fleet, "_PRELOAD", ("pdhef_logtool.runs.*",))  # no compiled code
     with pytest.raises(KeyboardInterrupt):
-        run_logs(logs, two, config, schedule=Schedule(jobs=2), reporter=Reporter(killed))
-    assert run_logs(logs, two, config, schedule=Schedule(jobs=2, resume=True)).exit_code == 0
+        run_logs(logs, two, config, schedule=Schedule(jobs=2), reporter=Reporter(killed), report=False)
+    assert run_logs(logs, two, config, schedule=Schedule(jobs=2, resume=True), report=False).exit_code == 0
     assert contents(one) == contents(two)
     folder = two / "logs/dlc"
     assert {p.name for p in folder.iterdir()} == {"estimates.parquet", "metrics.parquet", "report.json", "model.toml"}
