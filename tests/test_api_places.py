@@ -82,7 +82,7 @@ def test_what_learns_takes_texts_and_paths(kind: Callable[[object], Any], tmp_pa
     for name in ("learn", "extract"):
         for logs in (kind(log), [kind(log)]):
             assert "no such file" in _ends(lambda: getattr(pdhef, name)(logs, out, _settings(name, config))).lower()  # noqa: B023
-    assert "network" in _ends(lambda: pdhef.train(kind(tmp_path / "set"), out, init=kind(tmp_path / "net")))
+    assert "manifest.json" in _ends(lambda: pdhef.train(kind(tmp_path / "set"), out, init=kind(tmp_path / "net")))
 
 
 def test_every_name_of_the_api_is_tested_or_takes_no_file() -> None:
