@@ -2,31 +2,49 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.reports.fleet import fleet_page
 from pdhef_logtool.reports.pages import remove_pages, write_pages
 from pdhef_logtool.results.opened_run import open_run
-from tests.results.made_run import FleetRun
+from pdhef_logtool.results.parquet_sink import write_metrics
+from pdhef_logtool.storage.documents import seal
 
 HOSTILE = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>\u202egnp"
 
 
 def run_of(folder: Path, drives: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str] | None = None) -> Path:
     """Write a run: ``drives`` with RMSE in rad of pd-hef and physics, and changes of the report; ``failed`` reasons."""
-    run = FleetRun(folder)
-    cells = [{"speed": 1, "ay": 0, "seconds": 90.0, "scored": 9, "sideslip_mse_rad2": 1e-4}]
-    space = {"speed_edges_m_s": [0, 5, 10], "ay_edges_m_s2": [0, 1], "cells": cells}
+    logs, rows = [], []
     for label, drive in drives.items():
-        changes = {"operating_space": space, **drive}
-        run.add(label, dict(zip(("pd-hef", "physics"), changes.pop("errors", ()), strict=False)), **changes)
-    for label, reason in (failed or {}).items():
-        run.add(label, outcome=f"failed: {reason}")
-    run.opened()
+        given = dict(drive)
+        for name, value in zip(("pd-hef", "physics"), given.pop("errors", ()), strict=False):
+            rows.append((label, name, "sideslip_rad", "all", "rmse", value))
+        cells = [{"speed": 1, "ay": 0, "seconds": 90.0, "scored": 9, "sideslip_mse_rad2": 1e-4}]
+        report = {
+            "format": "pdhef.report",
+            "log": {"name": label, "duration_s": 100.0, "kind": "mcap"},
+            "vehicle": {"name": "golf"},
+            "truth": {"available": True, "not_independent": []},
+            "answer": {"main": "pd-hef", "naive": "zero"},
+            "verdicts": [{"signal": "sideslip_rad", "outcome": "better", "text": "x"}],
+            "operating_space": {"speed_edges_m_s": [0, 5, 10], "ay_edges_m_s2": [0, 1], "cells": cells},
+            **given,
+        }
+        place = folder / "logs" / label
+        place.mkdir(parents=True)
+        (place / "report.json").write_text(json.dumps(report))
+        (place / "report.html").write_text("x")
+        logs.append({"log": label, "outcome": "ok", "car": None})
+    logs += [{"log": label, "outcome": f"failed: {reason}", "car": None} for label, reason in (failed or {}).items()]
+    write_metrics(folder / "metrics.parquet", [MetricRow(*row, unit="rad", n=9) for row in rows])
+    (folder / "run.json").write_text(json.dumps(seal({"format": "pdhef.run", "logs": logs, "versions": {"a": "1"}})))
     return folder
 
 

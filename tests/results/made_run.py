@@ -12,7 +12,6 @@ import numpy as np
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.tracks import make_track
-from pdhef_logtool.results.opened_run import OpenedRun, open_run
 from pdhef_logtool.results.parquet_sink import write_estimates as write_estimates_file
 from pdhef_logtool.results.parquet_sink import write_metrics
 from pdhef_logtool.storage.documents import seal
@@ -78,53 +77,3 @@ def write_estimates(folder: Path, label: str, **tracks: Mapping[str, Any]) -> No
         stamps = known.pop("stamps_ns", START_NS + 10_000_000 * np.arange(n, dtype=np.int64))
         made.append(make_track(name.replace("_", "-"), stamps, **known))
     write_estimates_file(folder / "logs" / label / "estimates.parquet", made)
-
-
-def fleet_report(label: str, **changes: Any) -> dict[str, Any]:
-    """Return the entries of report.json that the page of a run reads."""
-    cells = [{"speed": 4, "ay": 1, "seconds": 5.0, "scored": 100, "sideslip_mse_rad2": 1e-4}]
-    made = {
-        "format": "pdhef.report",
-        "log": {"name": label, "duration_s": 12.0, "kind": "mcap"},
-        "vehicle": {"name": "golf"},
-        "truth": {"available": True, "not_independent": []},
-        "answer": {"main": "pd-hef", "naive": "zero"},
-        "friction": {"source": "option, 0.9"},
-        "checks": [],
-        "faults": [],
-        "verdicts": [{"signal": "sideslip_rad", "outcome": "better", "text": "x"}],
-        "operating_space": {"speed_edges_m_s": [0, 5, 10, 15, 20], "ay_edges_m_s2": [0, 1, 2], "cells": cells},
-        "metadata": {},
-    }
-    return {**made, **changes}
-
-
-class FleetRun:
-    """The folder of a run of many logs, with RMSE of the sideslip by estimator."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.logs: list[dict[str, Any]] = []
-        self.rows: list[tuple[Any, ...]] = []
-
-    def add(self, label: str, errors: Mapping[str, float] | None = None, outcome: str = "ok", **changes: Any) -> None:
-        self.logs.append({"log": label, "outcome": outcome, "car": {"name": "golf"}})
-        if outcome.startswith("failed"):
-            return
-        folder = self.folder / "logs" / label
-        folder.mkdir(parents=True)
-        (folder / "report.json").write_text(json.dumps(fleet_report(label, **changes)))
-        (folder / "report.html").touch()
-        for name, value in (errors or {}).items():
-            self.rows.append((label, name, "sideslip_rad", "all", "rmse", value))
-            self.rows.append((label, name, "sideslip_rad", "linear", "rmse", 99.0))
-
-    def row(self, label: str, *figure: Any) -> None:
-        estimator, signal, metric, value = figure
-        self.rows.append((label, estimator, signal, "all", metric, value))
-
-    def opened(self) -> OpenedRun:
-        write_metrics(self.folder / "metrics.parquet", [MetricRow(*row, unit="rad", n=9) for row in self.rows])
-        document = {"format": "pdhef.run", "logs": self.logs, "versions": {"a": "1"}}
-        (self.folder / "run.json").write_text(json.dumps(seal(document)))
-        return open_run(self.folder)

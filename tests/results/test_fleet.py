@@ -2,44 +2,94 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from pdhef_logtool.results.fleet import ANSWER, cause_and_remedy, read_fleet
-from tests.results.made_run import FleetRun
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.results.fleet import ANSWER, Fleet, cause_and_remedy, read_fleet
+from pdhef_logtool.results.opened_run import open_run
+from pdhef_logtool.results.parquet_sink import write_metrics
+from pdhef_logtool.storage.documents import seal
 
 LOST = {"what": "ends at byte 3; what follows is gone (a.mcap)", "severity": "lost"}
 NO_TRUTH = {"available": False, "not_independent": []}
 
 
+def report(label: str, **changes: Any) -> dict[str, Any]:
+    cells = [{"speed": 4, "ay": 1, "seconds": 5.0, "scored": 100, "sideslip_mse_rad2": 1e-4}]
+    made = {
+        "format": "pdhef.report",
+        "log": {"name": label, "duration_s": 12.0, "kind": "mcap"},
+        "vehicle": {"name": "golf"},
+        "truth": {"available": True, "not_independent": []},
+        "answer": {"main": "pd-hef", "naive": "zero"},
+        "friction": {"source": "option, 0.9"},
+        "checks": [],
+        "faults": [],
+        "verdicts": [{"signal": "sideslip_rad", "outcome": "better", "text": "x"}],
+        "operating_space": {"speed_edges_m_s": [0, 5, 10, 15, 20], "ay_edges_m_s2": [0, 1, 2], "cells": cells},
+        "metadata": {},
+    }
+    return {**made, **changes}
+
+
+class Run:
+    """A run's folder that a test fills."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.logs: list[dict[str, Any]] = []
+        self.rows: list[tuple[Any, ...]] = []
+
+    def add(self, label: str, errors: Mapping[str, float] | None = None, outcome: str = "ok", **changes: Any) -> None:
+        entry = {"log": label, "outcome": outcome, "car": {"name": "golf"}, "folder": changes.pop("folder", "")}
+        self.logs.append(entry)
+        if outcome.startswith("failed"):
+            return
+        folder = self.folder / "logs" / label
+        folder.mkdir(parents=True)
+        (folder / "report.json").write_text(json.dumps(report(label, **changes)))
+        for name, value in (errors or {}).items():
+            self.rows.append((label, name, "sideslip_rad", "all", "rmse", value))
+            self.rows.append((label, name, "sideslip_rad", "linear", "rmse", 99.0))
+
+    def row(self, label: str, *figure: Any) -> None:
+        estimator, signal, metric, value = figure
+        self.rows.append((label, estimator, signal, "all", metric, value))
+
+    def read(self, **options: Any) -> Fleet:
+        write_metrics(self.folder / "metrics.parquet", [MetricRow(*row, unit="rad", n=9) for row in self.rows])
+        (self.folder / "run.json").write_text(json.dumps(seal({"format": "pdhef.run", "logs": self.logs})))
+        return read_fleet(open_run(self.folder), **options)
+
+
 @pytest.fixture
-def run(tmp_path: Path) -> FleetRun:
-    return FleetRun(tmp_path)
+def run(tmp_path: Path) -> Run:
+    return Run(tmp_path)
 
 
-def test_six_drives_rank_nobody_and_seven_can(run: FleetRun) -> None:
+def test_six_drives_rank_nobody_and_seven_can(run: Run) -> None:
     for i in range(6):
         run.add(f"d{i}", {"pd-hef": 0.01 + 0.001 * i, "physics": 0.02, "zero": 0.2})
-    found = read_fleet(run.opened())
+    found = run.read()
     assert found.ranking == () and found.least_to_rank == 7
     run.add("d6", {"pd-hef": 0.01, "physics": 0.02, "zero": 0.2})
-    assert [(r.place, r.estimator) for r in read_fleet(run.opened()).ranking] == [
-        (1, "pd-hef"),
-        (2, "physics"),
-        (3, "zero"),
-    ]
+    assert [(r.place, r.estimator) for r in run.read().ranking] == [(1, "pd-hef"), (2, "physics"), (3, "zero")]
 
 
-def test_drives_without_independent_truth_stand_apart_and_score_nothing(run: FleetRun) -> None:
+def test_drives_without_independent_truth_stand_apart_and_score_nothing(run: Run) -> None:
     run.add("good", {"pd-hef": 0.01})
     run.add("none", truth=NO_TRUTH)
     run.add("own", {"pd-hef": 0.0}, truth={"available": True, "not_independent": ["sideslip_rad"]})
     run.row("own", "pd-hef", "sideslip_rad", "not_independent", 1.0)
     for name, d2 in (("pd-hef", 0.3), ("zero", 0.1)):
         run.row("none", name, "vy_m_s", "d2", d2)
-    found = read_fleet(run.opened())
+    found = run.read()
     assert [d.label for d in found.scored] == ["good"]
     assert [(d.label, d.unscored) for d in found.without_truth] == [
         ("none", "the log has no ground truth"),
@@ -49,7 +99,7 @@ def test_drives_without_independent_truth_stand_apart_and_score_nothing(run: Fle
     assert (answer.estimator, answer.drives) == (ANSWER, 1)
 
 
-def test_failures_are_told_by_reason_and_bad_reports_among_them(run: FleetRun) -> None:
+def test_failures_are_told_by_reason_and_bad_reports_among_them(run: Run) -> None:
     run.add("ok", {"pd-hef": 0.01}, outcome="lost: 2 things", losses=[LOST, {**LOST, "severity": "note"}])
     for i in range(12):
         run.add(f"f{i}", outcome=f"failed: /x/{i}.mcap: expected a log, got {i} bytes; copy it again")
@@ -57,7 +107,7 @@ def test_failures_are_told_by_reason_and_bad_reports_among_them(run: FleetRun) -
     (run.folder / "logs" / "bad" / "report.json").write_text("{")
     run.add("other", {})
     (run.folder / "logs" / "other" / "report.json").write_text('{"format": "other"}')
-    found = read_fleet(run.opened())
+    found = run.read()
     first = found.failed[0]
     assert (first.count, first.reason) == (12, "expected a log, got 0 bytes; copy it again")
     assert len(found.failed[0].labels) == 10
@@ -65,7 +115,7 @@ def test_failures_are_told_by_reason_and_bad_reports_among_them(run: FleetRun) -
     assert [f.reason for f in found.losses] == ["ends at byte 3; what follows is gone"]
 
 
-def test_effects_have_intervals_and_keys_without_one_are_not_significant(run: FleetRun) -> None:
+def test_effects_have_intervals_and_keys_without_one_are_not_significant(run: Run) -> None:
     rng = np.random.default_rng(2)
     for i in range(40):
         wet = i % 2
@@ -78,7 +128,7 @@ def test_effects_have_intervals_and_keys_without_one_are_not_significant(run: Fl
             "same": "1",
         }
         run.add(f"d{i}", {"pd-hef": float((3.0 if wet else 1.0) * rng.lognormal(0.0, 0.2))}, metadata=metadata)
-    found = read_fleet(run.opened())
+    found = run.read()
     by_key = {b.key: b for b in found.breakdowns}
     assert found.breakdowns[0].key == "road" and found.breakdowns[0].also == ("water",)
     dry, wet = found.breakdowns[0].groups
@@ -89,21 +139,21 @@ def test_effects_have_intervals_and_keys_without_one_are_not_significant(run: Fl
     assert by_key["odometer"].groups[0].value == "1000 to 1010"
     assert sum(g.drives for g in by_key["odometer"].groups) == 40
     assert not {"same", "driver"} & set(by_key) and by_key["tyre"].p > 0.05
-    (only,) = read_fleet(run.opened(), by=["same"]).breakdowns
+    (only,) = run.read(by=["same"]).breakdowns
     assert [(g.value, g.scored, g.effect) for g in only.groups] == [("1", 40, None)]
-    assert read_fleet(run.opened(), by=["driver"]).breakdowns[0].groups[0].value == "28 others"
-    (nothing,) = read_fleet(run.opened(), by=["no such key"]).breakdowns
+    assert run.read(by=["driver"]).breakdowns[0].groups[0].value == "28 others"
+    (nothing,) = run.read(by=["no such key"]).breakdowns
     assert [g.value for g in nothing.groups] == ["not given"]
 
 
-def test_the_operating_space_adds_up_and_empty_cells_are_empty(run: FleetRun) -> None:
+def test_the_operating_space_adds_up_and_empty_cells_are_empty(run: Run) -> None:
     cells = [{"speed": 0, "ay": 2, "seconds": 1.0, "scored": 300, "sideslip_mse_rad2": 9e-4}]
     space = {"speed_edges_m_s": [0, 5, 10, 15, 20], "ay_edges_m_s2": [0, 1, 2], "cells": cells}
     run.add("a", {"pd-hef": 0.1})
     run.add("b", {"pd-hef": 0.1})
     run.add("c", {"pd-hef": 0.1}, operating_space=space)
     run.add("older", {"pd-hef": 0.1}, operating_space=None)
-    found = read_fleet(run.opened()).space
+    found = run.read().space
     assert found is not None and found.drives == 3
     assert found.seconds[4, 1] == 10.0 and found.seconds.sum() == 11.0
     assert found.rmse_rad[4, 1] == pytest.approx(0.01) and found.rmse_rad[0, 2] == pytest.approx(0.03)
