@@ -105,3 +105,11 @@ def test_run_says_how_each_log_ended(tmp_path):
     with pytest.raises(jsonschema.ValidationError):
         follows(run, "run.schema.json")
     follows(build_run({}, ("st-resnet", SHA), []), "run.schema.json")
+
+
+def test_json_is_sorted_and_the_same_each_time(tmp_path):
+    write_json(tmp_path / "a.json", {"b": 1, "a": float("inf"), "c": {"z": 1, "y": "β"}})
+    assert (tmp_path / "a.json").read_bytes() == (
+        '{\n  "a": null,\n  "b": 1,\n  "c": {\n    "y": "β",\n    "z": 1\n  }\n}\n'.encode()
+    )
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
