@@ -159,16 +159,22 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
         )
     certain = [clock for name, clock in clocks.items() if name != chosen and clock.is_certain]
     clock = _read_clock(sheet, chosen, (*others, *certain), rate_hz) if certain else clocks[chosen]
-    if rest := re.fullmatch(r"(.*?)_?(?:s|sec|secs|seconds)", snake(chosen)):
-        of_unit = {f"{rest[1]}_{unit}".strip("_"): ns for unit, ns in TIME_UNITS_NS.items()}
-        within = next((n for n in names if of_unit.get(n, _SECOND_NS) < _SECOND_NS), None)
-        if within is not None:
-            clock = with_fractions(clock, _numbers(sheet.columns[names[within]]), of_unit[within], names[within])
+    clock = _in_two_columns(clock, sheet, chosen, names)
     if clock.notes and not (clock.is_certain or certain or others):
         clock = _as_motion_shows(clock, sheet, chosen)
     apart = [n for n in rivals if abs(clocks[n].length_s - clock.length_s) > _ALIKE * clock.length_s]
     note = f"{chosen} is the clock; the times of {', '.join(apart)} have another length"
     return replace(clock, notes=(*clock.notes, note)) if apart else clock
+
+
+def _in_two_columns(clock: Clock, sheet: Sheet, name: str, names: Mapping[str, str]) -> Clock:
+    """Return a clock of seconds with the fractions of another column, ``stamp.sec`` and ``stamp.nanosec``."""
+    rest = re.fullmatch(r"(.*?)_?(?:s|sec|secs|seconds)", snake(name))
+    for unit, ns in TIME_UNITS_NS.items() if rest else ():
+        within = names.get(f"{rest[1]}_{unit}".strip("_") if rest else "")
+        if within is not None and ns < _SECOND_NS:
+            return with_fractions(clock, _numbers(sheet.columns[within]), ns, within)
+    return clock
 
 
 def _as_motion_shows(clock: Clock, sheet: Sheet, name: str) -> Clock:
