@@ -13,6 +13,7 @@ from pdhef_logtool.evaluation.requirement_verdicts import joint_notes, next_step
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.records.printable import listed, printable
+from pdhef_logtool.results.selected_estimate import friction_text
 
 #: Class of the style by outcome.
 _KINDS = {"PASS": "pass", "FAIL": "fail", "INCONCLUSIVE": "unknown"}
@@ -135,7 +136,7 @@ def _road(report: Mapping[str, Any]) -> str:
     parts = [
         "" if speed is None else f"speed up to {speed:.1f} m/s",
         "" if ay is None else f"lateral acceleration up to {ay:.1f} m/s²",
-        f"friction: {friction['source']}" if friction.get("source") else "",
+        f"friction: {friction_text(friction)}" if friction.get("source") else "",
     ]
     return ", ".join(filter(None, parts))
 

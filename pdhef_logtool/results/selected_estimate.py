@@ -136,6 +136,12 @@ def truth_of(report: Report, name: str) -> str:
     return f"ground truth: {' and '.join(topics)}" if topics else "ground truth"
 
 
+def friction_text(friction: Mapping[str, Any]) -> str:
+    """Return the source of a friction with its topic or value."""
+    value = None if friction["value"] is None else f"{friction['value']:.3g}"
+    return ", ".join(filter(None, (friction["source"], friction["topic"], value)))
+
+
 def _assumed(report: Report, main: MainFacts) -> list[str]:
     friction, calibration = report["friction"], report["self_calibration"]
     estimator = next(e for e in report["estimators"] if e["name"] == main.name)
@@ -146,11 +152,8 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
             said.append(f"not calibrated on this log: {calibration['refused']}")
         elif not calibration["parameters"]:
             said.append(calibration["text"])
-        if calibration["understeer"] is not None and calibration["understeer"]["contradicts"]:
-            said.append("the understeer gradient of the drive contradicts the file")
     if friction is not None and modelled:
-        source: str = friction["source"]
-        said.append(f"friction {source if source.startswith('assumed') else f'given ({source})'}")
+        said.append(f"friction {'given' if friction['given'] else 'not given'} ({friction_text(friction)})")
     if main.distrusted:
         said.append(main.why)
     algorithm = estimator["algorithm"] or {"options": {}}
@@ -192,7 +195,7 @@ def _next_steps(report: Report, main: MainFacts) -> list[str]:
     if vehicle["file"] is not None and not (vehicle["proven"] or vehicle.get("taught")):
         steps.append(f"learn the car from its drives: pdhef learn LOGS --car {vehicle['file']} -o mycar")
     friction = report["friction"]
-    if friction is not None and friction["source"].startswith("assumed"):
+    if friction is not None and not friction["given"] and vehicle["file"] is not None:
         steps.append("give the friction if it is known: --friction 0.8")
     return steps
 
