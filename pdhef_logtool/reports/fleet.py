@@ -14,7 +14,7 @@ from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.charts import BarsFigure, Charts, Cloud, Interval, IntervalsFigure, PointsFigure
 from pdhef_logtool.reports.colours import INK, PLAIN, colour
-from pdhef_logtool.reports.first_screen import plan_head, tested_run
+from pdhef_logtool.reports.first_screen import plan_head
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.breakdown import LEAST_DRIVES
 from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Space, read_fleet
@@ -72,7 +72,7 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
     _add_figures(charts, fleet)
     texts: dict[str, Any] = {
         "plan": plan_head(run.document.get("plan")),
-        "tested": tested_run(run.document, sum(d.seconds for d in fleet.drives) / 3600.0),
+        "seconds": sum(d.seconds for d in fleet.drives),
         "steps": next_steps(run.document.get("plan"), ["repair the failed logs: causes below"] if fleet.failed else ()),
         "worst": _worst(fleet, charts),
         "answer": next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),

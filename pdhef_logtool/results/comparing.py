@@ -6,7 +6,7 @@ import filecmp
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -21,7 +21,7 @@ from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, Outpu
 from pdhef_logtool.records.printable import listed
 from pdhef_logtool.results.changed_signals import ChangedSignal, changed_signals
 from pdhef_logtool.results.gate import MAIN, Figure, Gate
-from pdhef_logtool.results.opened_run import METRICS_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.results.opened_run import METRICS_FILE, OpenedRun
 from pdhef_logtool.results.paired_change import PairedChange, Verdict, holm, log_ratios, paired_change
 from pdhef_logtool.results.pairing import Pair, Pairing, pair_logs
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
@@ -236,7 +236,7 @@ def compare_runs(
         )
     gated = any(f.limit is not None for f in gate.figures)
     damaged = _Damaged()
-    tables = _Tables(a, b, pairing.pairs, damaged)
+    tables = _Tables(a, b, pairing.pairs)
     changed = tables.changed()
     result = Comparison(
         a=a.place,
@@ -265,7 +265,7 @@ def compare_runs(
     main = figures[0].figure.estimator
     signals: list[ChangedSignal] = []
     for pair in followed:
-        with damaged.noted(pair.a, pair.b):
+        with damaged.noted():
             signals += changed_signals(pair, tables.name_of(pair, main))
     return replace(
         result, figures=figures, others=others, signals=tuple(signals), followed=len(followed), damaged=damaged.lines
@@ -284,13 +284,10 @@ class _Damaged:
         return tuple(self._lines)
 
     @contextmanager
-    def noted(self, *logs: OpenedLog) -> Iterator[None]:
+    def noted(self) -> Iterator[None]:
         """Skip damaged logs and note them."""
         try:
-            with ExitStack() as stack:
-                for log in logs:
-                    stack.enter_context(log.reading())
-                yield
+            yield
         except OutputError as error:
             self._lines[str(error)] = None
 
@@ -298,13 +295,10 @@ class _Damaged:
 class _Tables:
     """Figures of two runs for their pairs; only requested rows are read."""
 
-    def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair], damaged: _Damaged) -> None:
+    def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair]) -> None:
         self._runs = (a, b)
         self._pairs = pairs
-        self._main = [""] * len(pairs)
-        for number, pair in enumerate(pairs):
-            with damaged.noted(pair.a):
-                self._main[number] = pair.a.main()
+        self._main = [pair.a.main() for pair in pairs]
 
     def name_of(self, pair: Pair, estimator: str) -> str:
         """Return the name of ``estimator`` in a pair."""
@@ -493,7 +487,7 @@ def _grouping(pairing: Pairing, key: str | None, damaged: _Damaged) -> _Grouping
         return _Grouping()
     stated: list[dict[str, str | None]] = [{} for _ in pairing.pairs]
     for number, pair in enumerate(pairing.pairs):
-        with damaged.noted(pair.a):
+        with damaged.noted():
             report = pair.a.report()
             stated[number] = {**((report or {}).get("metadata") or {}), **factors_of(pair.a.entry, report)}
     if key is None:

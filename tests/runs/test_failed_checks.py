@@ -64,3 +64,4 @@ def test_the_exit_code_of_a_run(
     (failed,) = (c for c in report["checks"] if c["verdict"] == "failed")
     assert failed["waived"] == ("steer_rad.sign" in waived)
     assert report["log"]["name"] == "sweep"
+    assert [e["name"] for e in report["estimators"]] == ["zero"] == [report["selected_estimate"]]
