@@ -133,7 +133,7 @@ def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str])
     return three_lines(
         said if given is None else Text.assemble(said, "; ", plan_line(given)),
         "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "none"),
-        steps[0] if steps else f"no action needed; pdhef view {result.place or 'OUT'} shows the drive",
+        steps[0] if steps else "no action needed",
     )
 
 

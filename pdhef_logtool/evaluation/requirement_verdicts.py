@@ -39,8 +39,6 @@ Outcome: TypeAlias = Literal["PASS", "FAIL", "INCONCLUSIVE"]
 _Lacking: TypeAlias = tuple[float | None, float, str]
 #: Least margin relative to an estimated reference, in standard deviations of the reference.
 REFERENCE_SDS = 2.0
-#: Smallest share of drives that is shown.
-_SHARE_SHOWN = 0.5
 #: Largest factor on the driving that is recommended.
 _MOST_TIMES = 30.0
 
@@ -318,7 +316,7 @@ def _case(
 def _words() -> Any:
     """Return the sentences of ``requirement.txt`` as functions."""
     limits: dict[str, Any] = {"LEAST_BLOCKS": LEAST_BLOCKS, "LEAST_DRIVES": LEAST_DRIVES, "MOST_TIMES": _MOST_TIMES}
-    limits |= {"REFERENCE_SDS": REFERENCE_SDS, "SHARE_SHOWN": _SHARE_SHOWN, "AY_NOTE": AY_NOTE}
+    limits |= {"REFERENCE_SDS": REFERENCE_SDS, "AY_NOTE": AY_NOTE}
     names = {"POOLED": POOLED, "WORST_DRIVE": WORST_DRIVE, "shown": shown, "least_drives": least_drives}
     layout = {"layout": lambda what: "%.0f" if what.startswith("drives") else "%.1f"}
     return template(Path(__file__).parent / "templates" / "requirement.txt", **limits, **names, **layout).module
@@ -371,11 +369,6 @@ def gates(verdicts: Sequence[RequirementVerdict], *, strict: bool) -> bool:
     return any(v.outcome == "FAIL" or (strict and v.outcome == "INCONCLUSIVE") for v in verdicts)
 
 
-def of_documents(verdicts: Sequence[Mapping[str, Any]], outcome: Outcome) -> list[Mapping[str, Any]]:
-    """Return the verdicts of a document with an outcome."""
-    return [v for v in verdicts if v["outcome"] == outcome]
-
-
 def joint_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
     """Return each note of the requirements once, with the ids of its requirements unless it applies to all."""
     ids: dict[str, list[str]] = {}
@@ -387,10 +380,10 @@ def joint_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
 
 def next_steps(plan: Mapping[str, Any] | None, more: Sequence[str] = ()) -> list[str]:
     """Return the next steps of a document: failed requirements, inconclusive ones, ``more``."""
-    requirements = (plan or {}).get("requirements") or ()
+    requirements = sorted((plan or {}).get("requirements") or (), key=lambda r: r["outcome"] != "FAIL")
     ids: dict[str, list[str]] = {}
-    for r in (*of_documents(requirements, "FAIL"), *of_documents(requirements, "INCONCLUSIVE")):
-        if r["next"]:
+    for r in requirements:
+        if r["next"] and r["outcome"] != "PASS":
             ids.setdefault(str(r["next"]), []).append(str(r["id"]))
     asked = [f"{', '.join(names)}: {text}" for text, names in ids.items()]
     return [*asked, *filter(None, more)]

@@ -6,19 +6,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import AY_NOTE
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.reports.drive_figures import Roles, drive_figures
 from pdhef_logtool.reports.drive_tables import by_segment, consistency, definitions, disagreements, residuals, scores
-from pdhef_logtool.reports.first_screen import plan_head, steps_of
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
 from pdhef_logtool.results.run_report import reasons_line
 
-#: The best filter with physics only.
-_PHYSICS = "physics"
+#: The best filter with physics only, and the baseline, whose errors would hide all others in a figure.
+_PHYSICS, _ZERO = "physics", "zero"
 #: Keys of the figures, in the order of the page.
 OVER_TIME = ("sideslip", "error", "yaw_rate", "ay", "speed", "strip")
 IN_PLANE = ("path", "ay_sideslip")
@@ -53,6 +53,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         except OutputError as error:
             wrong = f"the figures cannot be drawn: {error}"
     charts = Charts() if figures is None else figures.charts
+    texts = (report.get("answer") or {}).get("texts") or {}
     html = render(
         "drive.html",
         charts,
@@ -60,9 +61,8 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         back=back,
         report=report,
         roles=roles,
-        plan=plan_head(report.get("plan")),
         outcome=log.outcome,
-        steps=steps_of(report),
+        steps=next_steps(report.get("plan"), texts.get("next", "").split("; ")),
         identical=[] if roles is None else identical_to(report, roles.main),
         drawn=figures,
         path=path,
@@ -95,7 +95,7 @@ def roles_of(report: Mapping[str, Any]) -> Roles | None:
     main: str = answer["main"] if answer.get("main") in names else names[0]
     identical = identical_to(report, main)
     others = [n for n in names if n not in identical]
-    rival = next((n for n in (_PHYSICS, *others) if n in others and n != main), "")
+    rival = next((n for n in (_PHYSICS, *sorted(others, key=lambda n: n == _ZERO)) if n in others and n != main), "")
     return Roles(main, rival, tuple(n for n in names if n not in (main, rival)))
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.evaluation.dead_reckoned import aligned_path
+from pdhef_logtool.evaluation.largest_errors import ErrorPlace
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
@@ -30,7 +31,6 @@ from pdhef_logtool.reports.charts import (
 from pdhef_logtool.reports.colours import FAULT, NOTE, PLAIN, colour
 from pdhef_logtool.reports.drive_series import DriveSeries, Reference, Tracks, gather, thinned
 from pdhef_logtool.reports.encoding import grid_of
-from pdhef_logtool.results.error_places import ErrorPlace
 from pdhef_logtool.results.sink import TRUTH
 
 #: Storage resolution of figures: in degrees, and in °/s, m/s or m/s².

@@ -12,7 +12,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,13 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from pdhef_logtool.evaluation.requirement_verdicts import joint_notes
 from pdhef_logtool.evaluation.units import LABELS
+from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.version import __version__
 from pdhef_logtool.reports.charts import Charts
-from pdhef_logtool.reports.first_screen import duration
 
 _HERE = Path(__file__).parent
 #: Scripts in order: before.js sets the drawing resolution for uPlot.
@@ -36,6 +37,8 @@ _STYLES = ("uplot.min.css", "report.css")
 _MOST_SIGNS = 600
 DASH = "–"
 _UNIT = re.compile(r"_(rad_s|rad|m_s2|m_s)$")
+#: The interval in brackets after a value.
+_BRACKETS = re.compile(r"^\((.*?)\)")
 
 
 def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
@@ -81,6 +84,9 @@ def _environment() -> Environment:
     made.filters |= {
         "number": number,
         "duration": duration,
+        "joint_notes": lambda plan: joint_notes({str(r["id"]): r.get("notes") or () for r in plan["requirements"]}),
+        "reason": _reason,
+        "shown": shown,
         "minute": lambda stamp_ns: f"{stamp(stamp_ns)[:16].replace('T', ' ')} UTC",
         "range": _range,
         "signal": _signal,
@@ -94,6 +100,12 @@ def _environment() -> Environment:
     }
     made.tests["topic"] = lambda source: str(source).startswith("/")
     return made
+
+
+def _reason(requirement: Mapping[str, Any]) -> str:
+    """Return the reason of a verdict without its value, which is shown beside it."""
+    value = "" if requirement["value"] is None else shown(requirement["value"], str(requirement["unit"]))
+    return _BRACKETS.sub(r"\1", str(requirement["reason"]).removeprefix(value).lstrip("; "))
 
 
 def _signal(name: str) -> str:
@@ -182,6 +194,14 @@ def change(share: float | None) -> str:
 def seconds(value_s: float | None) -> str:
     """Return seconds with milliseconds."""
     return DASH if value_s is None else f"{value_s:.3f} s"
+
+
+def duration(seconds: float) -> str:
+    """Return a duration for display."""
+    if seconds < 120.0:
+        return f"{seconds:.1f} s"
+    hours = seconds / 3600.0
+    return f"{seconds / 60.0:.1f} min" if hours < 2.0 else f"{hours:.1f} h" if hours < 100.0 else f"{hours:.0f} h"
 
 
 def stamp(stamp_ns: int) -> str:

@@ -19,7 +19,6 @@ from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts, TimeFigure
 from pdhef_logtool.reports.drive import drive_page
-from pdhef_logtool.reports.first_screen import PlanHead, plan_head
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
 from pdhef_logtool.storage.files import write_bytes
@@ -35,12 +34,11 @@ _TIMEOUT_S = 180.0
 
 @dataclass(frozen=True, slots=True)
 class DriveSection:
-    """One drive of the document: its report, verdicts, and keys of its figures."""
+    """One drive of the document: its report, and keys of its figures."""
 
     label: str
     outcome: str
     report: Mapping[str, Any] | None
-    head: PlanHead | None
     figures: Sequence[str]
 
 
@@ -116,9 +114,6 @@ def pdf_page(run: OpenedRun, *, positions: bool = False) -> bytes:
         charts,
         title=(plan or {}).get("title")
         or f"Validation of {len(run.logs)} {'drive' if len(run.logs) == 1 else 'drives'}",
-        plan=plan_head(plan),
-        plan_file=(plan or {}).get("file"),
-        plan_sha256=(plan or {}).get("sha256"),
         run=document,
         seconds=seconds,
         steps=next_steps(plan),
@@ -152,11 +147,11 @@ def _gravity(report: Mapping[str, Any] | None) -> tuple[int, float]:
 def _section(log: OpenedLog, report: Mapping[str, Any] | None, charts: Charts, *, positions: bool) -> DriveSection:
     """Return a drive of the document; add its figures, each with its own time, to ``charts``."""
     if report is None:
-        return DriveSection(log.label, log.outcome, None, None, ())
+        return DriveSection(log.label, log.outcome, None, ())
     drawn, keys = drive_page(log).charts, []
     for key in (*_FIGURES, *(_POSITIONS if positions else ())):
         if (figure := drawn.figures.get(key)) is not None:
             keys.append(f"{key}-{len(charts.figures)}")
             timed = isinstance(figure, TimeFigure)
             charts.figures[keys[-1]] = replace(figure, time=drawn.time()) if timed else figure
-    return DriveSection(log.label, log.outcome, report, plan_head(report.get("plan")), keys)
+    return DriveSection(log.label, log.outcome, report, keys)
