@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.evaluation.dead_reckoned import aligned_path
+from pdhef_logtool.evaluation.largest_errors import ErrorPlace
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
@@ -30,7 +31,6 @@ from pdhef_logtool.reports.charts import (
 from pdhef_logtool.reports.colours import FAULT, NOTE, PLAIN, colour
 from pdhef_logtool.reports.drive_series import DriveSeries, Reference, Tracks, gather, thinned
 from pdhef_logtool.reports.encoding import grid_of
-from pdhef_logtool.results.error_places import ErrorPlace
 from pdhef_logtool.results.sink import TRUTH
 
 #: Storage resolution of figures: in degrees, and in °/s, m/s or m/s².
@@ -91,7 +91,6 @@ class DriveFigures:
     scored: bool
     moves: bool
     absent: Sequence[str]
-    path_text: str = ""
 
     @property
     def in_plane(self) -> bool:
@@ -135,13 +134,14 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveF
     _add_motion(charts, series, roles)
     rows = _rows(report, series, roles, stamps, origin_ns)
     charts.figures["strip"] = StripFigure("Faults, gaps and segments", rows)
-    path_text = _add_path(charts, series, roles, report.get("path_drift")) if TRUTH in series else ""
+    if TRUTH in series:
+        _add_path(charts, series, roles)
     clouds = [_cloud(series[n], origin_ns) for n in (TRUTH, roles.main) if n in series]
     if drawn := [cloud for cloud in clouds if cloud is not None]:
         charts.figures["ay_sideslip"] = PointsFigure("|a_y| and sideslip", "|a_y| in m/s²", "sideslip in °", drawn)
     _add_worst(charts, answer, reference, peaks, origin_ns)
     absent = [n for n in roles.names if n not in tracks.names]
-    return DriveFigures(charts, peaks, scored, moves, absent, path_text)
+    return DriveFigures(charts, peaks, scored, moves, absent)
 
 
 def _reference(tracks: Tracks, peaks: Sequence[Peak]) -> Reference | None:
@@ -271,31 +271,19 @@ def _add_worst(
     charts.figures["worst"] = PointsFigure(title, "s from the log's start", "sideslip in °", clouds)
 
 
-def _add_path(
-    charts: Charts, series: Mapping[str, DriveSeries], roles: Roles, drift: Mapping[str, float] | None
-) -> str:
-    """Add the dead-reckoned path, aligned with the ground truth's; return a text about its drift."""
+def _add_path(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
+    """Add the dead-reckoned path, aligned with the ground truth's."""
     truth, estimate = (thinned(series[n].path, _MOST_POINTS) for n in (TRUTH, roles.main))
     if truth.shape[1] < 2 or max(np.ptp(truth[1]), np.ptp(truth[2])) < _LEAST_PATH_M:
-        return ""
+        return
     common, at_truth, at_own = np.intersect1d(truth[0], estimate[0], return_indices=True)
     clouds = [Cloud(TRUTH, colour(TRUTH), truth[1], truth[2], _seconds(truth[0], charts), line=True)]
-    if len(common) < 2:
-        charts.figures["path"] = PointsFigure("Path of the ground truth", "m east", "m north", clouds, equal=True)
-        return ""
-    target, source = truth[1:, at_truth], estimate[1:, at_own]
-    aligned = aligned_path(source, target)
-    clouds += _by_error(aligned, common, series[roles.main], charts)
-    title = "Path, aligned with the ground truth"
+    title = "Path of the ground truth"
+    if len(common) > 1:
+        title = "Path, aligned with the ground truth"
+        aligned = aligned_path(estimate[1:, at_own], truth[1:, at_truth])
+        clouds += _by_error(aligned, common, series[roles.main], charts)
     charts.figures["path"] = PointsFigure(title, "m east", "m north", clouds, equal=True)
-    if drift is None:
-        return ""
-    return (
-        f"Path: {roles.main} integrates its velocity without position measurements. Drift: {drift['end_m']:.1f} m "
-        f"({drift['end_m'] / drift['length_m']:.1%}) at the end of {drift['length_m'] / 1000.0:.2f} km from a common "
-        f"start. The figure shows it after one rotation and translation (SE(2)); the largest remaining distance is "
-        f"{drift['largest_aligned_m']:.1f} m. Colours: absolute sideslip error."
-    )
 
 
 def _by_error(aligned: FloatArray, at_ns: FloatArray, estimate: DriveSeries, charts: Charts) -> list[Cloud]:

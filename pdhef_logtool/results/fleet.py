@@ -203,7 +203,7 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
     OutputError
         metrics.parquet is damaged.
     """
-    figures = _figures(run)
+    figures = read_figures(run)
     gathered = _Gathered()
     for log in run.logs:
         gathered.add(log, figures.get(log.label, {}))
@@ -251,24 +251,19 @@ class _Gathered:
             if kind == "failed" or report is None:
                 self.failed.append((log.label, reason or "its report is not there any more"))
                 return
-            with log.reading():
-                drive = _drive(log, report, figures)
-                lost = [(log.label, str(x["what"])) for x in report.get("losses", ()) if x.get("severity") == "lost"]
-                self._add_space(report.get("operating_space"))
         except PdhefError as error:
             self.failed.append((log.label, f"its report cannot be read: {error.expected}, got {error.got}"))
             return
-        self.drives.append(drive)
-        self.lost += lost
+        self.drives.append(_drive(log, report, figures))
+        self.lost += [(log.label, str(x["what"])) for x in report.get("losses", ()) if x.get("severity") == "lost"]
+        self._add_space(report.get("operating_space"))
 
     def _add_space(self, space: Mapping[str, Any] | None) -> None:
         if not space:
             return
-        edges = np.array(space["speed_edges_m_s"]), np.array(space["ay_edges_m_s2"])
         if self.edges is None:
-            self.edges, self.cells = edges, np.zeros((3, len(edges[0]), len(edges[1])))
-        elif not all(map(np.array_equal, edges, self.edges)):
-            return  # of another version's grid
+            self.edges = np.array(space["speed_edges_m_s"]), np.array(space["ay_edges_m_s2"])
+            self.cells = np.zeros((3, *map(len, self.edges)))
         self.mapped += 1
         for cell in space["cells"]:
             scored = cell["scored"] if cell["sideslip_mse_rad2"] is not None else 0
@@ -283,7 +278,16 @@ class _Gathered:
             return Space(*self.edges, seconds, np.sqrt(squares / counts), self.mapped)
 
 
-def _figures(run: OpenedRun) -> dict[str, dict[tuple[str, str, str], float]]:
+def independent_errors(figures: Mapping[tuple[str, str, str], float]) -> dict[tuple[str, str], float]:
+    """Return the RMSE by estimator and signal, where the ground truth is independent of both."""
+    return {
+        (e, s): value
+        for (e, s, metric), value in figures.items()
+        if metric == "rmse" and math.isfinite(value) and (e, s, "not_independent") not in figures
+    }
+
+
+def read_figures(run: OpenedRun) -> dict[str, dict[tuple[str, str, str], float]]:
     """Return the figures of whole drives by log, then by estimator, signal and metric."""
     import polars as pl
 
@@ -309,11 +313,7 @@ def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str
     answer = report.get("answer") or {}
     ran = [e["name"] for e in report.get("estimators", ()) if e["outcome"] == "ran"]
     main = answer.get("main") or next(iter(ran), "")  # without an answer the first of recorded estimates
-    errors = {
-        (e, s): value
-        for (e, s, metric), value in figures.items()
-        if metric == "rmse" and math.isfinite(value) and (e, s, "not_independent") not in figures
-    }
+    errors = independent_errors(figures)
     dof = figures.get((main, "state", "nis_dof"), math.nan)
     nis = figures.get((main, "state", "nis"), math.nan)
     kind, _, reason = log.outcome.partition(": ")

@@ -15,13 +15,13 @@ from pdhef_logtool.estimators.base import notes_of
 from pdhef_logtool.estimators.presets import calibration_of
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.evaluation.dependence import day_and_route
+from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.evaluation.reasons import Interval, SensorFault, sensor_faults
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
-from pdhef_logtool.results.error_places import largest_errors
 from pdhef_logtool.results.no_position import without_names
 from pdhef_logtool.results.run_report import LogOutcome, build_report, estimator_entry, run_versions
 from pdhef_logtool.runs.estimating import Estimated

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.car.parts import Algorithm
@@ -15,7 +15,7 @@ from pdhef_logtool.model.intervals import drive_intervals
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH
-from pdhef_logtool.runs.estimating import estimate_drive
+from pdhef_logtool.runs.estimating import Estimated, estimate_drive
 from pdhef_logtool.runs.preparing import choose
 
 if TYPE_CHECKING:
@@ -28,15 +28,24 @@ class Estimates:
 
     Attributes
     ----------
-    tracks : by estimator, and ``truth`` where the log has one, with dead-reckoned poses, divergence and intervals.
-    signals : input of the estimators. algorithms : by name. skipped : estimators that could not run, with reasons.
+    algorithms : by name. skipped : estimators that could not run, with reasons.
     """
 
     drive: Drive
-    tracks: dict[str, StateTrack]
-    signals: Signals
+    estimated: Estimated
     algorithms: dict[str, Algorithm]
     skipped: tuple[Skipped, ...]
+
+    @property
+    def tracks(self) -> dict[str, StateTrack]:
+        """Tracks by estimator, and ``truth`` where the log has one, with dead-reckoned poses, divergence, intervals."""
+        truth = self.estimated.drawn_truth
+        return ({} if truth is None else {TRUTH: truth}) | self.estimated.tracks
+
+    @property
+    def signals(self) -> Signals:
+        """Input of the estimators."""
+        return self.estimated.signals
 
     def frame(self) -> pl.DataFrame:
         """Return the tracks as rows of estimates.parquet, in SI units."""
@@ -71,9 +80,7 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     whole = drive.whole()
     corrected = DriveModel.of(drive).apply(whole.signals)
     estimated = estimate_drive(whole, corrected, estimators, intervals=drive_intervals(drive.car, estimators))
-    truth = {} if estimated.drawn_truth is None else {TRUTH: estimated.drawn_truth}
-    algorithms = {e.name: resolve(e) for e in estimators}
-    return Estimates(drive, truth | estimated.tracks, estimated.signals, algorithms, tuple(skipped))
+    return Estimates(drive, estimated, {e.name: resolve(e) for e in estimators}, tuple(skipped))
 
 
 def score(estimates: Estimates) -> pl.DataFrame:
@@ -89,13 +96,8 @@ def score(estimates: Estimates) -> pl.DataFrame:
 
     from pdhef_logtool.runs.scoring import evaluate
 
-    def read(name: str) -> StateTrack | None:
-        """Return a track; the ground truth counts wherever one of its quantities is known."""
-        track = estimates.tracks.get(name)
-        return replace(track, valid=track.something_known) if track is not None and name == TRUTH else track
-
-    names = [name for name in estimates.tracks if name != TRUTH]
-    calibrated = DriveModel.of(estimates.drive).calibrated(estimates.signals)
-    rows = evaluate(estimates.drive, names, read, estimates.signals, calibrated).rows
+    estimated = estimates.estimated
+    calibrated = DriveModel.of(estimates.drive).calibrated(estimated.signals)
+    rows = evaluate(estimates.drive, estimated, [*estimated.tracks], calibrated).rows
     columns = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
     return pl.DataFrame([[getattr(r, c) for c in columns] for r in rows], schema=columns, orient="row")

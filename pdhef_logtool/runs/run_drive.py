@@ -11,7 +11,6 @@ from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.plug_ins import package_of
-from pdhef_logtool.evaluation.metrics import EvaluatedDrive
 from pdhef_logtool.evaluation.operating_space import operating_space
 from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS
 from pdhef_logtool.evaluation.validation_plan import SIDESLIP
@@ -127,8 +126,8 @@ def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter)
 
 def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     """Score the tracks; add contradictions as notes of the drive."""
-    drive, signals = run.drive, estimated.signals
-    scored = evaluate(drive, run.names, estimated.read, signals, run.model.calibrated(signals))
+    drive = run.drive
+    scored = evaluate(drive, estimated, run.names, run.model.calibrated(estimated.signals))
     digests = {e.name: resolve(e).sha256[:SHOWN_DIGITS] for e in run.estimators}
     scored = replace(scored, rows=[replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows])
     truth, reference = estimated.truth, estimated.read(REFERENCE)
@@ -155,9 +154,7 @@ def _judge(
 ) -> dict[str, Any]:
     """Return the entries of the report on the requirements of a plan."""
     drive, vehicle, truth = run.drive, run.car.vehicle, estimated.truth
-    slow, dependent = vehicle.low_speed_blend_m_s, drive.plan.dependent
-    of_drive = EvaluatedDrive(drive.name, estimated.tracks, truth, None, scored.masks, slow, dependent=dependent)
     most = BRIEF_BLOCKS if run.config.kept == "metrics" else MOST_BLOCKS
-    blocks = drive_blocks([*plan.requirements, SIDESLIP], main.name, of_drive, most)
+    blocks = drive_blocks([*plan.requirements, SIDESLIP], main.name, scored.drive, most)
     space = operating_space(estimated.signals, truth, estimated.read(main.name), vehicle)
     return judge_drive(plan, drive, main.name, scored.rows, blocks, space)

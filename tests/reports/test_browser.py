@@ -60,7 +60,7 @@ def test_a_page_draws_all_figures_zooms_all_of_them_and_says_nothing(browser, tm
     file = page_of(write_run(tmp_path, drive_tracks(60.0, NAMES)))
     opened(browser, file)
     places = browser.value("document.querySelectorAll('[data-figure]').length")
-    assert browser.value("document.querySelectorAll('.canvas canvas').length") == places == 12
+    assert browser.value("document.querySelectorAll('.canvas canvas').length") == places == 9
     browser.drag('[data-figure="sideslip"] .u-over', 0.1, 0.2)
     browser.value(_DRAWN)
     low, high = (float(s) for s in browser.value("document.querySelector('.range').textContent").split()[0:3:2])
