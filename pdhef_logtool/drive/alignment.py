@@ -24,6 +24,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.geometry import WGS84_A_M
 from pdhef_logtool.records.signals import (
@@ -147,7 +148,7 @@ class AlignmentPlan:
         return {**jsonable(self), "unused": dict(self.unused)}
 
 
-def plan_alignment(channels: Mapping[str, Channel], *, steering_ratio: float, wheel_radius_m: float) -> AlignmentPlan:
+def plan_alignment(channels: Mapping[str, Channel], vehicle: VehicleParameters) -> AlignmentPlan:
     """Decide clock, method, gaps and lateness of every channel.
 
     The grid channel is the first of yaw rate, a_y, a_x with a rate within a factor 2 of the fastest of them.
@@ -155,7 +156,7 @@ def plan_alignment(channels: Mapping[str, Channel], *, steering_ratio: float, wh
     Parameters
     ----------
     channels : every mapped signal by name, with its samples in the survey, if any.
-    steering_ratio : steering-wheel angle over road-wheel angle. wheel_radius_m : m.
+    vehicle : its steering ratio and wheel radius are used.
 
     Raises
     ------
@@ -166,7 +167,7 @@ def plan_alignment(channels: Mapping[str, Channel], *, steering_ratio: float, wh
     grid = _grid_channel(periods)
     grid_period = periods[grid]
     assert grid_period is not None
-    chosen, unused = _choose_sources(survey, steering_ratio, wheel_radius_m)
+    chosen, unused = _choose_sources(survey, vehicle)
     plans = tuple(
         _plan_channel(survey[name], target, scale, survey[grid], grid_period)
         for name, (target, scale) in sorted(chosen.items())
@@ -334,12 +335,12 @@ def _grid_channel(periods: Mapping[str, float | None]) -> str:
 
 
 def _choose_sources(
-    survey: Mapping[str, Channel], steering_ratio: float, wheel_radius_m: float
+    survey: Mapping[str, Channel], vehicle: VehicleParameters
 ) -> tuple[dict[str, tuple[str, float]], dict[str, str]]:
     """Return the aligned column and the scale of every channel used, and the reason for those unused."""
-    alternatives = {"steering_wheel_rad": ("steer_rad", 1.0 / steering_ratio)}
+    alternatives = {"steering_wheel_rad": ("steer_rad", 1.0 / vehicle.steering_ratio)}
     for w in WHEELS:
-        alternatives[f"wheel_speed_{w}_rad_s"] = (f"wheel_speed_{w}_m_s", wheel_radius_m)
+        alternatives[f"wheel_speed_{w}_rad_s"] = (f"wheel_speed_{w}_m_s", vehicle.wheel_radius_m)
     chosen: dict[str, tuple[str, float]] = {}
     unused: dict[str, str] = {}
     for name in survey:

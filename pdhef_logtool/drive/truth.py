@@ -53,6 +53,7 @@ _COLUMNS = {
     **{name: (name,) for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "yaw_rad")},
     "position_m": ("x_m", "y_m"),
 }
+_SCORED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2")
 #: Friction is a condition of the drive, not a state to score.
 _FRICTION = "friction"
 _AY_DERIVED = "smoothing derivative of v_y plus v_x times yaw rate plus g sin(roll), without body roll"
@@ -266,25 +267,14 @@ def truth_at(
     """
     track = truth.track
     bracket = Bracket(track.stamps_ns, stamps_ns + round(latency_s * 1e9), round(truth.max_gap_s * 1e9))
-    vx, vy = bracket.linear(track.vx_m_s), bracket.linear(track.vy_m_s)
-    beta = bracket.angle(track.sideslip_rad)
+    columns = {name: bracket.linear(getattr(track, name)) for name in (*_SCORED, "x_m", "y_m", _FRICTION)}
+    columns |= {name: bracket.angle(getattr(track, name)) for name in ("sideslip_rad", "yaw_rad")}
+    vx, vy = columns["vx_m_s"], columns["vy_m_s"]
     finite = np.isfinite(vx) & np.isfinite(vy)
-    beta[finite] = np.arctan2(vy[finite], vx[finite])
-    rate, ay = bracket.linear(track.yaw_rate_rad_s), bracket.linear(track.ay_m_s2)
-    return make_track(
-        "truth",
-        stamps_ns,
-        vx_m_s=vx,
-        vy_m_s=vy,
-        yaw_rate_rad_s=rate,
-        sideslip_rad=beta,
-        ay_m_s2=ay,
-        x_m=bracket.linear(track.x_m),
-        y_m=bracket.linear(track.y_m),
-        yaw_rad=bracket.angle(track.yaw_rad),
-        friction=bracket.linear(track.friction),
-        valid=bracket.inside & np.isfinite(np.stack([vx, vy, rate, beta, ay])).any(axis=0),
-    ).without_sideslip_below(standstill_m_s)
+    columns["sideslip_rad"][finite] = np.arctan2(vy[finite], vx[finite])
+    scored = np.stack([columns[name] for name in (*_SCORED, "sideslip_rad")])
+    valid = bracket.inside & np.isfinite(scored).any(axis=0)
+    return make_track("truth", stamps_ns, valid=valid, **columns).without_sideslip_below(standstill_m_s)
 
 
 def valid_as_a_whole(truth: StateTrack, derivation: Mapping[str, str], standstill_m_s: float) -> StateTrack:

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.alignment import AlignmentPlan, align, combine_wheel_speeds, plan_alignment
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, Channel, Signals
@@ -35,8 +36,9 @@ def seconds(stamps_ns):
     return (np.asarray(stamps_ns) - T0) * 1e-9
 
 
-def plan_of(channels, **kwargs) -> AlignmentPlan:
-    return plan_alignment(channels, **{"steering_ratio": 16.0, "wheel_radius_m": 0.3, **kwargs})
+def plan_of(channels, wheel_radius_m=0.3) -> AlignmentPlan:
+    changed = {"steering_ratio": 16.0, "wheel_radius_m": wheel_radius_m}
+    return plan_alignment(channels, default_vehicle().model_copy(update=changed))
 
 
 def whole(channels, plan) -> Signals:
@@ -91,7 +93,7 @@ def test_stamps_in_a_wrong_unit_are_refused_in_one_line():
     stamps = np.arange(500) * 10
     channels = {name: channel(name, stamps, np.ones(500)) for name in ("ay_m_s2", "speed_m_s")}
     with pytest.raises(MappingError, match=r"1e\+08 samples a second"):
-        plan_alignment(channels, steering_ratio=16.0, wheel_radius_m=0.3)
+        plan_of(channels)
 
 
 def test_an_imu_channel_of_another_device_is_brought_to_the_grid():

@@ -41,10 +41,7 @@ def drive(shared_dir):
 
 
 def aligned(channels, vehicle):
-    plan = plan_alignment(
-        channels.signals, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m
-    )
-    return align(channels.signals, plan)[0]
+    return align(channels.signals, plan_alignment(channels.signals, vehicle))[0]
 
 
 def test_the_phones_velocity_is_turned_into_the_car(drive):
