@@ -17,7 +17,7 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import ANGLES, HYPOTHESES, MOST_FIELDS, Field, Role, stamp_of
 from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, is_of_both_signs, ratio, spread
-from pdhef_logtool.mapping.fields import EXCITED_A_M_S2, Fields
+from pdhef_logtool.mapping.fields import Fields
 from pdhef_logtool.mapping.naming import Meaning, is_command, is_unlabelled, meaning_of
 from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.mapping.units import CERTAIN, Gain, Unit, posterior
@@ -232,10 +232,8 @@ def _same(a: _Choice, b: _Choice) -> bool:
 
 def _steering(fields: Fields, columns: Sequence[Field], speed: FloatArray, rate: FloatArray) -> list[Field]:
     """Return the column that follows the path's curvature far better than all others, as a steering angle."""
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        slow = max(1.0, 0.25 * float(np.nanquantile(speed, 0.95)))
-        curve = fields.pieces.smooth(np.where(speed > slow, rate / speed, np.nan))
-    if not spread(curve * speed**2) > EXCITED_A_M_S2:
+    curve = fields.curvature(speed, rate)
+    if curve is None:
         return []
     relations = ((fit(fields.pieces.smooth(item.seen.cells), curve), item) for item in columns)
     fits = [(abs(relation.correlation), item) for relation, item in relations if relation is not None]
