@@ -277,11 +277,12 @@ def _snapped(turn: _Turn) -> FloatArray:
     step = nearest_step(rotation)
     rest = rotation @ step.T
     is_precise = turn.correlation >= ASKEW_CORRELATION and turn.error_deg <= ASKEW_ERROR_DEG
-    if not is_precise or turn.samples < ASKEW_SAMPLES or not (parts := _parts_of(turn)):
+    if not is_precise or turn.samples < ASKEW_SAMPLES:
         return step
+    parts = _parts_of(turn)
     yaw = math.degrees(math.atan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1]))
     angles = [abs(yaw) - math.copysign(left, yaw * left) for left, _ in parts]
-    is_turned = min(angles) > max(TURNED_DEG, 3.0 * turn.error_deg)
+    is_turned = all(a > TURNED_DEG for a in angles) and abs(yaw) > max(TURNED_DEG, 3.0 * turn.error_deg)
     is_turned &= abs(angles[0] - angles[1]) < max(PARTS_AGREE_DEG, PARTS_AGREE_SHARE * abs(yaw))
     # One of the parts may be a hill.
     first, second = (step @ rotation.T @ up for _, up in parts)
@@ -305,24 +306,21 @@ def _parts_of(turn: _Turn) -> list[tuple[float, FloatArray]]:
     """Return, for two parts of the drive, the yaw (deg) that the fit leaves and up [3] in the axes of the rotation.
 
     Steady sideslip rotates the acceleration by an angle that grows with lateral acceleration and curvature. Roll and
-    pitch change the gains of both axes. Each has a regressor; the constant is gravity on a tilted sensor, grade and
-    crossfall. The result is empty if the drive does not separate them.
+    pitch change the gains of both axes. Each has a regressor; grade and crossfall are part of the constant. The yaw is
+    NaN if the part does not separate them. Up is the force at zero acceleration.
     """
-    axes = turn.f @ turn.rotation.T
-    z, lateral = axes[:, 0] + 1j * axes[:, 1], turn.driven.imag
-    regressors = [turn.driven, turn.driven.conj(), 1j * derivative(turn.rate), lateral**2, turn.rate**2]
-    matrix = np.stack([*regressors, np.ones_like(z)], axis=1)
+    axes, driven = turn.f @ turn.rotation.T, turn.driven
+    z, ones = axes[:, 0] + 1j * axes[:, 1], np.ones(len(axes))
+    matrix = np.stack([driven, driven.conj(), 1j * derivative(turn.rate), driven.imag**2, turn.rate**2, ones], axis=1)
+    level = np.stack([driven.real, driven.imag, ones], axis=1)
     parts = []
     for part in halves(len(z)):
         usable = turn.use & part & np.isfinite(matrix).all(axis=1) & np.isfinite(z)
-        size = np.linalg.norm(matrix[usable], axis=0)
-        if independent_samples(int(np.count_nonzero(usable))) < ASKEW_SAMPLES / 2.0 or (size <= 1e-9).any():
-            return []
-        scaled = matrix[usable] / size
-        if np.linalg.cond(scaled) > WELL_CONDITIONED:
-            return []
-        gain, *_, level = np.linalg.lstsq(scaled, z[usable], rcond=None)[0] / size
-        up = np.array([level.real, level.imag, axes[usable, 2].mean()])
+        size = np.maximum(np.linalg.norm(matrix[usable], axis=0), 1e-9)
+        is_long = independent_samples(int(np.count_nonzero(usable))) >= ASKEW_SAMPLES / 2.0
+        is_separable = is_long and np.linalg.cond(matrix[usable] / size) <= WELL_CONDITIONED
+        gain = np.linalg.lstsq(matrix[usable] / size, z[usable], rcond=None)[0][0] if is_separable else np.nan
+        up = np.linalg.lstsq(level[usable], axes[usable], rcond=None)[0][2] if is_long else np.zeros(3)
         parts.append((math.degrees(float(np.angle(gain))), up / max(float(np.linalg.norm(up)), 1e-9)))
     return parts
 

@@ -171,8 +171,9 @@ def _choices(fields: Fields, unlabelled: Sequence[Field]) -> Iterator[_Choice]:
                     continue
                 left = math.prod(max(1.0 - f.correlation**2, RESOLVED) for f in (turning, speeding))
                 units, share = _explained(columns, turning, speeding) if power == 1.0 else ((), 1.0)
-                score = math.log(max(share, RESOLVED)) - 0.5 * seconds * math.log(left)
-                yield _Choice(columns, turning, speeding, units, share, power, score)
+                if share > RESOLVED:
+                    score = math.log(share) - 0.5 * seconds * math.log(left)
+                    yield _Choice(columns, turning, speeding, units, share, power, score)
 
 
 def _close(y: FloatArray, x: FloatArray) -> Fit | None:
