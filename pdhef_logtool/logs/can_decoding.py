@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import MappingFileError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
+
+    from pdhef_logtool.logs.table_log import Table
 
 CAN_TYPE = "can/msg/Frame"
 _MAX_DBC_BYTES = 32 << 20
@@ -76,6 +77,8 @@ class Frames:
 
     def table(self, name: str) -> Table:
         """Return the frames as they are, with NaN behind the length."""
+        from pdhef_logtool.logs.table_log import Table
+
         names = [f"data[{i}]" for i in range(self.data.shape[1])]
 
         def load(path: str, rows: slice) -> NDArray[Any]:
@@ -125,6 +128,8 @@ class Decoder:
         table of the best bus and the most frequent address has the name of the message; the names of the others end
         with bus or address (``#bus1``). Multiplexed signals have a table for each value of their multiplexer.
         """
+        from pdhef_logtool.logs.table_log import Table
+
         rows = self.frames.by_source()
         described = [described_sources(database, rows) for _, database in self.databases]
         fits = {
