@@ -128,8 +128,6 @@ class Decoder:
         table of the best bus and the most frequent address has the name of the message; the names of the others end
         with bus or address (``#bus1``). Multiplexed signals have a table for each value of their multiplexer.
         """
-        from pdhef_logtool.logs.table_log import Table
-
         rows = self.frames.by_source()
         described = [described_sources(database, rows) for _, database in self.databases]
         fits = {
@@ -167,6 +165,8 @@ class Decoder:
 
     def _messages(self, message: Message, ending: str, rows: IntArray, *, is_j1939: bool) -> Iterator[Table]:
         """Yield the tables of a message from one sender, without the signals that no frame contains."""
+        from pdhef_logtool.logs.table_log import Table
+
         data = self.frames.data
         lengths = np.minimum(self.frames.parts["length"], data.shape[1])
         for condition, signals, selectors in signal_groups(message):
