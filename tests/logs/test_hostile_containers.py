@@ -19,7 +19,7 @@ from pdhef_logtool.logs.compression import decompress, decompress_message
 from pdhef_logtool.logs.container import SpanDamageError
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, Meter, ResourceLimits
+from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, ResourceLimits
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.inspection import inspect_log
@@ -134,28 +134,10 @@ def _mcap_of_chunk(path: Path, size: int, compression: bytes, stored: bytes, crc
     return path
 
 
-def _lz4_of(size: int) -> bytes:
-    import lz4.frame
-
-    compressor = lz4.frame.LZ4FrameCompressor()
-    block = bytes(64 << 20)
-    parts = [compressor.begin(), *(compressor.compress(block) for _ in range(size >> 26)), compressor.flush()]
-    return b"".join(parts)
-
-
-def _bomb(kind: str) -> tuple[bytes, bytes]:
-    if kind == "zstd":
-        return b"zstd", zstandard.ZstdCompressor(write_content_size=False).compress(bytes(400 << 20))
-    if kind == "lz4":
-        return b"lz4", _lz4_of(256 << 20)
-    return b"bz2", bz2.compress(bytes(64 << 20))
-
-
 @pytest.mark.parametrize("claim", [1000, 100 << 30])
-@pytest.mark.parametrize("kind", ["zstd", pytest.param("lz4", marks=pytest.mark.slow)])
-def test_a_chunk_that_would_fill_memory_is_refused_by_name(tmp_path: Path, kind: str, claim: int) -> None:
-    compression, stored = _bomb(kind)
-    read, (loss,), _ = _outcome(_mcap_of_chunk(tmp_path / "a.mcap", claim, compression, stored))
+def test_a_chunk_that_would_fill_memory_is_refused_by_name(tmp_path: Path, claim: int) -> None:
+    stored = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(400 << 20))
+    read, (loss,), _ = _outcome(_mcap_of_chunk(tmp_path / "a.mcap", claim, b"zstd", stored))
     assert read == 0
     assert "chunk at byte 25" in loss.what
     assert loss.kind == ("bad-chunk" if claim == 1000 else "over-budget")
@@ -253,20 +235,6 @@ def test_a_log_that_takes_too_long_loses_its_rest(tmp_path: Path, monkeypatch: p
     assert (loss.kind, loss.count) == ("over-budget", sum(sum(s.counts.values()) for s in container.spans[3:]))
     assert "--set budget" in loss.what
     log.close()
-
-
-def test_a_sound_log_can_be_read_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [0.0]
-    monkeypatch.setattr("pdhef_logtool.logs.resource_limits.time.thread_time", lambda: now[0])
-    meter = Meter(ResourceLimits(seconds=1.0, seconds_per_mib=2.0))
-    for _ in range(100):
-        with meter.running(1 << 20):
-            now[0] += 1.9
-        meter.check()
-    with meter.running():
-        now[0] += 20.0
-    with pytest.raises(LimitError, match="longer than"):
-        meter.check()
 
 
 @pytest.mark.parametrize("chunked", [True, False])
