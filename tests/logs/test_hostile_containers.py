@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType
 
 from pdhef_logtool.logs.compression import decompress, decompress_message
 from pdhef_logtool.logs.container import SpanDamageError
@@ -23,6 +23,7 @@ from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError, Resou
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.inspection import inspect_log
+from tests.mcap_files import mcap_writer
 
 T0 = 1_700_000_000_000_000_000
 N = 300
@@ -30,22 +31,19 @@ _MAGIC = b"\x89MCAP0\r\n"
 
 
 def _write(path: Path, *, chunk_size: int = 4000, chunked: bool = True, index: bool = True, padding: str = "") -> Path:
-    with path.open("wb") as stream:
-        writer = Writer(
-            stream,
-            chunk_size=chunk_size,
-            use_chunking=chunked,
-            compression=CompressionType.ZSTD,
-            index_types=IndexType.ALL if index else IndexType.NONE,
-            use_statistics=index,
-        )
-        writer.start()
+    with mcap_writer(
+        path,
+        chunk_size=chunk_size,
+        use_chunking=chunked,
+        compression=CompressionType.ZSTD,
+        index_types=IndexType.ALL if index else IndexType.NONE,
+        use_statistics=index,
+    ) as writer:
         schema = writer.register_schema("T", "jsonschema", b'{"type": "object"}')
         channels = [writer.register_channel(topic, "json", schema) for topic in ("/a", "/b")]
         for i in range(N):
             for channel in channels:
                 writer.add_message(channel, T0 + i, f'{{"x": {i}, "p": "{padding}"}}'.encode(), T0 + i, i)
-        writer.finish()
     return path
 
 
@@ -186,13 +184,10 @@ def test_a_sparse_length_near_the_largest_integer_is_a_loss(tmp_path: Path) -> N
 
 def test_too_many_channels_cost_the_surplus_and_end(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=20_000)
-        writer.start()
+    with mcap_writer(path, chunk_size=20_000) as writer:
         for i in range(400):
             channel = writer.register_channel(f"/t{i}", "json", 0)
             writer.add_message(channel, T0 + i, b"{}", T0 + i)
-        writer.finish()
     read, lost, claimed = _outcome(path, ResourceLimits(channels=300))
     assert read == claimed == 300
     assert {"over-budget", "unknown-channel"} <= {loss.kind for loss in lost}
@@ -203,15 +198,12 @@ def test_too_many_channels_cost_the_surplus_and_end(tmp_path: Path) -> None:
 
 def test_a_channel_that_nothing_declares_in_a_log_whose_clock_is_set_back(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream, use_chunking=False)
-        writer.start()
+    with mcap_writer(path, use_chunking=False) as writer:
         channel = writer.register_channel("/a", "json", 0)
         for i in range(2000):
             at = T0 + (i - 500 * (i // 1000)) * 10_000_000
             for id_ in (channel, 9):
                 writer.add_message(id_, at, b"{}", at)
-        writer.finish()
     read, lost, _ = _outcome(path)
     assert 0 < read < 2000
     assert {loss.kind for loss in lost} == {"unknown-channel", "time-jump"}

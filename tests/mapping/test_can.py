@@ -16,7 +16,6 @@ from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 from pdhef_logtool.logs.can_decoding import signal_values
 from pdhef_logtool.logs.open_log import open_log
@@ -24,6 +23,7 @@ from pdhef_logtool.mapping import Mapping, check_mapping, fit_clocks, load_mappi
 from pdhef_logtool.mapping.evidence import LARGEST
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.runs.inspection.report import inspect_log
+from tests.mcap_files import mcap_writer
 
 S = 1_000_000_000
 
@@ -95,14 +95,11 @@ _ROS_FRAME = (
 
 
 def _write(path: Path, encoding: str, schema: tuple[str, str, bytes], payloads: Sequence[bytes]) -> None:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
+    with mcap_writer(path) as writer:
         schema_id = writer.register_schema(*schema) if schema[0] else 0
         channel = writer.register_channel("/can/raw", encoding, schema_id)
         for i, payload in enumerate(payloads):
             writer.add_message(channel, S + i * 1_000_000, payload, S + i * 1_000_000)
-        writer.finish()
 
 
 def _write_ros(path: Path, frames: Sequence[Frame]) -> None:
