@@ -238,14 +238,3 @@ def test_a_mutated_schema_is_read_or_refused(encoding: str, cuts: list[tuple[int
             _columns(schema, leaf.path, message, b"\0\1\0\0" + message)
         except MappingError:
             continue
-
-
-@pytest.mark.parametrize(("name", "topic"), [("ros_listed_bomb.mcap", "/b"), ("json_ref_bomb.mcap", "/j")])
-def test_the_bombs_that_did_harm_are_losses_that_name_their_channel(shared_dir: Path, name: str, topic: str) -> None:
-    path = shared_dir / "torture" / name
-    if not path.is_file():
-        pytest.skip("needs ../shared/torture")
-    log = open_log(path)
-    assert log.fields(topic) == ()
-    assert [(loss.kind, loss.where) for loss in log.lost] == [("bad-schema", topic)]
-    log.close()

@@ -291,15 +291,6 @@ def test_an_unknown_name_tells_the_nearest(tmp_path: Path, field: str, says: str
         _read(tmp_path / "a.mcap", mapping)
 
 
-def test_an_unknown_topic_tells_the_nearest(tmp_path: Path) -> None:
-    _write_ros(tmp_path / "a.mcap", [Frame(256, bytes(8))])
-    (tmp_path / "car.dbc").write_text(DBC)
-    text = '[can]\ndbc = "car.dbc"\n[signals.speed_m_s]\ntopic = "/can/rwa"\nfield = "can:Motion.Speed"\n'
-    (tmp_path / "m.toml").write_text(text)
-    with pytest.raises(MappingError, match=r"no topic /can/rwa \(did you mean /can/raw\?\)"):
-        _read(tmp_path / "a.mcap", load_mapping(tmp_path / "m.toml"))
-
-
 @pytest.mark.parametrize("text", ["", "BO_ 256 Motion: 8 ECU\n SG_ Speed : nonsense", "\x00\xff\x00", None])
 def test_a_dbc_that_cannot_be_used_is_one_clear_line(tmp_path: Path, text: str | None) -> None:
     _write_ros(tmp_path / "a.mcap", [Frame(256, bytes(8))])
