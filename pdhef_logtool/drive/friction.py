@@ -47,7 +47,7 @@ class FrictionFrom(StrEnum):
     TOPIC = "topic"
     FILE = "vehicle file"
     SEDAN = "default sedan"
-    ASSUMED = "assumed"
+    ASSUMED = "no value given"
     REACHED = "largest lateral acceleration"
     TRUTH = "ground truth"
     NONE = "none"

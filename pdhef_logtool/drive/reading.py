@@ -377,7 +377,8 @@ def _tell_doubts(plan: DrivePlan, options: ReadOptions, tell: Tell) -> None:
     for name in sorted(unknown):
         tell(f"--waive {name}: no check of this log is called that")
     for channel in (c for c in plan.alignment.channels if c.clock == "stamp"):
-        source = plan.mapping.signals[channel.name].label
+        mapped = plan.mapping.signals.get(channel.name)
+        source = mapped.label if mapped else "from other channels"
         tell(
             f"{channel.name} ({source}) arrives {channel.delay_s:.2f} s after its stamps, expected at most "
             f"{MAX_PREDICTION_S:g} s: it is read by its stamps, and no estimate of this log is causal"

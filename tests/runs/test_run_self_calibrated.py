@@ -55,6 +55,12 @@ def calibrated(sample_logs_dir: Path, wrong_car: Path, tmp_path_factory: pytest.
     return out
 
 
+def causal_rows(folder: Path) -> dict[object, pl.Series]:
+    """Return the column ``causal`` of estimates.parquet by estimator."""
+    rows = pl.read_parquet(folder / "estimates.parquet").with_columns(pl.col("estimator").cast(pl.String))
+    return {name: part["causal"] for (name,), part in rows.group_by("estimator", maintain_order=True)}
+
+
 def rmse(out: Path, estimator: str) -> float:
     chosen = {"estimator": estimator, "signal": "sideslip_rad", "metric": "rmse", "segment": "all"}
     return float(pl.read_parquet(out / "metrics.parquet").filter(**chosen)["value"].item())
@@ -73,6 +79,7 @@ def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the
     assert "calibrated on this log without ground truth" in report["answer"]["texts"]["assumed"]
     assert told["physics"]["intervals"] == ["intervals: own, parameters and sensors"]
     assert told["open-loop:calibrated"]["intervals"] == []
+    assert not causal_rows(calibrated / "logs/road")["zero"].any(), "settings and model are those of the whole log"
 
 
 def test_a_wrong_file_is_mended(calibrated: Path) -> None:
@@ -93,6 +100,9 @@ def test_a_model_of_an_earlier_drive_is_causal_and_mends_the_file(
     follows(report)
     assert all(e["causal"] for e in report["estimators"] if e["name"] != "open-loop:calibrated")
     assert report["model"]["source"] == "file"
+    causal = causal_rows(tmp_path / "logs/dlc")
+    assert causal["zero"][100:].all() and causal["truth"].is_null().all()
+    assert not causal["open-loop:calibrated"].any() and causal["selected"].equals(causal["physics"])
     assert "from earlier drives" in report["answer"]["texts"]["assumed"]
     assert rmse(tmp_path, "physics") < 0.65 * rmse(tmp_path, "phy-ukf")
     passed_on = tomllib.loads((tmp_path / "logs/dlc/model.toml").read_text())
@@ -158,14 +168,13 @@ def test_an_estimate_that_contradicts_the_sensors_is_not_selected_and_keeps_its_
     if Car.load().network is None:
         pytest.skip("no network is shipped, without which there is no pd-hef")
     monkeypatch.setattr(selection, "FACTOR", 0.0)
-    report = run(
-        sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, estimators=("zero", "phy-ukf", "pd-hef"), end=None
-    )
+    names = ("zero", "phy-ukf", "pd-hef", "physics")
+    report = run(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, estimators=names, end=None)
     follows(report)
     assert any(w.startswith("WARNING: pd-hef contradicts the sensors") for w in report["warnings"])
     assert report["selected_estimate"] == report["answer"]["main"] == "physics"
     file = tmp_path / "logs" / "sweep" / "estimates.parquet"
-    assert list_estimators(file) == ("truth", "zero", "phy-ukf", "pd-hef", "physics")
+    assert list_estimators(file) == ("truth", *names)
     selected, named, other = (read_track(file, name) for name in ("selected", "physics", "pd-hef"))
     np.testing.assert_array_equal(selected.sideslip_rad, named.sideslip_rad)
     assert (selected.sideslip_rad != other.sideslip_rad).any()
