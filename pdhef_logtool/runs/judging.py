@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pdhef_logtool.evaluation.dependence import factors_of
 from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
 from pdhef_logtool.evaluation.validation_plan import default_plan
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.tracks import REFERENCE
-from pdhef_logtool.results.opened_run import OpenedLog
 from pdhef_logtool.runs.run_result import FEW_LOGS, LogResult
 from pdhef_logtool.storage.documents import jsonable
 
@@ -93,13 +90,10 @@ def judge(
     if not plan.file and len(done) < LEAST_DRIVES:
         return None
     from pdhef_logtool.results.parquet_sink import read_metrics
-    from pdhef_logtool.results.plan_against import other_runs
-    from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_file, figures_of_rows, plan_verdicts
+    from pdhef_logtool.results.plan_against import judged_drive, other_runs
+    from pdhef_logtool.results.plan_verdicts import figures_of_file, figures_of_rows, plan_verdicts
 
-    drives = [
-        JudgedDrive(r.outcome.log, r.outcome.main, partial(_report, r), factors_of(asdict(r.outcome), None))
-        for r in done
-    ]
+    drives = [judged_drive(r.opened, partial(_report, r)) for r in done]
     if metrics is None:
         figures = figures_of_rows(row for r in done for row in r.rows)
     elif len(done) <= FEW_LOGS:
@@ -108,8 +102,7 @@ def judge(
         import polars as pl
 
         figures = figures_of_file(pl.scan_parquet(metrics), plan, [d.main for d in drives])
-    logs = [OpenedLog(o.log, o.outcome, Path(), asdict(o)) for o in (r.outcome for r in done)]
-    return plan_verdicts(plan, figures, drives, strict=strict, against=other_runs(plan, logs))
+    return plan_verdicts(plan, figures, drives, strict=strict, against=other_runs(plan, [r.opened for r in done]))
 
 
 @lru_cache(maxsize=LEAST_DRIVES)
