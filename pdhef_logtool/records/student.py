@@ -1,4 +1,4 @@
-"""Quantiles of Student's t and of chi-square without SciPy, whose import takes longer than a short log."""
+"""Quantiles of Student's t and of chi-square without SciPy: its import takes longer than a short log."""
 
 from __future__ import annotations
 
