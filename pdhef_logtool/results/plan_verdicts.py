@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pdhef_logtool.evaluation.metrics import MetricRow
@@ -24,8 +23,7 @@ if TYPE_CHECKING:
 
 #: Figures beside the requirement's own: exposure, independence, and the estimated reference.
 _BESIDE = ("exposure_s", "exposure_m", NOT_INDEPENDENT, "reference_rms", "reference_std")
-#: What identifies a figure.
-_COLUMNS = ("log", "estimator", "signal", "segment", "metric")
+#: Log, estimator, signal, segment and metric.
 _Key = tuple[str, str, str, str, str]
 
 
@@ -99,14 +97,6 @@ def _figures(rows: Iterable[tuple[str, str, str, str, str, float | None, int]]) 
     return Figures(values, {log: list(of_log) for log, of_log in names.items()})
 
 
-def figures_of_few(metrics: Path) -> Figures:
-    """Return all figures of the metrics.parquet of few logs, without the import of polars."""
-    import pyarrow.parquet as pq
-
-    table = pq.ParquetFile(metrics).read([*_COLUMNS, "value", "n"])
-    return _figures(zip(*(table[name].to_pylist() for name in (*_COLUMNS, "value", "n")), strict=True))
-
-
 def figures_of_file(metrics: pl.LazyFrame, plan: ValidationPlan, mains: Iterable[str | None]) -> Figures:
     """Return the rows of metrics.parquet that a plan needs; only these are read."""
     import polars as pl
@@ -120,7 +110,8 @@ def figures_of_file(metrics: pl.LazyFrame, plan: ValidationPlan, mains: Iterable
     rows = metrics.filter(*(pl.col(key).cast(pl.String).is_in(sorted(values)) for key, values in wanted.items()))
     if all(m is not None for m in mains):
         rows = rows.filter(pl.col("estimator").cast(pl.String).is_in(sorted(named)))
-    table = rows.select(*(pl.col(c).cast(pl.String) for c in _COLUMNS), "value", "n").collect()
+    columns = ("log", "estimator", "signal", "segment", "metric")
+    table = rows.select(*(pl.col(c).cast(pl.String) for c in columns), "value", "n").collect()
     return _figures(table.iter_rows())
 
 

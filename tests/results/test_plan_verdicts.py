@@ -18,14 +18,7 @@ from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
 from pdhef_logtool.evaluation.requirement_verdicts import RequirementVerdict
 from pdhef_logtool.evaluation.validation_plan import ExposureNeed, Requirement, ValidationPlan, default_plan
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.results.parquet_sink import write_metrics
-from pdhef_logtool.results.plan_verdicts import (
-    JudgedDrive,
-    figures_of_few,
-    figures_of_file,
-    figures_of_rows,
-    plan_verdicts,
-)
+from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_file, figures_of_rows, plan_verdicts
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs.judging import judge, read_validation_plan
 from pdhef_logtool.runs.run_result import LogResult
@@ -62,15 +55,13 @@ def test_drives_are_pooled_with_the_exposure_of_their_scored_stamps() -> None:
     assert verdict.estimators == ("pd-hef",)
 
 
-def test_a_file_gives_the_same_verdict_as_the_rows(tmp_path: Path) -> None:
+def test_a_file_gives_the_same_verdict_as_the_rows() -> None:
     rows = scored() + scored(value=0.5, estimator="zero")
     plan = ValidationPlan((BETA,))
     frame = pl.DataFrame([{k: getattr(r, k) for k in MetricRow.__dataclass_fields__} for r in rows]).lazy()
     drives = [JudgedDrive(log, "pd-hef") for log in SIX]
     of_file = plan_verdicts(plan, figures_of_file(frame, plan, ["pd-hef"] * 6), drives)
-    write_metrics(tmp_path / "metrics.parquet", rows)
-    of_few = plan_verdicts(plan, figures_of_few(tmp_path / "metrics.parquet"), drives)
-    assert of_file == of_few == plan_verdicts(plan, figures_of_rows(rows), drives)
+    assert of_file == plan_verdicts(plan, figures_of_rows(rows), drives)
 
 
 def test_the_estimated_reference_counts_only_without_ground_truth() -> None:
