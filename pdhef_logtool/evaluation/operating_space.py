@@ -88,5 +88,6 @@ def operating_space(
         for i in np.flatnonzero(seconds)
     ]
     friction = signals.friction[np.isfinite(signals.friction)]
-    most = (float(c[finite].max()) if finite.any() else None for c in (speed, ay))
-    return OperatingSpace(cells, *most, float(np.median(friction)) if friction.size else vehicle.assumed_friction)
+    fastest, hardest = (float(c[finite].max()) if finite.any() else None for c in (speed, ay))
+    median = float(np.median(friction)) if friction.size else vehicle.assumed_friction
+    return OperatingSpace(cells, fastest, hardest, median)
