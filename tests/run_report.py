@@ -83,7 +83,7 @@ def report(
         ],
         "truth": TRUTH,
         "model": None,
-        "friction": {"source": "option, 0.9"},
+        "friction": {"source": "option", "value": 0.9, "topic": None, "given": True},
         "self_calibration": None,
         "reference": None,
         "ledger": {"samples": []},

@@ -88,6 +88,6 @@ def operating_space(
         for i in np.flatnonzero(seconds)
     ]
     friction = signals.friction[np.isfinite(signals.friction)]
-    fastest, hardest = (float(c[finite].max()) if finite.any() else None for c in (speed, ay))
-    median = float(np.median(friction)) if friction.size else vehicle.assumed_friction
-    return OperatingSpace(cells, fastest, hardest, median)
+    top_speed, top_ay = (float(c[finite].max()) if finite.any() else None for c in (speed, ay))
+    usual = float(np.median(friction)) if friction.size else vehicle.assumed_friction
+    return OperatingSpace(cells, top_speed, top_ay, usual)

@@ -352,7 +352,7 @@ def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str
         "car": car.get("name") or report["vehicle"]["name"],
         "log format": report["log"]["kind"],
         "answer": main,
-        "friction source": source.partition(",")[0],
+        "friction source": source,
         "length": _length(float(report["log"]["duration_s"])),
         "sensor faults": _fault_text(report),
         "month": (factors_of(log.entry, report)["day"] or "")[:7],

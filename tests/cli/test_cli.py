@@ -6,7 +6,6 @@ import json
 import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -38,32 +37,12 @@ def test_help_names_every_command_with_a_whole_sentence() -> None:
     assert all(re.search(r"\.(\n[A-Z].*:)?\s*$", entry) for entry in listed)
 
 
-#: Print the help of every command in one process, at two widths.
-_HELPS = """
-import contextlib, io, json, os, sys
-from pdhef_logtool.cli.app import main
-helps = {}
-for command in ["", *sys.argv[1:]]:
-    helps[command] = {}
-    for width in ("80", "120"):
-        os.environ["COLUMNS"] = width
-        sys.argv = ["pdhef", *command.split(), "--help"]
-        with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
-            main()
-        helps[command][width] = out.getvalue()
-print(json.dumps(helps))
-"""
-
-
 def test_help_says_what_each_command_does() -> None:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    call = [sys.executable, "-c", _HELPS, *COMMANDS]
-    done = subprocess.run(call, capture_output=True, text=True, check=True, env=environment)
-    helps: dict[str, dict[str, str]] = json.loads(done.stdout)
     for command in COMMANDS:
-        for width, text in helps[command].items():
+        for width in (80, 120):
+            text = called(*command.split(), "--help", env={"COLUMNS": str(width)}).stdout
             assert f"Usage: pdhef {command} [OPTIONS]" in text
-            assert all(len(line) <= int(width) for line in text.splitlines()), command
+            assert all(len(line) <= width for line in text.splitlines()), command
             examples = text[text.index("Examples:") :].splitlines()[1:]
             assert f"{examples[0]} ".startswith(f"    pdhef {command} ")
 

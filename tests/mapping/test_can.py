@@ -70,7 +70,6 @@ def _signals(draw: st.DrawFn) -> tuple[Signal, int]:
     return Signal("S", start, length, order, signed, conversion=conversion), size
 
 
-@pytest.mark.slow
 @settings(max_examples=100, derandomize=True, deadline=None)
 @given(layout=_signals(), frames=st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=5))
 def test_any_layout_decodes_as_cantools_decodes_it(layout: tuple[Signal, int], frames: list[bytes]) -> None:

@@ -28,7 +28,7 @@ def report(label: str, **changes: Any) -> dict[str, Any]:
         "vehicle": {"name": "golf"},
         "truth": {"available": True, "not_independent": []},
         "answer": {"main": "pd-hef", "naive": "zero"},
-        "friction": {"source": "option, 0.9"},
+        "friction": {"source": "option", "value": 0.9, "topic": None, "given": True},
         "checks": [],
         "faults": [],
         "operating_space": {"speed_edges_m_s": [0, 5, 10, 15, 20], "ay_edges_m_s2": [0, 1, 2], "cells": cells},
