@@ -85,9 +85,8 @@ def judge(
 
     ``metrics``: the file with the figures of all logs, None: they are in memory. A log that failed has no figures.
     """
-    from pdhef_logtool.results.parquet_sink import read_metrics
     from pdhef_logtool.results.plan_against import judged_drive, other_runs
-    from pdhef_logtool.results.plan_verdicts import figures_of_file, figures_of_rows, plan_verdicts
+    from pdhef_logtool.results.plan_verdicts import figures_of_file, figures_of_rows, figures_of_table, plan_verdicts
 
     done = [r for r in results if r.outcome.failed is None or r.document is not None]
     if not plan.file and len(done) < LEAST_DRIVES:
@@ -96,7 +95,7 @@ def judge(
     if metrics is None:
         figures = figures_of_rows(row for r in done for row in r.rows)
     elif len(done) <= FEW_LOGS:
-        figures = figures_of_rows(read_metrics(metrics))
+        figures = figures_of_table(metrics)
     else:
         import polars as pl
 
