@@ -286,7 +286,7 @@ def _snapped(turn: _Turn) -> FloatArray:
     is_turned &= abs(angles[0] - angles[1]) < max(PARTS_AGREE_DEG, PARTS_AGREE_SHARE * abs(yaw))
     # One of the parts may be a hill.
     first, second = (step @ rotation.T @ up for _, up in parts)
-    *tilts, apart = (_angle_deg(x) for x in (rest[2, 2], first[2], second[2], first @ second))
+    *tilts, apart = (_angle_deg(float(x)) for x in (rest[2, 2], first[2], second[2], first @ second))
     if min(tilts) > TURNED_DEG and apart < PARTS_AGREE_DEG:
         from scipy.spatial.transform import Rotation
 

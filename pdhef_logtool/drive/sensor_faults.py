@@ -78,7 +78,7 @@ def without_faults(signals: Signals, vehicle: VehicleParameters) -> Signals:
         faults |= _without_stuck(sound[name], signals, cells, turning, vehicle.sensors) << i
         extra[:, i], bits = _without_spikes(sound[name], i, signals, cells, vehicle.sensors)
         faults |= bits << i
-    calm = {name: np.where(extra.any(axis=1), np.nan, column) for name, column in sound.items()}
+    calm: dict[str, Any] = {name: np.where(extra.any(axis=1), np.nan, column) for name, column in sound.items()}
     dead, told = _dead(cells_of(replace(signals, **calm)), turning, vehicle)
     for i, name in enumerate(COLUMNS):
         sound[name][dead[cells.of_stamp, i]] = np.nan

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.columns import median_known
@@ -58,7 +59,7 @@ _SCORED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2")
 _FRICTION = "friction"
 _AY_DERIVED = "smoothing derivative of v_y plus v_x times yaw rate plus g sin(roll), without body roll"
 _AY_UNKNOWN = "not scored: needs a mapped a_y, or an attitude with roll and the car's roll gradient"
-_CHUNK = 16384
+_CHUNK = 4096
 _ANGLES = frozenset({"yaw_rad", "course_rad", "sideslip_rad"})
 _NED_TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _FRD_TO_FLU = np.diag([1.0, -1.0, -1.0])
@@ -562,12 +563,10 @@ def _turn(matrix: FloatArray, vectors: FloatArray) -> FloatArray:
 
 
 def cubic_equations(u: FloatArray) -> tuple[list[FloatArray], FloatArray]:
-    """Return the powers 0 to 6 of times [N, k], each [N, k], and the normal matrices [N, 4, 4] of a cubic in them."""
-    powers = [np.ones_like(u)]
-    for _ in range(6):
-        powers.append(powers[-1] * u)
-    moments = [p.sum(axis=1) for p in powers]
-    return powers, np.stack([np.stack([moments[i + j] for j in range(4)], axis=1) for i in range(4)], axis=1)
+    """Return the powers 0 to 3 of times [N, k], each [N, k], and the normal matrices [N, 4, 4] of a cubic in them."""
+    powers = [np.ones_like(u), u, u * u, u * u * u]
+    moments = [np.einsum("nk,nk->n", powers[i // 2], powers[i - i // 2]) for i in range(7)]
+    return powers, np.stack([np.stack(moments[i : i + 4], axis=1) for i in range(4)], axis=1)
 
 
 def differentiate(
@@ -585,19 +584,18 @@ def differentiate(
     gaps = np.concatenate([[0], np.cumsum(np.diff(stamps_ns) > max_gap_ns)])
     missing_before = np.concatenate([[0], np.cumsum(~np.isfinite(values))])
     whole = (gaps[2 * h :] == gaps[: n - 2 * h]) & (missing_before[2 * h + 1 :] == missing_before[: n - 2 * h])
-    centres = np.flatnonzero(whole) + h
-    offsets = np.arange(-h, h + 1)
-    for start in range(0, centres.shape[0], _CHUNK):
-        centre = centres[start : start + _CHUNK]
-        window = centre[:, None] + offsets
-        t = (stamps_ns[window] - stamps_ns[centre][:, None]) * 1e-9
-        span = np.abs(t).max(axis=1)
-        u = t / span[:, None]
-        y = values[window] - values[centre][:, None]
+    firsts = np.flatnonzero(whole)
+    times, samples = (sliding_window_view(column, 2 * h + 1) for column in (stamps_ns, values))
+    for start in range(0, firsts.shape[0], _CHUNK):
+        first = firsts[start : start + _CHUNK]
+        centre = first + h
+        t = (times[first] - stamps_ns[centre][:, None]) * 1e-9
+        span = np.maximum(t[:, -1], -t[:, 0])
+        y = np.asarray(samples[first] - values[centre][:, None], np.float64)
         if angle:
             y = wrap_angle(y)
-        powers, normal = cubic_equations(u)
-        right = np.stack([(powers[i] * y).sum(axis=1) for i in range(4)], axis=1)
+        powers, normal = cubic_equations(t / span[:, None])
+        right = np.stack([np.einsum("nk,nk->n", power, y) for power in powers], axis=1)
         slope[centre] = np.linalg.solve(normal, right[:, :, None])[:, 1, 0] / span
     return slope
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pdhef_logtool.evaluation.metrics import MetricRow
@@ -96,15 +95,6 @@ def _figures(rows: Iterable[tuple[str, str, str, str, str, float | None, int]]) 
         if "~" not in name and name not in (SENSORS, TRUTH, REFERENCE):
             names.setdefault(log, {})[name] = None
     return Figures(values, {log: list(of_log) for log, of_log in names.items()})
-
-
-def figures_of_table(path: Path) -> Figures:
-    """Return all figures of a small metrics.parquet without Polars, whose import takes longer than the file."""
-    import pyarrow.parquet as pq
-
-    columns = ("log", "estimator", "signal", "segment", "metric", "value", "n")
-    table = pq.read_table(path, columns=list(columns))
-    return _figures(zip(*(table[c].to_pylist() for c in columns), strict=True))
 
 
 def figures_of_file(metrics: pl.LazyFrame, plan: ValidationPlan, mains: Iterable[str | None]) -> Figures:

@@ -28,10 +28,10 @@ BRIEF_BLOCKS = 12
 
 def read_validation_plan(file: Path | None, junit: Path | None) -> ValidationPlan:
     """Return the plan of a file or the default one; raises UsageError when it is wrong or missing for ``junit``."""
-    from pdhef_logtool.evaluation.validation_plan import load_plan
-    from pdhef_logtool.results.plan_against import other_runs
-
     if file is not None:
+        from pdhef_logtool.evaluation.validation_plan import load_plan
+        from pdhef_logtool.results.plan_against import other_runs
+
         plan = load_plan(file)
         other_runs(plan, ())  # a missing one ends the command before the work
         return plan
@@ -70,12 +70,13 @@ def judge_drive(
     space: OperatingSpace,
 ) -> dict[str, Any]:
     """Return the entries of report.json on one drive: verdicts of a plan file, blocks of time, operating space."""
+    entries = {"requirement_blocks": jsonable(blocks), "operating_space": jsonable(space)}
+    if not plan.file:
+        return {"plan": None, **entries}
     from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
 
-    entries = {"requirement_blocks": jsonable(blocks), "operating_space": jsonable(space)}
     judged = JudgedDrive(drive.name, main, lambda: entries, {"car": drive.car.vehicle.name})
-    verdicts = plan_verdicts(plan, figures_of_rows(rows), [judged]).to_dict() if plan.file else None
-    return {"plan": verdicts, **entries}
+    return {"plan": plan_verdicts(plan, figures_of_rows(rows), [judged]).to_dict(), **entries}
 
 
 def judge(
@@ -85,17 +86,18 @@ def judge(
 
     ``metrics``: the file with the figures of all logs, None: they are in memory. A log that failed has no figures.
     """
-    from pdhef_logtool.results.plan_against import judged_drive, other_runs
-    from pdhef_logtool.results.plan_verdicts import figures_of_file, figures_of_rows, figures_of_table, plan_verdicts
-
     done = [r for r in results if r.outcome.failed is None or r.document is not None]
     if not plan.file and len(done) < LEAST_DRIVES:
         return None
+    from pdhef_logtool.results.parquet_sink import read_metrics
+    from pdhef_logtool.results.plan_against import judged_drive, other_runs
+    from pdhef_logtool.results.plan_verdicts import figures_of_file, figures_of_rows, plan_verdicts
+
     drives = [judged_drive(r.opened, partial(_report, r)) for r in done]
     if metrics is None:
         figures = figures_of_rows(row for r in done for row in r.rows)
     elif len(done) <= FEW_LOGS:
-        figures = figures_of_table(metrics)
+        figures = figures_of_rows(read_metrics(metrics))
     else:
         import polars as pl
 
@@ -110,8 +112,8 @@ def _report(result: LogResult) -> Mapping[str, Any] | None:
 
 def write_verdicts(junit: Path | None, verdicts: PlanVerdicts | None, results: Sequence[LogResult]) -> None:
     """Write JUnit XML if ``junit`` is a file; raises OutputError."""
-    from pdhef_logtool.results.junit import write_junit
-
     if junit is not None and verdicts is not None:
+        from pdhef_logtool.results.junit import write_junit
+
         checks = {r.outcome.log: (r.report or {}).get("checks", ()) for r in results}
         write_junit(junit, verdicts, checks)

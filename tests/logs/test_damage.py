@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.writer import CompressionType, IndexType
 from recorded import numeric_paths
 
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import PdhefError
+from tests.mcap_files import mcap_writer
 
 T0 = 1_700_000_000_000_000_000
 N = 400
@@ -33,33 +36,21 @@ def _mcap(folder: Path) -> bytes:
     return path.read_bytes()
 
 
-def _mcap_of_another_writer(folder: Path) -> bytes:
-    from mcap.writer import CompressionType, Writer
-
-    path = folder / "other.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=2000, compression=CompressionType.LZ4)
-        writer.start()
-        schema = writer.register_schema("T", "jsonschema", b'{"type": "object"}')
-        channel = writer.register_channel("/t", "json", schema)
+def _json_log(folder: Path, **options: Any) -> Path:
+    path = folder / "log.mcap"
+    with mcap_writer(path, chunk_size=2000, **options) as writer:
+        channel = writer.register_channel("/t", "json", writer.register_schema("T", "jsonschema", b"{}"))
         for i in range(N):
-            writer.add_message(channel, T0 + i, b'{"a": %d}' % i, T0 + i, i)
-        writer.finish()
-    return path.read_bytes()
+            writer.add_message(channel, T0 + i, b'{"a": %03d}' % (100 + i), T0 + i, i)
+    return path
+
+
+def _mcap_of_another_writer(folder: Path) -> bytes:
+    return _json_log(folder, compression=CompressionType.LZ4).read_bytes()
 
 
 def _mcap_of_a_killed_recorder(folder: Path) -> bytes:
-    from mcap.writer import CompressionType, IndexType, Writer
-
-    path = folder / "killed.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=2000, compression=CompressionType.ZSTD, index_types=IndexType.NONE)
-        writer.start()
-        channel = writer.register_channel("/t", "json", writer.register_schema("T", "jsonschema", b"{}"))
-        for i in range(N):
-            writer.add_message(channel, T0 + i, b'{"a": %d}' % i, T0 + i, i)
-        writer.finish()
-    return path.read_bytes()
+    return _json_log(folder, compression=CompressionType.ZSTD, index_types=IndexType.NONE).read_bytes()
 
 
 def _bag(folder: Path) -> bytes:
@@ -216,16 +207,7 @@ def test_a_damaged_record_length_costs_at_most_what_the_summary_does_not_describ
 
 
 def test_a_byte_that_only_the_crc_shows_costs_its_chunk(tmp_path: Path) -> None:
-    from mcap.writer import CompressionType, Writer
-
-    path = tmp_path / "plain.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=2000, compression=CompressionType.NONE)
-        writer.start()
-        channel = writer.register_channel("/t", "json", writer.register_schema("T", "", b""))
-        for i in range(N):
-            writer.add_message(channel, T0 + i, b'{"a": %03d}' % (100 + i), T0 + i, i)
-        writer.finish()
+    path = _json_log(tmp_path, compression=CompressionType.NONE)
     content = path.read_bytes()
     path.write_bytes(content.replace(b'{"a": 350}', b'{"a": 950}'))
     log = open_log(path)

@@ -79,7 +79,6 @@ DIALECTS = {
         _csv([f"2312,{302418 - 43200 + t:.2f}" for t in TIME_S], "GPS_Week,tow," + _HEAD.partition(",")[2]).encode(),
         DAY_NS,
     ),
-    "duplicates": (_csv(SECONDS, "time,ay [m/s²],speed (km/h)").encode(), RELATIVE_NS),
     "units-and-sources": (
         b"made by a phone\nFormat,3\n\n"
         + _csv([f"{t:.2f},7" for t in TIME_S], "time,lap,ay,speed\ns,,m/s\xc2\xb2,km/h\n,,100: acc,calc").encode(

@@ -12,7 +12,6 @@ import numpy as np
 import polars as pl
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from pdhef_logtool.mapping.records import Mapping, SignalSource
 from pdhef_logtool.records.errors import UsageError
@@ -20,6 +19,7 @@ from pdhef_logtool.results.no_position import topics_with_position
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import Schedule, run_logs
 from tests.fake_drive_log import FakeLog, FakeTopic
+from tests.mcap_files import mcap_writer
 
 
 def _topics(path: Path) -> set[str]:
@@ -83,9 +83,7 @@ SECRETS = (b"57.1234", b"Hemliga", b"Alice", b"jane", b"to_work", b"/gpx", b"Ope
 def _personal_log(path: Path) -> None:
     """Write 6 s of a drive with places in topics, attachment, metadata and channel metadata."""
     path.parent.mkdir()
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
+    with mcap_writer(path) as writer:
         turn = {"/car": {"speed": 20.0, "steering_wheel_angle": 0.1}, "/imu": {"ax": 0.0, "ay": 1.0, "yaw_rate": 0.05}}
         channels = {}
         for topic, message in (turn | PLACES_IN_JSON).items():
@@ -100,7 +98,6 @@ def _personal_log(path: Path) -> None:
                 writer.add_message(channels[topic], at_ns, json.dumps(moved).encode(), at_ns)
         writer.add_attachment(0, 0, "route/gpx", "text/xml", b'<trkpt lat="57.123456">')
         writer.add_metadata("drive", {"driver": "Alice", "start": "57.123456"})
-        writer.finish()
 
 
 def _all_bytes(folder: Path) -> Iterator[tuple[str, bytes]]:
