@@ -3,8 +3,8 @@
 All gains use the noise of the car's physics: the gain scales the residual only, and ``physics`` has gain 0 and no
 network. The mechanism (docs/method.md#adaptation) does not treat model error as noise.
 
-Bottom layer: the drive marks faults of a_y and yaw rate (:mod:`~.checked_inputs`). Its findings apply to every filter
-here and to the parallel one, and keep bad samples from the network.
+Bottom layer: the drive marks faults of a_y and yaw rate (:mod:`~.checked_inputs`). They apply to every filter here and
+to the parallel one, and keep bad samples from the network.
 
 Top layer: a bank of filters, each a hypothesis about the car's model. F1 assumes that the model with its residual is
 complete; each other filter adds one state: a scale of all forces, or the bank of the road. With both at once, the

@@ -19,7 +19,7 @@ ALL = frozenset({"steer_rad", "ay_m_s2", "friction"})
         ("auto", VEHICLE, ALL, "topic /road.mu"),
         ("auto", VEHICLE, ALL - {"friction"}, "vehicle file, 0.85"),
         ("auto", default_vehicle(), ALL - {"friction"}, "default sedan, 0.85"),
-        ("auto", NO_FRICTION, ALL - {"friction"}, "assumed, 1"),
+        ("auto", NO_FRICTION, ALL - {"friction"}, "no value given, 1"),
         ("file", VEHICLE, ALL, "vehicle file, 0.85"),
         (0.4, VEHICLE, ALL, "option, 0.4"),
     ],
