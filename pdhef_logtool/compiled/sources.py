@@ -24,7 +24,6 @@ _COMPILED = tuple(
 _IMPORT = re.compile(rb"^from ((?:pdhef_logtool|truthsim)[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
 
 
-@cache
 def compiled_sources(root: Path = ROOT) -> Mapping[Path, bytes]:
     """Return the modules with compiled functions and the modules that these import, which contain their constants."""
     texts = {path: path.read_bytes() for package in PACKAGES for path in sorted((root / package).rglob("*.py"))}

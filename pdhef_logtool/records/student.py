@@ -6,7 +6,8 @@ import math
 from functools import cache
 from statistics import NormalDist
 
-_STEPS, _PRECISION = 20, 1e-12
+#: Of Newton's method: largest number of steps, and relative precision.
+STEPS, PRECISION = 20, 1e-12
 
 
 @cache
@@ -17,11 +18,11 @@ def student_quantile(share: float, freedom: float) -> float:
         return t
     t += (t**3 + t) / (4.0 * freedom)
     scale = math.exp(math.lgamma(0.5 * (freedom + 1.0)) - math.lgamma(0.5 * freedom)) / math.sqrt(math.pi * freedom)
-    for _ in range(_STEPS):
+    for _ in range(STEPS):
         density = scale * (1.0 + t * t / freedom) ** (-0.5 * (freedom + 1.0))
         change = (share - _distribution(t, int(freedom))) / density
         t += change
-        if abs(change) < _PRECISION * abs(t):
+        if abs(change) < PRECISION * abs(t):
             break
     return t
 
