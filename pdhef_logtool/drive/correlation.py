@@ -159,7 +159,7 @@ def parabolic_peak(before: float, middle: float, after: float) -> float:
 
 
 def _correlations(grid: CommonGrid, reach: int) -> FloatArray:
-    """Return Pearson's coefficient of a(t) and b(t + k) for k in ± ``reach`` [2 reach + 1], over what both have.
+    """Return Pearson's coefficient of a(t) and b(t + k) for k in ± ``reach`` [2 reach + 1], over the common samples.
 
     NaN where a side does not vary. The sums of products at all shifts are cross-correlations, by Fourier transforms;
     where one factor is 1 and no sample is missing, cumulative sums replace them.

@@ -25,6 +25,7 @@ from pdhef_logtool.drive.delays import LateSensor, late_sensors
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.frames import (
     IS_GRAVITY_M_S2,
+    angle_deg,
     frames_alone,
     frames_check,
     gravity_agrees,
@@ -286,7 +287,7 @@ def _snapped(turn: _Turn) -> FloatArray:
     is_turned &= abs(angles[0] - angles[1]) < max(PARTS_AGREE_DEG, PARTS_AGREE_SHARE * abs(yaw))
     # One of the parts may be a hill.
     first, second = (step @ rotation.T @ up for _, up in parts)
-    *tilts, apart = (_angle_deg(x) for x in (rest[2, 2], first[2], second[2], first @ second))
+    *tilts, apart = (angle_deg(float(x)) for x in (rest[2, 2], first[2], second[2], first @ second))
     if min(tilts) > TURNED_DEG and apart < PARTS_AGREE_DEG:
         from scipy.spatial.transform import Rotation
 
@@ -296,10 +297,6 @@ def _snapped(turn: _Turn) -> FloatArray:
         return step
     c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
     return np.asarray(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ step)
-
-
-def _angle_deg(cosine: float) -> float:
-    return math.degrees(math.acos(float(np.clip(cosine, -1.0, 1.0))))
 
 
 def _parts_of(turn: _Turn) -> list[tuple[float, FloatArray]]:

@@ -591,7 +591,7 @@ def differentiate(
         centre = first + h
         t = (times[first] - stamps_ns[centre][:, None]) * 1e-9
         span = np.maximum(t[:, -1], -t[:, 0])
-        y = samples[first] - values[centre][:, None]
+        y = np.asarray(samples[first] - values[centre][:, None], np.float64)
         if angle:
             y = wrap_angle(y)
         powers, normal = cubic_equations(t / span[:, None])

@@ -46,7 +46,9 @@ class SensorFaults:
     def of(cls, signals: Signals) -> SensorFaults:
         """Return the faults of the signals [N]."""
         extra, names = np.nan_to_num(signals.extra_variance), ("ay_m_s2", "yaw_rate_rad_s")
-        seen = {n: np.where(extra[:, i] > 0.0, np.nan, getattr(signals, n)) for i, n in enumerate(names)}
+        seen: dict[str, Any] = {
+            n: np.where(extra[:, i] > 0.0, np.nan, getattr(signals, n)) for i, n in enumerate(names)
+        }
         return cls(extra, np.nan_to_num(signals.faults).astype(np.int64), signals, replace(signals, **seen))
 
 

@@ -16,9 +16,10 @@ from typing import Literal
 
 import numpy as np
 
+from pdhef_logtool.evaluation.chi_square import chi_square_quantile
 from pdhef_logtool.evaluation.dependence import Dependence, Factors, dependence, deviate
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.records.student import chi_square_quantile, student_quantile
+from pdhef_logtool.records.student import student_quantile
 
 #: With fewer drives, blocks within them are drawn. With fewer blocks, there are no bounds.
 LEAST_DRIVES, LEAST_BLOCKS = 5, 6

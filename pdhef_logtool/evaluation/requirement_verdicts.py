@@ -32,7 +32,7 @@ from pdhef_logtool.evaluation.validation_plan import (
     shown,
 )
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.storage.templates import one_line, template
+from pdhef_logtool.storage.templates import clauses, one_line, template
 
 Outcome: TypeAlias = Literal["PASS", "FAIL", "INCONCLUSIVE"]
 #: Driving that is missing: amount so far (None: unknown), needed amount, and its unit.
@@ -160,7 +160,6 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
     reason = words.reason(case, requirement, bounded, count, lacking, why, sd, share)
     to_do = words.next(case, requirement, bounded, exposure, lacking, remedy, times)
     same = drives[0].estimator if drives and all(d.same for d in drives) else ""
-    notes = words.notes(requirement, bounded, count, estimated, same).split("|")
     value = bounded.value if math.isfinite(bounded.value) else None
     margin = None if value is None else (value - bound if at_least else bound - abs(value))
     return RequirementVerdict(
@@ -179,7 +178,7 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
         _worst(requirement, drives),
         one_line(reason),
         one_line(to_do),
-        tuple(filter(None, map(one_line, notes))),
+        tuple(clauses(words.notes(requirement, bounded, count, estimated, same))),
         bounded.effect.design_effect,
     )
 

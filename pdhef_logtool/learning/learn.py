@@ -7,6 +7,7 @@ give a residual, which is chosen on held-out driving (:mod:`~.teach`).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -127,19 +128,7 @@ def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[s
     records, content = drives.read(read, 0.3)
     teachers = [r.opened for r in content if r.opened is not None]
     if not teachers and config.reference != "on":
-        fits = [None if r.driving is None else fit_car(r.driving, car.vehicle) for r in content]
-        records = tuple(
-            replace(r, left_out=r.left_out if fit is None else fit.refused)
-            for r, fit in zip(records, fits, strict=True)
-        )
-        used = [(fit, r.sensors) for fit, r in zip(fits, content, strict=True) if fit is not None and not fit.refused]
-        refused = "" if used else next((r.left_out for r in records), "no drive")
-        _check(refused, "driving that calibrates the car, such as lane changes and bends")
-        parameters = tuple(p for fit, _ in used for p in for_later_drives(fit))
-        seconds = math.fsum(fit.seconds for fit, _ in used)
-        evidence = f"calibrated without ground truth on {seconds:.0f} s of driving"
-        model = model_of(car, used[0][1], parameters=parameters, evidence=evidence)
-        return records, model, {"self_calibration": [fit.to_dict() for fit, _ in used]}
+        return _without_truth(records, content, car)
     _check("" if teachers else "none", "at least one drive with a true sideslip and the signals of a calibration")
     seconds, slow = math.fsum(d.seconds for d in teachers), car.vehicle.low_speed_blend_m_s
     few = "" if seconds >= LEAST_S else f"{seconds:.1f} s"
@@ -147,6 +136,25 @@ def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[s
     taught = learn_from(teachers, progress)
     sensors = next(r.sensors for r in content if r.opened is not None)
     return records, model_of(car, sensors, **taught.entries), figures_of(taught)
+
+
+def _without_truth(
+    records: Sequence[DriveRecord], content: Sequence[_Read], car: Car
+) -> tuple[tuple[DriveRecord, ...], CarModel, dict[str, Any]]:
+    """Return the records of drives without ground truth, their model, and figures."""
+    fits = [None if r.driving is None else fit_car(r.driving, car.vehicle) for r in content]
+    left_out = [r.left_out if fit is None else fit.refused for r, fit in zip(records, fits, strict=True)]
+    records = tuple(replace(r, left_out=reason) for r, reason in zip(records, left_out, strict=True))
+    used = [(fit, r.sensors) for fit, r in zip(fits, content, strict=True) if fit is not None and not fit.refused]
+    _check(
+        "" if used else next(iter(left_out), "no drive"),
+        "driving that calibrates the car, such as lane changes and bends",
+    )
+    seconds = math.fsum(fit.seconds for fit, _ in used)
+    evidence = f"calibrated without ground truth on {seconds:.0f} s of driving"
+    parameters = tuple(p for fit, _ in used for p in for_later_drives(fit))
+    model = model_of(car, used[0][1], parameters=parameters, evidence=evidence)
+    return records, model, {"self_calibration": [fit.to_dict() for fit, _ in used]}
 
 
 def _check(got: str, expected: str) -> None:

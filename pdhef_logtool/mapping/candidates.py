@@ -176,7 +176,7 @@ class Field:
     def standing_for(self, speed: FloatArray) -> Field:
         """Return a speed on the grid [M] in m/s with a known unit, computed from this field and similar ones."""
         meaning = Meaning("speed", "x", 1.0, "m/s", 1.0, "mean of wheel speeds")
-        seen = Seen(speed, speed, self.seen.rate_hz)
+        seen = Seen.of(speed, speed, self.seen.rate_hz)
         return replace(self, meaning=meaning, seen=seen, factors=(("m/s", 1.0),), sign=1.0, offset=0.0, unit_known=True)
 
     def use(self, unit: str) -> None:
@@ -280,7 +280,7 @@ def look(
         if key in samples:
             size, its = samples[key], samples[key[0], sign]
             values, cells = signed(size.values, its.values), signed(size.cells, its.cells)
-            samples[key] = replace(size, values=values, cells=cells)
+            samples[key] = Seen.of(values, cells, size.rate_hz)
     weighable = [item for entry in named for item in _weighable(log, entry, samples, vendors) if item.factors]
     for item in weighable:
         item.sign_path = signs.get((item.topic.name, item.path), "")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -34,19 +35,36 @@ class Fit:
     correlation: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Seen:
     """Values of a field in the pieces of the log.
 
     Attributes
     ----------
-    values : float64 [N], raw. cells : float64 [M], means on the grid, NaN in empty cells.
-    rate_hz : sample rate while the field is recorded.
+    values : float64 [N], raw. make_grid : returns ``cells`` and ``rate_hz``, which most fields do not need.
     """
 
     values: FloatArray
-    cells: FloatArray
-    rate_hz: float
+    make_grid: Callable[[], tuple[FloatArray, float]]
+
+    @classmethod
+    def of(cls, values: FloatArray, cells: FloatArray, rate_hz: float) -> Seen:
+        """Return computed values with their means on the grid."""
+        return cls(values, lambda: (cells, rate_hz))
+
+    @cached_property
+    def _grid(self) -> tuple[FloatArray, float]:
+        return self.make_grid()
+
+    @property
+    def cells(self) -> FloatArray:
+        """Means on the grid, float64 [M], NaN in empty cells."""
+        return self._grid[0]
+
+    @property
+    def rate_hz(self) -> float:
+        """Sample rate while the field is recorded."""
+        return self._grid[1]
 
     @property
     def largest(self) -> float:
@@ -90,7 +108,8 @@ class Pieces:
                         continue
                     for i, column in enumerate(values.T[:most]):
                         parts.setdefault((topic, f"{path}[{i}]"), []).append((number, cell, column))
-        return {key: self._seen(samples) for key, samples in parts.items()}
+        whole = {key: np.concatenate([column for _, _, column in samples]) for key, samples in parts.items()}
+        return {key: Seen(values, partial(self._on_grid, values, parts[key])) for key, values in whole.items()}
 
     def _columns(self, requests: Mapping[str, Sequence[str]], start: int) -> dict[str, Columns]:
         try:
@@ -101,10 +120,10 @@ class Pieces:
             one_by_one = (self._columns({t: p}, start) for t, p in requests.items())
             return {t: c for samples in one_by_one for t, c in samples.items()}
 
-    def _seen(self, samples: list[tuple[int, IntArray, FloatArray]]) -> Seen:
+    def _on_grid(self, values: FloatArray, samples: list[tuple[int, IntArray, FloatArray]]) -> tuple[FloatArray, float]:
+        """Return the means of the usual values on the grid [M], and the sample rate."""
         total = np.zeros(len(self.starts) * self.cells_a_piece)
         count = np.zeros_like(total)
-        values = np.concatenate([c for _, _, c in samples])
         low, high = _usual(values)
         for number, cell, column in samples:
             use = (column >= low) & (column <= high)
@@ -115,7 +134,7 @@ class Pieces:
         with np.errstate(invalid="ignore", divide="ignore"):
             cells = _filled((total / count).reshape(len(self.starts), -1)).ravel()
         busy = max(1, int(np.count_nonzero(count)))
-        return Seen(values, cells, float(values.shape[0]) / (busy * CELL_NS * 1e-9))
+        return cells, float(values.shape[0]) / (busy * CELL_NS * 1e-9)
 
     def rate_of(self, cells: FloatArray) -> FloatArray:
         """Return the time derivative of values on the grid [M], within each piece."""

@@ -15,7 +15,7 @@ from pdhef_logtool.records.signals import FloatArray
 CLEAR = 0.75
 #: Smallest standard deviation of an acceleration that excites a relation.
 EXCITED_A_M_S2 = 0.25
-#: Standard deviation of the curvature below which a path counts as straight; speed of a car that stands.
+#: Standard deviation of the curvature below which a path counts as straight; speed at standstill.
 EXCITED_CURVATURE_1_M, SLOW_M_S = 0.0001, 1.0
 
 

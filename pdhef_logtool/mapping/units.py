@@ -52,7 +52,7 @@ def posterior(units: Sequence[Sequence[Unit]], gains: Sequence[Gain]) -> FloatAr
     """Return the probabilities [K_1, K_2, ...] of the combinations of the K_i units of each field i.
 
     The logarithm of a gain is normal; if its relation does not apply, it is uniform over a range of four. The
-    probabilities are those of all relations with these units; the rest is that a relation does not apply.
+    probabilities sum to less than 1: the rest is the probability that a relation does not apply.
     """
     grids = np.meshgrid(*(range(len(ways)) for ways in units), indexing="ij")
     factors, spreads, energies = (

@@ -2,9 +2,9 @@
 
 Each choice of columns as speed, yaw rate and accelerations has a likelihood, by the residuals of a_y = v r and a_x = v̇,
 one sample per second, and by the units that explain both slopes. Steering angles compete as r √v and as r alone: the
-yaw rate that they cause grows less than in proportion to speed. A choice that is far likelier than all others is taken.
-The slope of a_x = v̇ gives the units of speed and accelerations; the ratio of both slopes gives the unit of the yaw
-rate. Left and right are not observable.
+yaw rate that they cause grows less than in proportion to speed. The result is the choice that is far likelier than all
+others. The slope of a_x = v̇ gives the units of speed and accelerations; the ratio of both slopes gives the unit of the
+yaw rate. Left and right are not observable.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MOST_UNLABELLED = 40
 MOST_OF_ARRAY = 32
 #: Minimum correlations of a_y with v r and of a_x with v̇, and of both in a choice that competes.
 TURNS, SPEEDS_UP, COMPETES = 0.92, 0.75, 0.6
-#: Powers of the speed in the relation of a_y with the yaw rate, and with signals that are none.
+#: Powers of the speed in the relation of a_y with the yaw rate, and with a steering angle.
 POWERS = (1.0, 0.5, 0.0)
 #: Minimum lead of the log likelihood of a choice.
 DECISIVE = 6.0

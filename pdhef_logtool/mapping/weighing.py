@@ -67,7 +67,7 @@ WHEEL_UNITS = (
     *(Unit(n, f * USUAL_RADIUS_M, "wheel rate", 0.4) for n, f in HYPOTHESES["wheel rate"]),
 )
 IN_SI = {"m/s": 0.0, "km/h": 3.0, "mph": 3.0, "rad/s": 0.0, "rpm": 3.0}
-#: Probability, relative to that of the best unit, of another unit that is a doubt: of wheels, and of a steering angle.
+#: Probability of a unit over the highest one from which the unit is a doubt: of wheels, and of a steering angle.
 POSSIBLE, LIKELY = 0.05, 0.25
 
 
@@ -190,7 +190,7 @@ class _Weighing:
         return usable
 
     def _drop_vectors_over_ground(self) -> None:
-        """Take velocities x, y over ground as those of a receiver; they are no velocities of the body."""
+        """Take velocities x, y over ground as the signals of a receiver; they are no velocities of the body."""
         steps, rates = path_velocity(self.fields), self.fields.open("rate", "z")
         for x, y in list(self._vectors()):
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)

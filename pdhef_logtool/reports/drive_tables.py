@@ -32,7 +32,7 @@ def scores(report: Mapping[str, Any], roles: Roles) -> list[_Table]:
             | {"n": figures[n]["rmse"]["n"]}
             for n in order
         ]
-        table = {"name": LABELS[signal], "heads": [m.head() for m in shown], "rows": rows}
+        table: dict[str, Any] = {"name": LABELS[signal], "heads": [m.head() for m in shown], "rows": rows}
         table["independent"] = signal not in report["truth"]["not_independent"]
         tables += [table | {"unit": read_unit(figures[order[0]]["rmse"]["unit"])[0]}] if order else []
     return tables

@@ -152,6 +152,6 @@ def _section(log: OpenedLog, report: Mapping[str, Any] | None, charts: Charts, *
     for key in (*_FIGURES, *(_POSITIONS if positions else ())):
         if (figure := drawn.figures.get(key)) is not None:
             keys.append(f"{key}-{len(charts.figures)}")
-            timed = isinstance(figure, TimeFigure)
-            charts.figures[keys[-1]] = replace(figure, time=drawn.time()) if timed else figure
+            figure = replace(figure, time=drawn.time()) if isinstance(figure, TimeFigure) else figure
+            charts.figures[keys[-1]] = figure
     return DriveSection(log.label, log.outcome, report, keys)

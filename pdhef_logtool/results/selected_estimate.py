@@ -18,7 +18,7 @@ from pdhef_logtool.evaluation.requirement_bounds import LEAST_BLOCKS, pooled
 from pdhef_logtool.evaluation.validation_plan import SIDESLIP
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.tracks import REFERENCE
-from pdhef_logtool.storage.templates import one_line, template
+from pdhef_logtool.storage.templates import clauses, one_line, template
 
 #: Templates of texts and files of results.
 TEMPLATES = Path(__file__).parent / "templates"
@@ -81,8 +81,8 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
         "consistency": "" if report["truth"]["available"] else words.consistency(main, value),
         "band": words.band(main, intervals, value(main.name, "coverage95")),
         "hindsight": words.hindsight(best, main),
-        "assumed": "; ".join(_clauses(words.assumed(report, main))),
-        "next": "; ".join(_clauses(words.next(report, main))[:_MOST_STEPS]),
+        "assumed": "; ".join(clauses(words.assumed(report, main))),
+        "next": "; ".join(clauses(words.next(report, main))[:_MOST_STEPS]),
     }
     texts = {key: one_line(text) for key, text in texts.items()}
     chosen = {"main" if key == "name" else key: value for key, value in asdict(main).items()}
@@ -134,11 +134,6 @@ def truth_of(report: Report, name: str) -> str:
     words = " ".join(f"{q['source']} {q['derivation']}" for q in parts).replace(",", " ").split()
     topics = dict.fromkeys(w.partition(".")[0] for w in words if w.startswith("/"))
     return f"ground truth: {' and '.join(topics)}" if topics else "ground truth"
-
-
-def _clauses(text: object) -> list[str]:
-    """Return the clauses of a rendered text, which have a bar between them."""
-    return [clause for part in str(text).split("|") if (clause := one_line(part))]
 
 
 def _best_in_hindsight(report: Report, main: MainFacts, figures: _Figures) -> dict[str, Any] | None:

@@ -19,7 +19,7 @@ ALL = frozenset({"steer_rad", "ay_m_s2", "friction"})
         ("auto", VEHICLE, ALL, "topic /road.mu"),
         ("auto", VEHICLE, ALL - {"friction"}, "vehicle file, 0.85"),
         ("auto", default_vehicle(), ALL - {"friction"}, "default sedan, 0.85"),
-        ("auto", NO_FRICTION, ALL - {"friction"}, "assumed, 1"),
+        ("auto", NO_FRICTION, ALL - {"friction"}, "no value given, 1"),
         ("file", VEHICLE, ALL, "vehicle file, 0.85"),
         (0.4, VEHICLE, ALL, "option, 0.4"),
     ],
@@ -27,8 +27,8 @@ ALL = frozenset({"steer_rad", "ay_m_s2", "friction"})
 def test_the_source_is_named(choice, vehicle, available, label):
     source = friction_source(choice, vehicle, available, "/road.mu")
     assert source.label == label
-    assert bool(source.note) == label.startswith("assumed")
-    assert source.is_given is not label.startswith(("assumed", "default sedan"))
+    assert bool(source.note) == label.startswith("no value given")
+    assert source.is_given is not label.startswith(("no value given", "default sedan"))
 
 
 def test_a_file_without_friction_is_refused():

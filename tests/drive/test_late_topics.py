@@ -83,7 +83,7 @@ def test_a_run_of_it_scores_and_calls_nothing_causal(
     code, report, err = run(capsys, tmp_path / "out", late, "--estimators", "zero,phy-ukf")
     assert code == 0
     assert STEERING in err
-    assert [e["causal"] for e in report["estimators"]] == [False] * 3
+    assert [e["causal"] for e in report["estimators"]] == [False] * 2
     assert all("steer_rad read by stamp" in " ".join(e["notes"]) for e in report["estimators"])
     rows = pl.read_parquet(tmp_path / "out/logs/late/estimates.parquet").filter(estimator="phy-ukf")
     assert rows["valid"].mean() > 0.95  # type: ignore[operator]

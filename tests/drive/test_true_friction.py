@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pdhef_logtool.drive.friction import FrictionFrom
 from pdhef_logtool.drive.reading import Drive, friction_of, read_drive
 from pdhef_logtool.evaluation.segments import segment_masks
 from pdhef_logtool.runs.config import RunConfig
@@ -36,7 +37,7 @@ def test_a_friction_of_the_options_and_another_ground_truth_go_before(
 ) -> None:
     with _read(sample_logs_dir, **options) as drive:
         source = friction_of(drive.plan, drive.car.vehicle, drive.options, of_truth=True)
-        assert not source.of_truth
+        assert source.source is not FrictionFrom.TRUTH
 
 
 def test_segments_take_the_friction_of_the_ground_truth_and_estimators_do_not(sample_logs_dir: Path) -> None:

@@ -106,8 +106,8 @@ def test_what_was_assumed_of_car_friction_and_network() -> None:
     unknown = texts(vehicle=UNKNOWN)
     assert unknown["assumed"].startswith("default sedan (no car given)")
     assert unknown["next"].startswith("give your car")
-    assumed = texts(friction={"source": "assumed", "value": 1.0, "topic": None, "given": False})
-    assert "friction not given (assumed, 1);" in assumed["assumed"]
+    assumed = texts(friction={"source": "no value given", "value": 1.0, "topic": None, "given": False})
+    assert "friction assumed (no value given, 1);" in assumed["assumed"]
     assert "--friction" in assumed["next"]
     assert texts(replace(MAIN, name="zero"))["assumed"] == "no vehicle model (zero needs none)"
 

@@ -198,7 +198,7 @@ def test_drives_at_other_lateral_accelerations_inform_less_and_none_leaves_the_p
     far, without = prior_of(RIGHT_FILE, softer, 0.01), prior_of(RIGHT_FILE)
     assert far.file_share == pytest.approx(without.file_share, abs=1e-3)
     near = prior_of(RIGHT_FILE, softer, 8.0)  # the earlier drive contradicts the tyres of the file
-    assert near.file_share < 0.5 * without.file_share
+    assert near.file_share < 0.7 * without.file_share
 
 
 def test_steering_that_does_not_explain_the_yaw_rate_is_refused() -> None:
