@@ -409,10 +409,11 @@ class Run(NamedTuple):
     repeats: float
 
 
-def long_runs(column: FloatArray, cells: Cells, moving: BoolArray, share: float = 0.0, least: int = 2) -> list[Run]:
+def long_runs(column: FloatArray, cells: Cells, moving: BoolArray, share: float = 0.0, least: int = 0) -> list[Run]:
     """Return the repetitions of a column [N] beyond chance in the cells [n] in which the car moves.
 
-    A value repeats if its step is at most a share of the RMS of the steps so far; ``least``: number of equal samples.
+    A value repeats if its step is at most a share of the RMS of the steps so far. With ``least``, a repetition has as
+    many samples, and twice as many as any before.
     """
     rows = np.flatnonzero(np.isfinite(column) & moving[cells.of_stamp])
     cell, step = cells.of_stamp[rows], np.abs(np.diff(column[rows], prepend=math.nan))
@@ -422,15 +423,15 @@ def long_runs(column: FloatArray, cells: Cells, moving: BoolArray, share: float 
     lengths = np.append(starts[1:], len(rows))[: len(starts)] - starts
     repeats = (np.cumsum(same)[starts] + 0.5 * FEW_SAMPLES) / (starts + FEW_SAMPLES)
     chance = np.ceil(1.0 + math.log(CHANCE) / np.log(np.clip(repeats, 1e-3, 0.9999)))
-    needed = np.maximum(chance.astype(int), least)
-    longer = LONGER * np.maximum.accumulate(np.append(1, lengths))[:-1]
+    longest = np.maximum.accumulate(np.append(1, lengths))[:-1]
+    needed = np.maximum(chance.astype(int), np.maximum(least, 2 * longest) if least else 2)
 
     def until(count: IntArray) -> IntArray:
         passed = cell[np.minimum(starts + count, len(rows) - 1)] - cell[starts]
         return np.where(count < lengths, np.maximum(passed, round(LEAST_STUCK_S / CELL_S)), len(cells.speed))
 
     driven_s = CELL_S * np.cumsum(np.diff(cell, prepend=-1) > 0)
-    unseen = np.where(driven_s[starts] > SEEN_S, until(longer), len(cells.speed))
+    unseen = np.where(driven_s[starts] > SEEN_S, until(LONGER * longest), len(cells.speed))
     sure = rows[np.minimum(starts + needed, len(rows)) - 1]
     columns = (rows[starts], rows[starts + lengths - 1] + 1, sure, until(needed), unseen, repeats)
     is_long = (lengths >= needed) & (starts > 0)

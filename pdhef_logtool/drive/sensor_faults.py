@@ -6,8 +6,8 @@ that a model error cannot be interpreted as noise (docs/method.md#faults). For e
 * noise beyond ``BURST_RATIO`` of the usual one, and spikes (:mod:`~.sample_noise`). The excess of the variance is added
   to R in every filter, and the network does not receive the sample. The usual noise is the vehicle file's, or that of
   the log if larger: a rough road is no burst.
-* stuck: at least five identical samples that chance does not explain. A coarse signal is stuck only if the car has
-  turned meanwhile.
+* stuck: at least five identical samples, twice as many as ever before, that chance does not explain. A coarse signal
+  is stuck only if the car has turned meanwhile.
 * dead, with or without noise: three measures of the yaw rate: r, a_y/v_x, and steering times speed. If two agree and
   the third stays near zero, the third is dead.
 
@@ -47,14 +47,14 @@ MOVED_RAD_S = 0.05
 #: channel. The steering is used above a speed.
 WITNESS_RAD_S, WITNESS_NOISE_SIGMAS = 0.06, 5.0
 DEAD_BAND_RAD_S, DEAD_BAND_SIGMAS = 0.008, 2.0
-DEAD_AFTER_S = 0.15
+DEAD_AFTER_S = 0.4
 WITNESS_SPEED_M_S = 6.0
 #: A dead channel recovers if it reads this share of both others for a time, or after a longer time without rotation.
 ALIVE_SHARE, ALIVE_AFTER_S = 0.6, 0.2
 QUIET_RAD_S, QUIET_AFTER_S = 0.03, 1.0
 
-#: Reports. Number of independent samples of a burst, and share of them that is noisy.
-BURST_SAMPLES, BURST_SHARE = 75.0, 0.67
+#: Reports. Number of independent samples of a burst, and share of them with this ratio to the drive's median variance.
+BURST_SAMPLES, BURST_SHARE, LOUD_RATIO = 75.0, 0.8, 6.0
 #: Evidence of a spike at its limit, exponent of its ratio to the limit, and evidence that is forgotten per second, in
 #: nats, against one false alarm in an hour. With a tail of the fourth power and a spike in 45 s (Student's t with 4
 #: degrees) the evidence does not accumulate.
@@ -118,7 +118,9 @@ def _without_spikes(
     noise, usual, beyond = scan(time_s, column[rows], moves, s0, CURVATURE[channel], sensors.imu_span_s)
     extra[rows] = np.where(noise > BURST_RATIO * usual, noise - s0 * s0, 0.0)
     column[rows[beyond > 1.0]] = np.nan
-    faults[rows[_is_burst(time_s, extra[rows] > 0.0, BURST_SAMPLES / sensors.imu_rate_hz)]] |= BURST_AY
+    # A rough car is no burst: its noise is usual.
+    is_loud = noise > LOUD_RATIO * (np.median(noise) if len(rows) else 0.0)
+    faults[rows[_is_burst(time_s, is_loud, BURST_SAMPLES / sensors.imu_rate_hz)]] |= BURST_AY
     faults[rows[_told_spikes(time_s, beyond)]] |= SPIKE_AY
     return extra, faults
 
