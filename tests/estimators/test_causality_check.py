@@ -20,7 +20,7 @@ from pdhef_logtool.estimators.base import Steps, make_steps
 from pdhef_logtool.estimators.causality_check import SHORT_CUT, CausalityCheck
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import Spec
-from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
+from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
@@ -168,26 +168,23 @@ def test_a_run_leaves_out_what_looks_ahead_says_why_and_ends_with_3(
     result = _run(tmp_path / "a", sample_logs_dir, "zero", "peeks", "honest")
     report = result.results[0].report
     outcomes = {e["name"]: e["outcome"] for e in report["estimators"]}
-    assert outcomes == {"zero": "ran", "honest": "ran", "pd-hef": "ran", "peeks": "failed"}
+    assert outcomes == {"zero": "ran", "honest": "ran", "peeks": "failed"}
     failed = next(e for e in report["estimators"] if e["name"] == "peeks")
     assert "causality check" in failed["reason"]
     assert result.exit_code == EXIT_PARTIAL
     assert any("peeks" in text and "causality check" in text for text in result.results[0].outcome.lost)
     assert {r.estimator for r in result.results[0].rows} & {"zero", "honest", "peeks", "physics"} == {"zero", "honest"}
     rows = pl.read_parquet(tmp_path / "a/logs/dlc/estimates.parquet")
-    assert set(rows["estimator"].unique()) == {"zero", "honest", "pd-hef", "selected", "truth"}
+    assert set(rows["estimator"].unique()) == {"zero", "honest", "selected", "truth"}
     sound = _run(tmp_path / "b", sample_logs_dir, "zero", "honest")
     assert sound.exit_code == EXIT_OK
     assert rows.equals(pl.read_parquet(tmp_path / "b/logs/dlc/estimates.parquet"))
 
 
 @pytest.mark.slow
-def test_a_run_of_nothing_else_selects_a_candidate(plugged: None, tmp_path: Path, sample_logs_dir: Path) -> None:
-    result = _run(tmp_path, sample_logs_dir, "peeks")
-    report = result.results[0].report
-    assert result.exit_code == EXIT_PARTIAL and report is not None
-    assert {e["name"]: e["outcome"] for e in report["estimators"]} == {"pd-hef": "ran", "peeks": "failed"}
-    assert report["selected_estimate"] == "pd-hef"
+def test_a_run_of_nothing_else_fails_with_the_reason(plugged: None, tmp_path: Path, sample_logs_dir: Path) -> None:
+    with pytest.raises(EstimatorError, match="causality check"):
+        _run(tmp_path, sample_logs_dir, "peeks")
 
 
 # --- estimators of other packages ------------------------------------------------------------------------------------
@@ -218,7 +215,7 @@ def test_an_estimator_of_another_package_runs_under_its_name(
     result = _run(tmp_path / "out", sample_logs_dir, "zero", "half-slip")
     assert result.exit_code == EXIT_OK
     algorithms = {e["name"]: e["algorithm"]["algorithm"] for e in result.results[0].report["estimators"]}
-    assert algorithms == {"zero": "pass-through", "half-slip": "half-slip", "pd-hef": "adaptive-physics"}
+    assert algorithms == {"zero": "pass-through", "half-slip": "half-slip"}
     rows = pl.read_parquet(tmp_path / "out/logs/dlc/estimates.parquet").filter(pl.col("estimator") == "half-slip")
     valid = rows.filter("valid")
     assert len(valid) > 900

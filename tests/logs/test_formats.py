@@ -194,7 +194,7 @@ def test_a_fleet_of_tables_runs_in_several_processes(package: Path, npz: Path, t
         annotated = open_log(folder / "annotated.mcap")
         assert {t.name for t in annotated.topics} == {"/pdhef/log"} | {
             f"/pdhef/{name}/{kind}"
-            for name in ("phy_ukf", "zero", "pd_hef", "reference")
+            for name in ("phy_ukf", "zero", "reference")
             for kind in ("state", "odometry", "plot", "path")
         }  # fmt: skip
         annotated.close()
