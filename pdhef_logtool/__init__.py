@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig as RunConfig
     from pdhef_logtool.runs.fleet import Schedule as Schedule
     from pdhef_logtool.runs.fleet import run_logs as run  # noqa: F401
-    from pdhef_logtool.runs.frames import choose as choose
     from pdhef_logtool.runs.frames import estimate as estimate
     from pdhef_logtool.runs.frames import score as score
     from pdhef_logtool.runs.inspection import inspect_log as inspect_log
+    from pdhef_logtool.runs.preparing import choose as choose
 
 #: Module of each public name, ``module`` or ``module:name in it``.
 _HOMES = {
@@ -45,7 +45,7 @@ _HOMES = {
     "Reporter": "records.reporter",
     "RunConfig": "runs.config",
     "Schedule": "runs.fleet",
-    "choose": "runs.frames",
+    "choose": "runs.preparing",
     "estimate": "runs.frames",
     "score": "runs.frames",
     "run": "runs.fleet:run_logs",

@@ -144,7 +144,7 @@ def true_values(right: Mapping[str, Any], imu_x_m: float) -> dict[str, float]:
     """
     gain = 1.0 + GRAVITY_M_S2 * right["roll_gradient_rad_per_m_s2"]
     return {
-        **{f"{axle} cornering stiffness": t["B"] * t["C"] * t["D_n"] for axle, t in right["tyres"].items()},
+        "rear cornering stiffness": math.prod(right["tyres"]["rear"][name] for name in ("B", "C", "D_n")),
         "yaw inertia": right["yaw_inertia_kg_m2"],
         "steering ratio": right["steering_ratio"],
         "lever of a_y": imu_x_m,

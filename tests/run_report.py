@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ from jsonschema import Draft202012Validator
 from jsonschema.exceptions import best_match
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.evaluation.standing import Standing
 from pdhef_logtool.results.arrow_schema import load_schema
 from pdhef_logtool.results.run_report import build_report, estimator_entry, tool_versions
 from pdhef_logtool.results.selected_estimate import MainFacts
@@ -59,7 +57,6 @@ def ran(name: str, **changes: Any) -> dict[str, Any]:
 
 def report(
     main: MainFacts | None = MAIN,
-    standings: Sequence[Standing] = (),
     *,
     name: str = "drive",
     vehicle: dict[str, Any] | None = None,
@@ -86,10 +83,10 @@ def report(
         ],
         "truth": TRUTH,
         "model": None,
-        "friction": {"source": "option, 0.9"},
+        "friction": {"source": "option", "value": 0.9, "topic": None, "given": True},
         "self_calibration": None,
         "reference": None,
         "ledger": {"samples": []},
         "versions": tool_versions(),
     }
-    return build_report(content | nothing | changes, main, standings)
+    return build_report(content | nothing | changes, main)

@@ -25,6 +25,7 @@ from pdhef_logtool.car.parts import (
     LearntOn,
     physics_sha256,
 )
+from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file, with_sensors
 from pdhef_logtool.car.vehicle import DEFAULT_VEHICLE_NAME, VehicleParameters, default_vehicle
 from pdhef_logtool.records.errors import VehicleError
@@ -49,23 +50,6 @@ SHOWN_DIGITS = 12
 Place = Path | str | None
 
 
-@dataclass(frozen=True, slots=True)
-class WithoutTruth:
-    """The vehicle as calibrated without ground truth, for one log.
-
-    ``noise`` : of ``physics``. ``note`` : a warning for the reader of the report. ``varied`` : the vehicle one
-    posterior 1-sigma away, in independent directions. ``causal`` : whether it depends on no sample of the log.
-    ``error_scale`` : residual of the sensors after the fit, relative to the assumption of the calibration.
-    """
-
-    vehicle: VehicleParameters
-    noise: FilterNoise
-    note: str
-    varied: tuple[VehicleParameters, ...] = ()
-    causal: bool = False
-    error_scale: float = 1.0
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Car:
     """A vehicle with its identified parts.
@@ -80,7 +64,7 @@ class Car:
     network, network_name : the residual network, None without.
     network_gain : residual gain of ``pd-hef``; None: 1 with a network that was trained with these physics, otherwise 0.
     learnt_on : drives on which ``vehicle`` was identified.
-    self_calibrated : the vehicle as calibrated on the current log, for the estimators that use it; None without.
+    self_calibrated : the posterior of the current drive, for the estimators that use it; None without.
     assumed : missing entries of the file. source : folder or file, None for the default car.
     notes : stale parts, with the reason.
     """
@@ -94,7 +78,7 @@ class Car:
     learnt_on: tuple[LearntOn, ...] = ()
     fitted_physics: FittedPhysics | None = None
     model: CarModel | None = None
-    self_calibrated: WithoutTruth | None = None
+    self_calibrated: Posterior | None = None
     assumed: tuple[AssumedValue, ...] = ()
     source: Path | None = None
     notes: tuple[str, ...] = ()

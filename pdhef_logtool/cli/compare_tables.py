@@ -48,7 +48,8 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
         for line in comparison.differences:
             print_indented(line, console)
     if comparison.changed:
-        console.print(f"\n{comparison.changed} of {sum(comparison.pairs.values())} drives have a changed figure")
+        which = "another changed figure" if comparison.verdict == "equal" else "a changed figure"
+        console.print(f"\n{comparison.changed} of {sum(comparison.pairs.values())} drives have {which}")
     if comparison.figures and not comparison.equal:
         _print_figures(comparison, console)
     if any(f.drives for f in comparison.figures) and not comparison.equal:

@@ -15,7 +15,7 @@ from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
-    from pdhef_logtool.results.gate import Gate
+    from pdhef_logtool.results.gate import Figure
 
 commands = typer.Typer()
 #: Time around events: repeated crossings of a threshold are one event; a clip shows the time before and after.
@@ -67,9 +67,9 @@ def compare(
         [*(Path(x) for x in (a, b) if not is_url(x)), plan], [file for file in (html, junit) if file is not None]
     )
     validation = None if plan is None else load_plan(plan)
-    asked = _gate(validation, max_regression, estimator, metric, allow_unpaired=allow_unpaired)
+    asked = _figures(validation, max_regression, estimator, metric)
     run_a, run_b = open_run(a), open_run(b)
-    comparison = compare_runs(run_a, run_b, asked, cluster=cluster, strict=strict)
+    comparison = compare_runs(run_a, run_b, asked, allow_unpaired=allow_unpaired, cluster=cluster, strict=strict)
     if validation is not None:
         comparison = replace(comparison, requirements=plan_verdicts_against(validation, run_a, run_b, strict=strict))
     for line in comparison.damaged:
@@ -84,31 +84,26 @@ def compare(
     console.finish(comparison, render_comparison, as_json)
 
 
-def _gate(
-    plan: ValidationPlan | None,
-    max_regression: str | None,
-    estimator: str | None,
-    metric: str | None,
-    *,
-    allow_unpaired: bool,
-) -> Gate:
-    """Return the limits from the options; raises UsageError."""
+def _figures(
+    plan: ValidationPlan | None, max_regression: str | None, estimator: str | None, metric: str | None
+) -> tuple[Figure, ...]:
+    """Return the figures to compare by, with their limits, from the options; raises UsageError."""
     from pdhef_logtool.evaluation.units import share_of
-    from pdhef_logtool.results.gate import MAIN, Figure, Gate, figure_problems, figures_of
+    from pdhef_logtool.results.gate import MAIN, Figure, figure_problems, figures_of
 
     single = {"--max-regression": max_regression, "--estimator": estimator, "--metric": metric}
     given = [name for name, value in single.items() if value is not None]
     if plan is not None:
         if given:
             raise UsageError(expected=f"--plan or {given[0]}", got="both", where="--plan")
-        return Gate(figures_of(plan), allow_unpaired)
+        return figures_of(plan)
     limit = None if max_regression is None else share_of(max_regression)
     if max_regression is not None and limit is None:
         raise UsageError(expected="a share such as 5% or 0.05", got=max_regression, where="--max-regression")
     figure = Figure(metric=metric or "rmse", estimator=estimator or MAIN, limit=limit)
     if problems := figure_problems(figure.signal, figure.metric, figure.segment):
         raise UsageError(expected="a figure; lower is better", got="; ".join(problems), where="--metric")
-    return Gate((figure,), allow_unpaired)
+    return (figure,)
 
 
 @options.command(commands)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def render_learning(result: LearnResult, console: Console) -> None:
-    """Print result, assumptions and next step, and the tables of teaching."""
+    """Print result, assumptions and next step, and the table of teaching."""
     used, left_out = len(result.drives), len(result.records) - len(result.drives)
     left = f", {left_out} left out" if left_out else ""
     head = three_lines(
@@ -32,7 +32,7 @@ def render_learning(result: LearnResult, console: Console) -> None:
 
 
 def _teaching(figures: Mapping[str, Any], console: Console) -> None:
-    """Print the tested residual models and priors."""
+    """Print the tested residual models."""
     rungs = table("residual model", ">RMSE °, held-out\nblocks", ">difference °²", ">± 1 se", "outcome")
     for t in figures["rungs"]:
         outcome = "" if not t["against"] else "better" if t["taken"] else "not better"
@@ -40,10 +40,6 @@ def _teaching(figures: Mapping[str, Any], console: Console) -> None:
         against = [cell(t[k] if t["against"] else None, digits=4) for k in ("difference_deg2", "standard_error_deg2")]
         rungs.add_row(t["rung"], cell(t["rmse_deg"], digits=3), *against, outcome)
     console.print(rungs)
-    for p in figures["priors"]:
-        console.print(
-            f"  tyre prior at {p['ay_m_s2']:.1f} m/s²: helps with a probability of {p['support']:.2f} (0: unused)"
-        )
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:

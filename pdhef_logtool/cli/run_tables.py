@@ -100,7 +100,7 @@ def render_run(result: RunResult, console: Console) -> None:
         render_plan(result.requirements, console)
     failed = [r for r, report in reports_by_log if report is None]
     lost = [r for r in result.results if r.outcome.lost]
-    if len(result.results) > 1 or failed:
+    if lost or failed:
         done = f"{len(result.results) - len(failed)} done, {len(failed)} failed, {len(lost)} with input lost"
         console.print(f"{len(result.results)} logs: {done}")
     if result.place is not None:
@@ -126,14 +126,14 @@ def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str])
     if len(result.results) == 1:
         said = (texts[0].get("result") or _recorded(reports[0])) if texts else "the log failed"
     else:
-        said = f"{len(reports)} of {len(result.results)} logs are done{_range(reports)}"
+        said = _range(reports)
     steps = [f"{', '.join(failed[:_MOST_FAILED])} failed: read the cause below"] if failed else []
     steps += dict.fromkeys(c for t in texts for c in _clauses(t, "next"))
     steps = next_steps(None if given is None else given.to_dict(), steps)
     return three_lines(
         said if given is None else Text.assemble(said, "; ", plan_line(given)),
         "; ".join(assumed) or ("differs by log, see below" if len(reports) > 1 else "none"),
-        steps[0] if steps else f"no action needed; pdhef view {result.place or 'OUT'} shows the drive",
+        steps[0] if steps else "no action needed",
     )
 
 
@@ -142,8 +142,8 @@ def _range(reports: Sequence[_Report]) -> str:
     errors = [_figures(r).get((r["answer"]["main"], "sideslip_rad", "all", "rmse")) for r in reports if r["answer"]]
     scored = [e for e in errors if e is not None]
     if not scored:
-        return ", none is scored"
-    return f"; sideslip RMSE {degrees(min(scored))} to {degrees(max(scored))} ({len(scored)} scored)"
+        return f"sideslip of {len(reports)} logs is not scored" if reports else "all logs failed"
+    return f"Sideslip RMSE of {len(scored)} logs: {degrees(min(scored))} to {degrees(max(scored))}"
 
 
 def _recorded(report: _Report) -> str:
@@ -184,7 +184,7 @@ def render_fleet(summary: Mapping[str, Any], console: Console) -> None:
         console.print(spread)
         console.print()
     if summary["worst"]:
-        names = list(dict.fromkeys(n for d in summary["worst"] for n in d["errors_rad"] if n != d["main"]))
+        names = list(dict.fromkeys(n for d in summary["worst"] for n in d["errors_rad"] if n != d["main"]))[:3]
         worst = table("worst drives", "by", ">RMSE °", *(f">{n} °" for n in names), fold=1)
         for drive in summary["worst"]:
             errors = (cell(drive["errors_rad"].get(n), DEGREES, 3) for n in (drive["main"], *names))
@@ -257,14 +257,7 @@ def _print_log(  # positional: two callers in this file
 
 def _texts(report: _Report) -> dict[str, str]:
     """Return the texts of the selected estimate in order; empty without an estimate."""
-    answer = report["answer"]
-    if answer is None:
-        return {}
-    texts, best = dict(answer["texts"]), answer["best_in_hindsight"]
-    if best is not None and best["name"] != answer["main"]:
-        error = degrees(best["sideslip_rmse_rad"])
-        name = best["name"] if best["causal"] else f"{best['name']} (not causal)"
-        texts["hindsight"] = f"{name} has the lowest error by ground truth, {error} RMSE; not used for the selection"
+    texts = (report["answer"] or {"texts": {}})["texts"]
     return {key: texts[key] for key in _TEXTS if texts.get(key)}
 
 

@@ -13,7 +13,7 @@ import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
-from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
+from pdhef_logtool.records.errors import OutputError, UsageError
 
 if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig
@@ -142,19 +142,7 @@ def view(
     web: Annotated[bool, Option("--web", help="Open in the browser, for machines without a display.")] = False,
 ) -> None:
     """Open the recordings of a run in the Rerun viewer."""
-    from pdhef_logtool.results.sink import is_finished_recording
-
-    named = find_recordings(output, log or ())
-    recordings = [path for path in named if path == output or is_finished_recording(path)]
-    damaged = [
-        OutputError(expected="a finished recording", got="a damaged one", where=str(path), remedy="run the log again")
-        for path in named
-        if path not in recordings
-    ]
-    if not recordings:
-        raise damaged[0]
-    for error in damaged:
-        console.warn(str(error))
+    recordings = find_recordings(output, log or ())
     if not web and not console.has_display():
         raise UsageError(
             expected="a display to open the viewer on",
@@ -163,7 +151,7 @@ def view(
             remedy="add --web and open the address that it prints, or copy the .rrd files to a machine with a display",
         )
     console.say(f"opening {recordings[0] if len(recordings) == 1 else f'{len(recordings)} recordings of {output}'}")
-    raise typer.Exit(open_viewer(recordings, web=web) or (EXIT_PARTIAL if damaged else EXIT_OK))
+    raise typer.Exit(open_viewer(recordings, web=web))
 
 
 def _finish(result: RunResult, as_json: bool) -> NoReturn:
@@ -179,7 +167,7 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
         console.show(summary, render_fleet, as_json)
     else:
         if not as_json:  # the tables read the reports; a copy of all metric rows for the terminal would be unused
-            result = replace(result, results=tuple(replace(entry, figures=()) for entry in result.results))
+            result = replace(result, results=tuple(replace(entry, rows=()) for entry in result.results))
         console.show(result, render_run, as_json)
         for entry in result.results:
             if entry.outcome.failed is not None and entry.report is not None:  # the tables show the others

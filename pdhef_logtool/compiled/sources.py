@@ -10,6 +10,7 @@ import hashlib
 import os
 import re
 import sys
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -17,33 +18,30 @@ from pathlib import Path
 #: The folder that contains the packages: a checkout or ``site-packages``.
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("pdhef_logtool", "truthsim")
-_COMPILED = re.compile(rb"compiled\.cache import njit|numba\.extending import register_jitable")
+_COMPILED = tuple(
+    b"%s import %s" % names for names in ((b"compiled.cache", b"njit"), (b"numba.extending", b"register_jitable"))
+)
 _IMPORT = re.compile(rb"^from ((?:pdhef_logtool|truthsim)[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
 
 
 @cache
-def compiled_sources(root: Path = ROOT) -> tuple[Path, ...]:
+def compiled_sources(root: Path = ROOT) -> Mapping[Path, bytes]:
     """Return the modules with compiled functions and the modules that these import, which contain their constants."""
-    compiled = [
-        (path, text)
-        for package in PACKAGES
-        for path in sorted((root / package).rglob("*.py"))
-        if _COMPILED.search(text := path.read_bytes())
-    ]
-    sources = {path for path, _ in compiled}
-    for _, text in compiled:
-        for module, in_brackets, on_the_line in _IMPORT.findall(text):
+    texts = {path: path.read_bytes() for package in PACKAGES for path in sorted((root / package).rglob("*.py"))}
+    sources = {path for path, text in texts.items() if any(mark in text for mark in _COMPILED)}
+    for path in tuple(sources):
+        for module, in_brackets, on_the_line in _IMPORT.findall(texts[path]):
             place = root.joinpath(*module.decode().split("."))
             names = re.findall(r"\w+", (in_brackets or on_the_line).decode()) if place.is_dir() else []
-            sources |= {f for f in (place.with_suffix(".py"), *(place / f"{n}.py" for n in names)) if f.is_file()}
-    return tuple(sorted(sources))
+            sources |= {f for f in (place.with_suffix(".py"), *(place / f"{n}.py" for n in names)) if f in texts}
+    return {path: texts[path] for path in sorted(sources)}
 
 
 def sources_digest(root: Path = ROOT) -> str:
     """Return the digest of the sources, and of the versions of the compiler."""
     digest = hashlib.sha256(f"numba {version('numba')}, llvmlite {version('llvmlite')}\n".encode())
-    for path in compiled_sources(root):
-        digest.update(f"{path.relative_to(root).as_posix()}\n".encode() + hashlib.sha256(path.read_bytes()).digest())
+    for path, text in compiled_sources(root).items():
+        digest.update(f"{path.relative_to(root).as_posix()}\n".encode() + hashlib.sha256(text).digest())
     return digest.hexdigest()[:16]
 
 

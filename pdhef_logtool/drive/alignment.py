@@ -1,7 +1,6 @@
 """From channels on their own clocks to :class:`~pdhef_logtool.records.signals.Signals` on the IMU's stamps.
 
-A plan is made once per log from the first ten minutes; :func:`align` applies it to the whole drive or to a part of it.
-No rule needs samples beyond ``AlignmentPlan.margin_ns``.
+A plan is made once per log from the first ten minutes; :func:`align` applies it to the whole drive.
 
 Rules
 -----
@@ -25,6 +24,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.geometry import WGS84_A_M
 from pdhef_logtool.records.signals import (
@@ -53,7 +53,7 @@ SURVEY_S = 600.0
 #: A gap is more than this many median periods, and more than ``MIN_GAP_S``.
 GAP_PERIODS = 5.0
 MIN_GAP_S = 0.1
-#: Never bridged, however slow the channel: it bounds ``margin_ns``.
+#: Never bridged, however slow the channel.
 LONGEST_GAP_S = 10.0
 #: Assumed for a channel that shows fewer than two samples in the survey.
 UNKNOWN_PERIOD_S = 0.1
@@ -61,7 +61,7 @@ UNKNOWN_PERIOD_S = 0.1
 LATE_NEIGHBOURHOOD_S = 1.0
 #: Jitter below this is never lateness.
 MIN_LATE_S = 0.05
-#: How far delays may drift away from the survey's before samples count as missing; it bounds ``margin_ns``.
+#: How far delays may drift away from the survey's before samples count as missing.
 DELAY_DRIFT_S = 2.0
 #: Share of stamps that must coincide for two channels to be on one clock.
 SAME_CLOCK_SHARE = 0.9
@@ -105,11 +105,6 @@ class ChannelPlan:
     max_gap_s: float
     clock: Clock = "arrival"
 
-    @property
-    def max_delay_s(self) -> float:
-        """Delay beyond which a sample counts as missing regardless of its neighbours."""
-        return self.delay_s + self.late_limit_s + DELAY_DRIFT_S
-
 
 @dataclass(frozen=True, slots=True)
 class AlignmentPlan:
@@ -148,38 +143,31 @@ class AlignmentPlan:
         speed_from = _speed_source({c.target for c in channels})
         return replace(self, channels=channels, unused=tuple(sorted(unused.items())), speed_from=speed_from)
 
-    @property
-    def margin_ns(self) -> int:
-        """Duration before ``start_ns`` and after ``end_ns`` that :func:`align` needs in addition."""
-        gap_s = max((c.max_gap_s for c in self.channels), default=0.0)
-        delay_s = max((c.max_delay_s for c in self.channels), default=0.0)
-        return _ns(gap_s + delay_s) + _ns(gap_s + LATE_NEIGHBOURHOOD_S + delay_s)
-
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as JSON-able dictionaries and lists."""
         return {**jsonable(self), "unused": dict(self.unused)}
 
 
-def plan_alignment(channels: Mapping[str, Channel], *, steering_ratio: float, wheel_radius_m: float) -> AlignmentPlan:
-    """Decide clock, method, gaps and lateness of every channel from the first ``SURVEY_S`` seconds.
+def plan_alignment(channels: Mapping[str, Channel], vehicle: VehicleParameters) -> AlignmentPlan:
+    """Decide clock, method, gaps and lateness of every channel.
 
     The grid channel is the first of yaw rate, a_y, a_x with a rate within a factor 2 of the fastest of them.
 
     Parameters
     ----------
-    channels : every mapped signal by name, even if it has no sample in the survey.
-    steering_ratio : steering-wheel angle over road-wheel angle. wheel_radius_m : m.
+    channels : every mapped signal by name, with its samples in the survey, if any.
+    vehicle : its steering ratio and wheel radius are used.
 
     Raises
     ------
     MappingError : No IMU channel has two samples in the survey, so that there is no grid.
     """
-    survey = _cut_to_survey(with_gnss_velocity(channels))
+    survey = with_gnss_velocity(channels)
     periods = {name: _median_period_s(c) for name, c in survey.items()}
     grid = _grid_channel(periods)
     grid_period = periods[grid]
     assert grid_period is not None
-    chosen, unused = _choose_sources(survey, steering_ratio, wheel_radius_m)
+    chosen, unused = _choose_sources(survey, vehicle)
     plans = tuple(
         _plan_channel(survey[name], target, scale, survey[grid], grid_period)
         for name, (target, scale) in sorted(chosen.items())
@@ -205,8 +193,8 @@ def no_alignment(channels: Mapping[str, Channel]) -> AlignmentPlan:
     return AlignmentPlan("", (), float("nan"), (), unused, "none")
 
 
-def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, end_ns: int) -> Signals:
-    """Bring the channels to the grid stamps in [start_ns, end_ns).
+def align(channels: Mapping[str, Channel], plan: AlignmentPlan) -> tuple[Signals, dict[str, int]]:
+    """Bring the channels to the stamps of the grid, and count the late samples of each channel that has some.
 
     Measurements are used once. ``exact``: the sample has the stamp of the grid. ``interpolate``: the value at a grid
     stamp lies between the samples before and after; it is missing if the previous grid stamp has used the same sample
@@ -217,56 +205,46 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
 
     ``ready_ns`` is the availability time of each step: the running maximum of the stamp and of the arrivals of all
     samples used there (both neighbours of an interpolation). An estimator cannot finish step k before ``ready_ns[k]``.
-
-    Parameters
-    ----------
-    channels : with the samples within ``plan.margin_ns`` before ``start_ns`` and after ``end_ns``, if the log contains
-        them. A channel without samples may be absent.
+    A channel without samples may be absent.
     """
-    margin, channels = plan.margin_ns, with_gnss_velocity(channels)
-    usable = {
-        p.name: _without_late(channels[p.name].between(start_ns - margin, end_ns + margin), p)
-        for p in plan.channels
-        if p.name in channels
-    }
-    stamps = _grid_stamps(channels, plan, start_ns - margin, end_ns)
-    columns = {p.target: np.full(stamps.shape[0], np.nan) for p in plan.channels}
-    ready, gnss_ready = stamps.copy(), stamps.copy()
-    for p in plan.channels:
-        if p.name in usable and stamps.size:
-            values, arrival = _to_grid(usable[p.name], p, stamps, _ns(_max_gap_s(plan.grid_period_s)))
-            columns[p.target] = p.scale * values if p.scale != 1.0 else values
-            if p.name.startswith(GNSS):
-                np.maximum(gnss_ready, arrival, out=gnss_ready)
-            if p.name not in _TILT_RATES and (not p.name.startswith(GNSS) or plan.speed_from == "GNSS"):
-                np.maximum(ready, arrival, out=ready)
-    ready = np.maximum.accumulate(ready)
-
-    inside = slice(int(np.searchsorted(stamps, start_ns)), None)
+    channels = with_gnss_velocity(channels)
+    stamps = _grid_stamps(channels, plan)
     missing = np.full(stamps.shape[0], np.nan)
+    columns = {p.target: missing for p in plan.channels}
+    ready, gnss_ready = stamps.copy(), stamps.copy()
+    late: dict[str, int] = {}
+    for p in plan.channels:
+        if p.name not in channels or not stamps.size:
+            continue
+        is_late = _is_late(channels[p.name], p)
+        if is_late.any():
+            late[p.name] = int(np.count_nonzero(is_late))
+        values, arrival = _to_grid(channels[p.name].take(~is_late), p, stamps, _ns(_max_gap_s(plan.grid_period_s)))
+        columns[p.target] = p.scale * values
+        if p.name.startswith(GNSS):
+            np.maximum(gnss_ready, arrival, out=gnss_ready)
+        if p.name not in _TILT_RATES and (not p.name.startswith(GNSS) or plan.speed_from == "GNSS"):
+            np.maximum(ready, arrival, out=ready)
+
     wheels = np.stack([columns.get(f"wheel_speed_{w}_m_s", missing) for w in WHEELS], axis=1)
     velocity = gnss_velocity(columns) if plan.has_gnss else np.full((stamps.shape[0], 2), np.nan)
     if plan.speed_from == "wheel speeds":
-        speed = combine_wheel_speeds(wheels)
+        columns["speed_m_s"] = combine_wheel_speeds(wheels)
     elif plan.speed_from == "GNSS":
-        speed = np.hypot(velocity[:, 0], velocity[:, 1])
-    else:
-        speed = columns.get("speed_m_s", missing)
-
-    made = {name: columns.get(name, missing)[inside].copy() for name in (*ALIGNED_SIGNALS, *_ALONE)}
-    made["speed_m_s"] = speed[inside].copy()
-    return Signals(
-        stamps_ns=stamps[inside].copy(),
-        ready_ns=ready[inside].copy(),
-        wheel_speed_m_s=wheels[inside].copy(),
+        columns["speed_m_s"] = np.hypot(velocity[:, 0], velocity[:, 1])
+    signals = Signals(
+        stamps_ns=stamps,
+        ready_ns=np.maximum.accumulate(ready),
+        wheel_speed_m_s=wheels,
         available=plan.available,
-        gnss_velocity_m_s=velocity[inside].copy(),
-        gnss_velocity_std_m_s=columns.get("gnss_velocity_accuracy_m_s", missing)[inside].copy(),
-        gnss_late_s=np.where(np.isfinite(velocity[inside, 0]), (gnss_ready - stamps)[inside] * 1e-9, np.nan),
-        gnss_position_deg=np.stack([columns.get(name, missing)[inside] for name in GNSS_POSITION], axis=1),
-        gnss_position_std_m=columns.get("gnss_position_accuracy_m", missing)[inside].copy(),
-        **made,
+        gnss_velocity_m_s=velocity,
+        gnss_velocity_std_m_s=columns.get("gnss_velocity_accuracy_m_s", missing),
+        gnss_late_s=np.where(np.isfinite(velocity[:, 0]), (gnss_ready - stamps) * 1e-9, np.nan),
+        gnss_position_deg=np.stack([columns.get(name, missing) for name in GNSS_POSITION], axis=1),
+        gnss_position_std_m=columns.get("gnss_position_accuracy_m", missing),
+        **{name: columns.get(name, missing).copy() for name in (*ALIGNED_SIGNALS, "speed_m_s", *_ALONE)},
     )
+    return signals, late
 
 
 def gnss_velocity(columns: Mapping[str, FloatArray]) -> FloatArray:
@@ -304,22 +282,6 @@ def with_gnss_velocity(channels: Mapping[str, Channel]) -> Mapping[str, Channel]
     return {**channels, **{n: Channel(n, "m/s", north.source, middle, arrival, v) for n, v in made.items()}}
 
 
-def count_late(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, end_ns: int) -> dict[str, int]:
-    """Count the samples with stamps in [start_ns, end_ns) that arrived too late to be used, by channel name.
-
-    Channels without late samples are left out. ``channels`` as for :func:`align`.
-    """
-    counts = {}
-    for p in plan.channels:
-        if p.name in channels:
-            channel = channels[p.name].between(start_ns - plan.margin_ns, end_ns + plan.margin_ns)
-            inside = (channel.stamps_ns >= start_ns) & (channel.stamps_ns < end_ns)
-            late = int(np.count_nonzero(_is_late(channel, p) & inside))
-            if late:
-                counts[p.name] = late
-    return counts
-
-
 def combine_wheel_speeds(wheel_speed_m_s: FloatArray) -> FloatArray:
     """Combine wheel speeds [N, 4] (fl, fr, rl, rr; NaN = missing) into one speed [N] in m/s.
 
@@ -345,13 +307,6 @@ def _ns(seconds: float) -> int:
 def _max_gap_s(period_s: float | None) -> float:
     periods = GAP_PERIODS * (UNKNOWN_PERIOD_S if period_s is None else period_s)
     return min(max(periods, MIN_GAP_S), LONGEST_GAP_S)
-
-
-def _cut_to_survey(channels: Mapping[str, Channel]) -> dict[str, Channel]:
-    starts = [int(c.stamps_ns[0]) for c in channels.values() if len(c)]
-    if not starts:
-        return dict(channels)
-    return {name: c.between(min(starts), min(starts) + _ns(SURVEY_S)) for name, c in channels.items()}
 
 
 def _median_period_s(channel: Channel) -> float | None:
@@ -380,12 +335,12 @@ def _grid_channel(periods: Mapping[str, float | None]) -> str:
 
 
 def _choose_sources(
-    survey: Mapping[str, Channel], steering_ratio: float, wheel_radius_m: float
+    survey: Mapping[str, Channel], vehicle: VehicleParameters
 ) -> tuple[dict[str, tuple[str, float]], dict[str, str]]:
     """Return the aligned column and the scale of every channel used, and the reason for those unused."""
-    alternatives = {"steering_wheel_rad": ("steer_rad", 1.0 / steering_ratio)}
+    alternatives = {"steering_wheel_rad": ("steer_rad", 1.0 / vehicle.steering_ratio)}
     for w in WHEELS:
-        alternatives[f"wheel_speed_{w}_rad_s"] = (f"wheel_speed_{w}_m_s", wheel_radius_m)
+        alternatives[f"wheel_speed_{w}_rad_s"] = (f"wheel_speed_{w}_m_s", vehicle.wheel_radius_m)
     chosen: dict[str, tuple[str, float]] = {}
     unused: dict[str, str] = {}
     for name in survey:
@@ -474,70 +429,50 @@ def _fastest_nearby(stamps_ns: IntArray, delay_ns: IntArray) -> IntArray:
 
 
 def _is_late(channel: Channel, p: ChannelPlan) -> BoolArray:
-    if p.clock == "stamp":
+    delay, limit = channel.arrival_ns - channel.stamps_ns, _ns(p.late_limit_s)
+    if p.clock == "stamp" or not len(channel):
         return np.zeros(len(channel), dtype=np.bool_)
-    delay = channel.arrival_ns - channel.stamps_ns
-    limit = _ns(p.late_limit_s)
-    late = delay > _ns(p.max_delay_s)
-    if len(channel) and int(delay.max() - delay.min()) > limit:
+    late = delay > _ns(p.delay_s + p.late_limit_s + DELAY_DRIFT_S)
+    if int(delay.max() - delay.min()) > limit:
         late |= delay - _fastest_nearby(channel.stamps_ns, delay) > limit
     return late
-
-
-def _without_late(channel: Channel, p: ChannelPlan) -> Channel:
-    if p.clock == "stamp":
-        return replace(channel, arrival_ns=channel.stamps_ns)
-    late = _is_late(channel, p)
-    return channel.take(~late) if late.any() else channel
 
 
 # ---- to the grid ----
 
 
-def _grid_stamps(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, end_ns: int) -> IntArray:
-    """Return the union of the IMU channels' stamps in [start_ns, end_ns), late samples included: time still passes."""
-    present = [channels[name].between(start_ns, end_ns).stamps_ns for name in plan.grid_channels if name in channels]
-    if not present:
-        return np.empty(0, dtype=np.int64)
-    if all(np.array_equal(s, present[0]) for s in present[1:]):
-        return present[0]
-    return np.unique(np.concatenate(present))
+def _grid_stamps(channels: Mapping[str, Channel], plan: AlignmentPlan) -> IntArray:
+    """Return the union of the IMU channels' stamps, late samples included: time still passes."""
+    present = [channels[name].stamps_ns for name in plan.grid_channels if name in channels]
+    return np.unique(np.concatenate([np.empty(0, dtype=np.int64), *present]))
 
 
 def _to_grid(channel: Channel, p: ChannelPlan, grid_ns: IntArray, grid_gap_ns: int) -> tuple[FloatArray, IntArray]:
     """Return values [N] at the grid stamps (NaN = missing) and the latest arrival used [N] (0 = none)."""
     values = np.full(grid_ns.shape[0], np.nan)
     arrival = np.zeros(grid_ns.shape[0], dtype=np.int64)
-    n = len(channel)
+    stamps, n = channel.stamps_ns, len(channel)
     if n == 0:
         return values, arrival
-    stamps = channel.stamps_ns
+    arrived = stamps if p.clock == "stamp" else channel.arrival_ns
     right = np.searchsorted(stamps, grid_ns, side="left")  # first sample at or after
     hit = stamps[np.minimum(right, n - 1)] == grid_ns
     left = np.where(hit, right, right - 1)  # last sample at or before
+    sampled = stamps[np.maximum(left, 0)]
     if p.method == "exact":
         use = hit
     elif p.method == "interpolate":
-        bracketed = (left >= 0) & (right < n)
-        a, b = np.maximum(left, 0), np.minimum(right, n - 1)
-        use = bracketed & (stamps[b] - stamps[a] <= _ns(p.max_gap_s))
+        use = (left >= 0) & (right < n) & (stamps[np.minimum(right, n - 1)] - sampled <= _ns(p.max_gap_s))
         if p.name not in _INPUTS:
-            served = np.zeros_like(use)
-            served[1:] = use[:-1] & (right[1:] == right[:-1])
-            use &= ~served
+            use[1:] &= ~(use[:-1] & (right[1:] == right[:-1]))
     elif p.method == "hold":
-        use = (left >= 0) & (grid_ns - stamps[np.maximum(left, 0)] <= _ns(p.max_gap_s))
+        use = (left >= 0) & (grid_ns - sampled <= _ns(p.max_gap_s))
     else:
-        sampled = stamps[np.maximum(left, 0)]
         use = (left >= 0) & (grid_ns - sampled <= grid_gap_ns)
         use[1:] &= sampled[1:] > grid_ns[:-1]
     i = left[use]
-    values[use] = channel.values[i]
-    arrival[use] = channel.arrival_ns[i]
-    if p.method == "interpolate":
-        j = right[use]
-        step = np.maximum(stamps[j] - stamps[i], 1)
-        share = (grid_ns[use] - stamps[i]) / step
-        values[use] += share * (channel.values[j] - channel.values[i])
-        arrival[use] = np.maximum(channel.arrival_ns[i], channel.arrival_ns[j])
+    j = right[use] if p.method == "interpolate" else i
+    share = (grid_ns[use] - stamps[i]) / np.maximum(stamps[j] - stamps[i], 1)
+    values[use] = channel.values[i] + share * (channel.values[j] - channel.values[i])
+    arrival[use] = np.maximum(arrived[i], arrived[j])
     return values, arrival

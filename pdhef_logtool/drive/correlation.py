@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pdhef_logtool.drive.columns import student
 from pdhef_logtool.drive.interpolation import Bracket
@@ -17,9 +17,8 @@ from pdhef_logtool.records.signals import FloatArray, IntArray
 GAP_PERIODS = 3.0
 #: Bounds of the common grid's step. Finer steps do not improve the result; coarser ones lose the peak.
 MIN_STEP_S, MAX_STEP_S = 0.005, 0.05
-#: Bound of the rounding error of a rough correlation, and least share of a signal's power that is its variance: below
-#: that share, the correlation is computed from exact sums only.
-_ROUGH_ERROR, _LEAST_POWER = 1e-10, 1e-4
+#: Least share of a signal's power that is its variance: below that share, it counts as constant.
+_LEAST_POWER = 1e-9
 #: For the error of a shift: averaging time of both sides, number of blocks, and 1-sigma that stamps and filters of the
 #: two sensors cause (studies/plus_minus.py).
 _ERROR_MEAN_S, _ERROR_BLOCKS, _RESAMPLING_S = 0.2, 10, 2e-4
@@ -68,14 +67,15 @@ class EvenGrid:
 
     def of_a(self, values: FloatArray) -> FloatArray:
         """Return a column [N] of the first signal on the grid, its linear trend removed; NaN in gaps."""
-        return _without_trend(self._a.linear(values))
+        return without_trend(self._a.linear(values))
 
     def of_b(self, values: FloatArray) -> FloatArray:
         """Return a column [M] of the second signal as :meth:`of_a` does."""
-        return _without_trend(self._b.linear(values))
+        return without_trend(self._b.linear(values))
 
 
-def _without_trend(values: FloatArray) -> FloatArray:
+def without_trend(values: FloatArray) -> FloatArray:
+    """Return a column [N] without its linear trend; NaN stays."""
     finite, n = np.flatnonzero(np.isfinite(values)), values.shape[0]
     if finite.size < 2:
         return values
@@ -101,22 +101,13 @@ def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:
     neighbours refines it below the grid's step. NaN when a signal does not vary.
     """
     reach = round(max_shift_s / grid.step_s)
-    if grid.both < 2 or not all(np.nan_to_num(values, nan=0.0).any() for values in (grid.a, grid.b)):
+    every = _correlations(grid, reach)
+    if not np.isfinite(every).any():
         return Shift(float("nan"), float("nan"), False)
-    rough, error = _rough_correlations(grid.a, grid.b, reach)
-    # Candidates: shifts within the rounding error of the largest value, and shifts without a rough value.
-    near = ~(rough + error < np.nanmax(rough - error, initial=-np.inf))
-    exact = {k: _correlation(grid.a, grid.b, k) for k in (np.flatnonzero(near) - reach).tolist()}
-    finite = [k for k, value in exact.items() if np.isfinite(value)]
-    if not finite:
-        return Shift(float("nan"), float("nan"), False)
-    best = max(finite, key=lambda k: (exact[k], -k))
-    if abs(best) == reach:
-        return Shift(best * grid.step_s, exact[best], False)
-    refined = parabolic_peak(
-        *(exact[k] if k in exact else _correlation(grid.a, grid.b, k) for k in (best - 1, best, best + 1))
-    )
-    return Shift((best + refined) * grid.step_s, exact[best], True)
+    best = int(np.nanargmax(every))
+    inside = 0 < best < 2 * reach
+    refined = parabolic_peak(*every[best - 1 : best + 2].tolist()) if inside else 0.0
+    return Shift((best - reach + refined) * grid.step_s, float(every[best]), inside)
 
 
 def shift_error(grid: CommonGrid, shift_s: float) -> float:
@@ -154,8 +145,9 @@ def shift_error(grid: CommonGrid, shift_s: float) -> float:
 
 def has_peak_within(grid: CommonGrid, low_s: float, high_s: float, least: float) -> bool:
     """Return whether the correlation has a peak of ``least`` or more inside a range."""
-    shifts = range(round(low_s / grid.step_s) - 1, round(high_s / grid.step_s) + 2)
-    correlations = np.array([_correlation(grid.a, grid.b, k) for k in shifts])
+    first, last = round(low_s / grid.step_s) - 1, round(high_s / grid.step_s) + 1
+    reach = max(-first, last)
+    correlations = _correlations(grid, reach)[reach + first : reach + last + 1]
     inner = correlations[1:-1]
     return bool(((inner > correlations[:-2]) & (inner >= correlations[2:]) & (inner >= least)).any())
 
@@ -166,26 +158,21 @@ def parabolic_peak(before: float, middle: float, after: float) -> float:
     return float(0.5 * (before - after) / curvature) if curvature < 0 else 0.0
 
 
-def _rough_correlations(a: FloatArray, b: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:
-    """Return :func:`_correlation` at all shifts within ± ``reach`` and its error bound; NaN if rounding is too large.
+def _correlations(grid: CommonGrid, reach: int) -> FloatArray:
+    """Return Pearson's coefficient of a(t) and b(t + k) for k in ± ``reach`` [2 reach + 1], over the common samples.
 
-    Sums of products at all shifts: by Fourier transforms, or by cumulative sums if the other factor is 1.
+    NaN where a side does not vary. The sums of products at all shifts are cross-correlations, by Fourier transforms;
+    where one factor is 1 and no sample is missing, cumulative sums replace them.
     """
-    n, shifts = a.shape[0], np.arange(-reach, reach + 1)
+    n, shifts = grid.a.shape[0], np.arange(-reach, reach + 1)
     size = min(base << max(-(-(n + reach) // base) - 1, 0).bit_length() for base in (1, 3, 5, 9, 15))
     powers = []  # powers 0, 1 and 2 of each signal, 0 where the signal is NaN
-    for values in (_unit_power(a), _unit_power(b)):
+    for values in (_unit_power(grid.a), _unit_power(grid.b)):
         finite = np.isfinite(values)
         values = np.where(finite, values, 0.0)
-        with np.errstate(over="ignore", invalid="ignore"):
-            powers.append((finite.astype(np.float64), values, values * values))
+        powers.append((finite.astype(np.float64), values, values * values))
     whole = reach < n and all(finite.all() for finite, *_ in powers)
-    spectra: dict[tuple[int, int], NDArray[np.complexfloating]] = {}
-
-    def spectrum(side: int, power: int) -> NDArray[np.complexfloating]:
-        if (side, power) not in spectra:
-            spectra[side, power] = np.fft.rfft(powers[side][power], size)
-        return spectra[side, power]
+    spectrum = cache(lambda side, power: np.fft.rfft(powers[side][power], size))
 
     def sums(of_a: int, of_b: int) -> FloatArray:
         if whole and 0 in (of_a, of_b):
@@ -199,11 +186,8 @@ def _rough_correlations(a: FloatArray, b: FloatArray, reach: int) -> tuple[Float
     with np.errstate(divide="ignore", invalid="ignore"):
         sum_a, sum_b = sums(1, 0), sums(0, 1)
         power_a, power_b = sums(2, 0) - sum_a**2 / count, sums(0, 2) - sum_b**2 / count
-        least = np.minimum(power_a, power_b)
-        correlations = (sums(1, 1) - sum_a * sum_b / count) / np.sqrt(power_a * power_b)
-        error = _ROUGH_ERROR * a.shape[0] / least
-        unsure = ~((count >= 2) & (least > _LEAST_POWER * count))
-    return np.where(unsure, np.nan, correlations), np.where(unsure, np.nan, error)
+        shows = (count >= 2) & (np.minimum(power_a, power_b) > _LEAST_POWER * count)
+        return np.where(shows, (sums(1, 1) - sum_a * sum_b / count) / np.sqrt(power_a * power_b), np.nan)
 
 
 def _overlap(n: int, shift: int) -> tuple[slice, slice]:
@@ -212,25 +196,10 @@ def _overlap(n: int, shift: int) -> tuple[slice, slice]:
 
 
 def _unit_power(values: FloatArray) -> FloatArray:
+    """Return values [N] without their mean, divided by their root mean square."""
     finite = np.isfinite(values)
-    finite_values = values if finite.all() else values[finite]
-    with np.errstate(over="ignore"):
-        size = float(np.sqrt(np.mean(np.square(finite_values)))) if finite_values.size else 0.0
-    return values / size if size > 0 and np.isfinite(size) else values
-
-
-def _correlation(a: FloatArray, b: FloatArray, shift: int) -> float:
-    n = a.shape[0]
-    if abs(shift) >= n:
-        return float("nan")
-    x, y = (values[part] for values, part in zip((a, b), _overlap(n, shift), strict=True))
-    both = np.isfinite(x) & np.isfinite(y)
-    if np.count_nonzero(both) < 2:
-        return float("nan")
-    if not both.all():
-        x, y = x[both], y[both]
-    x, y = x - x.mean(), y - y.mean()
-    power = float((x * x).sum()) * float((y * y).sum())
-    # A constant leaves rounding noise after detrending, which must not correlate.
-    floor = (1e-20 * x.size) ** 2
-    return float((x * y).sum()) / power**0.5 if power > floor else float("nan")
+    if not finite.any():
+        return values
+    values = values - values[finite].mean()
+    size = float(np.sqrt(np.mean(np.square(values[finite]))))
+    return values / size if size > 0.0 and math.isfinite(size) else values

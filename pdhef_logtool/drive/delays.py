@@ -8,13 +8,12 @@ pairs also differ by sideslip, pitch and the vehicle's response; they detect onl
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
-from pdhef_logtool.drive.correlation import has_peak_within, on_common_grid
-from pdhef_logtool.drive.truth import differentiate, estimate_truth_latency
+from pdhef_logtool.drive.columns import GRID_S, columns_on_grid, derivative
+from pdhef_logtool.drive.correlation import CommonGrid, find_shift, has_peak_within, shift_error, without_trend
+from pdhef_logtool.drive.truth import MAX_LATENCY_S
 from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
 
 #: Plausible delay of the second of two correct signals relative to the first, s. On simulated and recorded drives the
@@ -30,12 +29,6 @@ MAX_SHIFT_ERROR_S, SURE = 0.015, 4.0
 LEAST_CORRELATION = (0.9, 0.95)
 #: A peak in the plausible range with this share of the highest correlation may be the right one.
 AS_HIGH = 0.8
-#: Both sides are averaged over this time, which shifts neither, and differentiated over this half window.
-SMOOTH_S = 0.1
-DERIVATIVE_S = 0.15
-#: The averages are thinned to this step; a parabola refines the peak.
-THIN_S = 0.04
-LONGEST_STEP_S = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,23 +44,22 @@ class LateSensor:
 def late_sensors(signals: Mapping[str, Channel]) -> tuple[LateSensor, ...]:
     """Return the sensors with late stamps; pairs that do not show a delay are ignored."""
     late: dict[str, LateSensor] = {}
-    for pair in _pairs(signals):
-        first, second = _averaged(pair.first), _averaged(pair.second)
-        shift = estimate_truth_latency(first, second, max_error_s=MAX_SHIFT_ERROR_S)
-        low, high = pair.plausible_s
-        margin = SURE * shift.std_error_s
-        is_plausible = low - margin <= shift.latency_s <= high + margin
-        if is_plausible or not shift.reliable or shift.correlation < LEAST_CORRELATION[pair.exact]:
+    for pair in _pairs(columns_on_grid(signals)):
+        grid = CommonGrid(GRID_S, without_trend(pair.first), without_trend(pair.second))
+        shift, (low, high) = find_shift(grid, MAX_LATENCY_S), pair.plausible_s
+        if not shift.inside or shift.correlation < LEAST_CORRELATION[pair.exact]:
             continue
+        error_s = shift_error(grid, shift.shift_s)
+        beyond_s = max(low - shift.shift_s, shift.shift_s - high)
         # A sine also correlates with itself a period later.
-        grid = on_common_grid(first.stamps_ns, first.values, second.stamps_ns, second.values)
-        if has_peak_within(grid, low, high, AS_HIGH * shift.correlation):
+        if error_s > min(MAX_SHIFT_ERROR_S, beyond_s / SURE) or has_peak_within(
+            grid, low, high, AS_HIGH * shift.correlation
+        ):
             continue
-        name = pair.names[shift.latency_s >= low]
-        beyond_s = max(low - shift.latency_s, shift.latency_s - high)
-        late_ms, sd_ms, low_ms, high_ms = (1e3 * x for x in (shift.latency_s, shift.std_error_s, low, high))
+        name = pair.names[shift.shift_s >= low]
+        late_ms, sd_ms, low_ms, high_ms = (1e3 * x for x in (shift.shift_s, error_s, low, high))
         evidence = f"{pair.text} by {late_ms:.0f} +- {sd_ms:.0f} ms where {low_ms:.0f} to {high_ms:.0f} are plausible"
-        delay_s = abs(shift.latency_s) if pair.exact else beyond_s
+        delay_s = abs(shift.shift_s) if pair.exact else beyond_s
         wheels = tuple(n for n in signals if n.startswith("wheel_speed_")) if name.startswith("wheel_speed_") else ()
         sensor = LateSensor(wheels or (name,), delay_s, pair.exact, evidence)
         late.setdefault(sensor.names[0], sensor)
@@ -84,63 +76,35 @@ class _Pair(NamedTuple):
     """
 
     text: str
-    first: Channel
-    second: Channel
+    first: FloatArray
+    second: FloatArray
     names: tuple[str, str]
     plausible_s: tuple[float, float]
     exact: bool = False
 
 
-def _pairs(signals: Mapping[str, Channel]) -> Iterator[_Pair]:
-    """Yield the pairs of signals that follow one motion."""
-    channels = {n: c for n, c in signals.items() if len(c) > 1}
-    gyro, ax, ay = (channels.get(n) for n in ("yaw_rate_rad_s", "ax_m_s2", "ay_m_s2"))
-    wheels = [c for u in ("m_s", "rad_s") for w in WHEELS if (c := channels.get(f"wheel_speed_{w}_{u}"))]
+def _pairs(columns: Mapping[str, FloatArray]) -> Iterator[_Pair]:
+    """Yield the pairs of columns that follow one motion."""
+    gyro, ax, ay = (columns.get(n) for n in ("yaw_rate_rad_s", "ax_m_s2", "ay_m_s2"))
     for unit in ("m_s", "rad_s"):
-        left, right = (channels.get(f"wheel_speed_r{side}_{unit}") for side in "lr")
-        if gyro and left and right:
-            difference = replace(left, values=_sampled(right, left) - left.values)
+        names = [f"wheel_speed_r{side}_{unit}" for side in "lr"]
+        if gyro is not None and columns.keys() >= {*names}:
             text = "the difference of the rear wheel speeds follows the yaw rate"
-            yield _Pair(text, gyro, difference, (gyro.name, left.name), WHEELS_AFTER_GYRO_S, exact=True)
-    speed = channels.get("speed_m_s") or (wheels[-1] if wheels else None)
-    if speed is None:
+            difference = columns[names[1]] - columns[names[0]]
+            yield _Pair(text, gyro, difference, ("yaw_rate_rad_s", names[0]), WHEELS_AFTER_GYRO_S, exact=True)
+    wheels = [n for u in ("rad_s", "m_s") for w in WHEELS[::-1] if (n := f"wheel_speed_{w}_{u}") in columns]
+    pace = next((n for n in ("speed_m_s", *wheels) if n in columns), "")
+    if not pace:
         return
-    if ax:
-        text = f"the derivative of {speed.name} follows ax_m_s2"
-        yield _Pair(text, ax, _derivative(_averaged(speed)), ("ax_m_s2", speed.name), SPEED_AFTER_A_X_S)
-    if gyro and ay:
+    speed = columns[pace]
+    if ax is not None:
+        yield _Pair(
+            f"the derivative of {pace} follows ax_m_s2", ax, derivative(speed), ("ax_m_s2", pace), SPEED_AFTER_A_X_S
+        )
+    if gyro is not None and ay is not None:
         text = "ay_m_s2 follows yaw_rate_rad_s x speed"
-        yield _Pair(text, _times(gyro, speed), ay, (gyro.name, "ay_m_s2"), A_Y_AFTER_TURNING_S)
-    steer = channels.get("steer_rad") or channels.get("steering_wheel_rad")
-    if gyro and steer:
-        text = f"yaw_rate_rad_s follows {steer.name} x speed"
-        yield _Pair(text, _times(steer, speed), gyro, (steer.name, gyro.name), YAW_RATE_AFTER_STEERING_S)
-
-
-def _times(channel: Channel, speed: Channel) -> Channel:
-    return replace(channel, values=channel.values * _sampled(speed, channel))
-
-
-def _sampled(channel: Channel, other: Channel) -> FloatArray:
-    return np.interp(other.stamps_ns, channel.stamps_ns, channel.values)
-
-
-def _period_s(channel: Channel) -> float:
-    return max(float(np.median(np.diff(channel.stamps_ns))) * 1e-9, 1e-4) if len(channel) > 1 else 1.0
-
-
-def _derivative(channel: Channel) -> Channel:
-    half = max(2, round(DERIVATIVE_S / _period_s(channel)))
-    values = differentiate(channel.stamps_ns, channel.values, half, round(LONGEST_STEP_S * 1e9))
-    return replace(channel, values=values).take(np.isfinite(values))
-
-
-def _averaged(channel: Channel) -> Channel:
-    half = round(SMOOTH_S / _period_s(channel))
-    count = 2 * half + 1
-    if half == 0 or len(channel) < 2 * count:
-        return channel
-    mean = np.convolve(channel.values, np.full(count, 1.0 / count), "valid")
-    thin = max(1, int(THIN_S / _period_s(channel)))
-    inside = slice(half, len(channel) - half)
-    return replace(channel.take(inside), values=mean).take(slice(None, None, thin))
+        yield _Pair(text, gyro * speed, ay, ("yaw_rate_rad_s", "ay_m_s2"), A_Y_AFTER_TURNING_S)
+    steer = next((n for n in ("steer_rad", "steering_wheel_rad") if n in columns), "")
+    if gyro is not None and steer:
+        text = f"yaw_rate_rad_s follows {steer} x speed"
+        yield _Pair(text, columns[steer] * speed, gyro, (steer, "yaw_rate_rad_s"), YAW_RATE_AFTER_STEERING_S)

@@ -1,7 +1,7 @@
 """IMU samples with sensor faults, which are excluded from the relations between signals.
 
-The filters' detector (:mod:`pdhef_logtool.estimators.sensor_faults`) finds them. It cannot distinguish a dead channel
-from a channel in another unit; this module can, because the whole drive is available.
+:mod:`~pdhef_logtool.drive.sensor_faults` finds them. A dead channel with noise may also be in another unit: it counts
+only if it repeats its value.
 """
 
 from __future__ import annotations
@@ -12,14 +12,12 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.alignment import SURVEY_S, align, has_imu, plan_alignment
-from pdhef_logtool.records.reasons import BURST_AY
+from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.reasons import BURST_AY, STUCK_AY
 from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray, IntArray
 
 #: Time excluded on both sides of a faulty sample: a fault starts before its detection, and the low pass spreads it.
 BESIDE_S = 0.3
-#: Averaging time, s. A silent channel's averages change by no more than this share of its usual change.
-MEAN_S = 0.25
-SILENT = 0.2
 #: A burst begins this long before it is reported.
 BURST_S = 1.5
 
@@ -29,14 +27,14 @@ _OTHER = {"ay_m_s2": "yaw_rate_rad_s", "yaw_rate_rad_s": "ay_m_s2"}
 def without_faulty_samples(
     signals: Mapping[str, Channel], vehicle: VehicleParameters
 ) -> tuple[dict[str, Channel], dict[str, float]]:
-    """Return the channels without the samples that are stuck, dead, a spike or in a burst of noise.
+    """Return the channels without the samples that are stuck or in a burst of noise.
 
     Returns
     -------
     channels : without the faulty samples. shares : for each shortened channel, the share of the drive's motion during
         its silent samples.
     """
-    from pdhef_logtool.estimators.sensor_faults import find_faults  # loads the compiler
+    from pdhef_logtool.drive.sensor_faults import without_faults  # loads the compiler
 
     sound = dict(signals)
     if any(n not in signals or not len(signals[n]) for n in _OTHER):
@@ -46,18 +44,15 @@ def without_faulty_samples(
     signals = {n: c.between(middle - reach, middle + reach) for n, c in signals.items()}
     if not has_imu(signals):
         return sound, {}
-    plan = plan_alignment(signals, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m)
-    aligned = align(signals, plan, middle - reach, middle + reach)
-    faults, _ = find_faults(aligned, vehicle, None)
+    aligned, _ = align(signals, plan_alignment(signals, vehicle))
+    checked = without_faults(without_impossible(aligned), vehicle)
     shares: dict[str, float] = {}
     for i, (name, other) in enumerate(_OTHER.items()):
-        finite = np.isfinite(getattr(aligned, name))
-        silent = finite & ~np.isfinite(getattr(faults.filtered, name))
+        finite, faults = np.isfinite(getattr(aligned, name)), checked.faults.astype(np.int64) >> i
+        silent = finite & (faults & STUCK_AY > 0)
         # Rough roads raise the noise too: only reported bursts count.
-        reported = aligned.stamps_ns[faults.reason & (BURST_AY << i) > 0]
-        bursts = finite & (faults.extra_r[:, i] > 0.0) & _beside(aligned.stamps_ns, reported, BURST_S)
-        if silent.any() and _moves(aligned.stamps_ns, getattr(aligned, name), silent):
-            silent &= False
+        reported = aligned.stamps_ns[faults & BURST_AY > 0]
+        bursts = finite & (checked.extra_variance[:, i] > 0.0) & _beside(aligned.stamps_ns, reported, BURST_S)
         if not (bursts | silent).any():
             continue
         shares[name] = _share_of_motion(getattr(aligned, other), silent)
@@ -69,21 +64,6 @@ def without_faulty_samples(
 
 def _topic(channel: Channel) -> str:
     return channel.source.split(".")[0]
-
-
-def _moves(stamps_ns: IntArray, values: FloatArray, silent: BoolArray) -> bool:
-    """Return whether a channel changes in its silent samples as much as elsewhere: it is weak, not silent."""
-    cells = (stamps_ns - stamps_ns[0]) // round(MEAN_S * 1e9)
-    finite = np.isfinite(values)
-    count = np.bincount(cells[finite])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        steps = np.diff(np.bincount(cells[finite], weights=values[finite]) / count)
-    quiet = np.bincount(cells[finite], weights=silent[finite]) == count
-    within = quiet[1:] & quiet[:-1] & np.isfinite(steps)
-    beyond = ~within & np.isfinite(steps)
-    if not within.any() or not beyond.any():
-        return bool(beyond.any())
-    return bool(np.mean(steps[within] ** 2) > SILENT**2 * np.mean(steps[beyond] ** 2))
 
 
 def _share_of_motion(other: FloatArray, faulty: BoolArray) -> float:

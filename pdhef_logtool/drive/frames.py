@@ -106,8 +106,13 @@ def _tilt_deg(placed: Placement, force: FloatArray) -> float | None:
     size = float(np.linalg.norm(force))
     if not IS_GRAVITY_M_S2[0] < size < IS_GRAVITY_M_S2[1]:
         return None
-    return math.degrees(math.acos(float(np.clip(placed.rotation[2] @ force / size, -1.0, 1.0))))
+    return angle_deg(float(placed.rotation[2] @ force) / size)
 
 
 def _between_deg(a: FloatArray, b: FloatArray) -> float:
-    return math.degrees(math.acos(float(np.clip(0.5 * (np.trace(a @ b.T) - 1.0), -1.0, 1.0))))
+    return angle_deg(0.5 * float(np.trace(a @ b.T) - 1.0))
+
+
+def angle_deg(cosine: float) -> float:
+    """Return the angle of a cosine, deg; rounding may exceed 1."""
+    return math.degrees(math.acos(float(np.clip(cosine, -1.0, 1.0))))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.vehicle import DEFAULT_VEHICLE_NAME, VehicleParameters
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.records.signals import Signals
@@ -38,28 +40,59 @@ def parse_friction(text: str | float) -> str | float:
     return value
 
 
+class FrictionFrom(StrEnum):
+    """Where a friction comes from. The ground truth's is for datasets only; estimators of a run never receive it."""
+
+    OPTION = "option"
+    TOPIC = "topic"
+    FILE = "vehicle file"
+    SEDAN = "default sedan"
+    ASSUMED = "no value given"
+    REACHED = "largest lateral acceleration"
+    TRUTH = "ground truth"
+    NONE = "none"
+
+
 @dataclass(frozen=True, slots=True)
 class FrictionSource:
     """Fills in the friction of a run.
 
     Attributes
     ----------
-    label : source of the friction, for the report.
-    note : warning to the user before the run; empty without one.
+    source : where it comes from. value : of the whole drive; None if it varies. topic : of the log, ``/a.b``.
     constant : friction for all estimators; None uses the signals' friction, or else the vehicle file's.
-    assumed : neither option, log nor vehicle file gives a friction.
-    of_truth : uses the friction of the ground truth, for datasets only; estimators of a run never receive it.
     """
 
-    label: str
-    note: str = ""
+    source: FrictionFrom
+    value: float | None = None
+    topic: str = ""
     constant: float | None = None
-    of_truth: bool = False
-    assumed: bool = False
+
+    @property
+    def is_given(self) -> bool:
+        """Whether option, log or vehicle file gives it."""
+        return self.source in (FrictionFrom.OPTION, FrictionFrom.TOPIC, FrictionFrom.FILE, FrictionFrom.TRUTH)
+
+    @property
+    def note(self) -> str:
+        """A warning to the user before the run; empty without one."""
+        if self.source is not FrictionFrom.ASSUMED:
+            return ""
+        return f"friction is assumed, {self.value:g}: neither log nor vehicle file has one; give --friction VALUE"
+
+    @property
+    def label(self) -> str:
+        """Source with value or topic."""
+        value = "" if self.value is None else f", {self.value:.3g}"
+        return f"{self.source} {self.topic}".rstrip() + value
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry ``friction`` of report.json."""
+        return {"source": self.source, "value": self.value, "topic": self.topic or None, "given": self.is_given}
 
     def fill(self, signals: Signals, truth: StateTrack | None = None) -> Signals:
         """Return the signals of a drive [N] with their friction."""
-        if self.of_truth and truth is not None:
+        if self.source is FrictionFrom.TRUTH and truth is not None:
             signals = replace(signals, friction=truth.friction)
         if self.constant is not None:
             return replace(signals, friction=np.full(len(signals), self.constant))
@@ -71,7 +104,7 @@ def friction_source(
 ) -> FrictionSource:
     """Choose the source of a drive's friction.
 
-    ``auto`` uses the friction of the log, otherwise of the vehicle file; without both, 1 is assumed.
+    ``auto`` uses the friction of the log, otherwise of the vehicle file or the default sedan; without, 1 is assumed.
 
     Parameters
     ----------
@@ -82,12 +115,13 @@ def friction_source(
     UsageError : The vehicle file has no friction.
     """
     if not isinstance(choice, str):
-        return FrictionSource(f"option, {choice:g}", constant=choice)
+        return FrictionSource(FrictionFrom.OPTION, choice, constant=choice)
     if choice == "auto" and "friction" in available:
-        return FrictionSource(f"topic {topic}" if topic else "topic")
+        return FrictionSource(FrictionFrom.TOPIC, topic=topic)
     if vehicle.friction is not None:
+        source = FrictionFrom.SEDAN if vehicle.name == DEFAULT_VEHICLE_NAME else FrictionFrom.FILE
         constant = vehicle.friction if "friction" in available else None
-        return FrictionSource(f"vehicle file, {vehicle.friction:g}", constant=constant)
+        return FrictionSource(source, vehicle.friction, constant=constant)
     if choice == "file":
         raise UsageError(
             expected="a vehicle file with friction",
@@ -95,6 +129,4 @@ def friction_source(
             where="--friction file",
             remedy="write friction = ... into the file, or give --friction VALUE",
         )
-    assumed = f"assumed, {vehicle.assumed_friction:g}"
-    note = f"friction is {assumed}: neither log nor vehicle file has one; give --friction VALUE"
-    return FrictionSource(assumed, note, assumed=True)
+    return FrictionSource(FrictionFrom.ASSUMED, vehicle.assumed_friction)

@@ -25,6 +25,7 @@ from pdhef_logtool.drive.delays import LateSensor, late_sensors
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.frames import (
     IS_GRAVITY_M_S2,
+    angle_deg,
     frames_alone,
     frames_check,
     gravity_agrees,
@@ -276,13 +277,18 @@ def _snapped(turn: _Turn) -> FloatArray:
     rotation = turn.rotation
     step = nearest_step(rotation)
     rest = rotation @ step.T
-    tilt = math.degrees(math.acos(float(np.clip(rest[2, 2], -1.0, 1.0))))
-    yaw = math.degrees(math.atan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1]))
     is_precise = turn.correlation >= ASKEW_CORRELATION and turn.error_deg <= ASKEW_ERROR_DEG
     if not is_precise or turn.samples < ASKEW_SAMPLES:
         return step
-    is_turned = abs(yaw) > max(TURNED_DEG, 3.0 * turn.error_deg) and _parts_turned(turn, yaw)
-    if tilt > TURNED_DEG and _parts_tilted(turn):
+    parts = _parts_of(turn)
+    yaw = math.degrees(math.atan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1]))
+    angles = [abs(yaw) - math.copysign(left, yaw * left) for left, _ in parts]
+    is_turned = all(a > TURNED_DEG for a in angles) and abs(yaw) > max(TURNED_DEG, 3.0 * turn.error_deg)
+    is_turned &= abs(angles[0] - angles[1]) < max(PARTS_AGREE_DEG, PARTS_AGREE_SHARE * abs(yaw))
+    # One of the parts may be a hill.
+    first, second = (step @ rotation.T @ up for _, up in parts)
+    *tilts, apart = (angle_deg(float(x)) for x in (rest[2, 2], first[2], second[2], first @ second))
+    if min(tilts) > TURNED_DEG and apart < PARTS_AGREE_DEG:
         from scipy.spatial.transform import Rotation
 
         level_only = Rotation.align_vectors([[0.0, 0.0, 1.0]], [rest[2]])[0].as_matrix()
@@ -293,48 +299,27 @@ def _snapped(turn: _Turn) -> FloatArray:
     return np.asarray(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ step)
 
 
-def _parts_turned(turn: _Turn, yaw_deg: float) -> bool:
-    """Return whether two parts of the drive agree that the sensor is rotated about the vertical.
+def _parts_of(turn: _Turn) -> list[tuple[float, FloatArray]]:
+    """Return, for two parts of the drive, the yaw (deg) that the fit leaves and up [3] in the axes of the rotation.
 
     Steady sideslip rotates the acceleration by an angle that grows with lateral acceleration and curvature. Roll and
-    pitch change the gains of both axes. Each has a regressor; grade and crossfall are part of the constant.
+    pitch change the gains of both axes. Each has a regressor; grade and crossfall are part of the constant. The yaw is
+    NaN if the part does not separate them. Up is the force at zero acceleration.
     """
-    z, lateral = turn.f @ (turn.rotation[0] + 1j * turn.rotation[1]), turn.driven.imag
-    regressors = [turn.driven, turn.driven.conj(), 1j * derivative(turn.rate), lateral**2, turn.rate**2]
-    matrix = np.stack([*regressors, np.ones_like(z)], axis=1)
-    angles = []
+    axes, driven = turn.f @ turn.rotation.T, turn.driven
+    z, ones = axes[:, 0] + 1j * axes[:, 1], np.ones(len(axes))
+    matrix = np.stack([driven, driven.conj(), 1j * derivative(turn.rate), driven.imag**2, turn.rate**2, ones], axis=1)
+    level = np.stack([driven.real, driven.imag, ones], axis=1)
+    parts = []
     for part in halves(len(z)):
         usable = turn.use & part & np.isfinite(matrix).all(axis=1) & np.isfinite(z)
-        size = np.linalg.norm(matrix[usable], axis=0)
-        if independent_samples(int(np.count_nonzero(usable))) < ASKEW_SAMPLES / 2.0 or (size <= 1e-9).any():
-            return False
-        scaled = matrix[usable] / size
-        if np.linalg.cond(scaled) > WELL_CONDITIONED:
-            return False
-        left = np.linalg.lstsq(scaled, z[usable], rcond=None)[0][0]
-        angles.append((yaw_deg - math.degrees(float(np.angle(left)))) * np.sign(yaw_deg))
-    apart_deg = max(PARTS_AGREE_DEG, PARTS_AGREE_SHARE * abs(yaw_deg))
-    return bool(min(angles) > TURNED_DEG and abs(angles[0] - angles[1]) < apart_deg)
-
-
-def _parts_tilted(turn: _Turn) -> bool:
-    """Return whether two parts of the drive agree that the sensor is tilted: one of them may be a hill."""
-    ups = []
-    for part in halves(len(turn.use)):
-        usable = turn.use & part
-        if not usable.any():
-            return False
-        level, driven = turn.rotation @ turn.f[usable].T, turn.driven[usable]
-        # The body rolls and pitches with the accelerations; the tilt is the remainder at zero acceleration.
-        along = [
-            (d, float(np.cov(d, z)[0, 1] / max(float(d.var()), 1e-9)))
-            for d, z in zip((driven.real, driven.imag), level[:2], strict=True)
-        ]
-        mean = level.mean(axis=1) - np.array([*(slope * d.mean() for d, slope in along), 0.0])
-        ups.append(nearest_step(turn.rotation) @ turn.rotation.T @ (mean / max(float(np.linalg.norm(mean)), 1e-9)))
-    first, second = ups
-    tilts = [math.degrees(math.acos(float(np.clip(x, -1.0, 1.0)))) for x in (first[2], second[2], first @ second)]
-    return min(tilts[:2]) > TURNED_DEG and tilts[2] < PARTS_AGREE_DEG
+        size = np.maximum(np.linalg.norm(matrix[usable], axis=0), 1e-9)
+        is_long = independent_samples(int(np.count_nonzero(usable))) >= ASKEW_SAMPLES / 2.0
+        is_separable = is_long and np.linalg.cond(matrix[usable] / size) <= WELL_CONDITIONED
+        gain = np.linalg.lstsq(matrix[usable] / size, z[usable], rcond=None)[0][0] if is_separable else np.nan
+        up = np.linalg.lstsq(level[usable], axes[usable], rcond=None)[0][2] if is_long else np.zeros(3)
+        parts.append((math.degrees(float(np.angle(gain))), up / max(float(np.linalg.norm(up)), 1e-9)))
+    return parts
 
 
 # ------------------------------------------------------------------------------------- into the mapping

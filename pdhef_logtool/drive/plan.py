@@ -102,11 +102,7 @@ def plan_drive(
     if sensors is not None:
         alignment = sensors.alignment
     elif require_imu or has_imu(survey.signals):
-        alignment = plan_alignment(
-            survey.signals,
-            steering_ratio=vehicle.steering_ratio,
-            wheel_radius_m=vehicle.wheel_radius_m,
-        )
+        alignment = plan_alignment(survey.signals, vehicle)
     else:
         alignment = no_alignment(survey.signals)
     # The signals of earlier sensors must not depend on later samples.

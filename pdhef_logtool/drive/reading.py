@@ -10,7 +10,7 @@ from typing import Self
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import CHANGE_SUFFIX, change_checks
-from pdhef_logtool.drive.friction import FrictionSource, friction_source
+from pdhef_logtool.drive.friction import FrictionFrom, FrictionSource, friction_source
 from pdhef_logtool.drive.model_file import CLOCK_START_S, Sensors, is_device_clock, with_earlier_drive
 from pdhef_logtool.drive.options import AS_IT_IS, AUTO, OFF, ReadOptions, time_slice
 from pdhef_logtool.drive.plan import DrivePlan, plan_drive
@@ -377,7 +377,8 @@ def _tell_doubts(plan: DrivePlan, options: ReadOptions, tell: Tell) -> None:
     for name in sorted(unknown):
         tell(f"--waive {name}: no check of this log is called that")
     for channel in (c for c in plan.alignment.channels if c.clock == "stamp"):
-        source = plan.mapping.signals[channel.name].label
+        mapped = plan.mapping.signals.get(channel.name)
+        source = mapped.label if mapped else "from other channels"
         tell(
             f"{channel.name} ({source}) arrives {channel.delay_s:.2f} s after its stamps, expected at most "
             f"{MAX_PREDICTION_S:g} s: it is read by its stamps, and no estimate of this log is causal"
@@ -401,9 +402,9 @@ def friction_of(
     With ``of_truth``, ``auto`` uses the friction of the ground truth if the log contains it.
     """
     if of_truth and options.friction == "auto" and (true := plan.mapping.truth.get("friction")) is not None:
-        return FrictionSource(f"ground truth {true.label}", of_truth=True)
+        return FrictionSource(FrictionFrom.TRUTH, topic=true.label)
     source = plan.mapping.signals.get("friction")
     topic = "" if source is None else source.label
     if options.friction is None:
-        return FrictionSource(f"topic {topic}" if topic else "none")
+        return FrictionSource(FrictionFrom.TOPIC if topic else FrictionFrom.NONE, topic=topic)
     return friction_source(options.friction, vehicle, plan.alignment.available, topic)

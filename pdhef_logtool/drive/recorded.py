@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import correct_signals
-from pdhef_logtool.drive.alignment import align, count_late
+from pdhef_logtool.drive.alignment import align
 from pdhef_logtool.drive.channel_hash import channels_sha256
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.sensor_changes import SensorChange, find_changes
@@ -18,7 +18,7 @@ from pdhef_logtool.drive.truth import derive_truth, truth_at
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, clock_key, merge_losses, read_signals
 from pdhef_logtool.records.ledger import Role, SampleCount
-from pdhef_logtool.records.readings import impossible_readings
+from pdhef_logtool.records.readings import impossible_readings, without_impossible
 from pdhef_logtool.records.signals import Channel, FloatArray, Loss, Signals
 from pdhef_logtool.records.steps import last_known
 from pdhef_logtool.records.tracks import StateTrack
@@ -57,21 +57,25 @@ class Recorded:
 
 def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = ()) -> Recorded:
     """Read the slice of a plan once, align it and derive the ground truth; ``unchanged`` sensors are not corrected."""
+    from pdhef_logtool.drive.sensor_faults import without_faults  # loads the compiler
+
     log.keep_no_more()
     part = read_signals(log, plan.mapping, plan.clocks, plan.start_ns, plan.end_ns)
     channels = [*part.signals.values(), *part.truth.values()]
     samples: Counter[str] = Counter()
     for channel in channels:
         samples[channel.source] += len(channel)
-    stamps = [c.stamps_ns for c in part.signals.values() if len(c)]
-    start_ns, end_ns = (min(int(s[0]) for s in stamps), max(int(s[-1]) for s in stamps) + 1) if stamps else (0, 0)
-    aligned = correct_signals(align(part.signals, plan.alignment, start_ns, end_ns), plan.vehicle)
-    signals, changes = find_changes(aligned, unchanged)
+    aligned, late_counts = align(part.signals, plan.alignment)
+    aligned = correct_signals(aligned, plan.vehicle)
+    signals, changes = find_changes(without_impossible(aligned), unchanged)
+    signals = without_faults(signals, plan.vehicle)
     late = []
-    for name, count in count_late(part.signals, plan.alignment, start_ns, end_ns).items():
-        part.counts["signal", name]["late"] += count
-        late.append(Loss("late", _LATE, part.signals[name].source, start_ns, end_ns, count, "note"))
-    losses = merge_losses([part.losses, *map(_gaps, channels), late, _impossible(signals)])
+    for name in sorted(late_counts.keys() & part.signals.keys()):
+        part.counts["signal", name]["late"] += late_counts[name]
+        channel = part.signals[name]
+        start_ns, end_ns = int(channel.stamps_ns[0]), int(channel.stamps_ns[-1]) + 1
+        late.append(Loss("late", _LATE, channel.source, start_ns, end_ns, late_counts[name], "note"))
+    losses = merge_losses([part.losses, *map(_gaps, channels), late, _impossible(aligned)])
     truth = None
     if plan.truth is not None:
         at_stamps = truth_at(

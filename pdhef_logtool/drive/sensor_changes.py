@@ -31,7 +31,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 
 #: Cells of the grid; means of the relations; a window after a change, of three, behind the low pass, and the window
@@ -57,6 +56,8 @@ CHANCE, LEAST_STUCK_S = 1e-6, 0.3
 #: Change that a stuck channel has missed: of the steering relation, with its standard deviations; of the speed by a_x
 #: against the mean a_x of the time before.
 LEAST_STEER_CHANGE_RAD, MISSED, LEAST_SPEED_CHANGE_M_S, GRADE_S = 0.006, 5.0, 1.5, 5.0
+#: Samples of a coarse signal, half of them repetitions, that are assumed before a drive.
+FEW_SAMPLES = 10.0
 #: Share of the usual step of a value below which an accelerometer or a gyro repeats it.
 LEAKED = 0.1
 #: A value is stuck without a change that it misses if it repeats this many times as long as any value before, in a
@@ -88,7 +89,7 @@ class SensorChange:
     std: float
 
 
-class _Cells(NamedTuple):
+class Cells(NamedTuple):
     """Cell of each stamp [N], and means of the signals in the cells [n]; NaN without a recent sample."""
 
     stamps_ns: IntArray
@@ -136,7 +137,7 @@ def find_changes(signals: Signals, ignored: Collection[str] = ()) -> tuple[Signa
     """
     if len(signals) < 2:
         return signals, ()
-    cells = _cells(signals)
+    cells = cells_of(signals)
     sound, changes = _without_stuck(signals, cells, [n for n in ("steer_rad", "speed_m_s") if n not in ignored])
     fitted, after_ns = _without_repeats(sound, cells), 0
     while len(changes) < MOST_CHANGES and (jump := _first_jump(fitted, after_ns, ignored)) is not None:
@@ -156,7 +157,7 @@ def shifted(signals: Signals, name: str, by: float, start_ns: int, end_ns: int) 
 # ------------------------------------------------------------------------------------------------ relations
 
 
-def _cells(signals: Signals) -> _Cells:
+def cells_of(signals: Signals) -> Cells:
     """Average the samples of each cell; a cell without one repeats the last, for up to a tenth of a second."""
     steps_ns = np.diff(signals.stamps_ns, prepend=signals.stamps_ns[0])
     cell = np.cumsum(np.minimum(steps_ns, round(LONGEST_GAP_S * 1e9))) // round(CELL_S * 1e9)
@@ -170,9 +171,9 @@ def _cells(signals: Signals) -> _Cells:
         fresh = (last >= 0) & (np.arange(count) - last <= most)
         return np.where(fresh, total[last] / np.maximum(samples[last], 1), np.nan)
 
-    s = without_impossible(signals)
+    s = signals
     columns = (s.ay_m_s2, s.yaw_rate_rad_s, s.steer_rad, s.speed_m_s, s.ax_m_s2)
-    return _Cells(signals.stamps_ns, cell, *map(mean, columns, (2, 2, 2, 10, 2)))
+    return Cells(signals.stamps_ns, cell, *map(mean, columns, (2, 2, 2, 10, 2)))
 
 
 def _mean(column: FloatArray, start: int, end: int) -> FloatArray:
@@ -186,7 +187,7 @@ def _mean(column: FloatArray, start: int, end: int) -> FloatArray:
     return np.where(finite, (sums[last] - sums[first]) / (end - start), np.nan)
 
 
-def _relations(cells: _Cells) -> tuple[_Relation, _Relation]:
+def _relations(cells: Cells) -> tuple[_Relation, _Relation]:
     """Return the relations of kinematics and steering."""
     ay, r, steer, v, _ = (_mean(column, 1 - MEAN_CELLS, 1) for column in cells[2:])
     v = np.where(v > LEAST_SPEED_M_S, v, np.nan)
@@ -269,7 +270,7 @@ def _std_so_far(column: FloatArray, least: float) -> FloatArray:
     return np.where(count < 0.5 * LEAST_CELLS, np.inf, np.maximum(few * np.sqrt(total / np.maximum(count, 1.0)), least))
 
 
-def _sample_steps(column: FloatArray, cells: _Cells) -> tuple[FloatArray, IntArray]:
+def _sample_steps(column: FloatArray, cells: Cells) -> tuple[FloatArray, IntArray]:
     """Return the largest step between neighbouring samples of a column [N] in each cell, [n], and its stamp.
 
     A straight line with a step is fitted to the samples up to ``STEP_S`` before and after.
@@ -298,21 +299,20 @@ def _largest_near(steps: FloatArray) -> FloatArray:
 
 def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> SensorChange | None:
     """Return the first jump of gyro or accelerometer behind a time."""
-    cells, end_ns = _cells(signals), int(signals.stamps_ns[-1]) + 1
-    s = without_impossible(signals)
+    cells, end_ns = cells_of(signals), int(signals.stamps_ns[-1]) + 1
     kinematics, steering = _relations(cells)
     v = _mean(np.where(cells.speed > LEAST_SPEED_M_S, cells.speed, np.nan), -PART_CELLS, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         ay, of_steer = _step(kinematics, LEAST_AY_STD), _step(steering, LEAST_STEER_STD)
         by_ay, by_steer = ay.scaled(-1.0 / v), of_steer.scaled(-1.0 / (steering.fit[:, 1] / v + steering.fit[:, 2] * v))
-        step, at_ns = _sample_steps(s.yaw_rate_rad_s, cells)
+        step, at_ns = _sample_steps(signals.yaw_rate_rad_s, cells)
         step_std = np.fmax(_std_so_far(step, LEAST_GYRO_STD), np.sqrt(_mean(step**2, 3, WINDOW_CELLS)))  # a burst
         is_gyro = np.abs(step) > np.maximum(ALARM * step_std, LEAST_GYRO_JUMP_RAD_S)
         is_gyro &= by_ay.confirms(step) | (by_steer.confirms(step) & (SURE * by_ay.std > np.abs(step)))
         is_gyro &= ~by_ay.contradicts(step) & ~by_steer.contradicts(step)
         is_ay = (np.abs(ay.size) > np.maximum(ALARM * ay.std, LEAST_AY_JUMP_M_S2)) & ay.is_sharp
         # The steering shows that the car did not change its motion, or the samples of both sensors do.
-        sampled, turned = (_largest_near(steps) for steps in (_sample_steps(s.ay_m_s2, cells)[0], step))
+        sampled, turned = (_largest_near(steps) for steps in (_sample_steps(signals.ay_m_s2, cells)[0], step))
         is_sampled = np.abs(sampled - ay.size) < AGREES * np.abs(ay.size)
         is_sampled &= by_ay.excludes(turned, step_std) & ~by_steer.contradicts(0.0 * step)
         is_ay &= by_ay.excludes(by_steer.size, by_steer.std) | is_sampled
@@ -345,7 +345,7 @@ def _weighted(measured: Sequence[tuple[FloatArray, FloatArray]], k: int) -> tupl
 # ------------------------------------------------------------------------------------------------ stuck values
 
 
-def _without_stuck(signals: Signals, cells: _Cells, names: Sequence[str]) -> tuple[Signals, list[SensorChange]]:
+def _without_stuck(signals: Signals, cells: Cells, names: Sequence[str]) -> tuple[Signals, list[SensorChange]]:
     """Replace stuck steering by the steering relation, and remove stuck speeds."""
     cell, changes = cells.of_stamp, []
     _, steering = _relations(cells)
@@ -353,7 +353,8 @@ def _without_stuck(signals: Signals, cells: _Cells, names: Sequence[str]) -> tup
     travelled = np.cumsum(np.nan_to_num(cells.ax)) * CELL_S
     columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in names}
     for name, column in columns.items():
-        for start, end, sure, unseen in _long_runs(column, cells):
+        for run in long_runs(column, cells, cells.speed > LEAST_SPEED_M_S):
+            start, end = run.start, run.end
             k0, k = cell[start], np.arange(cell[start], cell[end - 1] + 1)
             if name == "steer_rad":
                 expected = steering.table[k, 1:] @ steering.fit[k0]
@@ -365,8 +366,8 @@ def _without_stuck(signals: Signals, cells: _Cells, names: Sequence[str]) -> tup
                 change, limit, std, expected = expected, LEAST_SPEED_CHANGE_M_S, math.nan, np.full(len(k), np.nan)
             is_stuck = np.abs(change) > limit
             if name == "steer_rad":  # a cruising car has one speed
-                is_stuck |= k - k0 >= unseen
-            missed = sure + np.flatnonzero(is_stuck[sure:])
+                is_stuck |= k - k0 >= run.unseen_cells
+            missed = run.sure_cells + np.flatnonzero(is_stuck[run.sure_cells :])
             if not len(missed):
                 continue
             known_ns = cells.time_of(k[missed[0]] + 1)
@@ -378,32 +379,50 @@ def _without_stuck(signals: Signals, cells: _Cells, names: Sequence[str]) -> tup
     return (replace(signals, **columns) if changes else signals), changes
 
 
-def _without_repeats(signals: Signals, cells: _Cells) -> Signals:
+def _without_repeats(signals: Signals, cells: Cells) -> Signals:
     """Return signals without stuck values of accelerometer and gyro, whose end would be a jump.
 
     A stuck axis of a sensor that is mounted askew has a small part of the other axes' noise.
     """
     columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in ("ay_m_s2", "yaw_rate_rad_s")}
     for column in columns.values():
-        for start, end, *_ in _long_runs(column, cells, LEAKED):
-            column[start:end] = np.nan
+        for run in long_runs(column, cells, cells.speed > LEAST_SPEED_M_S, LEAKED):
+            column[run.start : run.end] = np.nan
     return replace(signals, **columns)
 
 
-def _long_runs(column: FloatArray, cells: _Cells, share: float = 0.0) -> list[list[int]]:
-    """Return the repetitions of a column [N] beyond chance, while the car moves.
+class Run(NamedTuple):
+    """A repetition of one value beyond chance.
 
-    Each has its first row, the row behind its last, and the cells until chance is excluded and until it is ``LONGER``
-    times as long as any before. A value repeats if its step is at most a share of the RMS of the steps so far.
+    Attributes
+    ----------
+    start, end : its rows. sure : the row at which chance is excluded.
+    sure_cells, unseen_cells : cells until then, and until it is ``LONGER`` times as long as any before.
+    repeats : share of repetitions before.
     """
-    rows = np.flatnonzero(np.isfinite(column) & (np.nan_to_num(cells.speed)[cells.of_stamp] > LEAST_SPEED_M_S))
+
+    start: int
+    end: int
+    sure: int
+    sure_cells: int
+    unseen_cells: int
+    repeats: float
+
+
+def long_runs(column: FloatArray, cells: Cells, moving: BoolArray, share: float = 0.0, least: int = 2) -> list[Run]:
+    """Return the repetitions of a column [N] beyond chance in the cells [n] in which the car moves.
+
+    A value repeats if its step is at most a share of the RMS of the steps so far; ``least``: number of equal samples.
+    """
+    rows = np.flatnonzero(np.isfinite(column) & moving[cells.of_stamp])
     cell, step = cells.of_stamp[rows], np.abs(np.diff(column[rows], prepend=math.nan))
     usual = np.sqrt(np.cumsum(np.nan_to_num(step) ** 2) / np.maximum(np.arange(len(rows)), 1))
     same = step <= share * usual
     starts = np.flatnonzero(~same)
     lengths = np.append(starts[1:], len(rows))[: len(starts)] - starts
-    repeats = np.clip(np.cumsum(same)[starts] / np.maximum(starts, 1), 1e-3, 0.9999)
-    needed = np.ceil(1.0 + math.log(CHANCE) / np.log(repeats)).astype(int)
+    repeats = (np.cumsum(same)[starts] + 0.5 * FEW_SAMPLES) / (starts + FEW_SAMPLES)
+    chance = np.ceil(1.0 + math.log(CHANCE) / np.log(np.clip(repeats, 1e-3, 0.9999)))
+    needed = np.maximum(chance.astype(int), least)
     longer = LONGER * np.maximum.accumulate(np.append(1, lengths))[:-1]
 
     def until(count: IntArray) -> IntArray:
@@ -412,5 +431,7 @@ def _long_runs(column: FloatArray, cells: _Cells, share: float = 0.0) -> list[li
 
     driven_s = CELL_S * np.cumsum(np.diff(cell, prepend=-1) > 0)
     unseen = np.where(driven_s[starts] > SEEN_S, until(longer), len(cells.speed))
-    runs = np.stack([rows[starts], rows[starts + lengths - 1] + 1, until(needed), unseen], axis=1)
-    return [list(map(int, run)) for run in runs[(lengths > needed) & (starts > 0)]]
+    sure = rows[np.minimum(starts + needed, len(rows)) - 1]
+    columns = (rows[starts], rows[starts + lengths - 1] + 1, sure, until(needed), unseen, repeats)
+    is_long = (lengths >= needed) & (starts > 0)
+    return [Run(*run) for run in zip(*(c[is_long].tolist() for c in columns), strict=True)]

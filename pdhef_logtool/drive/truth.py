@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.columns import median_known
@@ -53,12 +54,12 @@ _COLUMNS = {
     **{name: (name,) for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "yaw_rad")},
     "position_m": ("x_m", "y_m"),
 }
+_SCORED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2")
 #: Friction is a condition of the drive, not a state to score.
 _FRICTION = "friction"
 _AY_DERIVED = "smoothing derivative of v_y plus v_x times yaw rate plus g sin(roll), without body roll"
 _AY_UNKNOWN = "not scored: needs a mapped a_y, or an attitude with roll and the car's roll gradient"
-_SURVEY_NS = 600_000_000_000
-_CHUNK = 16384
+_CHUNK = 4096
 _ANGLES = frozenset({"yaw_rad", "course_rad", "sideslip_rad"})
 _NED_TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _FRD_TO_FLU = np.diag([1.0, -1.0, -1.0])
@@ -157,7 +158,7 @@ def plan_truth(
     max_gap_s: float | None = None,
     roll_gradient_rad_per_m_s2: float = 0.0,
 ) -> TruthPlan | None:
-    """Decide clock, derivation, local frame and the convention of the quaternion from the first 600 s.
+    """Decide clock, derivation, local frame and the convention of the quaternion.
 
     Parameters
     ----------
@@ -169,7 +170,7 @@ def plan_truth(
     -------
     TruthPlan, or None when no channel has two samples.
     """
-    survey = _survey(channels)
+    survey = {name: c for name, c in channels.items() if len(c) > 1}
     if not survey.keys() - {_FRICTION}:
         return None
     has = frozenset(survey)
@@ -267,25 +268,14 @@ def truth_at(
     """
     track = truth.track
     bracket = Bracket(track.stamps_ns, stamps_ns + round(latency_s * 1e9), round(truth.max_gap_s * 1e9))
-    vx, vy = bracket.linear(track.vx_m_s), bracket.linear(track.vy_m_s)
-    beta = bracket.angle(track.sideslip_rad)
+    columns = {name: bracket.linear(getattr(track, name)) for name in (*_SCORED, "x_m", "y_m", _FRICTION)}
+    columns |= {name: bracket.angle(getattr(track, name)) for name in ("sideslip_rad", "yaw_rad")}
+    vx, vy = columns["vx_m_s"], columns["vy_m_s"]
     finite = np.isfinite(vx) & np.isfinite(vy)
-    beta[finite] = np.arctan2(vy[finite], vx[finite])
-    rate, ay = bracket.linear(track.yaw_rate_rad_s), bracket.linear(track.ay_m_s2)
-    return make_track(
-        "truth",
-        stamps_ns,
-        vx_m_s=vx,
-        vy_m_s=vy,
-        yaw_rate_rad_s=rate,
-        sideslip_rad=beta,
-        ay_m_s2=ay,
-        x_m=bracket.linear(track.x_m),
-        y_m=bracket.linear(track.y_m),
-        yaw_rad=bracket.angle(track.yaw_rad),
-        friction=bracket.linear(track.friction),
-        valid=bracket.inside & np.isfinite(np.stack([vx, vy, rate, beta, ay])).any(axis=0),
-    ).without_sideslip_below(standstill_m_s)
+    columns["sideslip_rad"][finite] = np.arctan2(vy[finite], vx[finite])
+    scored = np.stack([columns[name] for name in (*_SCORED, "sideslip_rad")])
+    valid = bracket.inside & np.isfinite(scored).any(axis=0)
+    return make_track("truth", stamps_ns, valid=valid, **columns).without_sideslip_below(standstill_m_s)
 
 
 def valid_as_a_whole(truth: StateTrack, derivation: Mapping[str, str], standstill_m_s: float) -> StateTrack:
@@ -408,16 +398,6 @@ def dependent_signals(
 
 
 # ---- planning ----
-
-
-def _survey(channels: Mapping[str, Channel]) -> dict[str, Channel]:
-    starts = [int(c.stamps_ns[0]) for c in channels.values() if len(c)]
-    survey = {}
-    for name, c in channels.items():
-        n = int(np.searchsorted(c.stamps_ns, min(starts) + _SURVEY_NS)) if starts else 0
-        if n >= 2:
-            survey[name] = c.take(slice(n))
-    return survey
 
 
 def _first(has: frozenset[str], *names: str) -> str | None:
@@ -583,12 +563,10 @@ def _turn(matrix: FloatArray, vectors: FloatArray) -> FloatArray:
 
 
 def cubic_equations(u: FloatArray) -> tuple[list[FloatArray], FloatArray]:
-    """Return the powers 0 to 6 of times [N, k], each [N, k], and the normal matrices [N, 4, 4] of a cubic in them."""
-    powers = [np.ones_like(u)]
-    for _ in range(6):
-        powers.append(powers[-1] * u)
-    moments = [p.sum(axis=1) for p in powers]
-    return powers, np.stack([np.stack([moments[i + j] for j in range(4)], axis=1) for i in range(4)], axis=1)
+    """Return the powers 0 to 3 of times [N, k], each [N, k], and the normal matrices [N, 4, 4] of a cubic in them."""
+    powers = [np.ones_like(u), u, u * u, u * u * u]
+    moments = [np.einsum("nk,nk->n", powers[i // 2], powers[i - i // 2]) for i in range(7)]
+    return powers, np.stack([np.stack(moments[i : i + 4], axis=1) for i in range(4)], axis=1)
 
 
 def differentiate(
@@ -606,19 +584,18 @@ def differentiate(
     gaps = np.concatenate([[0], np.cumsum(np.diff(stamps_ns) > max_gap_ns)])
     missing_before = np.concatenate([[0], np.cumsum(~np.isfinite(values))])
     whole = (gaps[2 * h :] == gaps[: n - 2 * h]) & (missing_before[2 * h + 1 :] == missing_before[: n - 2 * h])
-    centres = np.flatnonzero(whole) + h
-    offsets = np.arange(-h, h + 1)
-    for start in range(0, centres.shape[0], _CHUNK):
-        centre = centres[start : start + _CHUNK]
-        window = centre[:, None] + offsets
-        t = (stamps_ns[window] - stamps_ns[centre][:, None]) * 1e-9
-        span = np.abs(t).max(axis=1)
-        u = t / span[:, None]
-        y = values[window] - values[centre][:, None]
+    firsts = np.flatnonzero(whole)
+    times, samples = (sliding_window_view(column, 2 * h + 1) for column in (stamps_ns, values))
+    for start in range(0, firsts.shape[0], _CHUNK):
+        first = firsts[start : start + _CHUNK]
+        centre = first + h
+        t = (times[first] - stamps_ns[centre][:, None]) * 1e-9
+        span = np.maximum(t[:, -1], -t[:, 0])
+        y = np.asarray(samples[first] - values[centre][:, None], np.float64)
         if angle:
             y = wrap_angle(y)
-        powers, normal = cubic_equations(u)
-        right = np.stack([(powers[i] * y).sum(axis=1) for i in range(4)], axis=1)
+        powers, normal = cubic_equations(t / span[:, None])
+        right = np.stack([np.einsum("nk,nk->n", power, y) for power in powers], axis=1)
         slope[centre] = np.linalg.solve(normal, right[:, :, None])[:, 1, 0] / span
     return slope
 

@@ -3,8 +3,8 @@
 All gains use the noise of the car's physics: the gain scales the residual only, and ``physics`` has gain 0 and no
 network. The mechanism (docs/method.md#adaptation) does not treat model error as noise.
 
-Bottom layer: :mod:`~.sensor_faults` checks a_y and yaw rate. Its findings apply to every filter here and to the
-parallel one, and keep bad samples from the network.
+Bottom layer: the drive marks faults of a_y and yaw rate (:mod:`~.checked_inputs`). They apply to every filter here and
+to the parallel one, and keep bad samples from the network.
 
 Top layer: a bank of filters, each a hypothesis about the car's model. F1 assumes that the model with its residual is
 complete; each other filter adds one state: a scale of all forces, or the bank of the road. With both at once, the
@@ -208,7 +208,9 @@ class AdaptivePhysics:
 
     def inputs(self, signals: Signals, state: InputState | None) -> tuple[CheckedInputs, InputState]:
         """Return the inputs of the filters, checked signals with the residual at gain 1, and the state."""
-        return check_inputs(self.physics, self.network, signals, state, detects=self.adaptive)
+        if not self.adaptive:
+            signals = replace(signals, extra_variance=np.zeros((len(signals), 2)))
+        return check_inputs(self.physics, self.network, signals, state)
 
     def run(self, signals: Signals, state: AdaptiveState | None) -> tuple[MixtureSteps, AdaptiveState]:
         """Process one window (see :class:`~.base.Estimator`)."""

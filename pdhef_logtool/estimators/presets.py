@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pdhef_logtool.car.car import Car, WithoutTruth
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.car.posterior import Posterior
     from pdhef_logtool.residual_model.interface import ResidualModel
 
 #: Presets built on ``physics``. They use the calibrated vehicle if available; all others use the vehicle file.
@@ -22,7 +23,7 @@ def uses_calibration(name: str) -> bool:
     return name == OPEN_LOOP or preset_of(name) in SELF_CALIBRATED
 
 
-def calibration_of(name: str, car: Car) -> WithoutTruth | None:
+def calibration_of(name: str, car: Car) -> Posterior | None:
     """Return the calibration of the log that an estimator of a car uses; None without one."""
     return car.self_calibrated if uses_calibration(name) else None
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -35,12 +33,21 @@ def block_bootstrap_difference(
     ``errors`` belong to the better estimator if the whole interval is below 0. ``block_s``: at least 10 s
     (docs/method.md#evaluation). ``n``: number of resamples.
     """
-    return rmse_difference_interval(*_block_sums([errors, other_errors], stamps_ns, block_s), n=n, seed=seed)
+    sums, counts = _block_sums([errors, other_errors], stamps_ns, block_s)
+    nan, blocks = float("nan"), int(counts.shape[0])
+    if blocks == 0:
+        return Interval(nan, nan, nan, 0)
 
+    def difference(squares: FloatArray, stamps: FloatArray) -> FloatArray:
+        first, second = np.sqrt(squares / stamps)
+        return np.asarray(first - second)
 
-def rmse_difference_interval(sums: FloatArray, counts: FloatArray, *, n: int = 1000, seed: int = 0) -> Interval:
-    """Return the first RMSE minus the second with its interval; ``sums`` of squares [2, K], ``counts`` [K]."""
-    return _interval(lambda s, c: np.sqrt(s[0] / c) - np.sqrt(s[1] / c), sums, counts, n, seed)
+    value = float(difference(sums.sum(axis=1), counts.sum()))
+    if blocks < 2:
+        return Interval(value, nan, nan, blocks)
+    draws = np.random.default_rng(seed).multinomial(blocks, np.full(blocks, 1.0 / blocks), size=n)
+    low, high = np.percentile(difference(sums @ draws.T, draws @ counts), [2.5, 97.5])
+    return Interval(value, float(low), float(high), blocks)
 
 
 def _block_sums(columns: list[FloatArray], stamps_ns: IntArray, block_s: float) -> tuple[FloatArray, FloatArray]:
@@ -52,29 +59,3 @@ def _block_sums(columns: list[FloatArray], stamps_ns: IntArray, block_s: float) 
     _, index = np.unique(block, return_inverse=True)
     sums = [np.bincount(index, weights=c[finite] ** 2) for c in columns]
     return np.stack(sums).astype(np.float64), np.bincount(index).astype(np.float64)
-
-
-def _interval(
-    statistic: Callable[[FloatArray, FloatArray], FloatArray],
-    sums: FloatArray,
-    counts: FloatArray,
-    n: int,
-    seed: int,
-) -> Interval:
-    nan = float("nan")
-    blocks = int(counts.shape[0])
-    if blocks == 0:
-        return Interval(nan, nan, nan, 0)
-    value = float(statistic(sums.sum(axis=1), counts.sum()))
-    if blocks < 2:
-        return Interval(value, nan, nan, blocks)
-    draws = _draws(blocks, n, seed)
-    resampled = statistic(sums @ draws.T, draws @ counts)
-    low, high = np.percentile(resampled, [2.5, 97.5])
-    return Interval(value, float(low), float(high), blocks)
-
-
-@lru_cache(maxsize=2)
-def _draws(blocks: int, n: int, seed: int) -> IntArray:
-    """Return the count of each block in each resample, [n, blocks], the same for all values of a drive."""
-    return np.random.default_rng(seed).multinomial(blocks, np.full(blocks, 1.0 / blocks), size=n)

@@ -1,16 +1,62 @@
-"""Rows of the largest errors of a drive, at least a second apart."""
+"""The places of the largest sideslip errors of a drive, at least a second apart."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
+from pdhef_logtool.evaluation.track_errors import signal_error
+from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.tracks import StateTrack
 
 #: Largest number of rows; least distance of two rows in time, and as a share of the drive.
 PLACES, _APART_S, _APART_SHARE = 10, 1.0, 0.02
 
 
-def largest_places(stamps_ns: IntArray, error: FloatArray) -> list[int]:
+@dataclass(frozen=True, slots=True)
+class ErrorPlace:
+    """A place of a large sideslip error: stamp in ns, angles in rad, and the track that ``truth_rad`` is of."""
+
+    stamp_ns: int
+    estimate_rad: float
+    truth_rad: float
+    error_rad: float
+    against: str
+
+
+def largest_errors(
+    estimate: StateTrack, truth: StateTrack | None, others: Sequence[StateTrack], low_speed_m_s: float
+) -> list[ErrorPlace]:
+    """Return the largest sideslip errors of a track [N], the largest first.
+
+    Without ground truth that scores it, the largest differences from the first of ``others`` that has a sideslip at
+    its stamps.
+    """
+    for reference in (truth, *others):
+        if reference is None or len(reference) != len(estimate):
+            continue
+        if reference is truth:
+            error = signal_error(estimate, reference, "sideslip_rad", low_speed_m_s)
+        else:
+            error = wrap_angle(_known(estimate, low_speed_m_s) - _known(reference, low_speed_m_s))
+        if np.isfinite(error).any():
+            stamps, beta = estimate.stamps_ns, estimate.sideslip_rad
+            return [
+                ErrorPlace(int(stamps[i]), float(beta[i]), float(beta[i] - error[i]), float(error[i]), reference.name)
+                for i in _largest_places(stamps, error)
+            ]
+    return []
+
+
+def _known(track: StateTrack, low_speed_m_s: float) -> FloatArray:
+    """Return the sideslip [N], NaN if it is invalid or the car is too slow for a direction."""
+    return np.where(track.valid, track.without_sideslip_below(low_speed_m_s).sideslip_rad, np.nan)
+
+
+def _largest_places(stamps_ns: IntArray, error: FloatArray) -> list[int]:
     """Return the rows of the largest absolute errors [N], the largest first, without NaN."""
     if not len(stamps_ns):
         return []

@@ -43,9 +43,11 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class OperatingSpace:
-    """Cells with data of a drive, in order, the grid, and the median friction of the drive."""
+    """Cells with data of a drive, in order, its highest speed and |a_y| (None: unknown), median friction, the grid."""
 
     cells: Sequence[Cell]
+    speed_max_m_s: float | None
+    ay_max_m_s2: float | None
     friction_median: float
     speed_edges_m_s: Sequence[float] = SPEED_EDGES_M_S
     ay_edges_m_s2: Sequence[float] = AY_EDGES_M_S2
@@ -86,4 +88,6 @@ def operating_space(
         for i in np.flatnonzero(seconds)
     ]
     friction = signals.friction[np.isfinite(signals.friction)]
-    return OperatingSpace(cells, float(np.median(friction)) if friction.size else vehicle.assumed_friction)
+    top_speed, top_ay = (float(c[finite].max()) if finite.any() else None for c in (speed, ay))
+    usual = float(np.median(friction)) if friction.size else vehicle.assumed_friction
+    return OperatingSpace(cells, top_speed, top_ay, usual)

@@ -173,11 +173,5 @@ def _summands(
 
 
 def from_document(documents: Sequence[Mapping[str, object]]) -> list[RequirementBlocks]:
-    """Return the blocks of a report.json; blocks of other versions are skipped."""
-    results = []
-    for document in documents:
-        try:
-            results.append(RequirementBlocks(**document))  # type: ignore[arg-type]
-        except TypeError:
-            continue
-    return results
+    """Return the blocks of a report.json."""
+    return [RequirementBlocks(**document) for document in documents]  # type: ignore[arg-type]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
+from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -30,14 +32,13 @@ from pdhef_logtool.evaluation.validation_plan import (
     shown,
 )
 from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.storage.templates import clauses, one_line, template
 
 Outcome: TypeAlias = Literal["PASS", "FAIL", "INCONCLUSIVE"]
+#: Driving that is missing: amount so far (None: unknown), needed amount, and its unit.
+_Lacking: TypeAlias = tuple[float | None, float, str]
 #: Least margin relative to an estimated reference, in standard deviations of the reference.
 REFERENCE_SDS = 2.0
-#: Explanation of a coverage that is too low.
-NARROW = "the stated uncertainty of the estimate is too small; other requirements limit its error"
-#: Smallest share of drives that is shown.
-_SHARE_SHOWN = 0.5
 #: Largest factor on the driving that is recommended.
 _MOST_TIMES = 30.0
 
@@ -151,11 +152,14 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
     bounded = _statistic(requirement, drives)
     sd = _reference_sd(requirement, drives) if estimated else 0.0
     bound, at_least = requirement.bound, requirement.metric in AT_LEAST
-    notes = _notes(requirement, drives, bounded, estimated)
-    if bounded.basis == "drives" and bounded.effect.levels:
-        notes.append(bounded.effect.text(len(drives)))
-    lacking = _lacking(requirement, exposure, drives)
-    outcome, reason, to_do = _decide(requirement, bounded, exposure, lacking, sd, missing)
+    words, lacking, count = _words(), _lacking(requirement, exposure, drives), len(drives)
+    outcome, case = _case(requirement, bounded, exposure, lacking, sd)
+    why, _, remedy = missing.partition("; ")
+    share = (0.5 * (1.0 - requirement.confidence)) ** (1.0 / max(count, 1))
+    times = _times(requirement, bounded) if case == "undecided" else math.inf
+    reason = words.reason(case, requirement, bounded, count, lacking, why, sd, share)
+    to_do = words.next(case, requirement, bounded, exposure, lacking, remedy, times)
+    same = drives[0].estimator if drives and all(d.same for d in drives) else ""
     value = bounded.value if math.isfinite(bounded.value) else None
     margin = None if value is None else (value - bound if at_least else bound - abs(value))
     return RequirementVerdict(
@@ -172,9 +176,9 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
         bounded.block_s,
         "estimated reference" if estimated else "ground truth",
         _worst(requirement, drives),
-        reason,
-        to_do,
-        tuple(notes),
+        one_line(reason),
+        one_line(to_do),
+        tuple(clauses(words.notes(requirement, bounded, count, estimated, same))),
         bounded.effect.design_effect,
     )
 
@@ -289,38 +293,32 @@ def _worst(requirement: Requirement, drives: Sequence[DriveValue]) -> str | None
     return drives[int(np.nanargmin(values) if requirement.metric in AT_LEAST else np.nanargmax(values))].log
 
 
-def _decide(
-    requirement: Requirement,
-    bounded: Bounded,
-    exposure: Exposure,
-    lacking: Sequence[tuple[str, str]],
-    sd: float,
-    missing: str,
-) -> tuple[Outcome, str, str]:
-    """Return outcome, reason and next step."""
-    where = "" if requirement.segment == "all" else f" ({requirement.segment})"
+def _case(
+    requirement: Requirement, bounded: Bounded, exposure: Exposure, lacking: Sequence[_Lacking], sd: float
+) -> tuple[Outcome, str]:
+    """Return the outcome, and the case that decides the sentences of ``requirement.txt``."""
     if not exposure.drives or not math.isfinite(bounded.value):
-        reason, _, remedy = missing.partition("; ")
-        return "INCONCLUSIVE", reason or "no drive has this metric", remedy or _what_to_record(requirement)
+        return "INCONCLUSIVE", "missing"
     if lacking:
-        more = f"drive {' and '.join(more for _, more in lacking)} more{where}, with ground truth"
-        return "INCONCLUSIVE", f"too little driving: {'; '.join(w for w, _ in lacking)}", more
+        return "INCONCLUSIVE", "lacking"
     if _without_bounds(requirement, bounded):
-        return "INCONCLUSIVE", *_too_few(requirement, bounded, where)
+        return "INCONCLUSIVE", "unbounded"
     outcome = _outcome(requirement, bounded)
-    interval = _interval(requirement, bounded, exposure, outcome)
     if outcome == "INCONCLUSIVE":
-        return outcome, f"{interval} includes the limit", _decisive(requirement, bounded, exposure, where)
+        return outcome, "undecided"
     if abs(requirement.bound - bounded.value) < REFERENCE_SDS * sd:
-        sds = f"{REFERENCE_SDS:g} standard deviations of the estimated reference ({shown(sd, requirement.unit)})"
-        to_do = f"record drives{where} with ground truth: a two-antenna INS or an optical sensor"
-        return "INCONCLUSIVE", f"{interval}; the limit is closer than {sds}", to_do
-    if outcome == "PASS":
-        return outcome, interval, ""
-    if requirement.metric == "coverage95":
-        return outcome, f"{interval}; {NARROW}", "recalibrate the intervals on drives like these"
-    place = "the worst drive" if exposure.drives > 1 else "the largest error"
-    return outcome, interval, f"look at {place} first"
+        return "INCONCLUSIVE", "reference"
+    return outcome, "narrow" if outcome == "FAIL" and requirement.metric == "coverage95" else outcome
+
+
+@cache
+def _words() -> Any:
+    """Return the sentences of ``requirement.txt`` as functions."""
+    limits: dict[str, Any] = {"LEAST_BLOCKS": LEAST_BLOCKS, "LEAST_DRIVES": LEAST_DRIVES, "MOST_TIMES": _MOST_TIMES}
+    limits |= {"REFERENCE_SDS": REFERENCE_SDS, "AY_NOTE": AY_NOTE}
+    names = {"POOLED": POOLED, "WORST_DRIVE": WORST_DRIVE, "shown": shown, "least_drives": least_drives}
+    layout = {"layout": lambda what: "%.0f" if what.startswith("drives") else "%.1f"}
+    return template(Path(__file__).parent / "templates" / "requirement.txt", **limits, **names, **layout).module
 
 
 def _without_bounds(requirement: Requirement, bounded: Bounded) -> bool:
@@ -337,62 +335,22 @@ def _outcome(requirement: Requirement, bounded: Bounded) -> Outcome:
     return "PASS" if high <= bound else "FAIL" if low > bound else "INCONCLUSIVE"
 
 
-def _interval(requirement: Requirement, bounded: Bounded, exposure: Exposure, outcome: Outcome) -> str:
-    """Return the statistic with its interval as text."""
-    value, unit = shown(bounded.value, requirement.unit), requirement.unit
-    if requirement.statistic != WORST_DRIVE:
-        bounds = f"{shown(bounded.low, unit)} to {shown(bounded.high, unit)}"
-        return f"{value} ({100.0 * requirement.confidence:.4g} % CI {bounds})"
-    share = (0.5 * (1.0 - requirement.confidence)) ** (1.0 / exposure.drives)
-    text = f"worst of {exposure.drives} drives: {value}"
-    if outcome != "PASS" or share <= _SHARE_SHOWN:
-        return text
-    return f"{text}; at least {share:.0%} of drives like these are within it, with this confidence"
-
-
-def _lacking(requirement: Requirement, exposure: Exposure, drives: Sequence[DriveValue]) -> list[tuple[str, str]]:
-    """Return the missing part of the required driving as texts: amounts so far, and amounts to add."""
-    needs: list[tuple[str, float, float | None, str]] = [
-        ("drives", float(requirement.exposure_drives), float(exposure.drives), "{:.0f}"),
-        ("minutes", requirement.exposure_minutes, exposure.minutes, "{:.1f}"),
-        ("km", requirement.exposure_km, exposure.km, "{:.1f}"),
+def _lacking(requirement: Requirement, exposure: Exposure, drives: Sequence[DriveValue]) -> list[_Lacking]:
+    """Return the required driving that is missing."""
+    needs: list[_Lacking] = [
+        (float(exposure.drives), float(requirement.exposure_drives), "drives"),
+        (exposure.minutes, requirement.exposure_minutes, "minutes"),
+        (exposure.km, requirement.exposure_km, "km"),
     ]
     for need in requirement.exposure:
         seconds = [d.seconds_in(need) for d in drives]
-        needs.append((f"drives at {need.label}", float(need.drives), float(sum(s > 0.0 for s in seconds)), "{:.0f}"))
-        needs.append((f"minutes at {need.label}", need.minutes, math.fsum(seconds) / 60.0, "{:.1f}"))
-    lacking = []
-    for word, needed, has, layout in needs:
-        if needed > 0.0 and (has is None or has < needed):
-            has_words = "an unknown number" if has is None else layout.format(has)
-            lacking.append((f"{has_words} of {needed:g} {word}", f"{layout.format(needed - (has or 0.0))} {word}"))
-    return lacking
+        needs.append((float(sum(s > 0.0 for s in seconds)), float(need.drives), f"drives at {need.label}"))
+        needs.append((math.fsum(seconds) / 60.0, need.minutes, f"minutes at {need.label}"))
+    return [(has, needed, what) for has, needed, what in needs if needed > 0.0 and (has is None or has < needed)]
 
 
-def _what_to_record(requirement: Requirement) -> str:
-    segment = "" if requirement.segment == "all" else f"{requirement.segment} and "
-    if requirement.other_run is not None:
-        return "compare with another run: pdhef compare A B --plan PLAN"
-    return f"record drives with {segment}ground truth"
-
-
-def _too_few(requirement: Requirement, bounded: Bounded, where: str) -> tuple[str, str]:
-    """Return the reason for a missing interval, and the driving that is needed."""
-    value = shown(bounded.value, requirement.unit)
-    if requirement.quantile is not None:
-        least = least_drives(requirement.quantile, requirement.confidence)
-        more = f"drive {least - bounded.units} more drives{where}"
-        return f"{value}; no confidence interval from {bounded.units} drives", more
-    if bounded.basis == "blocks" and not bounded.units:
-        return f"{value}; this run stored no blocks for this requirement", "run the logs again with this plan"
-    blocks = "1 block" if bounded.units == 1 else f"{bounded.units} blocks"
-    reason = f"{value}; no confidence interval from {blocks} of driving{where}, it needs {LEAST_BLOCKS}"
-    seconds = (LEAST_BLOCKS - bounded.units) * 10
-    return reason, f"drive at least {seconds} s more{where}, better {LEAST_DRIVES} drives or more"
-
-
-def _decisive(requirement: Requirement, bounded: Bounded, exposure: Exposure, where: str) -> str:
-    """Return the amount of driving that decides if value and spread do not change.
+def _times(requirement: Requirement, bounded: Bounded) -> float:
+    """Return how many times as much driving decides if value and spread do not change, in tenths.
 
     The width of the interval is in proportion to the inverse square root of the amount, for positive values in the
     logarithm, as in the bootstrap.
@@ -401,41 +359,13 @@ def _decisive(requirement: Requirement, bounded: Bounded, exposure: Exposure, wh
     end = bounded.low if value > near else bounded.high
     if min(near, bounded.low) > 0.0 and requirement.metric not in AT_LEAST:
         near, value, end = math.log(near), math.log(value), math.log(end)
-    distance, width = abs(near - value), abs(end - value)
-    if not math.isfinite(width) or (times := (width / distance) ** 2 if distance else math.inf) > _MOST_TIMES:
-        far = "the value is close to the limit for the spread of the drives"
-        return f"{far}: more than {_MOST_TIMES:g} times as much driving would be needed"
-    times = math.ceil(10.0 * times) / 10.0
-    minutes = f" ({exposure.minutes * (times - 1.0):.2g} min more)" if exposure.minutes else ""
-    return f"about {times:g} times as much driving{where} would decide, if value and spread stay the same{minutes}"
-
-
-def _notes(requirement: Requirement, drives: Sequence[DriveValue], bounded: Bounded, estimated: bool) -> list[str]:
-    notes = []
-    if drives and bounded.basis == "blocks" and requirement.statistic == POOLED:
-        length = "" if bounded.block_s is None else f" of {bounded.block_s:g} s"
-        notes.append(
-            f"interval from blocks{length} within {len(drives)} {'drive' if len(drives) == 1 else 'drives'}: other "
-            f"drives may differ more; from {LEAST_DRIVES} drives on it is drawn from drives"
-        )
-    if estimated:
-        notes.append("errors are relative to the estimated reference: no ground truth")
-    if requirement.signal == "ay_m_s2":
-        notes.append(AY_NOTE)
-    if drives and all(d.same for d in drives):
-        why = "" if requirement.other_run is not None else " (residual gain 0)"
-        notes.append(f"{drives[0].estimator} equals {requirement.baseline} in these drives{why}")
-    return notes
+    times = (abs(end - value) / abs(near - value)) ** 2 if near != value and math.isfinite(end) else math.inf
+    return times if times > _MOST_TIMES else math.ceil(10.0 * times) / 10.0
 
 
 def gates(verdicts: Sequence[RequirementVerdict], *, strict: bool) -> bool:
     """Return whether a verdict is a FAIL, or with ``strict`` an INCONCLUSIVE."""
     return any(v.outcome == "FAIL" or (strict and v.outcome == "INCONCLUSIVE") for v in verdicts)
-
-
-def of_documents(verdicts: Sequence[Mapping[str, Any]], outcome: Outcome) -> list[Mapping[str, Any]]:
-    """Return the verdicts of a document with an outcome."""
-    return [v for v in verdicts if v["outcome"] == outcome]
 
 
 def joint_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
@@ -449,10 +379,10 @@ def joint_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
 
 def next_steps(plan: Mapping[str, Any] | None, more: Sequence[str] = ()) -> list[str]:
     """Return the next steps of a document: failed requirements, inconclusive ones, ``more``."""
-    requirements = (plan or {}).get("requirements") or ()
+    requirements = sorted((plan or {}).get("requirements") or (), key=lambda r: r["outcome"] != "FAIL")
     ids: dict[str, list[str]] = {}
-    for r in (*of_documents(requirements, "FAIL"), *of_documents(requirements, "INCONCLUSIVE")):
-        if r["next"]:
+    for r in requirements:
+        if r["next"] and r["outcome"] != "PASS":
             ids.setdefault(str(r["next"]), []).append(str(r["id"]))
     asked = [f"{', '.join(names)}: {text}" for text, names in ids.items()]
     return [*asked, *filter(None, more)]

@@ -341,12 +341,18 @@ def _limit(table: RequirementTable, where: str, problems: list[str]) -> float | 
     return None
 
 
+#: The requirement on sideslip of the default plan.
+SIDESLIP = Requirement(
+    "sideslip", "Sideslip is accurate enough for stability control", "sideslip_rad", limit=1.0 / DEGREES
+)
+
+
 def default_plan() -> ValidationPlan:
     """Return the plan of reports without ``--plan``: an orientation, not a standard."""
     beta, degree = "sideslip_rad", 1.0 / DEGREES
     return ValidationPlan(
         (
-            Requirement("sideslip", "Sideslip is accurate enough for stability control", beta, limit=degree),
+            SIDESLIP,
             Requirement("use", "Sideslip is 10 % better than zero sideslip", beta, baseline="zero", max_ratio=0.9),
             Requirement("interval", "The 95 % interval of sideslip is wide enough", beta, "coverage95", limit=0.9),
             Requirement("yaw-rate", "Yaw rate is accurate", "yaw_rate_rad_s", limit=degree),

@@ -1,7 +1,7 @@
 """``pdhef learn``: the model of a car (``model.toml``) from its drives, with or without ground truth.
 
-The drives of a car are pooled to the prior of later drives (:mod:`~.taught_prior`). Drives with ground truth
-also give a residual, which is chosen on held-out driving (:mod:`~.teach`).
+The posterior of each drive informs later drives (:mod:`pdhef_logtool.model.priors`). Drives with ground truth also
+give a residual, which is chosen on held-out driving (:mod:`~.teach`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,6 @@ from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.store import check_output, update_car
 from pdhef_logtool.drive.model_file import Sensors
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.estimators.calibration.calibration import self_calibrate
-from pdhef_logtool.estimators.calibration.driving import Driving
 from pdhef_logtool.learning.drives import (
     DriveRecord,
     DriveSet,
@@ -30,6 +28,8 @@ from pdhef_logtool.learning.drives import (
 from pdhef_logtool.learning.teach import LEAST_S, OpenedDrive, figures_of, learn_from, open_drive
 from pdhef_logtool.logs.discovery import LogInput, Logs
 from pdhef_logtool.model.drive_model import for_later_drives, lacking, model_of, read_driving
+from pdhef_logtool.model.driving import Driving
+from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.residual_model.bundle import NO_MODEL
@@ -118,7 +118,7 @@ def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[s
         with read_drive(log, car, drives.mapping, config.read_options) as drive:
             record, opened = open_drive(drive, config)
             if opened is not None:
-                return record, _Read(opened.taught.driving, drive.plan.sensors, opened)
+                return record, _Read(opened.driving, drive.plan.sensors, opened)
             start_s, end_s = ((t - drive.log.start_ns) * 1e-9 for t in (drive.plan.start_ns, drive.plan.end_ns))
             driving = None if lacking(drive) else read_driving(drive)
             record = replace(record, seconds=end_s - start_s, span_s=(start_s, end_s))
@@ -127,13 +127,19 @@ def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[s
     records, content = drives.read(read, 0.3)
     teachers = [r.opened for r in content if r.opened is not None]
     if not teachers and config.reference != "on":
-        used = [r.driving is not None and len(r.driving.stretches) > 0 for r in content]
-        records = tuple(replace(r, left_out="" if u else r.left_out) for r, u in zip(records, used, strict=True))
-        calibration = self_calibrate([r.driving for r in content if r.driving is not None], car.vehicle)
-        _check(calibration.refused, "driving that calibrates the car, such as lane changes and bends")
-        parameters, evidence = for_later_drives(calibration), calibration.text
-        model = model_of(car, content[used.index(True)].sensors, parameters=parameters, evidence=evidence)
-        return records, model, {"self_calibration": calibration.to_dict()}
+        fits = [None if r.driving is None else fit_car(r.driving, car.vehicle) for r in content]
+        records = tuple(
+            replace(r, left_out=r.left_out if fit is None else fit.refused)
+            for r, fit in zip(records, fits, strict=True)
+        )
+        used = [(fit, r.sensors) for fit, r in zip(fits, content, strict=True) if fit is not None and not fit.refused]
+        refused = "" if used else next((r.left_out for r in records), "no drive")
+        _check(refused, "driving that calibrates the car, such as lane changes and bends")
+        parameters = tuple(p for fit, _ in used for p in for_later_drives(fit))
+        seconds = math.fsum(fit.seconds for fit, _ in used)
+        evidence = f"calibrated without ground truth on {seconds:.0f} s of driving"
+        model = model_of(car, used[0][1], parameters=parameters, evidence=evidence)
+        return records, model, {"self_calibration": [fit.to_dict() for fit, _ in used]}
     _check("" if teachers else "none", "at least one drive with a true sideslip and the signals of a calibration")
     seconds, slow = math.fsum(d.seconds for d in teachers), car.vehicle.low_speed_blend_m_s
     few = "" if seconds >= LEAST_S else f"{seconds:.1f} s"

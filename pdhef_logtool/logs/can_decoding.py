@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.message_schema import FieldInfo
-from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import MappingFileError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
+
+    from pdhef_logtool.logs.table_log import Table
 
 CAN_TYPE = "can/msg/Frame"
 _MAX_DBC_BYTES = 32 << 20
@@ -76,6 +77,8 @@ class Frames:
 
     def table(self, name: str) -> Table:
         """Return the frames as they are, with NaN behind the length."""
+        from pdhef_logtool.logs.table_log import Table
+
         names = [f"data[{i}]" for i in range(self.data.shape[1])]
 
         def load(path: str, rows: slice) -> NDArray[Any]:
@@ -162,6 +165,8 @@ class Decoder:
 
     def _messages(self, message: Message, ending: str, rows: IntArray, *, is_j1939: bool) -> Iterator[Table]:
         """Yield the tables of a message from one sender, without the signals that no frame contains."""
+        from pdhef_logtool.logs.table_log import Table
+
         data = self.frames.data
         lengths = np.minimum(self.frames.parts["length"], data.shape[1])
         for condition, signals, selectors in signal_groups(message):

@@ -253,7 +253,7 @@ class ColumnarLog(DriveLog):
                 for id_, times in (stamps or {}).items():
                     keep = in_window(times, start_ns, end_ns)
                     parts[container.channels[id_].topic].append(times if keep is None else times[keep])
-        return {topic: np.sort(np.concatenate(part)) for topic, part in parts.items() if part}
+        return {topic: np.sort(np.concatenate(part), kind="stable") for topic, part in parts.items() if part}
 
     def covered_topics(self, topics: Collection[str]) -> frozenset[str]:
         """Return the topics with all messages in spans with one of these topics: they need no further read."""

@@ -16,7 +16,6 @@ from typing import TypeAlias
 
 from pdhef_logtool.logs.byte_source import ChangedError, require_regular
 from pdhef_logtool.logs.formats import COMPRESSED_SUFFIXES, ROSBAG2_METADATA, log_suffixes, without_general
-from pdhef_logtool.logs.recording_folder import is_recording
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.table_file import NO_SETTINGS, TableSettings
 from pdhef_logtool.records.errors import LogError, UsageError
@@ -242,6 +241,8 @@ def _matches(pattern: str) -> list[Path]:
 
 def _search(folder: Path, visited: set[str], settings: TableSettings) -> Iterator[Path]:
     """Yield the logs below a folder, each folder once: links can lead back to where they lie."""
+    from pdhef_logtool.logs.recording_folder import is_recording
+
     place = os.path.realpath(folder)
     if place in visited:
         return

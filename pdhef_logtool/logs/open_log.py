@@ -25,11 +25,9 @@ from pdhef_logtool.logs.formats import (
     without_general,
 )
 from pdhef_logtool.logs.log_file import LogFile
-from pdhef_logtool.logs.recording_folder import open_recording
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, Meter, ResourceLimits
 from pdhef_logtool.logs.table_file import NO_SETTINGS, TableSettings
-from pdhef_logtool.logs.table_log import TableLog
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.storage.documents import read_text
@@ -78,10 +76,12 @@ def open_log(
     if log.messages is not None:
         log.messages.definitions = definitions
     log.given_databases = databases
-    if databases and isinstance(log, TableLog):
+    if databases:
         from pdhef_logtool.logs.can_decoding import load_dbc
+        from pdhef_logtool.logs.table_log import TableLog
 
-        log.decode_frames([(path.name, load_dbc(path)) for path in databases])
+        if isinstance(log, TableLog):
+            log.decode_frames([(path.name, load_dbc(path)) for path in databases])
     return log
 
 
@@ -209,6 +209,8 @@ def _open_compressed(file: LogFile) -> Container | DriveLog:
 
 
 def _open_folder(file: LogFile) -> DriveLog:
+    from pdhef_logtool.logs.recording_folder import open_recording
+
     path = file.path
     if is_log_folder(path):
         return _open_rosbag2_folder(file)

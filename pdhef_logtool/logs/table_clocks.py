@@ -242,6 +242,29 @@ def placed(stamps: IntArray) -> IntArray:
     return stamps if _is_dated(stamps) else np.where(stamps != NO_TIME, stamps + RELATIVE_NS, NO_TIME)
 
 
+def with_fractions(clock: Clock, fractions: FloatArray, unit_ns: int, name: str) -> Clock:
+    """Return a clock of whole seconds [N] and the rest of each in the column ``name``, in units of ``unit_ns``."""
+    has_time = (clock.stamps_ns != NO_TIME) & (fractions >= 0.0) & (fractions * unit_ns < _SECONDS)
+    rest = np.where(has_time, fractions, 0.0).astype(np.int64) * unit_ns
+    return replace(clock, stamps_ns=np.where(has_time, clock.stamps_ns + rest, NO_TIME), columns=clock.columns | {name})
+
+
+def spread(clock: Clock) -> Clock:
+    """Return a clock whose rows are spread evenly where several share a time, as in exports in whole seconds."""
+    rows = np.flatnonzero(clock.stamps_ns != NO_TIME)
+    times, first, count = np.unique(clock.stamps_ns[rows], return_index=True, return_counts=True)
+    if len(times) < _CLOCKS["few_rows"] or (np.diff(first) < 0).any() or (usual := int(np.median(count))) < 2:
+        return clock
+    step = float(np.median(np.diff(times))) / usual
+    # The first and last time may have fewer rows than the others.
+    ends = np.array([first[1] - usual, *first[1:], first[-1] + usual])
+    given = np.array([times[1] - usual * step, *times[1:], times[-1] + usual * step])
+    stamps = clock.stamps_ns.copy()
+    stamps[rows] = np.round(np.interp(np.arange(len(rows)), ends, given - times[0])).astype(np.int64) + times[0]
+    note = f"{usual} rows share each time: they are spread over {usual * step / _SECONDS:g} s"
+    return replace(clock, stamps_ns=stamps, notes=(*clock.notes, note))
+
+
 # ---- GPS weeks ----
 
 
@@ -280,9 +303,10 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
     Day and month have one order in the whole column. Numbers above 12 decide it; then the shorter recording; otherwise
     the month is first, with a note.
     """
-    parts = texts.str.strip_chars().str.extract_groups(_TIME_TEXT).struct.unnest()
+    texts = _numbered_months(texts.str.strip_chars())
+    parts = texts.str.extract_groups(_TIME_TEXT).struct.unnest()
     if dates is not None and parts["a"].null_count() == len(parts):
-        return text_clock(dates.str.strip_chars() + " " + texts.str.strip_chars())
+        return text_clock(dates.str.strip_chars() + " " + texts)
     number = {n: parts[n].cast(int, strict=False).fill_null(-1).to_numpy() for n in parts.columns if n not in _WORDS}
     is_dated = number["a"] >= 0
     hour, minute, second = number["hour"], number["minute"], number["second"]
@@ -309,6 +333,16 @@ def text_clock(texts: Series, dates: Series | None = None) -> Clock:
 
 
 _WORDS = frozenset({"mark", "half", "sign", "fraction"})
+_MONTHS = [names.replace(" ", "|") for names in CONSTANTS["asc"]["months"]]
+_NAMED_MONTH = r"(?i)^(\d{{1,2}})[-./ ](?:{})[a-z]*[-./, ]+(\d{{2,4}})"
+
+
+def _numbered_months(texts: Series) -> Series:
+    """Return texts [N] in which a month between day and year is a number: ``24-Nov-2025`` becomes ``24.11.2025``."""
+    if texts.drop_nulls().head(1).str.contains(_NAMED_MONTH.format("|".join(_MONTHS))).any():
+        for number, names in enumerate(_MONTHS, 1):
+            texts = texts.str.replace(_NAMED_MONTH.format(names), f"${{1}}.{number}.${{2}}")
+    return texts
 
 
 def _days(a: IntArray, b: IntArray, c: IntArray, mark: NDArray[Any]) -> tuple[IntArray, BoolArray, str]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.clock_evidence import decades_too_short
+from pdhef_logtool.logs.constants import CONSTANTS
 from pdhef_logtool.logs.table_clocks import (
     NAMED_UNITS,
     NO_TIME,
@@ -22,8 +23,10 @@ from pdhef_logtool.logs.table_clocks import (
     number_clock,
     rate_clock,
     rescaled,
+    spread,
     text_clock,
     week_clock,
+    with_fractions,
 )
 from pdhef_logtool.logs.table_log import Table
 from pdhef_logtool.records.errors import LogError
@@ -53,15 +56,20 @@ _UNITS = frozenset(
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]([^\[\](){}<>]*)[\])}>]$")
 _LATIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"})
 
+#: Words of titles in other alphabets, and their English.
+_TRANSLATIONS: dict[str, str] = CONSTANTS["translations"]
+_OTHER_ALPHABET = re.compile("|".join(_TRANSLATIONS))
+
 _TIME = re.compile(
     r"(?:(?:time|t|timestamp|time_?stamps?|stamp|utc|utc_time|gps_time|date_?time|datetime|zeit(?:stempel)?|log_time|rel(?:ative)?_time|"
-    rf"elapsed(?:_time)?|time_of_day)(?:_(?:{'|'.join(TIME_UNITS_NS)}))?|seconds|milli(?:s|seconds)|micros|time_utc|epoch)"
+    rf"elapsed(?:_time)?|time_of_day|[cp]?ts|ticks?|secs?)(?:_(?:{'|'.join(TIME_UNITS_NS)}))?|seconds|milli(?:s|seconds)|micros|time_utc|epoch)"
 )
 _TIME_LIKE = re.compile(r"time|zeit|clock|stamp")
 _WEEK = re.compile(r"(?:gps|gnss)?_?week(?:_?(?:number|no|nr))?")
 _WEEK_TIME = re.compile(
     r"(?:(?:gps|gnss)_)?(?:i?tow|sow|time_of_week|seconds_of_week|week_seconds|seconds|time)(?:_m?s)?"
 )
+_SECOND_NS = TIME_UNITS_NS["seconds"]
 #: Columns of a table in long form, with a row for each value.
 _SIGNAL = re.compile(
     r"(?:signal|channel|variable|parameter|sensor|tag|key|telemetry|metric|pid|name)(?:_?(?:name|id))?"
@@ -72,6 +80,7 @@ _DATE = re.compile(r"(?:utc_|gps_)?(?:date|datum)")
 
 def field_name(text: str) -> str:
     """Return the name of a column as every format of messages takes it: ASCII letters, digits and ``_``."""
+    text = _OTHER_ALPHABET.sub(lambda match: f" {_TRANSLATIONS[match[0]]} ", text)
     text = unicodedata.normalize("NFKD", text.partition("\\")[0].translate(_LATIN)).encode("ascii", "ignore").decode()
     name = re.sub(r"[\W_]+", "_", text).strip("_") or "column"
     return f"n_{name}" if name[0].isdigit() else name
@@ -150,11 +159,22 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
         )
     certain = [clock for name, clock in clocks.items() if name != chosen and clock.is_certain]
     clock = _read_clock(sheet, chosen, (*others, *certain), rate_hz) if certain else clocks[chosen]
+    clock = _in_two_columns(clock, sheet, chosen, names)
     if clock.notes and not (clock.is_certain or certain or others):
         clock = _as_motion_shows(clock, sheet, chosen)
     apart = [n for n in rivals if abs(clocks[n].length_s - clock.length_s) > _ALIKE * clock.length_s]
     note = f"{chosen} is the clock; the times of {', '.join(apart)} have another length"
     return replace(clock, notes=(*clock.notes, note)) if apart else clock
+
+
+def _in_two_columns(clock: Clock, sheet: Sheet, name: str, names: Mapping[str, str]) -> Clock:
+    """Return a clock of seconds with the fractions of another column, ``stamp.sec`` and ``stamp.nanosec``."""
+    rest = re.fullmatch(r"(.*?)_?(?:s|sec|secs|seconds)", snake(name))
+    for unit, ns in TIME_UNITS_NS.items() if rest else ():
+        within = names.get(f"{rest[1]}_{unit}".strip("_") if rest else "")
+        if within is not None and ns < _SECOND_NS:
+            return with_fractions(clock, _numbers(sheet.columns[within]), ns, within)
+    return clock
 
 
 def _as_motion_shows(clock: Clock, sheet: Sheet, name: str) -> Clock:
@@ -178,7 +198,7 @@ def _grade(sheet: Sheet, name: str) -> int | None:
     column, text = sheet.columns[name], snake(name)
     is_time = _TIME.fullmatch(text) is not None
     if not isinstance(column, np.ndarray):
-        if not is_time and not _DATE.fullmatch(text):
+        if not (is_time or _TIME_LIKE.search(text) or _DATE.fullmatch(text)):
             return None
         times = {*text_clock(column.drop_nulls().head(20)).stamps_ns.tolist()} - {NO_TIME}
         return (0 if is_time else 1) if len(times) > (not is_time) else None
@@ -226,6 +246,7 @@ def tables_of(
     if stamps is None:
         named_values = _named_values(sheet)
         clock = find_clock(sheet, where, rate_hz=None if named_values else rate_hz)
+        clock = clock if named_values else spread(clock)
         stamps, used = clock.stamps_ns, clock.columns
         losses.extend(clock_notes(clock, where))
         if named_values and (long := list(_of_long_form(sheet, stamps, *named_values))):

@@ -131,19 +131,6 @@ class Pieces:
         out[:, 2:-2] = sum(rows[:, i : rows.shape[1] - 4 + i] for i in range(5)) / 5.0
         return out.ravel()
 
-    def ahead_s(self, y: FloatArray, x: FloatArray) -> float:
-        """Return by how many seconds y leads x (parabola through three cross-correlations); 0 if unknown."""
-        rows = x.reshape(len(self.starts), self.cells_a_piece)
-        correlations = []
-        for shift in (-1, 0, 1):
-            moved = np.roll(rows, shift, axis=1)
-            moved[:, [0, -1]] = np.nan
-            relation = fit(y, moved.ravel())
-            correlations.append(0.0 if relation is None else abs(relation.correlation))
-        before, middle, after = correlations
-        bend = 2.0 * middle - before - after
-        return 0.5 * (before - after) / bend * CELL_NS * 1e-9 if bend > 0.0 else 0.0
-
 
 def ratio(y: FloatArray, x: FloatArray, slow: float) -> float | None:
     """Return the ratio y/x where x is above ``slow``; None unless it is nearly constant."""

@@ -15,6 +15,8 @@ from pdhef_logtool.records.signals import FloatArray
 CLEAR = 0.75
 #: Smallest standard deviation of an acceleration that excites a relation.
 EXCITED_A_M_S2 = 0.25
+#: Standard deviation of the curvature below which a path counts as straight; speed at standstill.
+EXCITED_CURVATURE_1_M, SLOW_M_S = 0.0001, 1.0
 
 
 @dataclass(slots=True)
@@ -54,6 +56,18 @@ class Fields:
         if not spread(expected) > EXCITED_A_M_S2:
             return None
         return fit(self.pieces.smooth(ay), self.pieces.smooth(expected))
+
+    def curvature(
+        self, speed: FloatArray | None, rate: FloatArray | None, ay: FloatArray | None = None
+    ) -> FloatArray | None:
+        """Return the path's curvature while moving, 1/m [M], by yaw rate or else a_y; None if the path is straight."""
+        if speed is None or not np.isfinite(speed).any():
+            return None
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            turning = ay / speed if rate is None and ay is not None else rate
+            moving = speed > max(SLOW_M_S, 0.25 * float(np.nanquantile(speed, 0.95)))
+            curve = None if turning is None else self.pieces.smooth(np.where(moving, turning / speed, np.nan))
+        return curve if curve is not None and spread(curve) > EXCITED_CURVATURE_1_M else None
 
 
 def agree(a: FloatArray, b: FloatArray) -> bool:

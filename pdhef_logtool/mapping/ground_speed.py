@@ -11,14 +11,13 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping.candidates import Field, anchors_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen, fit, ratio
-from pdhef_logtool.mapping.fields import CLEAR, Fields
+from pdhef_logtool.mapping.fields import CLEAR, SLOW_M_S, Fields
 from pdhef_logtool.mapping.path import PLACES, path_speed, path_velocity
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.signals import FloatArray
 
 #: Tolerance of its ratio to the speed from positions.
 NEAR_PATH = 0.08
-SLOW_M_S = 1.0
 #: Speed over ground over that along the path if the axes are the earth's; share of the time that a body moves ahead.
 SAME_STEPS, AHEAD_SHARE = (0.7, 1.4), 0.6
 #: Axes of the x and y of a velocity; empty if the drive does not show them, "not ahead" if they are not the body's.

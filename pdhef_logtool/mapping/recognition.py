@@ -14,6 +14,7 @@ from pdhef_logtool.mapping.can_frames import CanSignalLog, decoded_frames, holds
 from pdhef_logtool.mapping.candidates import MOST, Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.clocks import with_usable_stamps
+from pdhef_logtool.mapping.evidence import Pieces, Seen
 from pdhef_logtool.mapping.gnss_signals import RAW_COURSE, gnss_signals, has_heading, receiver_signals
 from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, Axes, length_of, twist_axes
 from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
@@ -38,8 +39,6 @@ OWN_PREFIX = "/pdhef/"
 
 #: Subject of a choice between runs, and formats of files that may contain several.
 RUN, RUN_KINDS = "run", frozenset({"mat", "mat-7.3"})
-PROBE_NS = 2_000_000_000
-PROBE_AT = (0.0, 0.25, 0.5, 0.75, 1.0)
 #: Largest difference of the mean acceleration from 1 for accelerations in g.
 NEAR_1_G = 0.08
 
@@ -104,7 +103,7 @@ class _Draft:
     """A mapping under construction by :func:`auto_map`."""
 
     log: DriveLog
-    samples: dict[str, dict[str, FloatArray]]
+    samples: dict[tuple[str, str], Seen]
     signals: dict[str, SignalSource] = field(default_factory=dict)
     truth: dict[str, SignalSource] = field(default_factory=dict)
     quality: QualityGate | None = None
@@ -113,7 +112,8 @@ class _Draft:
     axes: dict[tuple[str, ...], Axes] = field(default_factory=dict)
 
     def values(self, topic: str, path: str) -> FloatArray:
-        return self.samples.get(topic, {}).get(path, np.empty(0))
+        seen = self.samples.get((topic, path))
+        return np.empty(0) if seen is None else seen.values
 
     def is_given(self, topic: str, path: str) -> bool:
         """Return whether the type has a field and its samples, if any, are not all NaN."""
@@ -537,22 +537,13 @@ def _join(prefix: str, path: str) -> str:
     return f"{prefix}.{path}" if prefix else path
 
 
-def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[str, dict[str, FloatArray]]:
-    """Read a few seconds in five places of the log, for fields that may contain constant fillers."""
-    requests: dict[str, list[str]] = {}
-    for topic in topics:
-        if paths := _probed_paths(topic):
-            fields = log.fields(topic.name)
-            requests[topic.name] = [p for p in dict.fromkeys(paths) if has_path(fields, p)]
-    if not requests:
-        return {}
-    span = max(0, log.end_ns - log.start_ns - PROBE_NS)
-    pieces: dict[str, dict[str, list[FloatArray]]] = {t: {p: [] for p in paths} for t, paths in requests.items()}
-    for start in sorted({log.start_ns + int(span * share) for share in PROBE_AT}):
-        for name, columns in log.read(requests, start, start + PROBE_NS).items():
-            for path in requests[name]:
-                pieces[name][path].append(np.asarray(columns.fields[path], dtype=np.float64))
-    return {t: {p: np.concatenate(v) for p, v in paths.items() if v} for t, paths in pieces.items()}
+def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[tuple[str, str], Seen]:
+    """Read pieces of the fields that may contain constant fillers."""
+    fields = {t.name: log.fields(t.name) for t in topics if _probed_paths(t)}
+    requests = {
+        t.name: [p for p in _probed_paths(t) if has_path(fields[t.name], p)] for t in topics if t.name in fields
+    }
+    return Pieces(log).read(requests) if any(requests.values()) else {}
 
 
 def _probed_paths(topic: TopicInfo) -> list[str]:

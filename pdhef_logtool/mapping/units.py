@@ -11,7 +11,7 @@ import numpy as np
 
 from pdhef_logtool.mapping.candidates import LEAST_SCORE, Field, leaf_group, triad_of
 from pdhef_logtool.mapping.evidence import fit, ratio
-from pdhef_logtool.mapping.fields import CLEAR, Fields
+from pdhef_logtool.mapping.fields import CLEAR, SLOW_M_S, Fields
 from pdhef_logtool.mapping.naming import G_M_S2
 from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.records.signals import FloatArray
@@ -22,8 +22,6 @@ SAME, BY_DRIVING = 0.03, 0.15
 CERTAIN = 0.9
 #: Energies of rare units.
 RARE = {"mph": 1.5, "mg": 1.5}
-#: Smaller raw speeds give no information on the unit.
-SLOWEST = 1.0
 #: Words in names of filtered or derived copies of a sensor.
 _SECOND_CHOICE = ("raw", "uncomp", "delta", "error", "offset", "relative")
 
@@ -54,7 +52,7 @@ def posterior(units: Sequence[Sequence[Unit]], gains: Sequence[Gain]) -> FloatAr
     """Return the probabilities [K_1, K_2, ...] of the combinations of the K_i units of each field i.
 
     The logarithm of a gain is normal; if its relation does not apply, it is uniform over a range of four. The
-    probabilities are those of all relations with these units; the rest is that a relation does not apply.
+    probabilities sum to less than 1: the rest is the probability that a relation does not apply.
     """
     grids = np.meshgrid(*(range(len(ways)) for ways in units), indexing="ij")
     factors, spreads, energies = (
@@ -129,7 +127,7 @@ def _speeds(fields: Fields) -> None:
     path = path_speed(fields)
     for item in fields.all("speed"):
         others = [path, None if reference is None or reference is item else reference.si]
-        times = [ratio(other, item.seen.cells, SLOWEST) for other in others if other is not None]
+        times = [ratio(other, item.seen.cells, SLOW_M_S) for other in others if other is not None]
         settle((item,), [Gain((1,), 1.0 / x, SAME) for x in times if x is not None and x > 0.0], "other speeds")
 
 

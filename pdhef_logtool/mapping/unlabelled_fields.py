@@ -1,8 +1,10 @@
 """Identify unlabelled fields (``data[3]``, ``ch7``, ``k``) by physical relations.
 
-Speed, yaw rate and accelerations are identified if exactly one choice of columns satisfies a_y = v r and a_x = v̇ with
-slopes that units explain. The slope of a_x = v̇ gives the units of speed and accelerations; the ratio of both slopes
-gives the unit of the yaw rate, and also separates a yaw rate from a steering angle. Left and right are not observable.
+Each choice of columns as speed, yaw rate and accelerations has a likelihood, by the residuals of a_y = v r and a_x = v̇,
+one sample per second, and by the units that explain both slopes. Steering angles compete as r √v and as r alone: the
+yaw rate that they cause grows less than in proportion to speed. The result is the choice that is far likelier than all
+others. The slope of a_x = v̇ gives the units of speed and accelerations; the ratio of both slopes gives the unit of the
+yaw rate. Left and right are not observable.
 """
 
 from __future__ import annotations
@@ -16,8 +18,8 @@ import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.candidates import ANGLES, HYPOTHESES, MOST_FIELDS, Field, Role, stamp_of
-from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, is_of_both_signs, ratio, spread
-from pdhef_logtool.mapping.fields import EXCITED_A_M_S2, Fields
+from pdhef_logtool.mapping.evidence import CELL_NS, Fit, Pieces, fit, is_of_both_signs, ratio, spread
+from pdhef_logtool.mapping.fields import Fields
 from pdhef_logtool.mapping.naming import Meaning, is_command, is_unlabelled, meaning_of
 from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.mapping.units import CERTAIN, Gain, Unit, posterior
@@ -26,50 +28,48 @@ from pdhef_logtool.records.signals import FloatArray
 #: Maximum number of columns to examine, in total and per array.
 MOST_UNLABELLED = 40
 MOST_OF_ARRAY = 32
-#: Minimum correlations of a_y with v r and of a_x with v̇; for competing choices, the loose ones.
-TURNS, SPEEDS_UP = 0.92, 0.75
-LOOSE_TURNS, LOOSE_SPEEDS_UP = 0.8, 0.6
-#: Minimum lead of the product of the correlations over any other choice.
-CLEARER = 0.05
-#: Largest residual of a_y over v r, relative to the residuals over r alone and over r √v. A steering angle gives a yaw
-#: rate that increases with speed, but less than in proportion, as cars understeer.
-BY_SPEED, BY_ROOT = 0.6, 0.85
-#: Minimum lead of a_y over v r, as the sideslip of a car grows first; a yaw rate lags the steering.
-AHEAD_S = 0.05
-#: 1-sigma of the logarithm of a slope: accelerations include roll and grade. Least probability of the units of a
-#: competing choice.
-SLOPE, PLAUSIBLE = 0.08, 1e-4
+#: Minimum correlations of a_y with v r and of a_x with v̇, and of both in a choice that competes.
+TURNS, SPEEDS_UP, COMPETES = 0.92, 0.75, 0.6
+#: Powers of the speed in the relation of a_y with the yaw rate, and with a steering angle.
+POWERS = (1.0, 0.5, 0.0)
+#: Minimum lead of the log likelihood of a choice.
+DECISIVE = 6.0
+#: 1-sigma of the logarithm of a slope: accelerations include roll and grade.
+SLOPE = 0.08
 #: Smallest standard deviation of an acceleration; a yaw rate in rad/s is smaller.
 LEAST_AY_M_S2 = 0.4
+#: Smallest share of a variance, or probability, that measurements resolve.
+RESOLVED = 1e-6
 #: Minimum correlation between copies of a quantity.
 COPY = 0.98
-#: Minimum correlation of a column sent twice.
-ITSELF = 0.999
 #: Strength of a name that is a letter; physics has priority over it.
 BY_LETTER = 0.6
-#: Minimum correlation of a steering angle with the path's curvature.
-STEERS = 0.9
+#: Minimum correlation of a steering angle with the path's curvature, and its lead over any other column.
+STEERS, CLEARER = 0.9, 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class _Choice:
     """Columns chosen as speed, yaw rate, a_y and a_x, their relations, and the units of the first three.
 
-    ``is_strict``: both relations fit well enough, with certain units and a large enough a_y, to be accepted unless
-    another choice fits almost as well. ``ahead_s``: lead of a_y over v r.
+    ``share``: probability of the units. ``power``: of the speed in the relation of a_y. ``score``: log likelihood.
     """
 
     columns: tuple[Field, Field, Field, Field]
     turning: Fit
     speeding: Fit
     units: tuple[tuple[str, float], ...]
-    is_strict: bool
-    ahead_s: float
+    share: float
+    power: float
+    score: float
 
     @property
-    def score(self) -> float:
-        """Product of the correlations."""
-        return abs(self.turning.correlation * self.speeding.correlation)
+    def is_plain(self) -> bool:
+        """Return whether it is the motion of a car, with both relations close and certain units."""
+        if self.power != 1.0 or self.share < CERTAIN:
+            return False
+        is_close = abs(self.turning.correlation) > TURNS and abs(self.speeding.correlation) > SPEEDS_UP
+        return is_close and spread(self.columns[2].seen.cells) * self.units[2][1] > LEAST_AY_M_S2
 
     @property
     def evidence(self) -> str:
@@ -115,11 +115,12 @@ def identified(fields: Fields, unlabelled: Sequence[Field]) -> tuple[list[Field]
     ----------
     unlabelled : columns with an empty meaning; named fields keep their quantity.
     """
-    order = sorted(_choices(fields, unlabelled), key=lambda c: (-c.score, -abs(c.turning.correlation)))
-    best = next((c for c in order if c.is_strict), None)
-    # A column that lags v r is not a_y if another one leads it.
-    others = (c for c in order if best is not None and c.ahead_s > 0.0 and not _same(best, c))
-    if best is None or any(c.score > best.score - CLEARER for c in others):
+    order = sorted(_choices(fields, unlabelled), key=lambda c: -c.score)
+    if (
+        not order
+        or not (best := order[0]).is_plain
+        or any(c.score > best.score - DECISIVE and not _same(best, c) for c in order)
+    ):
         return [], "", ""
     meant = _as_chosen(fields, unlabelled, best, best.evidence)
     return meant, meant[0].topic.name if meant else "", best.evidence
@@ -152,7 +153,7 @@ def _as_chosen(fields: Fields, unlabelled: Sequence[Field], choice: _Choice, why
 
 
 def _choices(fields: Fields, unlabelled: Sequence[Field]) -> Iterator[_Choice]:
-    """Yield the choices that satisfy the relations with plausible slopes."""
+    """Yield the choices of columns, each also with the relations of signals that are no yaw rate."""
     signed = [f for f in unlabelled if is_of_both_signs(f.seen.values)]
     others = (("speed", None, [f for f in unlabelled if _is_forward(f)]), ("rate", "z", signed),
               ("acceleration", "y", signed), ("acceleration", "x", unlabelled))  # fmt: skip
@@ -160,34 +161,25 @@ def _choices(fields: Fields, unlabelled: Sequence[Field]) -> Iterator[_Choice]:
     smooth = {id(f): fields.pieces.smooth(f.seen.cells) for f in (*ays, *axs)}
     for v in speeds:
         change = fields.pieces.rate_of(v.seen.cells)
-        fits = [(x, fit(change, smooth[id(x)])) for x in axs if x is not v]
-        ways = [(x, f) for x, f in fits if f is not None and abs(f.correlation) > LOOSE_SPEEDS_UP]
-        for r, y in itertools.product(rates, ays):
-            turning, by_speed, ahead_s = _turning(fields, v, r, smooth[id(y)])
-            for x, speeding in ways:
-                if turning is None:
-                    break
+        fits = [(x, f) for x in axs if x is not v and (f := _close(change, smooth[id(x)]))]
+        seconds = float(np.count_nonzero(np.isfinite(change))) * CELL_NS * 1e-9
+        for r, y, power in itertools.product(rates, ays, POWERS):
+            turning = _close(smooth[id(y)], fields.pieces.smooth(np.maximum(v.seen.cells, 0.0) ** power * r.seen.cells))
+            for x, speeding in fits if turning else ():
                 columns = (v, r, y, x)
-                units, share = _explained(columns, turning, speeding)
-                if share < PLAUSIBLE or len({*map(id, columns)}) < len(columns):
+                if turning is None or len({*map(id, columns)}) < len(columns):
                     continue
-                is_strict = by_speed and abs(speeding.correlation) > SPEEDS_UP and share > CERTAIN
-                is_strict &= spread(smooth[id(y)]) * units[2][1] > LEAST_AY_M_S2
-                yield _Choice(columns, turning, speeding, units, is_strict, ahead_s)
+                left = math.prod(max(1.0 - f.correlation**2, RESOLVED) for f in (turning, speeding))
+                units, share = _explained(columns, turning, speeding) if power == 1.0 else ((), 1.0)
+                if share > RESOLVED:
+                    score = math.log(share) - 0.5 * seconds * math.log(left)
+                    yield _Choice(columns, turning, speeding, units, share, power, score)
 
 
-def _turning(fields: Fields, v: Field, r: Field, ay: FloatArray) -> tuple[Fit | None, bool, float]:
-    """Fit a_y to v r; return the fit, whether other powers of the speed fit worse, and the lead of a_y in s."""
-    smooth, speed, rate = fields.pieces.smooth, np.maximum(v.seen.cells, 0.0), r.seen.cells
-    relation, root, alone = (fit(ay, smooth(speed**p * rate)) for p in (1.0, 0.5, 0.0))
-    if relation is None or root is None or alone is None or abs(relation.correlation) < LOOSE_TURNS:
-        return None, False, 0.0
-    if abs(alone.correlation) > ITSELF:
-        return None, False, 0.0
-    left, of_root, of_alone = (1.0 - f.correlation**2 for f in (relation, root, alone))
-    strict = abs(relation.correlation) > TURNS and left < BY_SPEED * of_alone and left < BY_ROOT * of_root
-    ahead_s = fields.pieces.ahead_s(ay, smooth(v.seen.cells * rate))
-    return relation, strict and ahead_s > AHEAD_S, ahead_s
+def _close(y: FloatArray, x: FloatArray) -> Fit | None:
+    """Return the fit of a relation that may compete."""
+    relation = fit(y, x)
+    return relation if relation is not None and abs(relation.correlation) > COMPETES else None
 
 
 def _explained(
@@ -226,16 +218,16 @@ def _is_forward(item: Field) -> bool:
 
 
 def _same(a: _Choice, b: _Choice) -> bool:
-    """Return whether two choices use the same columns or copies of them."""
-    return all(item is other or _is_copy(item, other) for item, other in zip(a.columns, b.columns, strict=True))
+    """Return whether two choices use the same columns, or copies of them, in the same relation."""
+    return a.power == b.power and all(
+        item is other or _is_copy(item, other) for item, other in zip(a.columns, b.columns, strict=True)
+    )
 
 
 def _steering(fields: Fields, columns: Sequence[Field], speed: FloatArray, rate: FloatArray) -> list[Field]:
     """Return the column that follows the path's curvature far better than all others, as a steering angle."""
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        slow = max(1.0, 0.25 * float(np.nanquantile(speed, 0.95)))
-        curve = fields.pieces.smooth(np.where(speed > slow, rate / speed, np.nan))
-    if not spread(curve * speed**2) > EXCITED_A_M_S2:
+    curve = fields.curvature(speed, rate)
+    if curve is None:
         return []
     relations = ((fit(fields.pieces.smooth(item.seen.cells), curve), item) for item in columns)
     fits = [(abs(relation.correlation), item) for relation, item in relations if relation is not None]

@@ -25,8 +25,8 @@ from pdhef_logtool.mapping.candidates import (
     triad_of,
 )
 from pdhef_logtool.mapping.checking import has_path
-from pdhef_logtool.mapping.evidence import Fit, fit, ratio, spread
-from pdhef_logtool.mapping.fields import CLEAR, Fields, agree, mean_of
+from pdhef_logtool.mapping.evidence import Fit, fit, ratio
+from pdhef_logtool.mapping.fields import CLEAR, SLOW_M_S, Fields, agree, mean_of
 from pdhef_logtool.mapping.gnss_signals import has_heading
 from pdhef_logtool.mapping.ground_speed import axes_of
 from pdhef_logtool.mapping.naming import words_of
@@ -49,17 +49,15 @@ _SENSORS = (
     ("speed_m_s", "speed", ("", "x")), ("ax_m_s2", "acceleration", ("x",)), ("ay_m_s2", "acceleration", ("y",)),
     ("yaw_rate_rad_s", "rate", ("z",)),
 )  # fmt: skip
-#: Standard deviation of the curvature below which a path counts as straight.
-EXCITED_CURVATURE_1_M = 0.0001
 #: Least correlation of a yaw rate about the right axis.
 FOLLOWS = 0.5
 #: Plausible lengths that convert curvature to an angle: wheelbases of model cars to lorries, times a steering ratio for
 #: the steering wheel.
 _STEERING_M = {"steer_rad": (0.15, 8.0), "steering_wheel_rad": (12.0, 160.0)}
-#: Signals that may have an unknown sign; speed below which they give no information; largest log ratio between the
-#: length of a steering angle and a usual length if the signal could also be a share of the largest angle.
+#: Signals that may have an unknown sign; largest log ratio between the length of a steering angle and a usual length if
+#: the signal could also be a share of the largest angle.
 _SIGNED = ("steer_rad", "steering_wheel_rad", "yaw_rate_rad_s", "ay_m_s2")
-SLOW_M_S, USUAL = 1.0, 0.6
+USUAL = 0.6
 #: Usual lengths. Units of wheel speeds, which are mostly named as speeds; their energies where the rest is in SI units.
 USUAL_LENGTH_M = {"steer_rad": 2.7, "steering_wheel_rad": 43.0}
 #: Usual radius of a wheel, and 1-sigma of the logarithm of a radius that a car assumes for its wheel speeds.
@@ -69,7 +67,7 @@ WHEEL_UNITS = (
     *(Unit(n, f * USUAL_RADIUS_M, "wheel rate", 0.4) for n, f in HYPOTHESES["wheel rate"]),
 )
 IN_SI = {"m/s": 0.0, "km/h": 3.0, "mph": 3.0, "rad/s": 0.0, "rpm": 3.0}
-#: Probability, relative to that of the best unit, of another unit that is a doubt: of wheels, and of a steering angle.
+#: Probability of a unit over the highest one from which the unit is a doubt: of wheels, and of a steering angle.
 POSSIBLE, LIKELY = 0.05, 0.25
 
 
@@ -192,7 +190,7 @@ class _Weighing:
         return usable
 
     def _drop_vectors_over_ground(self) -> None:
-        """Take velocities x, y over ground as those of a receiver; they are no velocities of the body."""
+        """Take velocities x, y over ground as the signals of a receiver; they are no velocities of the body."""
         steps, rates = path_velocity(self.fields), self.fields.open("rate", "z")
         for x, y in list(self._vectors()):
             axes = axes_of(self.fields.pieces, x.si, y.si, steps, rates[0].si if rates else None)
@@ -294,15 +292,13 @@ class _Weighing:
         wheels = [f for n, f in self.taken.items() if n.startswith("wheel_speed") and n.endswith("m_s")]
         if speed is None and wheels:  # in their most likely unit
             speed = wheels[0].standing_for(mean_of([f.si for f in wheels]))
-        curvature = _curvature(speed, rate, ay)
+        curvature = self.fields.curvature(*(None if f is None else f.si for f in (speed, rate, ay)))
         judged: list[tuple[float, str, Field]] = []
         for item in candidates:
             if item.is_weak:
                 self.notes.append(f"{item.topic.name}.{item.path} is not used: {item.doubts[-1]}")
                 continue
-            relation = None
-            if curvature is not None:
-                relation = fit(self.fields.pieces.smooth(item.seen.cells), self.fields.pieces.smooth(curvature))
+            relation = None if curvature is None else fit(self.fields.pieces.smooth(item.seen.cells), curvature)
             name, follows = self._steering_kind(item, relation)
             if follows is False:
                 item.doubts.append("it does not follow the car's turning")
@@ -509,19 +505,6 @@ def truth_topic(weighable: Sequence[Field]) -> str:
         if worth > best[0] and (fields[0].role != "sensor" or worth >= 1.5 or fields[0].fixed):
             best = (worth, name)
     return best[1]
-
-
-def _curvature(speed: Field | None, rate: Field | None, ay: Field | None) -> FloatArray | None:
-    """Return the path's curvature in 1/m while moving, by yaw rate or else a_y; None if the path is straight."""
-    if speed is None or (rate is None and ay is None):
-        return None
-    v = speed.si
-    if not np.isfinite(v).any():
-        return None
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        moving = v > max(SLOW_M_S, 0.25 * float(np.nanquantile(v, 0.95)))
-        curve = np.where(moving, rate.si / v if rate is not None else ay.si / v**2 if ay is not None else v, np.nan)
-    return curve if spread(curve) > EXCITED_CURVATURE_1_M else None
 
 
 def _likeliest_unit(times: float | None, sigma: float, by: str, *, in_si: bool) -> tuple[Unit, str, str]:

@@ -23,19 +23,20 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.car import Car, WithoutTruth
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
 from pdhef_logtool.compiled.cache import njit
 from pdhef_logtool.estimators.adaptive_physics import CURES
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.calibration.joint import prior_variations
 from pdhef_logtool.estimators.latency_compensation import PIECE_STEPS
 from pdhef_logtool.estimators.presets import ON_FILE, preset_of, uses_calibration
 from pdhef_logtool.estimators.vehicle_model import VY
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, of_car, physics_filter
 from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
+from pdhef_logtool.model.priors import prior_variations
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
 from pdhef_logtool.records.signals import SIGNAL_COLUMNS, FloatArray, IntArray, Signals
@@ -50,6 +51,8 @@ OWN_SHARE = 0.5
 #: Standard deviations of the parameters of an identified car over those of a vehicle file: 8 % of the stiffness of an
 #: axle, which changes of the load cause.
 IDENTIFIED_SHARE = 0.16
+#: Smallest χ of parameters from earlier drives: later driving may fit less.
+EARLIER_ERROR_SCALE = 2.0
 #: Longest step of the filters whose differences count: parameters act slowly.
 SLOW_STEP_S = 0.04
 #: Largest standard deviation of sideslip.
@@ -153,11 +156,11 @@ def drive_intervals(car: Car, estimators: Sequence[Estimator]) -> DriveIntervals
     return DriveIntervals(by_name | {name: of_file for name in names if preset_of(name) == ON_FILE}, notes)
 
 
-def _of_drive(car: Car, calibration: WithoutTruth) -> Interval:
+def _of_drive(car: Car, posterior: Posterior) -> Interval:
     """Return the interval on the vehicle of the drive's posterior."""
-    filters = tuple(physics_filter(v, calibration.noise) for v in (calibration.vehicle, *calibration.varied))
-    whole_drive = not calibration.causal
-    return Interval(filters, car.vehicle, calibration.error_scale, CAR_STD_RAD, car.cg_std_m, whole_drive)
+    filters = tuple(physics_filter(v, posterior.noise) for v in (posterior.vehicle, *posterior.varied))
+    scale = max(posterior.error_scale, EARLIER_ERROR_SCALE) if posterior.causal else posterior.error_scale
+    return Interval(filters, car.vehicle, scale, CAR_STD_RAD, car.cg_std_m, whole_drive=not posterior.causal)
 
 
 def _of_file(car: Car, share: float, *, use_speed: bool) -> Interval:

@@ -164,6 +164,8 @@ class Signals:
         to the arrival of a velocity that ``ready_ns`` does not wait for.
     gnss_position_deg : float64 [N, 2], latitude and longitude; gnss_position_std_m, gnss_heading_rad : float64 [N].
     roll_rate_rad_s, pitch_rate_rad_s : float64 [N]. Missing columns are filled with NaN.
+    extra_variance : float64 [N, 2], variance of a_y and yaw rate in excess of the usual one, m²/s⁴ and rad²/s².
+    faults : float64 [N], bits of :mod:`pdhef_logtool.records.reasons`.
     """
 
     stamps_ns: IntArray
@@ -184,6 +186,8 @@ class Signals:
     gnss_heading_rad: FloatArray = field(default_factory=lambda: np.empty(0))
     roll_rate_rad_s: FloatArray = field(default_factory=lambda: np.empty(0))
     pitch_rate_rad_s: FloatArray = field(default_factory=lambda: np.empty(0))
+    extra_variance: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    faults: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         """Fill missing columns with NaN."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
@@ -108,7 +108,10 @@ class Figure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeFigure(Figure):
-    """Lines over time. ``level``: value of a horizontal line; ``resolution``: storage resolution in the unit."""
+    """Lines over time.
+
+    ``level``: value of a horizontal line. ``resolution``: storage resolution in the unit. ``time``: of this figure.
+    """
 
     kind = "time"
     unit: str
@@ -119,6 +122,7 @@ class TimeFigure(Figure):
     level: float | None = None
     resolution: float = 0.0
     height: int = 190
+    time: Mapping[str, float] | None = None
 
     @property
     def heading(self) -> str:
@@ -175,30 +179,12 @@ class Charts:
     origin_ns: int = 0
     figures: dict[str, Figure] = field(default_factory=dict)
 
-    def text(self, key: str) -> str:
-        """Return a text description of a figure with the range of each track."""
-        figure = self.figures[key]
-        if isinstance(figure, TimeFigure):
-            parts = [f"{s.label} {_range(s.values)}" for s in figure.series if not s.group]
-            return f"{figure.heading} over time: {'; '.join(parts)}."
-        if isinstance(figure, StripFigure):
-            parts = [f"{r.label} {len(r.spans)} times" for r in figure.rows if r.spans]
-            return f"{figure.heading} over time: {'; '.join(parts) or 'none'}."
-        if isinstance(figure, PointsFigure):
-            parts = [f"{c.label} {_range(c.x)} and {_range(c.y)}" for c in figure.clouds]
-            return f"{figure.heading}; {figure.x_label} and {figure.y_label}: {'; '.join(parts)}."
-        if isinstance(figure, IntervalsFigure):
-            parts = [f"{i.label} {i.middle:.3g} ({i.low:.3g} to {i.high:.3g})" for i in figure.intervals]
-            return f"{figure.heading} in {figure.unit}: {'; '.join(parts)}."
-        assert isinstance(figure, BarsFigure)
-        return (
-            f"{figure.heading} in {figure.unit}: histogram of {sum(figure.counts):.0f} values, "
-            f"{_range(np.array(figure.edges))}."
-        )
-
-    def start_s(self) -> float:
-        """Return the start of the grid in seconds from the origin."""
-        return 0.0 if self.grid is None else (self.grid.start_ns - self.origin_ns) * 1e-9
+    def time(self) -> dict[str, float] | None:
+        """Return the grid: start and width of the cells in seconds from the origin, and their number."""
+        grid = self.grid
+        if grid is None:
+            return None
+        return {"start": (grid.start_ns - self.origin_ns) * 1e-9, "cell": grid.cell_s, "cells": grid.cells}
 
     def document(self) -> tuple[dict[str, Any], dict[str, str]]:
         """Return the document for the page's script, and the text blocks that it refers to, by name."""
@@ -207,9 +193,7 @@ class Charts:
             key: {"kind": figure.kind, **packed.entries(figure, getattr(figure, "resolution", 0.0))}
             for key, figure in self.figures.items()
         }
-        grid = self.grid
-        time = None if grid is None else {"start": self.start_s(), "cell": grid.cell_s, "cells": grid.cells}
-        return {"time": time, "figures": figures}, packed.texts
+        return {"time": self.time(), "figures": figures}, packed.texts
 
 
 class _Blocks:
@@ -243,11 +227,6 @@ class _Blocks:
         if isinstance(value, list | tuple):
             return [self._plain(entry, resolution) for entry in value]
         return self.entries(value, resolution) if is_dataclass(value) else value
-
-
-def _range(values: FloatArray) -> str:
-    finite = values[np.isfinite(values)]
-    return f"{finite.min():.3g} to {finite.max():.3g}" if finite.size else "no value"
 
 
 def _label(text: str) -> str:

@@ -6,45 +6,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pdhef_logtool.evaluation.units import AY_NOTE, LABELS
+from pdhef_logtool.evaluation.requirement_verdicts import next_steps
+from pdhef_logtool.evaluation.units import AY_NOTE
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts
-from pdhef_logtool.reports.drive_figures import DriveFigures, Roles, drive_figures
+from pdhef_logtool.reports.drive_figures import Roles, drive_figures
 from pdhef_logtool.reports.drive_tables import by_segment, consistency, definitions, disagreements, residuals, scores
-from pdhef_logtool.reports.first_screen import plan_head, steps_of, tested_drive
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
 from pdhef_logtool.results.run_report import reasons_line
 
-#: The best filter with physics only.
-_PHYSICS = "physics"
-#: Minimum duration of a drive for conclusions, in s.
-_SHORT_S = 10.0
+#: The best filter with physics only, and the baseline, whose errors would hide all others in a figure.
+_PHYSICS, _ZERO = "physics", "zero"
 #: Keys of the figures, in the order of the page.
-OVER_TIME = ("sideslip", "error", "trust", "r_scale", "nis", "speed", "ay", "strip")
-IN_PLANE = ("path", "ay_sideslip", "phase")
+OVER_TIME = ("sideslip", "error", "yaw_rate", "ay", "speed", "strip")
+IN_PLANE = ("path", "ay_sideslip")
 #: Maximum number of rows of tables that grow with the length of the log.
 _MOST_ROWS = 200
-#: Word and style class of each outcome.
-OUTCOMES = {
-    "better": ("better", "good"),
-    "same": ("as good", ""),
-    "worse": ("worse", "bad"),
-    "undecided": ("inconclusive", ""),
-    "alone": ("alone", ""),
-    "none": ("no verdict", ""),
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """A sentence on one signal, and its summary in a word; ``kind``: class of the style."""
-
-    signal: str
-    word: str
-    text: str
-    kind: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,23 +44,16 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
     if report is None or not isinstance(report.get("log"), dict):
         cause, remedy = cause_and_remedy(log.outcome.removeprefix("failed: "))
         return DrivePage(render("failed.html", label=log.label, cause=cause, remedy=remedy, back=back), Charts())
-    figures, why_none, wrong = None, "", ""
+    figures, path, wrong = None, None, ""
     roles = roles_of(report)
-    if roles is None:
-        why_none = "No estimator ran, so that there are no figures."
-    else:
+    if roles is not None:
         try:
             path = log.file(ESTIMATES_FILE)
             figures = None if path is None else drive_figures(path, report, roles)
         except OutputError as error:
             wrong = f"the figures cannot be drawn: {error}"
-            why_none = f"{wrong[0].upper()}{wrong[1:]}"
-        else:
-            if path is None:
-                why_none = f"{ESTIMATES_FILE} is not in the folder of this log; the tables are from report.json."
-            elif figures is None:
-                why_none = f"{ESTIMATES_FILE} has no row of {roles.main}."
     charts = Charts() if figures is None else figures.charts
+    texts = (report.get("answer") or {}).get("texts") or {}
     html = render(
         "drive.html",
         charts,
@@ -89,21 +61,19 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         back=back,
         report=report,
         roles=roles,
-        plan=plan_head(report.get("plan")),
-        tested=tested_drive(report, log.outcome),
-        steps=steps_of(report),
+        outcome=log.outcome,
+        steps=next_steps(report.get("plan"), texts.get("next", "").split("; ")),
         identical=[] if roles is None else identical_to(report, roles.main),
-        verdicts=verdicts_of(report),
         drawn=figures,
-        why_none=why_none,
-        notices=_notices(report, figures),
+        path=path,
+        wrong=wrong,
+        reasons_line=reasons_line,
         scores=[] if roles is None else scores(report, roles),
         segments=[] if roles is None else by_segment(report, roles),
         consistency=consistency(report, roles),
         residuals=residuals(report),
         apart={} if roles is None else disagreements(report, roles),
         definitions=definitions(report),
-        estimators=_estimators(report),
         checks=sorted(report.get("checks") or (), key=lambda c: ("failed", "undecided", "passed").index(c["verdict"])),
         losses=(report.get("losses") or ())[:_MOST_ROWS],
         samples=[s for s in report["ledger"]["samples"] if s["dropped"]][:_MOST_ROWS],
@@ -117,16 +87,15 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
 
 
 def roles_of(report: Mapping[str, Any]) -> Roles | None:
-    """Return the names to draw: the selected estimate, its rival in the verdict on sideslip (else physics), others."""
+    """Return the names to draw: the selected estimate, physics (else the first other filter), others."""
     names: list[str] = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
     if not names:
         return None
     answer = report.get("answer") or {}
     main: str = answer["main"] if answer.get("main") in names else names[0]
-    rival_of_verdict = next((str(v.get("rival")) for v in _told(report) if v.get("signal") == "sideslip_rad"), "")
     identical = identical_to(report, main)
     others = [n for n in names if n not in identical]
-    rival = next((n for n in (rival_of_verdict, _PHYSICS, *others) if n in others and n != main), "")
+    rival = next((n for n in (_PHYSICS, *sorted(others, key=lambda n: n == _ZERO)) if n in others and n != main), "")
     return Roles(main, rival, tuple(n for n in names if n not in (main, rival)))
 
 
@@ -141,57 +110,3 @@ def identical_to(report: Mapping[str, Any], main: str) -> list[str]:
     apart = [m["estimator"] for m in report["metrics"] if m["metric"] == "disagreement_rms" and m["value"] == 0.0]
     pairs = [n for pair in apart if main in (names := pair.split("~")) for n in names if n != main]
     return [*dict.fromkeys([*same, *pairs])]
-
-
-def _told(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    return [v for v in report.get("verdicts") or () if isinstance(v, Mapping)]
-
-
-def verdicts_of(report: Mapping[str, Any]) -> list[Verdict]:
-    """Return the sentences at the head of a page; without verdicts, the text of the selected estimate."""
-    signals: dict[tuple[str, str, str], list[str]] = {}
-    for v in _told(report):
-        word, kind = OUTCOMES.get(str(v.get("outcome")), (str(v.get("outcome")), ""))
-        text = str(v.get("text", "")).removeprefix(f"{word}: ")
-        signals.setdefault((word, text, kind), []).append(LABELS.get(str(v.get("signal")), ""))
-    verdicts = [Verdict(", ".join(names), *of) for of, names in signals.items()]
-    answer = report.get("answer")
-    if verdicts or answer is None:
-        return verdicts
-    return [Verdict("sideslip", "result", str(answer["texts"]["result"]))]
-
-
-def _notices(report: Mapping[str, Any], figures: DriveFigures | None) -> list[str]:
-    """Return warnings that precede the figures."""
-    said = []
-    duration = report["log"]["duration_s"]
-    if duration < _SHORT_S:
-        said.append(f"The log is only {duration:.1f} s long: too short to evaluate an estimator.")
-    if figures is not None and not figures.moves:
-        said.append("The car is never fast enough for a sideslip; no sideslip is drawn.")
-    if not report["truth"]["available"]:
-        said.append(
-            "The log has no ground truth: no errors are available. The page shows instead "
-            "the disagreement of the estimates and the innovations of the filters."
-        )
-    elif figures is not None and not figures.scored and figures.moves:
-        said.append(
-            "The ground truth of this log does not score sideslip: "
-            "the page shows the disagreement of the estimates instead of errors."
-        )
-    if figures is not None and figures.absent:
-        said.append(f"Not drawn, as estimates.parquet does not contain them: {', '.join(figures.absent)}.")
-    return said
-
-
-def _estimators(report: Mapping[str, Any]) -> list[dict[str, Any]]:
-    start = report["log"]["start_ns"]
-    return [
-        {
-            **e,
-            "told": "; ".join(
-                filter(None, [e["reason"], *e["notes"], *e.get("intervals", ()), reasons_line(e, start)])
-            ),
-        }
-        for e in report["estimators"]
-    ]

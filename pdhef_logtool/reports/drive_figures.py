@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.evaluation.dead_reckoned import aligned_path
+from pdhef_logtool.evaluation.largest_errors import ErrorPlace
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
@@ -30,11 +31,10 @@ from pdhef_logtool.reports.charts import (
 from pdhef_logtool.reports.colours import FAULT, NOTE, PLAIN, colour
 from pdhef_logtool.reports.drive_series import DriveSeries, Reference, Tracks, gather, thinned
 from pdhef_logtool.reports.encoding import grid_of
-from pdhef_logtool.results.error_places import ErrorPlace
 from pdhef_logtool.results.sink import TRUTH
 
-#: Storage resolution of figures: in degrees, of shares, and in m/s or m/s².
-_DEGREES_SEEN, _SHARE_SEEN, _SEEN = 0.001, 0.001, 0.002
+#: Storage resolution of figures: in degrees, and in °/s, m/s or m/s².
+_DEGREES_SEEN, _SEEN = 0.001, 0.002
 #: Minimum size of a gap between stamps, in s and in median steps.
 _GAP_S, _GAP_STEPS = 0.25, 5.0
 _MOST_POINTS = 12_000
@@ -45,11 +45,6 @@ _ERROR_COLOURS = ("#0072b2", "#b07800", "#c8400a")
 #: Minimum extent of a path to be drawn.
 _LEAST_PATH_M = 1.0
 _DASHES: tuple[tuple[int, ...], ...] = ((6, 3), (2, 2), (8, 3, 2, 3), (4, 4), (10, 4))
-#: Figures in the plane: key, title, labels of the axes.
-_PLANES = (
-    ("ay_sideslip", "|a_y| and sideslip", "|a_y| in m/s²", "sideslip in °"),
-    ("phase", "Phase plane: sideslip rate is a_y/v_x − yaw rate", "sideslip in °", "sideslip rate in °/s"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,12 +91,11 @@ class DriveFigures:
     scored: bool
     moves: bool
     absent: Sequence[str]
-    path_text: str = ""
 
     @property
     def in_plane(self) -> bool:
         """Whether there is a figure without a time axis."""
-        return any(key in self.charts.figures for key in ("path", *(key for key, *_ in _PLANES)))
+        return not self.charts.figures.keys().isdisjoint(("path", "ay_sideslip"))
 
 
 def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveFigures | None:
@@ -127,39 +121,33 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveF
     peaks = _peaks(report)
     reference = _reference(tracks, peaks)
     scored = reference is not None and reference.scored
-    dof = _degrees_of_freedom(report)
     series = {}
     for name in dict.fromkeys([TRUTH, *roles.names]):
         if name in tracks.names:
             against = reference if scored else None if name == roles.main else Reference(answer, False, tracks)
             error_of = None if name == TRUTH else against
-            series[name] = gather(name, tracks, grid, error_of, dof, whole=name in (TRUTH, roles.main))
+            series[name] = gather(name, tracks, grid, error_of, whole=name in (TRUTH, roles.main))
     charts = Charts(grid, origin_ns)
     moves = bool(np.isfinite(series[roles.main].sideslip).any())
     _add_sideslip(charts, series, roles)
     _add_error(charts, series, roles, peaks, scored=scored)
-    _add_filter(charts, series, roles)
     _add_motion(charts, series, roles)
     rows = _rows(report, series, roles, stamps, origin_ns)
     charts.figures["strip"] = StripFigure("Faults, gaps and segments", rows)
-    path_text = _add_path(charts, series, roles, report.get("path_drift")) if TRUTH in series else ""
-    _add_planes(charts, [series[n] for n in (TRUTH, roles.main) if n in series])
+    if TRUTH in series:
+        _add_path(charts, series, roles)
+    clouds = [_cloud(series[n], origin_ns) for n in (TRUTH, roles.main) if n in series]
+    if drawn := [cloud for cloud in clouds if cloud is not None]:
+        charts.figures["ay_sideslip"] = PointsFigure("|a_y| and sideslip", "|a_y| in m/s²", "sideslip in °", drawn)
     _add_worst(charts, answer, reference, peaks, origin_ns)
     absent = [n for n in roles.names if n not in tracks.names]
-    return DriveFigures(charts, peaks, scored, moves, absent, path_text)
+    return DriveFigures(charts, peaks, scored, moves, absent)
 
 
 def _reference(tracks: Tracks, peaks: Sequence[Peak]) -> Reference | None:
     """Return the reference of the report's largest errors; None if it is not available."""
     against = peaks[0].against if peaks else ""
     return Reference(tracks.read(against), against == TRUTH, tracks) if against in tracks.names else None
-
-
-def _degrees_of_freedom(report: Mapping[str, Any]) -> dict[str, float]:
-    """Return the mean degrees of freedom of NIS by estimator."""
-    wanted = ("state", "all", "nis_dof")
-    rows = [m for m in report["metrics"] if (m["signal"], m["segment"], m["metric"]) == wanted and m["value"]]
-    return {m["estimator"]: float(m["value"]) for m in rows}
 
 
 def _peaks(report: Mapping[str, Any]) -> tuple[Peak, ...]:
@@ -210,22 +198,11 @@ def _add_error(
     charts.figures["error"] = TimeFigure(title, "°", lines, marks=marks, level=0.0, resolution=_DEGREES_SEEN)
 
 
-def _add_filter(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
-    if trust := _lines(series, roles, "trust", roles.names):
-        charts.figures["trust"] = TimeFigure("Residual gain", "", trust, resolution=_SHARE_SEEN, height=120)
-    scales = _lines(series, roles, "r_scale", roles.names)
-    if any(np.nanmax(s.values) > 1.0 + 1e-9 for s in scales):
-        title = "R scale: factor on the measurement noise (nominal 1)"
-        charts.figures["r_scale"] = TimeFigure(title, "×", scales, level=1.0, log=True, height=130)
-    if nis := _lines(series, roles, "nis", roles.names):
-        title = "NIS per degree of freedom, mean over 1 s (expected value 1)"
-        charts.figures["nis"] = TimeFigure(title, "", nis, level=1.0, height=130, resolution=_SEEN)
-
-
 def _add_motion(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
     for key, title, unit in (
-        ("speed", "Speed, longitudinal", "m/s"),
+        ("yaw_rate", "Yaw rate", "°/s"),
         ("ay", "Lateral acceleration, specific force", "m/s²"),
+        ("speed", "Speed, longitudinal", "m/s"),
     ):
         if lines := _lines(series, roles, key, (TRUTH, roles.main)):
             charts.figures[key] = TimeFigure(title, unit, lines, resolution=_SEEN, height=120)
@@ -264,19 +241,12 @@ def _rows(
     return rows or [Row("nothing", PLAIN, [])]
 
 
-def _add_planes(charts: Charts, series: Sequence[DriveSeries]) -> None:
-    for key, title, x_label, y_label in _PLANES:
-        clouds = [c for s in series if (c := _cloud(s.name, getattr(s, key), charts.origin_ns)) is not None]
-        if clouds:
-            charts.figures[key] = PointsFigure(title, x_label, y_label, clouds)
-
-
-def _cloud(name: str, points: FloatArray | None, origin_ns: int) -> Cloud | None:
-    at_ns, x, y = thinned(points, _MOST_POINTS)
+def _cloud(series: DriveSeries, origin_ns: int) -> Cloud | None:
+    at_ns, x, y = thinned(series.ay_sideslip, _MOST_POINTS)
     if len(x) < 2:
         return None
     at_s = np.asarray((at_ns - float(origin_ns)) * 1e-9, dtype=np.float64)
-    return Cloud(name, colour(name), x, y, at_s)
+    return Cloud(series.name, colour(series.name), x, y, at_s)
 
 
 def _add_worst(
@@ -301,31 +271,19 @@ def _add_worst(
     charts.figures["worst"] = PointsFigure(title, "s from the log's start", "sideslip in °", clouds)
 
 
-def _add_path(
-    charts: Charts, series: Mapping[str, DriveSeries], roles: Roles, drift: Mapping[str, float] | None
-) -> str:
-    """Add the dead-reckoned path, aligned with the ground truth's; return a text about its drift."""
+def _add_path(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
+    """Add the dead-reckoned path, aligned with the ground truth's."""
     truth, estimate = (thinned(series[n].path, _MOST_POINTS) for n in (TRUTH, roles.main))
     if truth.shape[1] < 2 or max(np.ptp(truth[1]), np.ptp(truth[2])) < _LEAST_PATH_M:
-        return ""
+        return
     common, at_truth, at_own = np.intersect1d(truth[0], estimate[0], return_indices=True)
     clouds = [Cloud(TRUTH, colour(TRUTH), truth[1], truth[2], _seconds(truth[0], charts), line=True)]
-    if len(common) < 2:
-        charts.figures["path"] = PointsFigure("Path of the ground truth", "m east", "m north", clouds, equal=True)
-        return ""
-    target, source = truth[1:, at_truth], estimate[1:, at_own]
-    aligned = aligned_path(source, target)
-    clouds += _by_error(aligned, common, series[roles.main], charts)
-    title = "Path, aligned with the ground truth"
+    title = "Path of the ground truth"
+    if len(common) > 1:
+        title = "Path, aligned with the ground truth"
+        aligned = aligned_path(estimate[1:, at_own], truth[1:, at_truth])
+        clouds += _by_error(aligned, common, series[roles.main], charts)
     charts.figures["path"] = PointsFigure(title, "m east", "m north", clouds, equal=True)
-    if drift is None:
-        return ""
-    return (
-        f"Path: {roles.main} integrates its velocity without position measurements. Drift: {drift['end_m']:.1f} m "
-        f"({drift['end_m'] / drift['length_m']:.1%}) at the end of {drift['length_m'] / 1000.0:.2f} km from a common "
-        f"start. The figure shows it after one rotation and translation (SE(2)); the largest remaining distance is "
-        f"{drift['largest_aligned_m']:.1f} m. Colours: absolute sideslip error."
-    )
 
 
 def _by_error(aligned: FloatArray, at_ns: FloatArray, estimate: DriveSeries, charts: Charts) -> list[Cloud]:

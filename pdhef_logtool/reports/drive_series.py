@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,14 +12,12 @@ from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.reports.encoding import Grid, envelope, first_known, means
+from pdhef_logtool.reports.encoding import Grid, envelope, first_known
 from pdhef_logtool.results.parquet_sink import list_estimators, read_track
 from pdhef_logtool.results.sink import TRUTH
 
-#: Averaging window of NIS in the figure.
-_NIS_S = 1.0
 #: Columns to draw of every track, and further columns of the ground truth and the selected estimate.
-_COLUMNS = ("vx_m_s", "vy_m_s", "sideslip_rad", "network_trust", "r_scale", "nis", "valid", "reason")
+_COLUMNS = ("vx_m_s", "vy_m_s", "sideslip_rad", "valid", "reason")
 _MORE_COLUMNS = ("yaw_rate_rad_s", "ay_m_s2", "x_m", "y_m", "sideslip_std_rad")
 #: Columns that determine errors and gaps of the sideslip.
 OF_SIDESLIP = ("vx_m_s", "vy_m_s", "sideslip_rad", "valid")
@@ -49,26 +46,22 @@ class Tracks:
 class DriveSeries:
     """Series of one track for the figures; angles in degrees.
 
-    Envelopes [cells, 2] of sideslip, residual gain, speed and a_y; largest values [cells] of the absolute ``error`` and
-    of ``r_scale``; NIS, mean over 1 s [cells]; the 95 % CI [cells]; points [3, K] in the planes: stamp, x and y.
-    ``invalid``, ``reason`` at each stamp [N]. Confidence interval, speed, a_y and planes are None except for the ground
-    truth and the selected estimate.
+    Envelopes [cells, 2] of sideslip, yaw rate, speed and a_y; largest values [cells] of the absolute ``error``; the
+    95 % CI [cells]; points [3, K] in the planes: stamp, x and y. ``invalid``, ``reason`` at each stamp [N]. Confidence
+    interval, motion and planes are None except for the ground truth and the selected estimate.
     """
 
     name: str
     sideslip: FloatArray
     error: FloatArray | None
-    trust: FloatArray
-    r_scale: FloatArray
-    nis: FloatArray
     invalid: BoolArray
     reason: IntArray
     band: tuple[FloatArray, FloatArray] | None = None
+    yaw_rate: FloatArray | None = None
     speed: FloatArray | None = None
     ay: FloatArray | None = None
     path: FloatArray | None = None
     ay_sideslip: FloatArray | None = None
-    phase: FloatArray | None = None
 
 
 def thinned(points: FloatArray | None, most: int) -> FloatArray:
@@ -98,20 +91,12 @@ class Reference:
         return np.asarray(wrap_angle(ours - theirs), dtype=np.float64)
 
 
-def gather(
-    name: str,
-    tracks: Tracks,
-    grid: Grid,
-    reference: Reference | None,
-    nis_dof: Mapping[str, float],
-    *,
-    whole: bool,
-) -> DriveSeries:
+def gather(name: str, tracks: Tracks, grid: Grid, reference: Reference | None, *, whole: bool) -> DriveSeries:
     """Return the series of one track.
 
     Parameters
     ----------
-    reference : reference of the errors; None for no errors. nis_dof : mean degrees of freedom by estimator.
+    reference : reference of the errors; None for no errors.
     whole : also return confidence interval, motion and planes.
     """
     track = tracks.read(name, (*_COLUMNS, *_MORE_COLUMNS) if whole else _COLUMNS)
@@ -119,20 +104,10 @@ def gather(
     beta = drawn.sideslip_rad * DEGREES
     in_cells = partial(envelope, grid, stamps)
     error = None if reference is None else in_cells(np.abs(reference.error(track)) * DEGREES).max(axis=1)
-    made = DriveSeries(
-        name,
-        in_cells(beta),
-        error,
-        in_cells(track.network_trust),
-        in_cells(track.r_scale).max(axis=1),
-        means(grid, stamps, track.nis / nis_dof.get(name, np.nan), _NIS_S),
-        ~track.valid,
-        track.reason,
-    )
+    made = DriveSeries(name, in_cells(beta), error, ~track.valid, track.reason)
     if not whole:
         return made
     half = NORMAL_95 * drawn.sideslip_std_rad * DEGREES
-    rate = np.where(np.isfinite(beta), sideslip_rate(track), np.nan) * DEGREES
 
     def points(x: FloatArray, y: FloatArray) -> FloatArray:
         rows = first_known(grid, stamps, np.isfinite(x) & np.isfinite(y))
@@ -141,15 +116,9 @@ def gather(
     return replace(
         made,
         band=(in_cells(beta - half).min(axis=1), in_cells(beta + half).max(axis=1)),
+        yaw_rate=in_cells(track.yaw_rate_rad_s * DEGREES),
         speed=in_cells(track.vx_m_s),
         ay=in_cells(track.ay_m_s2),
         path=points(track.x_m, track.y_m),
         ay_sideslip=points(np.abs(track.ay_m_s2), beta),
-        phase=points(beta, rate),
     )
-
-
-def sideslip_rate(track: StateTrack) -> FloatArray:
-    """Return a_y / v_x − yaw rate [N] in rad/s, which is the rate of sideslip at nearly constant speed."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(track.ay_m_s2 / track.vx_m_s - track.yaw_rate_rad_s, dtype=np.float64)

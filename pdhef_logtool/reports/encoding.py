@@ -37,10 +37,6 @@ class Grid:
         """Width of a cell."""
         return self.cell_ns * 1e-9
 
-    def seconds(self, stamp_ns: int) -> float:
-        """Return a stamp in seconds from the grid's start."""
-        return (stamp_ns - self.start_ns) * 1e-9
-
 
 def grid_of(stamps_ns: IntArray) -> Grid:
     """Return the grid for ascending stamps [N], N ≥ 1."""
@@ -75,24 +71,6 @@ def first_known(grid: Grid, stamps_ns: IntArray, is_known: BoolArray) -> IntArra
     """Return the rows of the first known stamp of each cell."""
     cell, rows = _cells(grid, stamps_ns, is_known)
     return rows[np.flatnonzero(np.diff(cell, prepend=-1))]
-
-
-def means(grid: Grid, stamps_ns: IntArray, values: FloatArray, span_s: float) -> FloatArray:
-    """Return at each cell the mean of the values [N] over its span of ``span_s`` from the grid's start, [cells].
-
-    NaN where less than half of the usual number of values of a span is finite.
-    """
-    span_ns = int(span_s * 1e9)
-    finite = np.isfinite(values)
-    spans = grid.cells * grid.cell_ns // span_ns + 1
-    span = np.clip((stamps_ns[finite] - grid.start_ns) // span_ns, 0, spans - 1)
-    counts, sums = np.bincount(span, minlength=spans), np.bincount(span, values[finite], spans)
-    mean = np.full(spans, np.nan)
-    if counts.any():
-        enough = counts > 0.5 * np.median(counts[counts > 0])
-        mean[enough] = sums[enough] / counts[enough]
-    middle = np.arange(grid.cells) * grid.cell_ns + grid.cell_ns // 2
-    return mean[middle // span_ns]
 
 
 def _cells(grid: Grid, stamps_ns: IntArray, is_known: BoolArray) -> tuple[IntArray, IntArray]:
@@ -136,12 +114,3 @@ def encode(values: FloatArray, resolution: float = 0.0) -> Encoded:
     folded = ((steps << 1) ^ (steps >> 15)).view(np.uint16)
     planes = (folded & 0xFF).astype(np.uint8).tobytes() + (folded >> 8).astype(np.uint8).tobytes()
     return Encoded(low, step, len(flat), base64.b64encode(zlib.compress(planes, 7)).decode("ascii"))
-
-
-def decode(encoded: Encoded) -> FloatArray:
-    """Decode a text to values [M] like the page does; gaps are NaN."""
-    planes = np.frombuffer(zlib.decompress(base64.b64decode(encoded.base64)), dtype=np.uint8).astype(np.uint16)
-    folded = planes[: encoded.count] | planes[encoded.count :] << 8
-    steps = (folded >> 1) ^ -(folded & 1)
-    q = np.cumsum(steps, dtype=np.uint16)
-    return np.where(q == GAP, np.nan, encoded.low + encoded.step * q)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +14,6 @@ from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.reports.charts import BarsFigure, Charts, Cloud, Interval, IntervalsFigure, PointsFigure
 from pdhef_logtool.reports.colours import INK, PLAIN, colour
-from pdhef_logtool.reports.drive import OUTCOMES
-from pdhef_logtool.reports.first_screen import plan_head, tested_run
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.breakdown import LEAST_DRIVES
 from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Space, read_fleet
@@ -34,15 +31,6 @@ _WORST = 10
 _DRAWN = 5.0
 #: Minimum range of the table of the operating space, so that driving without data is visible.
 _SPEED_M_S, _AY_M_S2 = 40.0, 8.0
-
-
-@dataclass(frozen=True, slots=True)
-class SpaceCell:
-    """A cell of the table: its style classes and contents, empty for a cell without driving."""
-
-    kind: str
-    minutes: str
-    rmse_rad: float | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,11 +61,10 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
     charts = Charts()
     _add_figures(charts, fleet)
     texts: dict[str, Any] = {
-        "plan": plan_head(run.document.get("plan")),
-        "tested": tested_run(run.document, sum(d.seconds for d in fleet.drives) / 3600.0),
+        "plan": run.document.get("plan"),
+        "seconds": sum(d.seconds for d in fleet.drives),
         "steps": next_steps(run.document.get("plan"), ["repair the failed logs: causes below"] if fleet.failed else ()),
         "worst": _worst(fleet, charts),
-        "verdicts": Counter(d.verdict for d in fleet.scored if d.verdict),
         "answer": next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),
         "rows": _rows(_told(fleet)),
         "mains": {ANSWER} if len(mains) > 1 else mains,
@@ -89,7 +76,6 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
         "idle_keys": [b.key for b in fleet.breakdowns if b not in shown],
         "space": None if fleet.space is None else _space_rows(fleet.space),
         "held": sorted(fleet.drives, key=lambda d: d.label)[:MOST_ROWS],
-        "words": {outcome: word for outcome, (word, _) in OUTCOMES.items()},
         "most_rows": MOST_ROWS,
         "least": LEAST_DRIVES,
     }
@@ -191,28 +177,18 @@ def _histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     return edges, counts.astype(np.float64)
 
 
-@dataclass(frozen=True, slots=True)
-class _Row:
-    """Errors of an estimator in a signal over drives, in display units."""
-
-    signal: str
-    unit: str
-    estimator: str
-    drives: int
-    figures: tuple[float, ...]
-
-
-def _rows(distributions: Sequence[Distribution]) -> list[_Row]:
+def _rows(distributions: Sequence[Distribution]) -> list[dict[str, Any]]:
     """Return rows with the median and its bounds, 10th and 90th percentile, and the largest value."""
     rows = []
     for d in distributions:
         unit, factor = read_unit(d.unit)
         quantiles = d.median.value, d.median.low, d.median.high, d.quantile(0.1), d.quantile(0.9), float(d.values[-1])
-        rows.append(_Row(LABELS[d.signal], unit, d.estimator, d.drives, tuple(x * factor for x in quantiles)))
-    return sorted(rows, key=lambda r: [*LABELS.values()].index(r.signal))
+        row = {"signal": LABELS[d.signal], "unit": unit, "estimator": d.estimator, "drives": d.drives}
+        rows.append(row | {"figures": [x * factor for x in quantiles]})
+    return sorted(rows, key=lambda r: [*LABELS.values()].index(r["signal"]))
 
 
-def _space_rows(space: Space) -> tuple[list[str], list[tuple[str, list[SpaceCell]]], int, int]:
+def _space_rows(space: Space) -> tuple[list[str], list[tuple[str, list[dict[str, Any]]]], int, int]:
     """Return heads, rows with the highest speed first, and the numbers of empty and of all cells."""
     rows = _reach(space.speed_edges_m_s, space.seconds.any(axis=1), _SPEED_M_S)
     columns = _reach(space.ay_edges_m_s2, space.seconds.any(axis=0), _AY_M_S2)
@@ -226,7 +202,7 @@ def _space_rows(space: Space) -> tuple[list[str], list[tuple[str, list[SpaceCell
             # Times differ by orders of magnitude: a level is a factor of three.
             level = max(0, _LEVELS + math.floor(math.log(spent / most, 3.0))) if spent else 0
             kind = f"h{min(level, _LEVELS)}" if spent else "empty"
-            cells.append(SpaceCell(kind, _time(spent), rmse if math.isfinite(rmse) else None))
+            cells.append({"kind": kind, "minutes": _time(spent), "rmse_rad": rmse if math.isfinite(rmse) else None})
         made.append((_bin(space.speed_edges_m_s, i), cells))
     return (
         [_bin(space.ay_edges_m_s2, j) for j in range(columns)],

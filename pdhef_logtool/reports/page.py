@@ -11,16 +11,23 @@ import datetime as dt
 import hashlib
 import json
 import math
+import re
+from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from pdhef_logtool.evaluation.requirement_verdicts import joint_notes
+from pdhef_logtool.evaluation.units import LABELS
+from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.records.printable import printable
+from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.version import __version__
-from pdhef_logtool.reports.charts import Charts, StripFigure, TimeFigure
+from pdhef_logtool.reports.charts import Charts
 
 _HERE = Path(__file__).parent
 #: Scripts in order: before.js sets the drawing resolution for uPlot.
@@ -29,6 +36,9 @@ _STYLES = ("uplot.min.css", "report.css")
 #: Maximum length of a text in a paragraph or table cell.
 _MOST_SIGNS = 600
 DASH = "–"
+_UNIT = re.compile(r"_(rad_s|rad|m_s2|m_s)$")
+#: The interval in brackets after a value.
+_BRACKETS = re.compile(r"^\((.*?)\)")
 
 
 def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
@@ -73,6 +83,14 @@ def _environment() -> Environment:
     )
     made.filters |= {
         "number": number,
+        "duration": duration,
+        "joint_notes": lambda plan: joint_notes({str(r["id"]): r.get("notes") or () for r in plan["requirements"]}),
+        "reason": _reason,
+        "shown": shown,
+        "minute": lambda stamp_ns: f"{stamp(stamp_ns)[:16].replace('T', ' ')} UTC",
+        "range": _range,
+        "signal": _signal,
+        "topic_of": lambda source: str(source).partition(".")[0],
         "degrees": degrees,
         "percent": percent,
         "change": change,
@@ -80,7 +98,21 @@ def _environment() -> Environment:
         "seconds": seconds,
         "unit": unit,
     }
+    made.tests["topic"] = lambda source: str(source).startswith("/")
     return made
+
+
+def _reason(requirement: Mapping[str, Any]) -> str:
+    """Return the reason of a verdict without its value, which is shown beside it."""
+    value = "" if requirement["value"] is None else shown(requirement["value"], str(requirement["unit"]))
+    return _BRACKETS.sub(r"\1", str(requirement["reason"]).removeprefix(value).lstrip("; "))
+
+
+def _signal(name: str) -> str:
+    """Return the name of a sensor signal for display."""
+    if name.startswith("wheel_speed_"):
+        return "wheel speeds"
+    return LABELS.get(name, _UNIT.sub("", name).replace("_", " ").replace("ax", "a_x"))
 
 
 @cache
@@ -92,19 +124,14 @@ def _place(charts: Charts, key: str) -> Markup:
     """Return the element in which the script draws a figure; empty if the page has no such figure."""
     if key not in charts.figures:
         return Markup()
-    chart = charts.figures[key]
-    keys = ' tabindex="0"' if isinstance(chart, TimeFigure | StripFigure) else ""
-    hint = " Keys: plus and minus zoom, arrows move, Home shows the whole drive." if keys else ""
-    return Markup(
-        '<figure class="figure" data-figure="{0}"><figcaption>{1}</figcaption>'
-        '<div class="legend" aria-hidden="true"></div>'
-        '<div class="canvas" aria-label="{2}"{3}></div></figure>'
-    ).format(
-        key,
-        printable(chart.heading, _MOST_SIGNS),
-        printable(charts.text(key) + hint, _MOST_SIGNS),
-        Markup(keys),  # noqa: S704 (a constant)
-    )
+    return Markup(_environment().get_template("figure.html").render(f=charts.figures[key], key=key))  # noqa: S704
+
+
+def _range(values: Sequence[float] | FloatArray) -> str:
+    """Return the finite range of values as text."""
+    finite = np.asarray(values, dtype=np.float64)
+    finite = finite[np.isfinite(finite)]
+    return f"{finite.min():.3g} to {finite.max():.3g}" if finite.size else "no value"
 
 
 def _policy(scripts: list[str], style: str) -> Markup:
@@ -167,6 +194,14 @@ def change(share: float | None) -> str:
 def seconds(value_s: float | None) -> str:
     """Return seconds with milliseconds."""
     return DASH if value_s is None else f"{value_s:.3f} s"
+
+
+def duration(seconds: float) -> str:
+    """Return a duration for display."""
+    if seconds < 120.0:
+        return f"{seconds:.1f} s"
+    hours = seconds / 3600.0
+    return f"{seconds / 60.0:.1f} min" if hours < 2.0 else f"{hours:.1f} h" if hours < 100.0 else f"{hours:.0f} h"
 
 
 def stamp(stamp_ns: int) -> str:

@@ -100,11 +100,7 @@ def write_drive_page(log: OpenedLog) -> WrittenPage:
     """Write the page of a log; raises OutputError."""
     from pdhef_logtool.reports.drive import drive_page
 
-    def make() -> DrivePage:
-        with log.reading():
-            return drive_page(log, f"../../{PAGE_FILE}")
-
-    return _write(log.folder, log.label, make)
+    return _write(log.folder, log.label, partial(drive_page, log, f"../../{PAGE_FILE}"))
 
 
 def remove_pages(run: OpenedRun) -> None:

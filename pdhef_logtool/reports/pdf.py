@@ -1,29 +1,25 @@
 """The validation report of a run as a PDF for signature: cover, contents, verdicts, drives and input hashes.
 
-The document is an HTML file with pictures of the figures, printed by a headless Chromium.
+The document is an HTML file with the figures of the pages, printed by a headless Chromium.
 """
 
 from __future__ import annotations
 
-import base64
 import os
 import re
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.reports.charts import Charts, TimeFigure
 from pdhef_logtool.reports.drive import drive_page
-from pdhef_logtool.reports.first_screen import PlanHead, plan_head, steps_of, tested_drive, tested_run
 from pdhef_logtool.reports.page import render
-from pdhef_logtool.reports.pictures import picture
 from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
 from pdhef_logtool.storage.files import write_bytes
 
@@ -38,15 +34,12 @@ _TIMEOUT_S = 180.0
 
 @dataclass(frozen=True, slots=True)
 class DriveSection:
-    """One drive of the document: its report, verdicts, facts, next steps, and pictures with their captions."""
+    """One drive of the document: its report, and keys of its figures."""
 
     label: str
     outcome: str
     report: Mapping[str, Any] | None
-    head: PlanHead | None
-    facts: Sequence[tuple[str, str]]
-    steps: Sequence[str]
-    pictures: Sequence[tuple[str, Markup]]
+    figures: Sequence[str]
 
 
 def write_pdf(run: OpenedRun, *, positions: bool = False) -> Path:
@@ -115,19 +108,17 @@ def pdf_page(run: OpenedRun, *, positions: bool = False) -> bytes:
     ranked = sorted(reports, key=lambda pair: _gravity(pair[1]))[:_MOST_DRIVES]
     seconds = sum(r["log"]["duration_s"] for _, r in reports if r is not None)
     plan = document.get("plan")
+    charts = Charts()
     return render(
         "pdf.html",
+        charts,
         title=(plan or {}).get("title")
         or f"Validation of {len(run.logs)} {'drive' if len(run.logs) == 1 else 'drives'}",
-        plan=plan_head(plan),
-        plan_file=(plan or {}).get("file"),
-        plan_sha256=(plan or {}).get("sha256"),
-        tested=tested_run(document, seconds / 3600.0),
+        run=document,
+        seconds=seconds,
         steps=next_steps(plan),
-        sections=[_section(log, report, positions=positions) for log, report in ranked],
+        sections=[_section(log, report, charts, positions=positions) for log, report in ranked],
         left_out=len(reports) - len(ranked),
-        inputs=document.get("logs") or (),
-        versions=document.get("versions") or {},
         positions=positions,
     )
 
@@ -153,22 +144,14 @@ def _gravity(report: Mapping[str, Any] | None) -> tuple[int, float]:
     return (-fails, -(errors[0] or 0.0) if errors else 0.0)
 
 
-def _section(log: OpenedLog, report: Mapping[str, Any] | None, *, positions: bool) -> DriveSection:
+def _section(log: OpenedLog, report: Mapping[str, Any] | None, charts: Charts, *, positions: bool) -> DriveSection:
+    """Return a drive of the document; add its figures, each with its own time, to ``charts``."""
     if report is None:
-        return DriveSection(log.label, log.outcome, None, None, (), (), ())
-    charts = drive_page(log).charts
-    keys = (*_FIGURES, *(_POSITIONS if positions else ()))
-    drawn = [
-        (charts.text(key), Markup(base64.b64encode(picture(charts.figures[key], charts)).decode()))  # noqa: S704 (base64)
-        for key in keys
-        if key in charts.figures
-    ]
-    return DriveSection(
-        log.label,
-        log.outcome,
-        report,
-        plan_head(report.get("plan")),
-        tested_drive(report, log.outcome),
-        steps_of(report),
-        drawn,
-    )
+        return DriveSection(log.label, log.outcome, None, ())
+    drawn, keys = drive_page(log).charts, []
+    for key in (*_FIGURES, *(_POSITIONS if positions else ())):
+        if (figure := drawn.figures.get(key)) is not None:
+            keys.append(f"{key}-{len(charts.figures)}")
+            figure = replace(figure, time=drawn.time()) if isinstance(figure, TimeFigure) else figure
+            charts.figures[keys[-1]] = figure
+    return DriveSection(log.label, log.outcome, report, keys)

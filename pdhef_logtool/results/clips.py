@@ -51,13 +51,13 @@ def write_clips(
     with OutputFolder(run.folder), FolderTransaction(run.folder / CLIPS, keep=False) as change:
         for label, events in groupby(found_events.events, key=lambda event: event.drive):
             try:
-                opened = open_log(_source_of(run, logs[label], source))
+                opened = open_log(_source_of(logs[label], source))
             except PdhefError as error:
                 failed = True
                 tell(f"{label}: no clip: {error}")
                 continue
             if opened.messages is None or all(t.name.startswith(NAMESPACE) for t in opened.topics):
-                tell(f"{label}: clips contain the tool's tracks only: the log has no messages to copy")
+                tell(f"{label}: clips contain the tool's tracks only: no messages to copy; --source DIR names the log")
             try:
                 names += [
                     str(run.folder / CLIPS / name)
@@ -97,7 +97,7 @@ def _span(log: DriveLog, event: FoundEvent, pad_s: float) -> tuple[int, int]:
     return max(event.start_ns - pad_ns, log.start_ns), min(event.end_ns + pad_ns, log.end_ns)
 
 
-def _source_of(run: OpenedRun, log: OpenedLog, folder: Path | None) -> Path:
+def _source_of(log: OpenedLog, folder: Path | None) -> Path:
     """Return a file with all messages of the source of a drive; raises OutputError if it does not exist."""
     sha256, name = log.entry.get("sha256"), str(log.entry.get("file", ""))
     if folder is not None:
@@ -107,8 +107,7 @@ def _source_of(run: OpenedRun, log: OpenedLog, folder: Path | None) -> Path:
                 return path
         got = f"{len(candidates)} of that name with other content" if candidates else "none of that name"
         raise OutputError(expected=f"the log {name}", got=got, where=str(folder), remedy="name its folder by --source")
-    copy = log.file(_ANNOTATED)
-    if copy is not None and (run.document.get("config") or {}).get("annotate") == "full":
+    if (copy := log.file(_ANNOTATED)) is not None:
         return copy
     raise OutputError(
         expected=f"a full copy of {name}, {_ANNOTATED}",

@@ -6,7 +6,7 @@ import filecmp
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -20,8 +20,8 @@ from pdhef_logtool.evaluation.units import SIGNALS
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.printable import listed
 from pdhef_logtool.results.changed_signals import ChangedSignal, changed_signals
-from pdhef_logtool.results.gate import MAIN, Figure, Gate
-from pdhef_logtool.results.opened_run import METRICS_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.results.gate import MAIN, Figure
+from pdhef_logtool.results.opened_run import METRICS_FILE, OpenedRun
 from pdhef_logtool.results.paired_change import PairedChange, Verdict, holm, log_ratios, paired_change
 from pdhef_logtool.results.pairing import Pair, Pairing, pair_logs
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
@@ -210,13 +210,19 @@ class Comparison:
 
 
 def compare_runs(
-    a: OpenedRun, b: OpenedRun, gate: Gate, *, cluster: str | None = None, strict: bool = False
+    a: OpenedRun,
+    b: OpenedRun,
+    figures: Sequence[Figure],
+    *,
+    allow_unpaired: bool = False,
+    cluster: str | None = None,
+    strict: bool = False,
 ) -> Comparison:
     """Compare two runs.
 
     Parameters
     ----------
-    gate : the figures; those without a limit are no gate.
+    figures : to compare by; those without a limit are no gate. allow_unpaired : accept drives on one side only.
     cluster : ``car``, ``day``, ``route`` or a key of the logs' metadata by which drives depend on one another;
         ``none``: independent drives; None: the dependence by day, car and route is estimated.
     strict : an inconclusive figure closes the gate.
@@ -234,9 +240,9 @@ def compare_runs(
             where=f"{a.place} and {b.place}",
             remedy="run both on the same drives",
         )
-    gated = any(f.limit is not None for f in gate.figures)
-    damaged = _Damaged()
-    tables = _Tables(a, b, pairing.pairs, damaged)
+    gated = any(f.limit is not None for f in figures)
+    damaged: dict[str, None] = {}
+    tables = _Tables(a, b, pairing.pairs)
     changed = tables.changed()
     result = Comparison(
         a=a.place,
@@ -249,62 +255,45 @@ def compare_runs(
         figures=(),
         cluster=cluster,
         gated=gated,
-        allow_unpaired=gate.allow_unpaired,
+        allow_unpaired=allow_unpaired,
         strict=strict,
     )
     if not changed and not gated:
-        return replace(result, damaged=damaged.lines)
+        return replace(result, damaged=tuple(damaged))
     asked = cluster not in (None, INDEPENDENT)
     grouping = _grouping(pairing, cluster, damaged) if changed or asked else _Grouping()
-    figures = tuple(tables.compared(gate.figures, grouping))
-    tables.check_estimators(figures)
+    compared = tuple(tables.compared(figures, grouping))
+    tables.check_estimators(compared)
     if not changed:
-        return replace(result, figures=figures, damaged=damaged.lines)
-    others = _corrected(tables.compared(_beside(gate.figures), grouping))
-    followed = _most_changed(pairing.pairs, changed, figures[0])
-    main = figures[0].figure.estimator
+        return replace(result, figures=compared, damaged=tuple(damaged))
+    others = _corrected(tables.compared(_beside(figures), grouping))
+    followed = _most_changed(pairing.pairs, changed, compared[0])
+    main = figures[0].estimator
     signals: list[ChangedSignal] = []
     for pair in followed:
-        with damaged.noted(pair.a, pair.b):
+        with _noted(damaged):
             signals += changed_signals(pair, tables.name_of(pair, main))
     return replace(
-        result, figures=figures, others=others, signals=tuple(signals), followed=len(followed), damaged=damaged.lines
+        result, figures=compared, others=others, signals=tuple(signals), followed=len(followed), damaged=tuple(damaged)
     )
 
 
-class _Damaged:
-    """The files of drives that could not be read."""
-
-    def __init__(self) -> None:
-        self._lines: dict[str, None] = {}
-
-    @property
-    def lines(self) -> tuple[str, ...]:
-        """A line a file."""
-        return tuple(self._lines)
-
-    @contextmanager
-    def noted(self, *logs: OpenedLog) -> Iterator[None]:
-        """Skip damaged logs and note them."""
-        try:
-            with ExitStack() as stack:
-                for log in logs:
-                    stack.enter_context(log.reading())
-                yield
-        except OutputError as error:
-            self._lines[str(error)] = None
+@contextmanager
+def _noted(damaged: dict[str, None]) -> Iterator[None]:
+    """Skip a damaged log and add its line."""
+    try:
+        yield
+    except OutputError as error:
+        damaged[str(error)] = None
 
 
 class _Tables:
     """Figures of two runs for their pairs; only requested rows are read."""
 
-    def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair], damaged: _Damaged) -> None:
+    def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair]) -> None:
         self._runs = (a, b)
         self._pairs = pairs
-        self._main = [""] * len(pairs)
-        for number, pair in enumerate(pairs):
-            with damaged.noted(pair.a):
-                self._main[number] = pair.a.main()
+        self._main = [pair.a.main() for pair in pairs]
 
     def name_of(self, pair: Pair, estimator: str) -> str:
         """Return the name of ``estimator`` in a pair."""
@@ -487,13 +476,13 @@ class _Grouping:
         return clusters, {name: [values[i] for i in places] for name, values in self.factors.items()}
 
 
-def _grouping(pairing: Pairing, key: str | None, damaged: _Damaged) -> _Grouping:
+def _grouping(pairing: Pairing, key: str | None, damaged: dict[str, None]) -> _Grouping:
     """Return the groups of the pairs by a key, or by day, car and route without one."""
     if key == INDEPENDENT:
         return _Grouping()
     stated: list[dict[str, str | None]] = [{} for _ in pairing.pairs]
     for number, pair in enumerate(pairing.pairs):
-        with damaged.noted(pair.a):
+        with _noted(damaged):
             report = pair.a.report()
             stated[number] = {**((report or {}).get("metadata") or {}), **factors_of(pair.a.entry, report)}
     if key is None:

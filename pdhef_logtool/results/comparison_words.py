@@ -13,14 +13,15 @@ from pdhef_logtool.results.comparing import INDEPENDENT, ComparedFigure, Compari
 from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
 from pdhef_logtool.results.selected_estimate import TEMPLATES
 from pdhef_logtool.results.sink import TRUTH
-from pdhef_logtool.storage.templates import one_line, template
+from pdhef_logtool.storage.templates import clauses, one_line, template
 
 
 @cache
 def _words() -> Any:
     """Return the sentences of ``comparison.txt`` as functions."""
-    context = {"change_text": change_text, "percent": percent, "LEAST_CLUSTERS": LEAST_CLUSTERS}
-    return template(TEMPLATES / "comparison.txt", **context).module
+    context = {"change_text": change_text, "percent": percent, "isfinite": math.isfinite}
+    limits = {"LEAST_CLUSTERS": LEAST_CLUSTERS, "INDEPENDENT": INDEPENDENT}
+    return template(TEMPLATES / "comparison.txt", **context, **limits).module
 
 
 def paired_text(comparison: Comparison) -> str:
@@ -35,8 +36,7 @@ def verdict_text(comparison: Comparison) -> str:
 
 def assumed_text(comparison: Comparison) -> str:
     """Return the assumptions of the verdict."""
-    dependence = next((dependence_text(f, comparison.cluster) for f in comparison.figures if f.drives), "")
-    return one_line(_words().assumed(comparison, dependence))
+    return one_line(_words().assumed(comparison))
 
 
 def next_text(comparison: Comparison) -> str:
@@ -49,34 +49,13 @@ def next_text(comparison: Comparison) -> str:
 
 def notes_of(comparison: Comparison) -> list[str]:
     """Return remarks on the requested figures, a line each."""
-    asked = [f for f in comparison.figures if f.drives and not comparison.equal]
-    texts = {f.figure.label: dependence_text(f, comparison.cluster) for f in asked}
-    alike = len(set(texts.values())) == 1
-    notes = [*dict.fromkeys(text if alike else f"{label}: {text}" for label, text in texts.items())]
-    for figure in comparison.figures:
-        notes += [f"{figure.figure.label}: {note}" for note in figure.notes]
-        if figure.neither and figure.drives:
-            notes.append(f"{figure.figure.label}: {figure.neither} drives have it on neither side")
-        if math.isfinite(figure.detectable):
-            least = percent(figure.detectable)
-            notes.append(f"{figure.figure.label}: smallest increase that these drives detect with 80 % power: {least}")
-    return notes
+    return clauses(_words().notes(comparison))
 
 
 def change_text(figure: ComparedFigure) -> str:
     """Return the median change with its interval: ``+3.1 % (+1.0 % to +5.2 %)``."""
     median, interval = percent(math.expm1(figure.change.median)), interval_text(figure)
     return median if interval == "-" else f"{median} ({interval})"
-
-
-def dependence_text(figure: ComparedFigure, cluster: str | None) -> str:
-    """Return the design effect of the drives and its known causes."""
-    of = figure.change.dependence
-    if cluster == INDEPENDENT:
-        return "Drives are assumed independent (--cluster none)."
-    if cluster is not None:
-        return f"Design effect {of.design_effect:.2g} of {figure.change.clusters} clusters by {cluster}."
-    return of.text(figure.change.drives)
 
 
 def interval_text(figure: ComparedFigure) -> str:

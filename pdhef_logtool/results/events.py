@@ -123,11 +123,10 @@ def find_events(
     unreadable = searched = 0
     for log in run.logs:
         try:
-            with log.reading():
-                reason = _unfit(log, condition, estimator)
-                if reason is None:
-                    events += _events_of(log, condition, estimator or log.main(), least_s, pad_s)
-                    searched += 1
+            reason = _unfit(log, condition, estimator)
+            if reason is None:
+                events += _events_of(log, condition, estimator or log.main(), least_s, pad_s)
+                searched += 1
         except OutputError as error:
             reason = error.got
             damaged[log.label] = str(error)

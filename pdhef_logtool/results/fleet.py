@@ -65,7 +65,7 @@ class FleetDrive:
     truth : whether its sideslip is scored against an independent ground truth. unscored : why not, else empty.
     errors : RMSE by estimator and signal, where the ground truth is independent of both.
     nis, d2, naive_d2 : without ground truth: NIS and v̇_y residual of the selected estimate, v̇_y residual of sideslip 0.
-    verdict : of sideslip: ``better``, ``worse`` and so on. coverage : of the 95 % confidence interval.
+    coverage : of the 95 % confidence interval.
     failed_checks : that count. lost : data that could not be used. keys : for grouping.
     factors : day, car and route, None where not stated.
     """
@@ -80,7 +80,6 @@ class FleetDrive:
     nis: float
     d2: float
     naive_d2: float
-    verdict: str
     failed_checks: int
     lost: str
     keys: Mapping[str, str]
@@ -204,7 +203,7 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
     OutputError
         metrics.parquet is damaged.
     """
-    figures = _figures(run)
+    figures = read_figures(run)
     gathered = _Gathered()
     for log in run.logs:
         gathered.add(log, figures.get(log.label, {}))
@@ -252,24 +251,19 @@ class _Gathered:
             if kind == "failed" or report is None:
                 self.failed.append((log.label, reason or "its report is not there any more"))
                 return
-            with log.reading():
-                drive = _drive(log, report, figures)
-                lost = [(log.label, str(x["what"])) for x in report.get("losses", ()) if x.get("severity") == "lost"]
-                self._add_space(report.get("operating_space"))
         except PdhefError as error:
             self.failed.append((log.label, f"its report cannot be read: {error.expected}, got {error.got}"))
             return
-        self.drives.append(drive)
-        self.lost += lost
+        self.drives.append(_drive(log, report, figures))
+        self.lost += [(log.label, str(x["what"])) for x in report.get("losses", ()) if x.get("severity") == "lost"]
+        self._add_space(report.get("operating_space"))
 
     def _add_space(self, space: Mapping[str, Any] | None) -> None:
         if not space:
             return
-        edges = np.array(space["speed_edges_m_s"]), np.array(space["ay_edges_m_s2"])
         if self.edges is None:
-            self.edges, self.cells = edges, np.zeros((3, len(edges[0]), len(edges[1])))
-        elif not all(map(np.array_equal, edges, self.edges)):
-            return  # of another version's grid
+            self.edges = np.array(space["speed_edges_m_s"]), np.array(space["ay_edges_m_s2"])
+            self.cells = np.zeros((3, *map(len, self.edges)))
         self.mapped += 1
         for cell in space["cells"]:
             scored = cell["scored"] if cell["sideslip_mse_rad2"] is not None else 0
@@ -284,7 +278,16 @@ class _Gathered:
             return Space(*self.edges, seconds, np.sqrt(squares / counts), self.mapped)
 
 
-def _figures(run: OpenedRun) -> dict[str, dict[tuple[str, str, str], float]]:
+def independent_errors(figures: Mapping[tuple[str, str, str], float]) -> dict[tuple[str, str], float]:
+    """Return the RMSE by estimator and signal, where the ground truth is independent of both."""
+    return {
+        (e, s): value
+        for (e, s, metric), value in figures.items()
+        if metric == "rmse" and math.isfinite(value) and (e, s, "not_independent") not in figures
+    }
+
+
+def read_figures(run: OpenedRun) -> dict[str, dict[tuple[str, str, str], float]]:
     """Return the figures of whole drives by log, then by estimator, signal and metric."""
     import polars as pl
 
@@ -310,27 +313,21 @@ def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str
     answer = report.get("answer") or {}
     ran = [e["name"] for e in report.get("estimators", ()) if e["outcome"] == "ran"]
     main = answer.get("main") or next(iter(ran), "")  # without an answer the first of recorded estimates
-    errors = {
-        (e, s): value
-        for (e, s, metric), value in figures.items()
-        if metric == "rmse" and math.isfinite(value) and (e, s, "not_independent") not in figures
-    }
+    errors = independent_errors(figures)
     dof = figures.get((main, "state", "nis_dof"), math.nan)
     nis = figures.get((main, "state", "nis"), math.nan)
-    verdicts = {v["signal"]: v for v in report.get("verdicts") or ()}
     kind, _, reason = log.outcome.partition(": ")
     return FleetDrive(
         label=log.label,
         seconds=float(report["log"]["duration_s"]),
         main=main,
         truth=(main, JUDGED) in errors,
-        unscored="" if (main, JUDGED) in errors else _why_unscored(report, verdicts.get(JUDGED, {})),
+        unscored="" if (main, JUDGED) in errors else _why_unscored(report),
         errors=errors,
         coverage=figures.get((main, JUDGED, "coverage95"), math.nan),
         nis=nis / dof if dof and dof > 0.0 else math.nan,
         d2=figures.get((main, "vy_m_s", "d2"), math.nan),
         naive_d2=figures.get((answer.get("naive") or "", "vy_m_s", "d2"), math.nan),
-        verdict=verdicts.get(JUDGED, {}).get("outcome", ""),
         failed_checks=sum(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks", ())),
         lost=reason if kind == "lost" else "",
         keys=_keys(log, report, main),
@@ -338,12 +335,13 @@ def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str
     )
 
 
-def _why_unscored(report: Mapping[str, Any], verdict: Mapping[str, Any]) -> str:
+def _why_unscored(report: Mapping[str, Any]) -> str:
     if not report["truth"]["available"]:
         return "the log has no ground truth"
     if JUDGED in report["truth"]["not_independent"]:
         return "its ground truth is not independent"
-    return str(verdict.get("text", "no figure of it is scored")).partition(": ")[2] or "no figure of it is scored"
+    texts = (report.get("answer") or {}).get("texts") or {}
+    return str(texts.get("result", "")).partition(" is not scored: ")[2] or "no figure of it is scored"
 
 
 def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str]:
@@ -354,7 +352,7 @@ def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str
         "car": car.get("name") or report["vehicle"]["name"],
         "log format": report["log"]["kind"],
         "answer": main,
-        "friction source": source.partition(",")[0],
+        "friction source": source,
         "length": _length(float(report["log"]["duration_s"])),
         "sensor faults": _fault_text(report),
         "month": (factors_of(log.entry, report)["day"] or "")[:7],

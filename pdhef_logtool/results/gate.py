@@ -42,14 +42,6 @@ class Figure:
         return what if self.segment == "all" else f"{what}, {self.segment}"
 
 
-@dataclass(frozen=True, slots=True)
-class Gate:
-    """Figures that must not become worse; ``allow_unpaired``: drives on one side only are accepted."""
-
-    figures: tuple[Figure, ...]
-    allow_unpaired: bool = False
-
-
 def figures_of(plan: ValidationPlan) -> tuple[Figure, ...]:
     """Return the figures of a plan's requirements for which lower is better, without limits."""
     figures = [Figure(r.signal, r.metric, r.segment, r.estimator or MAIN) for r in plan.requirements]

@@ -1,23 +1,19 @@
 """A finished run, read back from the files that it left; every command that reads a run reads it here.
 
-run.json contains its own digest and the sha256 of the files that are read back; entries and columns are checked.
+run.json contains its own digest and the sha256 of the files that are read back.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ConfigDict
-
 from pdhef_logtool.car.names import MODEL_FILE as MODEL_FILE
 from pdhef_logtool.logs.discovery import RUN_FILE
-from pdhef_logtool.records.errors import OutputError, PdhefError
-from pdhef_logtool.storage.documents import file_sha256, read_json, read_sealed, validated
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.storage.documents import file_sha256, read_json, read_sealed
 from pdhef_logtool.storage.object_store import Mirror, is_url
 
 if TYPE_CHECKING:
@@ -40,38 +36,6 @@ MAX_DOCUMENT_BYTES = 1 << 28
 
 _REMEDY = "pdhef run LOG -o OUT writes one"
 _AGAIN = "run the log again"
-
-
-class _Checked(BaseModel):
-    """The entries that commands use; each is optional, others are ignored."""
-
-    model_config = ConfigDict(extra="ignore", strict=True, defer_build=True)
-
-
-class _CarEntry(_Checked):
-    name: str = ""
-    sha256: str | None = None
-    network_sha256: str | None = None
-
-
-class _LogEntry(_Checked):
-    outcome: str = ""
-    main: str | None = None
-    sha256: str | None = None
-    signals_sha256: str | None = None
-    truth_sha256: str | None = None
-    mapping_sha256: str | None = None
-    folder: str = ""
-    car: _CarEntry | None = None
-    files: dict[str, str] = {}
-
-
-class _Run(_Checked):
-    logs: list[_LogEntry]
-    versions: dict[str, Any] = {}
-    config: dict[str, Any] = {}
-    remaining: int = 0
-    files: dict[str, str] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,23 +78,6 @@ class OpenedLog:
             got = f"format {report.get('format')!r}"
             raise OutputError(expected="a report.json", got=got, where=str(path), remedy=_AGAIN)
         return report
-
-    @contextmanager
-    def reading(self) -> Iterator[None]:
-        """Turn errors in reading a report without a checksum into an OutputError: it is damaged."""
-        try:
-            yield
-        except PdhefError:
-            raise
-        except Exception as error:
-            if REPORT_FILE in self.entry.get("files", {}):
-                raise
-            raise OutputError(
-                expected="a report.json as this version writes it",
-                got=f"one that raises {type(error).__name__}: {error}",
-                where=str(self.folder / REPORT_FILE),
-                remedy=_AGAIN,
-            ) from error
 
     def main(self) -> str:
         """Return the selected estimator of the drive, or an empty string."""
@@ -180,14 +127,9 @@ class OpenedRun:
 
 
 def _check(path: Path, sha256: str | None, remedy: str) -> None:
-    """Raise OutputError for a file that is not as it was written: by its sha256, or by the metadata of Parquet."""
+    """Raise OutputError for a file that is not as run.json names it."""
     try:
-        if sha256 is None:
-            if path.suffix == ".parquet":
-                from pdhef_logtool.results.parquet_sink import check_parquet
-
-                check_parquet(path, path.name)
-        elif file_sha256(path) != sha256:
+        if sha256 is not None and file_sha256(path) != sha256:
             got = "another content: it is damaged, or of another run"
             raise OutputError(expected=f"the {path.name} that run.json names", got=got, where=str(path), remedy=remedy)
     except OSError as error:
@@ -223,7 +165,6 @@ def open_run(output: Path | str) -> OpenedRun:
     if document.get("format") != "pdhef.run":
         got = f"format {document.get('format')!r}"
         raise OutputError(expected=what, got=got, where=str(path), remedy=_REMEDY)
-    validated(_Run, document, str(path), OutputError, expected=what, remedy=_REMEDY)
     place = folder / LOGS
     logs = tuple(_opened(entry, place, mirror) for entry in document["logs"])
     return OpenedRun(folder, document, logs, mirror)

@@ -31,6 +31,11 @@ class Pair:
         left, other = self.a.entry.get(key), self.b.entry.get(key)
         return None if left is None or other is None else bool(left == other)
 
+    @property
+    def same_file(self) -> bool:
+        """Whether the files of both sides are known to be the same."""
+        return self.same("sha256") is True
+
 
 @dataclass(frozen=True, slots=True)
 class Pairing:

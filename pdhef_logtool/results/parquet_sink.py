@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -27,7 +28,6 @@ ROWS_A_GROUP = 32768
 _LEVEL = 3
 #: Files of figures that are read before a row group of theirs is written.
 _PARTS_AT_ONCE = 256
-_ESTIMATES, _METRICS = "estimates.parquet", "metrics.parquet"
 #: Name of the copy of the selected estimate in estimates.parquet.
 SELECTED = "selected"
 _AGAIN = "run the log again"
@@ -136,11 +136,8 @@ def track_table(track: StateTrack, *, as_written: bool = False, causal: BoolArra
 
 def list_estimators(path: Path) -> tuple[str, ...]:
     """Return the names of the tracks in an estimates.parquet, by their row groups; the selected one is a copy."""
-    names: dict[str, None] = {}
-    with _open(path, _ESTIMATES) as file:
-        for group in range(file.num_row_groups):
-            names.update(dict.fromkeys(_estimators_of(file, group)))
-    return tuple(name for name in names if name != SELECTED)
+    with _reading(path), pq.ParquetFile(path) as file:
+        return tuple(dict.fromkeys(name for name in _names(file) if name != SELECTED))
 
 
 def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None) -> StateTrack:
@@ -164,33 +161,15 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
     ------
     OutputError : When the file is no estimates.parquet or contains no such track.
     """
-    tables = list(_tables(path, estimator, None if columns is None else set(columns)))
+    asked = None if columns is None else {"stamp_ns", *columns}
+    wanted = [c for c in TRACK_COLUMNS if asked is None or c in asked]
+    with _reading(path), pq.ParquetFile(path) as file:
+        names = _names(file)
+        tables = [file.read_row_group(i, columns=wanted) for i, name in enumerate(names) if name == estimator]
     if not tables:
-        raise OutputError(expected=f"one of {', '.join(list_estimators(path))}", got=estimator, where=str(path))
+        names = [*dict.fromkeys(name for name in names if name != SELECTED)]
+        raise OutputError(expected=f"one of {', '.join(names)}", got=estimator, where=str(path))
     return _track_from_table(estimator, pa.concat_tables(tables))
-
-
-def _tables(path: Path, estimator: str, columns: set[str] | None) -> Iterator[pa.Table]:
-    """Yield the row groups of an estimator with the given columns; None: all."""
-    wanted = [c for c in TRACK_COLUMNS if c == "stamp_ns" or columns is None or c in columns]
-    unknown = (columns or set()) - set(TRACK_COLUMNS)
-    if unknown:
-        raise OutputError(
-            expected=f"columns of {', '.join(TRACK_COLUMNS)}", got=", ".join(sorted(unknown)), where=str(path)
-        )
-    with _open(path, _ESTIMATES) as file:
-        for group in range(file.num_row_groups):
-            with _reading(path):
-                names = _estimators_of(file, group)
-                if estimator not in names:
-                    continue
-                if len(names) == 1:
-                    table = file.read_row_group(group, columns=wanted)
-                else:
-                    table = file.read_row_group(group, columns=[*wanted, "estimator"])
-                    of_estimator = pa.array([name == estimator for name in table["estimator"].to_pylist()])
-                    table = table.filter(of_estimator).select(wanted)
-            yield table
 
 
 def _track_from_table(name: str, table: pa.Table) -> StateTrack:
@@ -216,41 +195,10 @@ def _track_from_table(name: str, table: pa.Table) -> StateTrack:
     )
 
 
-def _estimators_of(file: pq.ParquetFile, group: int) -> tuple[str, ...]:
-    """Return the names in one row group, from its statistics when they leave no doubt."""
-    index = file.schema_arrow.get_field_index("estimator")
-    statistics = file.metadata.row_group(group).column(index).statistics
-    if statistics is not None and statistics.has_min_max and statistics.min == statistics.max:
-        return (str(statistics.min),)
-    column = file.read_row_group(group, columns=["estimator"])["estimator"]
-    return tuple(str(v) for v in column.unique().to_pylist())
-
-
-def _open(path: Path, kind: str) -> pq.ParquetFile:
-    """Open a file that has the columns of its kind."""
-    with _reading(path):
-        file = pq.ParquetFile(path)
-        types = {f.name: _class_of(f.type) for f in file.schema_arrow}
-    wanted = {f.name: _class_of(f.type) for f in arrow_schema(f"{kind}.json")}
-    absent = sorted(wanted.keys() - types.keys())
-    other = sorted(name for name in wanted.keys() & types.keys() if types[name] != wanted[name])
-    if absent or other:
-        file.close()
-        got = ", ".join(f"{name} of {types[name]}" for name in other)
-        got = f"a Parquet file without {', '.join(absent)}" if absent else got
-        raise OutputError(expected=f"the columns of {kind}", got=got, where=str(path), remedy=_AGAIN)
-    return file
-
-
-def _class_of(kind: pa.DataType) -> str:
-    """Return the kind of the values of a column, without their size; texts may be in a dictionary."""
-    if pa.types.is_dictionary(kind):
-        kind = kind.value_type
-    if pa.types.is_string(kind) or pa.types.is_large_string(kind):
-        return "texts"
-    if pa.types.is_integer(kind):
-        return "whole numbers"
-    return "numbers" if pa.types.is_floating(kind) else str(kind)
+def _names(file: pq.ParquetFile) -> list[str]:
+    """Return the estimator of each row group, which the statistics of its column state."""
+    column, metadata = file.schema_arrow.get_field_index("estimator"), file.metadata
+    return [str(metadata.row_group(i).column(column).statistics.min) for i in range(metadata.num_row_groups)]
 
 
 @contextmanager
@@ -263,16 +211,6 @@ def _reading(path: Path) -> Iterator[None]:
         raise OutputError(expected="a readable Parquet file", got=got, where=str(path), remedy=_AGAIN) from error
 
 
-def check_parquet(path: Path, kind: str) -> None:
-    """Read all of a file and raise OutputError if it is damaged or lacks columns of ``kind``.
-
-    ``kind`` : ``estimates.parquet`` or ``metrics.parquet``.
-    """
-    with _open(path, kind) as file, _reading(path):
-        for group in range(file.num_row_groups):
-            file.read_row_group(group).validate(full=True)
-
-
 def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
     """Write metrics.parquet, rows in the order given; NaN becomes null; raises OutputError."""
     schema = arrow_schema("metrics.parquet.json")
@@ -281,31 +219,20 @@ def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
         writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
 
 
+def read_metrics(path: Path) -> list[MetricRow]:
+    """Return the rows of a metrics.parquet, NaN for null; raises OutputError."""
+    with _reading(path), pq.ParquetFile(path) as file:
+        rows = file.read(columns=arrow_schema("metrics.parquet.json").names).to_pylist()
+    return [MetricRow(**(row | {"value": math.nan if row["value"] is None else row["value"]})) for row in rows]
+
+
 def join_metrics(path: Path, parts: Sequence[Path]) -> None:
     """Concatenate metrics.parquet of drives in their order, a few at a time; raises OutputError."""
     schema = arrow_schema("metrics.parquet.json")
     with parquet_writer(path, schema, checksums=False) as writer:
         for first in range(0, len(parts), _PARTS_AT_ONCE):
-            tables = [_metrics_table(part, schema) for part in parts[first : first + _PARTS_AT_ONCE]]
+            tables = []
+            for part in parts[first : first + _PARTS_AT_ONCE]:
+                with _reading(part), pq.ParquetFile(part) as file:
+                    tables.append(file.read().cast(schema))
             writer.write_table(pa.concat_tables(tables).combine_chunks())
-
-
-def _metrics_table(path: Path, schema: pa.Schema) -> pa.Table:
-    with _open(path, _METRICS) as file, _reading(path):
-        return file.read().select(schema.names).cast(schema)
-
-
-def read_metrics(path: Path) -> list[MetricRow]:
-    """Read a metrics.parquet; null becomes NaN, rows marked ``not_independent`` are so again; raises OutputError."""
-    schema = arrow_schema("metrics.parquet.json")
-    with _open(path, _METRICS) as file, _reading(path):
-        names = [n for n in schema.names if n in file.schema_arrow.names]
-        records = file.read(columns=names).to_pylist()
-    dependent = {(r["log"], r["estimator"], r["signal"]) for r in records if r["metric"] == "not_independent"}
-    return [
-        MetricRow(
-            **{**r, "value": float("nan") if r["value"] is None else r["value"]},
-            independent=(r["log"], r["estimator"], r["signal"]) not in dependent,
-        )
-        for r in records
-    ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -17,7 +17,7 @@ from pdhef_logtool.results.plan_verdicts import Against, JudgedDrive, PlanVerdic
 
 def plan_verdicts_against(plan: ValidationPlan, a: OpenedRun, b: OpenedRun, *, strict: bool) -> PlanVerdicts:
     """Return the verdicts on the drives of B; raises OutputError where metrics.parquet is damaged."""
-    drives = [_judged(log) for log in b.logs]
+    drives = [judged_drive(log) for log in b.logs]
     figures = figures_of_file(b.metrics(), plan, [d.main for d in drives])
     against = {**other_runs(plan, b.logs), RUN: _against(plan, a, b.logs)}
     return plan_verdicts(plan, figures, drives, strict=strict, against=against)
@@ -35,14 +35,15 @@ def other_runs(plan: ValidationPlan, logs: Sequence[OpenedLog]) -> dict[str, Aga
 
 
 def _against(plan: ValidationPlan, run: OpenedRun, logs: Sequence[OpenedLog]) -> Against:
-    partners = {pair.b.label: _judged(pair.a) for pair in pair_logs(run.logs, logs).pairs}
+    partners = {pair.b.label: judged_drive(pair.a) for pair in pair_logs(run.logs, logs).pairs}
     return figures_of_file(run.metrics(), plan, [d.main for d in partners.values()]), partners
 
 
-def _judged(log: OpenedLog) -> JudgedDrive:
+def judged_drive(log: OpenedLog, read_report: Callable[[], Mapping[str, Any] | None] | None = None) -> JudgedDrive:
+    """Return a log of a run for :func:`~.plan_verdicts.plan_verdicts`; ``read_report`` None: from its file."""
     main = log.entry.get("main")
     factors = factors_of(log.entry, None)
-    return JudgedDrive(log.label, None if main is None else str(main), partial(_report, log), factors)
+    return JudgedDrive(log.label, None if main is None else str(main), read_report or partial(_report, log), factors)
 
 
 def _report(log: OpenedLog) -> Mapping[str, Any] | None:

@@ -15,9 +15,7 @@ from typing import TYPE_CHECKING, Any
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
 from pdhef_logtool.evaluation.metrics.registry import registered
-from pdhef_logtool.evaluation.standing import Standing
 from pdhef_logtool.results.selected_estimate import TEMPLATES, MainFacts, answer_of
-from pdhef_logtool.results.verdicts import verdicts_of
 from pdhef_logtool.storage.documents import jsonable, seal
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.templates import template
@@ -98,23 +96,20 @@ def estimator_entry(name: str, *, causal: bool, outcome: str = "ran", **stated: 
     return {"name": name, "causal": causal, "outcome": outcome, **unstated, **stated}
 
 
-def build_report(
-    content: Mapping[str, Any], main: MainFacts | None = None, standings: Sequence[Standing] = ()
-) -> dict[str, Any]:
+def build_report(content: Mapping[str, Any], main: MainFacts | None = None) -> dict[str, Any]:
     """Return the document of report.json (schemas/report.schema.json); NaN becomes None.
 
     Parameters
     ----------
     content : entries of the document as records or JSON-able values, ``metrics`` as rows of metrics.parquet.
-    main : the selected estimate, None without one. standings : its errors beside the errors of other physics.
+    main : the selected estimate, None without one.
     """
     metrics = [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in content["metrics"]]
     entries = {"format": "pdhef.report", "version": 1, **content, "metrics": metrics}
     document = {key: jsonable(value) for key, value in entries.items()}
     if main is None:
         return document | {"selected_estimate": None, "answer": None}
-    document |= {"selected_estimate": main.name, "answer": answer_of(document, main)}
-    return document | {"verdicts": verdicts_of(document, main.name, standings)}
+    return document | {"selected_estimate": main.name, "answer": answer_of(document, main)}
 
 
 def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,9 +11,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
+import numpy as np
+
+from pdhef_logtool.evaluation.requirement_blocks import from_document
+from pdhef_logtool.evaluation.requirement_bounds import LEAST_BLOCKS, pooled
+from pdhef_logtool.evaluation.validation_plan import SIDESLIP
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.tracks import REFERENCE
-from pdhef_logtool.storage.templates import one_line, template
+from pdhef_logtool.storage.templates import clauses, one_line, template
 
 #: Templates of texts and files of results.
 TEMPLATES = Path(__file__).parent / "templates"
@@ -70,17 +75,30 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
 
     words = _words()
     intervals = next((e["intervals"] for e in report["estimators"] if e["name"] == main.name), ())
+    interval, best = _interval(report), _best_in_hindsight(report, main, figures)
     texts = {
-        "result": words.result(report, main, value),
+        "result": words.result(report, main, value, interval),
         "consistency": "" if report["truth"]["available"] else words.consistency(main, value),
         "band": words.band(main, intervals, value(main.name, "coverage95")),
-        "assumed": "; ".join(_assumed(report, main)),
-        "next": "; ".join(_next_steps(report, main)[:_MOST_STEPS]),
+        "hindsight": words.hindsight(best, main),
+        "assumed": "; ".join(clauses(words.assumed(report, main))),
+        "next": "; ".join(clauses(words.next(report, main))[:_MOST_STEPS]),
     }
     texts = {key: one_line(text) for key, text in texts.items()}
-    best = _best_in_hindsight(report, main, figures)
     chosen = {"main" if key == "name" else key: value for key, value in asdict(main).items()}
-    return {**chosen, "shown": list(main.shown), "best_in_hindsight": best, "texts": texts}
+    shown = {"shown": list(main.shown), "sideslip_rmse_ci_rad": interval}
+    return {**chosen, **shown, "best_in_hindsight": best, "texts": texts}
+
+
+def _interval(report: Report) -> list[float] | None:
+    """Return the 95 % CI of the sideslip RMSE of the selected estimate in rad, None with too few blocks of time."""
+    blocks = from_document(report.get("requirement_blocks") or ())
+    of = next((b for b in blocks if b.of == SIDESLIP.measured and not b.estimated and len(b.n) >= LEAST_BLOCKS), None)
+    if of is None:
+        return None
+    counts, values = np.array(of.n, dtype=np.float64), np.array(of.value)
+    bounded = pooled(counts, values, None, squares=True, positive=True, level=0.95)
+    return [bounded.low, bounded.high]
 
 
 @cache
@@ -116,67 +134,6 @@ def truth_of(report: Report, name: str) -> str:
     words = " ".join(f"{q['source']} {q['derivation']}" for q in parts).replace(",", " ").split()
     topics = dict.fromkeys(w.partition(".")[0] for w in words if w.startswith("/"))
     return f"ground truth: {' and '.join(topics)}" if topics else "ground truth"
-
-
-def _assumed(report: Report, main: MainFacts) -> list[str]:
-    friction, calibration = report["friction"], report["self_calibration"]
-    estimator = next(e for e in report["estimators"] if e["name"] == main.name)
-    modelled = estimator["algorithm"] is not None and estimator["algorithm"]["physics_sha256"] is not None
-    said = _model(report, estimator["causal"]) if modelled else [f"no vehicle model ({main.name} needs none)"]
-    if calibration is not None and modelled:
-        if calibration["refused"]:
-            said.append(f"not calibrated on this log: {calibration['refused']}")
-        elif not calibration["parameters"]:
-            said.append(calibration["text"])
-        if calibration["understeer"] is not None and calibration["understeer"]["contradicts"]:
-            said.append("the understeer gradient of the drive contradicts the file")
-    if friction is not None and modelled:
-        source: str = friction["source"]
-        said.append(f"friction {source if source.startswith('assumed') else f'given ({source})'}")
-    if main.distrusted:
-        said.append(main.why)
-    algorithm = estimator["algorithm"] or {"options": {}}
-    trust = algorithm["options"].get("trust", 0.0 if algorithm.get("algorithm") == "adaptive-physics" else None)
-    if trust is not None:
-        unused = "residual not used: no network was trained with the physics of this car"
-        said.append(f"residual gain {trust:g} within the region of validity" if trust else unused)
-    return said
-
-
-def _model(report: Report, causal: bool) -> list[str]:
-    """Return the car of an estimator with a vehicle model, and its evidence."""
-    vehicle, calibration = report["vehicle"], report["self_calibration"]
-    used = calibration is not None and not calibration["refused"]
-    taught = f", taught by {vehicle['taught']}" if vehicle.get("taught") else ""
-    if used and not causal:
-        return [_car(vehicle) + taught, "calibrated on this log without ground truth, therefore not causal"]
-    if vehicle["file"] is None:
-        return [_car(vehicle)]
-    proven = "validated on drives with ground truth" if vehicle["proven"] else "parameters of its file, not validated"
-    return [f"{_car(vehicle)}{taught or f', {proven}'}"]
-
-
-def _car(vehicle: Mapping[str, Any]) -> str:
-    return "default sedan (no car given)" if vehicle["file"] is None else f"car {vehicle['file']}"
-
-
-def _next_steps(report: Report, main: MainFacts) -> list[str]:
-    """Return the remedies, most important first."""
-    vehicle, steps = report["vehicle"], []
-    if any(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks", ())):
-        steps.append("correct the failed checks below, or waive them by name")
-    lacks = {e["reason"] for e in report["estimators"] if e["name"] == "physics" and e["outcome"] == "skipped"}
-    steps += [f"map the missing signals ({reason}): pdhef map LOG" for reason in lacks]
-    if vehicle["file"] is None:
-        steps.append("give your car: --car vehicle.toml with mass, geometry and tyres (docs/car.md)")
-    elif main.distrusted:
-        steps.append("check the vehicle file: mass, wheelbase, tyres, steering ratio")
-    if vehicle["file"] is not None and not (vehicle["proven"] or vehicle.get("taught")):
-        steps.append(f"learn the car from its drives: pdhef learn LOGS --car {vehicle['file']} -o mycar")
-    friction = report["friction"]
-    if friction is not None and friction["source"].startswith("assumed"):
-        steps.append("give the friction if it is known: --friction 0.8")
-    return steps
 
 
 def _best_in_hindsight(report: Report, main: MainFacts, figures: _Figures) -> dict[str, Any] | None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -15,9 +13,6 @@ TRUTH = "truth"
 
 #: Recordings of longer drives contain a subset of the stamps.
 LONGEST_WHOLE_NS = 600_000_000_000
-
-#: Footer of a complete Rerun recording, and the number of last bytes that contain it.
-_RECORDING_END, _RECORDING_TAIL = b"RRF2FOOT", 64
 
 #: Rounding steps in files, far below the resolution of sensors: powers of two, so that the last bytes are zero.
 _STEPS = {
@@ -80,13 +75,6 @@ def rounded(name: str, values: FloatArray) -> FloatArray:
 def resolution(name: str) -> tuple[float, float]:
     """Return the largest rounding error of a column in files: absolute and relative."""
     return (_STEPS[name] / 2.0, 0.0) if name in _STEPS else (0.0, 2.0 ** (_BITS_OUT - 24))
-
-
-def is_finished_recording(path: Path) -> bool:
-    """Return whether a Rerun recording has its footer; the rest is not read."""
-    with path.open("rb") as file:
-        file.seek(-min(_RECORDING_TAIL, path.stat().st_size), os.SEEK_END)
-        return _RECORDING_END in file.read()
 
 
 def first_of_slots(stamps_ns: IntArray, step_ns: int) -> IntArray:

@@ -1,24 +1,18 @@
-"""Summary of a run of many logs: distribution of errors, drives with the largest errors, and failures.
-
-Only the figures of sideslip are read, as columns, so that a drive takes some bytes of memory.
-"""
+"""Summary of a run of many logs: distribution of errors, drives with the largest errors, and failures."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from pdhef_logtool.results.fleet import ANSWER, JUDGED, grouped
+import numpy as np
+
+from pdhef_logtool.results.fleet import ANSWER, JUDGED, grouped, independent_errors, read_figures
 from pdhef_logtool.results.opened_run import OpenedRun
 
-if TYPE_CHECKING:
-    import polars as pl
-
-#: Number of drives with the largest errors, and estimators that are listed beside the selected estimate.
+#: Number of drives with the largest errors.
 WORST = 10
-_RIVALS = ("physics", "zero")
 
 
 def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> dict[str, Any]:
@@ -34,15 +28,12 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> d
     ------
     OutputError : metrics.parquet is damaged.
     """
-    import polars as pl
-
-    errors = _independent_errors(run)
-    answers = errors.filter(pl.col("estimator") == pl.col("main"))
-    error_rows = [_errors_of(ANSWER, answers)] if answers.height else []
-    for name in _RIVALS:
-        of_estimator = errors.filter(pl.col("estimator") == name)
-        if of_estimator.height and set(answers["main"].unique()) != {name}:
-            error_rows.append(_errors_of(name, of_estimator))
+    mains, errors = {log.label: log.main() for log in run.logs}, dict[str, dict[str, float]]()
+    for label, figures in read_figures(run).items():
+        errors[label] = {e: value for (e, signal), value in independent_errors(figures).items() if signal == JUDGED}
+    answers = {label: of[mains[label]] for label, of in errors.items() if mains.get(label) in of}
+    selected = {mains[label] for label in answers}
+    others = [name for name in dict.fromkeys(n for of in errors.values() for n in of) if {name} != selected]
     failed = [(log.label, log.outcome.partition(": ")[2]) for log in run.logs if log.outcome.startswith("failed")]
     return {
         "output": str(run.place),
@@ -50,53 +41,23 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> d
         "logs": len(run.logs),
         "done": len(run.logs) - len(failed),
         "lost": sum(log.outcome.startswith("lost") for log in run.logs),
-        "scored": answers.height,
+        "scored": len(answers),
         "remaining": int(run.document.get("remaining", 0)),
-        "errors": error_rows,
-        "worst": _worst(errors, answers),
+        "errors": [
+            *([_errors_of(ANSWER, [*answers.values()])] if answers else ()),
+            *(_errors_of(name, [of[name] for of in errors.values() if name in of]) for name in others),
+        ],
+        "worst": [
+            {"log": label, "main": mains[label], "errors_rad": {mains[label]: answers[label], **errors[label]}}
+            for label in sorted(answers, key=lambda label: (-answers[label], label))[:WORST]
+        ],
         "failed": [asdict(f) for f in grouped(failed)],
         "checks_failed": list(checks_failed),
         "plan": run.document.get("plan"),
     }
 
 
-def _independent_errors(run: OpenedRun) -> pl.DataFrame:
-    """Return log, estimator, RMSE (value) and main (selected estimator) of tracks with independent ground truth.
-
-    Raises
-    ------
-    OutputError : metrics.parquet of the run is damaged.
-    """
-    import polars as pl
-
-    texts = {"log": pl.String, "main": pl.String}
-    mains = pl.DataFrame([(log.label, log.main()) for log in run.logs], schema=texts, orient="row")
-    rows = run.metrics().filter(pl.col("signal") == JUDGED)
-    dependent = rows.filter(pl.col("metric") == "not_independent").select("log", "estimator")
-    scored = rows.filter(pl.col("metric") == "rmse", pl.col("segment") == "all", pl.col("value").is_finite())
-    scored = scored.select("log", "estimator", "value").join(dependent, on=["log", "estimator"], how="anti")
-    return scored.collect().join(mains, on="log").sort("log", "estimator")
-
-
-def _errors_of(estimator: str, errors: pl.DataFrame) -> dict[str, Any]:
+def _errors_of(estimator: str, values: Sequence[float]) -> dict[str, Any]:
     """Return the distribution of the sideslip RMSE in rad of one estimator over drives."""
-    values = errors["value"]
-    spread = {"median": values.median(), "p90": values.quantile(0.9, "linear"), "max": values.max()}
-    figures = {f"{name}_rad": _number(value) for name, value in spread.items()}
-    return {"estimator": estimator, "drives": errors.height, **figures}
-
-
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, int | float) else math.nan
-
-
-def _worst(errors: pl.DataFrame, answers: pl.DataFrame) -> list[dict[str, Any]]:
-    """Return the drives with the largest sideslip RMSE in rad by estimator, the selected estimate first."""
-    import polars as pl
-
-    worst = []
-    for log, main in answers.sort("value", "log", descending=[True, False]).head(WORST).select("log", "main").rows():
-        error_by_name = dict(errors.filter(pl.col("log") == log).select("estimator", "value").rows())
-        names = dict.fromkeys((main, *(name for name in _RIVALS if name in error_by_name)))
-        worst.append({"log": log, "main": main, "errors_rad": {name: error_by_name[name] for name in names}})
-    return worst
+    median, p90, largest = np.quantile(values, [0.5, 0.9, 1.0]).tolist()
+    return {"estimator": estimator, "drives": len(values), "median_rad": median, "p90_rad": p90, "max_rad": largest}

@@ -85,12 +85,12 @@ class DriveOutputs:
 
     def annotated(self) -> AbstractContextManager[AnnotatedMcap | None]:
         """Return the annotated log as a context, None if it is not asked for; add remarks of the drive."""
-        from pdhef_logtool.results.mcap_sink import AnnotatedMcap, thinned_step_ns
-
         config, drive = self._run.config, self._run.drive
         left_out = self._left_out() if config.no_position else None
         if config.annotation == "none":
             return nullcontext()
+        from pdhef_logtool.results.mcap_sink import AnnotatedMcap, thinned_step_ns
+
         if self._is_copy and drive.log.messages is None:
             drive.remarks.append(_NO_COPY.format(drive.log.kind))
         is_named = bool(config.estimators) and config.estimators != (ALL_ESTIMATORS,)

@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.drive.plan import DrivePlan
@@ -17,14 +15,13 @@ from pdhef_logtool.estimators.base import notes_of
 from pdhef_logtool.estimators.presets import calibration_of
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.evaluation.dependence import day_and_route
+from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.evaluation.reasons import Interval, SensorFault, sensor_faults
-from pdhef_logtool.evaluation.standing import standings
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
-from pdhef_logtool.results.error_places import largest_errors
 from pdhef_logtool.results.no_position import without_names
 from pdhef_logtool.results.run_report import LogOutcome, build_report, estimator_entry, run_versions
 from pdhef_logtool.runs.estimating import Estimated
@@ -59,18 +56,15 @@ def report_drive(
         "estimators": [*_estimator_entries(run, scored)],
         "metrics": scored.rows,
         "segments": scored.events,
-        "friction": {"source": run.model.friction},
-        "self_calibration": run.model.document,
+        "friction": run.model.friction.to_dict(),
+        "self_calibration": None if run.model.posterior is None else run.model.posterior.to_dict(),
         "reference": None if run.reference is None else run.reference.document,
         "largest_errors": [] if selected is None else largest_errors(selected, truth, others, slow),
         "faults": _faults(run, main.name, estimated.read),
         "path_drift": None if truth is None or selected is None else path_drift(selected, truth),
         "metadata": {} if config.no_position else _metadata(drive),
     }
-    compared = (
-        [] if truth is None else standings(main.name, _rivals(run, main.name, estimated), estimated.read, truth, slow)
-    )
-    report = build_report(content, main, compared)
+    report = build_report(content, main)
     return without_names(report, drive.path, drive.name) if config.no_position else report
 
 
@@ -107,26 +101,6 @@ def _faults(run: PreparedDrive, main: str, read: Callable[[str], StateTrack | No
         for c in run.drive.recorded().changes
     )
     return (*changes, *(faults or ())) if changes or faults is not None else None
-
-
-def _rivals(run: PreparedDrive, name: str, estimated: Estimated) -> list[str]:
-    """Return the estimators on the car's model alone to compare the selected one with; none sees more of the log."""
-    rivals, read = [], estimated.read
-    main = next(e for e in run.estimators if e.name == name)
-    for estimator in run.estimators:
-        algorithm = resolve(estimator)
-        physics = algorithm.physics_sha256 is not None and algorithm.network_sha256 is None
-        other = physics and estimator.name != main.name and (estimator.causal or not main.causal)
-        if other and not _is_same(read(estimator.name), read(main.name)):
-            rivals.append(estimator.name)
-    return rivals
-
-
-def _is_same(track: StateTrack | None, main: StateTrack | None) -> bool:
-    """Whether two tracks [N] have the same sideslip bit for bit: one filter under two names (residual gain 0)."""
-    if track is None or main is None or len(track) != len(main):
-        return False
-    return np.array_equal(track.sideslip_rad, main.sideslip_rad, equal_nan=True)
 
 
 def _metadata(drive: Drive) -> dict[str, str]:

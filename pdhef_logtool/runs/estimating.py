@@ -49,8 +49,6 @@ def estimate_drive(
     corrected: DriveSignals,
     estimators: Sequence[Estimator],
     *,
-    watched: bool = True,
-    drawn: bool = True,
     intervals: DriveIntervals | None = None,
     causality: CausalityCheck | None = None,
     progress: Callable[[float], None] = lambda _share: None,
@@ -60,7 +58,6 @@ def estimate_drive(
     Parameters
     ----------
     corrected : signals of the drive for the two vehicles of its car, whose estimators these are.
-    watched : complete ``diverged`` by the monitor of wrong branches. drawn : dead-reckon poses.
     intervals : None leaves them as the estimators give them.
     causality : collects the estimators that fail, or declare themselves causal and look ahead: they have no track.
         None does not check, and a failure is raised.
@@ -71,7 +68,7 @@ def estimate_drive(
     signals, truth, vehicle = drive.signals, drive.truth, drive.plan.vehicle
     start = first_pose(truth)
     drawn_truth = truth
-    if drawn and drawn_truth is not None:
+    if drawn_truth is not None:
         if not drive.plan.has_truth_pose:
             drawn_truth = dead_reckoned(drawn_truth, start)
         drawn_truth = valid_as_a_whole(drawn_truth, drive.plan.derivation, vehicle.standstill_m_s)
@@ -96,14 +93,14 @@ def estimate_drive(
         if computation in computations[number + 1 :]:
             shared[computation] = track
         track = without_impossible_states(replace(track, name=estimator.name))
-        track = watched_track(track, signals, vehicle) if watched else track
+        track = watched_track(track, signals, vehicle)
         compared = [track.vy_m_s, *varied]
         track = track if intervals is None else intervals.apply(track, signals)
         if varied:
             none = np.zeros(len(track))
             track = widened(track, compared, none, vehicle.low_speed_blend_m_s, 1.0)
         track = track.without_sideslip_below(vehicle.standstill_m_s)
-        tracks[track.name] = dead_reckoned(track, start) if drawn else track
+        tracks[track.name] = dead_reckoned(track, start)
     return Estimated(signals, truth, drawn_truth, tracks)
 
 

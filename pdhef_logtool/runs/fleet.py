@@ -10,11 +10,11 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, nullcontext, suppress
+from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.drive.reading import logs_of
 from pdhef_logtool.estimators.table import FILTERS
@@ -34,16 +34,15 @@ from pdhef_logtool.runs.planning import Plan, PlannedLog, plan_logs, settings_of
 from pdhef_logtool.runs.reporting import FleetProgress, collect, write_run_pages
 from pdhef_logtool.runs.run_drive import run_log
 from pdhef_logtool.runs.run_result import FEW_LOGS, LogResult, RunResult
-from pdhef_logtool.runs.stored_output import StoredEnd, StoredOutput, stored_drive
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work, failed_outcome, log_identity, run_drive, run_on_node
 from pdhef_logtool.storage.object_store import is_url
 from pdhef_logtool.storage.outputs import OutputFolder
-from pdhef_logtool.workers.ray_supervisor import supervise_on_ray
-from pdhef_logtool.workers.supervisor import Ended, Limits, supervise
+from pdhef_logtool.workers.supervisor import Ended, Limits, Tell, supervise
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.validation_plan import ValidationPlan
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
+    from pdhef_logtool.runs.stored_output import StoredOutput
 
 #: Drives with the largest errors that keep all files if the run keeps metrics only because of their number.
 FULL_WORST = 5
@@ -138,10 +137,19 @@ def run_logs(
     alone = len(inputs) == 1 and schedule == Schedule() and work is run_drive and not is_url(output)
     if alone and _given_limits(config) is None:
         return _run_alone(inputs[0], Path(output), job, reporter)
-    with StoredOutput(str(output)) if is_url(output) else nullcontext() as stored:
+    with _stored(output) as stored:
         fleet = _prepare(inputs, Path(output), job, schedule, work, reporter, stored)
         results, verdicts = fleet.run()
         return RunResult(fleet.plan.output, tuple(results), stored, verdicts)
+
+
+def _stored(output: Path | str) -> AbstractContextManager[StoredOutput | None]:
+    """Return the output in an object store if its URL is given."""
+    if not is_url(output):
+        return nullcontext()
+    from pdhef_logtool.runs.stored_output import StoredOutput
+
+    return StoredOutput(str(output))
 
 
 def _check_names(logs: Sequence[LogInput], output: Path, job: _Job, reporter: Reporter) -> None:
@@ -322,7 +330,7 @@ class _Fleet:
         self, tasks: Iterator[DriveTask], update: Callable[[int, str, float], None]
     ) -> Iterator[Ended[DriveTask, DriveEnd]]:
         """Yield how the tasks end, on this machine or on a cluster."""
-        work = self.work if self.stored is None else partial(stored_drive, self.stored.objects, self.work)
+        work: Callable[[DriveTask, Tell], Any] = self.work if self.stored is None else self.stored.uploading(self.work)
         schedule, limits = self.schedule, self.limits
         if schedule.ray is None:
             ends = supervise(
@@ -330,16 +338,15 @@ class _Fleet:
                 warn=self.reporter.warn,
             )  # fmt: skip
         else:
+            from pdhef_logtool.workers.ray_supervisor import supervise_on_ray
+
             on_node = partial(run_on_node, work, Path.cwd(), self.stored is None)
             ends = supervise_on_ray(on_node, tasks, address=schedule.ray, limits=limits, preload=_PRELOAD)
         with closing(ends):
             for ended in ends:
-                result = ended.result
-                if isinstance(result, OutputError):
-                    raise result
-                if isinstance(result, StoredEnd):
-                    assert self.stored is not None
-                    result = self.stored.take(result)
+                if isinstance(ended.result, OutputError):
+                    raise ended.result
+                result = ended.result if self.stored is None else self.stored.take(ended.result)
                 yield Ended(ended.number, ended.item, result, ended.failure)
 
     def _task(self, planned: PlannedLog, keep: Keep) -> DriveTask:

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.car.parts import Algorithm
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.table import Options, Skipped, runnable
+from pdhef_logtool.estimators.table import Skipped
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.intervals import drive_intervals
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH
-from pdhef_logtool.runs.estimating import estimate_drive
-from pdhef_logtool.runs.selection import default_names
+from pdhef_logtool.runs.estimating import Estimated, estimate_drive
+from pdhef_logtool.runs.preparing import choose
 
 if TYPE_CHECKING:
     import polars as pl
@@ -29,15 +28,24 @@ class Estimates:
 
     Attributes
     ----------
-    tracks : by estimator, and ``truth`` where the log has one, with dead-reckoned poses, divergence and intervals.
-    signals : input of the estimators. algorithms : by name. skipped : estimators that could not run, with reasons.
+    algorithms : by name. skipped : estimators that could not run, with reasons.
     """
 
     drive: Drive
-    tracks: dict[str, StateTrack]
-    signals: Signals
+    estimated: Estimated
     algorithms: dict[str, Algorithm]
     skipped: tuple[Skipped, ...]
+
+    @property
+    def tracks(self) -> dict[str, StateTrack]:
+        """Tracks by estimator, and ``truth`` where the log has one, with dead-reckoned poses, divergence, intervals."""
+        truth = self.estimated.drawn_truth
+        return ({} if truth is None else {TRUTH: truth}) | self.estimated.tracks
+
+    @property
+    def signals(self) -> Signals:
+        """Input of the estimators."""
+        return self.estimated.signals
 
     def frame(self) -> pl.DataFrame:
         """Return the tracks as rows of estimates.parquet, in SI units."""
@@ -47,13 +55,6 @@ class Estimates:
 
         frames = (pl.DataFrame(track_table(track)) for track in self.tracks.values())
         return pl.concat(f.with_columns(pl.col("estimator").cast(pl.String)) for f in frames)
-
-
-def choose(drive: Drive, names: Sequence[str] | None = None) -> tuple[list[Estimator], list[Skipped]]:
-    """Return the estimators that a drive and its car let run, and those that they do not; ``names`` as for estimate."""
-    names = default_names(drive.car, drive.available) if names is None else names
-    options = Options(drive.options.use_speed, gnss=True)
-    return runnable(names, drive.car, drive.available, options, drive.plan.refused)
 
 
 def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
@@ -79,9 +80,7 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     whole = drive.whole()
     corrected = DriveModel.of(drive).apply(whole.signals)
     estimated = estimate_drive(whole, corrected, estimators, intervals=drive_intervals(drive.car, estimators))
-    truth = {} if estimated.drawn_truth is None else {TRUTH: estimated.drawn_truth}
-    algorithms = {e.name: resolve(e) for e in estimators}
-    return Estimates(drive, truth | estimated.tracks, estimated.signals, algorithms, tuple(skipped))
+    return Estimates(drive, estimated, {e.name: resolve(e) for e in estimators}, tuple(skipped))
 
 
 def score(estimates: Estimates) -> pl.DataFrame:
@@ -97,13 +96,8 @@ def score(estimates: Estimates) -> pl.DataFrame:
 
     from pdhef_logtool.runs.scoring import evaluate
 
-    def read(name: str) -> StateTrack | None:
-        """Return a track; the ground truth counts wherever one of its quantities is known."""
-        track = estimates.tracks.get(name)
-        return replace(track, valid=track.something_known) if track is not None and name == TRUTH else track
-
-    names = [name for name in estimates.tracks if name != TRUTH]
-    calibrated = DriveModel.of(estimates.drive).calibrated(estimates.signals)
-    rows = evaluate(estimates.drive, names, read, estimates.signals, calibrated).rows
+    estimated = estimates.estimated
+    calibrated = DriveModel.of(estimates.drive).calibrated(estimated.signals)
+    rows = evaluate(estimates.drive, estimated, [*estimated.tracks], calibrated).rows
     columns = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
     return pl.DataFrame([[getattr(r, c) for c in columns] for r in rows], schema=columns, orient="row")

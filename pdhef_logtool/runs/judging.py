@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pdhef_logtool.evaluation.dependence import factors_of
 from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
 from pdhef_logtool.evaluation.validation_plan import default_plan
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.tracks import REFERENCE
-from pdhef_logtool.results.opened_run import OpenedLog
-from pdhef_logtool.runs.run_result import LogResult
+from pdhef_logtool.runs.run_result import FEW_LOGS, LogResult
 from pdhef_logtool.storage.documents import jsonable
 
 if TYPE_CHECKING:
@@ -31,10 +28,10 @@ BRIEF_BLOCKS = 12
 
 def read_validation_plan(file: Path | None, junit: Path | None) -> ValidationPlan:
     """Return the plan of a file or the default one; raises UsageError when it is wrong or missing for ``junit``."""
-    from pdhef_logtool.evaluation.validation_plan import load_plan
-    from pdhef_logtool.results.plan_against import other_runs
-
     if file is not None:
+        from pdhef_logtool.evaluation.validation_plan import load_plan
+        from pdhef_logtool.results.plan_against import other_runs
+
         plan = load_plan(file)
         other_runs(plan, ())  # a missing one ends the command before the work
         return plan
@@ -73,12 +70,13 @@ def judge_drive(
     space: OperatingSpace,
 ) -> dict[str, Any]:
     """Return the entries of report.json on one drive: verdicts of a plan file, blocks of time, operating space."""
+    entries = {"requirement_blocks": jsonable(blocks), "operating_space": jsonable(space)}
+    if not plan.file:
+        return {"plan": None, **entries}
     from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
 
-    entries = {"requirement_blocks": jsonable(blocks), "operating_space": jsonable(space)}
     judged = JudgedDrive(drive.name, main, lambda: entries, {"car": drive.car.vehicle.name})
-    verdicts = plan_verdicts(plan, figures_of_rows(rows), [judged]).to_dict() if plan.file else None
-    return {"plan": verdicts, **entries}
+    return {"plan": plan_verdicts(plan, figures_of_rows(rows), [judged]).to_dict(), **entries}
 
 
 def judge(
@@ -88,24 +86,23 @@ def judge(
 
     ``metrics``: the file with the figures of all logs, None: they are in memory. A log that failed has no figures.
     """
-    from pdhef_logtool.results.plan_against import other_runs
-    from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_file, figures_of_rows, plan_verdicts
-
     done = [r for r in results if r.outcome.failed is None or r.document is not None]
     if not plan.file and len(done) < LEAST_DRIVES:
         return None
-    drives = [
-        JudgedDrive(r.outcome.log, r.outcome.main, partial(_report, r), factors_of(asdict(r.outcome), None))
-        for r in done
-    ]
+    from pdhef_logtool.results.parquet_sink import read_metrics
+    from pdhef_logtool.results.plan_against import judged_drive, other_runs
+    from pdhef_logtool.results.plan_verdicts import figures_of_file, figures_of_rows, plan_verdicts
+
+    drives = [judged_drive(r.opened, partial(_report, r)) for r in done]
     if metrics is None:
         figures = figures_of_rows(row for r in done for row in r.rows)
+    elif len(done) <= FEW_LOGS:
+        figures = figures_of_rows(read_metrics(metrics))
     else:
         import polars as pl
 
         figures = figures_of_file(pl.scan_parquet(metrics), plan, [d.main for d in drives])
-    logs = [OpenedLog(o.log, o.outcome, Path(), asdict(o)) for o in (r.outcome for r in done)]
-    return plan_verdicts(plan, figures, drives, strict=strict, against=other_runs(plan, logs))
+    return plan_verdicts(plan, figures, drives, strict=strict, against=other_runs(plan, [r.opened for r in done]))
 
 
 @lru_cache(maxsize=LEAST_DRIVES)
@@ -115,8 +112,8 @@ def _report(result: LogResult) -> Mapping[str, Any] | None:
 
 def write_verdicts(junit: Path | None, verdicts: PlanVerdicts | None, results: Sequence[LogResult]) -> None:
     """Write JUnit XML if ``junit`` is a file; raises OutputError."""
-    from pdhef_logtool.results.junit import write_junit
-
     if junit is not None and verdicts is not None:
+        from pdhef_logtool.results.junit import write_junit
+
         checks = {r.outcome.log: (r.report or {}).get("checks", ()) for r in results}
         write_junit(junit, verdicts, checks)

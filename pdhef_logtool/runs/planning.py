@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +24,8 @@ from pdhef_logtool.runs.working import DriveEnd, log_identity
 
 #: Each choice keeps the files of the choices before it, too.
 _KEPT = ("metrics", "estimates", "full")
-#: Settings that change no result and no kept file, or that are compared separately.
-_NO_SETTING = frozenset(
-    {
-        "keep",
-        "annotate",
-        "allow_private_redirects",
-        "car",
-        "cars",
-        "network",
-    }
-)
+#: Settings that change no kept file, or that are compared separately; and those that name a file.
+_NO_SETTING = frozenset({"keep", "annotate", "car", "cars", "network"})
 _FILES = ("mapping", "msgs", "plan", "cars", "model", "sensor_profile")
 _READERS = 16
 _REPEATED = "they are tried again"
@@ -131,7 +122,7 @@ def settings_of(config: RunConfig) -> dict[str, str]:
     """Return, as texts, the settings that a drive's files depend on, besides the log and its car."""
     settings = {
         f"--{key.replace('_', '-')}": ",".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
-        for key, value in asdict(config).items()
+        for key, value in config.to_dict().items()
         if key not in _NO_SETTING and key not in _FILES and value is not None
     }
     for key in _FILES:

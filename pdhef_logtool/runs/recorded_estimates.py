@@ -28,6 +28,7 @@ from pdhef_logtool.drive.truth import (
     truth_at,
     valid_as_a_whole,
 )
+from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
 from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, EvaluatedDrive, evaluate_drive
 from pdhef_logtool.evaluation.operating_space import operating_space
@@ -57,7 +58,6 @@ from pdhef_logtool.records.signals import (
 )
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from pdhef_logtool.results.error_places import largest_errors
 from pdhef_logtool.results.opened_run import LOGS, METRICS_FILE, PAGE_FILE
 from pdhef_logtool.results.run_report import build_report, estimator_entry
 from pdhef_logtool.results.sink import TRUTH

@@ -11,6 +11,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.model.drive_model import DriveModel
+from pdhef_logtool.model.priors import AY_BIAS, AY_GAIN, IMU_X, IMU_X_REACH, RATE_BIAS
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
@@ -63,7 +64,6 @@ def prior_of(model: DriveModel) -> ReferencePrior:
 
     Without calibration or ground truth, the position of the accelerometer is not verified if no file gives one.
     """
-    from pdhef_logtool.estimators.calibration.joint import AY_BIAS, AY_GAIN, IMU_X, IMU_X_REACH, RATE_BIAS
     from pdhef_logtool.estimators.reference.drive import ReferencePrior
 
     car, calibration = model.car, model.posterior

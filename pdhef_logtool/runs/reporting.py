@@ -55,7 +55,7 @@ def _result(plan: Plan, entry: Entry, folder: str) -> LogResult:
     outcome = replace(plan.journal.outcome(entry), folder=folder)
     part = None if entry.part is None else plan.output / entry.part
     output = None if part is None else plan.output / log_place(entry.label)
-    return LogResult(outcome, output, figures=None, figures_file=part, failed_checks=entry.failed_checks)
+    return LogResult(outcome, output, figures_file=part, failed_checks=entry.failed_checks)
 
 
 def write_run_pages(output: Path, report: bool, labels: Collection[str] | None, reporter: Reporter) -> None:

@@ -11,9 +11,9 @@ from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.plug_ins import package_of
-from pdhef_logtool.evaluation.metrics import EvaluatedDrive
 from pdhef_logtool.evaluation.operating_space import operating_space
 from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS
+from pdhef_logtool.evaluation.validation_plan import SIDESLIP
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import merge_losses
@@ -70,7 +70,9 @@ def run_log(
         run = prepare(drive, config)
         with outputs.begin(log_place(drive.name), stale=STALE_FILES) as change:
             run, estimated = _estimate(run, CausalityCheck(is_first), reporter)
-            run, scored, main = _select(run, _score(run, estimated))
+            scored = _score(run, estimated)
+            named = run.config.estimators is not None
+            main = choose_main(run.names, scored.rows, proven=drive.car.has_evidence, named=named)
             judged = _judge(run, estimated, scored, main, validation)
             files = DriveOutputs((change, outputs.path), run, estimated, main)
             with files.annotated() as annotated:
@@ -124,8 +126,10 @@ def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter)
 
 def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     """Score the tracks; add contradictions as notes of the drive."""
-    drive, signals = run.drive, estimated.signals
-    scored = evaluate(drive, run.names, estimated.read, signals, run.model.calibrated(signals))
+    drive = run.drive
+    scored = evaluate(drive, estimated, run.names, run.model.calibrated(estimated.signals))
+    digests = {e.name: resolve(e).sha256[:SHOWN_DIGITS] for e in run.estimators}
+    scored = replace(scored, rows=[replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows])
     truth, reference = estimated.truth, estimated.read(REFERENCE)
     if truth is not None and reference is not None and run.reference is not None:
         contradictions = audit_truth(truth, reference, drive.car.vehicle.low_speed_blend_m_s)
@@ -139,28 +143,6 @@ def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     return scored
 
 
-def _select(run: PreparedDrive, scored: Evaluation) -> tuple[PreparedDrive, Evaluation, MainFacts]:
-    """Choose the selected estimate; leave out other estimators and figures that were not requested."""
-    validated = run.drive.car.has_evidence
-    main = choose_main(run.names, scored.rows, proven=validated, named=run.config.estimators is not None)
-    digests = {e.name: resolve(e).sha256[:SHOWN_DIGITS] for e in run.estimators}
-    left_out = frozenset(run.names) - run.requested - {main.name}
-    shown = [name for name in main.shown if name not in left_out]
-    return (
-        replace(run, estimators=[e for e in run.estimators if e.name not in left_out]),
-        replace(
-            scored,
-            rows=[
-                replace(r, algorithm=digests.get(r.estimator, ""))
-                for r in scored.rows
-                if left_out.isdisjoint(r.estimator.split("~"))
-            ],
-            silent=tuple(name for name in scored.silent if name not in left_out),
-        ),
-        replace(main, shown=shown, naive=None if main.naive in left_out else main.naive),
-    )
-
-
 def _losses(run: PreparedDrive, scored: Evaluation) -> Iterator[list[Loss]]:
     """Yield the estimators without a valid row and those that failed, as losses."""
     yield [Loss("no-valid-row", _SILENT.format(name), run.drive.name) for name in scored.silent]
@@ -172,9 +154,7 @@ def _judge(
 ) -> dict[str, Any]:
     """Return the entries of the report on the requirements of a plan."""
     drive, vehicle, truth = run.drive, run.car.vehicle, estimated.truth
-    slow, dependent = vehicle.low_speed_blend_m_s, drive.plan.dependent
-    of_drive = EvaluatedDrive(drive.name, estimated.tracks, truth, None, scored.masks, slow, dependent=dependent)
     most = BRIEF_BLOCKS if run.config.kept == "metrics" else MOST_BLOCKS
-    blocks = drive_blocks(plan.requirements, main.name, of_drive, most)
+    blocks = drive_blocks([*plan.requirements, SIDESLIP], main.name, scored.drive, most)
     space = operating_space(estimated.signals, truth, estimated.read(main.name), vehicle)
     return judge_drive(plan, drive, main.name, scored.rows, blocks, space)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,37 +22,31 @@ FEW_LOGS = 50
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LogResult:
-    """Result of one log. Values that are no longer in memory are read from the output files.
+    """Result of one log. A report that is no longer in memory is read from the output files.
 
     Attributes
     ----------
     output : folder of the log, None if no file was written.
-    document, figures : report and rows in memory, None: in files; ``figures_file`` contains the rows.
+    document : report in memory, None: in the folder. rows : figures in memory; ``figures_file``: of a fleet's drive.
     failed_checks : number of failed checks that are not waived.
     """
 
     outcome: LogOutcome
     output: Path | None
     document: dict[str, Any] | None = None
-    figures: tuple[MetricRow, ...] | None = ()
+    rows: tuple[MetricRow, ...] = ()
     failed_checks: int = 0
     figures_file: Path | None = None
 
     @property
     def report(self) -> dict[str, Any] | None:
         """The document of report.json, None if the log failed; raises OutputError for a damaged file."""
-        if self.document is not None or self.output is None:
-            return self.document
-        return OpenedLog(self.outcome.log, self.outcome.outcome, self.output, {"files": self.outcome.files}).report()
+        return self.document if self.document is not None or self.output is None else self.opened.report()
 
     @property
-    def rows(self) -> tuple[MetricRow, ...]:
-        """The figures; raises OutputError for a damaged file."""
-        from pdhef_logtool.results.parquet_sink import read_metrics
-
-        if self.figures is not None:
-            return self.figures
-        return () if self.figures_file is None else tuple(read_metrics(self.figures_file))
+    def opened(self) -> OpenedLog:
+        """The log as commands read it back from its files."""
+        return OpenedLog(self.outcome.log, self.outcome.outcome, self.output or Path(), asdict(self.outcome))
 
     @property
     def is_whole(self) -> bool:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.records.signals import BoolArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.sink import TRUTH, Event, ManoeuvreEvent
+from pdhef_logtool.results.sink import Event, ManoeuvreEvent
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
-    from pdhef_logtool.evaluation.metrics import MetricRow
+    from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
     from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
     from pdhef_logtool.evaluation.reasons import ReasonFacts
+    from pdhef_logtool.runs.estimating import Estimated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,50 +25,43 @@ class Evaluation:
 
     Attributes
     ----------
-    rows, events : figures, and events in order of time.
+    drive : what was scored. rows, events : figures, and events in order of time.
     reasons : by estimator, why it did not use its sensors as usual.
-    silent : estimators without a valid row although the car moves. moves : whether it does. masks : of the segments.
+    silent : estimators without a valid row although the car moves. moves : whether it does.
     """
 
+    drive: EvaluatedDrive
     rows: list[MetricRow]
     events: list[Event]
     reasons: dict[str, tuple[ReasonFacts, ...] | None]
     silent: tuple[str, ...]
     moves: bool
-    masks: Mapping[str, BoolArray]
 
 
-def evaluate(
-    drive: Drive,
-    names: Sequence[str],
-    read: Callable[[str], StateTrack | None],
-    signals: Signals,
-    calibrated: CalibratedSignals,
-) -> Evaluation:
+def evaluate(drive: Drive, estimated: Estimated, names: Sequence[str], calibrated: CalibratedSignals) -> Evaluation:
     """Score the tracks of a drive.
 
     Parameters
     ----------
-    names : of the estimators. read : returns the track of a name (also ``truth``), or None.
-    signals : as read with the vehicle file. calibrated : as the vehicle of the drive's model corrects them.
+    names : of the estimators. calibrated : signals as the vehicle of the drive's model corrects them.
     """
     from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
     from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
     from pdhef_logtool.evaluation.reasons import summarise_reasons
     from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
 
-    truth, vehicle = read(TRUTH), drive.car.vehicle
+    signals, truth, vehicle = estimated.signals, estimated.truth, drive.car.vehicle
     manoeuvres = find_manoeuvres(signals, vehicle)
     masks = segment_masks(signals, truth, vehicle, manoeuvres)
     moving = moving_mask(signals, truth, vehicle)
-    tracks = {name: track for name in names if (track := read(name)) is not None}
+    tracks = {name: track for name, track in estimated.tracks.items() if name in names}
     slow, dependent = vehicle.low_speed_blend_m_s, drive.plan.dependent
-    rows = evaluate_drive(EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, calibrated, dependent))
+    scored = EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, calibrated, dependent)
     events = drive_events(signals, masks, manoeuvres, [*tracks.values()])
     moves = bool(moving.any())
     silent = [n for n, track in tracks.items() if moves and not (moving & track.valid & track.something_known).any()]
     reasons = {name: summarise_reasons(track) for name, track in tracks.items()}
-    return Evaluation(rows, events, reasons, tuple(silent), moves, masks)
+    return Evaluation(scored, evaluate_drive(scored), events, reasons, tuple(silent), moves)
 
 
 def in_time(event: Event) -> tuple[int, int, str]:

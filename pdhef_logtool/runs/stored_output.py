@@ -8,8 +8,9 @@ ends, at most every 30 s, and all files at the end of the run.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -127,8 +128,14 @@ class StoredOutput(Mirror):
         """Return the names of a drive's objects in the store."""
         return tuple(sorted(self._there.get(label, ())))
 
-    def take(self, stored: StoredEnd) -> DriveEnd:
-        """Store the files of a drive and return its result."""
+    def uploading(self, work: Work) -> Callable[[DriveTask, Tell], StoredEnd | OutputError]:
+        """Return the work on a drive that also uploads its files."""
+        return partial(stored_drive, self.objects, work)
+
+    def take(self, stored: StoredEnd | None) -> DriveEnd | None:
+        """Store the files of a drive and return its result; None if there is none."""
+        if stored is None:
+            return None
         for name in stored.names:
             self._see(name)
         for name, data in stored.files.items():

@@ -20,7 +20,7 @@ from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.no_position import without_names
-from pdhef_logtool.results.opened_run import JOURNAL_FILE, PARTS, OpenedLog
+from pdhef_logtool.results.opened_run import JOURNAL_FILE, PARTS
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.config import RunConfig
@@ -166,7 +166,7 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
     part = f"{PARTS}/run={task.setting}/{place}/part-{digest_of(task.log.stem)}.parquet"
     write_metrics(task.output / part, result.rows)
     if task.page:
-        warned += _write_page(task.output, result.outcome)
+        warned += _write_page(result)
     return DriveEnd(
         result.outcome,
         _identity_of_slice(task.log, str(result.outcome.sha256)),
@@ -186,14 +186,12 @@ def _sideslip_error_rad(result: LogResult) -> float | None:
     return next((r.value for r in rows if r.independent and math.isfinite(r.value)), None)
 
 
-def _write_page(output: Path, outcome: LogOutcome) -> list[str]:
+def _write_page(result: LogResult) -> list[str]:
     """Write the page of a drive; return warnings."""
     from pdhef_logtool.reports.pages import write_drive_page
 
-    entry = {"main": outcome.main, "files": outcome.files}
-    log = OpenedLog(outcome.log, outcome.outcome, output / log_place(outcome.log), entry)
-    wrong = write_drive_page(log).wrong
-    return [f"no page of {outcome.log}: {wrong}"] if wrong else []
+    wrong = write_drive_page(result.opened).wrong
+    return [f"no page of {result.outcome.log}: {wrong}"] if wrong else []
 
 
 #: Cars and mapping of the run that this process works for, by the run's name.

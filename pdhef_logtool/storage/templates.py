@@ -27,3 +27,8 @@ def template(path: Path, **context: Any) -> Template:
 def one_line(text: object) -> str:
     """Return a rendered sentence, which may have several lines in its template, in one line."""
     return " ".join(str(text).split())
+
+
+def clauses(text: object) -> list[str]:
+    """Return the clauses of a rendered text, which have a bar between them, each in one line."""
+    return [clause for part in str(text).split("|") if (clause := one_line(part))]

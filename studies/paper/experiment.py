@@ -155,7 +155,7 @@ def read_simulated(scenario: Scenario, noise_seed: int, car: Car) -> ReadDrive:
 def track_of(estimator: Estimator, car: Car, drive: ReadDrive) -> StateTrack:
     """Run an estimator of a car over a drive."""
     corrected = DriveSignals.of(drive.whole.signals, car)
-    window = estimate_drive(drive.whole, corrected, [estimator], watched=False, drawn=False)
+    window = estimate_drive(drive.whole, corrected, [estimator])
     return next(iter(window.tracks.values()))
 
 

@@ -31,6 +31,7 @@ FIRST_RUNS = {
     "recorders": "layouts of recorders (first contact: tables and messages) were built last, too",
     "contact": "layouts of recorders were built after that, and scored once",
     "unseen": "layouts of documented tables and ROS messages were built last, and scored once",
+    "trackside": "layouts of track modes, cameras, simulators and receivers were built last, and scored once",
     "repositories": "layouts of files and messages in public repositories were held out before",
     "phones": "layouts of phones, games, makers and plotting tools were held out before",
     "stacks": "layouts of public stacks and loggers were held out before",

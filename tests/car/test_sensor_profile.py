@@ -13,9 +13,9 @@ from reference_car import drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import SENSOR_PROFILES, Sensors, VehicleParameters, default_vehicle
+from pdhef_logtool.drive.sensor_faults import without_faults
 from pdhef_logtool.estimators.kinematic import Kinematic
 from pdhef_logtool.estimators.pass_through import PassThrough
-from pdhef_logtool.estimators.sensor_faults import find_faults
 from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.estimators.vehicle_ukf import nominal_filter
 from pdhef_logtool.records import reasons
@@ -41,7 +41,7 @@ def seconds(signals: Signals) -> np.ndarray:
 
 
 def reasons_of(signals: Signals, **sensors: float) -> int:
-    return int(np.bitwise_or.reduce(find_faults(signals, vehicle(**sensors), None)[0].reason))
+    return int(np.bitwise_or.reduce(without_faults(signals, vehicle(**sensors)).faults.astype(int)))
 
 
 def masked(signals: Signals, column: str, gone: np.ndarray, value: float = np.nan) -> Signals:

@@ -174,34 +174,6 @@ def test_relations_find_a_slip_that_the_ranges_let_pass(tmp_path, entry, factor,
     assert entry in str(caught.value) or f"tyres.{'rear' if entry.startswith('corn') else 'front'}" in str(caught.value)
 
 
-#: Published values: mass, yaw inertia, l_f, l_r, stiffness of the axles, other parameters.
-CARS = {
-    "GTI": (1926.2, 2763.49, 1.264, 1.367, 80e3, 120e3, {"steering_ratio": 1, "wheel_radius_m": 0.318}),
-    "TT-S": (1466.9, 2235, 1.018, 1.450, 200e3, 160e3, {"steering_ratio": 1, "friction": 1.2, "track_m": 1.554}),
-    "truck, 18 t": (18_000, 130_000, 3.4, 2.4, 350e3, 700e3, {"track_m": 2.05, "cg_height_m": 1.5}),
-    "truck, 40 t": (40_000, 420_000, 3.8, 2.7, 700e3, 1.5e6, {"track_m": 2.05, "cg_height_m": 2.1}),
-    "coach": (18_500, 210_000, 4.3, 2.6, 400e3, 800e3, {"track_m": 2.1, "cg_height_m": 1.3}),
-    "kart": (160, 20, 0.6, 0.45, 20e3, 25e3, {"track_m": 1.1, "cg_height_m": 0.25, "steering_ratio": 1.5}),
-    "1:10, light": (1.6, 0.02, 0.13, 0.13, 45, 50, {"track_m": 0.17, "cg_height_m": 0.03, "low_speed_blend_m_s": 0.3}),
-}
-
-
-@pytest.mark.parametrize("name", CARS)
-def test_real_vehicles_are_taken(name):
-    mass, inertia, front, rear, stiffness_front, stiffness_rear, more = CARS[name]
-    raw = {
-        "mass_kg": mass,
-        "yaw_inertia_kg_m2": inertia,
-        "cg_to_front_axle_m": front,
-        "cg_to_rear_axle_m": rear,
-        "tyres": {
-            "front": {"cornering_stiffness_n_per_rad": stiffness_front},
-            "rear": {"cornering_stiffness_n_per_rad": stiffness_rear},
-        },
-    }
-    assert vehicle_of_entries(raw | more, where=name).vehicle.mass_kg == mass
-
-
 @pytest.mark.parametrize("path", [*sorted(FILES.glob("*.toml")), *sorted(SAMPLES.glob("vehicle*.toml"))], ids=str)
 def test_the_files_of_the_project_are_taken(path):
     read_vehicle_file(path)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.command_line import called
+from tests.command_line import called, pdhef
 
 pytestmark = pytest.mark.slow
 
@@ -31,19 +31,7 @@ limit_deg = 0.1
 def annotated(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     out = tmp_path_factory.mktemp("annotated")
     vehicle = str(sample_logs_dir / "vehicle.toml")
-    made = called(
-        "run",
-        str(sample_logs_dir / "dlc.mcap"),
-        "-o",
-        str(out),
-        "-e",
-        "phy-ukf",
-        "--annotate",
-        "full",
-        "--car",
-        vehicle,
-    )
-    assert made.returncode == 0, made.stderr
+    pdhef("run", sample_logs_dir / "dlc.mcap", "-o", out, "-e", "phy-ukf", "--annotate", "full", "--car", vehicle)
     return str(out / "logs/dlc/annotated.mcap")
 
 
@@ -80,36 +68,13 @@ def test_failed_gate_wins_over_lost_input_and_both_are_said(sample_logs_dir: Pat
     whole = (sample_logs_dir / "dlc.mcap").read_bytes()
     (tmp_path / "logs/cut.mcap").write_bytes(whole[: len(whole) * 3 // 4])
     log = str(tmp_path / "logs/cut.mcap")
-    arguments = ("run", log, "-e", "zero", "--annotate", "none", "-o", str(tmp_path / "out"))
-    assert called(*arguments, "--plan", _plan(tmp_path, 10.0)).returncode == 3
-    both = called(*arguments, "--plan", _plan(tmp_path, 0.01))
+    options = ("-e", "zero", "--annotate", "none", "--no-report", "-o", str(tmp_path / "out"))
+    both = called("run", log, *options, "--plan", _plan(tmp_path, 0.01))
     assert both.returncode == 4
     assert "FAIL: SR-1" in both.stderr
     assert "lost" in both.stderr
     (tmp_path / "logs/bad.mcap").write_bytes(b"no log")
     junit = tmp_path / "gate.xml"
-    several = called(
-        "run", str(tmp_path / "logs"), "-e", "zero", "--annotate", "none", "-o", str(tmp_path / "out2"),
-        "--plan", _plan(tmp_path, 10.0), "--junit", str(junit),
-    )  # fmt: skip
+    several = called("run", tmp_path / "logs", *options, "--plan", _plan(tmp_path, 10.0), "--junit", junit)
     assert several.returncode == 3  # a log that could not be read is no drive of the plan
     assert ET.parse(junit).getroot().attrib["failures"] == "0"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "said"),
-    [
-        (("--estimate", "/pdhef/phy_ukf/stat"), 1, "did you mean /pdhef/phy_ukf/state?"),
-        ((), 2, "--estimate"),
-        ((*ESTIMATE, "--junit", "gate.xml"), 2, "--plan"),
-        ((*ESTIMATE, "--plan", "none.toml"), 2, "none.toml"),
-        ((*ESTIMATE, "--start", "900"), 2, "--start"),
-    ],
-)
-def test_errors_are_one_line(annotated: str, arguments: tuple[str, ...], code: int, said: str) -> None:
-    result = called("metrics", annotated, *arguments)
-    assert result.returncode == code
-    lines = [line for line in result.stderr.splitlines() if not line.startswith("warning: ")]
-    assert len(lines) == 1, result.stderr
-    assert said in lines[0]
-    assert result.stdout == ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shlex
 from pathlib import Path
@@ -27,21 +26,6 @@ def test_a_drive_s_command_makes_the_same_file_again(tmp_path: Path) -> None:
     again = called(*shlex.split(facts["command"])[1:], "-o", str(tmp_path / "b.mcap"))
     assert again.returncode == 0, again.stderr
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
-
-
-def test_a_suite_and_each_of_its_commands(tmp_path: Path) -> None:
-    made = called(
-        *("simulate", "suite", "-o", str(tmp_path / "logs"), "--count", "3", "--seed", "5", "--duration", "5"),
-        *("--vehicles", "randomised", "--jobs", "2", "--json"),
-    )
-    assert made.returncode == 0, made.stderr
-    assert json.loads(made.stdout)["written"] == 3
-    manifest = json.loads((tmp_path / "logs" / "manifest.json").read_text())
-    assert len({entry["vehicle"] for entry in manifest["drives"]}) == 3
-    entry = manifest["drives"][1]
-    again = called(*shlex.split(entry["command"])[1:], "-o", str(tmp_path / "x.mcap"))
-    assert again.returncode == 0, again.stderr
-    assert hashlib.sha256((tmp_path / "x.mcap").read_bytes()).hexdigest() == entry["sha256"]
 
 
 def test_all_manoeuvres_are_listed_and_the_help_tells_of_faults() -> None:

@@ -6,8 +6,6 @@ import importlib.util
 import os
 import shutil
 import stat
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -62,9 +60,11 @@ def _code_files(folder: Path) -> list[Path]:
 def test_the_first_folder_that_can_be_written_keeps_the_code(
     module_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    installed, home, tmp = tmp_path / "installed", tmp_path / "home", tmp_path / "tmp"
+    named, installed, home, tmp = (tmp_path / name for name in ("named", "installed", "home", "tmp"))
     writable = cache._writable
-    for closed, keeps in [((), installed), ((installed,), home), ((installed, home), tmp)]:
+    monkeypatch.setattr(cache.config, "CACHE_DIR", str(named))
+    order = (named, installed, home, tmp)
+    for closed, keeps in ((order[:i], folder) for i, folder in enumerate(order)):
         _close(monkeypatch, *closed)
         assert _load(module_file).more(1) == 2
         assert _code_files(keeps), keeps
@@ -226,53 +226,12 @@ def test_another_compiler_or_processor_is_another_digest(monkeypatch: pytest.Mon
     assert digest() == usual
 
 
-#: Calls a compiled function with a compiled callee in another file; prints the module's file and the result.
-_USE = """
-import numpy as np
-from pdhef_logtool.car.nominal_model import model_parameters
-from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.vehicle_model import NOMINAL, __file__, planar_ay
-state = np.array([20.0, 0.1, 0.2, 0.0])
-print(__file__, planar_ay(state, 0.05, 0.9, 0.0, NOMINAL, model_parameters(default_vehicle())))
-"""
-_CALLEE, _LINE = "pdhef_logtool/car/nominal_model.py", "    return w * ay + (1.0 - w) * vx * r"
-
-
-def _used(python: str | Path, **environment: str) -> tuple[Path, float]:
-    """Return the file of the imported module and the result of its function."""
-    done = subprocess.run(
-        [python, "-c", _USE], capture_output=True, text=True, cwd="/", env={"PATH": os.environ["PATH"], **environment}
-    )
-    assert done.returncode == 0, done.stderr
-    file, value = done.stdout.split()
-    return Path(file), float(value)
-
-
-def _copied(folder: Path) -> Path:
-    """Return a copy of the sources."""
-    for package in sources.PACKAGES:
-        shutil.copytree(_ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__", "models"))
-    return folder
-
-
-def _change_the_callee(folder: Path) -> None:
-    text = (folder / _CALLEE).read_text()
-    assert text.count(_LINE) == 1
-    (folder / _CALLEE).write_text(text.replace(_LINE, f"{_LINE} + 1.0"))
-
-
-def _folders(place: Path) -> list[str]:
-    return sorted({p.parents[1].name for p in _code_files(place)})
-
-
-@pytest.mark.slow
 def test_an_edit_of_a_callee_in_another_file_counts(tmp_path: Path) -> None:
-    sources = _copied(tmp_path / "sources")
-    environment = {"PYTHONPATH": os.pathsep.join([str(sources), *filter(None, sys.path)])}
-    environment["NUMBA_CACHE_DIR"] = str(tmp_path / "cache")
-    file, before = _used(sys.executable, **environment)
-    assert file.is_relative_to(sources)
-    folders = _folders(tmp_path / "cache")
-    _change_the_callee(sources)
-    assert _used(sys.executable, **environment)[1] == pytest.approx(before + 1.0)
-    assert len(_folders(tmp_path / "cache")) == 1 and _folders(tmp_path / "cache") != folders
+    for package in sources.PACKAGES:
+        shutil.copytree(_ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__", "models"))
+    before = sources.sources_digest(tmp_path)
+    assert before == sources.sources_digest()
+    for file, is_compiled in (("cli/app.py", False), ("car/nominal_model.py", True)):
+        with (tmp_path / "pdhef_logtool" / file).open("a") as text:
+            text.write("\nG = 1.0\n")
+        assert (sources.sources_digest(tmp_path) != before) is is_compiled

@@ -54,20 +54,16 @@ def test_a_drive_is_read_once_and_says_the_same_again(
     assert first.seconds == pytest.approx(9.5, abs=0.1)
 
 
-def test_the_monitor_and_poses_change_no_estimate(sample_logs_dir: Path, car: Car) -> None:
+def test_estimates_have_poses_and_tell_their_progress(sample_logs_dir: Path, car: Car) -> None:
     estimators = [make_estimator(name, car) for name in ("zero", "kinematic", "phy-ukf")]
     shares: list[float] = []
     with read_drive(sample_logs_dir / "dlc.mcap", car) as drive:
         whole = drive.whole()
         corrected = DriveSignals.of(whole.signals, car)
         full = estimate_drive(whole, corrected, estimators, progress=shares.append)
-        plain = estimate_drive(whole, corrected, estimators, watched=False, drawn=False)
     assert shares == [0.0, 1 / 3, 2 / 3]
     assert list(full.tracks) == ["zero", "kinematic", "phy-ukf"]
-    for name, track in full.tracks.items():
-        assert np.isfinite(track.x_m).any()
-        assert not np.isfinite(plain.tracks[name].x_m).any()
-        _assert_equal(replace(plain.tracks[name], x_m=track.x_m, y_m=track.y_m, yaw_rad=track.yaw_rad), track)
+    assert all(np.isfinite(track.x_m).any() for track in full.tracks.values())
 
 
 def test_what_is_told_is_noted_and_named(sample_logs_dir: Path, car: Car) -> None:

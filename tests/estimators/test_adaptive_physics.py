@@ -10,6 +10,7 @@ from made_models import random_network
 from reference_car import drive, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.drive.sensor_faults import without_faults
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, mix
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
@@ -97,10 +98,11 @@ def test_a_burst_raises_r_for_its_time_and_costs_less(made):
         ay_m_s2=clean.ay_m_s2 + burst * 2.4 * rng.standard_normal(len(t)),
         yaw_rate_rad_s=clean.yaw_rate_rad_s + burst * 0.08 * rng.standard_normal(len(t)),
     )
-    track = run_estimator(adaptive(), bad)
+    checked = without_faults(bad, VEHICLE)
+    track = run_estimator(adaptive(), checked)
     assert np.median(track.r_scale[(t > 4.1) & burst]) > 50
     assert (track.r_scale[t > 6.7] == 1.0).all()
-    assert rmse(adaptive(), bad, made, burst) < 0.5 * rmse(fixed(), bad, made, burst)
+    assert rmse(adaptive(), checked, made, burst) < 0.5 * rmse(fixed(), bad, made, burst)
 
 
 @pytest.mark.parametrize("how", ["stuck", "dead"])
@@ -109,7 +111,7 @@ def test_a_gyro_that_fails_does_not_take_the_filter_with_it(made, how):
     bad = (t > 4) & (t < 8)
     held = signals.yaw_rate_rad_s[np.argmax(bad)] if how == "stuck" else 0.0
     faulty = replace(signals, yaw_rate_rad_s=np.where(bad, held, signals.yaw_rate_rad_s))
-    error = rmse(adaptive(), faulty, made, bad)
+    error = rmse(adaptive(), without_faults(faulty, VEHICLE), made, bad)
     assert error < min(np.radians(0.1), 0.2 * rmse(fixed(), faulty, made, bad))
 
 

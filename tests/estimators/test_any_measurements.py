@@ -11,12 +11,12 @@ import pytest
 from pdhef_logtool import Car, read_drive
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.reading import WholeDrive
-from pdhef_logtool.estimators.calibration.calibration import self_calibrate
-from pdhef_logtool.estimators.calibration.joint import FRONT_STIFFNESS, REAR_STIFFNESS
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.table import make_estimator, runnable
 from pdhef_logtool.model.drive_model import DriveModel, read_driving
+from pdhef_logtool.model.fit import fit_car
+from pdhef_logtool.model.priors import RATIO, REAR_STIFFNESS
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.frames import estimate, score
 
@@ -131,8 +131,8 @@ def test_without_a_y_the_yaw_rate_calibrates(sample_logs_dir: Path) -> None:
         with read_drive(sample_logs_dir / "sweep.mcap", car, adjust=without(*missing)) as drive:  # type: ignore[arg-type]
             driving = read_driving(drive)
         assert driving.has_ay is not bool(missing)
-        fits.append({p.name: p for p in self_calibrate([driving], car.vehicle).parameters})
-    for name in (FRONT_STIFFNESS, REAR_STIFFNESS):
+        fits.append({p.name: p for p in fit_car(driving, car.vehicle).parameters})
+    for name in (RATIO, REAR_STIFFNESS):
         both, alone = (fit[name] for fit in fits)
         assert both.sd < alone.sd
         assert abs(np.log(both.value / alone.value)) < 1.96 * np.hypot(both.sd, alone.sd)

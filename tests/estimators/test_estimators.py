@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from made_models import full_network, linear_residual
 from reference_car import cut, drive, keep, rolling_drive, slalom, tanh_tyre, with_noise
 
-from pdhef_logtool.car.car import Car, WithoutTruth
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators import latency_compensation
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
@@ -91,9 +92,9 @@ def rough() -> Signals:
 # --- pieces, causality, symmetry -------------------------------------------------------------------------------------
 
 
-def _calibrated() -> WithoutTruth:
+def _calibrated() -> Posterior:
     vehicle = VEHICLE.model_copy(update={"yaw_inertia_kg_m2": 1700.0, "steer_offset_rad": 0.003})
-    return WithoutTruth(vehicle, NOISE, "calibrated")
+    return Posterior(vehicle)
 
 
 def _taught() -> Car:

@@ -10,12 +10,11 @@ import pytest
 from made_models import linear_residual, random_network
 from reference_car import drive, slalom, with_noise
 
-from pdhef_logtool.car.car import Car, WithoutTruth
-from pdhef_logtool.car.model import CarModel, TaughtParameter
-from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.model import CarModel
+from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.calibration.joint import parameters_of, prior_vehicle, with_taught
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.residual_response import residual_response
@@ -109,7 +108,7 @@ def test_two_seconds_after_the_taught_region_it_is_physics_again(signals: Signal
 
 
 def test_a_residual_belongs_to_the_physics_that_it_was_fitted_on(signals: Signals) -> None:
-    calibration = WithoutTruth(SEDAN, FilterNoise(r_std={"ay_m_s2": 1.0}), "calibrated")
+    calibration = Posterior(SEDAN)
     for calibrated in (False, True):
         car = taught_car(linear_residual(), calibrated=calibrated)
         plain, of_log = (make_estimator("pd-hef", c) for c in (car, replace(car, self_calibrated=calibration)))
@@ -127,24 +126,3 @@ def test_a_car_without_a_residual_or_with_a_named_gain_does_not_take_it() -> Non
     assert not acts(make_estimator("pd-hef", taught_car(None)))
     with_network = replace(taught_car(linear_residual()), network=random_network())
     assert not acts(make_estimator("pd-hef:gain=1", with_network)) and acts(make_estimator("pd-hef", with_network))
-
-
-def test_a_taught_prior_moves_mean_and_width_of_the_calibration() -> None:
-    parameters = parameters_of(SEDAN)
-    first = parameters[0]
-    taught = (
-        TaughtParameter(name=first.name, value=1.1 * first.mean, std=0.5 * first.std),
-        TaughtParameter(name=parameters[1].name, value=parameters[1].mean, std=9.0),
-    )
-    moved = with_taught(parameters, taught)
-    assert (moved[0].mean, moved[0].std) == pytest.approx((1.1 * first.mean, 0.5 * first.std))
-    assert moved[1].std == parameters[1].std  # no teaching makes a prior wider
-    assert moved[2:] == parameters[2:]
-    of_road = (taught[0].model_copy(update={"ay_m_s2": 2.0}),)
-    unlike, near, alike = (with_taught(parameters, of_road, level)[0] for level in (8.0, 5.0, 3.0))
-    assert unlike.mean == pytest.approx(first.mean) and unlike.std == first.std
-    assert first.mean < near.mean < alike.mean and first.std > near.std > alike.std
-    assert (alike.mean, alike.std) == pytest.approx((moved[0].mean, moved[0].std))
-    vehicles = (prior_vehicle(SEDAN), prior_vehicle(SEDAN, taught))
-    before, after = (v.cornering_stiffness_n_per_rad(True, v.assumed_friction) for v in vehicles)
-    assert after == pytest.approx(1.1 * before, rel=1e-4)

@@ -41,12 +41,7 @@ def drive(shared_dir):
 
 
 def aligned(channels, vehicle):
-    plan = plan_alignment(
-        channels.signals, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m
-    )
-    starts = [int(c.stamps_ns[0]) for c in channels.signals.values()]
-    ends = [int(c.stamps_ns[-1]) for c in channels.signals.values()]
-    return align(channels.signals, plan, min(starts), max(ends) + 1)
+    return align(channels.signals, plan_alignment(channels.signals, vehicle))[0]
 
 
 def test_the_phones_velocity_is_turned_into_the_car(drive):

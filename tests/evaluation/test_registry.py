@@ -22,7 +22,7 @@ from pdhef_logtool.evaluation.metrics import registry
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.reports.comparison import comparison_page
 from pdhef_logtool.results.comparing import compare_runs
-from pdhef_logtool.results.gate import Figure, Gate
+from pdhef_logtool.results.gate import Figure
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
@@ -91,7 +91,7 @@ def test_plans_and_compare_accept_it(toy: str, result: RunResult) -> None:
     (verdict,) = result.requirements.verdicts
     assert (verdict.outcome, result.exit_code) == ("FAIL", 4)
     assert verdict.requirement.label == f"sideslip {LABEL} ≤ 0.001° (worst drive, physics)"
-    gate = Gate((Figure(metric=toy, limit=0.05),))
+    gate = (Figure(metric=toy, limit=0.05),)
     run = open_run(str(result.place))
     found = compare_runs(run, run, gate)
     (figure,) = found.figures

@@ -1,32 +1,48 @@
 """A single-track car in plain Python with a residual in closed form on top of the nominal model.
 
-It shares no code with ``pdhef_logtool.car.nominal_model``. The residual is ``A sin(2π f t)`` on v̇_y and another on ṙ,
+The car is that of ``reference_car``. The residual is ``A sin(2π f t)`` on v̇_y and another on ṙ,
 so that its increments are known exactly.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
+from reference_car import (
+    FRONT_M,
+    FRONT_TYRE,
+    MASS_KG,
+    REAR_M,
+    REAR_TYRE,
+    START_NS,
+    YAW_INERTIA,
+    forces,
+    keep,
+    signals_at,
+    with_noise,
+)  # fmt: skip
 
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
-START_NS = 1_700_000_000_000_000_000
 FRICTION = 0.9
 CAR = VehicleParameters(
     name="test car",
-    mass_kg=1500.0,
-    yaw_inertia_kg_m2=2500.0,
-    cg_to_front_axle_m=1.2,
-    cg_to_rear_axle_m=1.5,
+    mass_kg=MASS_KG,
+    yaw_inertia_kg_m2=YAW_INERTIA,
+    cg_to_front_axle_m=FRONT_M,
+    cg_to_rear_axle_m=REAR_M,
     friction=FRICTION,
-    tyres=Tyres(front=AxleTyre(B=10.0, C=1.35, D_n=8300.0, E=0.2), rear=AxleTyre(B=16.0, C=1.35, D_n=6700.0, E=0.1)),
+    tyres=Tyres(
+        **{
+            axle: AxleTyre(**dict(zip(("B", "C", "D_n", "E"), tyre, strict=True)))
+            for axle, tyre in (("front", FRONT_TYRE), ("rear", REAR_TYRE))
+        }
+    ),
 )
-FRONT, REAR = (10.0, 1.35, 8300.0, 0.2), (16.0, 1.35, 6700.0, 0.1)
 
 
 @dataclass(frozen=True)
@@ -63,17 +79,6 @@ class Motion:
         return START_NS + np.round(self.t * 1e9).astype(np.int64)
 
 
-def _force(alpha: float, tyre: tuple[float, float, float, float]) -> float:
-    b, c, d, e = tyre
-    return FRICTION * d * math.sin(c * math.atan(b * alpha - e * (b * alpha - math.atan(b * alpha))))
-
-
-def _accelerations(vx: float, vy: float, r: float, steer: float) -> tuple[float, float]:
-    front = _force(steer - math.atan((vy + 1.2 * r) / vx), FRONT) * math.cos(steer)
-    rear = _force(-math.atan((vy - 1.5 * r) / vx), REAR)
-    return (front + rear) / 1500.0, (1.2 * front - 1.5 * rear) / 2500.0
-
-
 def drive(seconds: float = 20.0, lateral: Wave = NONE, yaw: Wave = NONE, speed: float = 22.0) -> Motion:
     """Drive a weaving course at 100 Hz, integrated five times finer."""
 
@@ -82,7 +87,7 @@ def drive(seconds: float = 20.0, lateral: Wave = NONE, yaw: Wave = NONE, speed: 
 
     def rates(t: float, s: np.ndarray) -> np.ndarray:
         vx, vy, r = s
-        ay, r_dot = _accelerations(vx, vy, r, steering(t))
+        ay, r_dot = forces(vx, vy, r, steering(t), FRICTION)
         return np.array([0.3 * math.sin(0.5 * t), ay - vx * r + lateral(t), r_dot + yaw(t)])
 
     n, fine = round(seconds * 100), 5
@@ -100,7 +105,7 @@ def drive(seconds: float = 20.0, lateral: Wave = NONE, yaw: Wave = NONE, speed: 
             k4 = rates(at + h, s + h * k3)
             s = s + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     steer = np.array([steering(x) for x in t])
-    ay = np.array([_accelerations(*state[k], steer[k])[0] + lateral(t[k]) for k in range(n)])
+    ay = np.array([forces(*state[k], steer[k], FRICTION)[0] + lateral(t[k]) for k in range(n)])
     ax = 0.3 * np.sin(0.5 * t) - state[:, 1] * state[:, 2]
     residual = np.stack([lateral.increments(t), yaw.increments(t)], axis=1)
     return Motion(t, state, steer, ax, ay, residual)
@@ -116,27 +121,16 @@ class Measured:
 
 def window(motion: Motion, seed: int | None = None) -> Measured:
     """The whole drive: sensors (noisy with a seed) and the perfect truth."""
-    n = len(motion.t)
-    rng = np.random.default_rng(seed)
-    scale = 0.0 if seed is None else 1.0
-
-    def noisy(column: np.ndarray, std: float) -> np.ndarray:
-        return column + scale * rng.normal(0.0, std, n)
-
-    stamps = motion.stamps_ns
-    signals = Signals(
-        stamps_ns=stamps,
-        ready_ns=stamps,
-        steer_rad=noisy(motion.steer, 4e-4),
-        ax_m_s2=noisy(motion.ax, 0.05),
-        ay_m_s2=noisy(motion.ay, 0.1),
-        yaw_rate_rad_s=noisy(motion.state[:, 2], 0.002),
-        speed_m_s=np.where(np.arange(n) % 2 == 0, noisy(motion.state[:, 0], 0.05), np.nan),
-        friction=np.full(n, np.nan),
-        wheel_speed_m_s=np.full((n, 4), np.nan),
-        available=frozenset({"steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"}),
+    signals = signals_at(
+        motion.stamps_ns,
+        steer_rad=motion.steer,
+        ax_m_s2=motion.ax,
+        ay_m_s2=motion.ay,
+        yaw_rate_rad_s=motion.state[:, 2],
+        speed_m_s=np.where(np.arange(len(motion.t)) % 2 == 0, motion.state[:, 0], np.nan),
     )
-    return Measured(signals, truth_of(stamps, motion.state))
+    noisy = signals if seed is None else with_noise(signals, seed, 0.5)
+    return Measured(noisy, truth_of(motion.stamps_ns, motion.state))
 
 
 def truth_of(stamps: np.ndarray, state: np.ndarray) -> StateTrack:
@@ -152,10 +146,7 @@ def truth_of(stamps: np.ndarray, state: np.ndarray) -> StateTrack:
 
 def pick(whole: Measured, index: np.ndarray | slice) -> Measured:
     """Return only some rows of a drive: a part, or the rows of a recorder that lost the others."""
-    signals = replace(
-        whole.signals,
-        **{f.name: getattr(whole.signals, f.name)[index] for f in fields(Signals) if f.name != "available"},
-    )
+    signals = keep(whole.signals, index)
     truth = whole.truth
     assert truth is not None
     state = np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)[index]

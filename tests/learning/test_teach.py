@@ -17,12 +17,11 @@ from pdhef_logtool.car.parts import Fit, LearntOn
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.cli.learning_tables import render_learning
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.estimators.calibration.calibration import self_calibrate
-from pdhef_logtool.estimators.calibration.joint import REAR_STIFFNESS, prior_of
 from pdhef_logtool.learning.drives import LearnSettings
 from pdhef_logtool.learning.learn import LearnResult, learn
-from pdhef_logtool.learning.taught_prior import TYRES, taught_parameters
 from pdhef_logtool.learning.teach import OpenedDrive, learn_from, open_drive
+from pdhef_logtool.model.fit import fit_car
+from pdhef_logtool.model.priors import REAR_STIFFNESS, TYRES, prior_of
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.runs.config import RunConfig
 
@@ -62,17 +61,18 @@ def test_a_drive_teaches_a_prior_that_later_drives_start_from(
 ) -> None:
     car = Car.load(result.car, network="none")
     assert car.model is not None and not car.has_evidence and car.notes == ()
-    assert bool(car.taught_prior) is (any(p["support"] > 0.0 for p in result.figures["priors"]))
-    taught = taught_parameters([drive.taught], car.vehicle)
-    by_name = {p.name: p for p in taught}
-    parameters = {p.name: p for p in prior_of(car.vehicle)}
+    by_name = {p.name: p for p in car.taught_prior}
+    before = {p.name: p for p in prior_of(car.vehicle).parameters}
     assert by_name.keys() == set(TYRES)
-    assert all(p.std <= 1.00001 * parameters[p.name].std and p.ay_m_s2 > 0.0 for p in taught)
+    assert all(p.std <= 1.05 * before[p.name].std and p.ay_m_s2 > 0.0 for p in by_name.values())
     right = Car.load(sample_logs_dir / "vehicle.toml").vehicle
     true = right.cornering_stiffness_n_per_rad(False, right.assumed_friction)
     assert abs(np.log(by_name[REAR_STIFFNESS].value / true)) < 0.2
-    prior = {p.name: p.prior for p in self_calibrate([drive.taught.driving], car.vehicle, taught=taught).parameters}
-    assert [prior[name] for name in TYRES] == pytest.approx([by_name[name].value for name in TYRES])
+    alone, taught = (
+        next(p for p in fit_car(replace(drive.driving, slopes=None), car.vehicle, earlier).parameters if p.name == name)
+        for name, earlier in ((REAR_STIFFNESS, ()), (REAR_STIFFNESS, car.taught_prior))
+    )
+    assert abs(np.log(taught.prior / true)) < abs(np.log(alone.prior / true)) and taught.prior_sd < alone.prior_sd
 
 
 def test_the_figures_say_which_rung_is_used(result: LearnResult) -> None:
@@ -90,29 +90,14 @@ def test_the_figures_say_which_rung_is_used(result: LearnResult) -> None:
 def test_an_offset_of_the_ground_truth_changes_neither_prior_nor_residual(drive: OpenedDrive) -> None:
     truth, offset = drive.truth, 0.01
     moved = replace(truth, sideslip_rad=truth.sideslip_rad + offset, vy_m_s=truth.vy_m_s + offset * truth.vx_m_s)
-    taught = replace(drive.taught, slopes=drive.taught.slopes + offset)
-    shifted = replace(drive, whole=replace(drive.whole, truth=moved), taught=taught)
+    assert drive.driving.slopes is not None
+    driving = replace(drive.driving, slopes=drive.driving.slopes + offset)
+    shifted = replace(drive, whole=replace(drive.whole, truth=moved), driving=driving)
     first, second = (learn_from([d]) for d in (drive, shifted))
     assert [p.value for p in second.parameters] == pytest.approx([p.value for p in first.parameters], rel=1e-6)
     assert second.ladder.rung == first.ladder.rung
     if first.ladder.model is not None and second.ladder.model is not None:
         assert np.allclose(second.ladder.model.weights, first.ladder.model.weights, rtol=1e-4, atol=1e-9)
-
-
-def test_the_prior_of_several_drives_is_tested_with_each_left_out(sample_logs_dir: Path, bare: Path) -> None:
-    drives = [opened(sample_logs_dir / "road.mcap", bare, start=a, end=b) for a, b in (("60", "90"), ("95", "125"))]
-    taught, car = learn_from(drives), drives[0].drive.car.vehicle
-    (prior,) = taught.priors
-    assert prior.test is not None and prior.test.blocks >= 4
-    assert (prior.support > 0.5) == (prior.test.value < 0.0)
-    file, weak, full = (
-        {p.name: p for p in taught_parameters([d.taught for d in drives], car, support)} for support in (0.0, 0.5, 1.0)
-    )
-    for p in prior_of(car):
-        if p.name in TYRES:
-            assert file[p.name].value == pytest.approx(p.mean)
-            assert file[p.name].std == pytest.approx(p.std, rel=1e-5)
-            assert full[p.name].std <= weak[p.name].std <= file[p.name].std
 
 
 def test_a_model_takes_the_place_of_a_fit_unless_the_vehicle_file_has_changed(

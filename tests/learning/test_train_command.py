@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 
@@ -58,6 +59,9 @@ def test_train_writes_a_model_that_runs(
     config = RunConfig(car=car, network=network, estimators=("all",), annotate="none", end="5")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     assert {r.estimator for r in result.results[0].rows} >= {"pd-hef:fixed-r", "pd-hef"}
+    rows = pl.read_parquet(tmp_path / "out/logs/dlc/estimates.parquet")
+    physics, pd_hef = (rows.filter(estimator=e)["sideslip_rad"].to_numpy() for e in ("physics", "pd-hef"))
+    assert np.nanmax(np.abs(physics - pd_hef)) > 1e-4, "the network is in use"
     again = run_training(joined, tmp_path / "again", epochs=2)
     assert again.bundle.sha256 == bundle.sha256
     assert again.bundle.provenance["fine_tuned_on"] is None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from pdhef_logtool import inspect_log
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.logs.can_decoding import Decoder, Frames
 from pdhef_logtool.logs.can_logs import open_asc, open_blf, open_candump
+from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
 from pdhef_logtool.logs.table_clocks import RELATIVE_NS
@@ -514,23 +515,6 @@ def test_frames_survive_as_a_table() -> None:
     }
 
 
-@settings(max_examples=60, deadline=None)
-@given(data=st.data())
-def test_signals_are_decoded_as_cantools_decodes_them(data: st.DataObject) -> None:
-    length = data.draw(st.integers(2, 64))
-    little = data.draw(st.booleans())
-    first = data.draw(st.integers(0, 64 - length))
-    start = first if little else 8 * (first // 8) + 7 - first % 8
-    sign = data.draw(st.sampled_from("+-"))
-    dbc = f'BO_ 291 M: 8 A\n SG_ S : {start}|{length}@{int(little)}{sign} (0.25,-3) [0|0] "" A\n'
-    contents = data.draw(st.lists(st.binary(min_size=8, max_size=8), min_size=1, max_size=5))
-    tables, lost, _ = decoded([(291, c) for c in contents], dbc)
-    database = cantools.database.load_string(HEAD + dbc, "dbc")
-    expected = [database.decode_message(291, c, decode_choices=False)["S"] for c in contents]
-    np.testing.assert_allclose(column(tables["M"], "S"), expected, rtol=1e-15)
-    assert lost == []
-
-
 def test_the_same_identifiers_on_two_buses_are_two_tables() -> None:
     rows = [(bus, 291, struct.pack("<hH4x", 100 * bus + i, 0)) for i in range(5) for bus in (1, 0)]
     tables, lost, _ = decoded(made(rows), MOTION)
@@ -674,32 +658,49 @@ def test_multiplexed_signals_have_a_table_for_each_selector() -> None:
     assert [loss.where for loss in lost] == ["Mux"]
 
 
-@pytest.fixture(params=[".blf", ".asc", ".log"])
-def drive(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Path]:
-    """A log of Motion frames on bus 1, with others between them."""
+STEERING = MOTION.replace("291 Motion", "292 Steering").replace("AccelY", "Angle").replace('"g"', '"deg"')
+
+
+@pytest.fixture(params=[".blf", ".asc", ".log", ".mf4"])
+def drive(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A log of Motion and Steering frames on bus 1, with others between them."""
+    if request.param == ".mf4":
+        pytest.importorskip("asammdf")
     messages = []
     for i in range(300):
-        data = struct.pack("<hH4x", i, 7000 + i)
-        messages += [sent(i / 100, 291, data, channel=1), sent(i / 100 + 0.001, 0x1ABCDEF, b"\1\2\3", channel=1)]
+        frames = (291, struct.pack("<hH4x", i, 7000 + i)), (0x1ABCDEF, b"\1\2\3"), (292, struct.pack("<hH4x", -i, 0))
+        messages += [sent(i / 100 + k / 1000, *frame, channel=1) for k, frame in enumerate(frames)]
     return write(tmp_path / f"a{request.param}", messages)
 
 
-def test_a_log_is_decoded_by_its_mapping_or_by_a_given_dbc(drive: Path, tmp_path: Path) -> None:
-    (tmp_path / "car.dbc").write_text(HEAD + MOTION)
+def kinds_of(log: DriveLog) -> list[str]:
+    """What is lost and noted, but for the start of an MDF without a time zone."""
+    return [loss.kind for loss in log.lost if loss.kind != "no-clock"]
+
+
+def test_a_log_is_decoded_by_its_mapping_or_by_given_databases(drive: Path, tmp_path: Path) -> None:
+    (tmp_path / "dbc").mkdir()
+    (tmp_path / "dbc/car.dbc").write_text(HEAD + MOTION)
+    (tmp_path / "dbc/steering.dbc").write_text(HEAD + STEERING)
     (tmp_path / "m.toml").write_text(
-        '[can]\ndbc = ["car.dbc"]\n[signals.ay_m_s2]\ntopic = "can"\nfield = "can:Motion.AccelY"\nscale = 9.80665\n'
+        '[can]\ndbc = ["dbc/car.dbc"]\n[signals.ay_m_s2]\ntopic = "can"\nfield = "can:Motion.AccelY"\nscale = 9.80665\n'
     )
     with closing(open_log(drive)) as log:
-        assert [(t.name, t.messages) for t in log.topics] == [("can", 600)]
+        assert [(t.name, t.messages) for t in log.topics] == [("can", 900)]
         found = read_signals(log, load_mapping(tmp_path / "m.toml"), {}, log.start_ns, log.end_ns)
-        assert log.lost == ()
-    with closing(open_log(drive, msgs=tmp_path / "car.dbc")) as log:
-        assert [(t.name, t.messages) for t in log.topics] == [("can", 600), ("Motion", 300)]
+        assert kinds_of(log) == []
+    with closing(open_log(drive, msgs=tmp_path / "dbc")) as log:
+        assert [(t.name, t.messages) for t in log.topics] == [("can", 900), ("Motion", 300), ("Steering", 300)]
         assert {f.path: f.unit for f in log.fields("Motion")} == {"AccelY": "g", "Speed": "km/h"}
-        values = log.read({"Motion": ["AccelY"]})["Motion"]
-        assert [loss.severity for loss in log.lost] == ["note"]
-    np.testing.assert_allclose(values.fields["AccelY"], np.arange(300) / 1000, atol=1e-12)
-    np.testing.assert_allclose(values.log_time_ns, START_NS + np.arange(300) * 10**7, atol=1000)
+        values = log.read({"Motion": ["AccelY"], "Steering": ["Angle"]})
+        assert kinds_of(log) == ["unknown-frame"]
+    resolution_ns = 200_000 if drive.suffix == ".mf4" else 1000
+    for name, path, factor in (("Motion", "AccelY", 1e-3), ("Steering", "Angle", -1e-3)):
+        read, late_ns = values[name], 2 * 10**6 * (name == "Steering")
+        np.testing.assert_allclose(read.fields[path], np.arange(300) * factor, atol=1e-12)
+        np.testing.assert_allclose(
+            read.log_time_ns - START_NS, np.arange(300) * 10**7 + late_ns, rtol=0.0, atol=resolution_ns
+        )
     np.testing.assert_allclose(found.signals["ay_m_s2"].values, np.arange(300) * 9.80665e-3, atol=1e-9)
 
 
@@ -735,8 +736,8 @@ def test_losses_of_a_column_are_those_of_a_log_that_reads_it(drive: Path, tmp_pa
     with closing(open_log(drive, msgs=tmp_path / "car.dbc")) as log:
         log.read({"Motion": ["Speed"]}, quiet=True)
         log.read({"Motion": ["AccelY"]})
-        assert [loss.kind for loss in log.lost] == ["unknown-frame"]
+        assert kinds_of(log) == ["unknown-frame"]
         for _ in range(2):
             read = log.read({"Motion": ["Speed"]}, log.end_ns - 10**9, log.end_ns)["Motion"]
-        assert [loss.kind for loss in log.lost] == ["unknown-frame", "out-of-range"]
+        assert kinds_of(log) == ["unknown-frame", "out-of-range"]
     assert np.isnan(read.fields["Speed"]).sum() == 9

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 
 from pdhef_logtool.cli.app import app
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
+from tests.mcap_files import mcap_writer
 
 T0 = 1_700_000_000_000_000_000
 N = 400
@@ -23,17 +24,18 @@ N = 400
 def _log(path: Path, *, chunk_crcs: bool, data_crc: bool, chunked: bool = True) -> Path:
     """Write an MCAP file with plain numbers, so that a damaged value is still a valid number."""
     text = b"float64 a\nfloat64 b\nfloat64 c\n"
-    with path.open("wb") as file:
-        writer = Writer(
-            file, chunk_size=4000, compression=CompressionType.NONE, enable_crcs=chunk_crcs,
-            enable_data_crcs=data_crc, use_chunking=chunked,
-        )  # fmt: skip
-        writer.start()
+    with mcap_writer(
+        path,
+        chunk_size=4000,
+        compression=CompressionType.NONE,
+        enable_crcs=chunk_crcs,
+        enable_data_crcs=data_crc,
+        use_chunking=chunked,
+    ) as writer:
         channel = writer.register_channel("/t", "cdr", writer.register_schema("x/msg/T", "ros2msg", text))
         for i in range(N):
             data = b"\x00\x01\x00\x00" + struct.pack("<3d", i, 0.5 * i, -i)
             writer.add_message(channel, T0 + i * 10_000_000, data, T0 + i * 10_000_000, i)
-        writer.finish()
     return path
 
 
@@ -81,16 +83,13 @@ def test_a_log_that_is_read_in_part_from_a_server_says_what_was_not_verified(tmp
     from tests.counting_server import serving
 
     path = tmp_path / "log.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=4000, enable_crcs=False, enable_data_crcs=True)
-        writer.start()
+    with mcap_writer(path, chunk_size=4000, enable_crcs=False, enable_data_crcs=True) as writer:
         schema = writer.register_schema(
             "T", "jsonschema", b'{"type": "object", "properties": {"a": {"type": "number"}}}'
         )
         channels = [writer.register_channel(topic, "json", schema) for topic in ("/a", "/b")]
         for i in range(2 * N):  # each chunk has one topic
             writer.add_message(channels[i // N], T0 + i * 10_000_000, b'{"a": %d}' % i, T0 + i * 10_000_000)
-        writer.finish()
     with serving(**{"log.mcap": path.read_bytes()}) as server:
         place = RemotePlace(server.place("log.mcap"))
         log = open_log(place, wanted=Wanted(frozenset({"/a"})))

@@ -10,7 +10,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import RawChunk
@@ -18,6 +18,7 @@ from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
+from tests.mcap_files import mcap_writer
 
 pytestmark = pytest.mark.slow
 
@@ -28,9 +29,9 @@ TEXT = b"float64 x\n"
 def _write(path: Path, n: int = 600, *, compression=CompressionType.ZSTD, chunk_size=20_000, extra=(), **options):
     """Write three channels with the mcap library, which declares them inside the first chunk; ids as it gives them."""
     rng = np.random.default_rng(4)
-    with path.open("wb") as stream:
-        writer = Writer(stream, compression=compression, chunk_size=chunk_size, **options)
-        writer.start(profile="ros2", library="recorder")
+    with mcap_writer(
+        path, profile="ros2", library="recorder", compression=compression, chunk_size=chunk_size, **options
+    ) as writer:
         a = writer.register_schema("own/msg/A", "ros2msg", TEXT)
         b = writer.register_schema("own/msg/B", "ros2msg", TEXT + b"float64 y\n")
         channels = [
@@ -42,7 +43,6 @@ def _write(path: Path, n: int = 600, *, compression=CompressionType.ZSTD, chunk_
         for i in range(n):
             time = T0 + 1_000_000 * i
             writer.add_message(channels[i % len(channels)], time, rng.bytes(200), time - i, sequence=5 * i)
-        writer.finish()
 
 
 def _annotate(source: Path | ColumnarLog, target: Path, leave_out=lambda _: False, batches: bool = True, window=()):
@@ -213,9 +213,9 @@ def test_split_files_keep_their_chunks_while_their_ids_agree(tmp_path: Path, swa
 
 def test_overlapping_chunks_keep_the_order_of_the_file(tmp_path: Path) -> None:
     source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
-    with source.open("wb") as stream:
-        writer = Writer(stream, chunk_size=1)  # a chunk a message pair: late, early, and one of both times
-        writer.start(profile="ros2", library="recorder")
+    with mcap_writer(
+        source, profile="ros2", library="recorder", chunk_size=1
+    ) as writer:  # a chunk a message pair: late, early, and one of both times
         channel, other = (writer.register_channel(topic, "octets", 0) for topic in ("/a", "/b"))
         for times in ((5, 9), (2, 6), (20, 21), (12, 13)):
             writer._Writer__chunk_size = 10**6  # type: ignore[attr-defined]
@@ -223,7 +223,6 @@ def test_overlapping_chunks_keep_the_order_of_the_file(tmp_path: Path) -> None:
                 writer.add_message(channel, T0 + t, bytes([t]), T0)
             writer.add_message(other, T0 + times[0], b"", T0)
             writer._Writer__finalize_chunk()  # type: ignore[attr-defined]
-        writer.finish()
     assert [c.message_start_time - T0 for c in _chunks(source)] == [5, 2, 20, 12]
     _annotate(source, target, batches=False)
     assert [c.message_start_time - T0 for c in _chunks(target)] == [5, 2, 12, 20]

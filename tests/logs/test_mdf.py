@@ -506,6 +506,12 @@ def test_links_in_a_circle_are_one_line(kind: bytes, number: int, link: int, tmp
         contents(tmp_path / "a.mf4")
 
 
+def test_a_file_without_its_header_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "a.mf4").write_bytes(imu().replace(b"##HD", b"##XX"))
+    with pytest.raises(LogError, match="a block HD at byte 64"):
+        contents(tmp_path / "a.mf4")
+
+
 def test_groups_of_version_3_in_a_circle_are_one_line(tmp_path: Path) -> None:
     path = written(tmp_path / "a.mdf", [signal("ay", AY)], "3.30")
     data = bytearray(path.read_bytes())

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from pdhef_logtool import inspect_log
 from pdhef_logtool.logs import mcap_log
 from pdhef_logtool.logs.open_log import open_log
+from tests.mcap_files import copied, mcap_writer
 
 #: A JSON payload that is larger than the cached part of a chunk.
 LARGE = b'{"size": %d, "pixels": "' + b"x" * 20_000 + b'"}'
@@ -23,19 +22,11 @@ LARGE = b'{"size": %d, "pixels": "' + b"x" * 20_000 + b'"}'
 def mixed(sample_logs_dir: Path, tmp_path: Path) -> Path:
     """A drive with an image after every 50th message, in the same chunks."""
     path = tmp_path / "mixed.mcap"
-    with (sample_logs_dir / "dlc.mcap").open("rb") as file, path.open("wb") as out:
-        writer = Writer(out, chunk_size=400_000)
-        writer.start(profile="ros2")
+    with mcap_writer(path, profile="ros2", chunk_size=400_000) as writer:
         image = writer.register_channel("/camera", "json", 0)
-        channels: dict[int, int] = {}
-        for i, (schema, channel, message) in enumerate(make_reader(file).iter_messages()):
-            if channel.id not in channels:
-                schema_id = 0 if schema is None else writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, schema_id)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        for i, message in enumerate(copied(sample_logs_dir / "dlc.mcap", writer)):
             if i % 50 == 0:
                 writer.add_message(image, message.log_time, LARGE % i, message.publish_time)
-        writer.finish()
     return path
 
 

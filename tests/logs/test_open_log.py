@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from mcap.writer import Writer
 
 from pdhef_logtool.logs.container import Block
 from pdhef_logtool.logs.open_log import is_log_folder, open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError
+from tests.mcap_files import mcap_writer
 
 T0 = 1_700_000_000_000_000_000
 VALUES = np.arange(40) * 0.25
@@ -185,13 +185,10 @@ def test_rows_in_a_write_ahead_log_are_read_and_nothing_is_written_beside(tmp_pa
 
 
 def test_a_chunk_costs_the_same_however_many_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with (tmp_path / "many.mcap").open("wb") as file:
-        writer = Writer(file, chunk_size=1)
-        writer.start()
+    with mcap_writer(tmp_path / "many.mcap", chunk_size=1) as writer:
         channel = writer.register_channel("/a", "json", 0)
         for i in range(300):
             writer.add_message(channel, i, b'{"x": 1.0}', i)
-        writer.finish()
     asked = 0
 
     def nbytes(block: Block) -> int:

@@ -12,11 +12,12 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, ti
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 
 from pdhef_logtool.logs.decoding import NO_TIME_NS
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import MappingError
+from tests.mcap_files import mcap_writer
 
 _NUMBERS = {
     "a_double": Field.TYPE_DOUBLE, "a_float": Field.TYPE_FLOAT, "a_int32": Field.TYPE_INT32,
@@ -88,15 +89,12 @@ STATE = _message_class()
 
 
 def _write(path: Path, payloads: Sequence[bytes], *, schema: bytes | None = None, encoding: str = "protobuf") -> None:
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.ZSTD)
-        writer.start()
+    with mcap_writer(path, compression=CompressionType.ZSTD) as writer:
         data = _files().SerializeToString() if schema is None else schema
         schema_id = writer.register_schema("car.State", encoding, data)
         channel = writer.register_channel("/state", "protobuf", schema_id)
         for i, payload in enumerate(payloads):
             writer.add_message(channel, 10 + i, payload, 10 + i)
-        writer.finish()
 
 
 def _read(path: Path, *paths: str) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 from pdhef_logtool.logs.drive_log import windows
 from pdhef_logtool.logs.open_log import open_log
@@ -23,6 +22,7 @@ from pdhef_logtool.logs.recording_span import (
     steps_back,
 )
 from pdhef_logtool.records.signals import IntArray
+from tests.mcap_files import mcap_writer
 
 S = 1_000_000_000
 T0 = 1_767_225_600 * S
@@ -126,15 +126,12 @@ def test_any_time_can_be_shown() -> None:
 def test_indexes_say_whether_a_chunk_must_be_looked_at(back_s: int, tmp_path: Path) -> None:
     """In a chunk of 20 s the clock steps back midway; the first and last time do not show it."""
     path = tmp_path / "log.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=1 << 30)
-        writer.start()
+    with mcap_writer(path, chunk_size=1 << 30) as writer:
         ids = [writer.register_channel(topic, "json", 0) for topic in ("/fast", "/slow")]
         for i in range(2000):
             ns = T0 + i * S // 100 - (back_s * S if i >= 1000 else 0)
             for id_ in ids if i % 10 == 0 else ids[:1]:
                 writer.add_message(id_, ns, b"{}", ns)
-        writer.finish()
     log = open_log(path)
     (container,) = log.containers
     (span,) = container.spans

@@ -9,7 +9,6 @@ import pytest
 from google.protobuf import descriptor_pb2
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 from pdhef_logtool.logs.container import Block, ChannelRecord
 from pdhef_logtool.logs.decoding import ChannelDecoder, channel_schema
@@ -18,6 +17,7 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.records.errors import MappingError
+from tests.mcap_files import mcap_writer
 
 _NEXT = "=" * 80 + "\n"
 _HEAD, _TAIL = "module p { module msg { module A_Constants { ", " }; struct A { long x; }; }; };"
@@ -170,9 +170,7 @@ def test_one_wide_array_does_not_widen_all_the_others() -> None:
 
 def test_a_schema_that_does_not_parse_is_a_loss_of_its_channel_and_no_other(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="", library="test")
+    with mcap_writer(path) as writer:
         for topic, encoding, text, messages in [
             ("/bomb", "jsonschema", _nested(13, 10).encode(), "json"),
             ("/sound", "jsonschema", b'{"properties": {"x": {"type": "number"}}}', "json"),
@@ -181,7 +179,6 @@ def test_a_schema_that_does_not_parse_is_a_loss_of_its_channel_and_no_other(tmp_
             schema = writer.register_schema(topic, encoding, text)
             channel = writer.register_channel(topic, messages, schema)
             writer.add_message(channel, 5, b'{"x": 1}', 5)
-        writer.finish()
     log = open_log(path)
     assert [len(log.fields(topic)) for topic in ("/bomb", "/bomb", "/sound", "/other")] == [0, 0, 1, 0]
     (loss,) = log.lost
@@ -241,14 +238,3 @@ def test_a_mutated_schema_is_read_or_refused(encoding: str, cuts: list[tuple[int
             _columns(schema, leaf.path, message, b"\0\1\0\0" + message)
         except MappingError:
             continue
-
-
-@pytest.mark.parametrize(("name", "topic"), [("ros_listed_bomb.mcap", "/b"), ("json_ref_bomb.mcap", "/j")])
-def test_the_bombs_that_did_harm_are_losses_that_name_their_channel(shared_dir: Path, name: str, topic: str) -> None:
-    path = shared_dir / "torture" / name
-    if not path.is_file():
-        pytest.skip("needs ../shared/torture")
-    log = open_log(path)
-    assert log.fields(topic) == ()
-    assert [(loss.kind, loss.where) for loss in log.lost] == [("bad-schema", topic)]
-    log.close()

@@ -6,14 +6,12 @@ from collections import Counter
 from contextlib import closing
 from pathlib import Path
 
-import numpy as np
 import pytest
-from mcap.records import Attachment
 from recorded import decoded_by_rosbags
 
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
-from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
+from pdhef_logtool.logs.writer import McapLogWriter
 
 pytestmark = pytest.mark.slow
 
@@ -50,58 +48,6 @@ def _content(path: Path) -> list[tuple[object, ...]]:
             )
             for s, c, m in make_reader(file, validate_crcs=True).iter_messages()
         ]
-
-
-def _many_sided_source(path: Path) -> None:
-    """Two encodings, a channel without schema, two publishers of one topic, channel metadata, equal log times."""
-    text = b"float64 x\n"
-    with McapLogWriter(path, profile="mixed") as writer:
-        ids = [
-            writer.add_raw_channel(
-                topic,
-                schema_name=name,
-                schema_encoding=encoding,
-                schema_data=data,
-                message_encoding=kind,
-                metadata=metadata,
-            )
-            for topic, name, encoding, data, kind, metadata in (
-                ("/a", "own/msg/A", "ros2msg", text, "cdr", {"offered_qos_profiles": "- depth: 1"}),
-                ("/a", "own/msg/A", "ros2msg", text, "cdr", {"offered_qos_profiles": "- depth: 1"}),
-                ("/b", "", "", b"", "json", {}),
-                ("/c", "pb.C", "protobuf", b"\x0a\x01", "protobuf", {"k": "v"}),
-            )
-        ]
-        rng = np.random.default_rng(1)
-        times = T0 + np.sort(rng.integers(0, 500, size=3000))
-        writer.write(
-            [],
-            [
-                RawMessage(ids[i % 4], int(t), int(t) - i, 7 * i, rng.bytes(int(rng.integers(0, 1500))))
-                for i, t in enumerate(times)
-            ],
-        )
-        writer.attachment(Attachment(T0 - 1, T0, "notes.txt", "text/plain", b"windy"))
-        writer.metadata("car", {"tyres": "used"})
-
-
-def test_an_mcap_copy_equals_its_source(tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-
-    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
-    _many_sided_source(source)
-    _copy(source, target)
-    assert _content(target) == _content(source)
-    with target.open("rb") as file:
-        reader = make_reader(file)
-        assert reader.get_header().profile == "mixed"
-        summary = reader.get_summary()
-        assert summary is not None
-        assert len(summary.channels) == 4
-        (attachment,) = reader.iter_attachments()
-        assert (attachment.name, attachment.media_type, attachment.data) == ("notes.txt", "text/plain", b"windy")
-        assert (attachment.log_time, attachment.create_time) == (T0, T0 - 1)
-        assert [(m.name, m.metadata) for m in reader.iter_metadata()] == [("car", {"tyres": "used"})]
 
 
 @pytest.mark.parametrize(

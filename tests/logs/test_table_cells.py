@@ -14,36 +14,11 @@ from hypothesis import strategies as st
 from pdhef_logtool.logs.table_cells import read_cells
 
 EMPTY = [
-    "",
-    " ",
-    "nan",
-    "NaN",
-    "-nan(ind)",
-    "nan(snan)",
-    "1.#QNAN",
-    "-1.#IND00",
-    "#N/A",
-    "n/a",
-    "NULL",
-    "None",
-    "-",
-    "--",
-]
+    "", " ", "nan", "NaN", "-nan(ind)", "nan(snan)", "1.#QNAN", "-1.#IND00", "#N/A", "n/a", "NULL", "None", "-", "--",
+]  # fmt: skip
 UNREADABLE = [
-    "ERR",
-    "****",
-    "inf",
-    "-Infinity",
-    "1.#INF",
-    "12.5 km/h",
-    "1e999",
-    "12:00",
-    "0x",
-    "1,2,3",
-    "e5",
-    "+",
-    "x y",
-]
+    "ERR", "****", "inf", "-Infinity", "1.#INF", "12.5 km/h", "1e999", "12:00", "0x", "1,2,3", "e5", "+", "x y",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,6 @@ DIALECTS = {
         _csv([f"2312,{302418 - 43200 + t:.2f}" for t in TIME_S], "GPS_Week,tow," + _HEAD.partition(",")[2]).encode(),
         DAY_NS,
     ),
-    "duplicates": (_csv(SECONDS, "time,ay [m/s²],speed (km/h)").encode(), RELATIVE_NS),
     "units-and-sources": (
         b"made by a phone\nFormat,3\n\n"
         + _csv([f"{t:.2f},7" for t in TIME_S], "time,lap,ay,speed\ns,,m/s\xc2\xb2,km/h\n,,100: acc,calc").encode(
@@ -555,3 +554,31 @@ def test_texts_that_name_no_signals_make_no_columns(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("\n".join(["time,name,value", *rows, ""]))
     with closing(open_log(tmp_path / "a.csv")) as log:
         assert [f.path for t in log.topics for f in log.fields(t.name)] == ["value"]
+
+
+def test_titles_in_other_alphabets_and_short_names_of_a_clock(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("ts,车速 [km/h],横摆角速度(deg/s),左前轮速\n0.00,36,1,10\n0.01,36,2,10\n0.02,37,3,10\n")
+    with closing(open_log(path)) as log:
+        assert {f.path for t in log.topics for f in log.fields(t.name)} == {
+            "vehicle_speed", "yaw_rate", "front_left_wheel_speed"
+        }  # fmt: skip
+
+
+def _stamps_of(path: Path, text: str) -> list[int]:
+    path.write_text(text)
+    with closing(open_log(path)) as log:
+        return [int(stamp) for stamp in log.read({"csv": ["speed"]})["csv"].log_time_ns]
+
+
+def test_a_clock_in_two_columns_or_with_named_months(tmp_path: Path) -> None:
+    rows = [(1_700_000_000 + i // 4, 250_000 * (i % 4)) for i in range(1, 40)]
+    parts = "stamp.sec;stamp.usec;speed\n" + "".join(f"{s};{u};{i}\n" for i, (s, u) in enumerate(rows))
+    assert _stamps_of(tmp_path / "a.csv", parts) == [s * 10**9 + u * 1000 for s, u in rows]
+    named = "Device Time,speed\n" + "".join(f"05-Nov-2025 10:00:{i:02}.500,{i}\n" for i in range(20))
+    assert _stamps_of(tmp_path / "b.csv", named)[0] == 1_762_336_800_500_000_000
+
+
+def test_rows_that_share_whole_seconds_are_spread(tmp_path: Path) -> None:
+    rows = "time,speed\n" + "".join(f"10:00:{(i + 3) // 5:02},{i}\n" for i in range(99))
+    assert {*np.diff(_stamps_of(tmp_path / "a.csv", rows)).tolist()} == {200_000_000}

@@ -16,7 +16,6 @@ from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 from pdhef_logtool.logs.can_decoding import signal_values
 from pdhef_logtool.logs.open_log import open_log
@@ -24,6 +23,7 @@ from pdhef_logtool.mapping import Mapping, check_mapping, fit_clocks, load_mappi
 from pdhef_logtool.mapping.evidence import LARGEST
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.runs.inspection.report import inspect_log
+from tests.mcap_files import mcap_writer
 
 S = 1_000_000_000
 
@@ -70,7 +70,6 @@ def _signals(draw: st.DrawFn) -> tuple[Signal, int]:
     return Signal("S", start, length, order, signed, conversion=conversion), size
 
 
-@pytest.mark.slow
 @settings(max_examples=100, derandomize=True, deadline=None)
 @given(layout=_signals(), frames=st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=5))
 def test_any_layout_decodes_as_cantools_decodes_it(layout: tuple[Signal, int], frames: list[bytes]) -> None:
@@ -96,14 +95,11 @@ _ROS_FRAME = (
 
 
 def _write(path: Path, encoding: str, schema: tuple[str, str, bytes], payloads: Sequence[bytes]) -> None:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
+    with mcap_writer(path) as writer:
         schema_id = writer.register_schema(*schema) if schema[0] else 0
         channel = writer.register_channel("/can/raw", encoding, schema_id)
         for i, payload in enumerate(payloads):
             writer.add_message(channel, S + i * 1_000_000, payload, S + i * 1_000_000)
-        writer.finish()
 
 
 def _write_ros(path: Path, frames: Sequence[Frame]) -> None:
@@ -293,15 +289,6 @@ def test_an_unknown_name_tells_the_nearest(tmp_path: Path, field: str, says: str
     mapping = _mapping(tmp_path, {"speed_m_s": field})
     with pytest.raises(MappingError, match=says):
         _read(tmp_path / "a.mcap", mapping)
-
-
-def test_an_unknown_topic_tells_the_nearest(tmp_path: Path) -> None:
-    _write_ros(tmp_path / "a.mcap", [Frame(256, bytes(8))])
-    (tmp_path / "car.dbc").write_text(DBC)
-    text = '[can]\ndbc = "car.dbc"\n[signals.speed_m_s]\ntopic = "/can/rwa"\nfield = "can:Motion.Speed"\n'
-    (tmp_path / "m.toml").write_text(text)
-    with pytest.raises(MappingError, match=r"no topic /can/rwa \(did you mean /can/raw\?\)"):
-        _read(tmp_path / "a.mcap", load_mapping(tmp_path / "m.toml"))
 
 
 @pytest.mark.parametrize("text", ["", "BO_ 256 Motion: 8 ECU\n SG_ Speed : nonsense", "\x00\xff\x00", None])

@@ -1,7 +1,8 @@
-"""[estimates.NAME.SIGNAL] tables and ``[SIGNAL=]TOPIC[.FIELD]`` texts."""
+"""[estimates.NAME.SIGNAL] tables, ``[SIGNAL=]TOPIC[.FIELD]`` texts, and losses of several windows as one."""
 
 from __future__ import annotations
 
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,10 @@ import pytest
 from fake_drive_log import FakeLog, FakeTopic
 
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import load_mapping, mapping_to_toml
+from pdhef_logtool.mapping import load_mapping, mapping_to_toml, merge_losses
 from pdhef_logtool.mapping.estimates import choose_estimates, sources_of
-from pdhef_logtool.records.errors import MappingError
-from pdhef_logtool.records.signals import ESTIMATE_UNITS
+from pdhef_logtool.records.errors import MappingError, UsageError
+from pdhef_logtool.records.signals import ESTIMATE_UNITS, Loss
 
 TABLES = """
 [signals.yaw_rate_rad_s]
@@ -30,6 +31,9 @@ field = "speed"
 topic = "/ekf"
 field = "vy"
 """
+
+
+BETA = {"beta": np.zeros(10)}
 
 
 def _log(**topics: dict[str, np.ndarray]) -> FakeLog:  # type: ignore[type-arg]
@@ -77,7 +81,7 @@ def test_topics_with_dots_are_found_by_the_longest_that_fits() -> None:
 def test_flags_win_over_tables(tmp_path: Path) -> None:
     (tmp_path / "m.toml").write_text(TABLES)
     mapping = load_mapping(tmp_path / "m.toml")
-    log = _log(**{"/esc": {"beta": np.zeros(10)}})
+    log = _log(**{"/esc": BETA})
     (flag,) = choose_estimates(log, ["sideslip_rad=/esc.beta"], mapping, None)  # type: ignore[arg-type]
     assert flag.name == "esc"
     assert flag.signals["sideslip_rad"].scale == 1.0
@@ -94,3 +98,47 @@ def test_a_topic_named_as_a_whole_brings_its_covariance_and_a_field_does_not(sam
     _, none = sources_of(log, ["vx_m_s=/rtk/odometry.twist.twist.linear.x"], ESTIMATE_UNITS, "--estimate")
     assert none is None
     log.close()
+
+
+@pytest.mark.parametrize(
+    ("texts", "error", "said"),
+    [
+        (["sidslip_rad=/esc.beta"], UsageError, "did you mean sideslip_rad?"),
+        (["colour=/esc.beta"], UsageError, "got 'colour'"),
+        (["=/esc.beta"], UsageError, "SIGNAL out of"),
+        (["sideslip_rad=/esc.beta", "sideslip_rad=/imu/raw.beta"], UsageError, "expected each signal once"),
+        (["sideslip_rad=/ecs.beta"], MappingError, "did you mean /esc?"),
+        (["sideslip_rad=/nowhere/near.beta"], MappingError, "pdhef inspect lists the topics"),
+        (["/esc.beta"], UsageError, "the type does not give the signal"),
+    ],
+)
+def test_a_text_that_names_no_signal_of_the_log_is_refused(texts: list[str], error: type[Exception], said: str) -> None:
+    with pytest.raises(error) as caught:
+        sources_of(_log(**{"/esc": BETA, "/imu/raw": BETA}), texts, ESTIMATE_UNITS, "--estimate")  # type: ignore[arg-type]
+    assert said in str(caught.value)
+    assert "--estimate" in str(caught.value)
+
+
+def test_losses_of_one_kind_at_one_place_become_one_that_spans_and_counts_all() -> None:
+    parts = [
+        Loss("nan", "not a number", "/a.x", 40, 50, 3),
+        Loss("nan", "not a number", "/a.x", 10, 20, 4),
+        Loss("nan", "not a number", "/a.x"),  # whole and uncounted: adds no bound and no count
+    ]
+    for order in permutations(parts):
+        assert merge_losses([order[:1], order[1:]]) == (Loss("nan", "not a number", "/a.x", 10, 50, 7),)
+    assert merge_losses([parts[2:], parts[2:]]) == (parts[2],)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        Loss("gap", "w", "/a", 1, 2, 1),
+        Loss("nan", "v", "/a", 1, 2, 1),
+        Loss("nan", "w", "/b", 1, 2, 1),
+        Loss("nan", "w", "/a", 1, 2, 1, "note"),
+    ],
+)
+def test_losses_that_differ_in_kind_words_place_or_weight_stay_apart(other: Loss) -> None:
+    loss = Loss("nan", "w", "/a", 1, 2, 1)
+    assert merge_losses([[loss, other], [loss]]) == (Loss("nan", "w", "/a", 1, 2, 2), other)

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
-from mcap.writer import Writer
 
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import AutoMapping, auto_map, fit_clocks, read_signals
+from tests.mcap_files import mcap_writer
 
 S = 1_000_000_000
 _DOUBLE, _MESSAGE, _STRING = Field.TYPE_DOUBLE, Field.TYPE_MESSAGE, Field.TYPE_STRING
@@ -92,9 +92,7 @@ def _stamp(encoding: str, i: int) -> dict[str, int]:
 
 
 def _write(path: Path, topics: Mapping[str, tuple[str, str, bytes, list[bytes]]]) -> Path:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
+    with mcap_writer(path) as writer:
         for topic, (encoding, name, schema, payloads) in topics.items():
             schema_id = writer.register_schema(name, "jsonschema" if encoding == "json" else "protobuf", schema)
             channel = writer.register_channel(topic, encoding, schema_id)
@@ -102,7 +100,6 @@ def _write(path: Path, topics: Mapping[str, tuple[str, str, bytes, list[bytes]]]
                 # Recorded 20 ms after the measurement.
                 at = 100 * S + i * S // 10 + 20_000_000
                 writer.add_message(channel, at, payload, at)
-        writer.finish()
     return path
 
 

@@ -46,26 +46,6 @@ def test_race_car(shared_dir: Path) -> None:
     assert np.rad2deg([np.arctan2(vy, vx).min(), np.arctan2(vy, vx).max()]) == pytest.approx([-5.3, 3.5], abs=0.05)
 
 
-def test_damaged_drive_is_counted_exactly(shared_dir: Path) -> None:
-    got = read_drive(
-        shared_dir / "data" / "drives" / "faulty" / "revs_250lm_a_disorder.mcap",
-        load_mapping(MAPPINGS / "revs_250lm.toml"),
-    )
-    counts = {(x.kind, x.where.split(" ")[0]): x.count for x in got.losses}
-    assert counts == {
-        ("nan", "ay_m_s2"): 2,
-        ("nan", "yaw_rate_rad_s"): 1,
-        ("nan", "steer_rad"): 2,
-        ("duplicate-stamp", "/imu/data"): 20,
-    }
-    good = read_drive(shared_dir / "data" / "drives" / "revs_250lm_a.mcap", load_mapping(MAPPINGS / "revs_250lm.toml"))
-    for name in ("ax_m_s2", "steer_rad", "speed_m_s"):
-        mine, theirs = got.signals[name], good.signals[name]
-        at = np.searchsorted(theirs.stamps_ns, mine.stamps_ns)
-        np.testing.assert_array_equal(theirs.stamps_ns[at], mine.stamps_ns)
-        np.testing.assert_array_equal(theirs.values[at], mine.values)
-
-
 def test_phone_clock_is_found_from_log_times(shared_dir: Path) -> None:
     path = shared_dir / "data" / "drives" / "comma2k19_segment.mcap"
     log = open_log(path)

@@ -9,12 +9,12 @@ import pytest
 from reference_car import drive, signals_at, slalom, with_noise
 
 from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, FRONT_WEIGHT_SHARE, FRONT_WEIGHT_SHARE_SPREAD
-from pdhef_logtool.car.car import Car, WithoutTruth
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS, FilterNoise, FittedPhysics, FittedValues
+from pdhef_logtool.car.posterior import FittedParameter, Posterior
 from pdhef_logtool.car.toml_files import vehicle_of_entries
 from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters, corrected_anew, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.calibration.joint import prior_variations
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.presets import OPEN_LOOP
@@ -30,6 +30,7 @@ from pdhef_logtool.model.intervals import (
     drive_intervals,
     running_consistency,
 )
+from pdhef_logtool.model.priors import prior_variations
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.reasons import STUCK_YAW_RATE
 from pdhef_logtool.records.signals import Signals
@@ -45,11 +46,13 @@ FOUND = OWN.model_copy(
     }
 )
 VARIED = (FOUND.model_copy(update={"steer_offset_rad": 0.008}), FOUND.with_stiffness(1.0, 0.9))
-NOTE, NOISE = "calibrated", FilterNoise(r_std={"ay_m_s2": 1.0})
+NOISE = FilterNoise(r_std={"ay_m_s2": 1.0})
+#: A parameter of a fit: an interval on a fitted vehicle is not causal.
+FITTED = FittedParameter("yaw inertia", "kg m^2", 1700.0, 1500.0, 0.1, 0.2, log=True)
 
 
 def calibrated(varied: tuple[VehicleParameters, ...] = (), scale: float = 1.0, *, causal: bool = False) -> Car:
-    found = WithoutTruth(FOUND, NOISE, NOTE, varied=varied, error_scale=scale, causal=causal)
+    found = Posterior(FOUND, () if causal else (FITTED,), varied=varied, error_scale=scale)
     return replace(Car.of(OWN), self_calibrated=found)
 
 
@@ -80,9 +83,9 @@ def spread(vehicles: tuple[VehicleParameters, ...], noise: FilterNoise, signals:
 
 
 def assert_alike(got: np.ndarray, expected: np.ndarray) -> None:
-    """The filters of the variations run on means of samples: 2 % in the median, 15 % of the median anywhere."""
+    """The filters of the variations run on means of samples: 5 % in the median, 15 % of the median anywhere."""
     median = np.median(expected)
-    assert np.median(got) == pytest.approx(median, rel=0.02)
+    assert np.median(got) == pytest.approx(median, rel=0.05)
     np.testing.assert_allclose(got, expected, atol=0.15 * median)
 
 
@@ -104,7 +107,7 @@ def test_on_a_car_that_was_fitted_to_the_drive_it_is_the_sum_of_its_parts(
     expected = 4.0 * (plain.vy_std_m_s**2 + (CAR_STD_RAD * plain.vx_m_s) ** 2) + consistency**2
     fast = plain.vx_m_s > OWN.low_speed_blend_m_s
     if varied:
-        expected = expected + spread((FOUND, *varied), NOISE, signals)
+        expected = expected + spread((FOUND, *varied), Posterior(FOUND).noise, signals)
         assert_alike(wide.vy_std_m_s[fast], np.sqrt(expected[fast]))
     else:
         np.testing.assert_allclose(wide.vy_std_m_s[fast] ** 2, expected[fast], rtol=1e-9)

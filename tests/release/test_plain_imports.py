@@ -13,10 +13,8 @@ OPTIONAL = ("aiobotocore", "aiohttp", "asammdf", "botocore", "h5py", "ray", "s3f
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("extras", "code"), [((), 0), (("train",), 1)])
-def test_every_module_imports_without_extras(extras: tuple[str, ...], code: int) -> None:
+def test_every_module_imports_without_extras() -> None:
     without = f"import sys; sys.modules.update(dict.fromkeys({OPTIONAL!r}))"
-    command = [sys.executable, "-c", f"{without}\n{plain_install.IMPORTS}", *extras]
+    command = [sys.executable, "-c", f"{without}\n{plain_install.IMPORTS}"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == code, done.stdout + done.stderr
-    assert ("pdhef_logtool.residual_model.network: " in done.stdout) is bool(code), "an extra that is installed"
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.results.error_places import largest_errors
 from pdhef_logtool.results.parquet_sink import write_estimates, write_metrics
 from pdhef_logtool.results.run_report import write_json
 from pdhef_logtool.storage.documents import seal

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pdhef_logtool.reports.comparison import comparison_page
 from pdhef_logtool.results.comparing import compare_runs
-from pdhef_logtool.results.gate import Figure, Gate
+from pdhef_logtool.results.gate import Figure
 from pdhef_logtool.results.opened_run import open_run
 from tests.results.made_run import entry, write_run
 
@@ -16,7 +16,7 @@ HOSTILE = "<img src=x onerror=alert(1)>"
 
 
 def _page(a: Path, b: Path, limit: float | None = 0.05) -> str:
-    return comparison_page(compare_runs(open_run(a), open_run(b), Gate((Figure(limit=limit),)))).decode()
+    return comparison_page(compare_runs(open_run(a), open_run(b), (Figure(limit=limit),))).decode()
 
 
 def _text(page: str) -> str:

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from made_runs import START_NS, drive_tracks, write_run
 
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
-from pdhef_logtool.reports.drive import drive_page, roles_of
+from pdhef_logtool.reports.drive import drive_page
 from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.storage.documents import seal
@@ -40,9 +40,7 @@ def figures(page: str) -> dict:
 
 def test_a_page_has_its_figures_and_needs_nothing_else(tmp_path):
     page = page_of(write_run(tmp_path, drive_tracks()))
-    assert {"sideslip", "error", "trust", "r_scale", "nis", "speed", "ay", "strip", "path", "phase"} <= set(
-        figures(page)
-    )
+    assert {"sideslip", "error", "yaw_rate", "speed", "ay", "strip", "path", "ay_sideslip"} <= set(figures(page))
     assert page.count("<script") == page.count("</script>")
     assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page) == ['href="../../report.html"']
     assert " style=" not in page
@@ -113,15 +111,6 @@ def test_a_damaged_report_stops_no_other_page(tmp_path):
     assert result.pages[1].file.is_file()
 
 
-@pytest.mark.parametrize("outcome", ["better", "worse", "same", "undecided", "none"])
-def test_the_comparison_with_physics_follows_the_first_screen(tmp_path, outcome):
-    verdict = {"signal": "sideslip_rad", "outcome": outcome, "text": "a sentence", "rival": "zero"}
-    folder = write_run(tmp_path, drive_tracks(), verdicts=[verdict])
-    page = page_of(folder)
-    assert "Comparison with physics sideslip: " in words(page) and "a sentence" in words(page)
-    assert roles_of(open_run(folder).logs[0].report()).rival == "zero"
-
-
 def plan_of(*outcomes: str) -> dict:
     """Return the plan of a report with one requirement per outcome."""
     return {
@@ -147,7 +136,7 @@ def test_the_first_screen_has_answer_verdicts_what_was_tested_the_worst_place_an
         "Plan plan.toml: 1 FAIL, 1 INCONCLUSIVE, 1 PASS", "FAIL Title 1 SR-1", "INCONCLUSIVE Title 2 SR-2",
         "PASS Title 0 SR-0 value 0.458° limit ≤ 0.573° margin +0.115° scored 1 drive, 2.0 min, 3.0 km",
         "Note: interval from blocks of 10 s.", "Tested Car sedan", "Largest error", "Next SR-1: do 1 SR-2: do 2",
-        "Comparison with physics", "Over time",
+        "Over time",
     ]  # fmt: skip
     places = [text.find(part) for part in order]
     assert -1 not in places and places == sorted(places), dict(zip(order, places, strict=True))
@@ -209,7 +198,6 @@ def hostile_run(folder: Path) -> Path:
             {"name": h, "subject": h, "verdict": "failed", "evidence": h, "remedy": h, "waived": False} for h in HOSTILE
         ],
         versions=dict.fromkeys(HOSTILE, all_of_it),
-        verdicts=[{"signal": h, "outcome": h, "text": h, "rival": h} for h in HOSTILE],
         metadata=dict(zip(HOSTILE, HOSTILE, strict=True)),
         vehicle={"name": all_of_it, "file": all_of_it, "sha256": "0", "proven": False, "low_speed_blend_m_s": 3.0},
     )

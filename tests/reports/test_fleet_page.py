@@ -33,7 +33,6 @@ def run_of(folder: Path, drives: Mapping[str, Mapping[str, Any]], failed: Mappin
             "vehicle": {"name": "golf"},
             "truth": {"available": True, "not_independent": []},
             "answer": {"main": "pd-hef", "naive": "zero"},
-            "verdicts": [{"signal": "sideslip_rad", "outcome": "better", "text": "x"}],
             "operating_space": {"speed_edges_m_s": [0, 5, 10], "ay_edges_m_s2": [0, 1], "cells": cells},
             **given,
         }

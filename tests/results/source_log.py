@@ -6,8 +6,10 @@ import json
 from pathlib import Path
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 from rosbags.typesys import Stores, get_typestore
+
+from tests.mcap_files import mcap_writer
 
 START_NS = 1_700_000_000_000_000_123
 IMU = "sensor_msgs/msg/Imu"
@@ -17,9 +19,9 @@ def write_source(path: Path, seconds: float = 6.0) -> None:
     """Write IMU at 100 Hz (CDR), speed at 20 Hz (JSON), bytes at 1 Hz (no schema), attachments and metadata."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     definition, _ = store.generate_msgdef(IMU, ros_version=2)
-    with path.open("wb") as stream:
-        writer = Writer(stream, compression=CompressionType.LZ4, chunk_size=20_000)
-        writer.start(profile="ros2", library="recorder 1.2")
+    with mcap_writer(
+        path, profile="ros2", library="recorder 1.2", compression=CompressionType.LZ4, chunk_size=20_000
+    ) as writer:
         imu_schema = writer.register_schema(IMU, "ros2msg", definition.encode())
         speed_schema = writer.register_schema("can.Speed", "jsonschema", b'{"type": "object"}')
         imu = writer.register_channel("/imu", "cdr", imu_schema, {"offered_qos_profiles": "- depth: 10"})
@@ -36,7 +38,6 @@ def write_source(path: Path, seconds: float = 6.0) -> None:
                 writer.add_message(speed, stamp + 4_000_000, text, stamp + 1, sequence=i)
             if i % 100 == 50:
                 writer.add_message(blob, stamp + 5_000_000, bytes([i % 256, 0, 255]), stamp, sequence=7)
-        writer.finish()
 
 
 def _imu(store, stamp_ns: int, i: int) -> bytes:

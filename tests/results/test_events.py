@@ -93,13 +93,6 @@ def test_other_tracks_are_read_at_the_same_stamps(run: Path, tmp_path: Path) -> 
     assert len(_find(scored, "vx_m_s > 0", estimator="esc").events) == 1
 
 
-def test_a_damaged_file_leaves_a_drive_out(run: Path) -> None:
-    (run / "logs" / "a" / "estimates.parquet").write_bytes(b"PAR1 no")
-    found = _find(run, "speed_m_s > 1")
-    assert found.left_out["a"].startswith("one that cannot be read")
-    assert (found.exit_code, {e.drive for e in found.events}) == (3, {"b", "no_truth"})
-
-
 def test_rows_are_written_as_parquet_even_none(run: Path, tmp_path: Path) -> None:
     write_events(tmp_path / "e.parquet", _find(run, "speed_m_s < 3"))
     table = pl.read_parquet(tmp_path / "e.parquet")

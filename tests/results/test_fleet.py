@@ -28,10 +28,9 @@ def report(label: str, **changes: Any) -> dict[str, Any]:
         "vehicle": {"name": "golf"},
         "truth": {"available": True, "not_independent": []},
         "answer": {"main": "pd-hef", "naive": "zero"},
-        "friction": {"source": "option, 0.9"},
+        "friction": {"source": "option", "value": 0.9, "topic": None, "given": True},
         "checks": [],
         "faults": [],
-        "verdicts": [{"signal": "sideslip_rad", "outcome": "better", "text": "x"}],
         "operating_space": {"speed_edges_m_s": [0, 5, 10, 15, 20], "ay_edges_m_s2": [0, 1, 2], "cells": cells},
         "metadata": {},
     }

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
-from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, judge
 from pdhef_logtool.evaluation.validation_plan import Requirement, ValidationPlan
-from pdhef_logtool.results.junit import junit_bytes, write_junit
+from pdhef_logtool.results.junit import junit_bytes
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 WORST = Requirement("R1", "No bad drive", "sideslip_rad", limit=0.02, statistic="worst drive")
@@ -66,9 +65,3 @@ def test_checks_that_did_not_pass_are_properties() -> None:
 def test_any_name_gives_xml_that_parsers_read(name: str) -> None:
     root = ET.fromstring(junit_bytes(verdicts(0.03, title=name)))
     assert len(root.findall(".//failure")) == 1
-
-
-def test_file_appears_under_its_name_alone(tmp_path: Path) -> None:
-    write_junit(tmp_path / "deep" / "gate.xml", verdicts(0.01))
-    assert [p.name for p in (tmp_path / "deep").iterdir()] == ["gate.xml"]
-    assert (tmp_path / "deep" / "gate.xml").read_bytes() == junit_bytes(verdicts(0.01))

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import NonSeekingReader, make_reader
-from mcap.writer import Writer
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 from source_log import write_source
@@ -18,6 +17,7 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.mcap_sink import AnnotatedMcap, thinned_step_ns
 from pdhef_logtool.results.sink import Event
+from tests.mcap_files import copied, mcap_writer
 
 STATE = "pdhef_msgs/msg/VehicleStateEstimate"
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -202,19 +202,8 @@ def test_metrics_record_and_report_attachment(annotated):
 
 def cdr_only(path: Path, source: Path) -> None:
     """Copy the CDR topics, as rosbags opens no file with other encodings."""
-    with source.open("rb") as stream, path.open("wb") as out:
-        reader = make_reader(stream)
-        writer = Writer(out)
-        writer.start(profile="ros2", library="test")
-        channels: dict[int, int] = {}
-        for schema, channel, message in reader.iter_messages():
-            if channel.message_encoding != "cdr":
-                continue
-            if channel.id not in channels:
-                id_ = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, "cdr", id_)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
-        writer.finish()
+    with mcap_writer(path, profile="ros2") as writer:
+        list(copied(source, writer, lambda channel: channel.message_encoding == "cdr"))
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ import numpy as np
 import polars as pl
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from pdhef_logtool.mapping.records import Mapping, SignalSource
 from pdhef_logtool.records.errors import UsageError
@@ -20,31 +19,7 @@ from pdhef_logtool.results.no_position import topics_with_position
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import Schedule, run_logs
 from tests.fake_drive_log import FakeLog, FakeTopic
-
-PLACES = {"/rtk/odometry", "/rtk/fix", "/truth/perfect/odometry"}
-
-
-def test_tables_and_copy_of_a_run_contain_no_place(sample_logs_dir, tmp_path):
-    config = RunConfig(
-        car=sample_logs_dir / "vehicle.toml",
-        estimators=("kinematic",),
-        keep="estimates",
-        annotate="full",
-        no_position=True,
-        end="2",
-    )
-    run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config, report=False)
-    (folder,) = (tmp_path / "out" / "logs").iterdir()
-    estimates = pl.read_parquet(folder / "estimates.parquet")
-    assert {"kinematic", "truth"} <= set(estimates["estimator"])
-    for name in ("x_m", "y_m", "yaw_rad"):
-        assert estimates[name].drop_nulls().drop_nans().is_empty()
-    assert not estimates["vx_m_s"].drop_nulls().drop_nans().is_empty()
-    copied = _topics(folder / "annotated.mcap")
-    assert {"/imu/data", "/pdhef/kinematic/state"} <= copied
-    assert not PLACES & copied
-    assert sample_logs_dir.joinpath("dlc.mcap").exists()
-    assert _topics(sample_logs_dir / "dlc.mcap") >= PLACES
+from tests.mcap_files import mcap_writer
 
 
 def _topics(path: Path) -> set[str]:
@@ -108,9 +83,7 @@ SECRETS = (b"57.1234", b"Hemliga", b"Alice", b"jane", b"to_work", b"/gpx", b"Ope
 def _personal_log(path: Path) -> None:
     """Write 6 s of a drive with places in topics, attachment, metadata and channel metadata."""
     path.parent.mkdir()
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
+    with mcap_writer(path) as writer:
         turn = {"/car": {"speed": 20.0, "steering_wheel_angle": 0.1}, "/imu": {"ax": 0.0, "ay": 1.0, "yaw_rate": 0.05}}
         channels = {}
         for topic, message in (turn | PLACES_IN_JSON).items():
@@ -125,7 +98,6 @@ def _personal_log(path: Path) -> None:
                 writer.add_message(channels[topic], at_ns, json.dumps(moved).encode(), at_ns)
         writer.add_attachment(0, 0, "route/gpx", "text/xml", b'<trkpt lat="57.123456">')
         writer.add_metadata("drive", {"driver": "Alice", "start": "57.123456"})
-        writer.finish()
 
 
 def _all_bytes(folder: Path) -> Iterator[tuple[str, bytes]]:
@@ -157,7 +129,10 @@ def test_no_output_contains_a_place_a_name_of_a_file_or_metadata(tmp_path, jobs)
     assert {name for name, data in _all_bytes(tmp_path / "out") if any(secret in data for secret in SECRETS)} == set()
     digits = hashlib.sha256(log.read_bytes()).hexdigest()[:8]
     folder = tmp_path / "out" / "logs" / f"log-{digits}"
-    assert {"/car", "/imu"} <= _topics(folder / "annotated.mcap")
+    assert {"/car", "/imu", "/pdhef/zero/state"} <= _topics(folder / "annotated.mcap")
+    estimates = pl.read_parquet(folder / "estimates.parquet")
+    assert not estimates["vx_m_s"].drop_nulls().drop_nans().is_empty()
+    assert all(estimates[name].drop_nulls().drop_nans().is_empty() for name in ("x_m", "y_m", "yaw_rad"))
     remarks = next(r.report["remarks"] for r in result.results if r.report)
     assert "--no-position leaves out topics /array, /place, /text, attachments, metadata and file names" in remarks
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.evaluation.reasons import Interval, ReasonFacts
+from pdhef_logtool.evaluation.operating_space import Cell, OperatingSpace
+from pdhef_logtool.evaluation.reasons import Interval, ReasonFacts, SensorFault
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.results.run_report import LogOutcome, build_run, report_markdown, write_json
 from pdhef_logtool.results.sink import Event
@@ -113,3 +114,12 @@ def test_json_is_sorted_and_the_same_each_time(tmp_path):
         '{\n  "a": null,\n  "b": 1,\n  "c": {\n    "y": "β",\n    "z": 1\n  }\n}\n'.encode()
     )
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_records_of_a_drive_follow_the_schema() -> None:
+    fault = SensorFault("ay_m_s2", "spike", 70, 1.0, (Interval(1, 2),))
+    space = OperatingSpace([Cell(3, 2, 1.5, 0, float("nan"))], 12.3, 2.5, 0.9)
+    document = report(faults=[fault], metadata={"vehicle": "a"}, operating_space=space)
+    follows({**document, "estimators": []})
+    assert document["operating_space"]["cells"][0]["sideslip_mse_rad2"] is None
+    assert report(faults=None)["faults"] is None

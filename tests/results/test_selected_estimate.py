@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from run_report import GNSS, MAIN, TRUTH, errors_deg, figures, ran, report, truth
 
+from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
+from pdhef_logtool.evaluation.validation_plan import SIDESLIP
 from pdhef_logtool.results.selected_estimate import MainFacts
 
 UNKNOWN = {"file": None, "proven": False}
@@ -24,6 +27,16 @@ def test_the_result_says_how_good_against_which_truth_and_against_whom() -> None
         "Sideslip RMSE of pd-hef: 0.100° (ground truth: /ins), 17 % lower than physics (0.120°), "
         "1/10 of zero sideslip (1.00°)"
     )
+
+
+def test_the_interval_of_the_error_needs_six_blocks_of_time() -> None:
+    def said(count: int) -> str:
+        value = np.deg2rad(np.linspace(0.08, 0.12, count)).tolist()
+        blocks = RequirementBlocks(SIDESLIP.measured, "pd-hef", 10.0, range(count), [9] * count, (), (), value)
+        return texts(metrics=errors_deg(pd_hef=0.1), requirement_blocks=[blocks])["result"]
+
+    assert "0.100° (95 % CI 0.085° to 0.119°; ground truth: /ins)" in said(6)
+    assert "CI" not in said(5)
 
 
 @pytest.mark.parametrize(
@@ -93,8 +106,8 @@ def test_what_was_assumed_of_car_friction_and_network() -> None:
     unknown = texts(vehicle=UNKNOWN)
     assert unknown["assumed"].startswith("default sedan (no car given)")
     assert unknown["next"].startswith("give your car")
-    assumed = texts(friction={"source": "assumed, 1"})
-    assert "friction assumed, 1;" in assumed["assumed"]
+    assumed = texts(friction={"source": "no value given", "value": 1.0, "topic": None, "given": False})
+    assert "friction assumed (no value given, 1);" in assumed["assumed"]
     assert "--friction" in assumed["next"]
     assert texts(replace(MAIN, name="zero"))["assumed"] == "no vehicle model (zero needs none)"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 import zlib
 from pathlib import Path
@@ -40,6 +41,16 @@ def stub_drive(task: DriveTask, tell: Tell) -> DriveEnd:
     outputs = states_of(task.output, [part, *(f"logs/{log.stem}/{p.name}" for p in report.parent.iterdir())])
     record = {"digest": digest_of(record["parts"]), **record}
     return DriveEnd(outcome, identity, record, part, error_rad=value, outputs=outputs)
+
+
+def planted_stub(task: DriveTask, tell: Tell) -> DriveEnd:
+    """Hang or be killed if the log has that name, else do the work."""
+    if task.log.stem == "hangs":
+        tell("before it hangs", 0.1)
+        time.sleep(3600.0)
+    if task.log.stem == "kills":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return stub_drive(task, tell)
 
 
 def waiting_drive(folder: Path, task: DriveTask, tell: Tell) -> DriveEnd:

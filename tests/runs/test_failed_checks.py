@@ -1,4 +1,4 @@
-"""A failed check is in the report and makes the exit code of a run 3, until a person waives it by name."""
+"""A failed check is told by a drive and an inspection; test_check_registry.py has the exit codes of a run."""
 
 from __future__ import annotations
 
@@ -12,10 +12,7 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map, load_mapping, mapping_to_toml
-from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.inspection import inspect_log
-from tests.run_report import follows
 
 
 @pytest.fixture
@@ -47,20 +44,3 @@ def test_inspecting_shows_checks_of_the_same_names(sample_logs_dir: Path, wrong_
     assert not found.is_partial
     (check,) = (c for c in json.loads(json.dumps(found.to_dict()))["checks"] if c["verdict"] == "failed")
     assert check["subject"] == "steer_rad"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("waived", "code"), [((), 3), (("steer_rad.sign",), 0)])
-def test_the_exit_code_of_a_run(
-    sample_logs_dir: Path, tmp_path: Path, wrong_sign: Path, waived: tuple[str, ...], code: int
-) -> None:
-    config = RunConfig(
-        estimators=("zero",), car=sample_logs_dir / "vehicle.toml", mapping=wrong_sign, keep="estimates", waived=waived
-    )
-    result = run_logs([str(sample_logs_dir / "sweep.mcap")], tmp_path / "out", config, report=False)
-    assert result.exit_code == code
-    report = json.loads((tmp_path / "out" / "logs" / "sweep" / "report.json").read_text())
-    follows(report)
-    (failed,) = (c for c in report["checks"] if c["verdict"] == "failed")
-    assert failed["waived"] == ("steer_rad.sign" in waived)
-    assert report["log"]["name"] == "sweep"

@@ -12,10 +12,8 @@ from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.logs import byte_source
 from pdhef_logtool.logs.byte_source import ChangedError
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.runs import working
+from pdhef_logtool.runs import fleet, working
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import Schedule, run_logs
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, run_drive
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.workers.supervisor import Tell
@@ -112,7 +110,10 @@ def full_disk(task: DriveTask, tell: Tell) -> DriveEnd | OutputError:
 
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_full_disk_ends_the_run_at_once_and_quarantines_nothing(tmp_path: Path, jobs: int) -> None:
+def test_a_full_disk_ends_the_run_at_once_and_quarantines_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jobs: int
+) -> None:
+    monkeypatch.setattr(fleet, "_PRELOAD", (__name__,))  # no compiled code
     folder, out = named_logs(tmp_path / "logs", "a", "b", "c", "d"), tmp_path / "out"
     run(folder, tmp_path / "undisturbed")
     work = Counted(full_disk) if jobs == 1 else full_disk
@@ -124,13 +125,3 @@ def test_a_full_disk_ends_the_run_at_once_and_quarantines_nothing(tmp_path: Path
         assert "; 1 of 4 logs are done" in str(raised.value)
     assert run(folder, out, resume=True).exit_code == 0
     assert contents(out) == contents(tmp_path / "undisturbed")
-
-
-@pytest.mark.slow
-def test_a_real_drive_that_meets_a_full_disk_ends_the_run(logs: Path, tmp_path: Path) -> None:
-    def meets(task: DriveTask, tell: Tell) -> DriveEnd | OutputError:
-        with failing_writes(1):
-            return run_drive(task, tell)
-
-    with pytest.raises(OutputError, match=r"No space left.*0 of 2 logs are done; --resume goes on"):
-        run_logs([str(logs)], tmp_path / "out", CONFIG, schedule=Schedule(), work=meets, reporter=Reporter())

@@ -69,16 +69,13 @@ def test_estimators_that_can_run(sample_logs_dir: Path) -> None:
 
 
 @pytest.mark.slow
-def test_inspect_names_missing_signals_and_the_next_command(shared_dir: Path) -> None:
-    dart = inspect_log(shared_dir / "reader_corpus" / "dart_ros1" / "4_sept_random_driving_fast.bag")
-    text = text_of(render_inspection, dart, 200)
+def test_missing_signals_are_named_and_doubtful_candidates_stand_in_the_file_as_comments(
+    shared_dir: Path, tmp_path: Path
+) -> None:
+    found = inspect_log(shared_dir / "reader_corpus" / "dart_ros1" / "4_sept_random_driving_fast.bag")
+    text = text_of(render_inspection, found, 200)
     assert "speed_m_s" in next(line for line in text.splitlines() if line.startswith("missing"))
     assert "pdhef map LOG" in text
-
-
-@pytest.mark.slow
-def test_doubtful_candidates_stand_in_the_file_as_comments(shared_dir: Path, tmp_path: Path) -> None:
-    found = inspect_log(shared_dir / "reader_corpus" / "dart_ros1" / "4_sept_random_driving_fast.bag")
     write_mapping(found, tmp_path / "m.toml")
     text = (tmp_path / "m.toml").read_text()
     assert "undecided: /steering_angle_1.data is taken" in text

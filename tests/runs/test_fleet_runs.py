@@ -24,9 +24,8 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import Schedule, run_logs
 from pdhef_logtool.runs.working import DriveEnd, DriveTask
 from pdhef_logtool.workers.supervisor import Limits, Tell
-from tests.fleet_soak.planted import planted_stub
 from tests.run_report import follows
-from tests.runs.stub_drives import stub_drive
+from tests.runs.stub_drives import planted_stub, stub_drive
 
 
 def named_logs(folder: Path, *names: str) -> Path:
@@ -221,7 +220,7 @@ def test_a_failure_that_may_pass_is_tried_again_and_others_when_asked(tmp_path: 
 def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fleet, "_PRELOAD", ("tests.fleet_soak.planted",))  # all that a stub needs
+    monkeypatch.setattr(fleet, "_PRELOAD", ("tests.runs.stub_drives",))  # all that a stub needs
     logs, out = named_logs(tmp_path / "logs", "a", "hangs", "b", "kills"), tmp_path / "out"
     result = run(logs, out, work=planted_stub, jobs=2, limits=Limits(2.0))
     assert result.exit_code == 3
@@ -236,26 +235,39 @@ def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(
     assert work.asked == ["hangs", "kills"]
 
 
+@pytest.mark.fleet
+def test_memory_is_flat_to_3000_logs(tmp_path: Path) -> None:
+    memory: list[int] = []
+
+    def noted(*_: object) -> None:
+        memory.append(int(Path("/proc/self/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE"))
+
+    logs = named_logs(tmp_path / "logs", *(f"log_{i:05d}" for i in range(3000)))
+    run_logs([str(logs)], tmp_path / "out", RunConfig(), report=False, work=stub_drive, reporter=Reporter(noted))
+    assert len(labels(tmp_path / "out")) == 3000
+    assert memory[-1] - memory[len(memory) // 10] < 30e6
+
+
 @pytest.mark.slow
 def test_two_jobs_that_are_killed_and_go_on_leave_what_one_job_leaves(
-    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")]
-    config = RunConfig(car=Path("saloon"), estimators=("zero", "kinematic"), keep="estimates", end="1.5")
-    one, two = tmp_path / "one", tmp_path / "two"
-    assert run_logs(logs, one, config).exit_code == 0
+    monkeypatch.setattr(fleet, "_PRELOAD", ("tests.runs.stub_drives",))  # all that a stub needs
+    logs, one, two = named_logs(tmp_path / "logs", "a", "b", "c", "d"), tmp_path / "one", tmp_path / "two"
+    run(logs, one)
 
-    def killed(line: str, share: float) -> None:
+    def killed(_line: str, share: float) -> None:
         if share > 0.5:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(fleet, "_PRELOAD", ("pdhef_logtool.runs.*",))  # no compiled code
+    schedule = Schedule(jobs=2)
     with pytest.raises(KeyboardInterrupt):
-        run_logs(logs, two, config, schedule=Schedule(jobs=2), reporter=Reporter(killed))
-    assert run_logs(logs, two, config, schedule=Schedule(jobs=2, resume=True)).exit_code == 0
+        run_logs(
+            [str(logs)], two, RunConfig(), schedule=schedule, reporter=Reporter(killed), report=False, work=stub_drive
+        )
+    assert 0 < len(labels(two)) < 4
+    run(logs, two, jobs=2, resume=True)
     assert contents(one) == contents(two)
-    folder = two / "logs/dlc"
-    assert {p.name for p in folder.iterdir()} == {"estimates.parquet", "metrics.parquet", "report.json", "model.toml"}
 
 
 @pytest.mark.slow
@@ -273,8 +285,8 @@ def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir: Path,
     assert (tmp_path / "logs" / worst / "recording.rrd").is_file()
     assert (tmp_path / "logs" / worst / "report.html").is_file()
     assert (tmp_path / "report.html").is_file()
-    assert {r.metric for r in result.results[0].rows} >= {"rmse", "nees", "lag_s"}
-    assert [(r.document, r.figures) for r in result.results] == [(None, None)] * 2  # no drive stays in memory
+    assert set(pl.read_parquet(tmp_path / "metrics.parquet")["metric"]) >= {"rmse", "nees", "lag_s"}
+    assert [(r.document, r.rows) for r in result.results] == [(None, ())] * 2  # no drive stays in memory
 
 
 def test_a_fleets_summary_counts_what_the_figures_say(tmp_path: Path) -> None:

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.runs.inspection import inspect_log
 from pdhef_logtool.runs.inspection.page import inspection_page, sparkline
 from tests.command_line import called
+from tests.mcap_files import mcap_writer
 from tests.reports.browser import AXE, CHROMIUM, WHY_NOT, Browser, serious
 
 HOSTILE = "/<script>document.title='ran'</script>\x1b[31m\u202e&quot;\"'"
@@ -31,9 +31,7 @@ def _text(page: str) -> str:
 
 def write_log(path: Path, topics: dict[str, dict[str, np.ndarray]]) -> Path:
     """Write JSON messages at 20 Hz."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="", library="test")
+    with mcap_writer(path) as writer:
         for topic, columns in topics.items():
             kinds = {name: {"type": "number"} for name in columns}
             schema = writer.register_schema(f"t{topic}", "jsonschema", json.dumps({"properties": kinds}).encode())
@@ -41,7 +39,6 @@ def write_log(path: Path, topics: dict[str, dict[str, np.ndarray]]) -> Path:
             for i in range(len(next(iter(columns.values())))):
                 data = json.dumps({name: float(column[i]) for name, column in columns.items()}).encode()
                 writer.add_message(channel, 10**18 + i * 50_000_000, data, 10**18 + i * 50_000_000)
-        writer.finish()
     return path
 
 

@@ -134,6 +134,13 @@ def test_a_log_with_a_dropout_and_losses(shared_dir: Path) -> None:
     imu = next(t for t in found.topics if t.name == "/imu/data")
     assert imu.largest_gap_s == pytest.approx(30.01, abs=0.02)
     assert imu.largest_gap_at_s == pytest.approx(135.0, abs=0.1)
+    counts = {(x.kind, x.where.split(" ")[0]): x.count for x in found.lost if x.kind in ("nan", "duplicate-stamp")}
+    assert counts == {
+        ("nan", "ay_m_s2"): 2,
+        ("nan", "yaw_rate_rad_s"): 1,
+        ("nan", "steer_rad"): 2,
+        ("duplicate-stamp", "/imu/data"): 20,
+    }
     assert found.signals["ay_m_s2"].dropped == {"nan": 2, "duplicate-stamp": 20}
     # The ground truth of the same name has lost no sample.
     assert found.truth["yaw_rate_rad_s"].dropped == {}

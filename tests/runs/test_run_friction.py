@@ -47,11 +47,11 @@ def run(log: Path, out: Path, **changes: Any) -> tuple[dict[str, Any], pl.DataFr
 @pytest.mark.parametrize(
     ("choice", "with_topic", "car", "source", "value"),
     [
-        ("auto", True, "sample", "topic /truth/perfect/state.friction", SLIPPERY),
-        ("auto", False, "sample", "vehicle file, 0.85", 0.85),
-        ("file", True, "sample", "vehicle file, 0.85", 0.85),
-        (0.5, False, "car", "option, 0.5", 0.5),
-        ("auto", False, "car", "assumed, 1", 1.0),
+        ("auto", True, "sample", "topic", SLIPPERY),
+        ("auto", False, "sample", "vehicle file", 0.85),
+        ("file", True, "sample", "vehicle file", 0.85),
+        (0.5, False, "car", "option", 0.5),
+        ("auto", False, "car", "no value given", 1.0),
     ],
 )
 def test_what_is_asked_for_is_told_to_the_estimators(
@@ -61,7 +61,9 @@ def test_what_is_asked_for_is_told_to_the_estimators(
     file = sample_logs_dir / "vehicle.toml" if car == "sample" else files / "car.toml"
     mapping = files / "told.toml" if with_topic else None
     report, track = run(sample_logs_dir / "sweep.mcap", tmp_path, car=file, mapping=mapping, friction=choice, end="+3s")
-    assert report["friction"] == {"source": source}
+    assert report["friction"]["source"] == source
+    assert report["friction"]["given"] is (source != "no value given")
+    assert report["friction"]["topic"] == ("/truth/perfect/state.friction" if source == "topic" else None)
     friction = track.filter(pl.col("estimator") != "truth")["friction"].drop_nulls().drop_nans().to_numpy()
     assert friction.size
     np.testing.assert_allclose(friction, value, atol=1e-6)

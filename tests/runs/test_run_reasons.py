@@ -1,4 +1,4 @@
-"""A gyro that sticks in a simulated drive: the report, the recording's tables and the terminal say so."""
+"""An a_y that sticks and a gyro with bursts in a sample log: report, tables and terminal name them."""
 
 from __future__ import annotations
 
@@ -6,83 +6,78 @@ import io
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from rich.console import Console
 
 from pdhef_logtool.cli.run_tables import render_run
-from pdhef_logtool.records.reasons import STUCK_YAW_RATE
-from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
-from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.residual_model.network import ResidualNetwork
+from pdhef_logtool.records.reasons import STUCK_AY
 from pdhef_logtool.results.parquet_sink import read_track
 from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
 from tests.run_report import follows
-from truthsim.drive import simulate_drive, write_drive
-from truthsim.faults import parse_fault
 
 pytestmark = pytest.mark.slow
 
-START_S, END_S = 2.0, 4.0
+#: Planted faults, s from the start.
+FAULTS = {("yaw_rate_rad_s", "burst"): (5.0, 8.0), ("ay_m_s2", "stuck"): (12.0, 14.0)}
+START_S, END_S = FAULTS["ay_m_s2", "stuck"]
 
 
 @pytest.fixture(scope="module")
-def stuck_run(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, Path]:
-    folder = tmp_path_factory.mktemp("stuck")
-    fault = parse_fault(f"stuck:yaw_rate:{START_S:g}:{END_S:g}")
-    write_drive(simulate_drive("sine-sweep", seed=5, duration_s=8.0, faults=[fault]), folder / "stuck.mcap")
-    torch.manual_seed(0)
-    n = len(FEATURES)
-    network = ResidualNetwork(n, 8, 1, (4,))
-    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
-    scale = Normalisation((0.0,) * n, (10.0,) * n, (1.0, 1.0))
-    ModelBundle(FEATURES, 8, 1, (4,), 0.01, scale, weights).save(folder / "model")
-    config = RunConfig(
-        car=sample_logs_dir / "vehicle.toml",
-        network=folder / "model",
-        estimators=("phy-ukf", "pd-hef"),
-        keep="estimates",
-    )
-    return run_logs(
-        [str(folder / "stuck.mcap")], folder / "out", config, report=False
-    ), folder / "out" / "logs" / "stuck"
+def result(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    config = RunConfig(car=Path("saloon"), estimators=("phy-ukf", "pd-hef"), keep="estimates", end="20")
+    return run_logs([str(sample_logs_dir / "faults.mcap")], tmp_path_factory.mktemp("out"), config, report=False)
+
+
+@pytest.fixture(scope="module")
+def report(result: RunResult) -> dict[str, Any]:
+    document = json.loads((Path(str(result.place)) / "logs/faults/report.json").read_text())
+    follows(document)
+    return dict(document)
 
 
 def told(text: str) -> tuple[float, float]:
-    found = re.search(r"gyro stuck (\d+\.\d)-(\d+\.\d) s", text)
+    found = re.search(r"a_y stuck (\d+\.\d)-(\d+\.\d) s", text)
     assert found, text
     return float(found[1]), float(found[2])
 
 
-def test_the_report_says_when_the_gyro_stuck(stuck_run: tuple[RunResult, Path]) -> None:
-    _, folder = stuck_run
-    report = json.loads((folder / "report.json").read_text())
-    follows(report)
+def test_the_report_names_the_faults_with_their_times(report: dict[str, Any]) -> None:
+    assert report["plan"] is None  # nobody gave one, and one drive decides little
+    start_ns = report["log"]["start_ns"]
+    found = {
+        (f["sensor"], f["kind"]): ((i["start_ns"] - start_ns) * 1e-9, (i["end_ns"] - start_ns) * 1e-9)
+        for f in report["faults"]
+        for i in f["intervals"]
+    }
+    assert found == {fault: pytest.approx(times, abs=0.6) for fault, times in FAULTS.items()}
     filters = {e["name"]: e["reasons"] for e in report["estimators"]}
     assert filters["phy-ukf"] is None
-    (stuck,) = [r for r in filters["pd-hef"] if r["name"] == "stuck_yaw_rate"]
+    (stuck,) = [r for r in filters["pd-hef"] if r["name"] == "stuck_ay"]
     assert stuck["intervals"] == 1 and stuck["longest"] == [{"start_ns": stuck["first_ns"], "end_ns": stuck["end_ns"]}]
     # It is reported after it has lasted for 0.05 s.
-    assert told(report_markdown(report)) == (pytest.approx(START_S, abs=0.11), pytest.approx(END_S, abs=0.11))
+    assert told(report_markdown(report)) == pytest.approx((START_S, END_S), abs=0.11)
 
 
-def test_the_track_has_the_bit_where_the_gyro_stuck_and_nowhere_else(stuck_run: tuple[RunResult, Path]) -> None:
-    track = read_track(stuck_run[1] / "estimates.parquet", "pd-hef")
-    times = (track.stamps_ns - track.stamps_ns[0]) * 1e-9
-    stuck = track.reason & STUCK_YAW_RATE > 0
+def test_the_track_has_the_bit_where_the_sensor_stuck_and_nowhere_else(
+    result: RunResult, report: dict[str, Any]
+) -> None:
+    track = read_track(Path(str(result.place)) / "logs/faults/estimates.parquet", "pd-hef")
+    times = (track.stamps_ns - report["log"]["start_ns"]) * 1e-9
+    stuck = track.reason & STUCK_AY > 0
     assert stuck[(times > START_S + 0.1) & (times < END_S - 0.05)].all()
     assert not stuck[(times < START_S) | (times > END_S + 0.1)].any()
     assert np.isfinite(track.mixture_weight[track.valid]).all()
 
 
-def test_the_terminal_says_it_in_one_line(stuck_run: tuple[RunResult, Path]) -> None:
+def test_the_terminal_says_it_in_one_line(result: RunResult) -> None:
     out = io.StringIO()
-    render_run(stuck_run[0], Console(file=out, width=200))
-    (line,) = [one for one in out.getvalue().splitlines() if "gyro stuck" in one]
+    render_run(result, Console(file=out, width=200))
+    (line,) = [one for one in out.getvalue().splitlines() if "a_y stuck" in one]
     assert line.strip().startswith("pd-hef: ")
-    assert told(line) == (pytest.approx(START_S, abs=0.11), pytest.approx(END_S, abs=0.11))
+    assert told(line) == pytest.approx((START_S, END_S), abs=0.11)

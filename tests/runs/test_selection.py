@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -113,16 +112,15 @@ def test_the_interface_for_scripts_runs_the_same_ones(sample_logs_dir: Path) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["off", "auto"])
 def test_the_truth_of_a_log_never_chooses(
-    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: Any
+    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The best estimator by consistency is always selected here, so that a choice by ground truth would show."""
     monkeypatch.setattr(selection, "FACTOR", 0.0)
     answers, best = [], set()
     for name, text in (("right", TRUTH), ("shuffled", SHUFFLED)):
         (tmp_path / f"{name}.toml").write_text(text)
-        config = RunConfig(mapping=tmp_path / f"{name}.toml", keep="estimates", model=model, end="+4s")
+        config = RunConfig(mapping=tmp_path / f"{name}.toml", keep="estimates", end="+4s")
         result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config, report=False).results[0]
         assert result.report is not None
         answer = result.report["answer"]

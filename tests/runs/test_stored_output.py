@@ -184,7 +184,7 @@ def test_what_cannot_be_an_output_is_told_in_one_line(tmp_path: Path, s3: S3Stor
         run(logs, f"{s3.url}/held")
 
 
-@pytest.mark.parametrize("command", [("learn", "x", "--car", "saloon"), ("metrics", "x")])
+@pytest.mark.parametrize("command", [("learn", "x", "--car", "saloon"), ("metrics", "x"), ("extract", "x")])
 def test_what_writes_to_folders_alone_takes_no_url(
     command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from pdhef_logtool.car.car import SHIPPED_CARS, Car
 from pdhef_logtool.car.toml_files import read_vehicle_file
 from pdhef_logtool.evaluation.validation_plan import load_plan
-from pdhef_logtool.logs.can_decoding import load_dbc
 from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
 from pdhef_logtool.records.errors import EXIT_USAGE, PdhefError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, SHIPPED_FOLDERS, WEIGHTS_FILE, load_network
@@ -277,22 +276,3 @@ def test_hashes_that_stand_in_files_stay_what_they_were() -> None:
     assert mapping.sha256 == "95bc15effd8048a668853de7ce24f1e84c771acd8e1692d120c193d57d689937"
     linear = LinearModel(("ay_m_s2",), (0.5,), 0.25, 2.0)
     assert linear.sha256 == "47076088d4172941685a059bf407bb89750dff940ccc307b7ca6278cb1868aed"
-
-
-def test_a_dbc_that_is_none_is_a_wrong_mapping(tmp_path: Path) -> None:
-    (tmp_path / "folder.dbc").mkdir()
-    (tmp_path / "text.dbc").write_text("no DBC")
-    for name in ("folder.dbc", "text.dbc", "none.dbc"):
-        with pytest.raises(PdhefError) as caught:
-            load_dbc(tmp_path / name)
-        assert caught.value.exit_code == EXIT_USAGE
-
-
-def test_the_configurations_that_did_harm_are_wrong_ones(shared_dir: Path, tmp_path: Path) -> None:
-    cases = {"mapping.toml": "cfg_mapping.toml_RecursionError_1", DOCUMENT_FILE: "cfg_model.json_AttributeError_0"}
-    for loader in (one for one in LOADERS if one.name in cases):
-        file = shared_dir / "torture" / cases[loader.name]
-        if not file.is_file():
-            pytest.skip("needs ../shared/torture")
-        (tmp_path / loader.name).write_bytes(file.read_bytes())
-        assert outcome(loader, tmp_path / loader.name)

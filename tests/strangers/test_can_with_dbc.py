@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from pdhef_logtool import inspect_log
 from pdhef_logtool.drive.options import ReadOptions
@@ -18,6 +16,7 @@ from pdhef_logtool.mapping import fit_clocks, read_signals
 from pdhef_logtool.mapping.can_frames import decoded_frames
 from studies.strangers.cars import Series, drive
 from studies.strangers.containers import Topic, write
+from tests.mcap_files import copied, mcap_writer
 
 DBC = """VERSION ""
 NS_ :
@@ -88,18 +87,10 @@ def _topics(names: tuple[str, str]) -> list[Topic]:
 
 def _without_attachments(source: Path, target: Path, metadata: dict[str, bytes]) -> None:
     """Copy the messages of an MCAP, with DBC texts as a metadata record."""
-    with source.open("rb") as file, target.open("wb") as out:
-        writer = Writer(out)
-        writer.start()
-        channels: dict[int, int] = {}
-        for schema, channel, message in make_reader(file).iter_messages():
-            if channel.id not in channels:
-                schema_id = 0 if schema is None else writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, schema_id)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+    with mcap_writer(target) as writer:
+        list(copied(source, writer))
         if metadata:
             writer.add_metadata("dbc", {name: text.decode() for name, text in metadata.items()})
-        writer.finish()
 
 
 @pytest.mark.parametrize("place", ["attachments", "metadata", "given"])

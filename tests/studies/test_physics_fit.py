@@ -134,10 +134,10 @@ def test_the_car_at_theta_has_its_values_and_keeps_the_rest() -> None:
 
 @pytest.mark.slow
 def test_a_car_without_parts_is_given_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    few = {"ORDER": ("biases", "lag", "roll"), "MAX_ITERATIONS": 6, "TRIAL_ITERATIONS": 5, "STARTS": STARTS[:1]}
+    few = {"ORDER": ("biases", "lag", "roll"), "MAX_ITERATIONS": 4, "TRIAL_ITERATIONS": 3, "STARTS": STARTS[:1]}
     for name, value in {**few, "LEAST_FOLD_S": 5.0}.items():
         monkeypatch.setattr(physics_fit, name, value)
-    one, other = [static_drive(1, 12.0)], [static_drive(2, 12.0)]
+    one, other = [static_drive(1, 8.0)], [static_drive(2, 8.0)]
     told: list[str] = []
     found, tried = choose_parts([(one, other), (other, one)], guess(), progress=lambda text, _share: told.append(text))
     assert set(found.names) == set()

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
-import time
 import zlib
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -20,12 +17,8 @@ from studies.torture.mutating import mutant
 from studies.torture.seeds import SEEDS, write_seeds
 from studies.torture.table_damage import table_mutant, zeros
 from studies.torture.table_seeds import FORMATS, table_seeds
-from studies.torture.workers import Ended, Verdict, judge, read_journal, run_cases
+from studies.torture.workers import Ended, judge
 from tests.command_line import called
-
-
-def _quiet(_text: str) -> None:
-    """Print no progress."""
 
 
 @pytest.mark.slow
@@ -101,40 +94,6 @@ def test_what_outlives_a_command_or_its_limit_is_ended(
     monkeypatch.setattr(outside, "END_S", 0.5 if left else 60.0)
     process = outside.measured(limit_s=1.0 if late else 600.0)
     assert (process.late, process.left, process.code) == (late, left, -signal.SIGKILL if late else 3)
-
-
-def _case(folder: Path, number: int) -> Verdict:
-    with (folder / "done").open("a") as file:
-        file.write(f"{number}\n")
-    if number == 1:
-        os._exit(9)
-    if number == 2:
-        raise ValueError("no judge")
-    if number == 3:
-        time.sleep(60.0)
-    if number == 4:
-        kept = bytearray(b"x") * (700 << 20)
-        time.sleep(1.0)
-        del kept
-    return Verdict("exit 0")
-
-
-@pytest.mark.fleet
-@pytest.mark.slow
-def test_what_dies_hangs_or_grows_is_told_and_the_rest_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("studies.torture.workers.LIMIT_S", 5.0)
-    monkeypatch.setattr("studies.torture.workers.LIMIT_BYTES", 600 << 20)
-    journal = tmp_path / "cases.jsonl"
-    cases = run_cases(partial(_case, tmp_path), 8, journal, jobs=1, tell=_quiet)
-    assert [case.end for case in cases] == ["exit 0", *["no verdict"] * 4, *["exit 0"] * 3]
-    problems = ("exit code 9", "raised ValueError: no judge", "nothing heard for 5 s", "took more than")
-    assert all(problem in case.problem for problem, case in zip(problems, cases[1:5], strict=True))
-    with journal.open("a") as file:
-        file.write('[500, "exit')  # cut by a kill
-    before = (tmp_path / "done").read_text()
-    assert run_cases(partial(_case, tmp_path), 8, journal, jobs=1, tell=_quiet) == cases
-    assert (tmp_path / "done").read_text() == before
-    assert sorted(read_journal(journal), key=lambda case: case.number) == cases
 
 
 @pytest.mark.parametrize(

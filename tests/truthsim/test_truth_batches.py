@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import operator
+import shlex
 from collections import Counter
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.records.errors import UsageError
+from tests.command_line import pdhef
 from truthsim.batch import DriveSpec, Job, make_drive, run_jobs
 from truthsim.conditions import ROW_NAMES, plan_conditions, write_conditions
 from truthsim.suite import SHARES, is_held_out, plan_suite, write_suite
@@ -28,21 +30,22 @@ def digests(folder: Path) -> dict[str, str]:
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     folder = tmp_path_factory.mktemp("suite")
-    return folder, write_suite(folder, count=4, seed=3, duration_s=5.0, processes=2)
+    options = ("--count", 4, "--seed", 3, "--duration", 5, "--vehicles", "randomised", "--jobs", 2)
+    pdhef("simulate", "suite", "-o", folder, *options)
+    return folder, json.loads((folder / "manifest.json").read_text())
 
 
 def test_a_suite_does_not_depend_on_the_processes(suite: tuple[Path, dict], tmp_path: Path) -> None:
     folder, manifest = suite
-    alone = write_suite(tmp_path, count=4, seed=3, duration_s=5.0, processes=1)
+    alone = write_suite(tmp_path, count=4, seed=3, duration_s=5.0, processes=1, vehicles="randomised")
     assert alone == manifest
     assert digests(folder) == digests(tmp_path)
     assert (folder / "manifest.json").read_bytes() == (tmp_path / "manifest.json").read_bytes()
     assert not [p for p in folder.iterdir() if p.suffix not in (".mcap", ".json")]
 
 
-def test_a_suite_s_manifest_tells_what_is_there(suite: tuple[Path, dict]) -> None:
+def test_a_suite_s_manifest_tells_what_is_there(suite: tuple[Path, dict], tmp_path: Path) -> None:
     folder, manifest = suite
-    assert json.loads((folder / "manifest.json").read_text()) == manifest
     assert manifest["complete"] and manifest["written"] == len(manifest["drives"]) == 4
     assert sum(manifest["splits"].values()) == 4
     for entry in manifest["drives"]:
@@ -51,6 +54,9 @@ def test_a_suite_s_manifest_tells_what_is_there(suite: tuple[Path, dict]) -> Non
         assert entry["command"].startswith(f"pdhef simulate {entry['manoeuvre']} --speed ")
         assert entry["peak_share"] == pytest.approx(entry["peak_ay_m_s2"] / (entry["friction"] * 9.80665))
         assert not entry["spun"] and not entry["lifted"]
+    assert len({entry["vehicle"] for entry in manifest["drives"]}) == 4
+    pdhef(*shlex.split(manifest["drives"][1]["command"])[1:], "-o", tmp_path / "x.mcap")
+    assert hashlib.sha256((tmp_path / "x.mcap").read_bytes()).hexdigest() == manifest["drives"][1]["sha256"]
 
 
 def test_a_larger_suite_begins_with_the_smaller_one() -> None:
@@ -101,7 +107,7 @@ def test_what_is_there_is_kept_and_what_is_spoilt_is_made_again(suite: tuple[Pat
     (folder / names[1]).write_bytes(b"spoilt")
     (folder / names[2]).unlink()
     stamps = {name: (folder / name).stat().st_mtime_ns for name in names if (folder / name).exists()}
-    assert write_suite(folder, count=4, seed=3, duration_s=5.0) == manifest
+    assert write_suite(folder, count=4, seed=3, duration_s=5.0, vehicles="randomised") == manifest
     assert digests(folder) == before
     kept = [n for n in names if n in stamps and (folder / n).stat().st_mtime_ns == stamps[n]]
     assert kept == [names[0], *names[3:]]

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from other_readers import read_with_other_libraries
 from scipy import stats
 
 from pdhef_logtool.records.errors import UsageError
@@ -105,9 +104,8 @@ def test_late_and_lost_messages_and_a_clock_that_jumps(clean: Drive) -> None:
     assert everything["rtk"] is clean.channels["rtk"]
 
 
-def test_rtk_outages_open_the_gate_and_close_it() -> None:
+def test_rtk_outages_open_the_gate_and_close_it(clean: Drive) -> None:
     faults = [parse_fault("float:rtk:5:8"), parse_fault("lost:rtk:10:14")]
-    usual = simulate_drive("banked-road", seed=4, duration_s=DURATION_S)
     drive = simulate_drive("banked-road", seed=4, duration_s=DURATION_S, faults=faults)
     rtk, fix = drive.channels["rtk"], drive.channels["fix"]
     assert np.all(rtk.fields["quality"][inside(rtk, 5.0, 8.0)] == 5)
@@ -122,10 +120,10 @@ def test_rtk_outages_open_the_gate_and_close_it() -> None:
     assert rtk.fields["position_std_m"][inside(rtk, 13.9, 14.0)].min() > 0.1
     assert np.all(np.isnan(fix.fields["lat_deg"]) == (fix.fields["quality"] == 0))
     for key in ("x_m", "vy_m_s"):
-        assert np.array_equal(rtk.fields[key][good], usual.channels["rtk"].fields[key][good])
+        assert np.array_equal(rtk.fields[key][good], clean.channels["rtk"].fields[key][good])
     for name in ("imu", "steering", "wheels"):
         for key, column in drive.channels[name].fields.items():
-            assert np.array_equal(column, usual.channels[name].fields[key])
+            assert np.array_equal(column, clean.channels[name].fields[key])
 
 
 def test_every_fault_reads_back_from_its_text() -> None:
@@ -154,25 +152,12 @@ def test_what_is_no_fault_is_refused_in_one_line(text: str) -> None:
     assert "\n" not in str(caught.value) and "burst20:yaw_rate:5:8" in str(caught.value)
 
 
-def read(path: Path) -> tuple[dict[str, list], dict[str, str]]:
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    messages: dict[str, list] = {}
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        for schema, channel, message in reader.iter_messages():
-            if channel.topic not in messages:
-                store.register(get_types_from_msg(schema.data.decode(), schema.name))
-            messages.setdefault(channel.topic, []).append(store.deserialize_cdr(message.data, schema.name))
-        metadata = {m.name: m.metadata for m in reader.iter_metadata()}
-    return messages, metadata["truthsim"]
-
-
 def test_a_log_tells_its_faults_as_events_and_in_its_metadata(tmp_path: Path) -> None:
     texts = ("burst20:yaw_rate:2:4", "dropout:wheels:3:end", "lost:rtk:1:2")
     drive = simulate_drive("step-steer", faults=[parse_fault(t) for t in texts])
     write_drive(drive, tmp_path / "faulty.mcap", steering_wheel=True)
-    messages, metadata = read(tmp_path / "faulty.mcap")
-    events = messages["/truthsim/events"]
+    messages, _, metadata = read_with_other_libraries(tmp_path / "faulty.mcap")
+    events = [m for *_, m in messages["/truthsim/events"]]
     told = [((e.header.stamp.sec * 10**9 + e.header.stamp.nanosec - START_NS) * 1e-9, e.active) for e in events]
     assert told == [(1.0, True), (2.0, True), (2.0, False), (3.0, True), (4.0, False), (6.0, False)]
     first = events[1]
@@ -182,11 +167,11 @@ def test_a_log_tells_its_faults_as_events_and_in_its_metadata(tmp_path: Path) ->
     recorded = json.loads(metadata["faults"])
     assert [f["fault"] for f in recorded] == list(texts) and recorded[1]["end_s"] == 6.0
     assert len(messages["/vehicle/wheel_speeds"]) == 300
-    statuses = np.array([m.status.status for m in messages["/rtk/fix"]])
-    qualities = np.array([m.quality for m in messages["/rtk/quality"]])
+    statuses = np.array([m.status.status for *_, m in messages["/rtk/fix"]])
+    qualities = np.array([m.quality for *_, m in messages["/rtk/quality"]])
     assert np.all(statuses[10:20] == -1) and np.all(qualities[10:20] == 0) and np.sum(qualities != 4) == 10
-    odometry = messages["/rtk/odometry"]
+    odometry = [m for *_, m in messages["/rtk/odometry"]]
     assert odometry[199].pose.covariance[0] > odometry[110].pose.covariance[0] > odometry[50].pose.covariance[0]
-    wheel = np.array([m.angle_rad for m in messages["/vehicle/steering_wheel"]])
-    road = np.array([m.steering_tire_angle for m in messages["/vehicle/status/steering_status"]])
+    wheel = np.array([m.angle_rad for *_, m in messages["/vehicle/steering_wheel"]])
+    road = np.array([m.steering_tire_angle for *_, m in messages["/vehicle/status/steering_status"]])
     assert wheel == pytest.approx(16.0 * road, abs=1e-5)

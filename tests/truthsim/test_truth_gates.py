@@ -339,55 +339,25 @@ def recorded(factor: float, name: str) -> Wrong:
 
 COMPLIANCES = ("front_compliance_rad_per_n", "rear_compliance_rad_per_n")
 
-GATES: dict[Gate, list[Wrong]] = {
-    weight_is_carried: [times(1.1, "cg_to_front_axle_m"), times(1.1, "mass_kg")],
-    left_is_right: [recorded(1.1, "fz_fl_n"), recorded(-1.0, "fz_rr_n")],
-    steps_are_fine_enough: [recorded(1.1, "x_m"), recorded(-1.0, "vy_m_s")],
-    forces_lag_by_the_relaxation_length: [
-        tyres(1.1, "lateral_relaxation_m"),
-        tyres(-1.0, "lateral_relaxation_m"),
-        tyres(1.1, "stiffness_peak"),
-    ],
-    acceleration_is_that_of_the_velocities: [
-        *(recorded(factor, name) for factor in (-1.0, 1.1) for name in ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"))
-    ],
-    load_moves_as_statics_say: [
-        times(1.1, "cg_height_m"),
-        times(1.1, "front_anti_roll_n_m_per_rad"),
-        times(-1.0, "rear_anti_roll_n_m_per_rad"),
-        times(-1.0, "front_roll_centre_height_m", "rear_roll_centre_height_m"),
-        times(0.9, "track_m"),
-    ],
-    body_rolls_by_the_closed_form: [
-        times(1.1, "front_spring_n_per_m"),
-        times(1.1, "rear_anti_roll_n_m_per_rad"),
-        times(1.1, "tyre_vertical_n_per_m"),
-        times(-1.0, "front_anti_roll_n_m_per_rad"),
-        times(-1.0, "front_roll_centre_height_m"),
-    ],
-    understeer_is_linear_theory_s: [
-        times(1.1, COMPLIANCES[0]),
-        times(-1.0, COMPLIANCES[1]),
-        tyres(1.1, "stiffness_peak"),
-        times(1.1, "mass_kg"),
-    ],
-    responses_are_linear_theory_s: [
+GATES: dict[Gate, tuple[Wrong, ...]] = {
+    weight_is_carried: (times(1.1, "cg_to_front_axle_m"), times(1.1, "mass_kg")),
+    left_is_right: (recorded(1.1, "fz_fl_n"), recorded(-1.0, "fz_rr_n")),
+    steps_are_fine_enough: (recorded(1.1, "x_m"), recorded(-1.0, "vy_m_s")),
+    forces_lag_by_the_relaxation_length: (tyres(1.1, "lateral_relaxation_m"), tyres(1.1, "stiffness_peak")),
+    acceleration_is_that_of_the_velocities: tuple(recorded(1.1, n) for n in ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")),
+    load_moves_as_statics_say: (times(1.1, "cg_height_m"), times(1.1, "front_anti_roll_n_m_per_rad")),
+    body_rolls_by_the_closed_form: (times(1.1, "front_spring_n_per_m"), times(1.1, "tyre_vertical_n_per_m")),
+    understeer_is_linear_theory_s: (times(1.1, COMPLIANCES[0]), times(-1.0, COMPLIANCES[1])),
+    responses_are_linear_theory_s: (
         times(1.1, "yaw_inertia_kg_m2"),
-        times(-1.0, *COMPLIANCES),
-        tyres(1.1, "lateral_relaxation_m"),
         times(1.1, "front_damper_n_s_per_m", "rear_damper_n_s_per_m"),
-    ],
-    a_bank_is_felt: [Wrong(road=-1.0), Wrong(road=1.1)],
-    a_banked_bend_presses: [Wrong(road=-1.0), Wrong(road=1.1)],
-    a_hill_pulls: [Wrong(road=-1.0), Wrong(road=1.1)],
-    coasting_is_slowed_by_air_and_tyres: [
-        times(1.1, "drag_area_m2"),
-        times(-1.0, "drag_area_m2"),
-        times(1.1, "rolling_resistance"),
-        times(-1.0, "rolling_resistance"),
-    ],
-    torque_becomes_speed: [times(1.1, "wheel_radius_m"), times(0.9, "mass_kg")],
-    standing_still_is_still: [tyres(-1.0, "longitudinal_damping_s_per_m"), tyres(-1.0, "lateral_damping_s_per_m")],
+    ),
+    a_bank_is_felt: (Wrong(road=-1.0), Wrong(road=1.1)),
+    a_banked_bend_presses: (Wrong(road=-1.0), Wrong(road=1.1)),
+    a_hill_pulls: (Wrong(road=-1.0), Wrong(road=1.1)),
+    coasting_is_slowed_by_air_and_tyres: (times(1.1, "drag_area_m2"), times(1.1, "rolling_resistance")),
+    torque_becomes_speed: (times(1.1, "wheel_radius_m"), times(0.9, "mass_kg")),
+    standing_still_is_still: (tyres(-1.0, "longitudinal_damping_s_per_m"), tyres(-1.0, "lateral_damping_s_per_m")),
 }
 
 

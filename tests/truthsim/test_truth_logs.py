@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from other_readers import read_with_other_libraries
 
 from pdhef_logtool.car.toml_files import read_vehicle_file
 from studies.defaults import fit_nominal_tyres
@@ -31,24 +31,6 @@ TYPES = {
     "/truth/perfect/odometry": "nav_msgs/msg/Odometry",
     "/truth/perfect/state": "truthsim_msgs/msg/VehicleTruth",
 }
-
-
-def read_with_other_libraries(path: Path, *topics: str) -> tuple[dict[str, list], dict[str, str], dict[str, str]]:
-    """Messages of topics (default: all) as (log time, publish time, message), types, metadata; mcap and rosbags."""
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    messages: dict[str, list] = {}
-    types: dict[str, str] = {}
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        for schema, channel, message in reader.iter_messages(topics or None):
-            assert schema is not None and schema.encoding == "ros2msg" and channel.message_encoding == "cdr"
-            if channel.topic not in types:
-                store.register(get_types_from_msg(schema.data.decode(), schema.name))
-            types[channel.topic] = schema.name
-            decoded = store.deserialize_cdr(message.data, schema.name)
-            messages.setdefault(channel.topic, []).append((message.log_time, message.publish_time, decoded))
-        metadata = {m.name: m.metadata for m in reader.iter_metadata()}
-    return messages, types, metadata["truthsim"]
 
 
 def nanoseconds(stamp) -> int:

@@ -96,12 +96,6 @@ def _slowly(value: str, tell: Tell) -> str:
     return value
 
 
-def _burn(value: str, _tell: Tell) -> str:
-    while time.process_time() < 0.2:
-        pass
-    return value
-
-
 def _grow(_value: str, tell: Tell) -> None:
     held = []
     while True:
@@ -155,7 +149,6 @@ _FAULTS = {
     "stop": _stop,
     "cut": _cut,
     "slowly": _slowly,
-    "burn": _burn,
     "grow": _grow,
     "8 GB": _8_gb,
     "raise": _raise,

@@ -22,7 +22,6 @@ from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.reading import Drive, Tell, friction_of, logs_of, no_samples, read_drive
 from pdhef_logtool.drive.truth import derive_truth
-from pdhef_logtool.estimators.calibration.calibration import self_calibrate
 from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.estimators.table import FEATURES, FILTERS
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
@@ -61,6 +60,7 @@ from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import mapping_of
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.model.drive_model import DriveModel, read_driving
+from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import BoolArray, Loss
@@ -449,7 +449,7 @@ def _in_service(drive: Drive, job: _Job) -> tuple[DriveModel, str]:
     car = job.car
     if car.model is None or job.settings.model != PHYSICS_MODEL:
         return DriveModel.of(drive), ""
-    calibration = self_calibrate([read_driving(drive)], car.vehicle, taught=car.taught_prior)
+    calibration = fit_car(read_driving(drive), car.vehicle, car.taught_prior)
     return DriveModel.of(drive, calibration), calibration.text
 
 

@@ -133,20 +133,19 @@
     return out;
   }
 
+  /** Time of a figure: its own, or that of all figures of the page. */
+  const timeOf = (figure) => figure.data.time || page.time;
+
   /** Values on the figure's own instants: two a cell. */
-  function onGrid(values) {
-    const cells = page.time.cells;
+  function onGrid(values, cells) {
     if (values.length === 2 * cells) return values;
     const doubled = new Array(2 * cells);
     for (let i = 0; i < cells; i++) doubled[2 * i] = doubled[2 * i + 1] = values[i];
     return doubled;
   }
 
-  let instants = null;
-  function instantsOf() {
-    if (instants) return instants;
-    const { start, cell, cells } = page.time;
-    instants = new Float64Array(2 * cells);
+  function instantsOf({ start, cell, cells }) {
+    const instants = new Float64Array(2 * cells);
     for (let i = 0; i < cells; i++) {
       instants[2 * i] = start + (i + 0.25) * cell;
       instants[2 * i + 1] = start + (i + 0.75) * cell;
@@ -154,7 +153,8 @@
     return instants;
   }
 
-  const whole = () => [page.time.start, page.time.start + page.time.cell * page.time.cells];
+  const spanOf = ({ start, cell, cells }) => [start, start + cell * cells];
+  const whole = () => spanOf(page.time);
 
   // ---- words ------------------------------------------------------------------------------------------------------
 
@@ -265,8 +265,9 @@
 
   function drawTime(figure) {
     const { data: spec } = figure;
-    const nothing = new Array(2 * page.time.cells).fill(null);
-    const columns = [instantsOf()];
+    const time = timeOf(figure);
+    const nothing = new Array(2 * time.cells).fill(null);
+    const columns = [instantsOf(time)];
     const series = [{}];
     const bands = [];
     figure.items = [];
@@ -304,7 +305,7 @@
   function fill(figure) {
     for (const one of figure.items) {
       if (!isShown(one.item) || one.filled) continue;
-      for (let k = 0; k < one.parts.length; k++) figure.columns[one.at + k] = onGrid(decode(one.parts[k]));
+      for (let k = 0; k < one.parts.length; k++) figure.columns[one.at + k] = onGrid(decode(one.parts[k]), timeOf(figure).cells);
       one.filled = true;
     }
   }
@@ -686,6 +687,7 @@
     for (const figure of figures) draw[figure.data.kind](figure);
     makeToggles();
     if (page.time) zoomTo(null);
+    for (const figure of timed) if (figure.data.time) figure.chart.setScale("x", { min: spanOf(figure.data.time)[0], max: spanOf(figure.data.time)[1] });
     for (const button of document.querySelectorAll("button.jump")) {
       button.addEventListener("click", () => {
         zoomTo([Number(button.dataset.from), Number(button.dataset.to)]);

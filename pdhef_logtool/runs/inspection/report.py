@@ -339,11 +339,10 @@ def _topic_reports(
     log: DriveLog, index: ColumnarLog | None, stamps: MappingABC[str, Sequence[Columns]]
 ) -> tuple[TopicReport, ...]:
     """Return the reports of all topics; times are those of a local ``index``, else the ``stamps`` that were read."""
-    steps = {topic: Steps.of([c.log_time_ns for c in columns]) for topic, columns in stamps.items()}
+    times = {topic: [c.log_time_ns for c in columns] for topic, columns in stamps.items()}
     if index is not None and not index.is_remote:
-        steps |= {n: Steps.of([times]) for n, times in index.index_times(log.start_ns, log.end_ns).items()}
-    none = Steps.of([])
-    return tuple(_topic_report(t, steps.get(t.name, none), stamps.get(t.name, ()), log) for t in log.topics)
+        times |= {topic: [whole] for topic, whole in index.index_times(log.start_ns, log.end_ns).items()}
+    return tuple(_topic_report(t, Steps.of(times.get(t.name, ())), stamps.get(t.name, ()), log) for t in log.topics)
 
 
 def _topic_report(topic: TopicInfo, steps: Steps, stamps: Sequence[Columns], log: DriveLog) -> TopicReport:

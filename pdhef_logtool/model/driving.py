@@ -1,23 +1,22 @@
-"""Data of a log for its calibration: sensors on an even grid, in stretches of driving, without ground truth.
-
-A log is read and thinned window by window: ten hours take 72 MB. The result does not depend on the windows.
-"""
+"""Data of a drive for the fit of its car: sensors on an even grid, in stretches of driving."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.calibration.single_track import AY, FRICTION, SPEED, STEER, YAW_RATE
 from pdhef_logtool.estimators.speed_slip import believable
+from pdhef_logtool.model.equations import AY, FRICTION, SPEED, STEER, YAW_RATE
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 
 #: Step of the grid. The model is valid to 4 Hz; the integration is exact for tyre lags (12 ms at 40 m/s).
 STEP_S = 0.02
 #: Minimum length of a stretch; longest gap to interpolate, in general and for the speed, which varies slowly.
 LEAST_STRETCH_S, BRIDGED_S, SPEED_BRIDGED_S = 2.0, 0.3, 0.6
+#: Excluded start of each stretch, where the initial state is unknown.
+SETTLE_S = 1.0
 #: Longest driving of one log in a fit, and length of the pieces from which it is selected.
 MOST_S, PIECE_S = 300.0, 10.0
 
@@ -27,7 +26,7 @@ _PAUSE_CELLS = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Driving:
-    """Driving of one log for a calibration.
+    """Driving of one log for a fit.
 
     Attributes
     ----------
@@ -35,17 +34,28 @@ class Driving:
     stamps_ns : int64 [N], end of each cell of the grid.
     stretches : int64 [k, 2], [first, last) of each stretch without a gap above the vehicle's low-speed limit.
     has_ay : whether a_y was measured; if not, the column contains v_x r, which is not compared with the model.
+    slopes, weights : [N], v_y / v_x of the ground truth, NaN where unknown, for teaching; None otherwise.
     """
 
     columns: FloatArray
     stamps_ns: IntArray
     stretches: IntArray
     has_ay: bool = True
+    slopes: FloatArray | None = None
+    weights: FloatArray = field(default_factory=lambda: np.empty(0))
 
     @property
     def seconds(self) -> float:
         """Driving in all stretches."""
         return float(np.sum(np.diff(self.stretches, axis=1))) * STEP_S
+
+    @property
+    def settled(self) -> BoolArray:
+        """Mask [N] of used samples: the stretches without their start."""
+        inside = np.zeros(self.columns.shape[1], dtype=np.bool_)
+        for first, last in self.stretches:
+            inside[first + round(SETTLE_S / STEP_S) : last] = True
+        return inside
 
     def informative(self) -> Driving:
         """Return the same grid with at most :data:`MOST_S` of driving: the pieces in which a_y varies most."""
@@ -57,10 +67,6 @@ class Driving:
         for piece in sorted(pieces, key=lambda p: -float(np.var(ay[p])))[: round(MOST_S / PIECE_S)]:
             inside[piece] = True
         return replace(self, stretches=_long(_spans(inside)))
-
-    def between(self, first: int, last: int) -> Driving:
-        """Return the same grid with the stretches between two cells alone."""
-        return replace(self, stretches=_long(np.clip(self.stretches, first, last)))
 
 
 def driving_of(signals: Signals, vehicle: VehicleParameters) -> Driving:

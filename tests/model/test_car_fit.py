@@ -1,4 +1,4 @@
-"""Self-calibration: recovered parameters of a known car, and rejected drives."""
+"""Fit of a car to a drive: recovered parameters of a known car, rejected drives, and what earlier drives change."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -15,14 +14,25 @@ from hypothesis import strategies as st
 from reference_car import FRICTION, Drive, cut, drive, keep, with_noise
 
 from pdhef_logtool.car.model import TaughtParameter
+from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
-from pdhef_logtool.estimators.calibration import calibration as rules
-from pdhef_logtool.estimators.calibration.calibration import SelfCalibration, self_calibrate
-from pdhef_logtool.estimators.calibration.driving import STEP_S, Driving, driving_of
-from pdhef_logtool.estimators.calibration.joint import LIKE, REAR_STIFFNESS, like_drives, parameters_of, with_taught
+from pdhef_logtool.model import fit as rules
+from pdhef_logtool.model.driving import STEP_S, Driving, driving_of
+from pdhef_logtool.model.fit import fit_car
+from pdhef_logtool.model.priors import (
+    CORRELATION,
+    RATIO,
+    REAR_STIFFNESS,
+    front_stiffness,
+    parameters_of,
+    prior_of,
+    with_earlier,
+)
 from pdhef_logtool.records.signals import Signals
 
 RIGHT = default_vehicle()
+#: A vehicle file: the tyres of the default sedan are no statement about a car.
+RIGHT_FILE = RIGHT.with_stiffness(1.001, 1.001)
 
 
 def wrong(front: float, rear: float, vehicle: VehicleParameters = RIGHT) -> VehicleParameters:
@@ -50,19 +60,16 @@ def driving(signals: Signals, vehicle: VehicleParameters) -> Driving:
     return driving_of(signals, vehicle)
 
 
-def found(signals: Signals, vehicle: VehicleParameters) -> SelfCalibration:
-    return self_calibrate([driving(signals, vehicle)], vehicle)
+def found(signals: Signals, vehicle: VehicleParameters) -> Posterior:
+    return fit_car(driving(signals, vehicle), vehicle)
 
 
-def stiffness_errors(calibration: SelfCalibration) -> list[tuple[float, float]]:
-    """Return, by axle, the error of the logarithm of the cornering stiffness, and its sd."""
-    by = {p.name: p for p in calibration.parameters}
-    pairs = []
-    for axle, front in (("front", True), ("rear", False)):
-        parameter = by[f"{axle} cornering stiffness"]
-        true = RIGHT.cornering_stiffness_n_per_rad(front, FRICTION)
-        pairs.append((math.log(parameter.value / true), parameter.sd))
-    return pairs
+def stiffness_errors(posterior: Posterior) -> list[tuple[float, float]]:
+    """Return the errors of the logarithm of the rear axle's stiffness and of the ratio of the axles, and their sd."""
+    rear, front = (RIGHT.cornering_stiffness_n_per_rad(axle, FRICTION) for axle in (False, True))
+    true = {REAR_STIFFNESS: rear, RATIO: front / front_stiffness(RIGHT, 1.0, rear)}
+    by = {p.name: p for p in posterior.parameters}
+    return [(math.log(by[name].value / value), by[name].sd) for name, value in true.items()]
 
 
 @pytest.mark.slow
@@ -135,17 +142,17 @@ def test_what_straight_driving_does_not_excite_keeps_its_prior() -> None:
     straight = found(with_noise(drive(lambda _t: 0.0, 60.0).signals, 5), RIGHT)
     assert not straight.refused
     for p in straight.parameters:
-        if p.name.endswith("cornering stiffness"):
+        if p.name == REAR_STIFFNESS:
             assert not p.excited
             assert p.value == pytest.approx(p.prior, rel=0.1)
-    assert "not excited: front cornering stiffness" in straight.text
+    assert "rear cornering stiffness" in straight.text.partition("not excited: ")[2]
 
 
 def test_a_right_file_decides_what_gentle_driving_cannot_and_a_wrong_one_does_not() -> None:
     signals = with_noise(drive(sweep(0.001), 20.0).signals, 3)
 
     def level_error(file: VehicleParameters) -> float:
-        return abs(stiffness_errors(found(signals, file))[1][0])
+        return abs(stiffness_errors(found(signals, file))[0][0])
 
     right, wrong_level, without_file = (level_error(file) for file in (wrong(1.001, 1.001), wrong(2.0, 0.5), RIGHT))
     assert right < 0.7 * without_file
@@ -157,57 +164,46 @@ def test_a_car_that_slides_all_the_time_is_refused(monkeypatch: pytest.MonkeyPat
     signals = wide().signals
     slides = found(signals, RIGHT)
     assert "the rear axle slides in" in slides.refused
-    assert slides.sliding_friction == pytest.approx(np.abs(signals.ay_m_s2).max() / 9.81, rel=0.1)
+    assert slides.reached_friction == pytest.approx(np.abs(signals.ay_m_s2).max() / 9.81, rel=0.1)
 
 
-def test_a_taught_prior_that_the_driving_contradicts_is_not_used() -> None:
+def test_a_drive_overrules_earlier_drives_that_it_contradicts() -> None:
     log, rear = driving(wide().signals, RIGHT), RIGHT.cornering_stiffness_n_per_rad(False, FRICTION)
-    untaught, right, absurd = (
-        self_calibrate([log], RIGHT, taught=taught)
-        for taught in (
-            (),
-            [TaughtParameter(name=REAR_STIFFNESS, value=rear, std=0.1)],
-            [TaughtParameter(name=REAR_STIFFNESS, value=0.06 * rear, std=1e-4)],
-        )
-    )
-    assert absurd.vehicle == untaught.vehicle and not absurd.refused
-    assert right.vehicle != untaught.vehicle and not right.refused
+    absurd = TaughtParameter(name=REAR_STIFFNESS, value=0.06 * rear, std=1e-4)
+    posterior = fit_car(log, RIGHT, [absurd] * 9)
+    assert not posterior.refused
+    assert posterior.vehicle.cornering_stiffness_n_per_rad(False, FRICTION) == pytest.approx(rear, rel=0.2)
 
 
-@settings(max_examples=50, deadline=None)
-@given(st.lists(st.floats(0.05, 12.0), max_size=8))
-def test_drives_of_a_group_are_alike_in_their_level_and_groups_ascend(levels: list[float]) -> None:
-    groups = [[levels[k] for k in group] for group in like_drives(levels)]
-    assert sorted(level for group in groups for level in group) == sorted(levels)
-    assert all(min(group) >= LIKE[1] * max(group) for group in groups)
-    assert all(max(low) < LIKE[1] * max(high) for low, high in pairwise(groups))
+def test_earlier_drives_determine_a_parameter_as_random_effects_do() -> None:
+    """A drive is its car plus a deviation: one has the share ρ of its change in the next drive, many have all of it."""
+    before = next(p for p in parameters_of(RIGHT) if p.name == REAR_STIFFNESS)
+
+    def theta(count: int, level: float) -> tuple[float, float]:
+        drive = TaughtParameter(name=REAR_STIFFNESS, value=before.value(0.5), std=1e-6, ay_m_s2=4.0)
+        (after,) = with_earlier([before], [drive] * count, level)
+        return before.theta(after.mean), after.std / before.std
+
+    rho = CORRELATION
+    assert theta(1, 4.0) == pytest.approx((0.5 * rho, math.sqrt(1.0 - rho**2)))
+    assert theta(1, 8.0) == theta(1, 2.0) == pytest.approx((0.25 * rho, math.sqrt(1.0 - 0.25 * rho**2)))
+    assert theta(1, 0.0) == pytest.approx(theta(1, 4.0))  # an unknown level
+    assert theta(2000, 4.0) == pytest.approx((0.5, math.sqrt(1.0 - rho)), abs=1e-3)
 
 
-def test_of_priors_at_several_levels_the_nearest_one_counts() -> None:
-    taught = [TaughtParameter(name=REAR_STIFFNESS, value=v, std=0.2, ay_m_s2=a) for v, a in ((1e5, 2.0), (2e5, 7.0))]
-    parameters = parameters_of(RIGHT)
-
-    def rear(level_m_s2: float) -> float:
-        moved = with_taught(parameters, taught, level_m_s2)
-        assert [p for p in moved if p.name != REAR_STIFFNESS] == [p for p in parameters if p.name != REAR_STIFFNESS]
-        return next(p.mean for p in moved if p.name == REAR_STIFFNESS)
-
-    assert [rear(level) for level in (0.0, 2.0, 3.0, 5.0, 9.0)] == pytest.approx([1e5, 1e5, 1e5, 2e5, 2e5])
-    assert rear(0.1) == next(p.mean for p in parameters if p.name == REAR_STIFFNESS)
+def test_drives_at_other_lateral_accelerations_inform_less_and_none_leaves_the_prior_of_the_file() -> None:
+    softer = [TaughtParameter(name=REAR_STIFFNESS, value=4e4, std=0.05, ay_m_s2=8.0)]
+    stds = [prior_of(RIGHT_FILE, softer, level).of_cars[1].std for level in (8.0, 4.0, 0.1)]
+    assert stds == sorted(stds) and stds[0] < 0.7 * stds[2]
+    far, without = prior_of(RIGHT_FILE, softer, 0.01), prior_of(RIGHT_FILE)
+    assert far.file_share == pytest.approx(without.file_share, abs=1e-3)
+    near = prior_of(RIGHT_FILE, softer, 8.0)  # the earlier drive contradicts the tyres of the file
+    assert near.file_share < 0.7 * without.file_share
 
 
 def test_steering_that_does_not_explain_the_yaw_rate_is_refused() -> None:
     signals = wide().signals
     assert "of the yaw rate" in found(replace(signals, steer_rad=-2.0 * signals.steer_rad), RIGHT).refused
-
-
-@pytest.mark.slow
-def test_a_file_that_contradicts_the_drive_is_told() -> None:
-    slow = drive(sweep(0.01), 40.0).signals
-    agrees, contradicts = (self_calibrate([driving(slow, v)], v).understeer for v in (RIGHT, wrong(2.0, 0.6)))
-    assert agrees is not None and not agrees.contradicts
-    assert contradicts is not None and contradicts.contradicts
-    assert "contradicts" in contradicts.text
 
 
 def test_the_calibrated_vehicle_reads_its_signals_with_what_was_found() -> None:
@@ -216,7 +212,6 @@ def test_the_calibrated_vehicle_reads_its_signals_with_what_was_found() -> None:
     assert calibration.vehicle.steer_offset_rad == pytest.approx(0.005, abs=1e-3)
     assert calibration.vehicle.physics.names == ("lag", "roll", "bank")
     assert calibration.vehicle.mass_kg == RIGHT.mass_kg
-    assert calibration.vehicle_file is RIGHT
 
 
 def test_a_pause_of_a_day_costs_no_memory() -> None:
@@ -225,29 +220,6 @@ def test_a_pause_of_a_day_costs_no_memory() -> None:
     paused = driving(replace(signals, stamps_ns=signals.stamps_ns + day, ready_ns=signals.ready_ns + day), RIGHT)
     assert paused.columns.shape[1] < 60 / STEP_S + 200
     assert len(paused.stretches) == 2
-
-
-def test_a_pool_knows_more_than_each_of_its_logs() -> None:
-    logs = [driving(with_noise(cut(wide().signals, a, a + 2000), a), RIGHT) for a in (0, 2000, 4000)]
-    alone, pool = self_calibrate(logs[:1], RIGHT), self_calibrate(logs, RIGHT)
-    assert pool.logs == 3
-    for (_, together), (_, single) in zip(stiffness_errors(pool), stiffness_errors(alone), strict=True):
-        assert together < single
-
-
-def test_a_pool_states_what_its_drives_differ_in() -> None:
-    """A steering offset in one of three drives widens the pooled posterior to include the offset of every drive."""
-    parts = [with_noise(cut(wide().signals, a, a + 2000), a) for a in (0, 2000, 4000)]
-
-    def offset(*added_rad: float) -> tuple[float, float]:
-        logs = [driving(replace(s, steer_rad=s.steer_rad + x), RIGHT) for s, x in zip(parts, added_rad, strict=True)]
-        found = next(p for p in self_calibrate(logs, RIGHT).parameters if p.name == "steering offset")
-        return found.value, found.sd
-
-    (_, alike), (value, apart) = offset(0.0, 0.0, 0.0), offset(0.0, 0.0, 0.01)
-    assert alike < 0.003
-    assert apart > 1.5 * alike
-    assert all(abs(value - true) < 1.96 * apart for true in (0.0, 0.01))
 
 
 @settings(max_examples=15, deadline=None)
@@ -269,11 +241,9 @@ def test_the_vehicles_of_the_band_spread_as_the_posterior_does() -> None:
     assert len(calibration.varied) == 5
     by = {p.name: p for p in calibration.parameters}
     middle = calibration.vehicle
-    for axle, front in (("front", True), ("rear", False)):
-        at = math.log(middle.cornering_stiffness_n_per_rad(front, middle.assumed_friction))
-        away = [math.log(v.cornering_stiffness_n_per_rad(front, v.assumed_friction)) - at for v in calibration.varied]
-        sd = by[f"{axle} cornering stiffness"].sd
-        assert 0.7 * sd < math.sqrt(sum(x**2 for x in away)) < 1.05 * sd
+    at = math.log(middle.cornering_stiffness_n_per_rad(False, middle.assumed_friction))
+    away = [math.log(v.cornering_stiffness_n_per_rad(False, v.assumed_friction)) - at for v in calibration.varied]
+    assert 0.7 * by[REAR_STIFFNESS].sd < math.sqrt(sum(x**2 for x in away)) < 1.05 * by[REAR_STIFFNESS].sd
 
 
 @pytest.mark.slow

@@ -1,1 +1,0 @@
-"""A car that calibrates itself on a log without ground truth (docs/method.md#self-calibration)."""

@@ -1,0 +1,373 @@
+"""Fit of tyres, steering and sensors to a drive, without ground truth.
+
+See docs/method.md#self-calibration.
+
+The model of :mod:`~.equations` is fitted to yaw rate and a_y by output error. In normalised parameters θ (distance
+from the prior mean in prior standard deviations) the cost is
+
+    Σ_channels Σ_k (Δt / T) 2 (√(1 + (e_k / σ)²) − 1) + |θ|²
+
+with errors e after a zero-phase low pass, so that T = 1 s of driving is equivalent to one sample. σ is the RMS of the
+errors of each channel, at least :data:`ERROR_STD`: with a poor model the prior dominates. A drive for teaching has the
+sideslip of its ground truth as a third channel, without its mean over a few seconds: offsets of the ground truth are
+0.2 to 0.3 degrees and differ between days, and the road bank would be attributed to the tyres.
+
+The covariance of θ has three parts: the curvature of the cost; the spread of the cost's gradient between blocks of the
+drive (sandwich estimator, White 1982), which includes model error that changes within a drive; and the model error
+that is common to a whole drive, estimated on simulated cars (:data:`SHARED_SHARES`).
+
+Mass and position of the centre of gravity come from the file. Parameters that are not observable in the driving keep
+their prior and widen the interval.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+
+import numpy as np
+
+from pdhef_logtool.car.descent import descend
+from pdhef_logtool.car.model import TaughtParameter
+from pdhef_logtool.car.posterior import FittedParameter, Posterior
+from pdhef_logtool.car.vehicle import STIFFNESS_TYRE_SHAPE, VehicleParameters
+from pdhef_logtool.model.driving import STEP_S, Driving
+from pdhef_logtool.model.equations import (
+    AY,
+    BANK_HZ,
+    OF_AY,
+    OF_RATE,
+    SPEED,
+    YAW_RATE,
+    TrackParameters,
+    errors,
+    low_pass,
+    slow_parts,
+)
+from pdhef_logtool.model.priors import (
+    AY_BIAS,
+    AY_GAIN,
+    IMU_X,
+    INERTIA,
+    PEAK,
+    RATE_BIAS,
+    RATIO,
+    REAR_STIFFNESS,
+    RELAXATION,
+    STEER_DELAY,
+    STEER_OFFSET,
+    STEER_RATIO,
+    Prior,
+    coefficients,
+    front_stiffness,
+    parameters_of,
+    prior_of,
+    vehicle_with,
+)
+from pdhef_logtool.records.running_mean import running_mean
+from pdhef_logtool.records.signals import FloatArray
+
+#: Frequency limit of the comparison of model and sensors.
+CUTOFF_HZ = 4.0
+#: Smallest standard deviation of the errors of yaw rate (rad/s), a_y (m/s²) and sideslip (rad); larger errors have a
+#: linear cost.
+ERROR_STD = (0.02, 0.3, math.radians(0.3))
+#: Window of the mean of the sideslip error to remove, in s. If only a constant is removed, the bank of simulated roads
+#: doubles the sideslip error on other drives.
+SLOW_S = 4.0
+#: Maximum number of fits with updated standard deviations of the errors; relative change at which they end.
+SCALES, SAME_SCALE = 8, 0.05
+#: Driving equivalent to one independent sample of each channel.
+CORRELATION_S = 1.0
+#: Subsampling of the errors, in steps of the grid: 12.5 Hz, three times the cutoff.
+KEPT_STEPS = 4
+#: Length of the blocks for the spread of gradients: longer than a bend, so that blocks are nearly independent.
+BLOCK_S = 3.0
+ITERATIONS, DERIVATIVE_STEP, MAX_STEP, LEAST_GAIN = 40, 0.02, 1.0, 1e-3
+#: Lower limit of the peak force, as a share of this quantile of a_y, which includes bank and body roll.
+REACHED_SHARE, REACHED_QUANTILE = 0.8, 0.98
+#: Model error common to a whole drive, as a share of each prior's standard deviation: with it at least 95 % of the
+#: parameters of simulated cars are within 1.96 standard deviations. The lag of tyres and body affects the delay.
+SHARED_SHARE, SHARED_SHARES = 0.2, {STEER_DELAY: 0.4}
+#: Minimum driving above the low-speed limit.
+LEAST_S = 5.0
+#: A fit is rejected if its error exceeds this share of the RMS of yaw rate or of a_y, and ``ERROR_STD``: sign or topic
+#: of a signal may be wrong, or the car spins.
+LARGEST_SHARE = 0.5
+#: A fit is rejected if the rear axle slides for this time and this share of the driving: beyond this slip angle the
+#: lateral force depends on longitudinal slip, which the model lacks.
+SLIDING_RAD, SLIDING_S, SLIDING_SHARE = math.radians(8.0), 10.0, 0.2
+#: Smallest probability of the tyres of the file that is considered.
+LEAST_FILE_SHARE = 1e-3
+#: Maximum number of posterior directions in an interval.
+VARIED = 5
+
+
+def fit_car(driving: Driving, vehicle_file: VehicleParameters, earlier: Sequence[TaughtParameter] = ()) -> Posterior:
+    """Fit a car to a drive that was read with ``vehicle_file``.
+
+    ``earlier`` : posteriors of earlier drives; omitted if the fit is rejected with them.
+    """
+    driving = driving.informative()
+    if driving.seconds < LEAST_S:
+        why = f"{driving.seconds:.0f} s above {vehicle_file.low_speed_blend_m_s:g} m/s, {LEAST_S:g} are needed"
+        return Posterior(vehicle_file, refused=why, seconds=driving.seconds)
+    fit = CarFit(driving, vehicle_file, earlier)
+    best = fit.solve()
+    refused, slides = fit.refusal(best)
+    if refused and earlier:
+        return fit_car(driving, vehicle_file)
+    theta, covariance = fit.posterior(best)
+    vehicle, reached = fit.vehicle(theta), None
+    if refused:
+        reached = peak_reached(driving, vehicle_file) * vehicle_file.assumed_friction if slides else None
+        vehicle = vehicle_file if reached is None else vehicle_file.model_copy(update={"friction": reached})
+    root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+    varied = () if refused else varied_parameters(theta, root, fit.sideslip, VARIED)
+    rms = fit.rms(fit.values(theta))
+    return Posterior(
+        vehicle,
+        fit.fitted(theta, covariance),
+        refused,
+        tuple(fit.vehicle(to) for to in varied),
+        # A good fit is no proof of a better model.
+        error_scale=max(1.0, float(np.sqrt(np.mean((np.array(rms) / ERROR_STD[:2]) ** 2)))),
+        reached_friction=reached,
+        seconds=driving.seconds,
+        level_m_s2=level_of(driving),
+        rms=rms,
+        file_rms=fit.rms(_file_values(vehicle_file)),
+    )
+
+
+def level_of(driving: Driving) -> float:
+    """Return the RMS of a_y, m/s², weighted by its square, so that straight driving hardly contributes."""
+    ay2 = driving.columns[AY, driving.settled] ** 2
+    return math.sqrt(float(np.nansum(ay2**2)) / max(float(np.nansum(ay2)), 1e-9))
+
+
+def peak_reached(driving: Driving, vehicle_file: VehicleParameters) -> float:
+    """Return the share of the file's peak force that the a_y of the driving needs."""
+    ay = driving.columns[AY, driving.settled]
+    most = sum(vehicle_file.magic_formula(front, vehicle_file.assumed_friction)[2] for front in (True, False))
+    return float(np.quantile(np.abs(ay), REACHED_QUANTILE)) * vehicle_file.mass_kg / most
+
+
+class CarFit:
+    """The fit of a car to a drive, which was read with ``vehicle_file``."""
+
+    def __init__(
+        self, driving: Driving, vehicle_file: VehicleParameters, earlier: Sequence[TaughtParameter] = ()
+    ) -> None:
+        least_peak = REACHED_SHARE * peak_reached(driving, vehicle_file)
+        self.prior: Prior = prior_of(vehicle_file, earlier, level_of(driving), least_peak=least_peak)
+        self.parameters = self.prior.of_cars
+        self._driving, self.vehicle_file = driving, vehicle_file
+        self._filter = low_pass(CUTOFF_HZ, STEP_S)
+        self._kept = np.flatnonzero(driving.settled)[::KEPT_STEPS]
+        grid = driving.columns.shape[1]
+        self._columns = np.concatenate([driving.columns, np.empty((2, grid))])
+        slow_parts(self._columns, driving.stretches, low_pass(BANK_HZ, STEP_S))
+        self._out, self._differences = np.full((3, grid), np.nan), np.full((2, grid), np.nan)
+        self._block = np.unique(self._kept * STEP_S // BLOCK_S, return_inverse=True)[1]
+        self._weight = math.sqrt(KEPT_STEPS * STEP_S / CORRELATION_S)
+        self._least_std = self._error_std = np.array(ERROR_STD[: 2 if driving.slopes is None else 3])
+
+    def solve(self) -> FloatArray:
+        """Return the parameters of the lowest cost, with the standard deviation of their errors.
+
+        A descent from a dry road does not find a minimum with saturated tyres: there are two starts. Both are prior
+        values: starting from the fit without the taught prior, the taught fit often stays in the same minimum.
+        """
+        self._error_std = self._least_std
+        slippery = [p.theta(p.low) if p.name == PEAK else 0.0 for p in self.parameters]
+        descents = [self._descend(start) for start in (np.zeros(len(slippery)), np.array(slippery))]
+        theta = min(descents, key=lambda end: self._cost(self.errors_of(end), end))
+        for _ in range(SCALES):
+            error_std = np.maximum(self._least_std, self._rms(self.errors_of(theta)))
+            self._error_std = error_std
+            theta = self._descend(theta)
+            if np.allclose(np.maximum(self._least_std, self._rms(self.errors_of(theta))), error_std, rtol=SAME_SCALE):
+                break
+        return theta
+
+    def _descend(self, theta: FloatArray) -> FloatArray:
+        descent, _ = descend(
+            self.errors_of,
+            self._cost,
+            self._residuals,
+            theta,
+            iterations=ITERATIONS,
+            least_gain=lambda _: LEAST_GAIN,
+            derivative_step=DERIVATIVE_STEP,
+            max_step=MAX_STEP,
+        )
+        return descent.theta
+
+    def errors_of(self, theta: FloatArray) -> FloatArray:
+        """Return errors over their standard deviations: yaw rate, a_y, and sideslip if it is known, [2 or 3, K]."""
+        return self._errors(self.values(theta))
+
+    def rms(self, values: Mapping[str, float]) -> tuple[float, float]:
+        """Return the RMS error of yaw rate and a_y for parameters by name."""
+        rms = self._rms(self._errors(values))
+        return float(rms[OF_RATE]), float(rms[OF_AY])
+
+    def sideslip(self, theta: FloatArray) -> FloatArray:
+        """Return the model's v_y / v_x of all used samples [K]."""
+        self._errors(self.values(theta))
+        return np.asarray(self._out[2, self._kept] / self._columns[SPEED, self._kept], dtype=np.float64)
+
+    def values(self, theta: FloatArray) -> dict[str, float]:
+        """Return the parameters by name."""
+        return {p.name: p.value(t) for p, t in zip(self.parameters, theta.tolist(), strict=True)}
+
+    def vehicle(self, theta: FloatArray) -> VehicleParameters:
+        """Return the vehicle file with the parameters."""
+        return vehicle_with(self.vehicle_file, self.values(theta))
+
+    def fitted(self, theta: FloatArray, covariance: FloatArray) -> tuple[FittedParameter, ...]:
+        """Return the parameters of a posterior, with mean and standard deviation of their prior."""
+        rows = zip(self.parameters, self.prior.parameters, theta, np.sqrt(np.diag(covariance)), strict=True)
+        return tuple(
+            FittedParameter(p.name, p.unit, p.value(float(t)), prior.mean, float(sd) * p.std, prior.std, p.log)
+            for p, prior, t, sd in rows
+        )
+
+    def refusal(self, theta: FloatArray) -> tuple[str, bool]:
+        """Return why a fit is rejected, its error is too large or the car slides, and whether it slides."""
+        rms = self.rms(self.values(theta))
+        for name, column, row in (("yaw rate", YAW_RATE, OF_RATE), ("lateral acceleration", AY, OF_AY)):
+            measured = self._columns[column, self._driving.settled]
+            share = rms[row] / max(float(np.sqrt(np.mean(measured**2))), 1e-9)
+            if share > LARGEST_SHARE and rms[row] > ERROR_STD[row]:
+                return f"the model leaves {share:.0%} of the {name}, at most {LARGEST_SHARE:.0%} is plausible", False
+        turning = self._columns[YAW_RATE, self._kept] / self._columns[SPEED, self._kept]
+        rear_slip = self.vehicle_file.cg_to_rear_axle_m * turning - self.sideslip(theta)
+        sliding = float(np.mean(np.abs(rear_slip) > SLIDING_RAD))
+        if sliding > SLIDING_SHARE and sliding * self._driving.seconds > SLIDING_S:
+            return f"the rear axle slides in {sliding:.0%} of the driving", True
+        return "", False
+
+    def _errors(self, values: Mapping[str, float]) -> FloatArray:
+        driving, kept = self._driving, self._kept
+        track = _track_of(values, self.vehicle_file)
+        errors(self._columns, driving.stretches, STEP_S, track, self._filter, self._out, self._differences)
+        if not driving.has_ay:
+            self._differences[OF_AY] = 0.0
+        rows = self._differences[:, kept]
+        if driving.slopes is not None:
+            weights = driving.weights[kept]
+            error = self._out[2, kept] / self._columns[SPEED, kept] - driving.slopes[kept]
+            fast = error - running_mean(error, round(0.5 * SLOW_S / (KEPT_STEPS * STEP_S)), weights)
+            rows = np.vstack([rows, np.nan_to_num(np.sqrt(weights) * fast)])
+        return np.asarray(rows / self._error_std[:, None], dtype=np.float64)
+
+    def _rms(self, scaled: FloatArray) -> FloatArray:
+        """Return the RMS of each channel of errors over ``_error_std``."""
+        return np.asarray(np.sqrt(np.mean(scaled**2, axis=1)) * self._error_std, dtype=np.float64)
+
+    def _cost(self, scaled: FloatArray, theta: FloatArray) -> float:
+        robust = 2.0 * (np.sqrt(1.0 + scaled**2) - 1.0)
+        return float(self._weight**2 * np.sum(robust) + theta @ theta)
+
+    def _residuals(self, scaled: FloatArray, centre: FloatArray) -> FloatArray:
+        """Return residuals [2 K] with the soft L1 weights of the errors ``centre``."""
+        return np.asarray(self._weight * scaled / (1.0 + centre**2) ** 0.25, dtype=np.float64).ravel()
+
+    def _curvature(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the inverse curvature of the cost [n, n], and its gradient by block [blocks, n]."""
+        centre = self.errors_of(theta)
+        residuals = self._residuals(centre, centre)
+        jacobian = np.empty((residuals.size, theta.size))
+        for i in range(theta.size):
+            moved = theta.copy()
+            moved[i] += DERIVATIVE_STEP
+            jacobian[:, i] = (self._residuals(self.errors_of(moved), centre) - residuals) / DERIVATIVE_STEP
+        inverse = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(theta.size)), dtype=np.float64)
+        gradients = np.zeros((int(self._block.max()) + 1, theta.size))
+        np.add.at(gradients, np.tile(self._block, len(centre)), jacobian * residuals[:, None])
+        return inverse, gradients
+
+    def posterior(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of the parameters from the lowest cost with tyres as cars have.
+
+        The posterior is a mixture with the tyres of the file. Each part is normal and weighted by its evidence,
+        exp(-J / 2) times the root of the determinant of its inverse curvature (Laplace; MacKay 1992).
+        """
+        evidence, covariance = self._laplace(theta)
+        if self.prior.file_share < LEAST_FILE_SHARE:
+            return theta, covariance
+        other = copy(self)
+        other.parameters = self.prior.of_file
+        start = np.array(
+            [p.theta(value) for p, value in zip(other.parameters, self.values(theta).values(), strict=True)]
+        )
+        other_theta = other._descend(start)
+        other_evidence, other_covariance = other._laplace(other_theta)
+        odds = math.exp(min(evidence - other_evidence, 100.0)) * (1.0 - self.prior.file_share) / self.prior.file_share
+        share = 1.0 / (1.0 + odds)
+        scale = np.array([q.std / p.std for p, q in zip(self.parameters, other.parameters, strict=True)])
+        values = other.values(other_theta).values()
+        away = np.array([p.theta(value) for p, value in zip(self.parameters, values, strict=True)]) - theta
+        spread = share * (1.0 - share) * np.outer(away, away)
+        mixed = (1.0 - share) * covariance + share * other_covariance * np.outer(scale, scale) + spread
+        return theta + share * away, mixed
+
+    def _laplace(self, theta: FloatArray) -> tuple[float, FloatArray]:
+        """Return log evidence and covariance of the parameters at the lowest cost."""
+        inverse, gradients = self._curvature(theta)
+        evidence = 0.5 * (float(np.linalg.slogdet(inverse)[1]) - self._cost(self.errors_of(theta), theta))
+        count = len(gradients)
+        spread = gradients.T @ gradients * (count / (count - 1) if count > 1 else 0.0)
+        shared = np.diag([SHARED_SHARES.get(p.name, SHARED_SHARE) ** 2 for p in self.parameters])
+        return evidence, np.asarray(inverse + inverse @ spread @ inverse + shared, dtype=np.float64)
+
+
+def _file_values(file: VehicleParameters) -> dict[str, float]:
+    """Return the parameters of a vehicle file by name."""
+    front, rear = coefficients(file)
+    tyres = {RATIO: front / rear, REAR_STIFFNESS: rear * file.axle_load_n(False)}
+    return {p.name: p.mean for p in parameters_of(file)} | tyres
+
+
+def _track_of(values: Mapping[str, float], file: VehicleParameters) -> TrackParameters:
+    """Return the model of parameters for signals that were read with a vehicle file."""
+    mu, mass, rear = file.assumed_friction, file.mass_kg, values[REAR_STIFFNESS]
+    front_peak, rear_peak = (values[PEAK] * file.magic_formula(front, mu)[2] / mass for front in (True, False))
+    gain = file.steering_ratio / values[STEER_RATIO]
+    return TrackParameters(
+        front_m=file.cg_to_front_axle_m,
+        rear_m=file.cg_to_rear_axle_m,
+        mass_over_inertia=mass / values[INERTIA],
+        front_stiffness=front_stiffness(file, values[RATIO], rear) / mass,
+        rear_stiffness=rear / mass,
+        front_peak=front_peak,
+        rear_peak=rear_peak,
+        shape=STIFFNESS_TYRE_SHAPE,
+        friction=mu,
+        relaxation_m=values[RELAXATION],
+        ay_gain=values[AY_GAIN],
+        imu_x_m=values[IMU_X],
+        ay_bias=values[AY_BIAS] - file.sensors.ay_bias_m_s2,
+        rate_bias=values[RATE_BIAS] - file.sensors.yaw_rate_bias_rad_s,
+        steer_gain=gain,
+        steer_added=gain * file.steer_offset_rad - values[STEER_OFFSET],
+        steer_delay=values[STEER_DELAY] / STEP_S,
+    )
+
+
+def varied_parameters(
+    theta: FloatArray, root: FloatArray, sideslip: Callable[[FloatArray], FloatArray], most: int
+) -> list[FloatArray]:
+    """Return parameters 1-sigma away from θ [n] along the posterior directions with most effect on the sideslip.
+
+    ``root`` [n, m]: matrix root of the posterior covariance (root rootᵀ). ``sideslip``: function of parameters that
+    returns sideslip, or its errors, [K]. The directions, at most ``most`` and the largest first, are uncorrelated in
+    the posterior and in their effect on the sideslip.
+    """
+    centre = sideslip(theta)
+    moved = np.stack([sideslip(theta + step) - centre for step in root.T])
+    _, axes = np.linalg.eigh(moved @ moved.T)
+    return [theta + step for step in (root @ axes[:, ::-1][:, :most]).T]
