@@ -74,9 +74,14 @@ arrayobj.raise_with_shape_context = _sizes_differ
 
 
 def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:
-    """Compile a function as ``numba.njit`` does; ``cache`` keeps its machine code as described above."""
+    """Compile a function as ``numba.njit`` does; ``cache`` keeps its machine code as described above.
+
+    Functions that compiled code alone calls need no wrapper for Python (``no_cpython_wrapper``), which takes long to
+    compile for records of numbers.
+    """
     if function is None:
         return functools.partial(njit, cache=cache, **options)
+    options.setdefault("no_cpython_wrapper", bool(options.get("forceinline")))
     compiled = numba.njit(function, no_cfunc_wrapper=True, **options)
     if cache and not config.DISABLE_JIT:
         if (folder := kept_in()) is None:

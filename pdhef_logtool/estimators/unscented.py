@@ -8,6 +8,9 @@ deviations e of the points from the centre and their weighted sum δ, which is t
     2 δ δᵀ + w Σ (e − δ)(e − δ)ᵀ = w Σ e eᵀ + δ δᵀ,
 
 in which the centre's column has δ / √w.
+
+The last n − m entries of a state are constants on which the model does not depend: the points along the columns that
+they have alone are at the centre in all other entries, and a block has the first m columns of L only.
 """
 
 from __future__ import annotations
@@ -22,30 +25,32 @@ from pdhef_logtool.estimators.vehicle_model import WIDTH
 #: Smallest variance on the diagonal of a repaired covariance.
 COVARIANCE_FLOOR = 1e-12
 
+_compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
+_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 # Sums in any order, so that the compiler can take several terms at a time.
-_compiled = njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
-_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract", "reassoc"})
+_sum = njit(forceinline=True, error_model="numpy", fastmath={"contract", "reassoc"})
 
 
 @_inline
 def _factor(P, L):  # type: ignore[no-untyped-def]
+    # First C with P = Σ_k c_k c_kᵀ / c_kk, and above its diagonal C over c_kk: to take all roots at the end is faster.
     n = P.shape[0]
     for j in range(n):
-        s = P[j, j]
-        for k in range(j):
-            s -= L[j, k] * L[j, k]
-        if not s > 0.0:
-            if P[j, j] != 0.0:
-                return False
-            L[j:, j] = 0.0  # the entry is known
-            continue
-        L[j, j] = math.sqrt(s)
-        per_root = 1.0 / L[j, j]
-        for i in range(j + 1, n):
+        for i in range(j, n):
             s = P[i, j]
             for k in range(j):
-                s -= L[i, k] * L[j, k]
-            L[i, j] = s * per_root
+                s -= L[i, k] * L[k, j]
+            L[i, j] = s
+        if not L[j, j] > 0.0 and P[j, j] != 0.0:
+            return False
+        per = 1.0 / L[j, j] if L[j, j] > 0.0 else 0.0  # 0: the entry is known
+        for i in range(j + 1, n):
+            L[j, i] = L[i, j] * per
+    for j in range(n):
+        per_root = 1.0 / math.sqrt(L[j, j]) if L[j, j] > 0.0 else 0.0
+        L[:j, j] = 0.0
+        for i in range(j, n):
+            L[i, j] *= per_root
     return True
 
 
@@ -84,126 +89,139 @@ def repair_covariance(P):  # type: ignore[no-untyped-def]
             P[i, j] = s
 
 
+@_inline
+def _row(block, places, j):  # type: ignore[no-untyped-def]
+    return block[places[j] * WIDTH :]
+
+
 @_compiled
-def draw(x, L, places, columns, points):  # type: ignore[no-untyped-def]
+def draw(x, L, places, m, points):  # type: ignore[no-untyped-def]
     """Write the sigma points of the state x [n] with the root L [n, n] of its covariance to a block."""
-    n = x.shape[0]
-    root = math.sqrt(n)
-    for j in range(n):
-        row = places[j] * WIDTH
-        for i in range(columns):
-            points[row + i] = x[j]
-        for i in range(j + 1):
+    root = math.sqrt(x.shape[0])
+    for j in range(x.shape[0]):
+        row = _row(points, places, j)
+        for i in range(WIDTH):
+            row[i] = x[j]
+        for i in range(min(j + 1, m)):
             away = root * L[j, i]
-            points[row + 1 + i] += away
-            points[row + 1 + n + i] -= away
+            row[1 + i] = x[j] + away
+            row[1 + m + i] = x[j] - away
+
+
+@_sum
+def _products(block, places, a, b):  # type: ignore[no-untyped-def]
+    """Return the sums of products of row a and the four rows from b; rows behind the last one are the last one."""
+    last, of_a = places.shape[0] - 1, _row(block, places, a)
+    row_0, row_1 = _row(block, places, b), _row(block, places, min(b + 1, last))
+    row_2, row_3 = _row(block, places, min(b + 2, last)), _row(block, places, min(b + 3, last))
+    s_0 = s_1 = s_2 = s_3 = 0.0
+    for i in range(WIDTH):
+        s_0 += of_a[i] * row_0[i]
+        s_1 += of_a[i] * row_1[i]
+        s_2 += of_a[i] * row_2[i]
+        s_3 += of_a[i] * row_3[i]
+    return s_0, s_1, s_2, s_3
+
+
+@_sum
+def _deviate(row, m, n):  # type: ignore[no-untyped-def]
+    """Replace a row of a block by its deviations from the centre, in whose column is δ / √w; return the mean."""
+    centre, moved = row[0], 0.0
+    for i in range(WIDTH):
+        row[i] = row[i] - centre if i <= 2 * m else 0.0
+        moved += row[i]
+    row[0] = math.sqrt(0.5 / n) * moved
+    return centre + 0.5 / n * moved
 
 
 @_inline
-def _products(a, row_a, b, row_b, columns):  # type: ignore[no-untyped-def]
+def _covariance(L, a, row, m):  # type: ignore[no-untyped-def]
+    """Return the covariance of an entry a before the model and a result behind it, which has the deviations ``row``."""
     s = 0.0
-    for i in range(columns):
-        s += a[row_a + i] * b[row_b + i]
-    return s
-
-
-@_inline
-def _deviate(block, row, columns, weight, out, first):  # type: ignore[no-untyped-def]
-    """Write the deviations of a row of a block, with δ / √w in the centre's column; return the mean."""
-    centre, moved = block[row], 0.0
-    for i in range(columns):
-        out[first + i] = block[row + i] - centre
-        moved += out[first + i]
-    out[first] = math.sqrt(weight) * moved
-    return centre + weight * moved
+    for i in range(min(a + 1, m)):
+        s += L[a, i] * (row[1 + i] - row[1 + m + i])
+    return 0.5 / math.sqrt(L.shape[0]) * s
 
 
 @_compiled
-def moments(points, places, columns, q, x, P, E):  # type: ignore[no-untyped-def]
-    """Write mean [n] and covariance [n, n] of sigma points, with ``q`` [n] added to the variances; deviations to E."""
+def moments(points, places, m, q, x, P, rows):  # type: ignore[no-untyped-def]
+    """Write mean [n] and covariance [n, n] of sigma points, with ``q`` [n] added to the variances.
+
+    The points are replaced by their deviations. Only the first ``rows`` of the covariance count.
+    """
     n = x.shape[0]
-    weight = 0.5 / n
     for j in range(n):
-        x[j] = _deviate(points, places[j] * WIDTH, columns, weight, E, j * WIDTH)
-    for a in range(n):
-        for b in range(a + 1):
-            P[a, b] = P[b, a] = weight * _products(E, a * WIDTH, E, b * WIDTH, columns)
+        x[j] = _deviate(_row(points, places, j), m, n)
+    for a in range(rows):
+        end = min(a + 1, m)
+        for b in range(0, end, 4):
+            sums = _products(points, places, a, b)
+            for i in range(min(4, end - b)):
+                P[a, b + i] = P[b + i, a] = 0.5 / n * sums[i]
         P[a, a] += q[a]
 
 
 @_compiled
-def reading_moments(readings, L, columns, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
-    """Write mean [m], covariance [m, m] and cross covariance [m, n] of the readings of sigma points with the root L.
+def reading_moments(reading, L, m, covariance):  # type: ignore[no-untyped-def]
+    """Write the covariance [n] of a reading [WIDTH] of sigma points with the state; return its mean and variance.
 
-    ``readings`` are replaced by their deviations.
+    The reading is replaced by its deviations.
     """
-    n, m = L.shape[0], z_hat.shape[0]
-    weight, root = 0.5 / n, math.sqrt(n)
-    for k in range(m):
-        z_hat[k] = _deviate(readings, k * WIDTH, columns, weight, readings, k * WIDTH)
-        for b in range(k + 1):
-            S[k, b] = S[b, k] = weight * _products(readings, k * WIDTH, readings, b * WIDTH, columns)
-        for a in range(n):
-            s = 0.0
-            for i in range(a + 1):
-                s += L[a, i] * (readings[k * WIDTH + 1 + i] - readings[k * WIDTH + 1 + n + i])
-            Pxz[k, a] = weight * root * s
+    n, s = L.shape[0], 0.0
+    mean = _deviate(reading, m, n)
+    for i in range(2 * m + 1):
+        s += reading[i] * reading[i]
+    for a in range(n):
+        covariance[a] = _covariance(L, a, reading, m)
+    return mean, 0.5 / n * s
 
 
 @_compiled
-def cross_covariance(L, E, out):  # type: ignore[no-untyped-def]
-    """Write the covariance [n, n] of the state before a step, with the root L, and after it, with deviations E."""
+def cross_covariance(L, deviations, places, m, out):  # type: ignore[no-untyped-def]
+    """Write the covariance [n, n] of the state before a step, with the root L, and after it, with its deviations."""
     n = L.shape[0]
     for a in range(n):
         for b in range(n):
-            s = 0.0
-            for i in range(a + 1):
-                s += L[a, i] * (E[b * WIDTH + 1 + i] - E[b * WIDTH + 1 + n + i])
-            out[a, b] = 0.5 / math.sqrt(n) * s
+            out[a, b] = _covariance(L, a, _row(deviations, places, b), m)
+            for i in range(m, n):
+                out[a, b] += L[a, i] * L[b, i]
 
 
 @_compiled
 def update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
     """Update x [n], P [n, n] in place with the channels of ``use`` (bool [m]).
 
-    ν [m] is the innovation, S [m, m] its covariance with R, P_xz [m, n]. With S = Λ Λᵀ and G = Λ⁻¹ P_xz, the gain is
-    never formed: x += Gᵀ Λ⁻¹ ν, P −= Gᵀ G.
+    ν [m] is the innovation, S [m, m] its covariance with R, of which the lower triangle is read, P_xz [m, n]. With
+    S = Λ Λᵀ and G = Λ⁻¹ P_xz, the gain is never formed: x += Gᵀ Λ⁻¹ ν, P −= Gᵀ G. Λ, Λ⁻¹ ν and G replace S, ν and P_xz.
 
     Returns
     -------
     nis : νᵀ S⁻¹ ν over the used channels. dof : how many. log_likelihood : of the innovation, Gaussian.
     """
-    n, m, used = x.shape[0], nu.shape[0], 0
-    index, root, w, G = np.empty(m, np.int64), np.zeros((m, m)), np.empty(m), np.zeros((m, n))
-    for k in range(m):
-        if use[k]:
-            index[used] = k
-            used += 1
-    if used == 0:
-        return 0.0, 0, 0.0
-    A = np.empty((used, used))
-    for i in range(used):
-        for j in range(used):
-            A[i, j] = S[index[i], index[j]]
-    cholesky(A, root[:used, :used])
-    det, nis = 1.0, 0.0
-    for i in range(used):
-        w[i] = nu[index[i]]
+    n, used, det, nis = x.shape[0], 0, 1.0, 0.0
+    for i in range(nu.shape[0]):
+        used += use[i]
+        for j in range(i + 1):
+            if not (use[i] and use[j]):  # a channel that is not used has no covariance with anything
+                S[i, j] = 1.0 if i == j else 0.0
+            for k in range(j):
+                S[i, j] -= S[i, k] * S[j, k]
+            S[i, j] = math.sqrt(S[i, i]) if i == j else S[i, j] / S[j, j]
+        per_root = 1.0 / S[i, i] if use[i] else 0.0
+        nu[i] = nu[i] if use[i] else 0.0
         for j in range(i):
-            w[i] -= root[i, j] * w[j]
-        w[i] /= root[i, i]
-        nis += w[i] * w[i]
-        det *= root[i, i]
+            nu[i] -= S[i, j] * nu[j]
+        nu[i] *= per_root
+        nis += nu[i] * nu[i]
+        det *= S[i, i]
         for a in range(n):
-            s = Pxz[index[i], a]
+            s = Pxz[i, a]
             for j in range(i):
-                s -= root[i, j] * G[j, a]
-            G[i, a] = s / root[i, i]
-            x[a] += w[i] * G[i, a]
-    for a in range(n):
-        for b in range(a + 1):
-            s = P[a, b]
-            for i in range(used):
-                s -= G[i, a] * G[i, b]
-            P[a, b] = P[b, a] = s
+                s -= S[i, j] * Pxz[j, a]
+            Pxz[i, a] = s * per_root
+            x[a] += nu[i] * Pxz[i, a]
+        for a in range(n if use[i] else 0):
+            gain = Pxz[i, a]
+            for b in range(n):
+                P[a, b] -= gain * Pxz[i, b]
     return nis, used, -0.5 * (nis + used * math.log(2.0 * math.pi)) - math.log(det)

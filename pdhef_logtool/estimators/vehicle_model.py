@@ -51,12 +51,13 @@ from pdhef_logtool.records.signals import IntArray
 #: forces, the first four those of every model.
 VX, VY, YAW_RATE, AX_BIAS, FRONT, REAR, ROLL, ROLL_RATE, BANK, FORCE_SCALE, STEER_BIAS, AY_BIAS, RATE_BIAS = range(13)
 MOTION, CORE, PLACES = 3, 6, 13
-#: Rows of readings.
+#: Sensors.
 Z_AY, Z_YAW_RATE, Z_SPEED = range(3)
 READINGS = 3
-#: Columns of an inner loop, and columns of a block: a multiple of it, for two states an entry and one at the centre.
-LANES = 8
-WIDTH = 4 * LANES
+#: Columns of an inner loop, and columns of a block: a multiple of it, for two states an entry before the sensor
+#: biases and one at the centre.
+LANES = 4
+WIDTH = 6 * LANES
 
 #: Time constant with which the force scale returns to 0, s (docs/method.md#physics).
 FORCE_SCALE_TIME_S = 2.0
@@ -70,6 +71,7 @@ _LEAST_GRIP = 0.2
 LEAST_ROLL_GRADIENT = 1e-3
 
 _compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
+_inner = njit(cache=True, no_cpython_wrapper=True, error_model="numpy", fastmath={"contract"})
 _inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
 
@@ -206,7 +208,7 @@ def grip_under_braking(ax, friction, load_per_ax):  # type: ignore[no-untyped-de
     return max(1.0 + load_per_ax * ax, _LEAST_GRIP) * left
 
 
-@njit(cache=True)
+@_inner
 def _prepare_nominal(steer, friction, p):  # type: ignore[no-untyped-def]
     """Return the constants of the nominal model at a steering angle."""
     return _Nominal(
@@ -221,7 +223,7 @@ def _prepare_nominal(steer, friction, p):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True)
+@_inner
 def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
     """Return the constants of a step of ``h`` s at a speed of about ``vx``."""
     kept, tyre_s = 0.0, h
@@ -289,7 +291,7 @@ def advance(points, columns, over, dt, layout, p, f):  # type: ignore[no-untyped
 
 
 # positional: as advance.
-@_compiled
+@_inner
 def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ignore[no-untyped-def]
     """Advance states of the model with axle forces in ``n`` steps."""
     h = dt / n
@@ -378,7 +380,7 @@ def _nominal_derivative(vx, vy, r, ax, steer, c, p):  # type: ignore[no-untyped-
     return ax + r_dot * p.imu_y_m + r * r * p.imu_x_m + vy * r, vy_dot, r_dot
 
 
-@_compiled
+@_inner
 def _advance_nominal(points, columns, over, dt, n, p):  # type: ignore[no-untyped-def]
     """Advance states of the nominal model in ``n`` RK4 steps."""
     c, steer = _prepare_nominal(over.steer, over.friction, p), over.steer
@@ -415,8 +417,8 @@ def push(points, columns, vx, rate, dt, p):  # type: ignore[no-untyped-def]
 
 # positional: as advance.
 @_compiled
-def read(points, columns, steer, friction, rate_vy, layout, p, f, readings):  # type: ignore[no-untyped-def]
-    """Write the readings of accelerometer, gyro and speed in the states of a block to ``readings`` [READINGS · WIDTH].
+def read_ay(points, columns, steer, friction, rate_vy, layout, p, f, out):  # type: ignore[no-untyped-def]
+    """Write the accelerometer's lateral reading in the states of a block to ``out`` [WIDTH], without its bias.
 
     ``rate_vy`` is the residual of v̇_y, which the accelerometer feels as it does the tyres' forces.
     """
@@ -434,9 +436,7 @@ def read(points, columns, steer, friction, rate_vy, layout, p, f, readings):  # 
             ay, turn = _nominal_accelerations(vx, vy, r, steer, nominal, p)
         ay = w * (ay + max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j]) * rate_vy) + (1.0 - w) * vx * r
         ay = (1.0 + tilt) * ay + w * turn * p.imu_x_m - r * r * p.imu_y_m + GRAVITY_M_S2 * points[ROLL * WIDTH + j]
-        readings[Z_AY * WIDTH + j] = ay + points[AY_BIAS * WIDTH + j]
-        readings[Z_YAW_RATE * WIDTH + j] = r + points[RATE_BIAS * WIDTH + j]
-        readings[Z_SPEED * WIDTH + j] = vx
+        out[j] = ay
 
 
 @njit(cache=True)

@@ -57,7 +57,7 @@ from pdhef_logtool.estimators.vehicle_model import (
     physics_parameters,
     planar_ay,
     push,
-    read,
+    read_ay,
     settle_forces,
 )
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
@@ -136,7 +136,7 @@ MEMORY_FIELDS: list[tuple[Any, ...]] = [
 ]
 MEMORY = np.dtype(MEMORY_FIELDS)
 
-_compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
+_compiled = njit(cache=True, no_cpython_wrapper=True, error_model="numpy", fastmath={"contract"})
 _inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
 
@@ -333,45 +333,76 @@ def yield_to_kinematics(x, friction, dt, rules, p, f, m):  # type: ignore[no-unt
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
 @_compiled
-def predict(x, P, L, over, rate, dt, early, q, layout, places, p, f, points, E):  # type: ignore[no-untyped-def]
+def predict(x, P, L, over, rate, dt, early, q, layout, places, p, f, points, rows):  # type: ignore[no-untyped-def]
     """Move state and covariance by ``dt`` s with the residual ``rate`` of v̇_y and ṙ.
 
     The share ``early`` of the residual's increment comes before the model's step (Strang splitting: half of it), the
-    rest behind it. Leaves the root of the former covariance in L, and the deviations of the moved points in E.
+    rest behind it. Leaves the root of the former covariance in L, and deviations in place of the moved points. Only the
+    first ``rows`` of the new covariance count.
     """
-    columns = columns_of(x.shape[0])
+    m = changing(layout)
+    columns = columns_of(m)
     cholesky(P, L)
     given = rate[0] != 0.0 or rate[1] != 0.0
     vx = x[VX]
-    draw(x, L, places, columns, points)
+    draw(x, L, places, m, points)
     if given:
         push(points, columns, vx, rate, early * dt, p)
     advance(points, columns, over, dt, layout, p, f)
     if given:
         push(points, columns, vx, rate, (1.0 - early) * dt, p)
-    moments(points, places, columns, q, x, P, E)
+    moments(points, places, m, q, x, P, rows)
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
 @_compiled
-def expect(x, P, L, now, rate_vy, r, layout, places, p, f, points, readings, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
-    """Write the expected readings [3], their covariance with R [3, 3] and the cross covariance [3, n].
+def expect(x, P, L, now, rate_vy, r, layout, places, p, f, points, reading, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
+    """Write the expected readings [3], the lower triangle of their covariance with R, and the cross covariance [3, n].
 
-    ``r`` [3] are the variances of the sensors. Leaves the root of P in L.
+    ``r`` [3] are the variances of the sensors. The models of gyro and speed are linear, and so are the sensor biases:
+    the sigma points of a_y are sufficient. Leaves the root of P in L.
     """
-    columns = columns_of(x.shape[0])
+    m = changing(layout)
     cholesky(P, L)
-    draw(x, L, places, columns, points)
-    read(points, columns, now.steer, now.friction, rate_vy, layout, p, f, readings)
-    reading_moments(readings, L, columns, z_hat, S, Pxz)
+    draw(x, L, places, m, points)
+    read_ay(points, columns_of(m), now.steer, now.friction, rate_vy, layout, p, f, reading)
+    z_hat[Z_AY], S[Z_AY, Z_AY] = reading_moments(reading, L, m, Pxz[Z_AY])
+    for i, entry in ((Z_YAW_RATE, YAW_RATE), (Z_SPEED, VX)):
+        z_hat[i] = x[entry]
+        for a in range(x.shape[0]):
+            Pxz[i, a] = P[entry, a]
+        for j in range(i + 1):
+            S[i, j] = Pxz[j, entry]
+    if layout.sensor_bias >= 0:
+        add_biases(x, P, layout.sensor_bias, z_hat, S, Pxz)
     for i in range(READINGS):
         S[i, i] += r[i]
 
 
-@njit
-def columns_of(n):  # type: ignore[no-untyped-def]
-    """Return the columns of a block for the sigma points of n entries: whole vectors; the rest are at the centre."""
-    return (2 * n + LANES) // LANES * LANES
+@_inline
+def add_biases(x, P, first, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
+    """Add the biases of a_y and yaw rate, the entries from ``first``, to expected readings and their covariances."""
+    for i in range(READINGS):
+        for j in range(min(i, Z_YAW_RATE) + 1):
+            S[i, j] += Pxz[i, first + j]
+            if i <= Z_YAW_RATE:
+                S[i, j] += Pxz[j, first + i] + P[first + i, first + j]
+    for i in (Z_AY, Z_YAW_RATE):
+        z_hat[i] += x[first + i]
+        for a in range(x.shape[0]):
+            Pxz[i, a] += P[first + i, a]
+
+
+@_inline
+def changing(layout):  # type: ignore[no-untyped-def]
+    """Return the number of entries before the sensor biases, which the model neither changes nor depends on."""
+    return layout.sensor_bias if layout.sensor_bias >= 0 else layout.size
+
+
+@_inline
+def columns_of(m):  # type: ignore[no-untyped-def]
+    """Return the columns of a block for the sigma points of m entries: whole vectors; the rest are at the centre."""
+    return (2 * m + LANES) // LANES * LANES
 
 
 @_inline
@@ -482,7 +513,7 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
     out_x, out_P, out_inputs, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_linked, out_predicted_P, out_cross = links
     linked, n, bias = out_linked.shape[0] > 0, x.shape[0], layout.steer_bias
-    points, readings, E = np.zeros(PLACES * WIDTH), np.zeros(READINGS * WIDTH), np.zeros(n * WIDTH)
+    points, reading = np.zeros(PLACES * WIDTH), np.zeros(WIDTH)
     L, q, r = np.zeros((n, n)), np.zeros(n), np.zeros(READINGS)
     S, Pxz = np.zeros((READINGS, READINGS)), np.zeros((READINGS, n))
     z_hat, nu, at_gate = np.zeros(READINGS), np.zeros(READINGS), np.zeros(READINGS)
@@ -514,28 +545,28 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
                 factor, f = yield_to_kinematics(x, over.friction, now.dt, rules, p, f, m)
                 q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             process_noise(q_std, over.ax_known, now.dt, layout, q)
-            predict(x, P, L, over, rate, now.dt, 0.5, q, layout, places, p, f, points, E)
+            predict(x, P, L, over, rate, now.dt, 0.5, q, layout, places, p, f, points, n)
             if linked:
-                cross_covariance(L, E, out_cross[k])
+                cross_covariance(L, points, places, changing(layout), out_cross[k])
                 out_predicted_P[k] = P
             out_prior[k] = x
             alive, stands = is_finite(x, P), False
             if alive:
                 for i in range(READINGS):
                     r[i] = r_std[i] * r_std[i] + (window.extra_r[k, i] if i < Z_SPEED else 0.0)
-                expect(x, P, L, now, rate[0], r, layout, places, p, f, points, readings, z_hat, S, Pxz)
+                expect(x, P, L, now, rate[0], r, layout, places, p, f, points, reading, z_hat, S, Pxz)
                 innovate(now, z_hat, nu)
                 gated = gate(now, m, nu, S, at_gate, given, use)
                 for i in range(READINGS):
                     if given[i]:
                         out_nu[k, i] = nu[i]
                 if gated.outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
-                    _, _, out_likelihood[k] = update(x.copy(), P.copy(), at_gate, S, Pxz, given)
+                    _, _, out_likelihood[k] = update(x.copy(), P.copy(), at_gate, S.copy(), Pxz.copy(), given)
                 if gated.opens:
                     P *= GATE_INFLATION
                     if linked:  # to a smoother the inflation is process noise of the step that led here
                         out_predicted_P[k] = P
-                    expect(x, P, L, now, rate[0], r, layout, places, p, f, points, readings, z_hat, S, Pxz)
+                    expect(x, P, L, now, rate[0], r, layout, places, p, f, points, reading, z_hat, S, Pxz)
                     innovate(now, z_hat, nu)
                     for i in range(READINGS):
                         if use[i]:
@@ -568,7 +599,7 @@ def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-un
     out_x, out_P, out_ay = out
     layout, places, p, f = model
     n = held_x.shape[1]
-    points, E, L, q = np.zeros(PLACES * WIDTH), np.zeros(n * WIDTH), np.zeros((n, n)), np.zeros(n)
+    points, L, q = np.zeros(PLACES * WIDTH), np.zeros((n, n)), np.zeros(n)
     x, P = np.zeros(n), np.zeros((n, n))
     for row in range(step.shape[0]):
         k = step[row]
@@ -580,7 +611,7 @@ def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-un
         rate = (residual_rate[k, 0], residual_rate[k, 1])
         if horizon_s[row] > 0.0:
             process_noise(q_std, over.ax_known, noise[k] * horizon_s[row], layout, q)
-            predict(x, P, L, over, rate, horizon_s[row], early, q, layout, places, p, f, points, E)
+            predict(x, P, L, over, rate, horizon_s[row], early, q, layout, places, p, f, points, MOTION)
         if is_finite(x, P):
             out_x[row] = x
             out_P[row] = P[:MOTION, :MOTION]
@@ -863,13 +894,13 @@ class VehicleUkf:
 @njit(cache=True)
 def _expected_ay(x, inputs, model, out):  # type: ignore[no-untyped-def]
     layout, places, p, f = model
-    points, readings = np.zeros(PLACES * WIDTH), np.zeros(READINGS * WIDTH)
+    points, reading = np.zeros(PLACES * WIDTH), np.zeros(WIDTH)
     for k in range(x.shape[0]):
         if math.isfinite(x[k, VX]):
-            for j in range(x.shape[1]):
+            for j in range(places.shape[0]):
                 points[places[j] * WIDTH] = x[k, j]
-            read(points, 1, inputs[k, U_STEER], inputs[k, U_FRICTION], 0.0, layout, p, f, readings)
-            out[k] = readings[Z_AY * WIDTH]
+            read_ay(points, 1, inputs[k, U_STEER], inputs[k, U_FRICTION], 0.0, layout, p, f, reading)
+            out[k] = reading[0] + (x[k, layout.sensor_bias] if layout.sensor_bias >= 0 else 0.0)
 
 
 def resume(state: FilterState | None, n: int) -> Belief:
