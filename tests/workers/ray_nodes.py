@@ -23,7 +23,6 @@ def cluster_of_one() -> Iterator[Any]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        patch.setenv("RAY_CLIENT_MODE", "0")  # Ray sets it; the patch restores it
         patch.setenv("PYTHONPATH", str(ROOT), prepend=os.pathsep)  # nodes import the work of tests
         terminated = signal.getsignal(signal.SIGTERM)
         made = Cluster(initialize_head=True, head_node_args={**_NODE, "include_dashboard": False})
