@@ -211,6 +211,16 @@ def test_split_files_keep_their_chunks_while_their_ids_agree(tmp_path: Path, swa
         assert len(make_reader(stream).get_summary().channels) == 3
 
 
+def test_two_publishers_of_a_topic_stay_two_channels(tmp_path: Path) -> None:
+    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    _write(source, extra=("/d", "/d"))
+    _annotate(source, target, batches=False)
+    with target.open("rb") as stream:
+        topics = [channel.topic for channel in make_reader(stream).get_summary().channels.values()]
+    assert sorted(topics) == ["/a", "/b", "/c", "/d", "/d", "/ours"]
+    assert _messages(target) == _messages(source)
+
+
 def test_overlapping_chunks_keep_the_order_of_the_file(tmp_path: Path) -> None:
     source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
     with mcap_writer(
