@@ -94,6 +94,7 @@ def test_time_grows_with_what_is_read_and_counts_again_each_time(monkeypatch: py
             now[0] += 7.0
             meter.check()
     assert meter.allowed_s == 15.0
+    meter.check()
     with meter.running(), pytest.raises(LimitError, match="longer than 15 s"):
         now[0] += 1.1
         meter.check()
