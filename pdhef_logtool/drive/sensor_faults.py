@@ -79,10 +79,10 @@ def without_faults(signals: Signals, vehicle: VehicleParameters) -> Signals:
         extra[:, i], bits = _without_spikes(sound[name], i, signals, cells, vehicle.sensors)
         faults |= bits << i
     calm: dict[str, Any] = {name: np.where(extra.any(axis=1), np.nan, column) for name, column in sound.items()}
-    dead, told = _dead(cells_of(replace(signals, **calm)), turning, vehicle)
+    dead, reported = _dead(cells_of(replace(signals, **calm)), turning, vehicle)
     for i, name in enumerate(COLUMNS):
         sound[name][dead[cells.of_stamp, i]] = np.nan
-        faults[told[cells.of_stamp, i]] |= DEAD_AY << i
+        faults[reported[cells.of_stamp, i]] |= DEAD_AY << i
     return replace(signals, **sound, extra_variance=extra, faults=faults.astype(np.float64))
 
 
@@ -121,7 +121,7 @@ def _without_spikes(
     # A rough car is no burst: its noise is usual.
     is_loud = noise > LOUD_RATIO * (np.median(noise) if len(rows) else 0.0)
     faults[rows[_is_burst(time_s, is_loud, BURST_SAMPLES / sensors.imu_rate_hz)]] |= BURST_AY
-    faults[rows[_told_spikes(time_s, beyond)]] |= SPIKE_AY
+    faults[rows[_reported_spikes(time_s, beyond)]] |= SPIKE_AY
     return extra, faults
 
 
@@ -141,16 +141,16 @@ def _is_burst(time_s: FloatArray, is_noisy: BoolArray, window_s: float) -> BoolA
     return np.asarray((noisy[end] - noisy[first] > BURST_SHARE * (end - first)) & (time_s >= window_s))
 
 
-def _told_spikes(time_s: FloatArray, beyond: FloatArray) -> list[int]:
+def _reported_spikes(time_s: FloatArray, beyond: FloatArray) -> list[int]:
     """Return the spikes among samples [n] whose accumulated evidence exceeds the one of a long tail."""
-    told, nats, before_s = [], 0.0, 0.0
+    reported, nats, before_s = [], 0.0, 0.0
     for k in map(int, np.flatnonzero(beyond)):
         nats = max(nats - SPIKE_FORGOTTEN_NATS_PER_S * (time_s[k] - before_s), 0.0)
         nats = min(nats + SPIKE_AT_LIMIT_NATS + SPIKE_POWER * math.log(beyond[k]), 2.0 * SPIKE_NATS)
         before_s = time_s[k]
         if nats >= SPIKE_NATS:
-            told.append(k)
-    return told
+            reported.append(k)
+    return reported
 
 
 def _dead(cells: Cells, turning: FloatArray, vehicle: VehicleParameters) -> tuple[BoolArray, BoolArray]:
@@ -165,7 +165,7 @@ def _dead(cells: Cells, turning: FloatArray, vehicle: VehicleParameters) -> tupl
     noise = np.stack([sensors.ay_std_m_s2 / v, np.full(len(by_ay), sensors.yaw_rate_std_rad_s)])
     least = WITNESS_RAD_S + WITNESS_NOISE_SIGMAS * noise.max(axis=0)
     measures = (by_ay, cells.yaw_rate)
-    dead, told = np.zeros((len(by_ay), 2), np.bool_), np.zeros((len(by_ay), 2), np.bool_)
+    dead, reported = np.zeros((len(by_ay), 2), np.bool_), np.zeros((len(by_ay), 2), np.bool_)
     for i, (reading, other) in enumerate((measures, measures[::-1])):
         weakest = np.minimum(np.abs(other), np.abs(turning))
         agree = (other * turning > 0.0) & (weakest > least)
@@ -180,11 +180,11 @@ def _dead(cells: Cells, turning: FloatArray, vehicle: VehicleParameters) -> tupl
         stretch = np.cumsum(np.diff(dead[:, i], prepend=False))
         left, right = (np.bincount(stretch, silent & (turning * side > 0.0)) for side in (1.0, -1.0))
         silent_s = CELL_S * (2.0 * np.minimum(left, right) if i == 0 else left + right)
-        told[:, i] = dead[:, i] & (silent_s[stretch] >= DEAD_REPORTED_AFTER_S)
-    return dead, told
+        reported[:, i] = dead[:, i] & (silent_s[stretch] >= DEAD_REPORTED_AFTER_S)
+    return dead, reported
 
 
 def _lasts(mask: BoolArray, time_s: float) -> BoolArray:
-    """Return the cells [n] at the end of a time in which a condition [n] holds without a break."""
+    """Return the cells [n] up to which a condition [n] has been true for ``time_s`` without a break."""
     count = np.arange(len(mask))
     return np.asarray((count - np.maximum.accumulate(np.where(mask, -1, count))) * CELL_S >= time_s)

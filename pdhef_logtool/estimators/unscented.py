@@ -191,7 +191,7 @@ def cross_covariance(L, deviations, places, m, out):  # type: ignore[no-untyped-
 def update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
     """Update x [n], P [n, n] in place with the channels of ``use`` (bool [m]).
 
-    ν [m] is the innovation, S [m, m] its covariance with R, of which the lower triangle is read, P_xz [m, n]. With
+    ν [m] is the innovation, S [m, m] (lower triangle) its covariance with R, P_xz [m, n]. With
     S = Λ Λᵀ and G = Λ⁻¹ P_xz, the gain is never formed: x += Gᵀ Λ⁻¹ ν, P −= Gᵀ G. Λ, Λ⁻¹ ν and G replace S, ν and P_xz.
 
     Returns

@@ -71,7 +71,7 @@ _LEAST_GRIP = 0.2
 LEAST_ROLL_GRADIENT = 1e-3
 
 _compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
-_inner = njit(cache=True, no_cpython_wrapper=True, error_model="numpy", fastmath={"contract"})
+_compiled_inside = njit(cache=True, no_cpython_wrapper=True, error_model="numpy", fastmath={"contract"})
 _inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
 
@@ -208,7 +208,7 @@ def grip_under_braking(ax, friction, load_per_ax):  # type: ignore[no-untyped-de
     return max(1.0 + load_per_ax * ax, _LEAST_GRIP) * left
 
 
-@_inner
+@_compiled_inside
 def _prepare_nominal(steer, friction, p):  # type: ignore[no-untyped-def]
     """Return the constants of the nominal model at a steering angle."""
     return _Nominal(
@@ -223,7 +223,7 @@ def _prepare_nominal(steer, friction, p):  # type: ignore[no-untyped-def]
     )
 
 
-@_inner
+@_compiled_inside
 def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
     """Return the constants of a step of ``h`` s at a speed of about ``vx``."""
     kept, tyre_s = 0.0, h
@@ -291,7 +291,7 @@ def advance(points, columns, over, dt, layout, p, f):  # type: ignore[no-untyped
 
 
 # positional: as advance.
-@_inner
+@_compiled_inside
 def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ignore[no-untyped-def]
     """Advance states of the model with axle forces in ``n`` steps."""
     h = dt / n
@@ -380,7 +380,7 @@ def _nominal_derivative(vx, vy, r, ax, steer, c, p):  # type: ignore[no-untyped-
     return ax + r_dot * p.imu_y_m + r * r * p.imu_x_m + vy * r, vy_dot, r_dot
 
 
-@_inner
+@_compiled_inside
 def _advance_nominal(points, columns, over, dt, n, p):  # type: ignore[no-untyped-def]
     """Advance states of the nominal model in ``n`` RK4 steps."""
     c, steer = _prepare_nominal(over.steer, over.friction, p), over.steer
