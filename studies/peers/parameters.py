@@ -17,7 +17,7 @@ NORMAL_95 = 1.959964
 #: Parameters of the car; biases, offsets and delays belong to a drive.
 STEERING, PEAK = "steering ratio", "peak force over the file's"
 OF_CAR = (
-    "front cornering stiffness", "rear cornering stiffness", PEAK, "yaw inertia", "relaxation length", STEERING,
+    "rear cornering stiffness", PEAK, "yaw inertia", "relaxation length", STEERING,
     "roll gain", "lever of a_y",
 )  # fmt: skip
 
