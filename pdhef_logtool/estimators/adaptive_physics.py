@@ -207,7 +207,7 @@ class AdaptivePhysics:
         return tuple(replace(self.physics, vehicle=v) for v in vehicles)
 
     def inputs(self, signals: Signals, state: InputState | None) -> tuple[CheckedInputs, InputState]:
-        """Return the inputs of the filters, checked signals with the residual at gain 1, and the state."""
+        """Return faults and the residual at gain 1, and the state."""
         if not self.adaptive:
             signals = replace(signals, extra_variance=np.zeros((len(signals), 2)))
         return check_inputs(self.physics, self.network, signals, state)
@@ -218,7 +218,7 @@ class AdaptivePhysics:
         faults, rate, filters = checked.faults, self.trust * checked.rate, self.filters
         before: Sequence[FilterState | None] = state.filters if state else [None] * len(filters)
         members = zip(filters, before, self.residual_shares, strict=True)
-        runs = [f.run(faults.filtered, b, share * rate, faults.extra_r) for f, b, share in members]
+        runs = [f.run(signals, b, share * rate, faults.extra_r) for f, b, share in members]
         steps = tuple(filter_steps for filter_steps, _ in runs)
         dt_s = step_durations_s(signals.stamps_ns, state.filters[0].last_stamp_ns if state else None)
         evidence = state.evidence.copy() if state else np.zeros(len(filters))

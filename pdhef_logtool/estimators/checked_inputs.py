@@ -34,12 +34,11 @@ class SensorFaults:
     ----------
     extra_r : [N, 2], variance in excess of the usual one, m²/s⁴ and rad²/s²; 0 without a fault.
     reason : int64 [N], reported faults, bits of :mod:`pdhef_logtool.records.reasons`.
-    filtered : signals for filters. network : signals for the network's features, without samples of a burst.
+    network : signals for the network's features, without samples of a burst.
     """
 
     extra_r: FloatArray
     reason: IntArray
-    filtered: Signals
     network: Signals
 
     @classmethod
@@ -49,7 +48,7 @@ class SensorFaults:
         seen: dict[str, Any] = {
             n: np.where(extra[:, i] > 0.0, np.nan, getattr(signals, n)) for i, n in enumerate(names)
         }
-        return cls(extra, np.nan_to_num(signals.faults).astype(np.int64), signals, replace(signals, **seen))
+        return cls(extra, np.nan_to_num(signals.faults).astype(np.int64), replace(signals, **seen))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -57,8 +57,8 @@ def residual_response(physics: AdaptivePhysics, signals: Signals, row: IntArray)
     probe[:, 0] = PROBE_M_S2
     runs, transitions, drives = [], [], []
     for physics_filter, share in zip(physics.filters, physics.residual_shares, strict=True):
-        steps, _, links = physics_filter.linked_steps(faults.filtered, None, None, faults.extra_r)
-        moved, _ = physics_filter.run(faults.filtered, None, share * probe, faults.extra_r)
+        steps, _, links = physics_filter.linked_steps(signals, None, None, faults.extra_r)
+        moved, _ = physics_filter.run(signals, None, share * probe, faults.extra_r)
         transition = _transition(steps, links)
         change = np.nan_to_num((moved.x - steps.x) / PROBE_M_S2)
         drive = np.zeros_like(change)

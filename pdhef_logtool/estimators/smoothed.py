@@ -103,8 +103,8 @@ class SmoothedPhysics:
 
     def smooth(self, signals: Signals) -> StateTrack:
         """Return the track of a drive (see :class:`~.base.Smoother`)."""
-        checked, rate, gain, extra_r, reason = self._inputs(signals)
-        tracks, weights = self._filtered(checked, rate, extra_r)
+        rate, gain, extra_r, reason = self._inputs(signals)
+        tracks, weights = self._filtered(signals, rate, extra_r)
         track = mix(weights, tracks) if len(tracks) > 1 else tracks[0]
         raised = r_scale(extra_r, self.filtered.physics.measurement_std)
         track = self.filtered.described(track, weights, gain, raised, reason)
@@ -116,17 +116,15 @@ class SmoothedPhysics:
             mixture_weight=track.mixture_weight if len(tracks) > 1 else np.empty(0),
         )
 
-    def _inputs(self, signals: Signals) -> tuple[Signals, FloatArray, FloatArray, FloatArray, IntArray]:
-        """Return checked signals, residual rate times gain [N, 2], gain [N], extra variance [N, 2] and reasons [N]."""
+    def _inputs(self, signals: Signals) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+        """Return residual rate times gain [N, 2], gain [N], extra variance [N, 2] and reasons [N]."""
         state, columns = None, []
         for part in blocks(signals.stamps_ns, self.block_s):
             checked, state = self.filtered.inputs(signals.rows(part.start, part.stop), state)
             faults, trust = checked.faults, self.filtered.trust
-            seen, residual = faults.filtered, (trust * checked.rate, trust * checked.residual.gain)
-            columns.append((seen.ay_m_s2, seen.yaw_rate_rad_s, *residual, faults.extra_r, faults.reason))
-        ay, yaw_rate, *rest = (np.concatenate(column) for column in zip(*columns, strict=True))
-        rate, gain, extra_r, reason = rest
-        return replace(signals, ay_m_s2=ay, yaw_rate_rad_s=yaw_rate), rate, gain, extra_r, reason
+            columns.append((trust * checked.rate, trust * checked.residual.gain, faults.extra_r, faults.reason))
+        rate, gain, extra_r, reason = (np.concatenate(column) for column in zip(*columns, strict=True))
+        return rate, gain, extra_r, reason
 
     def _filtered(self, signals: Signals, rate: FloatArray, extra_r: FloatArray) -> tuple[list[StateTrack], FloatArray]:
         """Return the smoothed tracks of all filters [H], and their weights [N, H]."""

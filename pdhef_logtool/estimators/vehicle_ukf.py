@@ -136,7 +136,7 @@ MEMORY_FIELDS: list[tuple[Any, ...]] = [
 ]
 MEMORY = np.dtype(MEMORY_FIELDS)
 
-_compiled = njit(cache=True, no_cpython_wrapper=True, error_model="numpy", fastmath={"contract"})
+_compiled_inside = njit(cache=True, no_cpython_wrapper=True, error_model="numpy", fastmath={"contract"})
 _inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 
 
@@ -240,7 +240,7 @@ class GateResult(NamedTuple):
 # ------------------------------------------------------------------------------------------------ one step
 
 
-@_compiled
+@_compiled_inside
 def begin_step(k, window, rules, needs_steer, memory):  # type: ignore[no-untyped-def]
     """Reset after a time gap and zero-order-hold missing inputs. Return the inputs of step k."""
     dt, steers = window.dt_s[k], math.isfinite(window.steer[k])
@@ -332,7 +332,7 @@ def yield_to_kinematics(x, friction, dt, rules, p, f, m):  # type: ignore[no-unt
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
-@_compiled
+@_compiled_inside
 def predict(x, P, L, over, rate, dt, early, q, layout, places, p, f, points, rows):  # type: ignore[no-untyped-def]
     """Move state and covariance by ``dt`` s with the residual ``rate`` of v̇_y and ṙ.
 
@@ -355,7 +355,7 @@ def predict(x, P, L, over, rate, dt, early, q, layout, places, p, f, points, row
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
-@_compiled
+@_compiled_inside
 def expect(x, P, L, now, rate_vy, r, layout, places, p, f, points, reading, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
     """Write the expected readings [3], the lower triangle of their covariance with R, and the cross covariance [3, n].
 
@@ -413,7 +413,7 @@ def innovate(now, z_hat, nu):  # type: ignore[no-untyped-def]
     nu[Z_SPEED] = now.speed - z_hat[Z_SPEED]
 
 
-@_compiled
+@_compiled_inside
 def gate(now, m, nu, S, at_gate, given, use):  # type: ignore[no-untyped-def]
     """Decide which samples are used; those that are out of the gate for too long open it (docs/method.md#gate).
 
@@ -441,7 +441,7 @@ def gate(now, m, nu, S, at_gate, given, use):  # type: ignore[no-untyped-def]
     return GateResult(opens, outside, seen, squares)
 
 
-@_compiled
+@_compiled_inside
 def settle(now, gated, rules, standstill_std, x, P, m):  # type: ignore[no-untyped-def]
     """Average the normalised squared innovations, and contain the motion at rest; return whether the car is at rest."""
     if gated.seen > 0:

@@ -156,7 +156,7 @@ def lacking_of(drive: OpenedDrive, calibration: Posterior) -> TaughtDrive:
 def features_of(physics: AdaptivePhysics, signals: Signals) -> SlowFeatures:
     """Return the features of a drive's steps, as the filter in service computes them."""
     faults = physics.inputs(signals, None)[0].faults
-    table, dt_s, *_ = run_features(physics.physics, faults.filtered, None, seen=faults.network, extra_r=faults.extra_r)
+    table, dt_s, *_ = run_features(physics.physics, signals, None, seen=faults.network, extra_r=faults.extra_r)
     return slow_features(table, dt_s, None)[0]
 
 

@@ -170,8 +170,10 @@ def find_clock(sheet: Sheet, where: str, others: Sequence[Clock] = (), rate_hz: 
 def _in_two_columns(clock: Clock, sheet: Sheet, name: str, names: Mapping[str, str]) -> Clock:
     """Return a clock of seconds with the fractions of another column, ``stamp.sec`` and ``stamp.nanosec``."""
     rest = re.fullmatch(r"(.*?)_?(?:s|sec|secs|seconds)", snake(name))
-    for unit, ns in TIME_UNITS_NS.items() if rest else ():
-        within = names.get(f"{rest[1]}_{unit}".strip("_") if rest else "")
+    if rest is None:
+        return clock
+    for unit, ns in TIME_UNITS_NS.items():
+        within = names.get(f"{rest[1]}_{unit}".strip("_"))
         if within is not None and ns < _SECOND_NS:
             return with_fractions(clock, _numbers(sheet.columns[within]), ns, within)
     return clock

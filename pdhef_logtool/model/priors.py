@@ -38,7 +38,7 @@ MODEL_KG, MODEL_STDS, CAR_KG = 50.0, (0.5, 0.5), 400.0
 #: Log standard deviation of a file's peak force (wet or icy roads), and of its stiffness without a calibration.
 FILE_TYRE_STD = 0.5
 #: Correlation of a parameter between two drives of a car at the same level of a_y: chosen by the sideslip error of
-#: taught cars, with one car left out (docs/method.md#self-calibration).
+#: taught cars (docs/method.md#earlier-drives).
 CORRELATION = 0.75
 #: Usual share of gravity in a_y by body roll, rad/(m/s²), for files without one (3 degrees per g), and 1-sigma of the
 #: accelerometer's position in wheelbases.

@@ -68,7 +68,7 @@ def test_its_response_is_the_one_that_teaching_uses(signals: Signals) -> None:
     tracks = []
     for given in (0.0, 1.0):
         rates = np.stack([given * rate, np.zeros(len(rate))], axis=1)
-        steps, _ = estimator.physics.run(estimator.inputs(signals, None)[0].faults.filtered, None, rates)
+        steps, _ = estimator.physics.run(signals, None, rates)
         tracks.append(np.arctan2(steps.x[:, 1], steps.x[:, 0]))
     expected = tracks[1] - tracks[0]
     assert np.nanmax(np.abs(expected)) > 1e-4
