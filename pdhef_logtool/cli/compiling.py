@@ -9,6 +9,15 @@ from pdhef_logtool.cli import console, options
 commands = typer.Typer()
 
 
+#: The receiver of the simulated car as a sensor.
+_GNSS_MAPPING = """fill_recognised = true
+
+[signals]
+gnss_latitude_deg = { topic = "/rtk/fix", field = "latitude" }
+gnss_longitude_deg = { topic = "/rtk/fix", field = "longitude" }
+"""
+
+
 @options.command(commands, name="compile")
 def compile_() -> None:
     """Compile the filters in advance, so that the first run starts at once."""
@@ -24,10 +33,11 @@ def compile_() -> None:
 
     began_s = time.perf_counter()
     saloon = RunConfig(car=Path("saloon"), estimators=(ALL_ESTIMATORS,), keep="metrics", reference="on")
-    sedan = RunConfig(keep="metrics")
     with TemporaryDirectory() as folder:
-        log = Path(folder) / "drive.mcap"
+        log, mapping = Path(folder) / "drive.mcap", Path(folder) / "mapping.toml"
         write_drive(simulate_drive("banked-road"), log)
+        mapping.write_text(_GNSS_MAPPING, encoding="utf-8")
+        sedan = RunConfig(keep="metrics", reference="on", mapping=mapping)
         for config in (saloon, sedan):
             run_logs([str(log)], Path(folder) / "out", config, report=False)
     seconds = time.perf_counter() - began_s
