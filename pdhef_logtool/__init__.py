@@ -53,6 +53,11 @@ _HOMES = {
 __all__ = ["__version__", *sorted(_HOMES)]
 
 
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return [*__all__]
+
+
 def __getattr__(name: str) -> Any:
     """Import a public name at its first use, so that ``import pdhef_logtool`` stays fast."""
     if name not in _HOMES:

@@ -83,6 +83,9 @@ class Car:
     source: Path | None = None
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"<Car {self.vehicle.name}: {self.source or 'default'}, network {self.network_name}>"
+
     @classmethod
     def of(cls, vehicle: VehicleParameters, **parts: Any) -> Car:
         """Return a car of a vehicle with other attributes."""

@@ -58,6 +58,9 @@ class WholeDrive:
     log_start_ns: int
     changes: tuple[SensorChange, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"<WholeDrive {self.name}: {self.seconds:.1f} s, with{'out' * (self.truth is None)} ground truth>"
+
     @property
     def seconds(self) -> float:
         """Time from first to last stamp."""
@@ -97,6 +100,9 @@ class Drive:
     _recorded: Recorded | None = None
     _sha256: str = ""
     _state: tuple[tuple[int, int, int], ...] = ()
+
+    def __repr__(self) -> str:
+        return f"<Drive {self.name}: {self.path}, car {self.car.vehicle.name}>"
 
     @property
     def path(self) -> LogPlace:

@@ -200,6 +200,9 @@ class Signals:
         """Return the number of stamps."""
         return int(self.stamps_ns.shape[0])
 
+    def __repr__(self) -> str:
+        return f"<Signals: {len(self)} stamps of {', '.join(sorted(self.available))}>"
+
     def rows(self, start: int, end: int) -> Signals:
         """Return the stamps [start, end)."""
         return Signals(**{c: getattr(self, c)[start:end] for c in SIGNAL_COLUMNS}, available=self.available)

@@ -102,6 +102,9 @@ class StateTrack:
         """Return the number of stamps."""
         return int(self.stamps_ns.shape[0])
 
+    def __repr__(self) -> str:
+        return f"<StateTrack {self.name}: {len(self)} stamps, {np.count_nonzero(self.valid)} valid>"
+
     @property
     def vx_std_m_s(self) -> FloatArray:
         """Standard deviation of v_x, [N]; NaN without covariance."""

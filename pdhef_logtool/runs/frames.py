@@ -6,10 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pdhef_logtool.car.parts import Algorithm
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.table import Skipped
+from pdhef_logtool.evaluation.track_errors import signal_error
+from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.intervals import drive_intervals
 from pdhef_logtool.records.signals import Signals
@@ -36,6 +40,9 @@ class Estimates:
     algorithms: dict[str, Algorithm]
     skipped: tuple[Skipped, ...]
 
+    def __repr__(self) -> str:
+        return f"<Estimates of {self.drive.name}: {', '.join(self.estimated.tracks)}>"
+
     @property
     def tracks(self) -> dict[str, StateTrack]:
         """Tracks by estimator, and ``truth`` where the log has one, with dead-reckoned poses, divergence, intervals."""
@@ -47,14 +54,36 @@ class Estimates:
         """Input of the estimators."""
         return self.estimated.signals
 
-    def frame(self) -> pl.DataFrame:
-        """Return the tracks as rows of estimates.parquet, in SI units."""
+    def frame(self, *, errors: bool = False) -> pl.DataFrame:
+        """Return the tracks as rows of estimates.parquet, in SI units.
+
+        Parameters
+        ----------
+        errors : add estimate - ground truth as columns such as ``error_vy_m_s``, null where a stamp is not scored.
+        """
         import polars as pl
 
         from pdhef_logtool.results.parquet_sink import track_table
 
-        frames = (pl.DataFrame(track_table(track)) for track in self.tracks.values())
-        return pl.concat(f.with_columns(pl.col("estimator").cast(pl.String)) for f in frames)
+        frames = []
+        for track in self.tracks.values():
+            frame = pl.DataFrame(track_table(track)).with_columns(pl.col("estimator").cast(pl.String))
+            frames.append(frame.with_columns(**self._errors(track)) if errors else frame)
+        return pl.concat(frames)
+
+    def _errors(self, track: StateTrack) -> dict[str, pl.Series]:
+        """Return the errors of a track by column; the ground truth has none."""
+        import polars as pl
+
+        truth, slow = self.estimated.truth, self.drive.car.vehicle.low_speed_blend_m_s
+        unknown = np.full(len(track), np.nan)
+        scored = truth is not None and track.name != TRUTH
+        return {
+            f"error_{s}": pl.Series(
+                signal_error(track, truth, s, slow) if scored and truth else unknown, nan_to_null=True
+            )
+            for s in SCORED_SIGNALS
+        }
 
 
 def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
