@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn, Protocol, TypeVar
 import typer
 
 from pdhef_logtool.cli import stopping
+from pdhef_logtool.records import processes
 from pdhef_logtool.records.errors import EXIT_OK
 from pdhef_logtool.records.printable import all_printable, printable
 from pdhef_logtool.records.reporter import Reporter
@@ -92,9 +93,10 @@ def cell(value: float | None, factor: float = 1.0, digits: int = 2) -> str:
 
 
 def set_verbosity(*, quiet: bool = False, verbose: bool = False) -> None:
-    """Set the output on stderr: errors only (quiet), or also progress as lines (verbose)."""
+    """Set the output on stderr, also of workers: errors only (quiet), or also progress as lines (verbose)."""
     global _quiet, _verbose
-    _quiet, _verbose = quiet, verbose
+    _quiet = processes.quiet = quiet
+    _verbose = verbose
 
 
 def error(text: str) -> None:

@@ -20,7 +20,7 @@ from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.printable import all_printable, listed
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
 from pdhef_logtool.results.run_report import diverged_line, reasons_line
-from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, degrees, truth_of
+from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, SAME, degrees, truth_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -431,15 +431,20 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
     for report in reports:
         values, main = _figures(report), report["answer"]["main"]
         errors = [cell(values.get((n, "sideslip_rad", "all", "rmse")), DEGREES, 3) for n in (main, *rivals)]
+        own, naive = (values.get((n, "sideslip_rad", "all", "rmse")) for n in (main, report["answer"]["naive"]))
+        worse = own is not None and naive is not None and own > (1.0 + SAME) * naive
         inside = values.get((main, "sideslip_rad", "all", "coverage95"))
         seconds = f"{report['log']['duration_s']:.0f}"
-        notes = _look_at(report, inside, main if len(mains) > 1 else "")
+        notes = _look_at(report, inside, main if len(mains) > 1 else "", worse)
         joint.add_row(report["log"]["name"], seconds, *errors, cell(inside), notes)
     return joint
 
 
-def _look_at(report: _Report, inside: float | None, main: str) -> str:
-    """Return the points of a log to check as a short text; ``main``: its selected estimate if logs differ in it."""
+def _look_at(report: _Report, inside: float | None, main: str, worse: bool) -> str:
+    """Return the points of a log to check as a short text.
+
+    ``main``: its selected estimate if logs differ in it. ``worse``: whether it is worse than a constant.
+    """
     failed = sum(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks") or [])
     scored = any(m["signal"] == "sideslip_rad" and m["metric"] == "rmse" for m in report["metrics"])
     hints = [
@@ -448,6 +453,7 @@ def _look_at(report: _Report, inside: float | None, main: str) -> str:
         "input lost" if any(x["severity"] == "lost" for x in report["losses"]) else "",
         "no ground truth" if not report["truth"]["available"] else "" if scored else "not scored",
         "diverged" if diverged_line(report, report["answer"]["main"]) else "",
+        "worse than a constant" if worse else "",
         "interval too narrow" if inside is not None and inside < NEARLY_HOLDS else "",
     ]
     return ", ".join(filter(None, hints))

@@ -216,9 +216,9 @@ announced = False
 
 
 def announce() -> None:
-    """Print a note on stderr, once, that compiling begins; only the first of several workers prints it."""
+    """Print a note on stderr, once, that compiling begins; of several workers only the first, none with ``--quiet``."""
     global announced
-    if announced or processes.worker_number > 1:
+    if announced or processes.worker_number > 1 or processes.quiet:
         return
     announced, folder = True, kept_in()
     if folder is None:

@@ -82,7 +82,7 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
         "band": words.band(main, intervals, value(main.name, "coverage95")),
         "hindsight": words.hindsight(best, main),
         "assumed": "; ".join(clauses(words.assumed(report, main))),
-        "next": "; ".join(clauses(words.next(report, main))[:_MOST_STEPS]),
+        "next": "; ".join(clauses(words.next(report, main, value))[:_MOST_STEPS]),
     }
     texts = {key: one_line(text) for key, text in texts.items()}
     chosen = {"main" if key == "name" else key: value for key, value in asdict(main).items()}

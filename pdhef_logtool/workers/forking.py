@@ -89,7 +89,7 @@ class ForkServer:
                 [sys.executable, "-c", _START, json.dumps(sys.path), str(theirs.fileno()), json.dumps(list(preload))],
                 stdin=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
-                env={**os.environ, **_ENVIRONMENT},
+                env={**os.environ, **_ENVIRONMENT, **({processes.QUIET: "1"} if processes.quiet else {})},
             )
 
     @property

@@ -86,6 +86,14 @@ def test_without_any_folder_it_runs_and_says_so(
     assert "in every run" in capsys.readouterr().err
 
 
+def test_quiet_compiles_without_a_word(
+    module_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cache.processes, "quiet", True)
+    assert _load(module_file).more(1) == 2
+    assert capsys.readouterr().err == ""
+
+
 def test_code_serves_the_same_sources_at_another_place_and_time(
     module_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
