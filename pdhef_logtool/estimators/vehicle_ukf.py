@@ -119,8 +119,6 @@ DIVERGED_AVERAGE_S = 1.0
 DIVERGED_SIDESLIP_RAD = math.radians(60.0)
 #: If the speed sensor last read more than this, the car does not roll backwards: a v_x below zero is divergence.
 FORWARD_M_S = 0.5
-#: Difference of two states for a Jacobian, in the unit of their entry.
-DIFFERENCE = 1e-4
 #: Time of a rejection at its first sample, s; 0 is "the last sample was accepted".
 _JUST_REJECTED_S = 1e-9
 
@@ -281,12 +279,6 @@ def held_over_step(now, m):  # type: ignore[no-untyped-def]
     )
 
 
-@_inline
-def held_inputs(inputs, k):  # type: ignore[no-untyped-def]
-    """Return the inputs of step k, held during a prediction."""
-    return HeldInputs(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
-
-
 @njit(cache=True)
 def starts(now, unknown_steer, tuning, model, x, P, memory):  # type: ignore[no-untyped-def]
     """Start with the first sample of speed and steering; return whether this is it.
@@ -352,12 +344,10 @@ def predict(x, P, L, over, rate, dt, early, q, layout, places, p, f, points):  #
 @_inline
 def move(points, columns, over, rate, dt, early, layout, p, f):  # type: ignore[no-untyped-def]
     """Move the states of a block by the model and the residual, as :func:`predict` describes."""
-    given, vx = rate[0] != 0.0 or rate[1] != 0.0, points[VX * WIDTH]
-    if given:
-        push(points, columns, vx, rate, early * dt, p)
+    vx = points[VX * WIDTH]
+    push(points, columns, vx, rate, early * dt, p)
     advance(points, columns, over, dt, layout, p, f)
-    if given:
-        push(points, columns, vx, rate, (1.0 - early) * dt, p)
+    push(points, columns, vx, rate, (1.0 - early) * dt, p)
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
@@ -609,17 +599,17 @@ def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-un
     layout, places, p, f = model
     n, m = held_x.shape[1], changing(layout)
     points, x, q = np.zeros(PLACES * WIDTH), np.zeros(n), np.zeros(n)
-    J, JP = np.zeros((MOTION, m)), np.zeros(m)
+    J, JP, away = np.zeros((MOTION, m)), np.zeros(m), 1e-4  # of each entry, in its unit
     for row in range(step.shape[0]):
         k, dt = step[row], horizon_s[row]
         if k < 0:
             continue
-        P, over, rate = held_P[k], held_inputs(inputs, k), (residual_rate[k, 0], residual_rate[k, 1])
+        P, rate = held_P[k], (residual_rate[k, 0], residual_rate[k, 1])
+        over = HeldInputs(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
         process_noise(q_std, over.ax_known, noise[k] * dt, layout, q)
         for j in range(n):
-            entry = points[places[j] * WIDTH :]
-            for i in range(columns_of(m)):
-                entry[i] = held_x[k, j] + (DIFFERENCE if i == 1 + j else 0.0)
+            points[places[j] * WIDTH : (places[j] + 1) * WIDTH] = held_x[k, j]
+            points[places[j] * WIDTH + 1 + j] += away
         move(points, columns_of(m), over, rate, dt, early, layout, p, f)
         for j in range(n):
             x[j] = points[places[j] * WIDTH]
@@ -627,10 +617,9 @@ def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-un
             out_x[row] = x
             out_ay[row] = planar_ay(x, over.steer, over.friction, rate[0], layout, p)
             for a in range(MOTION):
-                for j in range(m):
-                    J[a, j] = (points[a * WIDTH + 1 + j] - x[a]) / DIFFERENCE
                 JP[:] = 0.0
                 for i in range(m):
+                    J[a, i] = (points[a * WIDTH + 1 + i] - x[a]) / away
                     for j in range(m):
                         JP[j] += J[a, i] * P[i, j]
                 for b in range(a + 1):

@@ -196,8 +196,7 @@ def _in_blocks(signals: Signals) -> tuple[Signals, int, IntArray]:
 
 def spread(vy: FloatArray, varied: Sequence[FloatArray]) -> FloatArray:
     """Return the root of the sum of squares of differences from v_y [N]; unknown ones are 0."""
-    away = (np.where(np.isfinite(other - vy), other - vy, 0.0) for other in varied)
-    return np.sqrt(sum((difference**2 for difference in away), np.zeros(len(vy))))
+    return np.sqrt(sum((np.nan_to_num(other - vy) ** 2 for other in varied), np.zeros(len(vy))))
 
 
 def widened(track: StateTrack, added_m_s: FloatArray, slow_m_s: float, own_share: float) -> StateTrack:
