@@ -82,7 +82,7 @@ class Interval:
     cg_std_m: float = 0.0
     whole_drive: bool = False
     _signals: Signals | None = None
-    _vy: list[FloatArray] = field(default_factory=list)
+    _spread: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def widen(self, track: StateTrack, signals: Signals) -> StateTrack:
         """Return a track [N] with wider 1-sigmas of sideslip and v_y."""
@@ -90,8 +90,8 @@ class Interval:
             return track
         if signals is not self._signals:
             slow, number, block = _in_blocks(signals)
-            of_blocks = [self._lateral_velocity(f, slow, number) for f in self.filters]
-            self._signals, self._vy = signals, [np.append(vy, np.nan)[block] for vy in of_blocks]
+            vy, *varied = (self._lateral_velocity(f, slow, number) for f in self.filters)
+            self._signals, self._spread = signals, np.append(spread(vy, varied), 0.0)[block]
         vehicle = self.filters[0].vehicle
         slow_m_s = vehicle.low_speed_blend_m_s
         if self.whole_drive:
@@ -101,7 +101,7 @@ class Interval:
             added = running_consistency(track, signals, vehicle.roll_gradient_rad_per_m_s2)
         added = np.hypot(np.nan_to_num(added), self.scale * self.car_std_rad * track.vx_m_s)
         added = np.hypot(added, self.cg_std_m * track.yaw_rate_rad_s)
-        return widened(track, self._vy, added, slow_m_s, self.scale)
+        return widened(track, np.hypot(np.nan_to_num(added), self._spread), slow_m_s, self.scale)
 
     def _lateral_velocity(self, physics: VehicleUkf, signals: Signals, number: int) -> FloatArray:
         """Return v_y [N] of a filter, on means of ``number`` samples as its vehicle corrects them.
@@ -194,24 +194,22 @@ def _in_blocks(signals: Signals) -> tuple[Signals, int, IntArray]:
     return Signals(**columns, available=signals.available), number, (np.arange(len(signals)) + 1) // number - 1
 
 
-def widened(
-    track: StateTrack, compared: Sequence[FloatArray], added_m_s: FloatArray, slow_m_s: float, own_share: float
-) -> StateTrack:
+def spread(vy: FloatArray, varied: Sequence[FloatArray]) -> FloatArray:
+    """Return the root of the sum of squares of differences from v_y [N]; unknown ones are 0."""
+    return np.sqrt(sum((np.nan_to_num(other - vy) ** 2 for other in varied), np.zeros(len(vy))))
+
+
+def widened(track: StateTrack, added_m_s: FloatArray, slow_m_s: float, own_share: float) -> StateTrack:
     """Return a track [N] with wider 1-sigmas of sideslip and v_y; NaN stays NaN.
 
     Parameters
     ----------
-    compared : v_y of the physics filter [N], first on the vehicle, then on those away from it.
     added_m_s : further standard deviation of v_y [N].
     slow_m_s : lower limit of the speed in the conversion of velocities to angles.
     own_share : factor on the track's own 1-sigma.
     """
-    added = np.where(np.isfinite(added_m_s), added_m_s, 0.0)
-    for vy in compared[1:]:
-        away = vy - compared[0]
-        added = np.hypot(added, np.where(np.isfinite(away), away, 0.0))
     speed = np.abs(track.vx_m_s)
-    added = np.minimum(added / np.maximum(speed, slow_m_s), MAX_SIDESLIP_STD_RAD)
+    added = np.minimum(added_m_s / np.maximum(speed, slow_m_s), MAX_SIDESLIP_STD_RAD)
     std = np.minimum(np.hypot(own_share * track.sideslip_std_rad, added), MAX_SIDESLIP_STD_RAD)
     covariance = track.covariance
     if covariance.shape[0]:

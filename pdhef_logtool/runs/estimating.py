@@ -17,7 +17,7 @@ from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.plug_ins import package_of
-from pdhef_logtool.model.intervals import DriveIntervals, widened
+from pdhef_logtool.model.intervals import DriveIntervals, spread, widened
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import dead_reckon
 from pdhef_logtool.records.readings import without_impossible_states
@@ -94,11 +94,9 @@ def estimate_drive(
             shared[computation] = track
         track = without_impossible_states(replace(track, name=estimator.name))
         track = watched_track(track, signals, vehicle)
-        compared = [track.vy_m_s, *varied]
         track = track if intervals is None else intervals.apply(track, signals)
         if varied:
-            none = np.zeros(len(track))
-            track = widened(track, compared, none, vehicle.low_speed_blend_m_s, 1.0)
+            track = widened(track, spread(track.vy_m_s, varied), vehicle.low_speed_blend_m_s, 1.0)
         track = track.without_sideslip_below(vehicle.standstill_m_s)
         tracks[track.name] = dead_reckoned(track, start)
     return Estimated(signals, truth, drawn_truth, tracks)

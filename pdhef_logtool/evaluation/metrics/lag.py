@@ -11,7 +11,8 @@ from pdhef_logtool.records.signals import FloatArray, IntArray
 
 MAX_LAG_S = 0.3
 MIN_LAG_CORRELATION = 0.5
-LAG_SPAN_NS = 3_600_000_000_000
+#: More driving does not make the lag more certain than the sampling of the signals.
+LAG_SPAN_NS = 600_000_000_000
 
 
 def lag_s(stamps_ns: IntArray, estimate: FloatArray, truth: FloatArray) -> float:
@@ -25,7 +26,7 @@ def lag_s(stamps_ns: IntArray, estimate: FloatArray, truth: FloatArray) -> float
     return shift.shift_s if clear else float("nan")
 
 
-def _lag_of_first_hour(_: FloatArray, since_start_ns: IntArray, estimate: FloatArray, truth: FloatArray) -> float:
+def _lag_of_start(_: FloatArray, since_start_ns: IntArray, estimate: FloatArray, truth: FloatArray) -> float:
     end = int(np.searchsorted(since_start_ns, LAG_SPAN_NS))
     return lag_s(since_start_ns[:end], estimate[:end], truth[:end])
 
@@ -35,9 +36,9 @@ METRICS = (
         "lag_s",
         "lag",
         "shift, within ± 0.3 s, at which the estimate correlates best with ground truth; positive = estimate late. "
-        "Segment `all` only, its first hour; NaN when the correlation stays below 0.5 or has no peak",
+        "Segment `all` only, its first ten minutes; NaN when the correlation stays below 0.5 or has no peak",
         columns=errors_of_drive,
-        formula=_lag_of_first_hour,
+        formula=_lag_of_start,
         over=("error", "since_start_ns", "estimate", "truth"),
         best=0.0,
         unit="s",

@@ -200,18 +200,9 @@ def _rows(
             values = [columns.values[name][place] for name in over]
             finite = np.isfinite(values[0])
             chosen[over] = values if finite.all() else [v[finite] for v in values]
-        values = chosen[over]
-        value = metric.formula(*values) if len(values[0]) else None
+        values, signal = chosen[over], columns.signal
+        n = len(values[0])
+        value = metric.formula(*values) if n else None
         if value is not None:
-            independent = not (metric.of_truth and columns.signal in drive.dependent)
-            yield MetricRow(
-                drive.log,
-                columns.estimator,
-                columns.signal,
-                segment,
-                metric.name,
-                value,
-                metric.unit_of(columns.signal),
-                len(values[0]),
-                independent,
-            )
+            unit, independent = metric.unit_of(signal), not (metric.of_truth and signal in drive.dependent)
+            yield MetricRow(drive.log, columns.estimator, signal, segment, metric.name, value, unit, n, independent)
