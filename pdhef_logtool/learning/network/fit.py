@@ -198,7 +198,7 @@ def train(
         document = {"recipe": asdict(recipe), "normalisation": asdict(normalisation), "init": init and init.sha256}
         document |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
         identity = json.loads(json.dumps(document))  # as it is read from a checkpoint
-        history, best, best_loss = _resume(work, identity, network, optimiser, device)
+        history, best, best_loss = _resume(work, identity, network, optimiser)
         for epoch in range(len(history), recipe.epochs):
             if len(history) - 1 - _best_epoch(history) >= recipe.patience:
                 break
@@ -476,7 +476,6 @@ def _resume(
     identity: dict[str, Any],
     network: ResidualNetwork,
     optimiser: torch.optim.Optimizer,
-    device: str,
 ) -> tuple[list[Epoch], dict[str, Any], float]:
     file = work / CHECKPOINT
     if not file.is_file():
@@ -485,7 +484,7 @@ def _resume(
         data, size = file.read_bytes(), hashlib.sha256().digest_size
         if data[:size] != hashlib.sha256(data[size:]).digest():
             raise ValueError("content that is not as it was written")
-        document = torch.load(io.BytesIO(data[size:]), map_location=device, weights_only=True)
+        document = torch.load(io.BytesIO(data[size:]), map_location="cpu", weights_only=True)
     except (OSError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
         raise ModelError(
             expected="a checkpoint of a training", got=str(error), where=str(file), remedy="remove it to train again"
@@ -500,5 +499,5 @@ def _resume(
     network.load_state_dict(document["network"])
     optimiser.load_state_dict(document["optimiser"])
     history = [Epoch(**e) for e in document["history"]]
-    best = {k: v.cpu().numpy() for k, v in document["best"].items()}
+    best = {k: v.numpy() for k, v in document["best"].items()}
     return history, best, min(e.validation_loss for e in history)
