@@ -95,9 +95,9 @@ def aligned_path(source: FloatArray, target: FloatArray) -> FloatArray:
     return np.asarray(rotated + target.mean(axis=1, keepdims=True), dtype=np.float64)
 
 
-def pose_known(truth: StateTrack) -> BoolArray:
-    """Return where ground truth has a pose [N]."""
-    is_known: BoolArray = truth.valid & np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad)
+def pose_known(track: StateTrack) -> BoolArray:
+    """Return where a track has a pose [N]."""
+    is_known: BoolArray = track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
     return is_known
 
 

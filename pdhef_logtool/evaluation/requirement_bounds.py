@@ -16,7 +16,6 @@ from typing import Literal
 
 import numpy as np
 
-from pdhef_logtool.evaluation.chi_square import chi_square_quantile
 from pdhef_logtool.evaluation.dependence import Dependence, Factors, dependence, deviate
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.student import student_quantile
@@ -113,9 +112,11 @@ def _lognormal_excess(values: FloatArray, power: float, tail: float) -> float:
     n = len(values)
     if not LEAST_DRIVES <= n < _LOGNORMAL or not (values > 0.0).all():
         return 0.0
+    from scipy.special import chdtri  # its import takes longer than one short log, which never gets here
+
     variance = float(np.var(np.log(values), ddof=1))
     of_mean = student_quantile(1.0 - tail, n - 1) * math.sqrt(variance / n)
-    return math.hypot(of_mean, power * variance * ((n - 1) / chi_square_quantile(tail, n - 1) - 1.0))
+    return math.hypot(of_mean, power * variance * ((n - 1) / float(chdtri(n - 1, 1.0 - tail)) - 1.0))
 
 
 def _error(top: FloatArray, below: FloatArray, counts: FloatArray, power: float, *, log: bool) -> FloatArray:

@@ -19,6 +19,7 @@ from pdhef_logtool.logs.formats import COMPRESSED_SUFFIXES, ROSBAG2_METADATA, lo
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.logs.table_file import NO_SETTINGS, TableSettings
 from pdhef_logtool.records.errors import LogError, UsageError
+from pdhef_logtool.storage.documents import file_sha256
 
 #: Stems are folder names on any system.
 _STEM_BYTES = 100
@@ -164,13 +165,11 @@ def hash_log(path: Path) -> str:
     """
     if not path.is_dir():
         require_regular(path)
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return file_sha256(path)
     total = hashlib.sha256()
     for file_path in sorted(p for p in path.rglob("*") if p.is_file()):
         total.update(file_path.relative_to(path).as_posix().encode() + b"\0")
-        with file_path.open("rb") as file:
-            total.update(hashlib.file_digest(file, "sha256").digest())
+        total.update(bytes.fromhex(file_sha256(file_path)))
     return total.hexdigest()
 
 

@@ -7,8 +7,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pdhef_logtool.evaluation.dead_reckoned import pose_known
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.results.mcap_sink import LOG_TOPIC, MAP_FRAME, has_pose, topic_of
+from pdhef_logtool.results.mcap_sink import LOG_TOPIC, MAP_FRAME, topic_of
 from pdhef_logtool.results.palette import colour_rgb
 from pdhef_logtool.results.run_report import json_bytes
 from pdhef_logtool.results.selected_estimate import TEMPLATES
@@ -91,7 +92,7 @@ def write_layouts(
         "plots": [plot for plots in tabs.values() for plot in plots if plot.field not in _STATES],
         "states": _STATES,
         "shown": shown,
-        "on_map": {t.name for t in tracks if has_pose(t).any()},
+        "on_map": {t.name for t in tracks if pose_known(t).any()},
         "fixes": fixes,
     }
     context = {"topic_of": topic_of, "TRUTH": TRUTH, "MAP_FRAME": MAP_FRAME, "LOG_TOPIC": LOG_TOPIC}

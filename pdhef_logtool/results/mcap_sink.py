@@ -14,6 +14,7 @@ import numpy as np
 from mcap.records import Attachment
 from numpy.typing import NDArray
 
+from pdhef_logtool.evaluation.dead_reckoned import pose_known
 from pdhef_logtool.logs.container import RawChunk
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.schema_files import message_definition
@@ -76,11 +77,6 @@ def topic_of(estimator: str, what: str) -> str:
     """Return the topic of a track as a legal ROS 2 name: ``/pdhef/phy_ukf/state`` of ``phy-ukf`` and ``state``."""
     token = re.sub(r"[^A-Za-z0-9_]", "_", estimator)
     return f"{NAMESPACE}{'_' if token[:1].isdigit() else ''}{token}/{what}"
-
-
-def has_pose(track: StateTrack) -> BoolArray:
-    """Return whether each stamp [N] has a pose, which ``odometry`` and ``path`` need."""
-    return track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
 
 
 def thinned_step_ns(source_bytes: int, *, rows: int, others: int, span_ns: int) -> int:
@@ -186,7 +182,7 @@ class AnnotatedMcap:
             stated = plotted if track.name == TRUTH else stated
         else:
             stated = posed = plotted = first_of_slots(track.stamps_ns, self._others_step_ns)
-        return stated, posed[has_pose(track)[posed]], plotted
+        return stated, posed[pose_known(track)[posed]], plotted
 
     def _batches(
         self, track: StateTrack, rows: Sequence[IntArray], piece: tuple[int, int], truth: StateTrack | None
@@ -230,7 +226,7 @@ class AnnotatedMcap:
         raws = []
         for track in tracks:
             rows = first_of_slots(track.stamps_ns, _PATH_STEP_NS)
-            rows = rows[has_pose(track)[rows]]
+            rows = rows[pose_known(track)[rows]]
             poses = np.stack([track.x_m[rows], track.y_m[rows], track.yaw_rad[rows]], axis=1)
             if len(poses):
                 start_ns = min(int(t.stamps_ns[0]) for t in tracks if len(t))

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference
 from pdhef_logtool.evaluation.dead_reckoned import lateral_errors, position_error
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
 from pdhef_logtool.evaluation.metrics.innovations import nees
@@ -268,42 +267,3 @@ def test_lateral_seconds_agree_with_a_plain_restart_every_second():
         left = np.array([-np.sin(truth.yaw_rad[j]), np.cos(truth.yaw_rad[j])])
         expected.append(left @ [x - truth.x_m[j], y - truth.y_m[j]])
     np.testing.assert_allclose(lateral_errors(estimate, truth), expected, atol=1e-9)
-
-
-# ---- bootstrap ----
-
-
-def interval_of(errors, stamps, **options):
-    """Return the RMSE and its interval: the difference from an estimate without error."""
-    return block_bootstrap_difference(errors, np.zeros(errors.size), stamps, **options)
-
-
-def test_bootstrap_value_and_determinism():
-    rng = np.random.default_rng(0)
-    stamps = stamps_of(30000)
-    e = rng.normal(0, 2.0, 30000)
-    e[100] = np.nan
-    a = interval_of(e, stamps, seed=3)
-    assert a == interval_of(e, stamps, seed=3)
-    assert a.blocks == 30
-    assert a.value == pytest.approx(np.sqrt(np.nanmean(e**2)))
-    assert a.low < a.value < a.high
-    # White noise: the standard error of an RMSE is σ/√(2N).
-    assert (a.high - a.low) / (2 * 1.96) == pytest.approx(2.0 / np.sqrt(60000), rel=0.35)
-
-
-def test_too_short_for_an_interval():
-    one = interval_of(np.ones(100), stamps_of(100))
-    assert (one.value, one.blocks) == (1.0, 1)
-    assert np.isnan(one.low)
-    assert np.isnan(interval_of(np.full(5, np.nan), stamps_of(5)).value)
-
-
-@pytest.mark.parametrize("start_s", [0.0, 3.0, 7.5])
-@pytest.mark.parametrize(("duration_s", "blocks"), [(9.9, 1), (20.0, 2), (20.2, 3)])
-def test_blocks_are_counted_from_the_first_known_error(start_s, duration_s, blocks):
-    stamps = stamps_of(round(duration_s * 10), 10) + round(start_s * 1e9)
-    errors = np.random.default_rng(1).normal(size=stamps.size)
-    before = np.concatenate([stamps[0] - 4_000_000_000 + np.arange(5), stamps])  # not known, so no start of a block
-    for e, at in ((errors, stamps), (np.concatenate([np.full(5, np.nan), errors]), before)):
-        assert interval_of(e, at, block_s=10.0, n=10).blocks == blocks

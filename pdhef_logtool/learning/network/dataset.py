@@ -10,7 +10,6 @@ do not belong to the dataset. A later call extends the manifest and replaces ent
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -34,7 +33,7 @@ from pdhef_logtool.results.arrow_schema import arrow_array, arrow_schema
 from pdhef_logtool.results.opened_run import MAX_DOCUMENT_BYTES
 from pdhef_logtool.results.parquet_sink import parquet_writer
 from pdhef_logtool.results.run_report import tool_versions, write_json
-from pdhef_logtool.storage.documents import DIGEST, digest, is_sealed, read_sealed, seal, validated
+from pdhef_logtool.storage.documents import DIGEST, digest, file_sha256, is_sealed, read_sealed, seal, validated
 
 FORMAT = "pdhef.residual-dataset"
 FORMAT_VERSION = 7
@@ -195,8 +194,7 @@ def _checked_sha256(path: Path, named: str | None) -> str:
     """Return the digest of a drive's file; raises OutputError if it differs from the one that the manifest names."""
     sha256, got = "", "another content"
     try:
-        with path.open("rb") as file:
-            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        sha256 = file_sha256(path)
     except OSError as error:
         got = error.strerror or str(error)
     if not sha256 or named not in (None, sha256):
