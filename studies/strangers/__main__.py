@@ -32,6 +32,7 @@ FIRST_RUNS = {
     "contact": "layouts of recorders were built after that, and scored once",
     "unseen": "layouts of documented tables and ROS messages were built last, and scored once",
     "trackside": "layouts of track modes, cameras, simulators and receivers were built last, and scored once",
+    "vendors": "layouts of race loggers, INS, phones, data frames and ROS tables were built last, and scored once",
     "repositories": "layouts of files and messages in public repositories were held out before",
     "phones": "layouts of phones, games, makers and plotting tools were held out before",
     "stacks": "layouts of public stacks and loggers were held out before",
