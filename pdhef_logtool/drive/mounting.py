@@ -140,7 +140,9 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     if not fitting:
         return None
     best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
-    mounting = Mounting(_snapped(best), named, best.evidence, best.sign > 0.0 or best.along, hand)
+    # Steering that counts to the left confirms gravity, and is no evidence against it: its sign is no standard.
+    steers = best.sign == 0.0 < hand and _sign_of(best.rate, steering_references(columns, speed_name))[0] > 0.0
+    mounting = Mounting(_snapped(best), named, best.evidence, best.sign > 0.0 or best.along or steers, hand)
     if not mounting.confident or mounting.is_as_named:
         return mounting
     parts = [

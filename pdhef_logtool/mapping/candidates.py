@@ -226,15 +226,19 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
 def _meaning_by_names(topic: TopicInfo, info: FieldInfo, there: set[str]) -> Meaning | None:
     """Return the meaning by names; short names depend on others: g_x with a_x is a gyro, r with v_x and v_y a yaw rate.
 
+    The letters u, v and r of one message are the velocities ahead and to the left and the yaw rate.
+
     An array without a known length is also tried as a vector of three axes.
     """
     path = info.path
     if (gyro := re.fullmatch(r"(.*(?:^|[._]))g([xyz])", path)) and f"{gyro[1]}a{gyro[2]}" in there:
         path = f"{gyro[1]}gyro_{gyro[2]}"
-    if rate := re.fullmatch(r"((?:.*\.)?)r", path):
-        beside = {p.removeprefix(rate[1]) for p in there if p.startswith(rate[1])}
-        if {"vx", "vy"} <= beside or ("v" in beside and {"ay", "a_y"} & beside and "u" not in beside):
-            path = f"{rate[1]}yaw_rate"
+    if letter := re.fullmatch(r"((?:.*\.)?)([uvr])", path):
+        beside = {p.removeprefix(letter[1]) for p in there if p.startswith(letter[1])}
+        if {"u", "v", "r"} <= beside:
+            path = letter[1] + {"u": "vx", "v": "vy", "r": "yaw_rate"}[letter[2]]
+        elif letter[2] == "r" and ({"vx", "vy"} <= beside or ("v" in beside and {"ay", "a_y"} & beside)):
+            path = f"{letter[1]}yaw_rate"
     paths = dict.fromkeys((path, path.replace("[]", "[2]")))
     meanings = (meaning_of(topic.name, topic.type_name, path, info.unit) for path in paths)
     return next((meaning for meaning in meanings if meaning is not None), None)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
@@ -157,6 +157,12 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
     """
     *parents, leaf = path.split(".")
     leaf_words = words_of(f"r_{unit_text.replace('°', 'deg')}" if leaf == "r" else re.sub(r"\[\d*\]", "", leaf))
+    if topic and not parents and leaf.isalpha() and set(leaf_words) <= _WORDS["counting"]:
+        # A recorder with a number in each topic names the topic.
+        name = "_".join(w for w in re.split("_", topic.rpartition("/")[2]) if w.lower() not in _WORDS["counting"])
+        meaning = meaning_of("", "", name, unit_text) if name else None
+        if meaning is not None:
+            return replace(meaning, strength=0.7 * meaning.strength, why=f"named by {topic!r}")
     inner = tuple(w for p in parents for w in words_of(p))
     outer = (*words_of(topic), *words_of(type_name.rpartition("/")[2].rpartition(".")[2]))
     if not leaf_words or _WORDS["other_devices"] & set(outer):
@@ -260,7 +266,7 @@ def _quantity(
         "@v_axis": leaf_words[0] == "v" and leaf_words[1:2] != () and leaf_words[1] in _AXES,
         "@bare_v": "v" in leaf <= _WORDS["of_v"],
         **{f"@unit_{kind.replace(' ', '_')}": bool(unit_of(named, kind)[0]) for kind in UNITS},
-        f"@place_{leaf_words[-1]}": set(leaf_words[:-1]) <= _PLACE_WORDS,
+        **{f"@place_{w}": leaf - {w} <= _PLACE_WORDS for w in leaf - _PLACE_WORDS},
     }
     tokens |= {flag for flag, is_set in flags.items() if is_set}
     for trait, rule in _TRAITS:

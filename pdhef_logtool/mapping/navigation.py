@@ -62,13 +62,16 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool 
     return max(truths, key=lambda t: len(t[0]), default=None)
 
 
-def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
+def named_gnss(log: DriveLog, topic: TopicInfo, speed: SignalSource | None = None) -> dict[str, SignalSource]:
     """Return position, velocity or speed and course over ground by the names of a topic's fields.
 
-    A velocity must agree with the path, if there is one. A heading that is the direction of the path is a course.
+    ``speed`` is mapped already, with a unit that the drive shows. A velocity must agree with the path, if there is one. A heading that is the direction of the path is a course.
     """
     fields = log.fields(topic.name, quiet=True)
     stamp, meanings = stamp_path_of(fields), _meanings(topic, fields)
+    if speed is not None and speed.topic == topic.name and isinstance(speed.scale, float):
+        shown = ((p, m) for p, m in meanings.items() if m.quantity == "speed" and (p,) == speed.paths)
+        meanings |= {p: replace(m, scale=speed.scale) for p, m in shown}
     first = {m.quantity: path for path, m in reversed(meanings.items())}
     velocity = next(_horizontal(fields), {})
     if not {"latitude", "longitude"} <= set(first):
