@@ -170,7 +170,7 @@ class Field:
         score = 0.45 * self.meaning.strength + 0.1 + self.bonus
         score += 0.15 if self.meaning.unit else 0.0
         score += 0.05 if self.seen.rate_hz >= 9.0 else -0.1 if self.seen.rate_hz < 3.0 else 0.0
-        score -= {"device": 0.2, "navigation": 0.1 if self.meaning.quantity == "speed" else 0.0}.get(self.role, 0.0)
+        score -= {"device": 0.1, "navigation": 0.1 if self.meaning.quantity == "speed" else 0.0}.get(self.role, 0.0)
         return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
 
     def standing_for(self, speed: FloatArray) -> Field:
@@ -312,9 +312,6 @@ def _weighable(
             its = replace(its, quantity="wheel rate")
             factors = _factors(its, seen)
         item = Field(topic, name, its, role, stamp_of(fields, name), seen, factors)
-        if _is_nested_imu(topic, fields, name):
-            item.unit_known = True
-            item.reasons.append("a nested sensor_msgs/Imu, in SI units")
         if documented:
             _document(item, vendors.of(topic.type_name).fields[info.path])
         elif its.scale is not None:
@@ -345,14 +342,6 @@ def _has_pedals_beside(item: Field, fields: tuple[FieldInfo, ...]) -> bool:
     """Return whether the same struct contains pedals, so that the steering signal is a control, too."""
     places = (f.path.rpartition(".") for f in fields)
     return any(struct == item.path.rpartition(".")[0] and _PEDALS & set(words_of(leaf)) for struct, _, leaf in places)
-
-
-def _is_nested_imu(topic: TopicInfo, fields: tuple[FieldInfo, ...], path: str) -> bool:
-    """Return whether a field belongs to a ``sensor_msgs/Imu`` nested in another ROS message."""
-    struct = path.rpartition(".")[0]
-    if topic.encoding not in ("cdr", "ros1") or not struct.endswith(("linear_acceleration", "angular_velocity")):
-        return False
-    return any(f.path.startswith(f"{struct}_covariance[") for f in fields)
 
 
 def _document(item: Field, entry: VendorField) -> None:

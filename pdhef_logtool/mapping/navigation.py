@@ -65,7 +65,8 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool 
 def named_gnss(log: DriveLog, topic: TopicInfo, speed: SignalSource | None = None) -> dict[str, SignalSource]:
     """Return position, velocity or speed and course over ground by the names of a topic's fields.
 
-    ``speed`` is mapped already, with a unit that the drive shows. A velocity must agree with the path, if there is one. A heading that is the direction of the path is a course.
+    ``speed`` is mapped already, with a unit that the drive shows. A velocity must agree with the path, if there is one.
+    A heading that is the direction of the path is a course.
     """
     fields = log.fields(topic.name, quiet=True)
     stamp, meanings = stamp_path_of(fields), _meanings(topic, fields)
