@@ -330,9 +330,10 @@ class _Weighing:
         open_truth = {n: f for n, f in self.truth.items() if n in ("vy_m_s", "yaw_rate_rad_s") and not f.fixed}
         lateral, across = open_fields.get("ay_m_s2"), open_truth.get("vy_m_s")
         groups: list[tuple[str, ...]] = [(n,) for n in open_fields]
-        groups += [(f"truth.{n}",) for n in open_truth if n != "vy_m_s"]
+        groups += [(f"truth.{n}",) for n in open_truth]
         if lateral is not None and across is not None and _share_axis(lateral, across):
-            groups[groups.index(("ay_m_s2",))] = ("ay_m_s2", "truth.vy_m_s")
+            groups = [g for g in groups if g not in (("ay_m_s2",), ("truth.vy_m_s",))]
+            groups.append(("ay_m_s2", "truth.vy_m_s"))
         return tuple(groups)
 
     def _speed(self) -> Field | None:
