@@ -77,8 +77,7 @@ def open_csv(file: TableFile) -> Tables:
         given |= {name: unit.strip("[](){} ") for name, unit in zip(fields, units, strict=False) if unit.strip()}
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
-        columns, of_cells = _columns(chain(head[first:], rows), fields, file, losses, decimal)
-    given |= of_cells
+        columns = _columns(chain(head[first:], rows), fields, file, losses, decimal, given)
     sheet = Sheet("csv", columns, given)
     return Tables("csv", list(tables_of(sheet, file.name, losses, rate_hz=file.settings.rate_hz)), losses)
 
@@ -95,7 +94,7 @@ def open_vbo(file: TableFile) -> Tables:
     fields, given = read_head(titles)
     losses: list[Loss] = []
     above = [""] * (head.count("\n") + 1)
-    columns, _ = _columns(_rows(chain(above, data.split("\n")), " "), fields, file, losses, ".")
+    columns = _columns(_rows(chain(above, data.split("\n")), " "), fields, file, losses, ".", given)
     if _is_mirrored(columns):
         what = "longitude is positive to the east, against the format, as the heading shows: its sign is changed"
         losses.append(Loss("mirrored", what, file.name, severity="note"))
@@ -154,11 +153,16 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     below = range(names + 1, full + 1)
     first = next(i for i in below if i == full or any(_VALUE.fullmatch(c) and not is_unit(c) for c in rows[i]))
     units = next((rows[i] for i in above if names < i < first and _share(rows[i], is_unit) >= 0.5), [])
-    titles = rows[names]
-    if names - 1 in above and len({c.strip() for c in rows[names - 1]}) < len(titles) and all(rows[names - 1]):
-        titles = [*titles[:1], *(f"{group}_{n}" for group, n in zip(rows[names - 1][1:], titles[1:], strict=False))]
-    index = next((rows[i][0] for i in above if names < i < first and rows[i][0] and not any(rows[i][1:])), titles[0])
-    return [index, *titles[1:]], units, first
+    groups = rows[names - 1] if names - 1 in above else []
+    below = [rows[i] for i in above if names < i < first]
+    return _joined(rows[names], groups, below), units, first
+
+
+def _joined(titles: Sequence[str], groups: Sequence[str], below: Sequence[Sequence[str]]) -> Sequence[str]:
+    """Return titles behind those of their groups, which repeat, and the first one of an index below them."""
+    if groups and len({c.strip() for c in groups}) < len(titles) and all(groups):
+        titles = [*titles[:1], *(f"{group}_{n}" for group, n in zip(groups[1:], titles[1:], strict=False))]
+    return [next((row[0] for row in below if row[0] and not any(row[1:])), titles[0]), *titles[1:]]
 
 
 def _uncommented(row: Sequence[str], width: int) -> Sequence[str]:
@@ -176,16 +180,21 @@ def _share(cells: Sequence[str], matches: Callable[[str], object]) -> float:
 
 
 def _columns(
-    rows: Iterable[tuple[int, list[str]]], names: Sequence[str], file: TableFile, losses: list[Loss], decimal: str
-) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the columns of numbered rows, numbers float64 [N] with NaN or texts [N], and units in all their cells.
+    rows: Iterable[tuple[int, list[str]]],
+    names: Sequence[str],
+    file: TableFile,
+    losses: list[Loss],
+    decimal: str,
+    units: dict[str, str],
+) -> dict[str, Any]:
+    """Return the columns of numbered rows: numbers float64 [N] with NaN, or texts [N]; add units of cells to ``units``.
 
     ``decimal`` is the decimal mark of columns that do not show theirs.
     """
     import polars as pl
 
     lines, data = _fitting(rows, len(names), file, losses)
-    columns, units = {}, {}
+    columns = {}
     step = max(1, _CELLS_AT_ONCE // len(lines))
     for start in range(0, len(names), step):
         places = [*range(len(names))[start : start + step]]
@@ -202,7 +211,7 @@ def _columns(
                 cells, units[name] = read_cells(column.str.strip_suffix(unit), decimal), unit
             columns[name] = column.str.strip_chars() if cells.is_text else cells.values
             losses += cells.losses(name, file.name, lines)
-    return columns, units
+    return columns
 
 
 def _unit_of_cells(texts: Series) -> str:

@@ -155,14 +155,12 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
 
     ``unit_text`` is the unit stored in the log (``km/h``, ``°/s``), empty without one.
     """
+    return _meaning_of_topic(topic, path, unit_text) or _meaning_of_path(topic, type_name, path, unit_text)
+
+
+def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> Meaning | None:
     *parents, leaf = path.split(".")
     leaf_words = words_of(f"r_{unit_text.replace('°', 'deg')}" if leaf == "r" else re.sub(r"\[\d*\]", "", leaf))
-    if topic and not parents and leaf.isalpha() and set(leaf_words) <= _WORDS["counting"]:
-        # A recorder with a number in each topic names the topic.
-        name = "_".join(w for w in re.split("_", topic.rpartition("/")[2]) if w.lower() not in _WORDS["counting"])
-        meaning = meaning_of("", "", name, unit_text) if name else None
-        if meaning is not None:
-            return replace(meaning, strength=0.7 * meaning.strength, why=f"named by {topic!r}")
     inner = tuple(w for p in parents for w in words_of(p))
     outer = (*words_of(topic), *words_of(type_name.rpartition("/")[2].rpartition(".")[2]))
     if not leaf_words or _WORDS["other_devices"] & set(outer):
@@ -188,6 +186,16 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
         if quantity is not None:
             return _with_unit(quantity, strength, where, inner, (named, *parents[-1:]))
     return None
+
+
+def _meaning_of_topic(topic: str, path: str, unit_text: str) -> Meaning | None:
+    """Return the meaning of the only number of a topic by the topic's name; None if the path has a name."""
+    is_bare = path.isalpha() and set(words_of(path)) <= _WORDS["counting"]
+    if not is_bare or _WORDS["other_devices"] & set(words_of(topic)):
+        return None
+    name = "_".join(w for w in topic.rpartition("/")[2].split("_") if w.lower() not in _WORDS["counting"])
+    meaning = meaning_of("", "", name, unit_text) if name else None
+    return meaning and replace(meaning, strength=0.7 * meaning.strength, why=f"named by {topic!r}")
 
 
 _TURNING = frozenset({"rate", "velocity", "velocities", "gyro", "gyroscope"})

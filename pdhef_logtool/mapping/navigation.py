@@ -70,9 +70,7 @@ def named_gnss(log: DriveLog, topic: TopicInfo, speed: SignalSource | None = Non
     """
     fields = log.fields(topic.name, quiet=True)
     stamp, meanings = stamp_path_of(fields), _meanings(topic, fields)
-    if speed is not None and speed.topic == topic.name and isinstance(speed.scale, float):
-        shown = ((p, m) for p, m in meanings.items() if m.quantity == "speed" and (p,) == speed.paths)
-        meanings |= {p: replace(m, scale=speed.scale) for p, m in shown}
+    meanings |= _with_known_unit(topic.name, meanings, speed)
     first = {m.quantity: path for path, m in reversed(meanings.items())}
     velocity = next(_horizontal(fields), {})
     if not {"latitude", "longitude"} <= set(first):
@@ -95,6 +93,13 @@ def named_gnss(log: DriveLog, topic: TopicInfo, speed: SignalSource | None = Non
     else:
         sources += _speed_and_course(topic.name, stamp, meanings, {p: seen[p] for p in angles if p in seen}, course)
     return {source.name: source for source in sources}
+
+
+def _with_known_unit(topic: str, meanings: Mapping[str, Meaning], speed: SignalSource | None) -> dict[str, Meaning]:
+    """Return the meaning of the field that is mapped as the speed, with the unit of the mapping."""
+    if speed is None or speed.topic != topic or not isinstance(speed.scale, float):
+        return {}
+    return {p: replace(meanings[p], scale=speed.scale) for p in speed.paths if p in meanings}
 
 
 def _velocity_over_ground(topic: str, stamp: str, velocity: Mapping[str, str]) -> Iterator[SignalSource]:
