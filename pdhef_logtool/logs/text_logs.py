@@ -154,8 +154,8 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     first = next(i for i in below if i == full or any(_VALUE.fullmatch(c) and not is_unit(c) for c in rows[i]))
     units = next((rows[i] for i in above if names < i < first and _share(rows[i], is_unit) >= 0.5), [])
     groups = rows[names - 1] if names - 1 in above else []
-    below = [rows[i] for i in above if names < i < first]
-    return _joined(rows[names], groups, below), units, first
+    under = [rows[i] for i in above if names < i < first]
+    return _joined(rows[names], groups, under), units, first
 
 
 def _joined(titles: Sequence[str], groups: Sequence[str], below: Sequence[Sequence[str]]) -> Sequence[str]:
