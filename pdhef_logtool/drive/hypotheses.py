@@ -249,10 +249,17 @@ def known_hypotheses(
     out = [h for part in (*alone, *dict.fromkeys(parts)) for h in _of_part(part)]
     every = tuple(n for group in open_signs for n in group)
     out = [h for h in out if h.kind != "sign" or not h.factors.keys() <= set(every)]
-    for part in dict.fromkeys([*open_signs, *([every] if every else [])]):
+    for part in dict.fromkeys([*open_signs, *_sides(open_signs), *([every] if every else [])]):
         out.append(Hypothesis(dict.fromkeys(part, -1.0), f"{_together(part)} count to the right", "open sign"))
     wheels = [(*g,) for g in groups if g and all(n.startswith("wheel_speed") for n in g)]
     return (*out, *(Hypothesis(dict.fromkeys(part, math.nan), _together(part), "field") for part in (*alone, *wheels)))
+
+
+def _sides(groups: Sequence[tuple[str, ...]]) -> Iterator[tuple[str, ...]]:
+    """Yield the signals of sensors and those of ground truth: two recorders may have a convention each."""
+    for is_true in (False, True):
+        if names := tuple(n for g in groups if any(m.startswith("truth.") == is_true for m in g) for n in g):
+            yield names
 
 
 def _of_part(part: tuple[str, ...]) -> Iterator[Hypothesis]:

@@ -140,13 +140,23 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     if not fitting:
         return None
     best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
-    mounting = Mounting(_snapped(best), named, best.evidence, best.sign > 0.0 or best.along, hand)
+    mounting = Mounting(_snapped(best), named, best.evidence, _is_shown(best, hand, measured), hand)
     if not mounting.confident or mounting.is_as_named:
         return mounting
     parts = [
         _turned(f, hand * w, np.where(part, speed, np.nan), best.rotation[2], references) for part in halves(len(speed))
     ]
-    return mounting if _parts_agree(best, parts) else replace(mounting, confident=False)
+    return replace(mounting, confident=_parts_agree(best, parts))
+
+
+def _is_shown(turn: _Turn, hand: float, measured: Measured) -> bool:
+    """Return whether another measurement of the yaw rate, the speed or the steering confirms a rotation.
+
+    Steering that counts to the left confirms gravity, and is no evidence against it: its sign is no standard.
+    """
+    if turn.sign != 0.0 or turn.along or hand < 0.0:
+        return turn.sign > 0.0 or turn.along
+    return _sign_of(turn.rate, steering_references(measured.columns, measured.speed_name))[0] > 0.0
 
 
 def _parts_agree(whole: _Turn, parts: Sequence[_Turn | None]) -> bool:

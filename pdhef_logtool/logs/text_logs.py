@@ -18,7 +18,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, islice
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from pdhef_logtool.logs.table_columns import Sheet, is_unit, read_head, tables_o
 from pdhef_logtool.logs.table_file import TableFile, Tables
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import FloatArray, IntArray, Loss
+
+if TYPE_CHECKING:
+    from polars import Series
 
 #: Lines at the start of a CSV file in which its header must be.
 _HEAD_LINES = 200
@@ -74,7 +77,7 @@ def open_csv(file: TableFile) -> Tables:
         given |= {name: unit.strip("[](){} ") for name, unit in zip(fields, units, strict=False) if unit.strip()}
         cells = islice((cell for _, row in head[first:] for cell in row), _CELLS_OF_HEAD)
         decimal = read_cells(pl.Series(cells, dtype=pl.String)).decimal or ("." if separator == "," else "")
-        columns = _columns(chain(head[first:], rows), fields, file, losses, decimal)
+        columns = _columns(chain(head[first:], rows), fields, file, losses, decimal, given)
     sheet = Sheet("csv", columns, given)
     return Tables("csv", list(tables_of(sheet, file.name, losses, rate_hz=file.settings.rate_hz)), losses)
 
@@ -91,7 +94,7 @@ def open_vbo(file: TableFile) -> Tables:
     fields, given = read_head(titles)
     losses: list[Loss] = []
     above = [""] * (head.count("\n") + 1)
-    columns = _columns(_rows(chain(above, data.split("\n")), " "), fields, file, losses, ".")
+    columns = _columns(_rows(chain(above, data.split("\n")), " "), fields, file, losses, ".", given)
     if _is_mirrored(columns):
         what = "longitude is positive to the east, against the format, as the heading shows: its sign is changed"
         losses.append(Loss("mirrored", what, file.name, severity="note"))
@@ -145,12 +148,21 @@ def _layout(rows: Sequence[Sequence[str]], where: str) -> tuple[Sequence[str], S
     if not above:
         got = "none" if full else "no row of numbers below it"
         raise LogError(expected="a CSV file with a row of column names", got=got, where=where)
-    # Titles, and below them units and sources.
+    # Titles, above them those of groups, below them units, sources and the name of an index.
     names = max(reversed(above[-3:]), key=lambda i: len({c.strip() for c in rows[i] if not is_unit(c)} - {""}))
     below = range(names + 1, full + 1)
     first = next(i for i in below if i == full or any(_VALUE.fullmatch(c) and not is_unit(c) for c in rows[i]))
     units = next((rows[i] for i in above if names < i < first and _share(rows[i], is_unit) >= 0.5), [])
-    return rows[names], units, first
+    groups = rows[names - 1] if names - 1 in above else []
+    under = [rows[i] for i in above if names < i < first]
+    return _joined(rows[names], groups, under), units, first
+
+
+def _joined(titles: Sequence[str], groups: Sequence[str], below: Sequence[Sequence[str]]) -> Sequence[str]:
+    """Return titles behind those of their groups, which repeat, and the first one of an index below them."""
+    if groups and len({c.strip() for c in groups}) < len(titles) and all(groups):
+        titles = [*titles[:1], *(f"{group}_{n}" for group, n in zip(groups[1:], titles[1:], strict=False))]
+    return [next((row[0] for row in below if row[0] and not any(row[1:])), titles[0]), *titles[1:]]
 
 
 def _uncommented(row: Sequence[str], width: int) -> Sequence[str]:
@@ -168,9 +180,14 @@ def _share(cells: Sequence[str], matches: Callable[[str], object]) -> float:
 
 
 def _columns(
-    rows: Iterable[tuple[int, list[str]]], names: Sequence[str], file: TableFile, losses: list[Loss], decimal: str
+    rows: Iterable[tuple[int, list[str]]],
+    names: Sequence[str],
+    file: TableFile,
+    losses: list[Loss],
+    decimal: str,
+    units: dict[str, str],
 ) -> dict[str, Any]:
-    """Return the columns of numbered rows: numbers float64 [N] with NaN, or texts [N].
+    """Return the columns of numbered rows: numbers float64 [N] with NaN, or texts [N]; add units of cells to ``units``.
 
     ``decimal`` is the decimal mark of columns that do not show theirs.
     """
@@ -190,9 +207,18 @@ def _columns(
             empty = column.null_count()
             is_plain = decimal == "." and np.count_nonzero(np.isfinite(values)) == len(values) - empty
             cells = Cells(values, empty) if is_plain else read_cells(column, decimal)
+            if cells.is_text and (unit := _unit_of_cells(column)):
+                cells, units[name] = read_cells(column.str.strip_suffix(unit), decimal), unit
             columns[name] = column.str.strip_chars() if cells.is_text else cells.values
             losses += cells.losses(name, file.name, lines)
     return columns
+
+
+def _unit_of_cells(texts: Series) -> str:
+    """Return the unit behind the number in every cell of a column (``0.01 sec``); empty without one."""
+    given = texts.str.extract(r"\d\s*([^\d\s.,:;-][^\d\s]*)\s*$")
+    unit = given[0] or ""
+    return unit if is_unit(unit) and (given == unit).all() and not given.null_count() else ""
 
 
 def _fitting(

@@ -170,7 +170,7 @@ class Field:
         score = 0.45 * self.meaning.strength + 0.1 + self.bonus
         score += 0.15 if self.meaning.unit else 0.0
         score += 0.05 if self.seen.rate_hz >= 9.0 else -0.1 if self.seen.rate_hz < 3.0 else 0.0
-        score -= {"device": 0.2, "navigation": 0.1 if self.meaning.quantity == "speed" else 0.0}.get(self.role, 0.0)
+        score -= {"device": 0.1, "navigation": 0.1 if self.meaning.quantity == "speed" else 0.0}.get(self.role, 0.0)
         return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
 
     def standing_for(self, speed: FloatArray) -> Field:
@@ -226,15 +226,19 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
 def _meaning_by_names(topic: TopicInfo, info: FieldInfo, there: set[str]) -> Meaning | None:
     """Return the meaning by names; short names depend on others: g_x with a_x is a gyro, r with v_x and v_y a yaw rate.
 
+    The letters u, v and r of one message are the velocities ahead and to the left and the yaw rate.
+
     An array without a known length is also tried as a vector of three axes.
     """
     path = info.path
     if (gyro := re.fullmatch(r"(.*(?:^|[._]))g([xyz])", path)) and f"{gyro[1]}a{gyro[2]}" in there:
         path = f"{gyro[1]}gyro_{gyro[2]}"
-    if rate := re.fullmatch(r"((?:.*\.)?)r", path):
-        beside = {p.removeprefix(rate[1]) for p in there if p.startswith(rate[1])}
-        if {"vx", "vy"} <= beside or ("v" in beside and {"ay", "a_y"} & beside and "u" not in beside):
-            path = f"{rate[1]}yaw_rate"
+    if letter := re.fullmatch(r"((?:.*\.)?)([uvr])", path):
+        beside = {p.removeprefix(letter[1]) for p in there if p.startswith(letter[1])}
+        if {"u", "v", "r"} <= beside:
+            path = letter[1] + {"u": "vx", "v": "vy", "r": "yaw_rate"}[letter[2]]
+        elif letter[2] == "r" and ({"vx", "vy"} <= beside or ("v" in beside and {"ay", "a_y"} & beside)):
+            path = f"{letter[1]}yaw_rate"
     paths = dict.fromkeys((path, path.replace("[]", "[2]")))
     meanings = (meaning_of(topic.name, topic.type_name, path, info.unit) for path in paths)
     return next((meaning for meaning in meanings if meaning is not None), None)
@@ -308,9 +312,6 @@ def _weighable(
             its = replace(its, quantity="wheel rate")
             factors = _factors(its, seen)
         item = Field(topic, name, its, role, stamp_of(fields, name), seen, factors)
-        if _is_nested_imu(topic, fields, name):
-            item.unit_known = True
-            item.reasons.append("a nested sensor_msgs/Imu, in SI units")
         if documented:
             _document(item, vendors.of(topic.type_name).fields[info.path])
         elif its.scale is not None:
@@ -341,14 +342,6 @@ def _has_pedals_beside(item: Field, fields: tuple[FieldInfo, ...]) -> bool:
     """Return whether the same struct contains pedals, so that the steering signal is a control, too."""
     places = (f.path.rpartition(".") for f in fields)
     return any(struct == item.path.rpartition(".")[0] and _PEDALS & set(words_of(leaf)) for struct, _, leaf in places)
-
-
-def _is_nested_imu(topic: TopicInfo, fields: tuple[FieldInfo, ...], path: str) -> bool:
-    """Return whether a field belongs to a ``sensor_msgs/Imu`` nested in another ROS message."""
-    struct = path.rpartition(".")[0]
-    if topic.encoding not in ("cdr", "ros1") or not struct.endswith(("linear_acceleration", "angular_velocity")):
-        return False
-    return any(f.path.startswith(f"{struct}_covariance[") for f in fields)
 
 
 def _document(item: Field, entry: VendorField) -> None:

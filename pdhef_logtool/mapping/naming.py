@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
@@ -155,6 +155,10 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
 
     ``unit_text`` is the unit stored in the log (``km/h``, ``°/s``), empty without one.
     """
+    return _meaning_of_topic(topic, path, unit_text) or _meaning_of_path(topic, type_name, path, unit_text)
+
+
+def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> Meaning | None:
     *parents, leaf = path.split(".")
     leaf_words = words_of(f"r_{unit_text.replace('°', 'deg')}" if leaf == "r" else re.sub(r"\[\d*\]", "", leaf))
     inner = tuple(w for p in parents for w in words_of(p))
@@ -182,6 +186,16 @@ def meaning_of(topic: str, type_name: str, path: str, unit_text: str = "") -> Me
         if quantity is not None:
             return _with_unit(quantity, strength, where, inner, (named, *parents[-1:]))
     return None
+
+
+def _meaning_of_topic(topic: str, path: str, unit_text: str) -> Meaning | None:
+    """Return the meaning of the only number of a topic by the topic's name; None if the path has a name."""
+    is_bare = path.isalpha() and set(words_of(path)) <= _WORDS["counting"]
+    if not is_bare or _WORDS["other_devices"] & set(words_of(topic)):
+        return None
+    name = "_".join(w for w in topic.rpartition("/")[2].split("_") if w.lower() not in _WORDS["counting"])
+    meaning = meaning_of("", "", name, unit_text) if name else None
+    return meaning and replace(meaning, strength=0.7 * meaning.strength, why=f"named by {topic!r}")
 
 
 _TURNING = frozenset({"rate", "velocity", "velocities", "gyro", "gyroscope"})
@@ -260,7 +274,7 @@ def _quantity(
         "@v_axis": leaf_words[0] == "v" and leaf_words[1:2] != () and leaf_words[1] in _AXES,
         "@bare_v": "v" in leaf <= _WORDS["of_v"],
         **{f"@unit_{kind.replace(' ', '_')}": bool(unit_of(named, kind)[0]) for kind in UNITS},
-        f"@place_{leaf_words[-1]}": set(leaf_words[:-1]) <= _PLACE_WORDS,
+        **{f"@place_{w}": leaf - {w} <= _PLACE_WORDS for w in leaf - _PLACE_WORDS},
     }
     tokens |= {flag for flag, is_set in flags.items() if is_set}
     for trait, rule in _TRAITS:

@@ -62,13 +62,15 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo], *, whole: bool 
     return max(truths, key=lambda t: len(t[0]), default=None)
 
 
-def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
+def named_gnss(log: DriveLog, topic: TopicInfo, speed: SignalSource | None = None) -> dict[str, SignalSource]:
     """Return position, velocity or speed and course over ground by the names of a topic's fields.
 
-    A velocity must agree with the path, if there is one. A heading that is the direction of the path is a course.
+    ``speed`` is mapped already, with a unit that the drive shows. A velocity must agree with the path, if there is one.
+    A heading that is the direction of the path is a course.
     """
     fields = log.fields(topic.name, quiet=True)
     stamp, meanings = stamp_path_of(fields), _meanings(topic, fields)
+    meanings |= _with_known_unit(topic.name, meanings, speed)
     first = {m.quantity: path for path, m in reversed(meanings.items())}
     velocity = next(_horizontal(fields), {})
     if not {"latitude", "longitude"} <= set(first):
@@ -91,6 +93,13 @@ def named_gnss(log: DriveLog, topic: TopicInfo) -> dict[str, SignalSource]:
     else:
         sources += _speed_and_course(topic.name, stamp, meanings, {p: seen[p] for p in angles if p in seen}, course)
     return {source.name: source for source in sources}
+
+
+def _with_known_unit(topic: str, meanings: Mapping[str, Meaning], speed: SignalSource | None) -> dict[str, Meaning]:
+    """Return the meaning of the field that is mapped as the speed, with the unit of the mapping."""
+    if speed is None or speed.topic != topic or not isinstance(speed.scale, float):
+        return {}
+    return {p: replace(meanings[p], scale=speed.scale) for p in speed.paths if p in meanings}
 
 
 def _velocity_over_ground(topic: str, stamp: str, velocity: Mapping[str, str]) -> Iterator[SignalSource]:

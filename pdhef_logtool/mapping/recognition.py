@@ -220,7 +220,8 @@ def _of_one_run(draft: _Draft, topics: list[TopicInfo]) -> list[TopicInfo]:
     for topic in topics if draft.log.kind in RUN_KINDS else ():
         fields = frozenset(f.path for f in draft.log.fields(topic.name, quiet=True))
         for place in (i for i, letter in enumerate(topic.name) if letter == "_"):
-            devices.setdefault(topic.name[:place], set()).add((topic.name[place:], fields))
+            if len(topic.name) > place + 2:  # a letter is an axis
+                devices.setdefault(topic.name[:place], set()).add((topic.name[place:], fields))
     runs = [run for run, d in devices.items() if any(len(d & o) > 1 for r, o in devices.items() if r != run)]
     runs = sorted(r for r in runs if not any(r.startswith(f"{o}_") for o in runs))
     if not runs:
@@ -371,7 +372,7 @@ def _receivers(draft: _Draft, topics: list[TopicInfo], others: list[TopicInfo], 
         if fields and (topic in others or has_path(fields, RAW_COURSE)):
             signals = receiver_signals(topic.name, stamp_path_of(fields), {f.path for f in fields}, vendors)
             by_name = not signals and not _is_well_known(topic) and _role(topic) in ("navigation", "sensor")
-            signals = named_gnss(draft.log, topic) if by_name else signals
+            signals = named_gnss(draft.log, topic, draft.signals.get("speed_m_s")) if by_name else signals
             if signals:
                 yield signals
 

@@ -22,8 +22,6 @@ SAME, BY_DRIVING = 0.03, 0.15
 CERTAIN = 0.9
 #: Energies of rare units.
 RARE = {"mph": 1.5, "mg": 1.5}
-#: Words in names of filtered or derived copies of a sensor.
-_SECOND_CHOICE = ("raw", "uncomp", "delta", "error", "offset", "relative")
 
 
 class Unit(NamedTuple):
@@ -87,7 +85,6 @@ def settle(items: Sequence[Field], gains: Sequence[Gain], by: str, bonus: float 
 def decide_units(fields: Fields) -> None:
     """Determine units that no name gives: by gravity first, then by relations between quantities."""
     _by_gravity(fields)
-    _rank(fields)
     _speeds(fields)
     _by_speeding_up(fields)
     _by_turning(fields)
@@ -106,18 +103,6 @@ def _by_gravity(fields: Fields) -> None:
             size = float(np.linalg.norm([np.nanmean(f.seen.values) for f in axes.values()]))
             for item in axes.values() if size > 0.0 else ():
                 settle((item,), [Gain((1,), size / G_M_S2, SAME)], f"gravity, of which {size:.4g} is the mean")
-
-
-def _rank(fields: Fields) -> None:
-    """Prefer fields of messages with both accelerations and rates, and a sensor over its copies."""
-    kinds: dict[tuple[str, str], set[str]] = {}
-    for item in fields.candidates:
-        kinds.setdefault(leaf_group(item), set()).add(item.meaning.quantity)
-    for item in fields.candidates:
-        if item.meaning.quantity in ("acceleration", "rate") and kinds[leaf_group(item)] >= {"acceleration", "rate"}:
-            item.bonus += 0.1
-        if any(w in item.path.lower() for w in _SECOND_CHOICE):
-            item.bonus -= 0.15
 
 
 def _speeds(fields: Fields) -> None:

@@ -24,7 +24,6 @@ from pdhef_logtool.mapping.candidates import (
     named_fields,
     triad_of,
 )
-from pdhef_logtool.mapping.checking import has_path
 from pdhef_logtool.mapping.evidence import Fit, fit, ratio
 from pdhef_logtool.mapping.fields import CLEAR, SLOW_M_S, Fields, agree, mean_of
 from pdhef_logtool.mapping.gnss_signals import has_heading
@@ -105,9 +104,8 @@ def weigh(
     if not (wanted or without_names) or log.end_ns <= log.start_ns:
         return Weighed()
     positions = [s for n, s in truth.items() if n in _POSITIONS]
-    mapped = {**signals, **_upward(log, signals)}
-    pieces, weighable = look(log, wanted, vendors, [*mapped.values(), *positions])
-    anchors = {n: f for n, s in mapped.items() if (f := anchor_of(s, weighable)) is not None}
+    pieces, weighable = look(log, wanted, vendors, [*signals.values(), *positions])
+    anchors = {n: f for n, s in signals.items() if (f := anchor_of(s, weighable)) is not None}
     places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
     fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
     decide_units(fields)
@@ -121,15 +119,6 @@ def weigh(
     weighing.choose_signals(set(signals))
     weighing.choose_truth()
     return weighing.result()
-
-
-def _upward(log: DriveLog, signals: Mapping[str, SignalSource]) -> dict[str, SignalSource]:
-    """Return the third axis of a mapped accelerometer, to locate gravity."""
-    lateral = signals.get("ay_m_s2")
-    path = "" if lateral is None else f"{lateral.paths[0].removesuffix('.y')}.z"
-    if lateral is None or not has_path(log.fields(lateral.topic), path):
-        return {}
-    return {"az_m_s2": SignalSource("az_m_s2", lateral.topic, path, lateral.stamp)}
 
 
 def _is_wanted(
@@ -341,9 +330,10 @@ class _Weighing:
         open_truth = {n: f for n, f in self.truth.items() if n in ("vy_m_s", "yaw_rate_rad_s") and not f.fixed}
         lateral, across = open_fields.get("ay_m_s2"), open_truth.get("vy_m_s")
         groups: list[tuple[str, ...]] = [(n,) for n in open_fields]
-        groups += [(f"truth.{n}",) for n in open_truth if n != "vy_m_s"]
+        groups += [(f"truth.{n}",) for n in open_truth]
         if lateral is not None and across is not None and _share_axis(lateral, across):
-            groups[groups.index(("ay_m_s2",))] = ("ay_m_s2", "truth.vy_m_s")
+            groups = [g for g in groups if g not in (("ay_m_s2",), ("truth.vy_m_s",))]
+            groups.append(("ay_m_s2", "truth.vy_m_s"))
         return tuple(groups)
 
     def _speed(self) -> Field | None:

@@ -32,6 +32,9 @@ FIRST_RUNS = {
     "contact": "layouts of recorders were built after that, and scored once",
     "unseen": "layouts of documented tables and ROS messages were built last, and scored once",
     "trackside": "layouts of track modes, cameras, simulators and receivers were built last, and scored once",
+    "vendors": "layouts of race loggers, INS, phones, data frames and ROS tables were built last, and scored once",
+    "later": "layouts of loggers, buses and exports in five languages were built after the causes were corrected, and "
+    "scored once",
     "repositories": "layouts of files and messages in public repositories were held out before",
     "phones": "layouts of phones, games, makers and plotting tools were held out before",
     "stacks": "layouts of public stacks and loggers were held out before",

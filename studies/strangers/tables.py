@@ -144,6 +144,30 @@ def _frame(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
     path.write_text(_text(clock, columns, ["", "Zeitstempel", *columns], ","), encoding="utf-8")
 
 
+def _logger(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write a manufacturer's logger: tabulators, a row of names and one of units in parentheses, time in µs."""
+    names = [_split(title) for title in columns]
+    head = ["\t".join(["timestamp", "status", *(n for n, _ in names)])]
+    head += ["\t".join(["(us)", "(na)", *(f"({u})" for _, u in names)])]
+    clock = [f"{(s - int(stamps[0])) // 1000}\t0" for s in stamps.tolist()]
+    path.write_text("\n".join([*head, _text(clock, columns, [], "\t")]), encoding="utf-8")
+
+
+def _levels(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write a data frame whose titles have two levels, ``device|signal``, below them the name of the index."""
+    names = [title.split("|") for title in columns]
+    head = [",".join(["device", *(n[0] for n in names)]), ",".join(["signal", *(n[1] for n in names)])]
+    head.append(",".join(["time", *("" for _ in names)]))
+    clock = [f"{s / 1e9:.3f}" for s in (stamps - stamps[0]).tolist()]
+    path.write_text("\n".join([*head, _text(clock, columns, [], ",")]), encoding="utf-8")
+
+
+def _duration(path: Path, stamps: IntArray, columns: dict[str, Any]) -> None:
+    """Write a timetable whose times are durations with their unit."""
+    clock = [f"{s / 1e9:.6g} sec" for s in (stamps - stamps[0]).tolist()]
+    path.write_text(_text(clock, columns, ["Time", *columns], ","), encoding="utf-8")
+
+
 def _long_rows(topics: Sequence[Topic]) -> list[tuple[int, str, float, str]]:
     """Return a row for each value: time in ns, signal, value, unit."""
     rows = [
@@ -339,6 +363,9 @@ _TABLES: dict[str, tuple[str, Callable[[Path, IntArray, dict[str, Any]], None]]]
     "csv-keyed": (".csv", _keyed),
     "csv-remarks": (".txt", _remarks),
     "csv-frame": (".csv", _frame),
+    "csv-logger": (".txt", _logger),
+    "csv-levels": (".csv", _levels),
+    "csv-duration": (".csv", _duration),
     "parquet-nested": (".parquet", _nested_parquet),
     "parquet": (".parquet", _parquet),
     "vbo": (".vbo", _vbo),
