@@ -1,22 +1,21 @@
-"""Sensors that change in mid-drive: a bias of gyro or accelerometer that jumps, and steering or speed that freezes.
+"""Sensors that change in mid-drive: bias or gain of gyro and accelerometer, steering offset, speed gain, stuck values.
 
-Two relations that every car on wheels obeys are fitted to the drive so far, by least squares over means of
+Three relations that every car on wheels obeys are fitted to the drive so far, by least squares over means of
 ``MEAN_CELLS`` cells (docs/method.md#changes):
 
 * kinematics: a_y = b · [1, v_x r, ṙ, d(v_x r)/dt, v_x d(v_x r)/dt] (bias, roll, lever arm, v̇_y of the rear axle);
-* steering: δ = c · [1, r / v_x, v_x r, ṙ] (offset, wheelbase, understeer, yaw inertia).
+* steering: δ = c · [1, r / v_x, v_x r, ṙ] (offset, wheelbase, understeer, yaw inertia);
+* speed: v_x = ∫ a_x dt.
 
-At each cell, a generalised likelihood ratio test compares the residuals in the windows after it with the window before
-it, in units of the same statistic in the drive so far:
+At each cell, a generalised likelihood ratio test (Willsky and Jones 1976) explains the steps of the three residuals,
+and those between neighbouring samples of each sensor, by a change of one sensor. The second moment of each step in the
+drive so far is its covariance. A sensor is named if its change is likely against none, against that of any other
+sensor, and against a change of the car's motion, which the relations cannot exclude but in which no single sensor
+steps; and if it leaves little unexplained.
 
-* gyro: its samples have a step that the kinematic residual confirms, or the steering residual if that of the kinematics
-  is too noisy, and neither contradicts;
-* a_y: the residual of the kinematics has a flat step, and the steering residual excludes that the car changed its
-  motion; or it does not decide, and of the samples of both sensors only those of a_y have the step. A slide moves the
-  steering residual too; a banked road begins slowly.
-* frozen: a value repeats for longer than the share of repetitions so far explains by chance (probability
-  ``CHANCE``), and either the other sensors show that it changes (the steering relation, or a_x for the speed), or
-  the steering repeats ``LONGER`` times as long as any value before.
+Frozen: a value repeats for longer than the share of repetitions so far explains by chance (probability ``CHANCE``), and
+either the other sensors show that it changes (the steering relation, or a_x for the speed), or the steering repeats
+``LONGER`` times as long as any value before.
 
 The decision is made ``DECIDED_CELLS`` after the change, from samples up to then, and corrections begin then, so that
 causal estimators stay causal.
@@ -52,9 +51,12 @@ TRIED = 1e-4
 #: Least standard deviations of the steps of relations and samples.
 LEAST_STDS = (0.06, 0.0005, 0.05)
 LEAST_STEPS = {"ay_m_s2": 0.06, "yaw_rate_rad_s": 0.003, "steer_rad": 0.001, "speed_m_s": 0.05}
-#: Twice the log-likelihood ratios of a change to none, without the samples' steps, and to that of another sensor; largest
-#: part that the change does not explain, and as a share of the part that it does.
-ALARM, SURE, SHARP, MARGIN, MISFIT, MISFIT_SHARE = 50.0, 9.0, 6.0, 14.0, 28.0, 0.01
+#: Twice the log-likelihood ratios: of a change to none; of the relations and of the samples alone (its root); to
+#: that of another sensor (1000 : 1); and to a change of the car's motion.
+ALARM, SURE, MARGIN, SHARP = 50.0, 3.0, 14.0, 6.0
+#: Chi-square of what the change does not explain, its degrees of freedom and largest value (99.9 %), and share of the
+#: change, as its effects are known to 10 %.
+MISFIT_FREEDOM, MISFIT, MISFIT_SHARE = 9.0, 28.0, 0.01
 #: Samples beside a step, s.
 STEP_S = 0.1
 #: A reading repeats by chance with this probability; shortest time that is reported.
@@ -81,8 +83,8 @@ class SensorChange:
 
     Attributes
     ----------
-    sensor, kind : signal; ``jump`` of its bias by ``size`` ± ``std``, or ``stuck`` at ``size``; ``std`` is then of the
-        values that replace it.
+    sensor, kind : signal; ``jump`` of its bias by ``size`` ± ``std``, ``gain`` that grows by this share, or ``stuck``
+        at ``size``; ``std`` is then of the values that replace it.
     start_ns, known_ns, end_ns : of the change, of its correction, and of a stuck value's end.
     """
 
@@ -94,10 +96,10 @@ class SensorChange:
     size: float
     std: float
 
-    def removed(self, signals: Signals, start_ns: int, by: float | None = None) -> Signals:
-        """Return signals [N] without this jump or gain from a time on; ``by`` replaces its size."""
-        size, column = self.size if by is None else by, getattr(signals, self.sensor)
-        other = column / (1.0 + size) if self.kind == "gain" else column - size
+    def removed(self, signals: Signals, start_ns: int, by: float) -> Signals:
+        """Return signals [N] without a jump or gain by ``by`` from a time to the end of this one."""
+        column = getattr(signals, self.sensor)
+        other = column / (1.0 + by) if self.kind == "gain" else column - by
         late = (signals.stamps_ns >= start_ns) & (signals.stamps_ns < self.end_ns)
         return replace(signals, **{self.sensor: np.where(late, other, column)})
 
@@ -150,8 +152,8 @@ class _Relation(NamedTuple):
 def find_changes(signals: Signals, ignored: Collection[str] = ()) -> tuple[Signals, tuple[SensorChange, ...]]:
     """Return the signals [N] without the changes of their sensors, and the changes in order of time.
 
-    A jump is subtracted, stuck steering is replaced by the steering relation, other stuck values are missing. Changes
-    of ``ignored`` signals are kept.
+    A jump or gain is removed, stuck steering is replaced by the steering relation, other stuck values are missing.
+    Changes of ``ignored`` signals are kept.
     """
     if len(signals) < 2:
         return signals, ()
@@ -161,8 +163,8 @@ def find_changes(signals: Signals, ignored: Collection[str] = ()) -> tuple[Signa
     while len(changes) < MOST_CHANGES and (step := _first_step(fitted, after_ns, ignored)) is not None:
         changes.append(step)
         after_ns = step.start_ns
-        fitted = step.removed(fitted, step.start_ns)
-        sound = step.removed(sound, step.known_ns)
+        fitted = step.removed(fitted, step.start_ns, step.size)
+        sound = step.removed(sound, step.known_ns, step.size)
     return sound, tuple(sorted(changes, key=lambda c: c.start_ns))
 
 
@@ -243,15 +245,15 @@ class _Block(NamedTuple):
     def information(self) -> FloatArray:
         """Return the inverse of the second moment in the drive so far, [n, p, p]; 0 where it is not known."""
         n, p = self.step.shape
-        finite = np.isfinite(self.step).all(axis=1) & np.isfinite(self.effects).all(axis=(1, 2))
+        finite = np.asarray(np.isfinite(self.step).all(axis=1) & np.isfinite(self.effects).all(axis=(1, 2)))
         rows, late = np.where(finite[:, None], self.step, 0.0), min(WINDOW_CELLS + PEAK_CELLS, n)
         total = np.cumsum(rows[:, :, None] * rows[:, None, :], axis=0)[: n - late]
         total = np.concatenate([np.zeros((late, p, p)), total])
         count = np.concatenate([np.zeros(late), np.cumsum(finite)[: n - late]])
         few = (1.0 + LEAST_CELLS / np.maximum(count, 1.0)) ** 2 / np.maximum(count, 1.0)
-        moment = total * few[:, None, None]
-        moment += np.maximum(self.least**2 - np.einsum("npp->n", moment) / p, 1e-2 * self.least**2)[:, None, None] * np.eye(p)
-        information = np.linalg.inv(moment)
+        moment, least = total * few[:, None, None], self.least**2
+        raised = np.maximum(least - np.einsum("npp->n", moment) / p, 0.01 * least)
+        information = np.linalg.inv(moment + raised[:, None, None] * np.eye(p))
         information[~finite | (count < LEAST_CELLS)] = 0.0
         return np.asarray(information)
 
@@ -311,45 +313,47 @@ def _std_so_far(column: FloatArray, least: float) -> FloatArray:
     return np.where(count < 0.5 * LEAST_CELLS, np.inf, np.maximum(few * np.sqrt(total / np.maximum(count, 1.0)), least))
 
 
+def _likeliest(signals: Signals, cells: Cells) -> tuple[BoolArray, IntArray, FloatArray, FloatArray, FloatArray]:
+    """Return whether the likeliest change behind each cell is named, its hypothesis, evidence, size and 1-sigma."""
+    tried = [cells.changed(FIELDS[name], kind, TRIED) for name, kind in HYPOTHESES]
+    blocks = [_relation_block(i, cells, tried) for i in range(len(LEAST_STDS))]
+    blocks += [_sample_block(name, signals, cells, tried) for name in FIELDS]
+    k, h = np.arange(len(cells.speed)), len(HYPOTHESES)
+    match, power, total = np.zeros((2, len(k), h)), np.zeros((2, len(k), h)), np.zeros((2, len(k)))
+    for i, block in enumerate(blocks):
+        part = int(i >= len(LEAST_STDS))  # relations, samples
+        step, effects, information = np.nan_to_num(block.step), np.nan_to_num(block.effects), block.information()
+        weighted = effects @ information
+        match[part] += (weighted @ step[..., None])[..., 0]
+        power[part] += (weighted * effects).sum(axis=2)
+        total[part] += np.einsum("np,npq,nq->n", step, information, step)
+    parts = match / np.sqrt(np.maximum(power, 1e-12))
+    match, power = match.sum(axis=0), np.maximum(power.sum(axis=0), 1e-12)
+    explained, sensor = match**2 / power, np.array([name for name, _ in HYPOTHESES])
+    best = np.argmax(explained, axis=1)
+    second = np.where(sensor == sensor[best][:, None], 0.0, explained).max(axis=1)
+    evidence, parts = explained[k, best], parts[:, k, best]
+    misfit = total.sum(axis=0) - evidence
+    is_named = (evidence > ALARM) & (evidence - second > MARGIN) & (evidence - total[0] > SHARP)
+    is_named &= (np.abs(parts).min(axis=0) > SURE) & (parts.prod(axis=0) > 0.0)
+    is_named &= misfit < MISFIT + MISFIT_SHARE * evidence
+    std = np.sqrt(np.maximum(1.0, misfit / MISFIT_FREEDOM) / power[k, best])
+    return is_named, best, evidence, match[k, best] / power[k, best], std
+
 
 def _first_step(signals: Signals, after_ns: int, ignored: Collection[str]) -> SensorChange | None:
-    """Return the first step of the bias or gain of a sensor behind a time."""
+    """Return the first change of the bias or gain of a sensor behind a time."""
     cells = cells_of(signals)
-    tried = [cells.changed(FIELDS[name], kind, TRIED) for name, kind in HYPOTHESES]
-    blocks = [_relation_block(i, cells, tried) for i in range(3)]
-    blocks += [_sample_block(name, signals, cells, tried) for name in FIELDS]
-    n, h = len(cells.speed), len(HYPOTHESES)
-    match, power, total = np.zeros((2, n, h)), np.zeros((2, n, h)), np.zeros((2, n))
-    for i, block in enumerate(blocks):
-        step, effects, information = np.nan_to_num(block.step), np.nan_to_num(block.effects), block.information()
-        weighted = np.einsum("nhp,npq->nhq", effects, information)
-        match[int(i > 2)] += np.einsum("nhp,np->nh", weighted, step)
-        power[int(i > 2)] += (weighted * effects).sum(axis=2)
-        total[int(i > 2)] += np.einsum("np,npq,nq->n", step, information, step)
-    relations, samples = match * np.abs(match) / np.maximum(power, 1e-12)
-    match, power = match.sum(axis=0), power.sum(axis=0)
-    explained, k = match**2 / np.maximum(power, 1e-12), np.arange(n)
-    best = np.argmax(explained, axis=1)
-    names = np.array([list(FIELDS).index(name) for name, _ in HYPOTHESES])
-    second = np.where(names[None, :] == names[best][:, None], 0.0, explained).max(axis=1)
-    evidence, misfit = explained[k, best], total.sum(axis=0) - explained[k, best]
-    # Of a change of the car's motion the relations say anything, and the samples of one sensor nothing.
-    is_alarm = (evidence > ALARM) & (evidence - second > MARGIN) & (evidence - total[0] > SHARP)
-    is_alarm &= (np.minimum(relations, samples) > SURE)[k, best] | (np.maximum(relations, samples) < -SURE)[k, best]
-    is_alarm &= misfit < MISFIT + MISFIT_SHARE * evidence
-    is_alarm &= ~np.isin(names[best], [i for i, name in enumerate(FIELDS) if name in ignored])
-
-    first = cells.of_stamp[np.searchsorted(signals.stamps_ns, after_ns)]
-    alarms = np.flatnonzero(is_alarm & (k > first + WINDOW_CELLS))
-    if not len(alarms):
+    is_named, best, evidence, size, std = _likeliest(signals, cells)
+    is_named &= np.array([name not in ignored for name, _ in HYPOTHESES])[best]
+    is_named[: cells.of_stamp[np.searchsorted(signals.stamps_ns, after_ns)] + WINDOW_CELLS + 1] = False
+    if not is_named.any():
         return None
-    at = int(alarms[0])
-    near = np.where(is_alarm, evidence, 0.0)[at : at + PEAK_CELLS + 1]
-    peak = at + int(np.argmax(near))
-    (name, kind), h = HYPOTHESES[best[peak]], best[peak]
-    size, std = match[peak, h] / power[peak, h], math.sqrt(max(1.0, misfit[peak] / 9.0) / power[peak, h])
+    at = int(np.argmax(is_named))
+    k = at + int(np.argmax(np.where(is_named, evidence, 0.0)[at : at + PEAK_CELLS + 1]))
     known_ns, end_ns = cells.time_of(at + DECIDED_CELLS), int(signals.stamps_ns[-1]) + 1
-    return SensorChange(name, kind, cells.time_of(peak), known_ns, end_ns, float(size), std)
+    name, kind = HYPOTHESES[best[k]]
+    return SensorChange(name, kind, cells.time_of(k), known_ns, end_ns, float(size[k]), float(std[k]))
 
 
 # ------------------------------------------------------------------------------------------------ stuck values
