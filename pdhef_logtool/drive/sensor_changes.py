@@ -1,22 +1,21 @@
-"""Sensors that change in mid-drive: a bias of gyro or accelerometer that jumps, and steering or speed that freezes.
+"""Sensors that change in mid-drive: bias or gain of gyro and accelerometer, steering offset, speed gain, stuck values.
 
-Two relations that every car on wheels obeys are fitted to the drive so far, by least squares over means of
+Three relations that every car on wheels obeys are fitted to the drive so far, by least squares over means of
 ``MEAN_CELLS`` cells (docs/method.md#changes):
 
 * kinematics: a_y = b · [1, v_x r, ṙ, d(v_x r)/dt, v_x d(v_x r)/dt] (bias, roll, lever arm, v̇_y of the rear axle);
-* steering: δ = c · [1, r / v_x, v_x r, ṙ] (offset, wheelbase, understeer, yaw inertia).
+* steering: δ = c · [1, r / v_x, v_x r, ṙ] (offset, wheelbase, understeer, yaw inertia);
+* speed: v_x = ∫ a_x dt.
 
-At each cell, a generalised likelihood ratio test compares the residuals in the windows after it with the window before
-it, in units of the same statistic in the drive so far:
+At each cell, a generalised likelihood ratio test (Willsky and Jones 1976) explains the steps of the three residuals,
+and those between neighbouring samples of each sensor, by a change of one sensor. The second moment of each step in the
+drive so far is its covariance. A sensor is named if its change is likely against none, against that of any other
+sensor, and against a change of the car's motion, which the relations cannot exclude but in which no single sensor
+steps; and if it leaves little unexplained.
 
-* gyro: its samples have a step that the kinematic residual confirms, or the steering residual if that of the kinematics
-  is too noisy, and neither contradicts;
-* a_y: the residual of the kinematics has a flat step, and the steering residual excludes that the car changed its
-  motion; or it does not decide, and of the samples of both sensors only those of a_y have the step. A slide moves the
-  steering residual too; a banked road begins slowly.
-* frozen: a value repeats for longer than the share of repetitions so far explains by chance (probability
-  ``CHANCE``), and either the other sensors show that it changes (the steering relation, or a_x for the speed), or
-  the steering repeats ``LONGER`` times as long as any value before.
+Frozen: a value repeats for longer than the share of repetitions so far explains by chance (probability ``CHANCE``), and
+either the other sensors show that it changes (the steering relation, or a_x for the speed), or the steering repeats
+``LONGER`` times as long as any value before.
 
 The decision is made ``DECIDED_CELLS`` after the change, from samples up to then, and corrections begin then, so that
 causal estimators stay causal.
@@ -44,13 +43,22 @@ DECIDED_CELLS = WINDOW_CELLS + PEAK_CELLS + 1
 LONGEST_GAP_S = 1.0
 #: Cells of driving before the first decision, and the speed above which the relations apply.
 LEAST_CELLS, LEAST_SPEED_M_S = 40, 3.0
-#: Alarm level and level of confirmation in standard deviations of a statistic, and the least standard deviations.
-ALARM, SURE = 4.0, 3.0
-LEAST_AY_STD, LEAST_STEER_STD, LEAST_GYRO_STD = 0.06, 0.0005, 0.003
-#: Smallest jumps that are reported. The crossfall of a road changes a_y by 0.5 m/s² from lane to lane.
-LEAST_AY_JUMP_M_S2, LEAST_GYRO_JUMP_RAD_S = 0.6, 0.02
-#: Samples beside a step of the gyro, s; largest relative difference of steps that agree, and of an absent one.
-STEP_S, AGREES, ABSENT = 0.05, 0.5, 0.35
+#: Signals and their columns of cells; steps that are tried, of bias and gain, by this much.
+FIELDS = {"ay_m_s2": "ay", "yaw_rate_rad_s": "yaw_rate", "steer_rad": "steer", "speed_m_s": "speed"}
+HYPOTHESES = (*((name, kind) for name in ("ay_m_s2", "yaw_rate_rad_s") for kind in ("jump", "gain")),
+              ("steer_rad", "jump"), ("speed_m_s", "gain"))  # fmt: skip
+TRIED = 1e-4
+#: Least standard deviations of the steps of relations and samples.
+LEAST_STDS = (0.06, 0.0005, 0.05)
+LEAST_STEPS = {"ay_m_s2": 0.06, "yaw_rate_rad_s": 0.003, "steer_rad": 0.001, "speed_m_s": 0.05}
+#: Twice the log-likelihood ratios: of a change to none; of the relations and of the samples alone (its root); to
+#: that of another sensor (1000 : 1); and to a change of the car's motion.
+ALARM, SURE, MARGIN, SHARP = 50.0, 3.0, 14.0, 6.0
+#: Chi-square of what the change does not explain, its degrees of freedom and largest value (99.9 %), and share of the
+#: change, as its effects are known to 10 %.
+MISFIT_FREEDOM, MISFIT, MISFIT_SHARE = 9.0, 28.0, 0.01
+#: Samples beside a step, s.
+STEP_S = 0.1
 #: A reading repeats by chance with this probability; shortest time that is reported.
 CHANCE, LEAST_STUCK_S = 1e-6, 0.3
 #: Change that a stuck channel has missed: of the steering relation, with its standard deviations; of the speed by a_x
@@ -75,8 +83,8 @@ class SensorChange:
 
     Attributes
     ----------
-    sensor, kind : signal; ``jump`` of its bias by ``size`` ± ``std``, or ``stuck`` at ``size``; ``std`` is then of the
-        values that replace it.
+    sensor, kind : signal; ``jump`` of its bias by ``size`` ± ``std``, ``gain`` that grows by this share, or ``stuck``
+        at ``size``; ``std`` is then of the values that replace it.
     start_ns, known_ns, end_ns : of the change, of its correction, and of a stuck value's end.
     """
 
@@ -87,6 +95,13 @@ class SensorChange:
     end_ns: int
     size: float
     std: float
+
+    def removed(self, signals: Signals, start_ns: int, by: float) -> Signals:
+        """Return signals [N] without a jump or gain by ``by`` from a time to the end of this one."""
+        column = getattr(signals, self.sensor)
+        other = column / (1.0 + by) if self.kind == "gain" else column - by
+        late = (signals.stamps_ns >= start_ns) & (signals.stamps_ns < self.end_ns)
+        return replace(signals, **{self.sensor: np.where(late, other, column)})
 
 
 class Cells(NamedTuple):
@@ -99,6 +114,11 @@ class Cells(NamedTuple):
     steer: FloatArray
     speed: FloatArray
     ax: FloatArray
+
+    def changed(self, column: str, kind: str, by: float) -> Cells:
+        """Return the cells with a change of the bias or gain of one column."""
+        values = getattr(self, column)
+        return self._replace(**{column: values + by if kind == "jump" else values * (1.0 + by)})
 
     def time_of(self, cell: int) -> int:
         """Return the first stamp in a cell or behind it."""
@@ -132,26 +152,20 @@ class _Relation(NamedTuple):
 def find_changes(signals: Signals, ignored: Collection[str] = ()) -> tuple[Signals, tuple[SensorChange, ...]]:
     """Return the signals [N] without the changes of their sensors, and the changes in order of time.
 
-    A jump is subtracted, stuck steering is replaced by the steering relation, other stuck values are missing. Changes
-    of ``ignored`` signals are kept.
+    A jump or gain is removed, stuck steering is replaced by the steering relation, other stuck values are missing.
+    Changes of ``ignored`` signals are kept.
     """
     if len(signals) < 2:
         return signals, ()
     cells = cells_of(signals)
     sound, changes = _without_stuck(signals, cells, [n for n in ("steer_rad", "speed_m_s") if n not in ignored])
     fitted, after_ns = _without_repeats(sound, cells), 0
-    while len(changes) < MOST_CHANGES and (jump := _first_jump(fitted, after_ns, ignored)) is not None:
-        changes.append(jump)
-        after_ns = jump.start_ns
-        fitted = shifted(fitted, jump.sensor, -jump.size, jump.start_ns, jump.end_ns)
-        sound = shifted(sound, jump.sensor, -jump.size, jump.known_ns, jump.end_ns)
+    while len(changes) < MOST_CHANGES and (step := _first_step(fitted, after_ns, ignored)) is not None:
+        changes.append(step)
+        after_ns = step.start_ns
+        fitted = step.removed(fitted, step.start_ns, step.size)
+        sound = step.removed(sound, step.known_ns, step.size)
     return sound, tuple(sorted(changes, key=lambda c: c.start_ns))
-
-
-def shifted(signals: Signals, name: str, by: float, start_ns: int, end_ns: int) -> Signals:
-    """Return signals with a value added to one column in [start, end)."""
-    column = getattr(signals, name) + np.where((signals.stamps_ns >= start_ns) & (signals.stamps_ns < end_ns), by, 0.0)
-    return replace(signals, **{name: column})
 
 
 # ------------------------------------------------------------------------------------------------ relations
@@ -187,9 +201,9 @@ def _mean(column: FloatArray, start: int, end: int) -> FloatArray:
     return np.where(finite, (sums[last] - sums[first]) / (end - start), np.nan)
 
 
-def _relations(cells: Cells) -> tuple[_Relation, _Relation]:
-    """Return the relations of kinematics and steering."""
-    ay, r, steer, v, _ = (_mean(column, 1 - MEAN_CELLS, 1) for column in cells[2:])
+def _tables(cells: Cells) -> tuple[FloatArray, ...]:
+    """Return the tables of kinematics, steering and speed."""
+    ay, r, steer, v, gained = (_mean(c, 1 - MEAN_CELLS, 1) for c in (*cells[2:6], np.cumsum(cells.ax) * CELL_S))
     v = np.where(v > LEAST_SPEED_M_S, v, np.nan)
     constant, turning = np.ones_like(v), v * r
 
@@ -198,7 +212,8 @@ def _relations(cells: Cells) -> tuple[_Relation, _Relation]:
         return np.asarray((column - before) / (MEAN_CELLS * CELL_S))
 
     kinematics = np.stack([ay, constant, turning, rate(r), rate(turning), v * rate(turning)], axis=1)
-    return _fitted(kinematics), _fitted(np.stack([steer, constant, r / v, turning, rate(r)], axis=1))
+    steering = np.stack([steer, constant, r / v, turning, rate(r)], axis=1)
+    return kinematics, steering, np.stack([v - gained, constant], axis=1)
 
 
 def _fitted(table: FloatArray) -> _Relation:
@@ -212,50 +227,78 @@ def _fitted(table: FloatArray) -> _Relation:
     return _Relation(table, np.where(np.cumsum(finite)[:, None] > LEAST_CELLS, fit, np.nan), square)
 
 
-# ------------------------------------------------------------------------------------------------ jumps
+# ------------------------------------------------------------------------------------------------ steps
 
 
-class _Step(NamedTuple):
-    """Step of a residual behind each cell [n]: mean of the windows after it, whether it is sharp, and its 1-sigma."""
+class _Block(NamedTuple):
+    """A part of the evidence: statistics of a step behind each cell, and what a unit of each hypothesis does to them.
 
-    size: FloatArray
-    is_sharp: BoolArray
-    std: FloatArray
-
-    def confirms(self, other: FloatArray) -> BoolArray:
-        """Return where this step equals another one and is significant."""
-        return (np.abs(self.size) > SURE * self.std) & (np.abs(self.size - other) < AGREES * np.abs(other))
-
-    def contradicts(self, other: FloatArray) -> BoolArray:
-        """Return where another step differs by more than the uncertainty; False where this one is not finite."""
-        return np.abs(self.size - other) > AGREES * np.abs(other) + SURE * self.std
-
-    def excludes(self, other: FloatArray, std: FloatArray) -> BoolArray:
-        """Return where another step with this 1-sigma is absent, although it would be significant."""
-        return (np.abs(other) < ABSENT * np.abs(self.size)) & (np.abs(self.size) > SURE * std)
-
-    def scaled(self, by: FloatArray) -> _Step:
-        """Return the step in another unit."""
-        return _Step(self.size * by, self.is_sharp, self.std * np.abs(by))
-
-
-def _step(relation: _Relation, least_std: float) -> _Step:
-    """Return the step of a relation's residual behind each cell, with the fit of the drive before it.
-
-    A sharp step has its size within ``2 MEAN_CELLS`` cells, and the residual is flat on both sides.
+    Attributes
+    ----------
+    step : [n, p]. effects : [n, h, p]. least : smallest standard deviation of the statistics, [n].
     """
-    table = relation.table
-    before = _mean(table, -PART_CELLS, 0)
-    starts = [MEAN_CELLS + i * PART_CELLS for i in range(PARTS)]
-    changes = [_mean(table, s, s + PART_CELLS) - before for s in starts]
-    size, change = np.mean([relation.residual(c) for c in changes], axis=0), np.mean(changes, axis=0)
-    short = _mean(table, MEAN_CELLS, MEAN_CELLS + 1) - _mean(table, -1, 0)
-    earlier = relation.residual(before - _mean(table, -2 * PART_CELLS, -PART_CELLS))
-    is_sharp = np.abs(earlier) < AGREES * np.abs(size)
-    for part in (*map(relation.residual, (*changes, short)), short[:, 0] - short[:, 2]):
-        is_sharp &= np.abs(part - size) < AGREES * np.abs(size)
-    leverage = relation.leverage(change[:, 1:])
-    return _Step(size, is_sharp, _std_so_far(size / leverage, least_std) * leverage)
+
+    step: FloatArray
+    effects: FloatArray
+    least: FloatArray
+
+    def information(self) -> FloatArray:
+        """Return the inverse of the second moment in the drive so far, [n, p, p]; 0 where it is not known."""
+        n, p = self.step.shape
+        finite = np.asarray(np.isfinite(self.step).all(axis=1) & np.isfinite(self.effects).all(axis=(1, 2)))
+        rows, late = np.where(finite[:, None], self.step, 0.0), min(WINDOW_CELLS + PEAK_CELLS, n)
+        total = np.cumsum(rows[:, :, None] * rows[:, None, :], axis=0)[: n - late]
+        total = np.concatenate([np.zeros((late, p, p)), total])
+        count = np.concatenate([np.zeros(late), np.cumsum(finite)[: n - late]])
+        few = (1.0 + LEAST_CELLS / np.maximum(count, 1.0)) ** 2 / np.maximum(count, 1.0)
+        moment, least = total * few[:, None, None], self.least**2
+        raised = np.maximum(least - np.einsum("npp->n", moment) / p, 0.01 * least)
+        information = np.linalg.inv(moment + raised[:, None, None] * np.eye(p))
+        information[~finite | (count < LEAST_CELLS)] = 0.0
+        return np.asarray(information)
+
+
+def _relation_block(index: int, cells: Cells, tried: Sequence[Cells]) -> _Block:
+    """Return the step of a relation's residual in the windows after each cell, with the fit of the drive before it."""
+    relation = _fitted(_tables(cells)[index])
+    units = [(_tables(other)[index] - relation.table) / TRIED for other in tried]
+    before = _mean(relation.table, -PART_CELLS, 0)
+    steps, effects = [], []
+    for start in range(MEAN_CELLS, WINDOW_CELLS, PART_CELLS):
+        change = _mean(relation.table, start, start + PART_CELLS) - before
+        leverage = relation.leverage(change[:, 1:])
+        steps.append(relation.residual(change) / leverage)
+        effects.append([relation.residual(_mean(unit, start, start + PART_CELLS)) / leverage for unit in units])
+    least = np.full(len(before), LEAST_STDS[index])
+    return _Block(np.stack(steps, axis=1), np.transpose(effects, (2, 1, 0)), least)
+
+
+def _sample_block(name: str, signals: Signals, cells: Cells, tried: Sequence[Cells]) -> _Block:
+    """Return the step between neighbouring samples of a sensor; bursts of noise or motion have neighbours."""
+    step, column = _sample_steps(getattr(signals, name), cells), getattr(cells, FIELDS[name])
+    units = [_mean((getattr(other, FIELDS[name]) - column) / TRIED, -1, 0) for other in tried]
+    square = np.nan_to_num(step) ** 2
+    beside = np.sqrt(np.fmax(_mean(square, 3, WINDOW_CELLS), _mean(square, -2 - PART_CELLS, -2)))
+    return _Block(step[:, None], np.stack(units, axis=1)[..., None], np.fmax(beside, LEAST_STEPS[name]))
+
+
+def _sample_steps(column: FloatArray, cells: Cells) -> FloatArray:
+    """Return the largest step between neighbouring samples of a column [N] in each cell, [n]; NaN without samples.
+
+    A straight line with a step is fitted to the samples up to ``STEP_S`` before and after.
+    """
+    finite = np.isfinite(column)
+    values, stamps, cell = column[finite], cells.stamps_ns[finite], cells.of_stamp[finite]
+    largest = np.full(len(cells.speed), np.nan)
+    half = max(2, round(STEP_S * 1e9 / float(np.median(np.diff(stamps))))) if len(stamps) > 1 else 2
+    if len(values) < 2 * half:
+        return largest
+    place = np.arange(2 * half) - (half - 0.5)
+    weights = np.linalg.pinv(np.stack([np.ones(2 * half), place, 0.5 * np.sign(place)], axis=1))[2]
+    steps = np.convolve(values, weights[::-1], "valid")
+    order = np.argsort(np.abs(steps), kind="stable")  # the largest of a cell is written last
+    largest[cell[half : half + len(steps)][order]] = steps[order]
+    return largest
 
 
 def _std_so_far(column: FloatArray, least: float) -> FloatArray:
@@ -270,76 +313,47 @@ def _std_so_far(column: FloatArray, least: float) -> FloatArray:
     return np.where(count < 0.5 * LEAST_CELLS, np.inf, np.maximum(few * np.sqrt(total / np.maximum(count, 1.0)), least))
 
 
-def _sample_steps(column: FloatArray, cells: Cells) -> tuple[FloatArray, IntArray]:
-    """Return the largest step between neighbouring samples of a column [N] in each cell, [n], and its stamp.
+def _likeliest(signals: Signals, cells: Cells) -> tuple[BoolArray, IntArray, FloatArray, FloatArray, FloatArray]:
+    """Return whether the likeliest change behind each cell is named, its hypothesis, evidence, size and 1-sigma."""
+    tried = [cells.changed(FIELDS[name], kind, TRIED) for name, kind in HYPOTHESES]
+    blocks = [_relation_block(i, cells, tried) for i in range(len(LEAST_STDS))]
+    blocks += [_sample_block(name, signals, cells, tried) for name in FIELDS]
+    k, h = np.arange(len(cells.speed)), len(HYPOTHESES)
+    match, power, total = np.zeros((2, len(k), h)), np.zeros((2, len(k), h)), np.zeros((2, len(k)))
+    for i, block in enumerate(blocks):
+        part = int(i >= len(LEAST_STDS))  # relations, samples
+        step, effects, information = np.nan_to_num(block.step), np.nan_to_num(block.effects), block.information()
+        weighted = effects @ information
+        match[part] += (weighted @ step[..., None])[..., 0]
+        power[part] += (weighted * effects).sum(axis=2)
+        total[part] += np.einsum("np,npq,nq->n", step, information, step)
+    parts = match / np.sqrt(np.maximum(power, 1e-12))
+    match, power = match.sum(axis=0), np.maximum(power.sum(axis=0), 1e-12)
+    explained, sensor = match**2 / power, np.array([name for name, _ in HYPOTHESES])
+    best = np.argmax(explained, axis=1)
+    second = np.where(sensor == sensor[best][:, None], 0.0, explained).max(axis=1)
+    evidence, parts = explained[k, best], parts[:, k, best]
+    misfit = total.sum(axis=0) - evidence
+    is_named = (evidence > ALARM) & (evidence - second > MARGIN) & (evidence - total[0] > SHARP)
+    is_named &= (np.abs(parts).min(axis=0) > SURE) & (parts.prod(axis=0) > 0.0)
+    is_named &= misfit < MISFIT + MISFIT_SHARE * evidence
+    std = np.sqrt(np.maximum(1.0, misfit / MISFIT_FREEDOM) / power[k, best])
+    return is_named, best, evidence, match[k, best] / power[k, best], std
 
-    A straight line with a step is fitted to the samples up to ``STEP_S`` before and after.
-    """
-    finite = np.isfinite(column)
-    values, stamps, cell = column[finite], cells.stamps_ns[finite], cells.of_stamp[finite]
-    count = len(cells.speed)
-    largest, stamp_ns = np.zeros(count), np.zeros(count, np.int64)
-    half = max(2, round(STEP_S * 1e9 / float(np.median(np.diff(stamps))))) if len(stamps) > 1 else 2
-    if len(values) < 2 * half:
-        return largest, stamp_ns
-    place = np.arange(2 * half) - (half - 0.5)
-    weights = np.linalg.pinv(np.stack([np.ones(2 * half), place, 0.5 * np.sign(place)], axis=1))[2]
-    steps = np.convolve(values, weights[::-1], "valid")
-    middle = slice(half, half + len(steps))
-    order = np.argsort(np.abs(steps), kind="stable")  # the largest of a cell is written last
-    largest[cell[middle][order]], stamp_ns[cell[middle][order]] = steps[order], stamps[middle][order]
-    return largest, stamp_ns
 
-
-def _largest_near(steps: FloatArray) -> FloatArray:
-    """Return the largest of each step and the ``PEAK_CELLS`` behind it, [n]."""
-    rows = np.lib.stride_tricks.sliding_window_view(np.append(steps, np.zeros(PEAK_CELLS)), PEAK_CELLS + 1)
-    return np.take_along_axis(rows, np.argmax(np.abs(rows), axis=1)[:, None], axis=1)[:, 0]
-
-
-def _first_jump(signals: Signals, after_ns: int, ignored: Collection[str]) -> SensorChange | None:
-    """Return the first jump of gyro or accelerometer behind a time."""
-    cells, end_ns = cells_of(signals), int(signals.stamps_ns[-1]) + 1
-    kinematics, steering = _relations(cells)
-    v = _mean(np.where(cells.speed > LEAST_SPEED_M_S, cells.speed, np.nan), -PART_CELLS, 0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ay, of_steer = _step(kinematics, LEAST_AY_STD), _step(steering, LEAST_STEER_STD)
-        by_ay, by_steer = ay.scaled(-1.0 / v), of_steer.scaled(-1.0 / (steering.fit[:, 1] / v + steering.fit[:, 2] * v))
-        step, at_ns = _sample_steps(signals.yaw_rate_rad_s, cells)
-        step_std = np.fmax(_std_so_far(step, LEAST_GYRO_STD), np.sqrt(_mean(step**2, 3, WINDOW_CELLS)))  # a burst
-        is_gyro = np.abs(step) > np.maximum(ALARM * step_std, LEAST_GYRO_JUMP_RAD_S)
-        is_gyro &= by_ay.confirms(step) | (by_steer.confirms(step) & (SURE * by_ay.std > np.abs(step)))
-        is_gyro &= ~by_ay.contradicts(step) & ~by_steer.contradicts(step)
-        is_ay = (np.abs(ay.size) > np.maximum(ALARM * ay.std, LEAST_AY_JUMP_M_S2)) & ay.is_sharp
-        # The steering shows that the car did not change its motion, or the samples of both sensors do.
-        sampled, turned = (_largest_near(steps) for steps in (_sample_steps(signals.ay_m_s2, cells)[0], step))
-        is_sampled = np.abs(sampled - ay.size) < AGREES * np.abs(ay.size)
-        is_sampled &= by_ay.excludes(turned, step_std) & ~by_steer.contradicts(0.0 * step)
-        is_ay &= by_ay.excludes(by_steer.size, by_steer.std) | is_sampled
-    is_gyro &= "yaw_rate_rad_s" not in ignored
-    is_ay &= "ay_m_s2" not in ignored
-    first = cells.of_stamp[np.searchsorted(signals.stamps_ns, after_ns)]
-    possible = np.arange(len(v)) > first + WINDOW_CELLS
-    alarms = np.flatnonzero((is_gyro | is_ay) & possible)
-    if not len(alarms):
+def _first_step(signals: Signals, after_ns: int, ignored: Collection[str]) -> SensorChange | None:
+    """Return the first change of the bias or gain of a sensor behind a time."""
+    cells = cells_of(signals)
+    is_named, best, evidence, size, std = _likeliest(signals, cells)
+    is_named &= np.array([name not in ignored for name, _ in HYPOTHESES])[best]
+    is_named[: cells.of_stamp[np.searchsorted(signals.stamps_ns, after_ns)] + WINDOW_CELLS + 1] = False
+    if not is_named.any():
         return None
-    k = int(alarms[0])
-    known_ns = cells.time_of(k + DECIDED_CELLS)
-    if is_gyro[k]:
-        three = (step, step_std), (by_ay.size, by_ay.std), (by_steer.size, by_steer.std)
-        return SensorChange("yaw_rate_rad_s", "jump", int(at_ns[k]), known_ns, end_ns, *_weighted(three, k))
-    k += int(np.argmax(np.abs(ay.size[k : k + PEAK_CELLS + 1])))
-    return SensorChange("ay_m_s2", "jump", cells.time_of(k), known_ns, end_ns, float(ay.size[k]), float(ay.std[k]))
-
-
-def _weighted(measured: Sequence[tuple[FloatArray, FloatArray]], k: int) -> tuple[float, float]:
-    """Return the mean of the finite sizes [n] in cell k, weighted by their 1-sigmas [n], and its 1-sigma."""
-    sizes, stds = (np.array([column[k] for column in columns]) for columns in zip(*measured, strict=True))
-    finite = np.isfinite(sizes) & np.isfinite(stds)
-    size, weight = sizes[finite], stds[finite] ** -2.0
-    mean = float(weight @ size / weight.sum())
-    scatter = float(weight @ (size - mean) ** 2) / max(len(size) - 1, 1)
-    return mean, math.sqrt(max(1.0, scatter) / float(weight.sum()))
+    at = int(np.argmax(is_named))
+    k = at + int(np.argmax(np.where(is_named, evidence, 0.0)[at : at + PEAK_CELLS + 1]))
+    known_ns, end_ns = cells.time_of(at + DECIDED_CELLS), int(signals.stamps_ns[-1]) + 1
+    name, kind = HYPOTHESES[best[k]]
+    return SensorChange(name, kind, cells.time_of(k), known_ns, end_ns, float(size[k]), float(std[k]))
 
 
 # ------------------------------------------------------------------------------------------------ stuck values
@@ -348,7 +362,7 @@ def _weighted(measured: Sequence[tuple[FloatArray, FloatArray]], k: int) -> tupl
 def _without_stuck(signals: Signals, cells: Cells, names: Sequence[str]) -> tuple[Signals, list[SensorChange]]:
     """Replace stuck steering by the steering relation, and remove stuck speeds."""
     cell, changes = cells.of_stamp, []
-    _, steering = _relations(cells)
+    steering = _fitted(_tables(cells)[1])
     error = _std_so_far(steering.residual(steering.table), 0.0)
     travelled = np.cumsum(np.nan_to_num(cells.ax)) * CELL_S
     columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in names}

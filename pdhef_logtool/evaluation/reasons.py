@@ -61,7 +61,7 @@ class SensorFault:
 
     Attributes
     ----------
-    sensor : signal. kind : ``burst``, ``spike``, ``stuck``, ``dead``, ``missing`` or ``jump`` (of its bias).
+    sensor : signal. kind : ``burst``, ``spike``, ``stuck``, ``dead``, ``missing``, ``jump`` (of its bias) or ``gain``.
     count, seconds : of all intervals. intervals : up to :data:`LISTED_INTERVALS` of the longest, in order of time.
     """
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pdhef_logtool.drive.reading import WholeDrive
-from pdhef_logtool.drive.sensor_changes import SensorChange, shifted
+from pdhef_logtool.drive.sensor_changes import SensorChange
 from pdhef_logtool.drive.truth import valid_as_a_whole
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
@@ -110,7 +110,7 @@ def _computation(estimator: Estimator, signals: Signals) -> tuple[str, int]:
 def _varied(estimator: Estimator, given: Signals, changes: Sequence[SensorChange]) -> list[FloatArray]:
     """Return v_y [N] of an estimator on signals whose corrected sensors are one 1-sigma away, one by one."""
     varied = (c for c in changes if math.isfinite(c.std))
-    away = (shifted(given, c.sensor, c.std, c.known_ns, c.end_ns) for c in varied)
+    away = (c.removed(given, c.known_ns, -c.std) for c in varied)
     return [run_estimator(estimator, signals).vy_m_s for signals in away]
 
 

@@ -74,6 +74,32 @@ def test_two_sensors_name_the_third_although_the_fourth_shows_nothing(road: Sign
     assert [only(s)[1].sensor for s in (noisy, without_steering)] == ["yaw_rate_rad_s", "ay_m_s2"]
 
 
+#: Sensor, gain and bias.
+STEPS = [("yaw_rate_rad_s", 1.0, np.radians(2.0)), ("speed_m_s", 0.95, 0.0), ("speed_m_s", 1.05, 0.0),
+         ("steer_rad", 1.0, np.radians(1.0)), ("steer_rad", 1.0, np.radians(10.0 / 16.0))]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "gain", "bias"), STEPS)
+def test_steps_of_bias_and_gain_are_named_within_2_s(road: Signals, name: str, gain: float, bias: float) -> None:
+    late = seconds(road) >= AT_S
+    column = getattr(road, name)
+    signals = replace(road, **{name: np.where(late, column * gain + bias, column)})
+    sound, change = only(signals)
+    assert (change.sensor, change.kind) == (name, "gain" if gain != 1.0 else "jump")
+    size = gain - 1.0 if gain != 1.0 else bias
+    assert abs(change.size - size) < max(3.0 * change.std, 0.1 * abs(size))
+    assert (change.known_ns - road.stamps_ns[0]) * 1e-9 < AT_S + 2.0
+    after = seconds(road) > AT_S + 2.0
+    error, planted = (np.nanmean((getattr(s, name) - column)[after] ** 2) for s in (sound, signals))
+    assert error < 0.2 * planted
+
+
+def test_an_offset_in_a_ramp_of_steering_is_no_change(road: Signals) -> None:
+    """A slide moves the steering relation as an offset of the steering does, but not from one sample to the next."""
+    ramp = np.radians(2.0) * np.clip((seconds(road) - AT_S) / 0.6, 0.0, 1.0)
+    assert find_changes(replace(road, steer_rad=road.steer_rad + ramp))[1] == ()
+
+
 @pytest.mark.parametrize(("name", "jump"), [(CHANGES[0]), CHANGES[2], CHANGES[4]])
 def test_a_correction_uses_earlier_samples_alone(road: Signals, name: str, jump: float) -> None:
     signals = changed(road, name, jump)
