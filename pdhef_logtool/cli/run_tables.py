@@ -431,8 +431,8 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
     for report in reports:
         values, main = _figures(report), report["answer"]["main"]
         errors = [cell(values.get((n, "sideslip_rad", "all", "rmse")), DEGREES, 3) for n in (main, *rivals)]
-        own, naive = (values.get((n, "sideslip_rad", "all", "rmse")) for n in (main, report["answer"]["naive"]))
-        worse = own is not None and naive is not None and own > (1.0 + SAME) * naive
+        error, naive = (values.get((n, "sideslip_rad", "all", "rmse")) for n in (main, report["answer"]["naive"]))
+        worse = error is not None and naive is not None and error > (1.0 + SAME) * naive
         inside = values.get((main, "sideslip_rad", "all", "coverage95"))
         seconds = f"{report['log']['duration_s']:.0f}"
         notes = _look_at(report, inside, main if len(mains) > 1 else "", worse)

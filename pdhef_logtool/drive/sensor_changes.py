@@ -349,9 +349,9 @@ def _first_step(signals: Signals, after_ns: int, ignored: Collection[str]) -> Se
     is_named[: cells.of_stamp[np.searchsorted(signals.stamps_ns, after_ns)] + WINDOW_CELLS + 1] = False
     if not is_named.any():
         return None
-    at = int(np.argmax(is_named))
-    k = at + int(np.argmax(np.where(is_named, evidence, 0.0)[at : at + PEAK_CELLS + 1]))
-    known_ns, end_ns = cells.time_of(at + DECIDED_CELLS), int(signals.stamps_ns[-1]) + 1
+    first = int(np.argmax(is_named))
+    k = first + int(np.argmax(np.where(is_named, evidence, 0.0)[first : first + PEAK_CELLS + 1]))
+    known_ns, end_ns = cells.time_of(first + DECIDED_CELLS), int(signals.stamps_ns[-1]) + 1
     name, kind = HYPOTHESES[best[k]]
     return SensorChange(name, kind, cells.time_of(k), known_ns, end_ns, float(size[k]), float(std[k]))
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 #: Result of :func:`process_name`, as a regular expression.
 NAME = r"[0-9a-f]{8}-\d+-\d+"
-#: Whether only errors and results are printed, and the environment variable that tells it to workers.
+#: Whether only errors and results are printed, and the environment variable that passes it on to workers.
 QUIET = "PDHEF_QUIET"
 quiet = QUIET in os.environ
 #: Number of this worker process, from 1; 0 in the command itself.
