@@ -136,19 +136,6 @@ def planar_lateral_acceleration(vx, vy, r, steer, friction, p):  # type: ignore[
 
 
 @njit(cache=True)
-def measured_lateral_acceleration(vx, vy, r, steer, friction, p):  # type: ignore[no-untyped-def]
-    """Return the accelerometer's reading: planar a_y at the IMU plus the gravity component of body roll."""
-    w = dynamic_share(vx, p)
-    ay = vx * r
-    r_dot = 0.0
-    if w > 0.0:
-        force_ay, r_dot = lateral_acceleration_and_yaw_acceleration(vx, vy, r, steer, friction, p)
-        ay = w * force_ay + (1.0 - w) * ay
-        r_dot *= w
-    return (1.0 + p.ay_roll_gain) * ay + r_dot * p.imu_x_m - r * r * p.imu_y_m
-
-
-@njit(cache=True)
 def substeps(vx, dt, friction, p):  # type: ignore[no-untyped-def]
     """Return the number of RK4 steps in ``dt`` that the model's fastest pole requires."""
     v = max(vx, p.blend_low_m_s)

@@ -49,7 +49,7 @@ FULL_WORST = 5
 #: Time without progress after which a log is aborted, if several logs are processed at once or there are many.
 SILENCE_S = 600.0
 #: Modules that workers have loaded; polars starts threads at its first query, and none of these makes one.
-_PRELOAD = ("pdhef_logtool.runs.*", "pdhef_logtool.logs.*", "pdhef_logtool.results.parquet_sink", *FILTERS)
+_PRELOAD = ("pdhef_logtool.runs.fleet", "pdhef_logtool.logs.mcap_log", "pdhef_logtool.results.parquet_sink", *FILTERS)
 #: Numbers the runs of this process.
 _RUNS = itertools.count()
 

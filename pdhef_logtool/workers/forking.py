@@ -42,8 +42,8 @@ _ENVIRONMENT = {"ARROW_DEFAULT_MEMORY_POOL": "system"} | dict.fromkeys(
     "1",
 )
 _START = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    f"from {__name__} import serve; serve(int(sys.argv[2]), json.loads(sys.argv[3]))"
+    "import gc, json, os, sys; gc.disable(); sys.path[:] = json.loads(sys.argv[1]); "
+    f"from {__name__} import serve; serve(int(sys.argv[2]), json.loads(sys.argv[3])); os._exit(0)"
 )
 _MOST_BYTES, _MOST_FILES = 1000, 4
 
@@ -137,6 +137,7 @@ def serve(descriptor: int, preload: Sequence[str]) -> None:
             _load(name)
     gc.collect()
     gc.freeze()  # so that garbage collection in a child copies no shared memory
+    gc.enable()
     children: set[int] = set()
     try:
         while True:

@@ -17,8 +17,6 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-import psutil
-
 from pdhef_logtool.records.errors import UsageError, WorkerError
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.workers.confinement import bound_memory
@@ -165,6 +163,8 @@ class _Worker(Generic[T]):
     silent_s: float = 0.0
 
     def resident_bytes(self) -> int:
+        import psutil
+
         try:
             return int(psutil.Process(self.child.pid).memory_info().rss)
         except psutil.Error:

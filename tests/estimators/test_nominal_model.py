@@ -45,9 +45,6 @@ def test_derivative_is_the_published_model(vx, vy, r, steer, ax, mu):
     np.testing.assert_allclose(got, want, rtol=1e-11, atol=1e-11)
     ay, _ = forces(vx, vy, r, steer, mu)
     assert nominal_model.planar_lateral_acceleration(vx, vy, r, steer, mu, P) == pytest.approx(ay, rel=1e-11, abs=1e-11)
-    assert nominal_model.measured_lateral_acceleration(vx, vy, r, steer, mu, P) == pytest.approx(
-        ay, rel=1e-11, abs=1e-11
-    )
 
 
 @pytest.mark.parametrize("vx", [-5.0, -1.0, 0.0, 0.5, 1.4])

@@ -130,9 +130,10 @@ def test_states_of_a_block_move_and_are_read_as_one_state_of_the_nominal_model(c
         half = 0.5 * share * dt * np.array(rate)
         end = nominal_model.rk4_step(state[0], *(state[1:3] + half), steer, ax - state[AX_BIAS], mu, dt, n, p)
         want[i, :3] = end[0], *(end[1:] + half)
-        ay = nominal_model.measured_lateral_acceleration(*state[:3], steer, mu, p)
-        ay += (1.0 + p.ay_roll_gain) * nominal_model.dynamic_share(state[0], p) * rate[0]
-        want_reading[i] = ay
+        w = nominal_model.dynamic_share(state[0], p)
+        ay = nominal_model.planar_lateral_acceleration(*state[:3], steer, mu, p) + w * rate[0]
+        _, yaw = nominal_model.lateral_acceleration_and_yaw_acceleration(*state[:3], steer, mu, p) if w else (0.0, 0.0)
+        want_reading[i] = (1.0 + p.ay_roll_gain) * ay + w * yaw * p.imu_x_m - state[2] ** 2 * p.imu_y_m
     np.testing.assert_allclose(reading[:LANES], want_reading, rtol=TOLERANCE, atol=TOLERANCE)
     np.testing.assert_allclose(block[[VX, VY, YAW_RATE, AX_BIAS], :LANES].T, want, rtol=TOLERANCE, atol=TOLERANCE)
 
