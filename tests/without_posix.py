@@ -103,7 +103,7 @@ def _open_below(path: str) -> str | None:
 
 if __name__ == "__main__":
     imitate()
-    from pdhef_logtool.__main__ import main
+    from pdhef_logtool.cli.app import main
 
     for command in " ".join(sys.argv[1:]).split(" then "):
         sys.argv[1:] = command.split()
