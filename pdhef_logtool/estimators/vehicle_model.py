@@ -408,8 +408,6 @@ def push(points, columns, vx, rate, dt, p):  # type: ignore[no-untyped-def]
 
     A residual counts in the dynamic range of the model, not in the kinematic one.
     """
-    if rate[0] == 0.0 and rate[1] == 0.0:
-        return
     share = dynamic_share(vx, p) * dt
     for j in range(columns):
         force = share * max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j])

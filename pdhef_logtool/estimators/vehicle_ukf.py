@@ -279,6 +279,12 @@ def held_over_step(now, m):  # type: ignore[no-untyped-def]
     )
 
 
+@_inline
+def held_inputs(inputs, k):  # type: ignore[no-untyped-def]
+    """Return the inputs of step k, held during a prediction."""
+    return HeldInputs(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
+
+
 @njit(cache=True)
 def starts(now, unknown_steer, tuning, model, x, P, memory):  # type: ignore[no-untyped-def]
     """Start with the first sample of speed and steering; return whether this is it.
@@ -327,27 +333,25 @@ def yield_to_kinematics(x, friction, dt, rules, p, f, m):  # type: ignore[no-unt
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
 @_compiled_inside
-def predict(x, P, L, over, rate, dt, early, q, layout, places, p, f, points):  # type: ignore[no-untyped-def]
+def predict(x, P, L, over, rate, dt, early, q, layout, places, p, f, points, rows):  # type: ignore[no-untyped-def]
     """Move state and covariance by ``dt`` s with the residual ``rate`` of v̇_y and ṙ.
 
     The share ``early`` of the residual's increment comes before the model's step (Strang splitting: half of it), the
-    rest behind it. Leaves the root of the former covariance in L, and deviations in place of the moved points.
+    rest behind it. Leaves the root of the former covariance in L, and deviations in place of the moved points. Only the
+    first ``rows`` of the new covariance count.
     """
     m = changing(layout)
+    columns = columns_of(m)
     cholesky(P, L)
+    given = rate[0] != 0.0 or rate[1] != 0.0
+    vx = x[VX]
     draw(x, L, places, m, points)
-    move(points, columns_of(2 * m), over, rate, dt, early, layout, p, f)
-    moments(points, places, m, q, x, P)
-
-
-# positional: to hand structures of arrays on at every step would cost as much as the step.
-@_inline
-def move(points, columns, over, rate, dt, early, layout, p, f):  # type: ignore[no-untyped-def]
-    """Move the states of a block by the model and the residual, as :func:`predict` describes."""
-    vx = points[VX * WIDTH]
-    push(points, columns, vx, rate, early * dt, p)
+    if given:
+        push(points, columns, vx, rate, early * dt, p)
     advance(points, columns, over, dt, layout, p, f)
-    push(points, columns, vx, rate, (1.0 - early) * dt, p)
+    if given:
+        push(points, columns, vx, rate, (1.0 - early) * dt, p)
+    moments(points, places, m, q, x, P, rows)
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
@@ -361,7 +365,7 @@ def expect(x, P, L, now, rate_vy, r, layout, places, p, f, points, reading, z_ha
     m = changing(layout)
     cholesky(P, L)
     draw(x, L, places, m, points)
-    read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
+    read_ay(points, columns_of(m), now.steer, now.friction, rate_vy, layout, p, f, reading)
     z_hat[Z_AY], S[Z_AY, Z_AY] = reading_moments(reading, L, m, Pxz[Z_AY])
     for i, entry in ((Z_YAW_RATE, YAW_RATE), (Z_SPEED, VX)):
         z_hat[i] = x[entry]
@@ -396,9 +400,9 @@ def changing(layout):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def columns_of(points):  # type: ignore[no-untyped-def]
-    """Return the columns of a block for the centre and other points: whole vectors; the rest are at the centre."""
-    return (points + LANES) // LANES * LANES
+def columns_of(m):  # type: ignore[no-untyped-def]
+    """Return the columns of a block for the sigma points of m entries: whole vectors; the rest are at the centre."""
+    return (2 * m + LANES) // LANES * LANES
 
 
 @_inline
@@ -541,7 +545,7 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
                 factor, f = yield_to_kinematics(x, over.friction, now.dt, rules, p, f, m)
                 q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             process_noise(q_std, over.ax_known, now.dt, layout, q)
-            predict(x, P, L, over, rate, now.dt, 0.5, q, layout, places, p, f, points)
+            predict(x, P, L, over, rate, now.dt, 0.5, q, layout, places, p, f, points, n)
             if linked:
                 cross_covariance(L, points, places, changing(layout), out_cross[k])
                 out_predicted_P[k] = P
@@ -589,44 +593,29 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
 
 @njit(cache=True)
 def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-untyped-def]
-    """Predict the steps that are due with their inputs held; the rows of no step (−1) are left.
-
-    Over a latency the model is linear: the covariance is J P Jᵀ + Q, with the Jacobian J by differences.
-    """
+    """Predict the steps that are due with their inputs held; the rows of no step (−1) are left."""
     step, horizon_s = due
     held_x, held_P, inputs, residual_rate, noise = held
     out_x, out_P, out_ay = out
     layout, places, p, f = model
-    n, m = held_x.shape[1], changing(layout)
-    points, x, q = np.zeros(PLACES * WIDTH), np.zeros(n), np.zeros(n)
-    J, JP, away = np.zeros((MOTION, m)), np.zeros(m), 1e-4  # of each entry, in its unit
+    n = held_x.shape[1]
+    points, L, q = np.zeros(PLACES * WIDTH), np.zeros((n, n)), np.zeros(n)
+    x, P = np.zeros(n), np.zeros((n, n))
     for row in range(step.shape[0]):
-        k, dt = step[row], horizon_s[row]
+        k = step[row]
         if k < 0:
             continue
-        P, rate = held_P[k], (residual_rate[k, 0], residual_rate[k, 1])
-        over = HeldInputs(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
-        process_noise(q_std, over.ax_known, noise[k] * dt, layout, q)
-        for j in range(n):
-            points[places[j] * WIDTH : (places[j] + 1) * WIDTH] = held_x[k, j]
-            points[places[j] * WIDTH + 1 + j] += away
-        move(points, columns_of(m), over, rate, dt, early, layout, p, f)
-        for j in range(n):
-            x[j] = points[places[j] * WIDTH]
+        x[:] = held_x[k]
+        P[:, :] = held_P[k]
+        over = held_inputs(inputs, k)
+        rate = (residual_rate[k, 0], residual_rate[k, 1])
+        if horizon_s[row] > 0.0:
+            process_noise(q_std, over.ax_known, noise[k] * horizon_s[row], layout, q)
+            predict(x, P, L, over, rate, horizon_s[row], early, q, layout, places, p, f, points, MOTION)
         if is_finite(x, P):
             out_x[row] = x
+            out_P[row] = P[:MOTION, :MOTION]
             out_ay[row] = planar_ay(x, over.steer, over.friction, rate[0], layout, p)
-            for a in range(MOTION):
-                JP[:] = 0.0
-                for i in range(m):
-                    J[a, i] = (points[a * WIDTH + 1 + i] - x[a]) / away
-                    for j in range(m):
-                        JP[j] += J[a, i] * P[i, j]
-                for b in range(a + 1):
-                    s = q[a] if a == b else 0.0
-                    for j in range(m):
-                        s += JP[j] * J[b, j]
-                    out_P[row, a, b] = out_P[row, b, a] = s
 
 
 # ------------------------------------------------------------------------------------------------ records
