@@ -30,7 +30,7 @@ class _Result(Protocol):
 
 
 _Shown = TypeVar("_Shown", bound=_Result | Mapping[str, Any])
-_quiet = _verbose = False
+_verbose = False
 #: Interval between lines of progress without a terminal, s.
 PROGRESS_S = 30.0
 #: A line on stderr is an error or a warning of several parts.
@@ -94,9 +94,8 @@ def cell(value: float | None, factor: float = 1.0, digits: int = 2) -> str:
 
 def set_verbosity(*, quiet: bool = False, verbose: bool = False) -> None:
     """Set the output on stderr, also of workers: errors only (quiet), or also progress as lines (verbose)."""
-    global _quiet, _verbose
-    _quiet = processes.quiet = quiet
-    _verbose = verbose
+    global _verbose
+    processes.quiet, _verbose = quiet, verbose
 
 
 def error(text: str) -> None:
@@ -106,7 +105,7 @@ def error(text: str) -> None:
 
 def say(text: str) -> None:
     """Print a note on stderr, except with ``--quiet``."""
-    if not _quiet:
+    if not processes.quiet:
         error(text)
 
 
@@ -170,7 +169,7 @@ def reporter() -> Iterator[Reporter]:
 
     Its progress raises :class:`~.stopping.Stopped` after a request to end.
     """
-    if _quiet or _verbose or not sys.stderr.isatty():
+    if processes.quiet or _verbose or not sys.stderr.isatty():
         yield Reporter(_progress_lines(), warn, say)
         return
     from rich.console import Console

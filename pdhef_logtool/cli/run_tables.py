@@ -20,7 +20,7 @@ from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.printable import all_printable, listed
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
 from pdhef_logtool.results.run_report import diverged_line, reasons_line
-from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, SAME, degrees, truth_of
+from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, degrees, is_worse, truth_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -431,11 +431,10 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
     for report in reports:
         values, main = _figures(report), report["answer"]["main"]
         errors = [cell(values.get((n, "sideslip_rad", "all", "rmse")), DEGREES, 3) for n in (main, *rivals)]
-        error, naive = (values.get((n, "sideslip_rad", "all", "rmse")) for n in (main, report["answer"]["naive"]))
-        worse = error is not None and naive is not None and error > (1.0 + SAME) * naive
+        compared = (values.get((n, "sideslip_rad", "all", "rmse")) for n in (main, report["answer"]["naive"]))
         inside = values.get((main, "sideslip_rad", "all", "coverage95"))
         seconds = f"{report['log']['duration_s']:.0f}"
-        notes = _look_at(report, inside, main if len(mains) > 1 else "", worse)
+        notes = _look_at(report, inside, main if len(mains) > 1 else "", is_worse(*compared))
         joint.add_row(report["log"]["name"], seconds, *errors, cell(inside), notes)
     return joint
 

@@ -12,6 +12,7 @@ import re
 import sys
 from collections.abc import Mapping
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 
 #: The folder that contains the packages: a checkout or ``site-packages``.
@@ -37,10 +38,7 @@ def compiled_sources(root: Path = ROOT) -> Mapping[Path, bytes]:
 
 def sources_digest(root: Path = ROOT) -> str:
     """Return the digest of the sources, and of the versions of the compiler."""
-    import llvmlite
-    import numba
-
-    digest = hashlib.sha256(f"numba {numba.__version__}, llvmlite {llvmlite.__version__}\n".encode())
+    digest = hashlib.sha256(f"numba {version('numba')}, llvmlite {version('llvmlite')}\n".encode())
     for path, text in compiled_sources(root).items():
         digest.update(f"{path.relative_to(root).as_posix()}\n".encode() + hashlib.sha256(text).digest())
     return digest.hexdigest()[:16]

@@ -202,10 +202,9 @@ def posterior(
     priors = np.array([*(h.energy + _of_scales(h, scales or {}) for h in useful), 0.0])
     # Factor of each mistake on each relation's gain; the last row is for no mistake.
     acts = np.ones((len(useful) + 1, len(telling)))
-    powers = {n: np.array([r.powers.get(n, 0) for r in telling]) for n in touched}
-    for act, mistake in zip(acts, useful, strict=False):
-        for name in powers.keys() & mistake.factors.keys():
-            act *= mistake.factors[name] ** powers[name]
+    for name in touched:
+        factors = np.array([*(h.factors.get(name, 1.0) for h in useful), 1.0])
+        acts *= factors[:, None] ** [r.powers.get(name, 0) for r in telling]
     looked_up = []
     for relation, column in zip(telling, acts.T, strict=True):
         single, index = np.unique(column, return_inverse=True)

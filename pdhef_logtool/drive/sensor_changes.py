@@ -301,16 +301,15 @@ def _sample_steps(column: FloatArray, cells: Cells) -> FloatArray:
     return largest
 
 
-def _std_so_far(column: FloatArray, least: float) -> FloatArray:
+def _std_so_far(column: FloatArray) -> FloatArray:
     """Return the RMS of a column over the cells that were decided before each; inf before ``LEAST_CELLS``."""
-    finite = np.isfinite(column)
-    late = WINDOW_CELLS + PEAK_CELLS
+    finite, late = np.isfinite(column), WINDOW_CELLS + PEAK_CELLS
     count, total = (
         np.concatenate([np.zeros(late), np.cumsum(x)[:-late]])[: len(column)]
         for x in (finite.astype(float), np.where(finite, column, 0.0) ** 2)
     )
     few = 1.0 + LEAST_CELLS / np.maximum(count, 1.0)
-    return np.where(count < 0.5 * LEAST_CELLS, np.inf, np.maximum(few * np.sqrt(total / np.maximum(count, 1.0)), least))
+    return np.where(count < 0.5 * LEAST_CELLS, np.inf, few * np.sqrt(total / np.maximum(count, 1.0)))
 
 
 def _likeliest(signals: Signals, cells: Cells) -> tuple[BoolArray, IntArray, FloatArray, FloatArray, FloatArray]:
@@ -363,7 +362,7 @@ def _without_stuck(signals: Signals, cells: Cells, names: Sequence[str]) -> tupl
     """Replace stuck steering by the steering relation, and remove stuck speeds."""
     cell, changes = cells.of_stamp, []
     steering = _fitted(_tables(cells)[1])
-    error = _std_so_far(steering.residual(steering.table), 0.0)
+    error = _std_so_far(steering.residual(steering.table))
     travelled = np.cumsum(np.nan_to_num(cells.ax)) * CELL_S
     columns: dict[str, Any] = {name: getattr(signals, name).copy() for name in names}
     for name, column in columns.items():

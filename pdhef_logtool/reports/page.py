@@ -28,7 +28,6 @@ from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.version import __version__
 from pdhef_logtool.reports.charts import Charts
-from pdhef_logtool.storage.templates import kept_beside
 
 _HERE = Path(__file__).parent
 #: Scripts in order: before.js sets the drawing resolution for uPlot.
@@ -76,7 +75,6 @@ def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
 def _environment() -> Environment:
     made = Environment(
         loader=FileSystemLoader(_HERE / "templates"),
-        bytecode_cache=kept_beside(_HERE / "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

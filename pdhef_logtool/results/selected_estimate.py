@@ -113,7 +113,12 @@ def _words() -> Any:
         "LESS": _LESS,
     }
     limits |= {"NO_SIDESLIP_RAD": NO_SIDESLIP_RAD, "NIS_RANGE": _NIS_RANGE, "DEGREES": DEGREES}
-    shown = {"degrees": degrees, "percent": lambda share: f"{100.0 * share:.0f}", "truth_of": truth_of}
+    shown = {
+        "degrees": degrees,
+        "percent": lambda share: f"{100.0 * share:.0f}",
+        "truth_of": truth_of,
+        "is_worse": is_worse,
+    }
     return template(TEMPLATES / "selected_estimate.txt", **limits, **shown).module
 
 
@@ -121,6 +126,11 @@ def degrees(value_rad: float) -> str:
     """Return an angle with as many digits as a person reads."""
     shown = value_rad * DEGREES
     return f"{shown:.3f}°" if shown < 1.0 else f"{shown:.2f}°"
+
+
+def is_worse(error: float | None, naive: float | None) -> bool:
+    """Return whether an RMSE is clearly above the one of the estimator to beat; False without either."""
+    return error is not None and naive is not None and error > (1.0 + SAME) * naive
 
 
 def _error(figures: _Figures, name: str | None) -> float | None:

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from pdhef_logtool.car.parts import Algorithm
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.algorithm import resolve
@@ -65,25 +63,19 @@ class Estimates:
 
         from pdhef_logtool.results.parquet_sink import track_table
 
-        frames = []
-        for track in self.tracks.values():
-            frame = pl.DataFrame(track_table(track)).with_columns(pl.col("estimator").cast(pl.String))
-            frames.append(frame.with_columns(**self._errors(track)) if errors else frame)
-        return pl.concat(frames)
+        name, added = pl.col("estimator").cast(pl.String), self._errors if errors else lambda _: {}
+        tracks = self.tracks.values()
+        return pl.concat(pl.DataFrame(track_table(t)).with_columns(name, **added(t)) for t in tracks)
 
-    def _errors(self, track: StateTrack) -> dict[str, pl.Series]:
+    def _errors(self, track: StateTrack) -> dict[str, pl.Expr]:
         """Return the errors of a track by column; the ground truth has none."""
         import polars as pl
 
         truth, slow = self.estimated.truth, self.drive.car.vehicle.low_speed_blend_m_s
-        unknown = np.full(len(track), np.nan)
-        scored = truth is not None and track.name != TRUTH
-        return {
-            f"error_{s}": pl.Series(
-                signal_error(track, truth, s, slow) if scored and truth else unknown, nan_to_null=True
-            )
-            for s in SCORED_SIGNALS
-        }
+        if truth is None or track.name == TRUTH:
+            return {f"error_{s}": pl.lit(None, pl.Float64) for s in SCORED_SIGNALS}
+        errors = ((s, signal_error(track, truth, s, slow)) for s in SCORED_SIGNALS)
+        return {f"error_{s}": pl.lit(pl.Series(error, nan_to_null=True)) for s, error in errors}
 
 
 def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:

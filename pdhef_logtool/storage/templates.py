@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jinja2 import BytecodeCache, Template
+    from jinja2 import Template
 
 
 def template(path: Path, **context: Any) -> Template:
@@ -16,7 +15,6 @@ def template(path: Path, **context: Any) -> Template:
 
     made = Environment(
         loader=FileSystemLoader(path.parent),
-        bytecode_cache=kept_beside(path.parent),
         autoescape=select_autoescape(("xml",)),
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -24,23 +22,6 @@ def template(path: Path, **context: Any) -> Template:
         keep_trailing_newline=True,
     )
     return made.get_template(path.name, globals=context)
-
-
-def kept_beside(templates: Path) -> BytecodeCache:
-    """Return a cache of the byte code of a folder's templates: beside the folder, as Python's, or none if read-only."""
-    from jinja2 import FileSystemBytecodeCache
-    from jinja2.bccache import Bucket
-
-    class Kept(FileSystemBytecodeCache):
-        def load_bytecode(self, bucket: Bucket) -> None:
-            with suppress(Exception):  # any error of a pickle that was cut short
-                super().load_bytecode(bucket)
-
-        def dump_bytecode(self, bucket: Bucket) -> None:
-            with suppress(OSError):
-                super().dump_bytecode(bucket)
-
-    return Kept(str(templates.parent / "__pycache__"))
 
 
 def one_line(text: object) -> str:

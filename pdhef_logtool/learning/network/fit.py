@@ -12,13 +12,11 @@ which batches are read. Only one sequence and one batch are in memory at a time.
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
-import pickle
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -30,13 +28,14 @@ from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import OUTPUT_COUNT, RESIDUAL, ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import ResidualNetwork, State
+from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.files import write_bytes, writing
 
 # isort: split
 # After the network, which checks that PyTorch is installed.
 import torch
 
-CHECKPOINT = "checkpoint.pt"
+CHECKPOINT = "checkpoint.safetensors"
 
 
 #: Maximum number of validation steps at once, with the state carried on; an hour at once would need a gigabyte.
@@ -198,7 +197,7 @@ def train(
         document = {"recipe": asdict(recipe), "normalisation": asdict(normalisation), "init": init and init.sha256}
         document |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
         identity = json.loads(json.dumps(document))  # as it is read from a checkpoint
-        history, best, best_loss = _resume(work, identity, network, optimiser)
+        history, best, best_loss = _resume(work, identity, network, optimiser, device)
         for epoch in range(len(history), recipe.epochs):
             if len(history) - 1 - _best_epoch(history) >= recipe.patience:
                 break
@@ -463,12 +462,24 @@ def _write_checkpoint(
     optimiser: torch.optim.Optimizer,
     best: dict[str, Any],
 ) -> None:
-    state = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
-    state["best"] = {k: torch.from_numpy(v) for k, v in best.items()}
-    made = io.BytesIO()
-    torch.save({"identity": identity, "history": [asdict(e) for e in history], **state}, made)
-    # Digest and content are in one file, so that an interrupted write cannot leave an inconsistent pair.
-    write_bytes(work / CHECKPOINT, hashlib.sha256(made.getvalue()).digest() + made.getvalue())
+    from safetensors.numpy import save
+
+    tensors = {f"network.{k}": v for k, v in _weights(network).items()}
+    tensors |= {f"best.{k}": v for k, v in best.items()}
+    for i, state in optimiser.state_dict()["state"].items():
+        for key, value in state.items():
+            tensors[f"optimiser.{i}.{key}"] = np.asarray(value.cpu().numpy()).copy()
+    document = seal({"identity": identity, "history": [asdict(e) for e in history], "sha256": _sha256(tensors)})
+    # Tensors and document are in one file, so that an interrupted write cannot leave an inconsistent pair.
+    data = save(tensors, metadata={"document": json.dumps(document)})
+    write_bytes(work / CHECKPOINT, data)
+
+
+def _sha256(tensors: Mapping[str, Any]) -> str:
+    total = hashlib.sha256()
+    for name in sorted(tensors):
+        total.update(name.encode() + np.ascontiguousarray(tensors[name]).tobytes())
+    return total.hexdigest()
 
 
 def _resume(
@@ -476,16 +487,20 @@ def _resume(
     identity: dict[str, Any],
     network: ResidualNetwork,
     optimiser: torch.optim.Optimizer,
+    device: str,
 ) -> tuple[list[Epoch], dict[str, Any], float]:
+    from safetensors import SafetensorError, safe_open
+
     file = work / CHECKPOINT
     if not file.is_file():
         return [], _weights(network), math.inf
     try:
-        data, size = file.read_bytes(), hashlib.sha256().digest_size
-        if data[:size] != hashlib.sha256(data[size:]).digest():
+        with safe_open(file, framework="numpy") as stored:
+            document = json.loads(stored.metadata()["document"])
+            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 (not a mapping)
+        if not is_sealed(document) or document["sha256"] != _sha256(tensors):
             raise ValueError("content that is not as it was written")
-        document = torch.load(io.BytesIO(data[size:]), map_location="cpu", weights_only=True)
-    except (OSError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
+    except (OSError, ValueError, LookupError, TypeError, SafetensorError) as error:
         raise ModelError(
             expected="a checkpoint of a training", got=str(error), where=str(file), remedy="remove it to train again"
         ) from None
@@ -496,8 +511,17 @@ def _resume(
             where=str(file),
             remedy="train into another folder, or remove the checkpoint",
         )
-    network.load_state_dict(document["network"])
-    optimiser.load_state_dict(document["optimiser"])
+    network.load_state_dict(
+        {k.removeprefix("network."): torch.from_numpy(v) for k, v in tensors.items() if k.startswith("network.")}
+    )
+    states: dict[int, dict[str, torch.Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith("optimiser."):
+            _, index, key = name.split(".", 2)
+            states.setdefault(int(index), {})[key] = torch.from_numpy(np.array(value)).to(
+                "cpu" if key == "step" else device
+            )
+    optimiser.load_state_dict({"state": states, "param_groups": optimiser.state_dict()["param_groups"]})
     history = [Epoch(**e) for e in document["history"]]
-    best = {k: v.numpy() for k, v in document["best"].items()}
+    best = {k.removeprefix("best."): v for k, v in tensors.items() if k.startswith("best.")}
     return history, best, min(e.validation_loss for e in history)
