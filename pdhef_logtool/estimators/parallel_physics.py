@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pdhef_logtool.estimators.vehicle_model import FRONT, REAR, VX
+from pdhef_logtool.estimators.vehicle_model import AX_BIAS, FRONT, REAR, VX
 from pdhef_logtool.estimators.vehicle_ukf import (
     U_FRICTION,
     U_SPEED,
@@ -51,7 +51,7 @@ def run_features(
     seen: Signals | None = None,
     extra_r: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, PosteriorSteps, FilterState]:
-    """Run the parallel filter over a window.
+    """Run the parallel filter over a window; the network sees measurements less the biases that the filter estimates.
 
     Parameters
     ----------
@@ -72,10 +72,13 @@ def run_features(
         body[:, :2] = steps.x[:, layout.roll : layout.roll + 2]
     if layout.forces >= 0:
         body[:, 2:] = steps.x[:, [FRONT, REAR]]
-    usable = without_impossible(seen)
+    usable, bias = without_impossible(seen), np.zeros((len(signals), 4))
+    if layout.sensor_bias >= 0:
+        bias = steps.x[:, [layout.steer_bias, layout.sensor_bias, layout.sensor_bias + 1, AX_BIAS]]
+    of_steer, of_ay, of_rate, of_ax = bias.T
     features = make_features(
-        steps.inputs[:, U_STEER], usable.ay_m_s2, usable.yaw_rate_rad_s, steps.x, steps.prior,
-        physics.expected_ay(steps.x, steps.inputs), steps.inputs[:, U_FRICTION], usable.ax_m_s2, body,
+        steps.inputs[:, U_STEER] - of_steer, usable.ay_m_s2 - of_ay, usable.yaw_rate_rad_s - of_rate, steps.x, steps.prior,
+        physics.expected_ay(steps.x, steps.inputs) - of_ay, steps.inputs[:, U_FRICTION], usable.ax_m_s2 - of_ax, body,
     )  # fmt: skip
     steers = steps.inputs[:, U_STEER_KNOWN] > 0.0
     features[~(steps.valid & steers & rolls_forward(steps.x[:, VX], steps.inputs[:, U_SPEED]))] = np.nan

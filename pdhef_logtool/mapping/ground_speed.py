@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal, TypeAlias
@@ -20,6 +21,8 @@ from pdhef_logtool.records.signals import FloatArray
 NEAR_PATH = 0.08
 #: Speed over ground over that along the path if the axes are the earth's; share of the time that a body moves ahead.
 SAME_STEPS, AHEAD_SHARE = (0.7, 1.4), 0.6
+#: Units of a yaw rate in one rad/s: rad/s, deg/s.
+_UNITS = (1.0, math.degrees(1.0))
 #: Axes of the x and y of a velocity; empty if the drive does not show them, "not ahead" if they are not the body's.
 Axes: TypeAlias = Literal["east, north", "north, east", "body", "not ahead", ""]
 #: Note on every speed that is a length.
@@ -57,7 +60,8 @@ def axes_of(
         turning = np.where(moving, (x * pieces.rate_of(y) - y * pieces.rate_of(x)) / length**2, np.nan)
     relation = None if rate is None else fit(pieces.smooth(rate), turning)
     sense = 0.0 if relation is None or abs(relation.correlation) <= CLEAR else relation.correlation
-    if sense > 0.0:
+    # The direction over ground turns as fast as the car; a sideslip that follows the yaw rate is smaller.
+    if relation is not None and sense > 0.0 and any(SAME_STEPS[0] < relation.slope / u < SAME_STEPS[1] for u in _UNITS):
         return "east, north"
     enough = np.count_nonzero(moving) >= FEWEST_CELLS
     # A car may reverse; without a path, a direction that is often opposite shows axes of the earth.

@@ -90,13 +90,16 @@ def make_priors(
     observable = gradient > 0.001
     priors += [
         Prior("yaw inertia", "kg m^2", start.yaw_inertia_kg_m2, 0.20, log=True),
-        Prior("steering offset", "rad", start.steer_offset_rad, math.radians(0.2)),
         Prior("roll gradient", "rad/(m/s^2)", gradient, 0.3, log=True)
         if observable
         else Prior("roll gradient", "rad/(m/s^2)", 0.004, 0.004, low=0.0),
-        Prior("a_y bias", "m/s^2", start.sensors.ay_bias_m_s2, 0.10),
-        Prior("yaw rate bias", "rad/s", start.sensors.yaw_rate_bias_rad_s, 0.002),
     ]
+    if not parts.biases:  # as states they are those of a drive: a mean over few drives would be no property of the car
+        priors += [
+            Prior("steering offset", "rad", start.steer_offset_rad, math.radians(0.2)),
+            Prior("a_y bias", "m/s^2", start.sensors.ay_bias_m_s2, 0.10),
+            Prior("yaw rate bias", "rad/s", start.sensors.yaw_rate_bias_rad_s, 0.002),
+        ]
     if parts.lag:
         priors.append(Prior("relaxation length", "m", start.relaxation_length_m or 0.5, 0.4, log=True))
     if parts.load_transfer:
@@ -140,18 +143,16 @@ def build_car(
         b = rounded(v[f"{axle} cornering stiffness"] / (shape * peak))
         return AxleTyre(B=b, C=shape, D_n=rounded(peak / mu), E=0.0, reference_friction=mu)
 
-    sensors = start.sensors.model_copy(
-        update={"ay_bias_m_s2": v["a_y bias"], "yaw_rate_bias_rad_s": v["yaw rate bias"]}
-    )
     update = {
         "yaw_inertia_kg_m2": v["yaw inertia"],
-        "steer_offset_rad": v["steering offset"],
         "roll_gradient_rad_per_m_s2": v["roll gradient"],
         "friction": mu,
-        "sensors": sensors,
         "tyres": Tyres(front=tyre("front"), rear=tyre("rear")),
         "physics": parts,
     }
+    if "a_y bias" in v:
+        biases = {"ay_bias_m_s2": v["a_y bias"], "yaw_rate_bias_rad_s": v["yaw rate bias"]}
+        update |= {"steer_offset_rad": v["steering offset"], "sensors": start.sensors.model_copy(update=biases)}
     for name, entry in (
         ("relaxation length", "relaxation_length_m"),
         ("load sensitivity", "load_sensitivity"),
@@ -163,7 +164,7 @@ def build_car(
             update[entry] = v[name]
     noise = FilterNoise(
         q_std=(PHYSICS_Q_STD[0], v["q v_y"], v["q yaw rate"], v["q a_x bias"], v["q axle force"], v["q axle force"]),
-        r_std={"ay_m_s2": v["r a_y"], "yaw_rate_rad_s": v["r yaw rate"], "speed_m_s": sensors.speed_std_m_s},
+        r_std={"ay_m_s2": v["r a_y"], "yaw_rate_rad_s": v["r yaw rate"], "speed_m_s": start.sensors.speed_std_m_s},
     )
     return start.model_copy(update=update), noise
 
