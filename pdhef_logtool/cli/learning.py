@@ -9,7 +9,6 @@ import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, learning_tables, options
-from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig
@@ -49,7 +48,7 @@ def extract(
     config: RunConfig,
     split: Annotated[str | None, Option(help="Split of all drives of this command: train, validation or test.")] = None,
     model: Annotated[
-        str, Option("--filter", help="Filter of the residuals: physics, or phy-ukf for train --paper and --baselines.")
+        str, Option("--filter", help="Filter of the residuals: physics, or phy-ukf for train --paper.")
     ] = "physics",
     where: Annotated[str | None, Option(metavar="EXPR", help="Condition on the rows to keep.")] = None,
     jobs: options.Jobs = 1,
@@ -72,7 +71,6 @@ def train(
     dataset: Annotated[Path, Argument(metavar="DATASET", help="Dataset folder of pdhef extract.")],
     output: Annotated[Path, Option("--output", "-o", help="Folder for the model bundle.")],
     init: Annotated[Path | None, Option(help="Model bundle to fine-tune, or default.")] = None,
-    baselines: Annotated[bool, Option("--baselines", help="Train pure-lstm and linear-regression instead.")] = False,
     paper: Annotated[bool, Option("--paper", help="Use the hyperparameters of Table 1 of the paper.")] = False,
     seed: Annotated[int, Option(help="Seed of initial weights, sample order and dropout.")] = 0,
     epochs: Annotated[int | None, Option(help="Number of epochs. Default: from the hyperparameters.")] = None,
@@ -82,16 +80,6 @@ def train(
     """Train the residual network on a dataset of extract."""
     from pdhef_logtool.learning.network.train_command import run_training
 
-    if baselines:
-        from pdhef_logtool.learning.network.baselines import run_baselines
-
-        if init is not None:
-            raise UsageError(expected="--baselines or --init", got="both", where="train")
-        with console.reporter() as reporter:
-            both = run_baselines(
-                dataset, output, paper=paper, seed=seed, epochs=epochs, device=device, progress=reporter.progress
-            )
-        console.finish(both, learning_tables.render_baselines, as_json)
     with console.reporter() as reporter:
         result = run_training(
             dataset, output, init=init, paper=paper, seed=seed, epochs=epochs, device=device, progress=reporter.progress

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pdhef_logtool.learning.learn import LearnResult
-    from pdhef_logtool.learning.network.baselines import BaselinesResult
     from pdhef_logtool.learning.network.extract_command import ExtractResult
     from pdhef_logtool.learning.network.train_command import TrainResult
 
@@ -60,12 +59,3 @@ def render_training(result: TrainResult, console: Console) -> None:
     if result.test_loss is not None:
         console.print(f"test drives: {result.test_loss:.4f}")
     console.print(f"model in {result.model} ({result.bundle.sha256[:12]})", soft_wrap=True)
-
-
-def render_baselines(result: BaselinesResult, console: Console) -> None:
-    """Print the errors of both baselines."""
-    render_training(result.pure_lstm, console)
-    errors = result.regression.provenance["sideslip_rmse_deg"]
-    shown = ", ".join(f"{split} {value:.3f}" for split, value in errors.items() if value is not None)
-    console.print(f"linear regression, sideslip RMSE in degrees: {shown}")
-    console.print(f"coefficients in {result.regression_file}", soft_wrap=True)

@@ -92,7 +92,7 @@ class Spec:
             has = car.network.paper_network is not None or car.network.model == NOMINAL_MODEL
             return "" if has else "no network of the paper's design; pdhef train --paper writes one"
         if getattr(car.network, self.network) is None:
-            return "the network has no such baseline; pdhef train --baselines writes it"
+            return "the network has no such baseline (docs/estimators.md)"
         return ""
 
     def make(self, car: Car, options: Options) -> Estimator:

@@ -93,7 +93,7 @@ def load_linear_model(path: Path) -> LinearModel:
         The file is missing or wrong, or its coefficients do not belong to its hash.
     """
     where = str(path)
-    remedy = "pdhef train DATASET -o MODEL --baselines writes them"
+    remedy = "remove the file, or take a complete network"
     document = read_json(path, "the coefficients of a linear regression", ModelError, remedy)
     kind = tuple(document.get(key) for key in ("format", "version", "target"))
     if kind != (FORMAT, FORMAT_VERSION, TARGET):

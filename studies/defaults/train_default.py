@@ -49,7 +49,7 @@ HOME = SHIPPED_CARS["saloon"]
 SEED, DRIVES = 1000, 800
 #: Residual gain of the car: of 0, 0.25, 0.5, 0.75 and 1 the one with the lowest sideslip RMSE on 200 other drives.
 GAIN = 0.75
-EPOCHS, BASELINE_EPOCHS = 66, 40
+EPOCHS = 66
 #: Folders of the paper's network.
 PAPER_DRIVES, PAPER_RESIDUALS = "paper", "paper-residuals"
 #: An epoch of the paper's network is one batch of windows of 6.4 s, so that 200 epochs take less than half an hour.
@@ -130,8 +130,8 @@ def extract(t: Training) -> None:
 
 def train(t: Training) -> None:
     """Train the residual network and the baselines beside it."""
-    how = ("--baselines", "--seed", t.seed, "--epochs", BASELINE_EPOCHS)
-    beside = _start("train", t.work / NOMINAL_MODEL, "-o", t.network, *how)
+    how = ("-o", t.network, "--seed", t.seed)
+    beside = _start("studies.defaults.train_baselines", t.work / NOMINAL_MODEL, *how)
     if t.jobs == 1:
         _finish(beside)
     torch.set_num_threads(1)  # small networks: a second process is faster than a second thread
@@ -183,8 +183,8 @@ def _print_epoch(text: str, _share: float) -> None:
 
 
 def _start(*words: object) -> subprocess.Popen[bytes]:
-    """Start the command line as a user would; its warnings go to the terminal."""
-    command = [sys.executable, "-m", "pdhef_logtool", *(str(w) for w in words)]
+    """Start a module as a user would; its warnings go to the terminal."""
+    command = [sys.executable, "-m", *(str(w) for w in words)]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
 
@@ -195,7 +195,7 @@ def _finish(process: subprocess.Popen[bytes]) -> None:
 
 def pdhef(*words: object) -> None:
     """Run one command of the tool; a failure ends the program."""
-    _finish(_start(*words))
+    _finish(_start("pdhef_logtool", *words))
 
 
 if __name__ == "__main__":

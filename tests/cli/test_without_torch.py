@@ -61,7 +61,6 @@ def test_what_trains_no_network_works_without_it_and_what_trains_one_ends_with_o
         ("run", *drive, "-e", "pd-hef,physics", "--annotate", "none", "-o", tmp_path / "out"),
         ("extract", *drive, "-o", tmp_path / "residuals"),
         trained,
-        (*trained, "--baselines"),
     )
     assert ran.startswith("run 0") and extracted.startswith("extract 0")
     assert (tmp_path / "out/logs/dlc/report.html").is_file()

@@ -11,12 +11,12 @@ import pytest
 import torch
 from residual_car import START_NS
 
-from pdhef_logtool.learning.network.baselines import SideslipSequence, fit_linear
 from pdhef_logtool.learning.network.dataset import DriveArrays
 from pdhef_logtool.learning.network.fit import FeatureSequence, Recipe, normalisation_of
 from pdhef_logtool.learning.network.train_command import LEAD_STEPS, gap_free_runs, make_recipe, weights_of
 from pdhef_logtool.records.errors import ModelError, UsageError
 from pdhef_logtool.residual_model.features import FEATURES
+from studies.defaults.train_baselines import SideslipSequence, fit_linear
 
 
 def arrays(count: int = 200, **changes: Any) -> DriveArrays:

@@ -19,7 +19,8 @@ from pdhef_logtool.residual_model.features import NOMINAL_FEATURES
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.storage.documents import seal
-from tests.command_line import called, pdhef, said
+from studies.defaults import train_baselines
+from tests.command_line import called, pdhef
 
 pytestmark = pytest.mark.slow
 
@@ -73,20 +74,16 @@ def test_train_writes_a_model_that_runs(
     with pytest.raises(OutputError, match="--filter phy-ukf"):
         run_training(joined, tmp_path / "paper", paper=True, epochs=1)
     nominal = extracted(sample_logs_dir, tmp_path / "nominal", "--filter", "phy-ukf")
-    check_baselines(sample_logs_dir, nominal, tmp_path, bundle.sha256, capsys)
+    check_baselines(sample_logs_dir, nominal, tmp_path, bundle.sha256)
 
 
-def check_baselines(
-    sample_logs_dir: Path, dataset: Path, folder: Path, network_sha256: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def check_baselines(sample_logs_dir: Path, dataset: Path, folder: Path, network_sha256: str) -> None:
     """Train the baselines into the model; they run, the network stays as it was, the split is the network's."""
-    document = said(capsys, "train", dataset, "-o", folder / "model", "--epochs", 2, "--baselines")
+    train_baselines.main([str(dataset), "-o", str(folder / "model"), "--epochs", "2"])
     bundle = load_bundle(folder / "model")
     assert bundle.sha256 == network_sha256
     assert bundle.pure_lstm is not None
     assert bundle.linear_regression is not None
-    assert document["pure_lstm"]["sha256"] == bundle.pure_lstm.sha256
-    assert document["linear_regression"]["sha256"] == bundle.linear_regression.sha256
     data = read_dataset(dataset).sha256
     assert {b.provenance["dataset_sha256"] for b in (bundle.pure_lstm, bundle.linear_regression)} == {data}
     assert bundle.pure_lstm.feature_names == bundle.linear_regression.feature_names == NOMINAL_FEATURES
@@ -97,8 +94,6 @@ def check_baselines(
     config = RunConfig(car=car, network=network, estimators=("all",), annotate="none", end="5")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], folder / "with_baselines", config)
     assert {r.estimator for r in result.results[0].rows} >= {"pure-lstm", "linear-regression"}
-    with pytest.raises(UsageError, match="--baselines or --init"):
-        pdhef("train", dataset, "-o", folder / "m", "--baselines", "--init", folder / "model")
 
 
 def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.learning.network.baselines import SideslipSequence, fit_linear
 from pdhef_logtool.learning.network.fit import FeatureSequence, Recipe, train
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.residual_model.bundle import (
@@ -23,6 +22,7 @@ from pdhef_logtool.residual_model.bundle import (
 )
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
+from studies.defaults.train_baselines import SideslipSequence, fit_linear
 
 pytestmark = pytest.mark.slow
 

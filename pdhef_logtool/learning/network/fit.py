@@ -5,8 +5,7 @@ Sequences are processed in chunks of ``chunk_steps``; the LSTM state is carried 
 by the inverse of its mean square, so that driving at the limit does not dominate calm driving. Every epoch is a pure
 function of the previous state, the seed and the epoch number, so that a resumed training gives the same result.
 
-A dataset may exceed the memory: sequences are read one by one, and their pieces are stored in a temporary file, from
-which batches are read. Only one sequence and one batch are in memory at a time.
+All pieces are in memory, 25 MB for an hour of driving at 100 Hz.
 """
 
 from __future__ import annotations
@@ -14,12 +13,11 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,7 +27,7 @@ from pdhef_logtool.residual_model.bundle import OUTPUT_COUNT, RESIDUAL, ModelBun
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import ResidualNetwork, State
 from pdhef_logtool.storage.documents import is_sealed, seal
-from pdhef_logtool.storage.files import write_bytes, writing
+from pdhef_logtool.storage.files import write_bytes
 
 # isort: split
 # After the network, which checks that PyTorch is installed.
@@ -191,24 +189,23 @@ def train(
     network = _new_network(recipe, init).to(device)
     optimiser = torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)
     signs = _signs(recipe)
-    with PieceFile(work) as train_pieces, PieceFile(work) as validation_pieces:
-        train_pieces.fill(training, lambda s: _pieces(s, recipe, normalisation))
-        validation_pieces.fill(validation, lambda s: [_balanced(_scaled(s, recipe, normalisation))])
-        document = {"recipe": asdict(recipe), "normalisation": asdict(normalisation), "init": init and init.sha256}
-        document |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
-        identity = json.loads(json.dumps(document))  # as it is read from a checkpoint
-        history, best, best_loss = _resume(work, identity, network, optimiser, device)
-        for epoch in range(len(history), recipe.epochs):
-            if len(history) - 1 - _best_epoch(history) >= recipe.patience:
-                break
-            began = time.perf_counter()
-            train_loss, rate = _train_epoch(network, optimiser, train_pieces, recipe, epoch, device)
-            loss = _validate(network, validation_pieces, device, signs if recipe.odd else None)
-            history.append(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
-            if loss < best_loss:
-                best, best_loss = _weights(network), loss
-            _write_checkpoint(work, identity, history, network, optimiser, best)
-            progress(history[-1], recipe.epochs)
+    train_pieces = Pieces(training, lambda s: _pieces(s, recipe, normalisation))
+    validation_pieces = Pieces(validation, lambda s: [_balanced(_scaled(s, recipe, normalisation))])
+    document = {"recipe": asdict(recipe), "normalisation": asdict(normalisation), "init": init and init.sha256}
+    document |= {"training": train_pieces.sha256, "validation": validation_pieces.sha256}
+    identity = json.loads(json.dumps(document))  # as it is read from a checkpoint
+    history, best, best_loss = _resume(work, identity, network, optimiser, device)
+    for epoch in range(len(history), recipe.epochs):
+        if len(history) - 1 - _best_epoch(history) >= recipe.patience:
+            break
+        began = time.perf_counter()
+        train_loss, rate = _train_epoch(network, optimiser, train_pieces, recipe, epoch, device)
+        loss = _validate(network, validation_pieces, device, signs if recipe.odd else None)
+        history.append(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
+        if loss < best_loss:
+            best, best_loss = _weights(network), loss
+        _write_checkpoint(work, identity, history, network, optimiser, best)
+        progress(history[-1], recipe.epochs)
     bundle = ModelBundle(
         **{name: getattr(recipe, name) for name in (*_SHAPE, "period_s")},
         normalisation=normalisation,
@@ -236,81 +233,28 @@ class _Piece(NamedTuple):
     weight: torch.Tensor
 
 
-class PieceFile:
-    """Pieces in an anonymous temporary file; each is read on access.
-
-    Parameters
-    ----------
-    folder : folder on the disk to use; created if missing.
+class Pieces(list[_Piece]):
+    """Pieces of sequences, single precision.
 
     Attributes
     ----------
-    sequences, steps : number of stored sequences and steps. sha256 : hash of the content.
-
-    Raises
-    ------
-    OutputError
-        The disk is full, or the folder cannot be written.
+    sequences, steps : number of sequences and steps. sha256 : hash of the pieces.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._places: list[tuple[int, int]] = []  # offset in the file and number of steps of each piece
-        self._shape = (0, 0)
-        self._hash = hashlib.sha256()
+    def __init__(
+        self, sequences: Iterable[FeatureSequence], cut: Callable[[FeatureSequence], Iterable[_Piece]]
+    ) -> None:
+        super().__init__()
         self.sequences = self.steps = 0
-        with writing(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (closed as a context)
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close and thereby delete the file."""
-        self._file.close()
-
-    @property
-    def sha256(self) -> str:
-        """Hash of the content."""
-        return self._hash.hexdigest()
-
-    def fill(self, sequences: Iterable[FeatureSequence], cut: Callable[[FeatureSequence], Iterable[_Piece]]) -> None:
-        """Store the pieces of sequences, one sequence at a time."""
+        content = hashlib.sha256()
         for s in sequences:
             self.sequences += 1
             self.steps += len(s.weight)
             for piece in cut(s):
-                self._add(piece)
-        with writing(self._folder):
-            self._file.flush()
-
-    def _add(self, piece: _Piece) -> None:
-        self._shape = (piece.features.shape[1], piece.target.shape[1])
-        data = b"".join(column.numpy().tobytes() for column in piece)
-        with writing(self._folder):
-            self._places.append((self._file.tell(), len(piece.weight)))
-            self._file.write(data)
-        self._hash.update(data)
-
-    def __len__(self) -> int:
-        """Return the number of pieces."""
-        return len(self._places)
-
-    def __getitem__(self, number: int) -> _Piece:
-        """Read a piece; raises IndexError after the last."""
-        offset, steps = self._places[number]
-        k, m = self._shape
-        self._file.seek(offset)
-        data = bytearray(self._file.read(4 * steps * (k + m + 1)))
-        values = torch.frombuffer(data, dtype=torch.float32)
-        features, target = values[: steps * k].view(steps, k), values[steps * k : steps * (k + m)].view(steps, m)
-        return _Piece(features, target, values[steps * (k + m) :])
-
-    def __iter__(self) -> Iterator[_Piece]:
-        """Read all pieces, one by one."""
-        return (self[number] for number in range(len(self)))
+                self.append(piece)
+                for column in piece:
+                    content.update(column.numpy().tobytes())
+        self.sha256 = content.hexdigest()
 
 
 def _signs(recipe: Recipe) -> torch.Tensor:
@@ -356,7 +300,7 @@ def _padded(pieces: Sequence[_Piece], device: str) -> _Piece:
 def _train_epoch(
     network: ResidualNetwork,
     optimiser: torch.optim.Optimizer,
-    pieces: PieceFile,
+    pieces: Sequence[_Piece],
     recipe: Recipe,
     epoch: int,
     device: str,

@@ -1,28 +1,24 @@
-"""``pdhef train --baselines``: pure LSTM and linear regression on the dataset of the residual network.
+"""Train the baselines ``pure-lstm`` and ``linear-regression`` on a dataset of ``pdhef extract --filter phy-ukf``.
 
-Drives, split, rows and recipe are the same; only the target differs. The regression is ordinary least squares of the
-true sideslip on low-passed features (see :mod:`pdhef_logtool.residual_model.linear_model`).
+    python -m studies.defaults.train_baselines DATASET -o NETWORK [--seed 0] [--epochs 40]
+
+Drives, split, rows and recipe are those of the residual network; only the target differs. The regression is ordinary
+least squares of the true sideslip on low-passed features (:mod:`pdhef_logtool.residual_model.linear_model`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+import sys
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.learning.network.dataset import Dataset
-from pdhef_logtool.learning.network.train_command import (
-    TrainResult,
-    dataset_for,
-    gap_free_runs,
-    make_recipe,
-    train_on,
-    weights_of,
-)
+from pdhef_logtool.learning.network.fit import Recipe
+from pdhef_logtool.learning.network.train_command import dataset_for, gap_free_runs, train_on, weights_of
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import (
@@ -34,10 +30,10 @@ from pdhef_logtool.residual_model.bundle import (
 from pdhef_logtool.residual_model.features import FEATURES, NOMINAL_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
-from pdhef_logtool.storage.files import write_bytes
-from pdhef_logtool.storage.outputs import OutputFolder
+from studies.pages import options
 
 LOW_PASS_HZ = 2.0
+EPOCHS = 40
 #: Relative variation below which a feature is constant, and thus redundant beside the intercept.
 CONSTANT_SHARE = 1e-5
 
@@ -54,57 +50,21 @@ class SideslipSequence:
     sideslip_rad: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BaselinesResult:
-    """Result of the command; the regression's errors are in its provenance."""
-
-    pure_lstm: TrainResult
-    regression_file: Path
-    regression: LinearModel
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the result as one JSON-able document."""
-        return {
-            "pure_lstm": self.pure_lstm.to_dict(),
-            "linear_regression": {
-                "file": str(self.regression_file),
-                "sha256": self.regression.sha256,
-                "provenance": self.regression.provenance,
-            },
-        }
-
-
-def run_baselines(
-    dataset: Path,
-    output: Path,
-    *,
-    paper: bool = False,
-    seed: int = 0,
-    epochs: int | None = None,
-    device: str = "cpu",
-    progress: Callable[[str, float], None] = lambda _text, _share: None,
-) -> BaselinesResult:
-    """Train both baselines on a residual dataset, into ``output/baselines``; options as for the residual network.
-
-    Raises
-    ------
-    UsageError
-        The device does not exist, or the number of epochs is not positive.
-    ModelError
-        The dataset has no usable drives, or another training's checkpoint is in the way.
-    """
-    recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
-    if not paper:
-        recipe = replace(recipe, feature_names=NOMINAL_FEATURES, odd=False)
-    data = dataset_for(dataset, NOMINAL_MODEL)
-    file = output / LINEAR_REGRESSION_FILE
-    with OutputFolder(output):
-        regression = fit_dataset(data, recipe.feature_names)
-        write_bytes(file, regression.to_json().encode())
-        lstm = train_on(
-            data, output / PURE_LSTM_FOLDER, replace(recipe, target=LATERAL_VELOCITY), device=device, progress=progress
-        )
-    return BaselinesResult(lstm, file, regression)
+def main(arguments: list[str] | None = None) -> int:
+    """Train both baselines into ``NETWORK/baselines``."""
+    parser = options("defaults.train_baselines", __doc__)
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the network")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--epochs", type=int, default=EPOCHS)
+    given = parser.parse_args(arguments)
+    data = dataset_for(given.dataset, NOMINAL_MODEL)
+    file: Path = given.output / LINEAR_REGRESSION_FILE
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(fit_dataset(data, NOMINAL_FEATURES).to_json(), encoding="utf-8")
+    recipe = Recipe(NOMINAL_FEATURES, odd=False, target=LATERAL_VELOCITY, seed=given.seed, epochs=given.epochs)
+    train_on(data, given.output / PURE_LSTM_FOLDER, recipe, progress=lambda text, _share: print(text, flush=True))
+    return 0
 
 
 def fit_dataset(data: Dataset, names: tuple[str, ...]) -> LinearModel:
@@ -141,7 +101,7 @@ def fit_linear(sequences: Sequence[SideslipSequence], names: tuple[str, ...]) ->
         raise ModelError(
             expected="training drives with a true sideslip",
             got=f"{rows.shape[0]} usable rows",
-            where="train --baselines",
+            where="train_baselines",
             remedy="extract more drives with ground truth",
         )
     mean, std = rows.mean(axis=0), rows.std(axis=0)
@@ -190,3 +150,7 @@ def _sequences(data: Dataset, split: str) -> Iterable[SideslipSequence]:
                 dt_s=np.concatenate([[np.nan], np.diff(rows.stamps_ns[part]) * 1e-9]),
                 sideslip_rad=np.where(used, np.arctan2(vy, vx), np.nan),
             )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
