@@ -175,7 +175,7 @@ class AdaptivePhysics:
     """
 
     algorithm = "adaptive-physics"
-    version = 1
+    version = 2
     options = ("physics", "trust", "adaptive")
 
     physics: VehicleUkf

@@ -14,7 +14,7 @@ from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.records.errors import UsageError
 
-_HYBRID = "adaptive-physics 1 (physics=vehicle-ukf, trust=0.75)"
+_HYBRID = "adaptive-physics 2 (physics=vehicle-ukf, trust=0.75)"
 #: Identity and digest of the presets on the shipped car. The digest covers noise, physics and network as well.
 SHIPPED = {
     "zero": ("pass-through 1 (claims_zero_sideslip=True)", "138e43c5f7aa"),
@@ -23,11 +23,11 @@ SHIPPED = {
     "open-loop": ("open-loop 1", "5afc5962fabb"),
     "linear-regression": ("linear-regression 1", "9de17837d3ad"),
     "phy-ukf": ("vehicle-ukf 1 (equations=nominal)", "cead32189ec2"),
-    "physics": ("adaptive-physics 1 (physics=vehicle-ukf)", "da0dc5b4f520"),
+    "physics": ("adaptive-physics 2 (physics=vehicle-ukf)", "da0dc5b4f520"),
     "phy-ukf:tuned": ("vehicle-ukf 1 (equations=nominal, roll_correction=True)", "2e213229f481"),
     "pure-lstm": ("direct-network 1", "4441758f4188"),
     "pd-hef": (_HYBRID, "d246eb1c7e30"),
-    "pd-hef:fixed-r": ("adaptive-physics 1 (adaptive=False, physics=vehicle-ukf, trust=1.0)", "4ce8b9b97611"),
+    "pd-hef:fixed-r": ("adaptive-physics 2 (adaptive=False, physics=vehicle-ukf, trust=1.0)", "4ce8b9b97611"),
     "pd-hef-smoothed": (
         "smoothed-physics 2 (filtered=adaptive-physics, filtered.physics=vehicle-ukf, filtered.trust=0.75)",
         "f20b45e944a7",
@@ -56,7 +56,7 @@ def test_a_new_option_at_its_default_changes_no_identity(saloon: Car) -> None:
     values = {f.name: getattr(estimator.physics, f.name) for f in fields(VehicleUkf)}
     assert resolve(replace(estimator, physics=kind(**values))) == resolve(estimator)
     changed = resolve(replace(estimator, physics=kind(**values, probe=True)))
-    assert changed.identity == "adaptive-physics 1 (physics=vehicle-ukf, physics.probe=True, trust=0.75)"
+    assert changed.identity == "adaptive-physics 2 (physics=vehicle-ukf, physics.probe=True, trust=0.75)"
     kind.version = 2  # type: ignore[attr-defined]
     assert "physics.version=2" in resolve(replace(estimator, physics=kind(**values))).identity
 
