@@ -19,7 +19,7 @@ from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.printable import all_printable, listed
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
-from pdhef_logtool.results.run_report import diverged_line, reasons_line
+from pdhef_logtool.results.run_report import diverged_line, faults_line
 from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, degrees, is_worse, truth_of
 
 if TYPE_CHECKING:
@@ -321,11 +321,12 @@ def _below(report: _Report) -> Iterable[str]:
     yield from (f"{e['name']} {e['reason']}" for e in report["estimators"] if e["outcome"] == "failed")
     happened: dict[str, list[str]] = {}
     for estimator in shown:
-        for event in (diverged_line(report, estimator["name"]), reasons_line(estimator, report["log"]["start_ns"])):
-            if event:
-                happened.setdefault(event, []).append(estimator["name"])
+        if event := diverged_line(report, estimator["name"]):
+            happened.setdefault(event, []).append(estimator["name"])
     for event, names in happened.items():
         yield f"{', '.join(names)}: {event}"
+    if faults := faults_line(report):
+        yield f"faults of the sensors: {faults}"
     yield from _losses(report)
     yield from (f"note: {remark}" for remark in report["remarks"])
 
@@ -431,7 +432,7 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
     for report in reports:
         values, main = _figures(report), report["answer"]["main"]
         errors = [cell(values.get((n, "sideslip_rad", "all", "rmse")), DEGREES, 3) for n in (main, *rivals)]
-        compared = (values.get((n, "sideslip_rad", "all", "rmse")) for n in (main, report["answer"]["naive"]))
+        compared = (values.get((n, "sideslip_rad", "all", "rmse")) for n in (main, "zero"))
         inside = values.get((main, "sideslip_rad", "all", "coverage95"))
         seconds = f"{report['log']['duration_s']:.0f}"
         notes = _look_at(report, inside, main if len(mains) > 1 else "", is_worse(*compared))

@@ -75,17 +75,6 @@ def consistency(report: Mapping[str, Any], roles: Roles | None) -> _Table | None
     return {"heads": heads, "rows": rows} if rows else None
 
 
-def residuals(report: Mapping[str, Any]) -> list[_Table]:
-    """Return the residuals of the sensors."""
-    rows = {signal: of.get("sensors", {}) for signal, of in _by_signal(report).items()}
-    return [
-        {"signal": LABELS[signal], "rms": of["residual_rms"]["value"], "unit": of["residual_rms"]["unit"]}
-        | {"bias": of.get("residual_bias", {}).get("value")}
-        for signal, of in rows.items()
-        if "residual_rms" in of
-    ]
-
-
 def disagreements(report: Mapping[str, Any], roles: Roles) -> dict[str, float]:
     """Return the RMS sideslip difference in rad between each other estimator and the selected estimate."""
     values = {}

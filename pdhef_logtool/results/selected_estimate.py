@@ -6,7 +6,7 @@ The report's document is the only source, so that terminal, report.json, Markdow
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -75,19 +75,18 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
 
     words = _words()
     intervals = next((e["intervals"] for e in report["estimators"] if e["name"] == main.name), ())
-    interval, best = _interval(report), _best_in_hindsight(report, main, figures)
+    interval = _interval(report)
     texts = {
         "result": words.result(report, main, value, interval),
         "consistency": "" if report["truth"]["available"] else words.consistency(main, value),
         "band": words.band(main, intervals, value(main.name, "coverage95")),
-        "hindsight": words.hindsight(best, main),
+        "hindsight": words.hindsight(_best_in_hindsight(report, main, figures), main),
         "assumed": "; ".join(clauses(words.assumed(report, main))),
         "next": "; ".join(clauses(words.next(report, main, value))[:_MOST_STEPS]),
     }
     texts = {key: one_line(text) for key, text in texts.items()}
-    chosen = {"main" if key == "name" else key: value for key, value in asdict(main).items()}
-    shown = {"shown": list(main.shown), "sideslip_rmse_ci_rad": interval}
-    return {**chosen, **shown, "best_in_hindsight": best, "texts": texts}
+    chosen = {"main": main.name, "why": main.why, "named": main.named, "shown": list(main.shown)}
+    return {**chosen, "sideslip_rmse_ci_rad": interval, "texts": texts}
 
 
 def _interval(report: Report) -> list[float] | None:
@@ -139,9 +138,8 @@ def _error(figures: _Figures, name: str | None) -> float | None:
 
 def truth_of(report: Report, name: str) -> str:
     """Return the topics that a ground truth quantity comes from, as far as its derivation names them."""
-    by_name = {q["name"]: q for q in report["truth"]["quantities"]}
-    parts = [by_name[n] for n in (name, "vx_m_s", "vy_m_s") if n in by_name]
-    words = " ".join(f"{q['source']} {q['derivation']}" for q in parts).replace(",", " ").split()
+    sources = report["truth"]["quantities"]
+    words = " ".join(sources.get(n, "") for n in (name, "vx_m_s", "vy_m_s")).replace(",", " ").split()
     topics = dict.fromkeys(w.partition(".")[0] for w in words if w.startswith("/"))
     return f"ground truth: {' and '.join(topics)}" if topics else "ground truth"
 
