@@ -17,15 +17,19 @@ from typing import Any
 
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.printable import listed
 from pdhef_logtool.reports.charts import Charts, TimeFigure
 from pdhef_logtool.reports.drive import drive_page
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
+from pdhef_logtool.results.selected_estimate import assumptions_of, failed_checks
 from pdhef_logtool.storage.files import write_bytes
 
 PDF_FILE = "report.pdf"
 #: Maximum number of drives with a section; drives with the worst verdicts come first.
 _MOST_DRIVES = 20
+#: Maximum number of drives that are named with an assumption or a failed check.
+_MOST_NAMED = 5
 #: Figures of a drive in the document. The path contains the positions of the car.
 _FIGURES, _POSITIONS = ("worst", "sideslip", "error", "ay"), ("path",)
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -117,10 +121,22 @@ def pdf_page(run: OpenedRun, *, positions: bool = False) -> bytes:
         run=document,
         seconds=seconds,
         steps=next_steps(plan),
+        answer=reports[0][1] if len(reports) == 1 else None,
+        told=_told([(log.label, report) for log, report in reports if report is not None]),
         sections=[_section(log, report, charts, positions=positions) for log, report in ranked],
         left_out=len(reports) - len(ranked),
         positions=positions,
     )
+
+
+def _told(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, str]:
+    """Return assumptions and failed checks of drives with the drives that have them, empty for all drives."""
+    labels: dict[str, list[str]] = {}
+    for label, report in reports:
+        for text in (*failed_checks(report), *assumptions_of(report)):
+            labels.setdefault(text, []).append(label)
+    ranked = sorted(labels.items(), key=lambda of: not of[0].startswith(("FAILED", "waived")))
+    return {text: "" if len(of) == len(reports) else listed(of, _MOST_NAMED) for text, of in ranked}
 
 
 def _report(log: OpenedLog) -> dict[str, Any] | None:

@@ -121,6 +121,41 @@ def _words() -> Any:
     return template(TEMPLATES / "selected_estimate.txt", **limits, **shown).module
 
 
+def result_of(report: Report) -> str:
+    """Return the result of a document in a sentence: of the selected estimate, or of recorded estimates."""
+    if report["answer"] is not None:
+        return str(report["answer"]["texts"]["result"])
+    names = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
+    wanted = ("sideslip_rad", "all", "rmse")
+    errors = {
+        m["estimator"]: m["value"] for m in report["metrics"] if (m["signal"], m["segment"], m["metric"]) == wanted
+    }
+    scored = ", ".join(f"{name}: {degrees(errors[name])}" for name in names if errors.get(name) is not None)
+    if scored:
+        return f"sideslip RMSE of {scored} ({truth_of(report, 'sideslip_rad')})"
+    return f"sideslip of {', '.join(names)} is not scored" if names else "no estimate"
+
+
+def assumptions_of(report: Report) -> list[str]:
+    """Return what the result of a document assumes, in independent clauses."""
+    if report["answer"] is not None:
+        return [clause for clause in report["answer"]["texts"]["assumed"].split("; ") if clause]
+    vehicle = report["vehicle"]
+    car = "no car given: the ground truth is assumed to be measured at the centre of gravity"
+    slow = f"sideslip is scored above {vehicle['low_speed_blend_m_s']:g} m/s"
+    return [car if vehicle["file"] is None else f"car {vehicle['file']}", slow]
+
+
+def failed_checks(report: Report) -> list[str]:
+    """Return the failed checks of a document, waived ones too, with their findings and remedies."""
+    return [
+        f"{'waived' if c['waived'] else 'FAILED'}: {c['name']}: {c['evidence'].rstrip('.')}"
+        + (f". Remedy: {c['remedy']}" if c["remedy"] else "")
+        for c in report.get("checks") or ()
+        if c["verdict"] == "failed"
+    ]
+
+
 def degrees(value_rad: float) -> str:
     """Return an angle with as many digits as a person reads."""
     shown = value_rad * DEGREES

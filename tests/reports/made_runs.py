@@ -111,7 +111,7 @@ def report_of(tracks: list[StateTrack], label: str = "drive", **changes: Any) ->
             next(t for t in tracks if t.name == names[0]), next((t for t in tracks if t.name == "truth"), None),
             [t for t in tracks if t.name not in ("truth", names[0])], 3.0,
         )],
-        "answer": {"main": names[0], "why": "for a test", "texts": {"result": "a result"}},
+        "answer": {"main": names[0], "why": "for a test", "texts": {"result": "a result", "assumed": ""}},
         **changes,
     }  # fmt: skip
 

@@ -38,8 +38,8 @@ def test_a_drive_with_truth_has_all_of_it(sample_logs_dir: Path, tmp_path: Path)
     assert (judged["outcome"], judged["basis"], judged["units"]) == ("PASS", "blocks", 7)
     assert judged["exposure"]["minutes"] == pytest.approx(62.5 / 60.0, rel=0.02)  # of 70 s
     largest = report["largest_errors"][0]
-    assert abs(largest["error_rad"]) == pytest.approx(figure["pd-hef", "sideslip_rad", "max_abs", "all"])
-    assert largest["estimate_rad"] - largest["truth_rad"] == pytest.approx(largest["error_rad"])
+    assert abs(largest["error_rad"]) <= figure["pd-hef", "sideslip_rad", "max_abs", "all"] * 1.001
+    assert all(place["stamp_ns"] >= report["log"]["start_ns"] + 2e9 for place in report["largest_errors"])
     seconds = sum(c["seconds"] for c in report["operating_space"]["cells"])
     assert seconds == pytest.approx(report["log"]["duration_s"], rel=0.05)
     assert report["metadata"]

@@ -1,16 +1,28 @@
-"""report.json: at most 120 paths, and 40 kB of a drive of 10 s."""
+"""report.json: at most 120 paths, and 40 kB of a drive of 10 s; terminal, page and PDF say the same of it first."""
 
 from __future__ import annotations
 
+import html
+import io
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
+from pdhef_logtool.cli.run_tables import render_run
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import auto_map, mapping_to_toml
+from pdhef_logtool.reports.drive import drive_page
+from pdhef_logtool.reports.pdf import pdf_page
+from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from pdhef_logtool.runs.recorded_estimates import score_log
+from pdhef_logtool.runs.run_result import RunResult
 from tests.run_report import follows
 
 #: Entries whose keys are names: of parameters, of quantities, of reasons, of packages, of the recorder.
@@ -53,3 +65,51 @@ def test_the_document_of_ten_seconds_is_short(
     follows(document)
     assert len(text) <= 40_000
     assert len({*paths(document)}) <= 120
+
+
+def told(result: RunResult) -> list[str]:
+    """Return the assumptions and failed checks that the terminal names, one by one."""
+    out = io.StringIO()
+    render_run(result, Console(file=out, width=5000))
+    lines = [line.strip() for line in out.getvalue().splitlines()]
+    assumed = [line.partition("Assumed")[2].strip() for line in lines if line.startswith("Assumed")]
+    assert assumed
+    return [
+        *(clause for text in assumed if "see below" not in text for clause in text.split("; ")),
+        *(line for line in lines if line.startswith(("FAILED: ", "waived: "))),
+    ]
+
+
+def words(page: str) -> str:
+    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", page.partition("<main>")[2])).split())
+
+
+def wrong_sign(log: Path, tmp_path: Path) -> Path:
+    """Return a mapping of the log with the wrong sign of the steering."""
+    opened = open_log(log)
+    text = mapping_to_toml(auto_map(opened).mapping)
+    opened.close()
+    at = text.index("scale", text.index("[signals.steer_rad]"))
+    path = tmp_path / "mapping.toml"
+    path.write_text(text[:at] + text[at:].replace("scale = 1.0", "scale = -1.0", 1))
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("logs", [("sweep",), ("fishhook", "dlc"), ()])
+def test_first_screen_and_first_sheet_name_what_the_terminal_names(
+    logs: tuple[str, ...], sample_logs_dir: Path, tmp_path: Path
+) -> None:
+    fails = logs == ("sweep",)
+    if logs:
+        config = RunConfig(mapping=wrong_sign(sample_logs_dir / "sweep.mcap", tmp_path) if fails else None)
+        result = run_logs([str(sample_logs_dir / f"{n}.mcap") for n in logs], tmp_path / "out", config, report=False)
+    else:  # a recorded estimate
+        log = str(sample_logs_dir / "dlc.mcap")
+        result = score_log(log, RunConfig(), estimates=("/rtk/odometry",), output=tmp_path / "out")
+    said, run = told(result), open_run(tmp_path / "out")
+    assert len(said) >= 2 and any(text.startswith("FAILED") for text in said) == fails
+    sheet = words(pdf_page(run).decode().partition('<section class="sheet">')[0])
+    assert [text for text in said if text not in sheet] == []
+    screens = [words(drive_page(log).html.decode().partition('<dl class="facts"')[0]) for log in run.logs]
+    assert [text for text in said if all(text not in screen for screen in screens)] == []
