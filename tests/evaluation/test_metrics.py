@@ -169,7 +169,7 @@ def test_the_constant_and_the_shift_of_ground_truth_are_taken_out_and_no_other_e
         return found["rmse"], found["rmse_aligned"]
 
     whole, aligned = errors(beta)
-    assert whole > 0.011 and aligned < 0.001
+    assert whole > 0.011 and aligned < 0.002
     assert errors(beta + 0.02)[1] == pytest.approx(0.02, rel=0.02)  # the estimate's own constant stays
 
 
