@@ -130,12 +130,12 @@ def pdf_page(run: OpenedRun, *, positions: bool = False) -> bytes:
 
 
 def _told(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, str]:
-    """Return assumptions and failed checks of drives with the drives that have them, empty for all drives."""
+    """Return failed checks, then assumptions, of drives with the drives that have them, empty for all drives."""
     labels: dict[str, list[str]] = {}
     for label, report in reports:
         for text in (*failed_checks(report), *assumptions_of(report)):
             labels.setdefault(text, []).append(label)
-    ranked = sorted(labels.items(), key=lambda of: not of[0].startswith(("FAILED", "waived")))
+    ranked = sorted(labels.items(), key=lambda of: (not of[0].startswith(("FAILED", "waived")), -len(of[1])))
     return {text: "" if len(of) == len(reports) else listed(of, _MOST_NAMED) for text, of in ranked}
 
 
