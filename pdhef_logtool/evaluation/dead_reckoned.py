@@ -17,9 +17,8 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
 ANCHOR_S = 1.0
-_MOST_POINTS = 500
-#: Share of the way by which paths are aligned.
-_ALIGNED_SHARE = 0.1
+#: Number of points of a drift, and the share of the way by which paths are aligned.
+_MOST_POINTS, _ALIGNED_SHARE = 500, 0.1
 #: Longest step between stamps within a second of dead reckoning.
 MAX_STEP_S = 0.2
 

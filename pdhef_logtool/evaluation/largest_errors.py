@@ -12,10 +12,9 @@ from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 
-#: Largest number of rows; least distance of two rows in time, and as a share of the drive.
-PLACES, _APART_S, _APART_SHARE = 10, 1.0, 0.02
-#: An estimator that begins to run on a moving car has not found its state; s.
-SETTLED_S = 2.0
+#: Largest number of rows; least distance of two rows in time, and as a share of the drive; duration of the start, in
+#: which an estimator on a moving car has not found its state.
+PLACES, _APART_S, _APART_SHARE, _SETTLED_S = 10, 1.0, 0.02, 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +32,7 @@ def largest_errors(
 ) -> list[ErrorPlace]:
     """Return the largest sideslip errors of a track [N], the largest first.
 
-    The first :data:`SETTLED_S` do not count, where more follows. Without ground truth that scores it, the largest
+    The first ``_SETTLED_S`` do not count, where more follows. Without ground truth that scores it, the largest
     differences from the first of ``others`` that has a sideslip at its stamps.
     """
     for reference in (truth, *others):
@@ -45,7 +44,7 @@ def largest_errors(
             error = wrap_angle(_known(estimate, low_speed_m_s) - _known(reference, low_speed_m_s))
         scored = np.flatnonzero(np.isfinite(error))
         if len(scored):
-            settled = int(np.searchsorted(estimate.stamps_ns, estimate.stamps_ns[scored[0]] + round(SETTLED_S * 1e9)))
+            settled = int(np.searchsorted(estimate.stamps_ns, estimate.stamps_ns[scored[0]] + round(_SETTLED_S * 1e9)))
             error[: settled if settled <= scored[-1] else 0] = np.nan
             stamps, beta = estimate.stamps_ns, estimate.sideslip_rad
             return [

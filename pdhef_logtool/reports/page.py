@@ -34,8 +34,6 @@ _HERE = Path(__file__).parent
 #: Scripts in order: before.js sets the drawing resolution for uPlot.
 _SCRIPTS = ("before.js", "uplot.min.js", "report.js")
 _STYLES = ("uplot.min.css", "report.css")
-#: 1971: no log with a date is older.
-_DATED_NS = 31_536_000_000_000_000
 #: Maximum length of a text in a paragraph or table cell.
 _MOST_SIGNS = 600
 DASH = "–"
@@ -212,7 +210,7 @@ def duration(seconds: float) -> str:
 
 def is_dated(stamp_ns: int) -> bool:
     """Return whether a stamp is a date: times that count from the start of a log are of the first days of 1970."""
-    return int(stamp_ns) >= _DATED_NS
+    return int(stamp_ns) >= 365 * 86_400 * 10**9
 
 
 def stamp(stamp_ns: int) -> str:

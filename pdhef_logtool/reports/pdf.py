@@ -28,8 +28,6 @@ from pdhef_logtool.storage.files import write_bytes
 PDF_FILE = "report.pdf"
 #: Maximum number of drives with a section; drives with the worst verdicts come first.
 _MOST_DRIVES = 20
-#: Maximum number of drives that are named with an assumption or a failed check.
-_MOST_NAMED = 5
 #: Figures of a drive in the document. The path contains the positions of the car.
 _FIGURES, _POSITIONS = ("worst", "sideslip", "error", "ay"), ("path",)
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -136,7 +134,7 @@ def _told(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, str]:
         for text in (*failed_checks(report), *assumptions_of(report)):
             labels.setdefault(text, []).append(label)
     ranked = sorted(labels.items(), key=lambda of: (not of[0].startswith(("FAILED", "waived")), -len(of[1])))
-    return {text: "" if len(of) == len(reports) else listed(of, _MOST_NAMED) for text, of in ranked}
+    return {text: "" if len(of) == len(reports) else listed(of) for text, of in ranked}
 
 
 def _report(log: OpenedLog) -> dict[str, Any] | None:

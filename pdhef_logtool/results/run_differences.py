@@ -58,7 +58,7 @@ def _cars(pairs: Sequence[Pair], key: str, *, named: bool) -> Counter[tuple[str,
 
 
 def _example(pair: Pair, role: str) -> str:
-    """Return how the first changed source of a role changed, empty where the reports do not state."""
+    """Return the first source that differs between the reports of a pair, empty where they do not state it."""
     try:
         reports = pair.a.report(), pair.b.report()
     except OutputError as error:

@@ -103,8 +103,8 @@ def build_report(content: Mapping[str, Any], main: MainFacts | None = None) -> d
 
     Parameters
     ----------
-    content : entries of the document as records or JSON-able values, ``metrics`` as rows of metrics.parquet, of which
-        the document has those that people read.
+    content : entries of the document as records or JSON-able values, ``metrics`` as rows of metrics.parquet, which
+        are selected here.
     main : the selected estimate, None without one.
     """
     rows = [m for m in content["metrics"] if _is_shown(m, main)]
@@ -124,8 +124,8 @@ def _is_shown(metric: MetricRow, main: MainFacts | None) -> bool:
     if main is not None and metric.estimator not in (*main.shown, PHYSICS):
         pair = metric.estimator.split("~")
         return metric.segment == "all" and (is_error or (main.name in pair and metric.metric == "disagreement_rms"))
-    known = registered().get(metric.metric)
-    is_read = metric.metric in _BY_REFERENCE or (known and metric.signal in (*known.terminal, *known.brief))
+    entry = registered().get(metric.metric)
+    is_read = metric.metric in _BY_REFERENCE or (entry and metric.signal in (*entry.terminal, *entry.brief))
     return is_error or (metric.segment == "all" and bool(is_read))
 
 

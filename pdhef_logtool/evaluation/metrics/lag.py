@@ -37,15 +37,15 @@ def _rms_aligned(
 ) -> float | None:
     """Return the RMS error [N] without the lag and without the ground truth's mean on straights.
 
-    A lag that is not clear is 0. None without straights, which alone tell a constant of ground truth from an error.
+    A lag that is not clear is 0. None without straights: an offset of ground truth is an error elsewhere.
     """
     lag = np.nan_to_num(_lag_of_start(_, since_start_ns, estimate, truth))
     then_ns = since_start_ns - lag * 1e9
-    known = (then_ns >= since_start_ns[0]) & (then_ns <= since_start_ns[-1])
-    if not straight.any() or not known.any():
+    covered = (then_ns >= since_start_ns[0]) & (then_ns <= since_start_ns[-1])
+    if not straight.any() or not covered.any():
         return None
-    shifted = np.interp(then_ns[known], since_start_ns, truth - np.mean(truth[straight]))
-    return rms(np.asarray(wrap_angle(estimate[known] - shifted), dtype=np.float64))
+    shifted = np.interp(then_ns[covered], since_start_ns, truth - np.mean(truth[straight]))
+    return rms(np.asarray(wrap_angle(estimate[covered] - shifted), dtype=np.float64))
 
 
 METRICS = (
