@@ -16,7 +16,7 @@ from pdhef_logtool.results.selected_estimate import MainFacts
 
 SHA = "ab" * 32
 MODEL = {"physics_sha256": SHA, "options": {"trust": 0.5}}
-MAIN = MainFacts("pd-hef", "evidence", "", False, "zero", ("pd-hef", "physics", "zero"), named=False)
+MAIN = MainFacts("pd-hef", "", False, "zero", ("pd-hef", "physics", "zero"), named=False)
 
 
 @functools.cache

@@ -77,11 +77,6 @@ class Peak(ErrorPlace):
     at_s: float
     during: str
 
-    @property
-    def truth_rad(self) -> float:
-        """The sideslip that the error is against."""
-        return self.estimate_rad - self.error_rad
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveFigures:

@@ -150,12 +150,9 @@ def _gravity(report: Mapping[str, Any] | None) -> tuple[int, float]:
     if report is None:
         return (1, 0.0)
     fails = sum(r["outcome"] == "FAIL" for r in (report.get("plan") or {}).get("requirements") or ())
-    main = (report.get("answer") or {}).get("main")
-    wanted = (main, "sideslip_rad", "all", "rmse")
-    errors = [
-        m["value"] for m in report["metrics"] if (m["estimator"], m["signal"], m["segment"], m["metric"]) == wanted
-    ]
-    return (-fails, -(errors[0] or 0.0) if errors else 0.0)
+    wanted = ((report.get("answer") or {}).get("main"), "sideslip_rad", "all", "rmse")
+    figures = {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
+    return -fails, -(figures.get(wanted) or 0.0)
 
 
 def _section(log: OpenedLog, report: Mapping[str, Any] | None, charts: Charts, *, positions: bool) -> DriveSection:

@@ -17,6 +17,7 @@ from pdhef_logtool.compiled.sources import compiled_digest
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.results.selected_estimate import TEMPLATES, MainFacts, answer_of
+from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.storage.documents import jsonable, seal
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.templates import template
@@ -121,7 +122,7 @@ def _is_shown(metric: MetricRow, main: MainFacts | None) -> bool:
     estimates are compared only with it.
     """
     is_error = (metric.signal, metric.metric) == ("sideslip_rad", "rmse")
-    if main is not None and metric.estimator not in (*main.shown, PHYSICS):
+    if main is not None and metric.estimator not in (*main.shown, PHYSICS, TRUTH):
         pair = metric.estimator.split("~")
         return metric.segment == "all" and (is_error or (main.name in pair and metric.metric == "disagreement_rms"))
     entry = registered().get(metric.metric)

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -49,14 +49,13 @@ class MainFacts:
 
     Attributes
     ----------
-    name : of it. chosen_by : evidence of the car's driving, consistency, or estimator order. why : in words.
+    name : of it. why : in words.
     distrusted : whether the lateral consistency contradicts the preferred one.
     naive : the estimator to beat, None if it did not run. shown : displayed tracks; all if the estimators were
         ``named``.
     """
 
     name: str
-    chosen_by: Literal["evidence", "d2", "order"]
     why: str
     distrusted: bool
     naive: str | None
@@ -167,10 +166,6 @@ def is_worse(error: float | None, naive: float | None) -> bool:
     return error is not None and naive is not None and error > (1.0 + SAME) * naive
 
 
-def _error(figures: _Figures, name: str | None) -> float | None:
-    return None if name is None else figures.get((name, "sideslip_rad", "rmse"))
-
-
 def truth_of(report: Report, name: str) -> str:
     """Return the topics that a ground truth quantity comes from, as far as its derivation names them."""
     sources = report["truth"]["quantities"]
@@ -182,7 +177,7 @@ def truth_of(report: Report, name: str) -> str:
 def _best_in_hindsight(report: Report, main: MainFacts, figures: _Figures) -> dict[str, Any] | None:
     """Return the estimator with the least error against ground truth, None without it; for display only."""
     ran = [e["name"] for e in report["estimators"] if e["outcome"] == "ran" and e["name"] != REFERENCE]
-    errors = {name: error for name in ran if (error := _error(figures, name)) is not None}
+    errors = {name: error for name in ran if (error := figures.get((name, "sideslip_rad", "rmse"))) is not None}
     if not errors:
         return None
     best = min(errors, key=lambda name: (errors[name], name != main.name))

@@ -59,11 +59,6 @@ def evaluate(drive: Drive, estimated: Estimated, names: Sequence[str], calibrate
     return Evaluation(scored, evaluate_drive(scored), events, tuple(silent), moves)
 
 
-def in_time(event: Event) -> tuple[int, int, str]:
-    """Return the sort key of events."""
-    return event.start_ns, event.end_ns, event.name
-
-
 def drive_events(
     stamped: Signals | StateTrack,
     masks: Mapping[str, BoolArray],
@@ -87,4 +82,4 @@ def drive_events(
             Event(f"{track.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
             for s in find_intervals(track, {"diverged": track.diverged})
         ]
-    return sorted(events, key=in_time)
+    return sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name))

@@ -75,7 +75,7 @@ def test_without_truth_the_page_says_why_there_is_no_score_and_shows_disagreemen
     text = words(page)
     assert "The log has no ground truth" in text
     assert "Largest disagreements of pd-hef" in text
-    assert "estimator NIS per degree of freedom pd-hef 1.03" in text  # NIS of 3.1 at 3 degrees of freedom
+    assert "estimator NIS pd-hef 1.03" in text  # NIS of 3.1 at 3 degrees of freedom
     assert figures(page)["error"]["title"].startswith("Disagreement")
     assert [s["label"] for s in figures(page)["error"]["series"]] == ["physics", "zero"]
 

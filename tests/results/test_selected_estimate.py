@@ -120,7 +120,7 @@ def test_the_next_steps_are_few_and_the_most_important_first() -> None:
     said = texts(replace(MAIN, name="zero"), estimators=lacking, vehicle=UNKNOWN)["next"]
     assert said.startswith("map the missing signals (the log has no steer_rad)")
     assert said.count("; ") == 1
-    distrusted = replace(MAIN, name="open-loop", chosen_by="d2", why="pd-hef contradicts", distrusted=True)
+    distrusted = replace(MAIN, name="open-loop", why="pd-hef contradicts", distrusted=True)
     estimators = [ran("open-loop")]
     said = texts(distrusted, estimators=estimators)
     assert "pd-hef contradicts" in said["assumed"]
