@@ -59,8 +59,8 @@ def whole_figures(report: Mapping[str, Any], names: Sequence[str], *, manoeuvres
 
     def value(name: str, signal: str, metric: Metric) -> float | None:
         rows = by_signal.get(signal, {}).get(name, {})
-        found, over = _read(rows, metric.name), _read(rows, "nis_dof") if metric.name == "nis" else 1.0
-        return found / over if found is not None and over else None
+        figure, over = _read(rows, metric.name), _read(rows, "nis_dof") if metric.name == "nis" else 1.0
+        return figure / over if figure is not None and over else None
 
     wanted = [m for m in registered().values() if (m.columns is responses) == manoeuvres]
     wanted = [m for m in wanted if not m.of_truth and m.name != "nis_dof"]

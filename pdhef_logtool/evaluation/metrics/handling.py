@@ -14,10 +14,9 @@ import numpy as np
 from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
-#: Driving after a manoeuvre that its figures need, and the end of a step that is its steady state; s.
-_AFTER_S, _STEADY_S = 2.0, 0.5
-#: Steering below this share of its peak is at zero.
-_AT_ZERO = 0.05
+#: Driving after a manoeuvre that its figures need, the end of a step that is its steady state, s, and the share of its
+#: peak below which steering is at zero.
+_AFTER_S, _STEADY_S, _AT_ZERO = 2.0, 0.5, 0.05
 #: Range of a_y in which the understeer gradient is constant, and least range that determines it; m/s².
 _LINEAR_M_S2, _LEAST_RANGE_M_S2 = 4.0, 1.0
 
@@ -27,7 +26,7 @@ def responses(drive: EvaluatedDrive) -> Iterator[Columns]:
     if drive.calibrated is None:
         return
     signals, vehicle, _ = drive.calibrated
-    since_s = (signals.stamps_ns - signals.stamps_ns[:1]) * 1e-9
+    since_s: FloatArray = (signals.stamps_ns - signals.stamps_ns[:1]) * np.float64(1e-9)
     wheelbase_m = vehicle.cg_to_front_axle_m + vehicle.cg_to_rear_axle_m
     step, lane = (_first(drive, since_s, (name,)) for name in ("step-steer", "dlc-3888-2"))
     dwell = _first(drive, since_s, ("sine-with-dwell",), _AFTER_S)
@@ -72,8 +71,8 @@ def _reached(since_s: FloatArray, share: FloatArray, level: float) -> float | No
 
 
 def _response_time(response: FloatArray, since_s: FloatArray, steer: FloatArray) -> float | None:
-    given, answer, _ = _step(response, since_s, steer)
-    start, end = _reached(since_s, given, 0.5), _reached(since_s, answer, 0.9)
+    steering, answer, _ = _step(response, since_s, steer)
+    start, end = _reached(since_s, steering, 0.5), _reached(since_s, answer, 0.9)
     return None if start is None or end is None else end - start
 
 
@@ -111,38 +110,19 @@ def _understeer(ay: FloatArray, beyond: FloatArray) -> float | None:
 _HANDLING = partial(Metric, columns=responses, whole=True)
 _STEP = partial(_HANDLING, over=("step", "since_s", "steer"), brief=("yaw_rate_rad_s", "ay_m_s2"))
 _DWELL = partial(_HANDLING, over=("dwell", "since_s", "steer"), unit="1", brief=("yaw_rate_rad_s",))
+_RESPONSE = "of the first step steer: from half of the steady steering angle to 90 % of the steady response"
+_RATIO = "of the first sine with dwell: yaw rate {} s after completion of steer over its peak after the reversal"
+_SLOPE = "slope of the road-wheel angle less L r / v over a_y up to 4 m/s², of the first ramp or steady circle"
 METRICS = (
-    _STEP(
-        "step_response_time",
-        "response time",
-        "of the first step steer: from half of the steady steering angle to 90 % of the steady response",
-        formula=_response_time,
-        unit="s",
-    ),
+    _STEP("step_response_time", "response time", _RESPONSE, formula=_response_time, unit="s"),
     _STEP("step_peak", "peak of step", "largest response to the first step steer", formula=_peak),
-    _STEP(
-        "step_overshoot",
-        "overshoot",
-        "of the first step steer: peak over the steady response, less 1",
-        formula=_overshoot,
-        unit="1",
-    ),
-    _DWELL(
-        "dwell_ratio_1s",
-        "yaw rate ratio 1 s",
-        "of the first sine with dwell: yaw rate 1 s after completion of steer over its peak after the reversal",
-        formula=partial(_ratio, after_s=1.0),
-    ),
-    _DWELL(
-        "dwell_ratio_1_75s",
-        "yaw rate ratio 1.75 s",
-        "the same 1.75 s after completion of steer",
-        formula=partial(_ratio, after_s=1.75),
-    ),
+    _STEP("step_overshoot", "overshoot", "`step_peak` over the steady response, less 1", formula=_overshoot, unit="1"),
+    _DWELL("dwell_ratio_1s", "ratio 1 s", _RATIO.format("1"), formula=partial(_ratio, after_s=1.0)),
+    _DWELL("dwell_ratio_1_75s", "ratio 1.75 s", _RATIO.format("1.75"), formula=partial(_ratio, after_s=1.75)),
     _HANDLING(
         "understeer_gradient",
         "understeer gradient",
-        "slope of the road-wheel angle less L r / v over a_y up to 4 m/s², of the first ramp or steady circle",
+        _SLOPE,
         formula=_understeer,
         over=("turn", "beyond"),
         unit="rad/(m/s^2)",
