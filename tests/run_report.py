@@ -16,7 +16,7 @@ from pdhef_logtool.results.selected_estimate import MainFacts
 
 SHA = "ab" * 32
 MODEL = {"physics_sha256": SHA, "options": {"trust": 0.5}}
-MAIN = MainFacts("pd-hef", "evidence", "", False, "zero", ("pd-hef", "physics", "zero"), named=False)
+MAIN = MainFacts("pd-hef", "", False, "zero", ("pd-hef", "physics", "zero"), named=False)
 
 
 @functools.cache
@@ -32,8 +32,7 @@ def follows(document: Any, schema: str = "report.schema.json") -> None:
 
 def truth(*quantities: tuple[str, str, str], **changes: Any) -> dict[str, Any]:
     """Return the ground truth of a report: name, source and derivation of each quantity."""
-    keys = {"unit": "", "samples": 9}
-    entries = [{"name": n, "source": s, "derivation": d, **keys} for n, s, d in quantities]
+    entries = {n: d or s for n, s, d in quantities}
     unknown = {"latency_s": None, "not_independent": [], "notes": []}
     return {"available": bool(entries), "quantities": entries, **unknown, **changes}
 
@@ -65,16 +64,16 @@ def report(
     """Return a report; ``vehicle`` : changed entries of the vehicle."""
     nothing: dict[str, Any] = dict.fromkeys(("metrics", "segments", "losses", "warnings", "remarks", "checks"), ())
     log = {
-        "name": name, "file": f"{name}.mcap", "kind": "mcap", "sha256": SHA, "signals_sha256": None,
-        "truth_sha256": None, "start_ns": 0, "end_ns": 10_000_000_000, "duration_s": 10.0, "topics": [],
+        "name": name, "file": f"{name}.mcap", "kind": "mcap", "sha256": SHA, "start_ns": 0,
+        "end_ns": 10_000_000_000, "duration_s": 10.0,
     }  # fmt: skip
     car = {
-        "name": "sedan", "sha256": SHA, "file": "golf", "proven": True, "taught": None, "sensors": {}, "assumed": [],
+        "name": "sedan", "sha256": SHA, "file": "golf", "proven": True, "taught": None, "assumed": {},
         "low_speed_blend_m_s": None,
     }  # fmt: skip
     content = {
         "log": log,
-        "mapping": {"signals": [], "missing": []},
+        "mapping": {"missing": []},
         "vehicle": car | (vehicle or {}),
         "estimators": [
             ran("zero", algorithm={"physics_sha256": None, "options": {}}),

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from pdhef_logtool.car.parts import LIMIT_GAIN, FilterNoise
@@ -53,7 +52,6 @@ class Posterior:
     from_earlier : whether earlier drives determine the prior.
     reached_friction : friction of ``vehicle`` if the fit is rejected because the car slides; None otherwise.
     seconds : used driving. level_m_s2 : its lateral acceleration; 0 if unknown.
-    rms : RMS error of yaw rate in rad/s and of a_y in m/s² after the fit; file_rms : the same of the vehicle file.
     """
 
     vehicle: VehicleParameters
@@ -65,8 +63,6 @@ class Posterior:
     reached_friction: float | None = None
     seconds: float = 0.0
     level_m_s2: float = 0.0
-    rms: tuple[float, float] = (math.nan, math.nan)
-    file_rms: tuple[float, float] = (math.nan, math.nan)
 
     @property
     def causal(self) -> bool:
@@ -105,9 +101,5 @@ class Posterior:
         return {
             "refused": self.refused or None,
             "text": self.text,
-            "seconds": self.seconds,
-            "parameters": [{**asdict(p), "excited": p.excited} for p in self.parameters],
-            "friction_fixed_at": self.vehicle.assumed_friction,
-            **dict(zip(("yaw_rate_rms_rad_s", "ay_rms_m_s2"), self.rms, strict=True)),
-            **dict(zip(("file_yaw_rate_rms_rad_s", "file_ay_rms_m_s2"), self.file_rms, strict=True)),
+            "parameters": [{k: getattr(p, k) for k in ("name", "unit", "value", "sd", "log")} for p in self.parameters],
         }

@@ -19,8 +19,15 @@ from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.printable import all_printable, listed
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
-from pdhef_logtool.results.run_report import diverged_line, reasons_line
-from pdhef_logtool.results.selected_estimate import NEARLY_HOLDS, degrees, is_worse, truth_of
+from pdhef_logtool.results.run_report import diverged_line, faults_line
+from pdhef_logtool.results.selected_estimate import (
+    NEARLY_HOLDS,
+    assumptions_of,
+    degrees,
+    failed_checks,
+    is_worse,
+    result_of,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -109,13 +116,7 @@ def render_run(result: RunResult, console: Console) -> None:
 
 def _assumed(reports: Sequence[_Report]) -> list[str]:
     """Return the common assumptions of all logs as clauses."""
-    if reports and all(report["answer"] is None for report in reports):  # recorded estimates
-        vehicle = reports[0]["vehicle"]
-        slow = f"sideslip is scored above {vehicle['low_speed_blend_m_s']:g} m/s"
-        if vehicle["file"] is not None:
-            return [f"car {vehicle['file']}", slow]
-        return ["no car given: the ground truth is assumed to be measured at the centre of gravity", slow]
-    first, *others = [_clauses(_texts(report), "assumed") for report in reports] or [[]]
+    first, *others = [assumptions_of(report) for report in reports] or [[]]
     return [clause for clause in first if all(clause in clauses for clauses in others)]
 
 
@@ -123,10 +124,8 @@ def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str])
     """Return the first three lines: result, assumptions, next step."""
     given, texts = result.requirements, [_texts(report) for report in reports]
     failed = [r.outcome.log for r in result.results if r.report is None]
-    if len(result.results) == 1:
-        said = (texts[0].get("result") or _recorded(reports[0])) if texts else "the log failed"
-    else:
-        said = _range(reports)
+    alone = len(result.results) == 1
+    said = _range(reports) if not alone else result_of(reports[0]) if reports else "the log failed"
     steps = [f"{', '.join(failed[:_MOST_FAILED])} failed: read the cause below"] if failed else []
     steps += dict.fromkeys(c for t in texts for c in _clauses(t, "next"))
     steps = next_steps(None if given is None else given.to_dict(), steps)
@@ -144,16 +143,6 @@ def _range(reports: Sequence[_Report]) -> str:
     if not scored:
         return f"sideslip of {len(reports)} logs is not scored" if reports else "all logs failed"
     return f"Sideslip RMSE of {len(scored)} logs: {degrees(min(scored))} to {degrees(max(scored))}"
-
-
-def _recorded(report: _Report) -> str:
-    """Return the sideslip error of recorded estimates as text."""
-    figures, names = _figures(report), [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
-    errors = [(n, e) for n in names if (e := figures.get((n, "sideslip_rad", "all", "rmse"))) is not None]
-    if not errors:
-        return f"sideslip of {', '.join(names)} is not scored" if names else "no estimate"
-    scored = ", ".join(f"{name}: {degrees(error)}" for name, error in errors)
-    return f"sideslip RMSE of {scored} ({truth_of(report, 'sideslip_rad')})"
 
 
 def _fleet_head(summary: Mapping[str, Any]) -> Table:
@@ -215,10 +204,10 @@ def _render_one_of_several(report: _Report, assumed: Sequence[str], console: Con
     """Print details of a log that need attention and are not in the joint table; ``assumed``: common assumptions."""
     texts, main = _texts(report), report["answer"]["main"]
     is_scored = _figures(report).get((main, "sideslip_rad", "all", "rmse")) is not None
-    rest = [clause for clause in _clauses(texts, "assumed") if clause not in assumed]
+    rest = [clause for clause in assumptions_of(report) if clause not in assumed]
     shown = {} if is_scored or "result" not in texts else {"result": texts["result"]}
     shown |= {"assumed": "; ".join(rest)} if rest else {}
-    lines = [*_failed_checks(report, undecided=False), *_losses(report, notes=False)]
+    lines = [*_checks(report, undecided=False), *_losses(report, notes=False)]
     if shown or lines or report["answer"]["named"]:
         _print_log(report, "", lines, shown, (), console, tabled=report["answer"]["named"])
 
@@ -230,13 +219,13 @@ def _render_log(report: _Report, console: Console) -> None:
     later = _clauses(texts, "next")[1:]  # the head contains the first one
     shown = {key: text for key, text in texts.items() if key not in ("result", "assumed", "next")}
     shown |= {"next": "; ".join(later)} if later else {}
-    _print_log(report, about, [*_failed_checks(report)], shown, [*_below(report)], console, tabled=True)
+    _print_log(report, about, [*_checks(report)], shown, [*_below(report)], console, tabled=True)
 
 
 def _print_log(  # positional: two callers in this file
     report: _Report,
     about: str,
-    above: Sequence[str | Text],
+    above: Sequence[str],
     texts: Mapping[str, str],
     below: Sequence[str],
     console: Console,
@@ -275,15 +264,9 @@ def _lines(texts: Mapping[str, str]) -> Table:
     return lines
 
 
-def _failed_checks(report: _Report, *, undecided: bool = True) -> Iterable[str | Text]:
-    checks = report.get("checks") or []
-    for check in checks:
-        if check["verdict"] == "failed":
-            waived = "waived" if check["waived"] else "FAILED"
-            remedy = f". Remedy: {check['remedy']}" if check["remedy"] else ""
-            evidence = check["evidence"].rstrip(".")
-            yield Text.assemble(f"{waived}: ", (check["name"], "bold"), f": {evidence}{remedy}")
-    names = [check["name"] for check in checks if check["verdict"] == "undecided"]
+def _checks(report: _Report, *, undecided: bool = True) -> Iterable[str]:
+    yield from failed_checks(report)
+    names = [check["name"] for check in report.get("checks") or () if check["verdict"] == "undecided"]
     if names and undecided:
         yield f"Not observable in this drive: {listed(names, _MOST_UNDECIDED)}"
 
@@ -321,11 +304,12 @@ def _below(report: _Report) -> Iterable[str]:
     yield from (f"{e['name']} {e['reason']}" for e in report["estimators"] if e["outcome"] == "failed")
     happened: dict[str, list[str]] = {}
     for estimator in shown:
-        for event in (diverged_line(report, estimator["name"]), reasons_line(estimator, report["log"]["start_ns"])):
-            if event:
-                happened.setdefault(event, []).append(estimator["name"])
+        if event := diverged_line(report, estimator["name"]):
+            happened.setdefault(event, []).append(estimator["name"])
     for event, names in happened.items():
         yield f"{', '.join(names)}: {event}"
+    if faults := faults_line(report):
+        yield f"faults of the sensors: {faults}"
     yield from _losses(report)
     yield from (f"note: {remark}" for remark in report["remarks"])
 
@@ -431,7 +415,7 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
     for report in reports:
         values, main = _figures(report), report["answer"]["main"]
         errors = [cell(values.get((n, "sideslip_rad", "all", "rmse")), DEGREES, 3) for n in (main, *rivals)]
-        compared = (values.get((n, "sideslip_rad", "all", "rmse")) for n in (main, report["answer"]["naive"]))
+        compared = (values.get((n, "sideslip_rad", "all", "rmse")) for n in (main, "zero"))
         inside = values.get((main, "sideslip_rad", "all", "coverage95"))
         seconds = f"{report['log']['duration_s']:.0f}"
         notes = _look_at(report, inside, main if len(mains) > 1 else "", is_worse(*compared))

@@ -182,11 +182,6 @@ class Drive:
         return tuple(replace(x, where=x.where.removeprefix(f"{self.path.parent}/")) for x in merged)
 
     @property
-    def samples(self) -> dict[str, int]:
-        """Messages that were used, by source."""
-        return {} if self._recorded is None else self._recorded.samples
-
-    @property
     def sample_ledger(self) -> tuple[SampleCount, ...]:
         """Counts of used and dropped samples of each mapped signal; empty before reading."""
         return () if self._recorded is None else self._recorded.ledger

@@ -39,7 +39,7 @@ class Recorded:
     Attributes
     ----------
     signals, truth : [N] at the same stamps; N may be 0, and ``truth`` is None without ground truth.
-    samples : number of used messages, by source. ledger : used and dropped samples of each mapped signal.
+    ledger : used and dropped samples of each mapped signal.
     changes : of the sensors in mid-drive, corrected in ``signals``.
     signals_sha256, truth_sha256 : hashes of the channels' content; None without samples.
     """
@@ -48,7 +48,6 @@ class Recorded:
     signals: Signals
     truth: StateTrack | None
     losses: tuple[Loss, ...]
-    samples: dict[str, int]
     ledger: tuple[SampleCount, ...]
     changes: tuple[SensorChange, ...]
     signals_sha256: str | None
@@ -62,9 +61,6 @@ def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (
     log.keep_no_more()
     part = read_signals(log, plan.mapping, plan.clocks, plan.start_ns, plan.end_ns)
     channels = [*part.signals.values(), *part.truth.values()]
-    samples: Counter[str] = Counter()
-    for channel in channels:
-        samples[channel.source] += len(channel)
     aligned, late_counts = align(part.signals, plan.alignment)
     aligned = correct_signals(aligned, plan.vehicle)
     signals, changes = find_changes(without_impossible(aligned), unchanged)
@@ -91,7 +87,6 @@ def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (
         signals=signals,
         truth=truth,
         losses=losses,
-        samples=dict(samples),
         ledger=sample_ledger(log, plan, part.counts),
         changes=changes,
         signals_sha256=channels_sha256(part.signals, mapping.signals),

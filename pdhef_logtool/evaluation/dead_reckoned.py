@@ -17,7 +17,8 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
 ANCHOR_S = 1.0
-_MOST_POINTS = 500
+#: Number of points of a drift, and the share of the way by which paths are aligned.
+_MOST_POINTS, _ALIGNED_SHARE = 500, 0.1
 #: Longest step between stamps within a second of dead reckoning.
 MAX_STEP_S = 0.2
 
@@ -61,15 +62,13 @@ def lateral_errors(estimate: StateTrack, truth: StateTrack) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class PathDrift:
-    """Distance of a dead-reckoned path from the path of the ground truth in m.
+    """Distance in m of the end of a dead-reckoned path from the ground truth's, which is ``length_m`` long.
 
-    ``end_m`` at the end of ``length_m`` from a common start; ``largest_aligned_m`` after the rotation and translation
-    (SE(2)) that minimise the distance of the paths.
+    The paths are aligned by position and heading first (:func:`aligned_path`).
     """
 
     end_m: float
     length_m: float
-    largest_aligned_m: float
 
 
 def path_drift(estimate: StateTrack, truth: StateTrack) -> PathDrift | None:
@@ -82,17 +81,22 @@ def path_drift(estimate: StateTrack, truth: StateTrack) -> PathDrift | None:
     length = float(np.hypot(*np.diff(target, axis=1)).sum())
     if not length > 0.0:
         return None
-    end = float(np.hypot(*((source - source[:, :1]) - (target - target[:, :1]))[:, -1]))
-    return PathDrift(end, length, float(np.hypot(*(aligned_path(source, target) - target)).max()))
+    return PathDrift(float(np.hypot(*(aligned_path(source, target) - target)[:, -1])), length)
 
 
 def aligned_path(source: FloatArray, target: FloatArray) -> FloatArray:
-    """Return points [2, K] after the rotation and translation that minimise their distance to ``target`` [2, K]."""
-    a, b = (p - p.mean(axis=1, keepdims=True) for p in (source, target))
-    angle = np.arctan2(np.sum(a[0] * b[1] - a[1] * b[0]), np.sum(a * b))
+    """Return points [2, K] after the rotation and translation that fit the beginning of ``target`` [2, K] best.
+
+    The beginning is the first :data:`_ALIGNED_SHARE` of the way. A path that is dead-reckoned from an unknown heading
+    is turned as a whole, which is no drift.
+    """
+    way = np.cumsum(np.hypot(*np.diff(target, axis=1)))
+    first = max(int(np.searchsorted(way, _ALIGNED_SHARE * way[-1])) + 2, 2)
+    centre, goal = (p[:, :first].mean(axis=1, keepdims=True) for p in (source, target))
+    a, b = source - centre, (target - goal)[:, :first]
+    angle = np.arctan2(np.sum(a[0, :first] * b[1] - a[1, :first] * b[0]), np.sum(a[:, :first] * b))
     cosine, sine = np.cos(angle), np.sin(angle)
-    rotated = np.stack([cosine * a[0] - sine * a[1], sine * a[0] + cosine * a[1]])
-    return np.asarray(rotated + target.mean(axis=1, keepdims=True), dtype=np.float64)
+    return np.asarray(np.stack([cosine * a[0] - sine * a[1], sine * a[0] + cosine * a[1]]) + goal, dtype=np.float64)
 
 
 def pose_known(track: StateTrack) -> BoolArray:

@@ -1,4 +1,4 @@
-"""The places of the largest sideslip errors of a drive, at least a second apart."""
+"""The places of the largest sideslip errors of a drive, at least a second apart, without the start of the estimate."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 
-#: Largest number of rows; least distance of two rows in time, and as a share of the drive.
-PLACES, _APART_S, _APART_SHARE = 10, 1.0, 0.02
+#: Largest number of rows; least distance of two rows in time, and as a share of the drive; duration of the start, in
+#: which an estimator on a moving car has not found its state.
+PLACES, _APART_S, _APART_SHARE, _SETTLED_S = 10, 1.0, 0.02, 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorPlace:
-    """A place of a large sideslip error: stamp in ns, angles in rad, and the track that ``truth_rad`` is of."""
+    """A place of a large sideslip error: stamp in ns, angles in rad, and the track that it is an error against."""
 
     stamp_ns: int
     estimate_rad: float
-    truth_rad: float
     error_rad: float
     against: str
 
@@ -32,8 +32,8 @@ def largest_errors(
 ) -> list[ErrorPlace]:
     """Return the largest sideslip errors of a track [N], the largest first.
 
-    Without ground truth that scores it, the largest differences from the first of ``others`` that has a sideslip at
-    its stamps.
+    The first ``_SETTLED_S`` do not count, where more follows. Without ground truth that scores it, the largest
+    differences from the first of ``others`` that has a sideslip at its stamps.
     """
     for reference in (truth, *others):
         if reference is None or len(reference) != len(estimate):
@@ -42,10 +42,13 @@ def largest_errors(
             error = signal_error(estimate, reference, "sideslip_rad", low_speed_m_s)
         else:
             error = wrap_angle(_known(estimate, low_speed_m_s) - _known(reference, low_speed_m_s))
-        if np.isfinite(error).any():
+        scored = np.flatnonzero(np.isfinite(error))
+        if len(scored):
+            settled = int(np.searchsorted(estimate.stamps_ns, estimate.stamps_ns[scored[0]] + round(_SETTLED_S * 1e9)))
+            error[: settled if settled <= scored[-1] else 0] = np.nan
             stamps, beta = estimate.stamps_ns, estimate.sideslip_rad
             return [
-                ErrorPlace(int(stamps[i]), float(beta[i]), float(beta[i] - error[i]), float(error[i]), reference.name)
+                ErrorPlace(int(stamps[i]), float(beta[i]), float(error[i]), reference.name)
                 for i in _largest_places(stamps, error)
             ]
     return []

@@ -19,7 +19,7 @@ from pdhef_logtool.records.tracks import StateTrack
 #: Errors are correlated over seconds (docs/method.md#evaluation).
 BLOCK_S = 10.0
 #: Largest number of blocks per requirement in a report; a longer drive has longer blocks.
-MOST_BLOCKS = 360
+_MOST_BLOCKS = 60
 _Read = Callable[[str], StateTrack | None]
 
 
@@ -29,14 +29,13 @@ class RequirementBlocks:
 
     Attributes
     ----------
-    of : :attr:`~.validation_plan.Requirement.measured`. estimator : the scored one. block_s : length of a block.
+    of : :attr:`~.validation_plan.Requirement.measured`. block_s : length of a block.
     number, n, seconds, metres : index from the start, scored stamps, time and distance of each block [K].
     value, baseline : metric of the estimator and of the baseline in each block [K]; baseline empty without one.
     std : root mean square of the reference's 1-sigma in the block [K]; empty for ground truth.
     """
 
     of: str
-    estimator: str
     block_s: float
     number: Sequence[int]
     n: Sequence[int]
@@ -68,7 +67,7 @@ class ScoredDrive:
 
 
 def requirement_blocks(
-    requirements: Sequence[Requirement], main: str | None, drive: ScoredDrive, most: int = MOST_BLOCKS
+    requirements: Sequence[Requirement], main: str | None, drive: ScoredDrive
 ) -> list[RequirementBlocks]:
     """Return the blocks of all requirements with a mean over stamps as the metric and with data in this drive.
 
@@ -82,7 +81,7 @@ def requirement_blocks(
         named = [name, *([requirement.baseline] if requirement.baseline != requirement.other_run else [])]
         tracks = [drive.read(n) for n in named if n is not None]
         if all(track is not None and len(track) == len(drive.truth) for track in tracks):
-            blocks = _blocks(requirement, name, [t for t in tracks if t is not None], drive, most)
+            blocks = _blocks(requirement, [t for t in tracks if t is not None], drive)
             if blocks is not None:
                 results.append(blocks)
     return results
@@ -100,15 +99,13 @@ def _has_blocks(requirement: Requirement, drive: ScoredDrive) -> bool:
     )
 
 
-def _blocks(
-    requirement: Requirement, name: str, tracks: Sequence[StateTrack], drive: ScoredDrive, most: int
-) -> RequirementBlocks | None:
+def _blocks(requirement: Requirement, tracks: Sequence[StateTrack], drive: ScoredDrive) -> RequirementBlocks | None:
     """Return the summands of one requirement, summed over blocks of time."""
     truth = drive.truth
     if not len(truth):
         return None
     since_ns = truth.stamps_ns - truth.stamps_ns[0]
-    block_s = BLOCK_S * max(1, math.ceil(float(since_ns[-1]) * 1e-9 / (BLOCK_S * most)))
+    block_s = BLOCK_S * max(1, math.ceil(float(since_ns[-1]) * 1e-9 / (BLOCK_S * _MOST_BLOCKS)))
     step_s = median_step_ns(truth.stamps_ns) * 1e-9
     columns = _summands(requirement, tracks, truth, drive)
     used = np.isfinite(columns).all(axis=0) & drive.masks[requirement.segment]
@@ -125,7 +122,6 @@ def _blocks(
     values = [_rounded(np.sqrt(s / counts) if root else s / counts) for s in scored]
     return RequirementBlocks(
         requirement.measured,
-        name,
         block_s,
         numbers.tolist(),
         [int(c) for c in counts],

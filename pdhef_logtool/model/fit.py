@@ -136,8 +136,6 @@ def fit_car(driving: Driving, vehicle_file: VehicleParameters, earlier: Sequence
         reached_friction=reached,
         seconds=driving.seconds,
         level_m_s2=level_of(driving),
-        rms=rms,
-        file_rms=fit.rms(_file_values(vehicle_file)),
     )
 
 

@@ -118,7 +118,6 @@ class TimeFigure(Figure):
     series: Sequence[Series]
     bands: Sequence[Band] = ()
     marks: Sequence[Mark] = ()
-    log: bool = False
     level: float | None = None
     resolution: float = 0.0
     height: int = 190

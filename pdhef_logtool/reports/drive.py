@@ -11,11 +11,11 @@ from pdhef_logtool.evaluation.units import AY_NOTE
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.reports.drive_figures import Roles, drive_figures
-from pdhef_logtool.reports.drive_tables import by_segment, consistency, definitions, disagreements, residuals, scores
+from pdhef_logtool.reports.drive_tables import by_segment, definitions, disagreements, scores, whole_figures
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
-from pdhef_logtool.results.run_report import reasons_line
+from pdhef_logtool.results.sink import TRUTH
 
 #: The best filter with physics only, and the baseline, whose errors would hide all others in a figure.
 _PHYSICS, _ZERO = "physics", "zero"
@@ -53,7 +53,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         except OutputError as error:
             wrong = f"the figures cannot be drawn: {error}"
     charts = Charts() if figures is None else figures.charts
-    texts = (report.get("answer") or {}).get("texts") or {}
+    texts, names = (report.get("answer") or {}).get("texts") or {}, () if roles is None else roles.names
     html = render(
         "drive.html",
         charts,
@@ -67,18 +67,15 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         drawn=figures,
         path=path,
         wrong=wrong,
-        reasons_line=reasons_line,
         scores=[] if roles is None else scores(report, roles),
         segments=[] if roles is None else by_segment(report, roles),
-        consistency=consistency(report, roles),
-        residuals=residuals(report),
+        consistency=whole_figures(report, names, manoeuvres=False),
+        key_figures=whole_figures(report, (TRUTH, *names), manoeuvres=True),
         apart={} if roles is None else disagreements(report, roles),
         definitions=definitions(report),
         checks=sorted(report.get("checks") or (), key=lambda c: ("failed", "undecided", "passed").index(c["verdict"])),
         losses=(report.get("losses") or ())[:_MOST_ROWS],
-        samples=[s for s in report["ledger"]["samples"] if s["dropped"]][:_MOST_ROWS],
-        faults=report.get("faults"),
-        metadata=report.get("metadata") or {},
+        samples=report["ledger"]["samples"][:_MOST_ROWS],
         ay_note=AY_NOTE,
         over_time=OVER_TIME,
         in_plane=IN_PLANE,

@@ -135,7 +135,7 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles) -> DriveF
     rows = _rows(report, series, roles, stamps, origin_ns)
     charts.figures["strip"] = StripFigure("Faults, gaps and segments", rows)
     if TRUTH in series:
-        _add_path(charts, series, roles)
+        _add_path(charts, series, roles, _axes(report))
     clouds = [_cloud(series[n], origin_ns) for n in (TRUTH, roles.main) if n in series]
     if drawn := [cloud for cloud in clouds if cloud is not None]:
         charts.figures["ay_sideslip"] = PointsFigure("|a_y| and sideslip", "|a_y| in m/s²", "sideslip in °", drawn)
@@ -271,8 +271,16 @@ def _add_worst(
     charts.figures["worst"] = PointsFigure(title, "s from the log's start", "sideslip in °", clouds)
 
 
-def _add_path(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
-    """Add the dead-reckoned path, aligned with the ground truth's."""
+def _axes(report: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the names of the axes of the drawn ground truth: of the Earth, of the log, or of the start."""
+    named = {s["name"] for s in report["ledger"]["samples"] if s["role"] == "truth"}
+    if not {"position_m", "yaw_rad"} <= {*report["truth"]["quantities"]}:
+        return "m, along the heading at the start", "m, to its left"
+    return ("x of the log in m", "y of the log in m") if {"x_m", "y_m"} <= named else ("m east", "m north")
+
+
+def _add_path(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles, axes: tuple[str, str]) -> None:
+    """Add the dead-reckoned path, aligned with the ground truth's at the start."""
     truth, estimate = (thinned(series[n].path, _MOST_POINTS) for n in (TRUTH, roles.main))
     if truth.shape[1] < 2 or max(np.ptp(truth[1]), np.ptp(truth[2])) < _LEAST_PATH_M:
         return
@@ -280,10 +288,10 @@ def _add_path(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -
     clouds = [Cloud(TRUTH, colour(TRUTH), truth[1], truth[2], _seconds(truth[0], charts), line=True)]
     title = "Path of the ground truth"
     if len(common) > 1:
-        title = "Path, aligned with the ground truth"
+        title = "Path, aligned with the ground truth at the start"
         aligned = aligned_path(estimate[1:, at_own], truth[1:, at_truth])
         clouds += _by_error(aligned, common, series[roles.main], charts)
-    charts.figures["path"] = PointsFigure(title, "m east", "m north", clouds, equal=True)
+    charts.figures["path"] = PointsFigure(title, *axes, clouds, equal=True)
 
 
 def _by_error(aligned: FloatArray, at_ns: FloatArray, estimate: DriveSeries, charts: Charts) -> list[Cloud]:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
 
-from pdhef_logtool.evaluation.metrics.independence import NOT_INDEPENDENT
+from pdhef_logtool.evaluation.metrics.handling import responses
+from pdhef_logtool.evaluation.metrics.metric import Metric
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.units import LABELS, SCORED_SIGNALS, SIGNALS, read_unit
 from pdhef_logtool.reports.drive_figures import Roles
 
 _Table = dict[str, Any]
-#: NIS and its degrees of freedom, which tables show as a ratio.
-_RATIO = ("nis", "nis_dof")
+_BySignal: TypeAlias = dict[str, dict[str, dict[str, Mapping[str, Any]]]]
 
 
 def scores(report: Mapping[str, Any], roles: Roles) -> list[_Table]:
@@ -22,11 +22,7 @@ def scores(report: Mapping[str, Any], roles: Roles) -> list[_Table]:
     for signal in [s for s in LABELS if s in SCORED_SIGNALS]:
         figures = by_signal.get(signal, {})
         order = [n for n in roles.names if "rmse" in figures.get(n, {})]
-        shown = [
-            m
-            for m in registered().values()
-            if m.of_truth and m.name != NOT_INDEPENDENT and any(m.name in figures[n] for n in order)
-        ]
+        shown = [m for m in registered().values() if m.of_truth and any(m.name in figures[n] for n in order)]
         rows = [
             {"name": n, "causal": causal[n], "values": [_read(figures[n], m.name) for m in shown]}
             | {"n": figures[n]["rmse"]["n"]}
@@ -54,36 +50,29 @@ def by_segment(report: Mapping[str, Any], roles: Roles) -> list[_Table]:
     return sorted(tables.values(), key=lambda row: (row["segment"] != "all", row["segment"]))
 
 
-def consistency(report: Mapping[str, Any], roles: Roles | None) -> _Table | None:
-    """Return the figures of whole estimators: heads, and rows of a name and its values; None without any."""
-    names, by_signal = () if roles is None else roles.names, _by_signal(report)
-    shown = [
-        (signal, m)
-        for m in registered().values()
-        for signal in SIGNALS
-        if not m.of_truth and m.name not in _RATIO
-        if any(_read(by_signal.get(signal, {}).get(name, {}), m.name) is not None for name in names)
+def whole_figures(report: Mapping[str, Any], names: Sequence[str], *, manoeuvres: bool) -> _Table | None:
+    """Return metrics that need no ground truth, of manoeuvres or the others, NIS per degree of freedom.
+
+    A table has heads, and rows of a name and its values; None without any value.
+    """
+    by_signal = _by_signal(report)
+
+    def value(name: str, signal: str, metric: Metric) -> float | None:
+        rows = by_signal.get(signal, {}).get(name, {})
+        figure, over = _read(rows, metric.name), _read(rows, "nis_dof") if metric.name == "nis" else 1.0
+        return figure / over if figure is not None and over else None
+
+    wanted = [m for m in registered().values() if (m.columns is responses) == manoeuvres]
+    wanted = [m for m in wanted if not m.of_truth and m.name != "nis_dof"]
+    columns = {(signal, m): [value(name, signal, m) for name in names] for m in wanted for signal in SIGNALS}
+    shown = {key: values for key, values in columns.items() if any(v is not None for v in values)}
+    heads = [f"{LABELS[s]}: {m.head(s)}" if len(m.brief) > 1 else m.head(s) for s, m in shown]
+    rows = [
+        (name, values)
+        for name, *values in zip(names, *shown.values(), strict=True)
+        if any(v is not None for v in values)
     ]
-    rows = []
-    for name in names:
-        nis, dof = (_read(by_signal.get("state", {}).get(name, {}), metric) for metric in _RATIO)
-        ratio = nis / dof if nis is not None and dof else None
-        values = [ratio, *(_read(by_signal[signal].get(name, {}), m.name) for signal, m in shown)]
-        if any(value is not None for value in values):
-            rows.append((name, values))
-    heads = ["NIS per degree of freedom", *(m.head(signal) for signal, m in shown)]
     return {"heads": heads, "rows": rows} if rows else None
-
-
-def residuals(report: Mapping[str, Any]) -> list[_Table]:
-    """Return the residuals of the sensors."""
-    rows = {signal: of.get("sensors", {}) for signal, of in _by_signal(report).items()}
-    return [
-        {"signal": LABELS[signal], "rms": of["residual_rms"]["value"], "unit": of["residual_rms"]["unit"]}
-        | {"bias": of.get("residual_bias", {}).get("value")}
-        for signal, of in rows.items()
-        if "residual_rms" in of
-    ]
 
 
 def disagreements(report: Mapping[str, Any], roles: Roles) -> dict[str, float]:
@@ -96,9 +85,9 @@ def disagreements(report: Mapping[str, Any], roles: Roles) -> dict[str, float]:
     return {name: float(value) for name, value in values.items() if value is not None}
 
 
-def _by_signal(report: Mapping[str, Any]) -> dict[str, dict[str, dict[str, Mapping[str, Any]]]]:
+def _by_signal(report: Mapping[str, Any]) -> _BySignal:
     """Return the rows of the whole drive by signal, estimator and metric."""
-    rows: dict[str, dict[str, dict[str, Mapping[str, Any]]]] = {}
+    rows: _BySignal = {}
     for m in report["metrics"]:
         if m["segment"] == "all":
             rows.setdefault(m["signal"], {}).setdefault(m["estimator"], {})[m["metric"]] = m

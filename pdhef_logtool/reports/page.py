@@ -28,6 +28,7 @@ from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.version import __version__
 from pdhef_logtool.reports.charts import Charts
+from pdhef_logtool.results.selected_estimate import assumptions_of, failed_checks, result_of
 
 _HERE = Path(__file__).parent
 #: Scripts in order: before.js sets the drawing resolution for uPlot.
@@ -82,12 +83,15 @@ def _environment() -> Environment:
         finalize=_printed,
     )
     made.filters |= {
+        "result_of": result_of,
+        "assumptions_of": assumptions_of,
+        "failed_checks": failed_checks,
         "number": number,
         "duration": duration,
         "joint_notes": lambda plan: joint_notes({str(r["id"]): r.get("notes") or () for r in plan["requirements"]}),
         "reason": _reason,
         "shown": shown,
-        "minute": lambda stamp_ns: f"{stamp(stamp_ns)[:16].replace('T', ' ')} UTC",
+        "minute": lambda stamp_ns: f"{stamp(stamp_ns)[:16].replace('T', ' ')} UTC" if is_dated(stamp_ns) else "",
         "range": _range,
         "signal": _signal,
         "topic_of": lambda source: str(source).partition(".")[0],
@@ -204,9 +208,16 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60.0:.1f} min" if hours < 2.0 else f"{hours:.1f} h" if hours < 100.0 else f"{hours:.0f} h"
 
 
+def is_dated(stamp_ns: int) -> bool:
+    """Return whether a stamp is a date: times that count from the start of a log are of the first days of 1970."""
+    return int(stamp_ns) >= 365 * 86_400 * 10**9
+
+
 def stamp(stamp_ns: int) -> str:
-    """Return a stamp in nanoseconds as RFC 3339 in UTC, exact; out of the range of dates as a number."""
+    """Return a stamp in nanoseconds as RFC 3339 in UTC, exact; without a date or out of their range as a number."""
     whole, rest = divmod(int(stamp_ns), 1_000_000_000)
+    if not is_dated(stamp_ns):
+        return f"{whole}.{rest:09d} s"
     try:
         moment = dt.datetime.fromtimestamp(whole, dt.UTC)
     except (OverflowError, ValueError, OSError):

@@ -17,10 +17,12 @@ from typing import Any
 
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.printable import listed
 from pdhef_logtool.reports.charts import Charts, TimeFigure
 from pdhef_logtool.reports.drive import drive_page
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
+from pdhef_logtool.results.selected_estimate import assumptions_of, failed_checks
 from pdhef_logtool.storage.files import write_bytes
 
 PDF_FILE = "report.pdf"
@@ -117,10 +119,22 @@ def pdf_page(run: OpenedRun, *, positions: bool = False) -> bytes:
         run=document,
         seconds=seconds,
         steps=next_steps(plan),
+        answer=reports[0][1] if len(reports) == 1 else None,
+        told=_told([(log.label, report) for log, report in reports if report is not None]),
         sections=[_section(log, report, charts, positions=positions) for log, report in ranked],
         left_out=len(reports) - len(ranked),
         positions=positions,
     )
+
+
+def _told(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, str]:
+    """Return failed checks, then assumptions, of drives with the drives that have them, empty for all drives."""
+    labels: dict[str, list[str]] = {}
+    for label, report in reports:
+        for text in (*failed_checks(report), *assumptions_of(report)):
+            labels.setdefault(text, []).append(label)
+    ranked = sorted(labels.items(), key=lambda of: (not of[0].startswith(("FAILED", "waived")), -len(of[1])))
+    return {text: "" if len(of) == len(reports) else listed(of) for text, of in ranked}
 
 
 def _report(log: OpenedLog) -> dict[str, Any] | None:
@@ -136,12 +150,9 @@ def _gravity(report: Mapping[str, Any] | None) -> tuple[int, float]:
     if report is None:
         return (1, 0.0)
     fails = sum(r["outcome"] == "FAIL" for r in (report.get("plan") or {}).get("requirements") or ())
-    main = (report.get("answer") or {}).get("main")
-    wanted = (main, "sideslip_rad", "all", "rmse")
-    errors = [
-        m["value"] for m in report["metrics"] if (m["estimator"], m["signal"], m["segment"], m["metric"]) == wanted
-    ]
-    return (-fails, -(errors[0] or 0.0) if errors else 0.0)
+    wanted = ((report.get("answer") or {}).get("main"), "sideslip_rad", "all", "rmse")
+    figures = {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
+    return -fails, -(figures.get(wanted) or 0.0)
 
 
 def _section(log: OpenedLog, report: Mapping[str, Any] | None, charts: Charts, *, positions: bool) -> DriveSection:

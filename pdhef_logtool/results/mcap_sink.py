@@ -207,7 +207,7 @@ class AnnotatedMcap:
                     self._writer.metadata(record.name, record.metadata)
         self._writer.metadata(METRICS_RECORD, metrics_record(report))
         end_ns = int(report["log"]["end_ns"])
-        text = json.dumps(jsonable(_attached(report)), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        text = json.dumps(jsonable(report), sort_keys=True, separators=(",", ":"), allow_nan=False)
         self._writer.attachment(Attachment(end_ns, end_ns, REPORT_ATTACHMENT, "application/json", text.encode()))
         self._writer.close()
 
@@ -286,14 +286,6 @@ def metrics_record(report: Mapping[str, Any]) -> dict[str, str]:
         value = "null" if m["value"] is None else f"{float(m['value']):.9g}"
         record[f"{m['estimator']}/{m['signal']}/{m['segment']}/{m['metric']}"] = f"{value} {m['unit']} n={m['n']}"
     return record
-
-
-def _attached(report: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the report with the figures of the selected estimate over the drive: the metrics record has them all."""
-    selected = report.get("selected_estimate")
-    if selected is None:
-        return report
-    return {**report, "metrics": [m for m in report["metrics"] if (m["estimator"], m["segment"]) == (selected, "all")]}
 
 
 def _is_our_report(attachment: Attachment) -> bool:

@@ -57,13 +57,14 @@ def _cars(pairs: Sequence[Pair], key: str, *, named: bool) -> Counter[tuple[str,
     return Counter((text(left), text(right)) for left, right in cars if left.get(key) != right.get(key))
 
 
-def _example(pair: Pair, part: str, key: str) -> str:
-    """Return how the first changed source of a pair changed, empty where the reports do not state."""
+def _example(pair: Pair, role: str) -> str:
+    """Return the first source that differs between the reports of a pair, empty where they do not state it."""
     try:
         reports = pair.a.report(), pair.b.report()
     except OutputError as error:
         return f"; {error}"
-    left, right = ({s["name"]: s["source"] for s in (r or {}).get(part, {}).get(key, ())} for r in reports)
+    sources = ((r or {}).get("ledger", {}).get("samples", ()) for r in reports)
+    left, right = ({s["name"]: s["source"] for s in of if s["role"] == role} for of in sources)
     changed = (name for name in sorted({*left, *right}) if left.get(name) != right.get(name) and None not in reports)
     texts = (f"; {pair.a.label}: {n} of {left.get(n, 'nothing')} → {right.get(n, 'nothing')}" for n in changed)
     return next(texts, "")

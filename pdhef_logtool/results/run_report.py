@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Any
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.compiled.sources import compiled_digest
 from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.results.selected_estimate import TEMPLATES, MainFacts, answer_of
+from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.storage.documents import jsonable, seal
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.templates import template
@@ -23,12 +25,13 @@ from pdhef_logtool.storage.templates import template
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 #: Columns of a figure in the report.
-_METRIC_COLUMNS = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
-#: Entries that a brief report keeps of a list.
-_MOST_LISTED = 5
+_METRIC_COLUMNS = ("estimator", "signal", "segment", "metric", "value", "unit", "n")
+#: Figures of a drive without ground truth.
+_BY_REFERENCE = ("reference_rms", "reference_std", "disagreement_rms")
 #: Distributions that affect the results of a run; their versions are recorded.
 VERSIONED = ("pdhef-logtool", "mcap", "numba", "numpy", "polars", "pyarrow", "rerun-sdk", "rosbags", "scipy", "torch")
 
@@ -90,9 +93,9 @@ def estimator_entry(name: str, *, causal: bool, outcome: str = "ran", **stated: 
     """Return the entry of an estimator in a report.
 
     ``stated``: ``reason`` if it was skipped or failed, ``notes`` on itself, ``intervals`` (origin of its 95 %
-    intervals), ``reasons`` why it did not use its sensors as usual (None: it does not monitor them), ``algorithm``.
+    intervals), ``algorithm``.
     """
-    unstated = {"reason": None, "algorithm": None, "notes": (), "intervals": (), "reasons": None}
+    unstated = {"reason": None, "algorithm": None, "notes": (), "intervals": ()}
     return {"name": name, "causal": causal, "outcome": outcome, **unstated, **stated}
 
 
@@ -101,64 +104,30 @@ def build_report(content: Mapping[str, Any], main: MainFacts | None = None) -> d
 
     Parameters
     ----------
-    content : entries of the document as records or JSON-able values, ``metrics`` as rows of metrics.parquet.
+    content : entries of the document as records or JSON-able values, ``metrics`` as rows of metrics.parquet, which
+        are selected here.
     main : the selected estimate, None without one.
     """
-    metrics = [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in content["metrics"]]
+    rows = [m for m in content["metrics"] if _is_shown(m, main)]
+    metrics = [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in rows]
     entries = {"format": "pdhef.report", "version": 1, **content, "metrics": metrics}
     document = {key: jsonable(value) for key, value in entries.items()}
-    if main is None:
-        return document | {"selected_estimate": None, "answer": None}
-    return document | {"selected_estimate": main.name, "answer": answer_of(document, main)}
+    return document | {"answer": None if main is None else answer_of(document, main)}
 
 
-def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a report of a few kB, of many drives: figures that tables show, and no list that grows with the log.
+def _is_shown(metric: MetricRow, main: MainFacts | None) -> bool:
+    """Whether the document has a figure: of the whole drive those that people read, of segments the RMSE of sideslip.
 
-    All figures are in metrics.parquet. Of topics those that were mapped stay, of algorithms all but the noise, of
-    segments the sideslip answer's own, and of the rest the first :data:`_MOST_LISTED`; the verdicts are in run.json.
+    Estimators that are not displayed with ``main``, the selected estimate, have their RMSE of sideslip alone. Two
+    estimates are compared only with it.
     """
-    answer = report["answer"]
-    names = {answer["main"], answer["naive"], PHYSICS} if answer else set()
-    first = {key: report[key][:_MOST_LISTED] for key in ("losses", "warnings", "remarks")}
-    if space := report.get("operating_space"):
-        first["operating_space"] = {**space, "cells": [*map(_rounded, space["cells"])]}
-    return {
-        **{key: value for key, value in report.items() if key != "plan"},
-        **first,
-        "log": {**report["log"], "topics": [t for t in report["log"]["topics"] if t["mapped"]]},
-        "estimators": [_brief_estimator(e, names) for e in report["estimators"]],
-        "metrics": [m for m in report["metrics"] if m["estimator"] in names and _is_shown(m, answer["main"])],
-        "segments": [s for s in report["segments"] if s["name"] in {f"{n} diverged" for n in names}][:_MOST_LISTED],
-        "ledger": {
-            "samples": _with_drops(report),
-        },
-        "checks": [c for c in report["checks"] if c["verdict"] != "passed"],
-    }
-
-
-def _brief_estimator(estimator: Mapping[str, Any], names: Container[str | None]) -> dict[str, Any]:
-    algorithm, is_shown = estimator["algorithm"], estimator["name"] in names
-    digest = None if algorithm is None else {k: v for k, v in algorithm.items() if k != "noise"}
-    kept = estimator["notes"] if is_shown else []
-    return {**estimator, "algorithm": digest, "notes": kept, "reasons": estimator["reasons"] if is_shown else None}
-
-
-def _is_shown(metric: Mapping[str, Any], main: str) -> bool:
-    """Whether a brief report keeps a figure: sideslip errors, all errors of the selected estimate, consistency, NIS."""
-    signal, name = metric["signal"], metric["metric"]
-    if metric["segment"] != "all":
-        return signal == "sideslip_rad" and name == "rmse" and metric["segment"] in ("linear", "nonlinear")
-    of_main = name == "rmse" and metric["estimator"] == main
-    return of_main or (name in registered() and signal in registered()[name].brief)
-
-
-def _rounded(cell: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: float(f"{v:.6g}") if isinstance(v, float) else v for k, v in cell.items()}
-
-
-def _with_drops(report: Mapping[str, Any]) -> list[Any]:
-    return [s for s in report["ledger"]["samples"] if s["dropped"]][:_MOST_LISTED]
+    is_error = (metric.signal, metric.metric) == ("sideslip_rad", "rmse")
+    if main is not None and metric.estimator not in (*main.shown, PHYSICS, TRUTH):
+        pair = metric.estimator.split("~")
+        return metric.segment == "all" and (is_error or (main.name in pair and metric.metric == "disagreement_rms"))
+    entry = registered().get(metric.metric)
+    is_read = metric.metric in _BY_REFERENCE or (entry and metric.signal in (*entry.terminal, *entry.brief))
+    return is_error or (metric.segment == "all" and bool(is_read))
 
 
 def build_run(
@@ -198,24 +167,20 @@ def _run_entry(outcome: LogOutcome) -> dict[str, Any]:
     return {key: value for key, value in entry.items() if key not in ("failed", "lost")}
 
 
-def json_bytes(document: Mapping[str, Any], *, brief: bool = False) -> bytes:
-    """Return the document as indented UTF-8 JSON with sorted keys and a final line feed; NaN is null.
-
-    ``brief``: without indentation.
-    """
-    layout: dict[str, Any] = {"separators": (",", ":")} if brief else {"indent": 2}
-    text = json.dumps(jsonable(document), sort_keys=True, ensure_ascii=False, allow_nan=False, **layout)
+def json_bytes(document: Mapping[str, Any]) -> bytes:
+    """Return the document as indented UTF-8 JSON with sorted keys and a final line feed; NaN is null."""
+    text = json.dumps(jsonable(document), sort_keys=True, ensure_ascii=False, allow_nan=False, indent=1)
     return (text + "\n").encode()
 
 
-def write_json(path: Path, document: Mapping[str, Any], *, brief: bool = False) -> None:
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write a document through a temporary name (see :func:`json_bytes`); raises OutputError."""
-    write_bytes(path, json_bytes(document, brief=brief))
+    write_bytes(path, json_bytes(document))
 
 
 def report_markdown(report: Mapping[str, Any]) -> str:
     """Return the document of :func:`build_report` in a few words, as Markdown for viewers; the page has the figures."""
-    context = {"diverged_line": diverged_line, "reasons_line": reasons_line}
+    context = {"diverged_line": diverged_line, "faults_line": faults_line}
     return template(TEMPLATES / "report.md", **context).render(report=report)
 
 
@@ -230,28 +195,23 @@ def diverged_line(report: Mapping[str, Any], name: str) -> str:
     return f"diverged for {seconds:.2f} s{often}, first at {first:.2f} s"
 
 
-#: A shorter interval is shown as one time.
-_SHORT_S = 0.1
-#: Share of the stamps inside the intervals from which on a reason counts as holding throughout.
-_THROUGHOUT = 0.9
+#: A shorter interval is shown as one time, and so many intervals of a fault are shown.
+_SHORT_S, _MOST_INTERVALS = 0.1, 3
 
 
-def reasons_line(estimator: Mapping[str, Any], start_ns: int) -> str:
-    """Return why an estimator of a report did not use its sensors as usual, and when; empty without a reason.
+def faults_line(report: Mapping[str, Any]) -> str:
+    """Return the faults and changes of the sensors, and when; empty without any.
 
-    ``a_y spike 1.20 s, 3.45 s, 7.00 s and 9 more; gyro stuck 12.3-16.3 s``: in order of time, the longest intervals.
+    ``a_y spike 1.20 s, 3.45 s, 7.00 s and 9 more; yaw rate stuck 12.3-16.3 s``.
     """
-    reasons = sorted(estimator.get("reasons") or (), key=lambda r: r["first_ns"])
-    return "; ".join(_reason_text(r, start_ns) for r in reasons)
 
-
-def _reason_text(reason: Mapping[str, Any], start_ns: int) -> str:
     def when(interval: Mapping[str, Any]) -> str:
-        start_s, end_s = ((interval[key] - start_ns) * 1e-9 for key in ("start_ns", "end_ns"))
+        start_s, end_s = ((interval[key] - report["log"]["start_ns"]) * 1e-9 for key in ("start_ns", "end_ns"))
         return f"{start_s:.2f} s" if end_s - start_s < _SHORT_S else f"{start_s:.1f}-{end_s:.1f} s"
 
-    more = reason["intervals"] - len(reason["longest"])
-    text = f"{reason['text']} {', '.join(map(when, reason['longest']))}" + (f" and {more} more" if more else "")
-    # A sensor at a lower rate than the stamps, or single spikes, do not contain throughout.
-    within = reason["share_within"]
-    return text if within > _THROUGHOUT else f"{text} ({within:.0%} of it)"
+    def text(fault: Mapping[str, Any]) -> str:
+        first = fault["intervals"][:_MOST_INTERVALS]
+        more = f" and {fault['count'] - len(first)} more" if fault["count"] > len(first) else ""
+        return f"{LABELS.get(fault['sensor'], fault['sensor'])} {fault['kind']} {', '.join(map(when, first))}{more}"
+
+    return "; ".join(map(text, report.get("faults") or ()))

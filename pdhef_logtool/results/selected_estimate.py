@@ -6,10 +6,10 @@ The report's document is the only source, so that terminal, report.json, Markdow
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -49,14 +49,13 @@ class MainFacts:
 
     Attributes
     ----------
-    name : of it. chosen_by : evidence of the car's driving, consistency, or estimator order. why : in words.
+    name : of it. why : in words.
     distrusted : whether the lateral consistency contradicts the preferred one.
     naive : the estimator to beat, None if it did not run. shown : displayed tracks; all if the estimators were
         ``named``.
     """
 
     name: str
-    chosen_by: Literal["evidence", "d2", "order"]
     why: str
     distrusted: bool
     naive: str | None
@@ -75,19 +74,18 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
 
     words = _words()
     intervals = next((e["intervals"] for e in report["estimators"] if e["name"] == main.name), ())
-    interval, best = _interval(report), _best_in_hindsight(report, main, figures)
+    interval = _interval(report)
     texts = {
         "result": words.result(report, main, value, interval),
         "consistency": "" if report["truth"]["available"] else words.consistency(main, value),
         "band": words.band(main, intervals, value(main.name, "coverage95")),
-        "hindsight": words.hindsight(best, main),
+        "hindsight": words.hindsight(_best_in_hindsight(report, main, figures), main),
         "assumed": "; ".join(clauses(words.assumed(report, main))),
         "next": "; ".join(clauses(words.next(report, main, value))[:_MOST_STEPS]),
     }
     texts = {key: one_line(text) for key, text in texts.items()}
-    chosen = {"main" if key == "name" else key: value for key, value in asdict(main).items()}
-    shown = {"shown": list(main.shown), "sideslip_rmse_ci_rad": interval}
-    return {**chosen, **shown, "best_in_hindsight": best, "texts": texts}
+    chosen = {"main": main.name, "why": main.why, "named": main.named, "shown": list(main.shown)}
+    return {**chosen, "sideslip_rmse_ci_rad": interval, "texts": texts}
 
 
 def _interval(report: Report) -> list[float] | None:
@@ -122,6 +120,41 @@ def _words() -> Any:
     return template(TEMPLATES / "selected_estimate.txt", **limits, **shown).module
 
 
+def result_of(report: Report) -> str:
+    """Return the result of a document in a sentence: of the selected estimate, or of recorded estimates."""
+    if report["answer"] is not None:
+        return str(report["answer"]["texts"]["result"])
+    names = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
+    wanted = ("sideslip_rad", "all", "rmse")
+    errors = {
+        m["estimator"]: m["value"] for m in report["metrics"] if (m["signal"], m["segment"], m["metric"]) == wanted
+    }
+    scored = ", ".join(f"{name}: {degrees(errors[name])}" for name in names if errors.get(name) is not None)
+    if scored:
+        return f"sideslip RMSE of {scored} ({truth_of(report, 'sideslip_rad')})"
+    return f"sideslip of {', '.join(names)} is not scored" if names else "no estimate"
+
+
+def assumptions_of(report: Report) -> list[str]:
+    """Return what the result of a document assumes, in independent clauses."""
+    if report["answer"] is not None:
+        return [clause for clause in report["answer"]["texts"]["assumed"].split("; ") if clause]
+    vehicle = report["vehicle"]
+    car = "no car given: the ground truth is assumed to be measured at the centre of gravity"
+    slow = f"sideslip is scored above {vehicle['low_speed_blend_m_s']:g} m/s"
+    return [car if vehicle["file"] is None else f"car {vehicle['file']}", slow]
+
+
+def failed_checks(report: Report) -> list[str]:
+    """Return the failed checks of a document, waived ones too, with their findings and remedies."""
+    return [
+        f"{'waived' if c['waived'] else 'FAILED'}: {c['name']}: {c['evidence'].rstrip('.')}"
+        + (f". Remedy: {c['remedy']}" if c["remedy"] else "")
+        for c in report.get("checks") or ()
+        if c["verdict"] == "failed"
+    ]
+
+
 def degrees(value_rad: float) -> str:
     """Return an angle with as many digits as a person reads."""
     shown = value_rad * DEGREES
@@ -133,15 +166,10 @@ def is_worse(error: float | None, naive: float | None) -> bool:
     return error is not None and naive is not None and error > (1.0 + SAME) * naive
 
 
-def _error(figures: _Figures, name: str | None) -> float | None:
-    return None if name is None else figures.get((name, "sideslip_rad", "rmse"))
-
-
 def truth_of(report: Report, name: str) -> str:
     """Return the topics that a ground truth quantity comes from, as far as its derivation names them."""
-    by_name = {q["name"]: q for q in report["truth"]["quantities"]}
-    parts = [by_name[n] for n in (name, "vx_m_s", "vy_m_s") if n in by_name]
-    words = " ".join(f"{q['source']} {q['derivation']}" for q in parts).replace(",", " ").split()
+    sources = report["truth"]["quantities"]
+    words = " ".join(sources.get(n, "") for n in (name, "vx_m_s", "vy_m_s")).replace(",", " ").split()
     topics = dict.fromkeys(w.partition(".")[0] for w in words if w.startswith("/"))
     return f"ground truth: {' and '.join(topics)}" if topics else "ground truth"
 
@@ -149,7 +177,7 @@ def truth_of(report: Report, name: str) -> str:
 def _best_in_hindsight(report: Report, main: MainFacts, figures: _Figures) -> dict[str, Any] | None:
     """Return the estimator with the least error against ground truth, None without it; for display only."""
     ran = [e["name"] for e in report["estimators"] if e["outcome"] == "ran" and e["name"] != REFERENCE]
-    errors = {name: error for name in ran if (error := _error(figures, name)) is not None}
+    errors = {name: error for name in ran if (error := figures.get((name, "sideslip_rad", "rmse"))) is not None}
     if not errors:
         return None
     best = min(errors, key=lambda name: (errors[name], name != main.name))

@@ -25,7 +25,7 @@ from pdhef_logtool.results.opened_run import (
     REPORT_FILE,
 )
 from pdhef_logtool.results.palette import REFERENCE_COLOUR
-from pdhef_logtool.results.run_report import brief_report, build_run, tool_versions, write_json
+from pdhef_logtool.results.run_report import build_run, tool_versions, write_json
 from pdhef_logtool.results.sink import TRUTH, Event
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.run_result import LogResult
@@ -119,8 +119,8 @@ class DriveOutputs:
         drive.remarks.append(f"--no-position leaves out {names}attachments, metadata and file names")
         return topics
 
-    def write(self, report: dict[str, Any], rows: Sequence[MetricRow], events: Sequence[Event]) -> dict[str, Any]:
-        """Write all files but the annotated log; return the report as written."""
+    def write(self, report: dict[str, Any], rows: Sequence[MetricRow], events: Sequence[Event]) -> None:
+        """Write all files but the annotated log."""
         config, drive = self._run.config, self._run.drive
         colours = {REFERENCE: REFERENCE_COLOUR, **{s.name: s.colour for s in all_specs()}}
         if config.annotation != "none":
@@ -130,11 +130,9 @@ class DriveOutputs:
         head = f"Sensors and car of {drive.name}, for pdhef run --model."
         write_bytes(self._change.file(MODEL_FILE), self._run.model.file.toml(head).encode())
         if config.kept == "metrics":
-            report = brief_report(report)
-            write_json(self._change.file(REPORT_FILE), report, brief=True)
+            write_json(self._change.file(REPORT_FILE), report)
         else:
             write_tables(self._change, report, rows, self.tracks, self._main.name, self._causal_from_ns())
-        return report
 
     def _causal_from_ns(self) -> dict[str, int]:
         """Return the first stamp from which the rows of each causal estimator depend on past samples only."""

@@ -17,10 +17,9 @@ from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.evaluation.dependence import day_and_route
 from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.evaluation.reasons import Interval, SensorFault, sensor_faults
-from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.printable import printable
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
+from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.results.no_position import without_names
 from pdhef_logtool.results.run_report import LogOutcome, build_report, estimator_entry, run_versions
@@ -32,10 +31,9 @@ from pdhef_logtool.storage.documents import digest
 if TYPE_CHECKING:
     from pdhef_logtool.results.selected_estimate import MainFacts
 
-#: Units of ground truth quantities without a channel of the same name.
-_DERIVED_UNITS = {"position_m": "m"}
 #: Entries of a log's metadata that a report keeps, and signs of each.
 _MOST_METADATA, _MOST_SIGNS = 64, 200
+_OF_CHECK = ("name", "verdict", "evidence", "remedy", "waived")
 
 
 def report_drive(
@@ -53,7 +51,7 @@ def report_drive(
     slow = run.car.vehicle.low_speed_blend_m_s
     content = drive_entries(drive, run.car, losses) | judged
     content |= {
-        "estimators": [*_estimator_entries(run, scored)],
+        "estimators": [*_estimator_entries(run)],
         "metrics": scored.rows,
         "segments": scored.events,
         "friction": run.model.friction.to_dict(),
@@ -68,7 +66,7 @@ def report_drive(
     return without_names(report, drive.path, drive.name) if config.no_position else report
 
 
-def _estimator_entries(run: PreparedDrive, scored: Evaluation) -> Iterator[dict[str, Any]]:
+def _estimator_entries(run: PreparedDrive) -> Iterator[dict[str, Any]]:
     """Yield the entries of the estimators that ran, failed or were skipped."""
     not_causal = run.drive.not_causal
     for e in run.estimators:
@@ -78,8 +76,7 @@ def _estimator_entries(run: PreparedDrive, scored: Evaluation) -> Iterator[dict[
             causal=e.causal and not not_causal,
             notes=(*notes_of(e), *filter(None, [calibration and calibration.note, not_causal])),
             intervals=run.intervals.notes(e.name),
-            reasons=scored.reasons[e.name],
-            algorithm={"sha256": algorithm.sha256, **algorithm.model_dump(mode="json")},
+            algorithm={"sha256": algorithm.sha256, **algorithm.model_dump(mode="json", exclude={"noise", "use_speed"})},
         )
     for name, reason in run.failed.items():
         yield estimator_entry(name, causal=False, outcome="failed", reason=reason)
@@ -115,32 +112,28 @@ def drive_entries(
     drive: Drive,
     car: Car,
     losses: Sequence[Loss],
-    samples: dict[str, int] | None = None,
     ledger: Sequence[SampleCount] | None = None,
 ) -> dict[str, Any]:
     """Return the entries of report.json that do not depend on an estimate.
 
     Parameters
     ----------
-    car : as calibrated on the drive. samples : messages by source; ledger : of all samples; None: of the drive.
+    car : as calibrated on the drive. ledger : of all samples; None: of the drive.
     """
     plan = drive.plan
-    samples = drive.samples if samples is None else samples
-    sources = [_source(n, s.label, SIGNAL_UNITS[n], samples) for n, s in plan.mapping.signals.items()]
     return {
         "log": _log(drive),
-        "mapping": {"signals": sources, "missing": drive.missing},
+        "mapping": {"missing": drive.missing},
         "vehicle": {
             "name": car.vehicle.name,
             "sha256": car.physics_sha256,
             "file": car.file_name,
             "proven": car.has_evidence,
             "taught": (car.model and car.model.truth) or None,
-            "sensors": car.vehicle.sensors.model_dump(),
-            "assumed": drive.car.assumed,
+            "assumed": {entry.entry: entry.value for entry in drive.car.assumed},
             "low_speed_blend_m_s": car.vehicle.low_speed_blend_m_s,
         },
-        "truth": _truth(plan, samples),
+        "truth": _truth(plan),
         "model": {
             "source": "log" if drive.earlier is None else "file",
             "decided_s": plan.decided_s,
@@ -153,51 +146,34 @@ def drive_entries(
         "ledger": {"samples": drive.sample_ledger if ledger is None else ledger},
         "warnings": drive.notes,
         "remarks": drive.remarks,
-        "checks": drive.checks,
+        "checks": [{k: getattr(c, k) for k in _OF_CHECK} for c in drive.checks],
         "versions": run_versions(),
     }
 
 
 def _log(drive: Drive) -> dict[str, Any]:
-    plan, mapped = drive.plan, set(drive.plan.mapping.topics)
-    topics = [
-        {"name": t.name, "type": t.type_name, "encoding": t.encoding, "messages": t.messages} for t in drive.log.topics
-    ]
+    plan = drive.plan
     return {
         "name": drive.name,
         "file": PurePath(drive.file).name,
         "kind": drive.log.kind,
         "sha256": drive.sha256,
-        "signals_sha256": drive.signals_sha256,
-        "truth_sha256": drive.truth_sha256,
         "start_ns": plan.start_ns,
         "end_ns": plan.end_ns,
         "duration_s": (plan.end_ns - plan.start_ns) * 1e-9,
-        "topics": [{**topic, "mapped": topic["name"] in mapped} for topic in topics],
     }
 
 
-def _source(name: str, source: str, unit: str, samples: dict[str, int], derivation: str = "") -> dict[str, Any]:
-    count = samples.get(source, 0)
-    return {"name": name, "source": source, "unit": unit, "samples": count, "derivation": derivation}
-
-
-def _truth(plan: DrivePlan, samples: dict[str, int]) -> dict[str, Any]:
+def _truth(plan: DrivePlan) -> dict[str, Any]:
+    sources = plan.mapping.truth
     derivation = {name: how for name, how in plan.derivation.items() if name != "cg"}
     return {
         "available": bool(derivation),
-        "quantities": [_truth_quantity(name, how, plan.mapping, samples) for name, how in derivation.items()],
+        "quantities": {n: sources[n].label if n in sources and not how else how for n, how in derivation.items()},
         "latency_s": None if plan.latency is None else plan.truth_latency_s,
         "not_independent": sorted(plan.dependent),
         "notes": _truth_notes(plan),
     }
-
-
-def _truth_quantity(name: str, how: str, mapping: Mapping, samples: dict[str, int]) -> dict[str, Any]:
-    source = mapping.truth.get(name)
-    if source is None:
-        return _source(name, "derived", _DERIVED_UNITS.get(name) or TRUTH_UNITS[name], {}, how)
-    return _source(name, source.label, TRUTH_UNITS[name], samples, "" if how == source.label else how)
 
 
 def _truth_notes(plan: DrivePlan) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,13 +30,12 @@ class RecordedEstimate:
     """A recorded estimate on its own stamps.
 
     ``channels`` are its quantities on their own stamps, NaN left out; ``claimed`` are the names of all that the
-    estimate consists of; ``samples`` counts the messages by source.
+    estimate consists of.
     """
 
     track: StateTrack
     channels: Mapping[str, Channel]
     claimed: frozenset[str]
-    samples: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
 
@@ -87,8 +86,7 @@ def read_estimate(
     _check_has_numbers(log, mapping, channels)
     track, notes = _track(source.name, channels[base].stamps_ns, channels, covariance)
     finite = {n: _without_nan(c) for n, c in channels.items() if n in BASE_ORDER}
-    samples = {s.label: len(channels[n]) for n, s in mapping.signals.items()}
-    return RecordedEstimate(track, finite, frozenset(channels), samples, notes), losses
+    return RecordedEstimate(track, finite, frozenset(channels), notes), losses
 
 
 def _check_has_numbers(log: DriveLog, mapping: SignalMapping, channels: Mapping[str, Channel]) -> None:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from pdhef_logtool.evaluation.validation_plan import Requirement, ValidationPlan
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
-#: Blocks of a requirement in a brief report.
-BRIEF_BLOCKS = 12
+#: Entries of a verdict on one drive; run.json has all of the verdicts on the run.
+_TOLD = ("id", "label", "outcome", "reason", "next")
 
 
 def read_validation_plan(file: Path | None, junit: Path | None) -> ValidationPlan:
@@ -43,11 +43,11 @@ def read_validation_plan(file: Path | None, junit: Path | None) -> ValidationPla
 
 
 def drive_blocks(
-    requirements: Sequence[Requirement], main: str | None, drive: EvaluatedDrive, most: int
+    requirements: Sequence[Requirement], main: str | None, drive: EvaluatedDrive
 ) -> list[RequirementBlocks]:
     """Return the blocks of time of requirements, against the reference where ground truth does not score them.
 
-    ``main`` : the selected estimate, for requirements that name no estimator. ``most`` : blocks of a requirement.
+    ``main`` : the selected estimate, for requirements that name no estimator.
     """
     from pdhef_logtool.evaluation.requirement_blocks import ScoredDrive, requirement_blocks
 
@@ -57,7 +57,7 @@ def drive_blocks(
         if base is not None:
             scored = ScoredDrive(read, base, drive.masks, slow, dependent, estimated=base is not drive.truth)
             left = [r for r in requirements if all(b.of != r.measured for b in blocks)]
-            blocks += requirement_blocks(left, main, scored, most)
+            blocks += requirement_blocks(left, main, scored)
     return blocks
 
 
@@ -70,13 +70,15 @@ def judge_drive(
     space: OperatingSpace,
 ) -> dict[str, Any]:
     """Return the entries of report.json on one drive: verdicts of a plan file, blocks of time, operating space."""
-    entries = {"requirement_blocks": jsonable(blocks), "operating_space": jsonable(space)}
+    stated = [{k: v for k, v in jsonable(block).items() if v != []} for block in blocks]
+    entries = {"requirement_blocks": stated, "operating_space": jsonable(space)}
     if not plan.file:
         return {"plan": None, **entries}
     from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
 
     judged = JudgedDrive(drive.name, main, lambda: entries, {"car": drive.car.vehicle.name})
-    return {"plan": plan_verdicts(plan, figures_of_rows(rows), [judged]).to_dict(), **entries}
+    verdicts = plan_verdicts(plan, figures_of_rows(rows), [judged]).to_dict()["requirements"]
+    return {"plan": {"file": plan.file, "requirements": [{k: v[k] for k in _TOLD} for v in verdicts]}, **entries}
 
 
 def judge(

@@ -32,7 +32,6 @@ from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
 from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, EvaluatedDrive, evaluate_drive
 from pdhef_logtool.evaluation.operating_space import operating_space
-from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS
 from pdhef_logtool.evaluation.segments import segment_masks
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput
@@ -195,7 +194,7 @@ def _score_drive(
     rows, blocks = _score(log, plan)
     scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in log.recorded]))
     whole, seen = log.at(scored_ns)
-    report = build_report(_entries(log, plan, rows, blocks, whole, seen, sources))
+    report = build_report(_entries(log, plan, rows, blocks, whole, seen))
     folder, files = None, dict[str, str]()
     if outputs is not None:
         tracks = [*(r.track for r in log.recorded), *whole.tracks.values()]
@@ -223,7 +222,6 @@ def _entries(
     blocks: Sequence[RequirementBlocks],
     whole: EvaluatedDrive,
     seen: Signals,
-    sources: Sequence[EstimateSource],
 ) -> dict[str, Any]:
     """Judge the drive; return the content of report.json. ``whole``, ``seen`` : at the stamps of all estimates."""
     drive, estimates = log.drive, [r.track for r in log.recorded]
@@ -231,10 +229,7 @@ def _entries(
     space = operating_space(seen, whole.truth, alone, drive.car.vehicle)
     others = [*whole.tracks.values()]
     places = [] if alone is None else largest_errors(alone, whole.truth, others, whole.low_speed_m_s)
-    entries = drive_entries(drive, drive.car, log.losses, drive.samples | log.samples, log.ledger)
-    read = {s.topic for e in sources for s in e.signals.values()}
-    for topic in entries["log"]["topics"]:
-        topic["mapped"] |= topic["name"] in read
+    entries = drive_entries(drive, drive.car, log.losses, log.ledger)
     if log.truth is not None and drive.plan.latency is None:
         entries["truth"]["notes"].insert(0, "no gyro to measure the ground truth's latency with: taken as 0")
     entries |= judge_drive(plan, drive, None, rows, blocks, space)
@@ -248,7 +243,7 @@ def _entries(
 
 def _read(drive: Drive, sources: Sequence[EstimateSource], config: RunConfig, reporter: Reporter) -> _Recording:
     """Read estimates, ground truth and sensors; add to the plan which ground truth depends on an estimate."""
-    plan, samples, losses = drive.plan, dict[str, int](), list[Loss]()
+    plan, losses = drive.plan, list[Loss]()
     recorded, dependent = [], dict(plan.dependent)
     for source in sources:
         estimate, lost = read_estimate(drive.log, source, plan.start_ns, plan.end_ns)
@@ -256,7 +251,6 @@ def _read(drive: Drive, sources: Sequence[EstimateSource], config: RunConfig, re
             drive.tell(f"{source.name}: {note}")
         recorded.append(estimate)
         losses += lost
-        samples |= estimate.samples
         same = dependent_signals(estimate.channels, plan.survey_truth, role=f"estimate {source.name}'s")
         dependent |= {name: why for name, why in same.items() if name not in dependent}
     truth: TruthTrack | None = None
@@ -264,7 +258,6 @@ def _read(drive: Drive, sources: Sequence[EstimateSource], config: RunConfig, re
     if drive.mapping.truth:
         part = read_signals(drive.log, replace(plan.mapping, signals={}), plan.clocks, plan.start_ns, plan.end_ns)
         truth = _truth_of(part.truth, drive)
-        samples |= {c.source: len(c) for c in part.truth.values()}
         losses += part.losses
         ledger = sample_ledger(drive.log, plan, part.counts)
     reporter.progress(drive.name, 0.6)
@@ -274,7 +267,7 @@ def _read(drive: Drive, sources: Sequence[EstimateSource], config: RunConfig, re
     reference = _reference(drive, config, scored=truth is not None)
     every_loss = merge_losses([drive.losses, losses, damage(ledger)])
     every_sample = (*drive.sample_ledger, *ledger)
-    return _Recording(drive, recorded, truth, reference, signals, manoeuvres, every_loss, samples, every_sample)
+    return _Recording(drive, recorded, truth, reference, signals, manoeuvres, every_loss, every_sample)
 
 
 def _reference(drive: Drive, config: RunConfig, *, scored: bool) -> ReferenceEstimator | None:
@@ -309,7 +302,7 @@ def _score(log: _Recording, plan: ValidationPlan) -> tuple[list[MetricRow], list
         equal |= same
         scored = replace(scored, tracks={name: track, **scored.tracks}, dependent={**drive.plan.dependent, **same})
         asked = [q for q in plan.requirements if q.estimator in (name, None if alone else name)]
-        blocks += drive_blocks(asked, name if alone else None, scored, MOST_BLOCKS)
+        blocks += drive_blocks(asked, name if alone else None, scored)
         figures = [row for row in evaluate_drive(scored) if row.estimator == name]
         if not any(row.metric in ("rmse", "reference_rms") for row in figures):
             drive.tell(f"{name}: nowhere are estimate and ground truth known together, so there are no errors")
@@ -332,7 +325,6 @@ class _Recording:
     signals: Signals | None
     manoeuvres: Sequence[Manoeuvre]
     losses: tuple[Loss, ...]
-    samples: dict[str, int]
     ledger: tuple[SampleCount, ...]
 
     def at(self, stamps_ns: IntArray) -> tuple[EvaluatedDrive, Signals]:

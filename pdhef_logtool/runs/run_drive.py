@@ -12,7 +12,6 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.plug_ins import package_of
 from pdhef_logtool.evaluation.operating_space import operating_space
-from pdhef_logtool.evaluation.requirement_blocks import MOST_BLOCKS
 from pdhef_logtool.evaluation.validation_plan import SIDESLIP
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
@@ -25,7 +24,7 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.drive_outputs import STALE_FILES, DriveOutputs, files_of, log_place
 from pdhef_logtool.runs.drive_report import car_entry, outcome_of, report_drive
 from pdhef_logtool.runs.estimating import Estimated, estimate_drive
-from pdhef_logtool.runs.judging import BRIEF_BLOCKS, drive_blocks, judge_drive
+from pdhef_logtool.runs.judging import drive_blocks, judge_drive
 from pdhef_logtool.runs.preparing import PreparedDrive, prepare
 from pdhef_logtool.runs.reference_audit import audit_truth
 from pdhef_logtool.runs.run_result import LogResult
@@ -82,7 +81,7 @@ def run_log(
                 report = report_drive(run, estimated, scored, main, judged, losses)
                 if annotated is not None:
                     annotated.finish(report, files.tracks, scored.events)
-            report = files.write(report, scored.rows, scored.events)
+            files.write(report, scored.rows, scored.events)
         outcome = outcome_of(
             drive,
             losses,
@@ -154,7 +153,6 @@ def _judge(
 ) -> dict[str, Any]:
     """Return the entries of the report on the requirements of a plan."""
     drive, vehicle, truth = run.drive, run.car.vehicle, estimated.truth
-    most = BRIEF_BLOCKS if run.config.kept == "metrics" else MOST_BLOCKS
-    blocks = drive_blocks([*plan.requirements, SIDESLIP], main.name, scored.drive, most)
+    blocks = drive_blocks([*plan.requirements, SIDESLIP], main.name, scored.drive)
     space = operating_space(estimated.signals, truth, estimated.read(main.name), vehicle)
     return judge_drive(plan, drive, main.name, scored.rows, blocks, space)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
     from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
     from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
-    from pdhef_logtool.evaluation.reasons import ReasonFacts
     from pdhef_logtool.runs.estimating import Estimated
 
 
@@ -26,14 +25,12 @@ class Evaluation:
     Attributes
     ----------
     drive : what was scored. rows, events : figures, and events in order of time.
-    reasons : by estimator, why it did not use its sensors as usual.
     silent : estimators without a valid row although the car moves. moves : whether it does.
     """
 
     drive: EvaluatedDrive
     rows: list[MetricRow]
     events: list[Event]
-    reasons: dict[str, tuple[ReasonFacts, ...] | None]
     silent: tuple[str, ...]
     moves: bool
 
@@ -47,7 +44,6 @@ def evaluate(drive: Drive, estimated: Estimated, names: Sequence[str], calibrate
     """
     from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
     from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
-    from pdhef_logtool.evaluation.reasons import summarise_reasons
     from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
 
     signals, truth, vehicle = estimated.signals, estimated.truth, drive.car.vehicle
@@ -60,13 +56,7 @@ def evaluate(drive: Drive, estimated: Estimated, names: Sequence[str], calibrate
     events = drive_events(signals, masks, manoeuvres, [*tracks.values()])
     moves = bool(moving.any())
     silent = [n for n, track in tracks.items() if moves and not (moving & track.valid & track.something_known).any()]
-    reasons = {name: summarise_reasons(track) for name, track in tracks.items()}
-    return Evaluation(scored, evaluate_drive(scored), events, reasons, tuple(silent), moves)
-
-
-def in_time(event: Event) -> tuple[int, int, str]:
-    """Return the sort key of events."""
-    return event.start_ns, event.end_ns, event.name
+    return Evaluation(scored, evaluate_drive(scored), events, tuple(silent), moves)
 
 
 def drive_events(
@@ -92,4 +82,4 @@ def drive_events(
             Event(f"{track.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
             for s in find_intervals(track, {"diverged": track.diverged})
         ]
-    return sorted(events, key=in_time)
+    return sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name))

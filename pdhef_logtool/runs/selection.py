@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS
@@ -105,22 +105,20 @@ def choose_main(names: Sequence[str], rows: Iterable[MetricRow], *, proven: bool
     name = next(n for n in (*_BEST_FIRST, *others, *_LAST) if n in names)
     rows = list(rows)
     against = None if proven else contradiction(rows, name)
-    chosen_by: Literal["evidence", "d2", "order"]
     if against is not None:
-        chosen_by, why = "d2", f"{name} contradicts the sensors more than {against.best} does"
+        why = f"{name} contradicts the sensors more than {against.best} does"
         name = against.best
     elif proven:
-        chosen_by, why = "evidence", "driving with ground truth has validated this car"
+        why = "driving with ground truth has validated this car"
     elif name not in _NOT_JUDGED and any(r.metric == "d2" and r.estimator == name for r in rows):
-        chosen_by, why = "d2", "no simple estimator agrees better with the sensors"
+        why = "no simple estimator agrees better with the sensors"
     else:
-        chosen_by, why = "order", "the best that the log's signals allow"
+        why = "the best that the log's signals allow"
     fails = not proven and _fails(rows, name)
     if fails:
         why = f"no estimate agrees with the sensors as well as sideslip 0 does; {name} is the least bad one"
     return MainFacts(
         name=name,
-        chosen_by=chosen_by,
         why=why,
         distrusted=against is not None or fails,
         naive=NAIVE if NAIVE in names else None,

@@ -169,10 +169,6 @@ def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(
         assert said[wrong].mean() > 0.7
         spans = [s for s in report["segments"] if s["name"] == f"{name} diverged"]
         assert (spans[0]["start_ns"] - int(of["stamp_ns"][0])) * 1e-9 == pytest.approx(first, abs=1e-6)
-        share = [
-            m for m in report["metrics"] if (m["estimator"], m["metric"], m["segment"]) == (name, "diverged", "all")
-        ]
-        assert share[0]["value"] == pytest.approx(said.mean(), abs=0.01)
         line = diverged_line(report, name)
         assert line.startswith("diverged for ")
         of_log = (spans[0]["start_ns"] - report["log"]["start_ns"]) * 1e-9

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from reference_car import signals_at
@@ -30,43 +28,6 @@ def rows_of(tracks, signals=None, names=None, masks=None) -> list[MetricRow]:
     signals = drive() if signals is None else signals
     evaluated = EvaluatedDrive("drive", {t.name: t for t in tracks}, None, signals, masks or {}, 3.0)
     return evaluate_drive(evaluated, names)
-
-
-def residuals(signals):
-    return {(r.signal, r.metric): r for r in rows_of([], signals, ("residual_rms", "residual_bias"))}
-
-
-def test_consistent_sensors_leave_no_residual():
-    rows = residuals(drive())
-    assert rows["ay_m_s2", "residual_rms"].value < 2e-3
-    assert rows["vx_m_s", "residual_rms"].value < 1e-4
-    assert rows["vx_m_s", "residual_rms"].n == T.size // 5 - 20
-
-
-def test_bias_bank_and_grade_are_seen_with_their_sign_and_size():
-    s = drive()
-    rows = residuals(replace(s, ay_m_s2=s.ay_m_s2 + 0.3, ax_m_s2=s.ax_m_s2 + 0.25))
-    assert rows["ay_m_s2", "residual_bias"].value == pytest.approx(0.3, abs=2e-3)
-    assert rows["vx_m_s", "residual_bias"].value == pytest.approx(-0.25, abs=1e-3)  # over one second
-    assert rows["ay_m_s2", "residual_bias"].unit == "m/s^2"
-    assert rows["ay_m_s2", "residual_bias"].estimator == "sensors"
-
-
-def test_no_integration_across_a_dropout_and_no_rows_without_a_sensor():
-    s = drive()
-    ax = s.ax_m_s2.copy()
-    ax[3000:3100] = np.nan
-    rows = residuals(replace(s, ax_m_s2=ax))
-    assert rows["vx_m_s", "residual_rms"].value < 1e-4
-    assert rows["vx_m_s", "residual_rms"].n < T.size // 5 - 20
-    nan = np.full(T.size, np.nan)
-    assert residuals(replace(s, speed_m_s=nan)) == {}
-    assert {k[0] for k in residuals(replace(s, ax_m_s2=nan))} == {"ay_m_s2"}
-
-
-def test_below_the_blend_a_y_says_nothing():
-    s = drive()
-    assert {k[0] for k in residuals(replace(s, speed_m_s=s.speed_m_s * 0.05))} == {"vx_m_s"}
 
 
 def test_figures_of_a_segment_are_formulas_over_its_stamps_and_steps() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.evaluation.dead_reckoned import lateral_errors, position_error
-from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive, score_track
 from pdhef_logtool.evaluation.metrics.innovations import nees
 from pdhef_logtool.evaluation.metrics.lag import lag_s
 from pdhef_logtool.records.tracks import StateTrack, make_track
@@ -152,6 +152,25 @@ def test_no_lag_is_claimed_without_likeness():
     assert np.isnan(lag_s(stamps, np.random.default_rng(0).normal(size=t.size), motion(t)))
     assert np.isnan(lag_s(stamps, motion(t - 0.4), motion(t)))
     assert np.isnan(lag_s(stamps, np.full(t.size, np.nan), motion(t)))
+
+
+def test_the_constant_and_the_shift_of_ground_truth_are_taken_out_and_no_other_error():
+    t = np.arange(0, 60, 0.01)
+    stamps, bends = T0 + np.round(t * 1e9).astype(np.int64), t > 20.0
+    beta = np.where(bends, 0.05 * motion(t), 0.0)
+    truth = np.where(bends, 0.05 * motion(t - 0.05), 0.0) + 0.01  # late by 50 ms, its heading is turned
+    mask = ~bends & (t < 19.0)
+
+    def errors(estimate):
+        moving = {"vx_m_s": np.full(t.size, 10.0)}
+        pair = (make_track(n, stamps, sideslip_rad=b, **moving) for n, b in (("a", estimate), ("truth", truth)))
+        rows = score_track(*pair, {"straight": mask}, log="x", low_speed_m_s=3.0)
+        found = {r.metric: r.value for r in rows if (r.signal, r.segment) == ("sideslip_rad", "all")}
+        return found["rmse"], found["rmse_aligned"]
+
+    whole, aligned = errors(beta)
+    assert whole > 0.011 and aligned < 0.002
+    assert errors(beta + 0.02)[1] == pytest.approx(0.02, rel=0.02)  # the estimate's own constant stays
 
 
 # ---- uncertainty ----

@@ -10,11 +10,9 @@ from hypothesis import strategies as st
 from pdhef_logtool.evaluation.reasons import (
     LISTED_INTERVALS,
     MERGE_S,
-    NAMED_INTERVALS,
     Interval,
     reason_intervals,
     sensor_faults,
-    summarise_reasons,
 )
 from pdhef_logtool.records.reasons import REASONS, SPIKE_AY, STUCK_AY, STUCK_YAW_RATE
 from pdhef_logtool.records.tracks import StateTrack, make_track
@@ -54,17 +52,6 @@ def test_intervals_are_those_found_by_hand(samples: list[tuple[int, int]]) -> No
     track = track_of(stamps_ns, reason)
     expected = {r.name: by_hand(stamps_ns, reason, r.bit) for r in REASONS}
     assert reason_intervals(track) == {name: spans for name, spans in expected.items() if spans}
-    for facts in summarise_reasons(track) or ():
-        bit = next(r.bit for r in REASONS if r.name == facts.name)
-        inside = np.zeros(len(reason), dtype=np.bool_)
-        for span in expected[facts.name]:
-            inside |= (stamps_ns >= span.start_ns) & (stamps_ns < span.end_ns)
-        held = reason & bit > 0
-        assert facts.share == pytest.approx(held.mean())
-        assert facts.share_within == pytest.approx(held[inside].mean())
-        assert (facts.first_ns, facts.end_ns) == (expected[facts.name][0].start_ns, expected[facts.name][-1].end_ns)
-        length = sorted((s.end_ns - s.start_ns for s in expected[facts.name]), reverse=True)
-        assert sorted((s.end_ns - s.start_ns for s in facts.longest), reverse=True) == length[:NAMED_INTERVALS]
 
 
 def test_a_break_longer_than_half_a_second_parts_two_intervals() -> None:
@@ -72,13 +59,6 @@ def test_a_break_longer_than_half_a_second_parts_two_intervals() -> None:
         # So many stamps without the bit between two with it: 0.5 s and 0.51 s apart.
         reason = np.array([STUCK_AY, *[0] * samples, STUCK_AY])
         assert len(reason_intervals(track_of(stamps(len(reason)), reason))["stuck_ay"]) == intervals
-
-
-def test_an_estimator_that_does_not_look_has_none_and_one_that_found_nothing_an_empty_list() -> None:
-    assert summarise_reasons(make_track("phy-ukf", stamps(5))) is None
-    assert summarise_reasons(make_track("pd-hef", stamps(5), reason=np.zeros(5, dtype=np.int64))) == ()
-    (facts,) = summarise_reasons(make_track("pd-hef", stamps(5), reason=np.full(5, STUCK_YAW_RATE))) or ()
-    assert (facts.text, facts.share) == ("gyro stuck", 1.0)
 
 
 def test_faults_are_told_by_sensor_and_kind_with_the_longest_intervals() -> None:

@@ -33,7 +33,7 @@ def drives(
 
 def blocks(values: Sequence[float], baseline: Sequence[float] = (), std: Sequence[float] = ()) -> RequirementBlocks:
     k = len(values)
-    return RequirementBlocks("x", "pd-hef", 10.0, range(k), [1000] * k, [10.0] * k, [200.0] * k, values, baseline, std)
+    return RequirementBlocks("x", 10.0, range(k), [1000] * k, [10.0] * k, [200.0] * k, values, baseline, std)
 
 
 @pytest.mark.parametrize(("spread", "count"), [(0.3, 5), (0.8, 5), (0.5, 100)])

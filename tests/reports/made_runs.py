@@ -73,7 +73,7 @@ def report_of(tracks: list[StateTrack], label: str = "drive", **changes: Any) ->
     end = int(stamps[-1]) + 1
 
     def figure(name: str, signal: str, metric: str, value: float, unit: str) -> dict[str, Any]:
-        return {"log": label, "estimator": name, "signal": signal, "segment": "all", "metric": metric, "value": value,
+        return {"estimator": name, "signal": signal, "segment": "all", "metric": metric, "value": value,
                 "unit": unit, "n": len(stamps)}  # fmt: skip
 
     metrics = [figure(n, "sideslip_rad", "rmse", 0.001 * (i + 1), "rad") for i, n in enumerate(names) if truth]
@@ -84,17 +84,17 @@ def report_of(tracks: list[StateTrack], label: str = "drive", **changes: Any) ->
         "format": "pdhef.report",
         "version": 1,
         "log": {"name": label, "file": f"{label}.mcap", "kind": "mcap", "sha256": "0" * 64, "start_ns": int(stamps[0]),
-                "end_ns": end, "duration_s": (end - int(stamps[0])) * 1e-9, "topics": []},
-        "mapping": {"signals": [], "missing": []},
+                "end_ns": end, "duration_s": (end - int(stamps[0])) * 1e-9},
+        "mapping": {"missing": []},
         "vehicle": {"name": "sedan", "sha256": "1" * 64, "file": None, "proven": False, "low_speed_blend_m_s": 3.0},
         "estimators": [
             {"name": n, "causal": n != "pd-hef-smoothed", "outcome": "ran", "reason": None, "notes": [],
-             "intervals": [], "reasons": [],
+             "intervals": [],
              "algorithm": {"sha256": "2" * 64, "physics_sha256": None if n == "zero" else "3" * 64,
                            "network_sha256": "4" * 64 if "hef" in n else None}}
             for n in names
         ],
-        "truth": {"available": truth, "quantities": [], "latency_s": None, "notes": [], "not_independent": []},
+        "truth": {"available": truth, "quantities": {}, "latency_s": None, "notes": [], "not_independent": []},
         "friction": None,
         "self_calibration": None,
         "metrics": metrics,
@@ -111,7 +111,7 @@ def report_of(tracks: list[StateTrack], label: str = "drive", **changes: Any) ->
             next(t for t in tracks if t.name == names[0]), next((t for t in tracks if t.name == "truth"), None),
             [t for t in tracks if t.name not in ("truth", names[0])], 3.0,
         )],
-        "answer": {"main": names[0], "why": "for a test", "texts": {"result": "a result"}},
+        "answer": {"main": names[0], "why": "for a test", "texts": {"result": "a result", "assumed": ""}},
         **changes,
     }  # fmt: skip
 

@@ -17,6 +17,7 @@ from made_runs import START_NS, drive_tracks, write_run
 
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.reports.drive import drive_page
+from pdhef_logtool.reports.page import _environment, stamp
 from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.storage.documents import seal
@@ -74,7 +75,7 @@ def test_without_truth_the_page_says_why_there_is_no_score_and_shows_disagreemen
     text = words(page)
     assert "The log has no ground truth" in text
     assert "Largest disagreements of pd-hef" in text
-    assert "estimator NIS per degree of freedom pd-hef 1.03" in text  # NIS of 3.1 at 3 degrees of freedom
+    assert "estimator NIS pd-hef 1.03" in text  # NIS of 3.1 at 3 degrees of freedom
     assert figures(page)["error"]["title"].startswith("Disagreement")
     assert [s["label"] for s in figures(page)["error"]["series"]] == ["physics", "zero"]
 
@@ -114,12 +115,10 @@ def test_a_damaged_report_stops_no_other_page(tmp_path):
 def plan_of(*outcomes: str) -> dict:
     """Return the plan of a report with one requirement per outcome."""
     return {
-        "title": "", "file": "plan.toml", "sha256": "a" * 64,
+        "file": "plan.toml",
         "requirements": [
-            {"id": f"SR-{i}", "title": f"Title {i}", "label": "sideslip RMSE ≤ 0.5°", "unit": "rad", "bound": 0.01,
-             "baseline": None, "outcome": outcome, "value": 0.008, "low": None, "high": None, "margin": 0.002,
-             "exposure": {"drives": 1, "minutes": 2.0, "km": 3.0}, "reason": f"reason {i}", "next": f"do {i}",
-             "notes": ["interval from blocks of 10 s"]}
+            {"id": f"SR-{i}", "label": "sideslip RMSE ≤ 0.5°", "outcome": outcome, "reason": f"reason {i}",
+             "next": f"do {i}"}
             for i, outcome in enumerate(outcomes)
         ],
     }  # fmt: skip
@@ -132,10 +131,10 @@ def test_the_first_screen_has_answer_verdicts_what_was_tested_the_worst_place_an
     page = page_of(write_run(tmp_path, drive_tracks(), plan=plan, checks=[check], answer=answer))
     text = words(page)
     order = [
-        "Result Sideslip RMSE 0.1° Assumed: not causal.", "Check failed: a.sign: gain -1",
-        "Plan plan.toml: 1 FAIL, 1 INCONCLUSIVE, 1 PASS", "FAIL Title 1 SR-1", "INCONCLUSIVE Title 2 SR-2",
-        "PASS Title 0 SR-0 value 0.458° limit ≤ 0.573° margin +0.115° scored 1 drive, 2.0 min, 3.0 km",
-        "Note: interval from blocks of 10 s.", "Tested Car sedan", "Largest error", "Next SR-1: do 1 SR-2: do 2",
+        "Result Sideslip RMSE 0.1° Assumed: not causal.", "Check FAILED: a.sign: gain -1",
+        "Plan plan.toml: 1 FAIL, 1 INCONCLUSIVE, 1 PASS (this drive alone)", "FAIL sideslip RMSE ≤ 0.5° SR-1 reason 1",
+        "INCONCLUSIVE sideslip RMSE ≤ 0.5° SR-2", "PASS sideslip RMSE ≤ 0.5° SR-0",
+        "Tested Car sedan", "Largest error", "Next SR-1: do 1 SR-2: do 2",
         "Over time",
     ]  # fmt: skip
     places = [text.find(part) for part in order]
@@ -150,21 +149,30 @@ def test_every_figure_has_a_role_and_a_text_and_those_over_time_take_the_keyboar
     assert any(label.startswith("Sideslip [°] over time: pd-hef ") and keys for label, keys in canvases)
 
 
-def test_the_path_is_aligned_and_its_drift_is_stated(tmp_path):
+def test_the_path_is_aligned_at_the_start_and_its_drift_is_stated(tmp_path):
     tracks = drive_tracks()
-    angle, x, y = 0.3, tracks[1].x_m, tracks[1].y_m
+    angle, x, y = 0.3, tracks[0].x_m, tracks[0].y_m
     turned = np.cos(angle) * x - np.sin(angle) * y + 5.0, np.sin(angle) * x + np.cos(angle) * y
+    longer = [x[0] + 1.02 * (x - x[0]), y[0] + 1.02 * (y - y[0])]
     tracks[1] = replace(tracks[1], x_m=turned[0], y_m=turned[1])
+    assert path_drift(tracks[1], tracks[0]).end_m == pytest.approx(0.0, abs=1e-6)  # an unknown heading is no drift
+    tracks[1] = replace(tracks[1], x_m=longer[0], y_m=longer[1])
     made = path_drift(tracks[1], tracks[0])
     page = drive_page(open_run(write_run(tmp_path, tracks, path_drift=asdict(made))).logs[0])
     text = words(page.html.decode())
-    assert "the largest remaining distance is 0.0 m" in text
     length = float(np.hypot(np.diff(x), np.diff(y)).sum())
     drift = float(re.search(r"Drift: ([\d.]+) m", text)[1])
-    assert drift == pytest.approx(2.0 * np.sin(angle / 2.0) * np.hypot(x[-1], y[-1]), abs=0.5)
+    assert drift == pytest.approx(0.02 * np.hypot(x[-1] - x[0], y[-1] - y[0]), rel=0.1)
     assert f"{length / 1000.0:.2f} km" in text
-    labels = [c.label for c in page.charts.figures["path"].clouds]
-    assert labels[0] == "truth" and all("°" in label for label in labels[1:])
+    figure = page.charts.figures["path"]
+    assert figure.clouds[0].label == "truth" and all("°" in cloud.label for cloud in figure.clouds[1:])
+    assert figure.x_label == "m, along the heading at the start"  # this log has neither position nor heading
+
+
+@pytest.mark.parametrize(("start_s", "dated"), [(86_400, False), (1_700_000_000, True)])
+def test_a_log_without_dates_is_not_of_1970(start_s, dated):
+    assert ("1970" in stamp(start_s * 10**9)) is False
+    assert ("UTC" in _environment().filters["minute"](start_s * 10**9)) is dated
 
 
 HOSTILE = (

@@ -79,7 +79,8 @@ def known(document: Any, start_ns: int) -> tuple[list[float], str]:
 
 
 def ratios(document: dict[str, Any]) -> Iterator[float]:
-    """Yield NIS over its degrees of freedom."""
+    """Yield NIS over its degrees of freedom, and what the estimate is compared with at the largest errors."""
+    yield from (place["estimate_rad"] - place["error_rad"] for place in document.get("largest_errors") or ())
     figures = {
         (m["estimator"], m["metric"]): m["value"] for m in document.get("metrics") or () if m["segment"] == "all"
     }

@@ -104,7 +104,7 @@ def test_blocks_are_read_only_where_fewer_than_five_drives_are_scored() -> None:
     def blocks(log: str) -> list[RequirementBlocks]:
         read.append(log)
         k = 8
-        return [RequirementBlocks(BETA.measured, "pd-hef", 10.0, range(k), [99] * k, [10.0] * k, [9.0] * k, [0.01] * k)]
+        return [RequirementBlocks(BETA.measured, 10.0, range(k), [99] * k, [10.0] * k, [9.0] * k, [0.01] * k)]
 
     def drives(logs: Sequence[str]) -> list[JudgedDrive]:
         return [

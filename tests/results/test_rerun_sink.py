@@ -31,10 +31,10 @@ REPORT = {
     "vehicle": {"name": "sedan"},
     "warnings": ["a warning"],
     "losses": [],
-    "truth": {"available": False, "quantities": [], "latency_s": None, "not_independent": [], "notes": []},
+    "truth": {"available": False, "quantities": {}, "latency_s": None, "not_independent": [], "notes": []},
     "metrics": [],
     "estimators": [],
-    "mapping": {"signals": [], "missing": []},
+    "mapping": {"missing": []},
     "versions": {"python": "3"},
 }
 EVENTS = (

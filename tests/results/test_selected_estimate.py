@@ -32,7 +32,7 @@ def test_the_result_says_how_good_against_which_truth_and_against_whom() -> None
 def test_the_interval_of_the_error_needs_six_blocks_of_time() -> None:
     def said(count: int) -> str:
         value = np.deg2rad(np.linspace(0.08, 0.12, count)).tolist()
-        blocks = RequirementBlocks(SIDESLIP.measured, "pd-hef", 10.0, range(count), [9] * count, (), (), value)
+        blocks = RequirementBlocks(SIDESLIP.measured, 10.0, range(count), [9] * count, (), (), value)
         return texts(metrics=errors_deg(pd_hef=0.1), requirement_blocks=[blocks])["result"]
 
     assert "0.100° (95 % CI 0.085° to 0.119°; ground truth: /ins)" in said(6)
@@ -120,7 +120,7 @@ def test_the_next_steps_are_few_and_the_most_important_first() -> None:
     said = texts(replace(MAIN, name="zero"), estimators=lacking, vehicle=UNKNOWN)["next"]
     assert said.startswith("map the missing signals (the log has no steer_rad)")
     assert said.count("; ") == 1
-    distrusted = replace(MAIN, name="open-loop", chosen_by="d2", why="pd-hef contradicts", distrusted=True)
+    distrusted = replace(MAIN, name="open-loop", why="pd-hef contradicts", distrusted=True)
     estimators = [ran("open-loop")]
     said = texts(distrusted, estimators=estimators)
     assert "pd-hef contradicts" in said["assumed"]

@@ -25,7 +25,7 @@ def test_colours_are_red_green_blue_and_a_names_own() -> None:
 
 
 def _report(**changes: Any) -> dict[str, Any]:
-    estimators = [ran("ukf", notes=["a", "b"]), ran("smooth", causal=False, reasons=())]
+    estimators = [ran("ukf", notes=["a", "b"]), ran("smooth", causal=False)]
     content = {"estimators": estimators, "warnings": ["careful"], "losses": [Loss("gap", "a gap", "/imu")], **changes}
     return report(None, **content)
 
@@ -54,5 +54,5 @@ def test_the_report_for_people_is_this() -> None:
 def test_versions_are_those_that_are_installed_and_json_is_the_same_everywhere() -> None:
     found = tool_versions()
     assert found["numpy"] == importlib.metadata.version("numpy") and "python" in found
-    assert json_bytes({"b": "µ", "a": [float("nan")]}) == '{\n  "a": [\n    null\n  ],\n  "b": "µ"\n}\n'.encode()
+    assert json_bytes({"b": "µ", "a": [float("nan")]}) == '{\n "a": [\n  null\n ],\n "b": "µ"\n}\n'.encode()
     assert json.loads(json_bytes({"a": 1})) == {"a": 1}

@@ -28,16 +28,18 @@ def test_a_drive_with_truth_has_all_of_it(sample_logs_dir: Path, tmp_path: Path)
     plan = tmp_path / "plan.toml"
     plan.write_text('[[requirement]]\nid = "a"\nsignal = "sideslip_rad"\nlimit_deg = 90.0\n')
     report = run("road", sample_logs_dir, tmp_path / "out", plan=plan, start="+60", end="+130")
+    of_run = json.loads((tmp_path / "out" / "run.json").read_text())
     figure = {(m["estimator"], m["signal"], m["metric"], m["segment"]): m["value"] for m in report["metrics"]}
     low, high = report["answer"]["sideslip_rmse_ci_rad"]
     assert low < figure["pd-hef", "sideslip_rad", "rmse", "all"] < high
     assert f"(95 % CI {math.degrees(low):.3f}° to {math.degrees(high):.3f}°; " in report["answer"]["texts"]["result"]
-    (judged,) = report["plan"]["requirements"]
+    assert report["plan"]["requirements"][0]["outcome"] == "PASS"
+    (judged,) = of_run["plan"]["requirements"]
     assert (judged["outcome"], judged["basis"], judged["units"]) == ("PASS", "blocks", 7)
     assert judged["exposure"]["minutes"] == pytest.approx(62.5 / 60.0, rel=0.02)  # of 70 s
     largest = report["largest_errors"][0]
-    assert abs(largest["error_rad"]) == pytest.approx(figure["pd-hef", "sideslip_rad", "max_abs", "all"])
-    assert largest["estimate_rad"] - largest["truth_rad"] == pytest.approx(largest["error_rad"])
+    assert abs(largest["error_rad"]) <= figure["pd-hef", "sideslip_rad", "max_abs", "all"] * 1.001
+    assert all(place["stamp_ns"] >= report["log"]["start_ns"] + 2e9 for place in report["largest_errors"])
     seconds = sum(c["seconds"] for c in report["operating_space"]["cells"])
     assert seconds == pytest.approx(report["log"]["duration_s"], rel=0.05)
     assert report["metadata"]

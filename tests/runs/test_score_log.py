@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -47,9 +48,9 @@ def _figures(metrics: list[dict[str, Any]], estimator: str) -> dict[Key, tuple[f
 
 def _scored(annotated: Path, config: RunConfig, *estimates: str, **options: Any) -> dict[str, Any]:
     result = score_log(str(annotated / "annotated.mcap"), config, estimates=estimates, **options)
-    report = result.results[0].report
-    assert report is not None
-    return report
+    (log,) = result.results
+    assert log.report is not None
+    return log.report | {"metrics": [asdict(row) for row in log.rows]}
 
 
 def _value(report: dict[str, Any], signal: str, metric: str, estimator: str | None = None) -> float:
@@ -67,7 +68,7 @@ def _value(report: dict[str, Any], signal: str, metric: str, estimator: str | No
 def test_state_topic_gives_the_figures_of_the_run_that_wrote_it(annotated: Path, sample_logs_dir: Path) -> None:
     config = RunConfig(car=sample_logs_dir / "vehicle.toml")
     report = _scored(annotated, config, "/pdhef/phy_ukf/state")
-    of_run = _figures(json.loads((annotated / "report.json").read_text())["metrics"], "phy-ukf")
+    of_run = _figures(pl.read_parquet(annotated / "metrics.parquet").to_dicts(), "phy-ukf")
     again = _figures(report["metrics"], "phy-ukf")
     assert again.keys() == of_run.keys()
     assert {("sideslip_rad", "nonlinear", "rmse"), ("sideslip_rad", "all", "coverage95"), ("state", "all", "nees")} <= (
@@ -229,8 +230,9 @@ def test_other_stamps_than_the_truths_without_any_imu(tmp_path: Path) -> None:
     result = score_log(
         str(tmp_path / "line.mcap"), RunConfig(), estimates=["/mine"], reporter=Reporter(warn=said.append)
     )
-    report = result.results[0].report
-    assert report is not None
+    (log,) = result.results
+    assert log.report is not None
+    report = log.report | {"metrics": [asdict(row) for row in log.rows]}
     assert _value(report, "vx_m_s", "rmse") == pytest.approx(0.05, rel=1e-6)
     assert _value(report, "vy_m_s", "bias") == pytest.approx(0.02, rel=1e-6)
     inside = t <= seconds(at_truth)[-1]
@@ -244,7 +246,7 @@ def test_other_stamps_than_the_truths_without_any_imu(tmp_path: Path) -> None:
 def test_named_truth_replaces_the_recognised_one(annotated: Path, config: RunConfig) -> None:
     truth = ["/pdhef/zero/state.vx_m_s", "/pdhef/zero/state.vy_m_s"]
     report = _scored(annotated, config, "/pdhef/phy_ukf/state", truth=truth)
-    sources = {q["name"]: q["source"] for q in report["truth"]["quantities"]}
+    sources = report["truth"]["quantities"]
     assert sources["vy_m_s"] == "/pdhef/zero/state.vy_m_s"
     stamps = pl.read_parquet(annotated / "estimates.parquet")
     a, b = (stamps.filter(pl.col("estimator") == n)["vy_m_s"].to_numpy() for n in ("phy-ukf", "zero"))

@@ -8,6 +8,7 @@ truth without it is not scored.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -30,7 +31,10 @@ def errors_of_drive(drive: EvaluatedDrive) -> Iterator[Columns]:
     has_pose = bool(pose_known(truth).any())
     for track in drive.tracks.values():
         for signal, has_truth in at_truth.items():
-            yield _errors(track, truth, signal, has_truth, since_start_ns)
+            columns = _errors(track, truth, signal, has_truth, since_start_ns)
+            if signal == "sideslip_rad" and "straight" in drive.masks:
+                columns = replace(columns, values={**columns.values, "straight": drive.masks["straight"]})
+            yield columns
         if has_pose:
             lateral = lateral_errors(track, truth)
             yield Columns(track.name, "position_m", {"error": position_error(track, truth)}, whole=True)

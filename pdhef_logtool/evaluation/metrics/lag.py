@@ -1,4 +1,4 @@
-"""``lag_s``: delay of an estimate after ground truth."""
+"""``lag_s``: delay of an estimate after ground truth; ``rmse_aligned``: error without that shift and a constant."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import numpy as np
 
 from pdhef_logtool.drive.correlation import find_shift, on_common_grid
 from pdhef_logtool.evaluation.metrics.errors import errors_of_drive
-from pdhef_logtool.evaluation.metrics.metric import Metric
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.evaluation.metrics.metric import Metric, rms
+from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 MAX_LAG_S = 0.3
 MIN_LAG_CORRELATION = 0.5
@@ -31,6 +32,22 @@ def _lag_of_start(_: FloatArray, since_start_ns: IntArray, estimate: FloatArray,
     return lag_s(since_start_ns[:end], estimate[:end], truth[:end])
 
 
+def _rms_aligned(
+    _: FloatArray, since_start_ns: IntArray, estimate: FloatArray, truth: FloatArray, straight: BoolArray
+) -> float | None:
+    """Return the RMS error [N] without the lag and without the ground truth's mean on straights.
+
+    A lag that is not clear is 0. None without straights: an offset of ground truth is an error elsewhere.
+    """
+    lag = np.nan_to_num(_lag_of_start(_, since_start_ns, estimate, truth))
+    then_ns = since_start_ns - lag * 1e9
+    covered = (then_ns >= since_start_ns[0]) & (then_ns <= since_start_ns[-1])
+    if not straight.any() or not covered.any():
+        return None
+    shifted = np.interp(then_ns[covered], since_start_ns, truth - np.mean(truth[straight]))
+    return rms(np.asarray(wrap_angle(estimate[covered] - shifted), dtype=np.float64))
+
+
 METRICS = (
     Metric(
         "lag_s",
@@ -46,5 +63,18 @@ METRICS = (
         of_truth=True,
         digits=0,
         terminal=("sideslip_rad",),
+    ),
+    Metric(
+        "rmse_aligned",
+        "RMSE aligned",
+        "`rmse` of sideslip after two corrections of ground truth: less its mean on straights, and shifted in time by "
+        "`lag_s`. Segment `all` only; absent without straights",
+        columns=errors_of_drive,
+        formula=_rms_aligned,
+        over=("error", "since_start_ns", "estimate", "truth", "straight"),
+        best="lower",
+        whole=True,
+        of_truth=True,
+        brief=("sideslip_rad",),
     ),
 )

@@ -118,7 +118,7 @@ class Metric:
     whole : only segment ``all`` has a value. of_truth : it compares with ground truth.
     digits : decimal places in the terminal, in the unit for display.
     terminal : signals with a column in the terminal's table, which narrow terminals omit.
-    brief : signals that the report.json of a run with ``--keep metrics`` contains.
+    brief : signals that report.json contains without a column in the terminal.
     """
 
     name: str

@@ -19,6 +19,7 @@ MODULES = (
     "reference",
     "sensors",
     "independence",
+    "handling",
 )
 
 

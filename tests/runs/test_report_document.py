@@ -1,0 +1,127 @@
+"""report.json: at most 120 paths, and 40 kB of a drive of 10 s; terminal, page and PDF say the same of it first."""
+
+from __future__ import annotations
+
+import html
+import io
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from pdhef_logtool.cli.run_tables import render_run
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import auto_map, mapping_to_toml
+from pdhef_logtool.reports.drive import drive_page
+from pdhef_logtool.reports.pdf import pdf_page
+from pdhef_logtool.results.opened_run import open_run
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import run_logs
+from pdhef_logtool.runs.recorded_estimates import score_log
+from pdhef_logtool.runs.run_result import RunResult
+from tests.run_report import follows
+
+#: Entries whose keys are names: of parameters, of quantities, of reasons, of packages, of the recorder.
+NAMED = ("assumed", "dropped", "metadata", "options", "quantities", "versions")
+
+
+def paths(value: Any, at: str = "") -> Iterator[str]:
+    """Yield the path of each leaf; entries of a list have one path, and so have entries by name."""
+    if at.rpartition(".")[2] in NAMED:
+        yield f"{at}.*"
+    elif isinstance(value, dict):
+        for key, entry in value.items():
+            yield from paths(entry, f"{at}.{key}")
+    elif isinstance(value, list) and any(isinstance(entry, dict | list) for entry in value):
+        for entry in value:
+            yield from paths(entry, f"{at}[]")
+    else:
+        yield at
+
+
+def test_entries_of_a_list_and_of_names_have_one_path() -> None:
+    document = {"a": [{"b": 1}, {"b": 2, "c": []}], "versions": {"x": "1", "y": "2"}, "d": [1, 2]}
+    assert sorted({*paths(document)}) == [".a[].b", ".a[].c", ".d", ".versions.*"]
+
+
+@pytest.mark.parametrize(
+    ("log", "settings"),
+    [
+        ("dlc", {"car": Path("saloon"), "plan": Path("sample_logs/plan.toml")}),
+        pytest.param("fishhook", {}, marks=pytest.mark.slow),
+        pytest.param("faults", {"end": "10"}, marks=pytest.mark.slow),
+    ],
+)
+def test_the_document_of_ten_seconds_is_short(
+    log: str, settings: dict[str, Any], sample_logs_dir: Path, tmp_path: Path
+) -> None:
+    run_logs([str(sample_logs_dir / f"{log}.mcap")], tmp_path, RunConfig(keep="estimates", **settings), report=False)
+    text = (tmp_path / "logs" / log / "report.json").read_bytes()
+    document = json.loads(text)
+    follows(document)
+    assert len(text) <= 40_000
+    assert len({*paths(document)}) <= 120
+
+
+def told(result: RunResult) -> list[str]:
+    """Return the assumptions and failed checks that the terminal names, one by one."""
+    out = io.StringIO()
+    render_run(result, Console(file=out, width=5000))
+    lines = [line.strip() for line in out.getvalue().splitlines()]
+    assumed = [line.partition("Assumed")[2].strip() for line in lines if line.startswith("Assumed")]
+    assert assumed
+    return [
+        *(clause for text in assumed if "see below" not in text for clause in text.split("; ")),
+        *(line for line in lines if line.startswith(("FAILED: ", "waived: "))),
+    ]
+
+
+def words(page: str) -> str:
+    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", page.partition("<main>")[2])).split())
+
+
+def wrong_sign(log: Path, tmp_path: Path) -> Path:
+    """Return a mapping of the log with the wrong sign of the steering."""
+    opened = open_log(log)
+    text = mapping_to_toml(auto_map(opened).mapping)
+    opened.close()
+    at = text.index("scale", text.index("[signals.steer_rad]"))
+    path = tmp_path / "mapping.toml"
+    path.write_text(text[:at] + text[at:].replace("scale = 1.0", "scale = -1.0", 1))
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("logs", [("sweep",), ("fishhook", "dlc"), ()])
+def test_first_screen_and_first_sheet_name_what_the_terminal_names(
+    logs: tuple[str, ...], sample_logs_dir: Path, tmp_path: Path
+) -> None:
+    fails = logs == ("sweep",)
+    if logs:
+        config = RunConfig(mapping=wrong_sign(sample_logs_dir / "sweep.mcap", tmp_path) if fails else None)
+        result = run_logs([str(sample_logs_dir / f"{n}.mcap") for n in logs], tmp_path / "out", config, report=False)
+    else:  # a recorded estimate
+        log = str(sample_logs_dir / "dlc.mcap")
+        result = score_log(log, RunConfig(), estimates=("/rtk/odometry",), output=tmp_path / "out")
+    said, run = told(result), open_run(tmp_path / "out")
+    assert len(said) >= 2 and any(text.startswith("FAILED") for text in said) == fails
+    sheet = words(pdf_page(run).decode().partition('<section class="sheet">')[0])
+    assert [text for text in said if text not in sheet] == []
+    screens = [words(drive_page(log).html.decode().partition('<dl class="facts"')[0]) for log in run.logs]
+    assert [text for text in said if all(text not in screen for screen in screens)] == []
+
+
+@pytest.mark.slow
+def test_the_page_of_a_step_has_its_key_figures_of_estimate_and_ground_truth(
+    sample_logs_dir: Path, tmp_path: Path
+) -> None:
+    config = RunConfig(car=Path("saloon"), keep="estimates")
+    run_logs([str(sample_logs_dir / "step.mcap")], tmp_path, config, report=False)
+    (log,) = open_run(tmp_path).logs
+    text = words(drive_page(log).html.decode()).partition("Key figures of manoeuvres")[2]
+    times = re.search(r"^ truth pd-hef physics zero yaw rate: response time ms ([\d.]+) ([\d.]+)", text)
+    assert times is not None and 50.0 < float(times[1]) == pytest.approx(float(times[2]), abs=10.0)
