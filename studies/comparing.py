@@ -16,15 +16,17 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.results.opened_run import METRICS_FILE
+from pdhef_logtool.results.opened_run import TABLES, TABLES_FOLDER, table_file
 from pdhef_logtool.results.paired_change import paired_change
-from pdhef_logtool.results.parquet_sink import write_metrics
+from pdhef_logtool.results.run_report import LogOutcome
+from pdhef_logtool.results.tables import drive_part, write_tables
 from pdhef_logtool.storage.documents import file_sha256, seal
 from studies.pages import DOCS, options, table, write
 
@@ -85,7 +87,7 @@ def shares_of_days(shared: float, times: int, seed: int) -> tuple[float, float]:
 
 
 def make_run(folder: Path, drives: int) -> int:
-    """Write run.json and metrics.parquet of a run of made-up drives; return the number of figures."""
+    """Write run.json and the tables of a run of made-up drives; return the number of figures."""
     rng = np.random.default_rng(5)
     labels = [f"drive_{i:05d}" for i in range(drives)]
     logs = [
@@ -104,8 +106,12 @@ def make_run(folder: Path, drives: int) -> int:
         for label in labels
         for value, (estimator, signal, segment, metric) in zip(rng.random(_PER_DRIVE), _names(), strict=True)
     ]
-    write_metrics(folder / METRICS_FILE, rows)
-    files = {METRICS_FILE: file_sha256(folder / METRICS_FILE)}
+    by_log = {label: [*of_log] for label, of_log in groupby(rows, key=lambda row: row.log)}
+    parts = (
+        drive_part(LogOutcome(**{k: v for k, v in o.items() if k != "outcome"}), {}, by_log[o["log"]]) for o in logs
+    )
+    write_tables(folder / TABLES_FOLDER, parts)
+    files = {table_file(name): file_sha256(folder / table_file(name)) for name in TABLES}
     document = {"format": "pdhef.run", "version": 1, "config": {}, "model": None, "versions": {}, "logs": logs}
     (folder / "run.json").write_text(json.dumps(seal({**document, "files": files}), indent=2))
     return len(rows)

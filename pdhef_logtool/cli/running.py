@@ -162,8 +162,7 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
         from pdhef_logtool.results.opened_run import open_run
         from pdhef_logtool.results.summary import summarise
 
-        checks_failed = [r.outcome.log for r in result.results if r.failed_checks]
-        summary = summarise(open_run(result.output), result.exit_code, checks_failed) | {"output": str(result.place)}
+        summary = summarise(open_run(result.output), result.exit_code) | {"output": str(result.place)}
         console.show(summary, render_fleet, as_json)
     else:
         if not as_json:  # the tables read the reports; a copy of all metric rows for the terminal would be unused

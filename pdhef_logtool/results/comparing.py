@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import filecmp
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.evaluation.dependence import FACTORS, factors_of
+from pdhef_logtool.evaluation.dependence import FACTORS
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.metrics.sensors import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
@@ -21,7 +20,7 @@ from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, Outpu
 from pdhef_logtool.records.printable import listed
 from pdhef_logtool.results.changed_signals import ChangedSignal, changed_signals
 from pdhef_logtool.results.gate import MAIN, Figure
-from pdhef_logtool.results.opened_run import METRICS_FILE, OpenedRun
+from pdhef_logtool.results.opened_run import OpenedRun
 from pdhef_logtool.results.paired_change import PairedChange, Verdict, holm, log_ratios, paired_change
 from pdhef_logtool.results.pairing import Pair, Pairing, pair_logs
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
@@ -42,8 +41,6 @@ INDEPENDENT = "none"
 MOST_FOLLOWED = 10
 #: Verdicts from grave to harmless; the gravest one is the overall verdict.
 _GRAVITY: tuple[FigureVerdict, ...] = ("worse", "no figure", "inconclusive", "not worse", "better", "equal")
-#: Rows of metrics.parquet that are in memory at once.
-_ROWS = 1 << 18
 _FIGURE = ["estimator", "signal", "segment", "metric", "value", "n", "unit"]
 
 
@@ -261,7 +258,7 @@ def compare_runs(
     if not changed and not gated:
         return replace(result, damaged=tuple(damaged))
     asked = cluster not in (None, INDEPENDENT)
-    grouping = _grouping(pairing, cluster, damaged) if changed or asked else _Grouping()
+    grouping = _grouping(a, pairing, cluster) if changed or asked else _Grouping()
     compared = tuple(tables.compared(figures, grouping))
     tables.check_estimators(compared)
     if not changed:
@@ -303,16 +300,9 @@ class _Tables:
         """Return the drives of A with any figure that is not the same bit for bit."""
         import polars as pl
 
-        for run in self._runs:
-            run.metrics()  # raises for a damaged file
-        a_file, b_file = (run.folder / METRICS_FILE for run in self._runs)
-        if all(pair.a.label == pair.b.label for pair in self._pairs) and filecmp.cmp(a_file, b_file, shallow=False):
-            return frozenset()
-
-        def hashed(rows: pl.LazyFrame) -> pl.LazyFrame:
-            return rows.select("log", row=pl.struct(_FIGURE).hash()).group_by("log").agg(pl.col("row").sum(), pl.len())
-
-        a, b = (_by_parts(run, hashed).group_by("log").agg(pl.col("row", "len").sum()) for run in self._runs)
+        hashed = (run.table("metrics").select("log", row=pl.struct(_FIGURE).hash()) for run in self._runs)
+        sums = (rows.group_by("log").agg(pl.col("row").sum(), pl.len()) for rows in hashed)
+        a, b = (rows.collect(engine="streaming") for rows in sums)
         pairs = pl.DataFrame({"log": [p.a.label for p in self._pairs], "b": [p.b.label for p in self._pairs]})
         both = pairs.join(a, on="log", how="left").join(b, left_on="b", right_on="log", how="left", suffix="_b")
         differs = pl.col("row").ne_missing(pl.col("row_b")) | pl.col("len").ne_missing(pl.col("len_b"))
@@ -367,7 +357,7 @@ class _Tables:
             missing -= {MAIN}
         if not missing:
             return
-        frames = [run.metrics().select("estimator").unique().collect(engine="streaming") for run in self._runs]
+        frames = [run.table("metrics").select("estimator").unique().collect(engine="streaming") for run in self._runs]
         estimators = {name for frame in frames for name in frame["estimator"]}
         for name in sorted(missing - estimators):
             single = sorted(k for k in estimators if "~" not in k and k != SENSORS)
@@ -386,21 +376,8 @@ class _Tables:
             "metric": {"not_independent", *(f.metric for f in figures)},
         }
         wanted = [pl.col(key).is_in(sorted(values)) for key, values in asked.items()]
-        return [_by_parts(run, lambda rows: rows.filter(*wanted).select("log", *_FIGURE)) for run in self._runs]
-
-
-def _by_parts(run: OpenedRun, query: Callable[[pl.LazyFrame], pl.LazyFrame]) -> pl.DataFrame:
-    """Return the results of a query over each part of a run's figures; few rows are in memory at once."""
-    import polars as pl
-    import pyarrow.parquet as pq
-
-    texts = ["log", *(c for c in _FIGURE if c not in ("value", "n"))]
-    pieces = []
-    with pq.ParquetFile(run.folder / METRICS_FILE, read_dictionary=texts) as file:
-        for batch in file.iter_batches(_ROWS, columns=["log", *_FIGURE]):
-            rows = pl.DataFrame(pl.from_arrow(batch)).lazy().with_columns(pl.col(texts).cast(pl.String))
-            pieces.append(query(rows).collect())
-    return pl.concat(pieces) if pieces else query(run.metrics()).collect()
+        rows = (run.table("metrics").filter(*wanted).select("log", *_FIGURE) for run in self._runs)
+        return [of.collect(engine="streaming") for of in rows]
 
 
 def _by_drive(rows: pl.DataFrame | None) -> dict[tuple[str, str], tuple[float, int, str]]:
@@ -476,15 +453,16 @@ class _Grouping:
         return clusters, {name: [values[i] for i in places] for name, values in self.factors.items()}
 
 
-def _grouping(pairing: Pairing, key: str | None, damaged: dict[str, None]) -> _Grouping:
+def _grouping(run: OpenedRun, pairing: Pairing, key: str | None) -> _Grouping:
     """Return the groups of the pairs by a key, or by day, car and route without one."""
     if key == INDEPENDENT:
         return _Grouping()
-    stated: list[dict[str, str | None]] = [{} for _ in pairing.pairs]
-    for number, pair in enumerate(pairing.pairs):
-        with _noted(damaged):
-            report = pair.a.report()
-            stated[number] = {**((report or {}).get("metadata") or {}), **factors_of(pair.a.entry, report)}
+    of_log: dict[str, dict[str, str | None]] = {}
+    for log, name, value in run.table("metadata").collect().iter_rows():
+        of_log.setdefault(log, {})[name] = value
+    for log, *values in run.table("drives").select("log", *FACTORS).collect().iter_rows():
+        of_log.setdefault(log, {}).update(zip(FACTORS, values, strict=True))
+    stated = [of_log.get(pair.a.label, {}) for pair in pairing.pairs]
     if key is None:
         return _Grouping(None, {name: [of.get(name) for of in stated] for name in FACTORS})
     values = [of.get(key) for of in stated]

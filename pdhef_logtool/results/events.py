@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -120,12 +120,13 @@ def find_events(
     events: list[FoundEvent] = []
     left_out: dict[str, str] = {}
     damaged: dict[str, str] = {}
+    drives = _drives(run)
     unreadable = searched = 0
     for log in run.logs:
         try:
             reason = _unfit(log, condition, estimator)
             if reason is None:
-                events += _events_of(log, condition, estimator or log.main(), least_s, pad_s)
+                events += _events_of(log, condition, estimator or log.main(), drives[log.label], least_s, pad_s)
                 searched += 1
         except OutputError as error:
             reason = error.got
@@ -146,6 +147,25 @@ def find_events(
         unreadable,
         lines,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Drive:
+    """Start of a log, lowest speed of scores, and intervals of its segments by name."""
+
+    start_ns: int
+    low_speed_m_s: float
+    spans: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
+
+
+def _drives(run: OpenedRun) -> dict[str, _Drive]:
+    """Return the drives of a run by log."""
+    rows = run.table("drives").select("log", "start_ns", "low_speed_m_s").collect().iter_rows()
+    drives = {log: _Drive(start_ns or 0, slow or 0.0) for log, start_ns, slow in rows}
+    events = run.table("events").select("log", "event", "start_ns", "end_ns").collect()
+    for log, event, *span in events.iter_rows():
+        drives[log].spans.setdefault(event, []).append((span[0], span[1]))
+    return drives
 
 
 def write_events(path: Path, events: FoundEvents) -> None:
@@ -201,16 +221,15 @@ def _needed(condition: Condition, main: str) -> set[str]:
     return {main} | {r.track or main for r in columns} | errors
 
 
-def _events_of(log: OpenedLog, condition: Condition, main: str, least_s: float, pad_s: float) -> list[FoundEvent]:
+def _events_of(
+    log: OpenedLog, condition: Condition, main: str, drive: _Drive, least_s: float, pad_s: float
+) -> list[FoundEvent]:
     """Return the events of one drive."""
     import polars as pl
 
     frame = log.estimates()
     assert frame is not None
-    report = log.report() or {}
-    low_speed = (report.get("vehicle") or {}).get("low_speed_blend_m_s")
-    segments = report.get("segments", [])
-    builder = _Builder(main, 0.0 if low_speed is None else float(low_speed), segments)
+    builder = _Builder(main, drive)
     named = [builder.column(reference).alias(name) for name, reference in condition.references.items()]
     peak = pl.lit(None) if condition.peak is None else condition.peak
     holds = condition.expression.fill_null(value=False)
@@ -218,7 +237,6 @@ def _events_of(log: OpenedLog, condition: Condition, main: str, least_s: float, 
     rows = columns.select("stamp_ns", holds=holds, peak=peak.cast(pl.Float64)).collect()
     stamps, mask = rows["stamp_ns"].to_numpy(), rows["holds"].to_numpy()
     values = rows["peak"].fill_null(math.nan).to_numpy()
-    log_start_ns = int((report.get("log") or {}).get("start_ns", stamps[0] if len(stamps) else 0))
     events = []
     for first, last in _spans(stamps, mask, least_s, pad_s):
         peak_row = _peak_at(values[first:last], condition.falls)
@@ -228,8 +246,8 @@ def _events_of(log: OpenedLog, condition: Condition, main: str, least_s: float, 
                 log.label,
                 start_ns,
                 end_ns,
-                (start_ns - log_start_ns) * 1e-9,
-                (end_ns - log_start_ns) * 1e-9,
+                (start_ns - drive.start_ns) * 1e-9,
+                (end_ns - drive.start_ns) * 1e-9,
                 None if peak_row is None else float(values[first + peak_row]),
                 None if peak_row is None else int(stamps[first + peak_row]),
             )
@@ -274,9 +292,8 @@ def _joined(frame: pl.LazyFrame, columns: Mapping[str, set[str]], main: str) -> 
 class _Builder:
     """Makes the columns of a condition; ``columns`` collects the stored columns that they need, by track."""
 
-    def __init__(self, main: str, low_speed_m_s: float, segments: Sequence[Mapping[str, Any]]) -> None:
-        self._main, self._segments = main, segments
-        self._low_speed_m_s = low_speed_m_s
+    def __init__(self, main: str, drive: _Drive) -> None:
+        self._main, self._drive = main, drive
         self.columns: dict[str, set[str]] = {main: set()}
 
     def column(self, reference: Reference) -> pl.Expr:
@@ -293,7 +310,7 @@ class _Builder:
         """Return where a stamp lies in a segment's intervals, which do not overlap."""
         import polars as pl
 
-        spans = sorted((s["start_ns"], s["end_ns"]) for s in self._segments if s["name"] == segment)
+        spans = sorted(self._drive.spans.get(segment, ()))
         starts, ends = np.array(spans, dtype=np.int64).reshape(-1, 2).T
 
         def inside(stamps: pl.Series) -> pl.Series:
@@ -320,5 +337,5 @@ class _Builder:
         scored = self._read(track, "valid") & self._read(TRUTH, "valid")
         if signal == "sideslip_rad":
             error = pl.arctan2(error.sin(), error.cos())
-            scored &= self._speed(TRUTH) > self._low_speed_m_s
+            scored &= self._speed(TRUTH) > self._drive.low_speed_m_s
         return pl.when(scored).then(error)

@@ -1,8 +1,8 @@
 """A run of one log or of a hundred thousand: planned (:mod:`~.planning`), processed (:mod:`~.working`), reported.
 
-Each drive is in the journal (:mod:`~.journal`) before the next one counts. At every end metrics.parquet and run.json
-are written from the journal and the figure files ``metrics/run=…/car=…/part-….parquet`` (:mod:`~.reporting`). No report
-and no figure is kept in memory.
+Each drive is in the journal (:mod:`~.journal`) before the next one counts. At every end the tables and run.json are
+written from the journal and the drives' parts of the tables (:mod:`~.reporting`). No report and no figure is kept in
+memory.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, Wo
 from pdhef_logtool.records.processes import process_name
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.results.no_position import neutral_stem
-from pdhef_logtool.results.opened_run import JOURNAL_FILE, LOGS, METRICS_FILE
+from pdhef_logtool.results.opened_run import JOURNAL_FILE, LOGS
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import Keep, RunConfig
-from pdhef_logtool.runs.drive_outputs import check_places, write_run
+from pdhef_logtool.runs.drive_outputs import check_places, write_run, write_run_tables
 from pdhef_logtool.runs.journal import Entry, Journal
 from pdhef_logtool.runs.judging import judge, read_validation_plan, write_verdicts
 from pdhef_logtool.runs.planning import Plan, PlannedLog, plan_logs, settings_of, sweep_parts
@@ -179,8 +179,6 @@ def _given_limits(config: RunConfig) -> Limits | None:
 
 def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> RunResult:
     """Run one log in this process; its error ends the run."""
-    from pdhef_logtool.results.parquet_sink import write_metrics
-
     config, car = job.config, job.cars.of_log(log)
     log = replace(log, stem=neutral_stem(log_identity(log))) if config.no_position else log
     _check_names([log], output, job, reporter)
@@ -196,7 +194,7 @@ def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> Ru
             stop.add_note("0 of 1 logs are done")
             raise
         verdicts = judge(job.validation, [result], job.strict)
-        write_metrics(output / METRICS_FILE, result.rows)
+        write_run_tables(output, [result])
         network = None if car.network is None else (Path(car.network_name).name, car.network.sha256)
         write_run(output, config.to_dict(), [result], verdicts, network)
         journal = Journal.of(output)  # of a run that this one replaces

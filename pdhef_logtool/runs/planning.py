@@ -260,7 +260,7 @@ class Plan:
         before = self.journal.entries.get(entry.label)
         self._damages[self.journal.add(entry, end.outcome, end.outputs).offset] = None
         if before is not None and before.part not in (None, entry.part):
-            remove_part(self.output, str(before.part))
+            (self.output / str(before.part)).unlink(missing_ok=True)
 
     def _changes(self, entry: Entry) -> Iterator[str]:
         """Yield as texts which settings and car of a drive have changed."""
@@ -286,17 +286,9 @@ class Plan:
 
 
 def sweep_parts(journal: Journal, output: Path) -> None:
-    """Remove figure files that no drive of the journal has, and the remains of killed workers."""
+    """Remove parts of tables that no drive of the journal has, and the remains of killed workers."""
     kept = {entry.part for entry in journal.entries.values()}
     root = output / PARTS
     for path in list(itertools.chain(root.rglob("*.parquet"), root.rglob(".*.partial"))):
         if path.relative_to(output).as_posix() not in kept:
-            remove_part(output, path.relative_to(output).as_posix())
-
-
-def remove_part(output: Path, part: str) -> None:
-    """Remove a file of figures and the folders that this leaves empty."""
-    with suppress(OSError):
-        (output / part).unlink(missing_ok=True)
-        for folder in itertools.islice((output / part).parents, 3):
-            folder.rmdir()
+            path.unlink(missing_ok=True)

@@ -88,12 +88,10 @@ def test_cannot_tell_is_an_answer_and_strict_refuses_it(tmp_path: Path) -> None:
 def test_drives_of_six_days_that_change_together_are_no_evidence_unless_the_user_says_so(tmp_path: Path) -> None:
     rmse = {f"d{i}": 0.01 for i in range(60)}
     changed = {label: 0.01 * (1.1 if i // 10 < 4 else 0.95) * (1 + 1e-4 * i) for i, label in enumerate(rmse)}
-    a, b = write_run(tmp_path / "a", rmse), write_run(tmp_path / "b", changed)
-    for i, label in enumerate(rmse):
-        start_ns = 1_700_000_000_000_000_000 + i // 10 * 86_400_000_000_000
-        report = {"format": "pdhef.report", "log": {"start_ns": start_ns}, "metadata": {"x.road": "north"}}
-        (a / "logs" / label).mkdir(parents=True)
-        (a / "logs" / label / "report.json").write_text(json.dumps(report))
+    of_days = [entry(label, day=f"2026-01-0{1 + i // 10}") for i, label in enumerate(rmse)]
+    reports = {label: {"metadata": {"x.road": "north"}} for label in rmse}
+    a = write_run(tmp_path / "a", rmse, entries=of_days, reports=reports)
+    b = write_run(tmp_path / "b", changed)
     found = _compare(a, b, GATE)
     (figure,) = found.figures
     assert (found.verdict, figure.change.dependence.by) == ("inconclusive", ("day",))

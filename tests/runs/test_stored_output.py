@@ -74,7 +74,7 @@ def test_a_store_has_what_a_folder_has_and_is_gone_on_with(tmp_path: Path, memor
     assert (opened.place, [log.label for log in opened.logs]) == (URL, ["a", "b", "c"])
     assert opened.logs[2].report() == {"format": "pdhef.report", "log": {"name": "c"}}
     assert opened.logs[2].estimates() is None
-    assert opened.metrics().collect().equals(pl.read_parquet(tmp_path / "out" / METRICS_FILE))
+    assert opened.table("metrics").collect().equals(pl.read_parquet(tmp_path / "out" / METRICS_FILE))
 
 
 @pytest.mark.slow
