@@ -32,11 +32,11 @@ SELECT kind, COUNT(DISTINCT log) AS drives, SUM(count) AS samples FROM faults
 WHERE origin = 'log' AND severity = 'lost' GROUP BY kind ORDER BY drives DESC;
 
 -- Which checks fail most often?
-SELECT "check", COUNT(*) AS drives FROM checks WHERE verdict = 'failed' AND NOT waived
-GROUP BY "check" ORDER BY drives DESC;
+SELECT name, COUNT(*) AS drives FROM checks WHERE verdict = 'failed' AND NOT waived
+GROUP BY name ORDER BY drives DESC;
 
 -- What is the evidence of a failed check, by drive?
-SELECT c.log, d.car, c."check", c.evidence, c.remedy FROM checks AS c JOIN drives AS d ON c.log = d.log
+SELECT c.log, d.car, c.name, c.evidence, c.remedy FROM checks AS c JOIN drives AS d ON c.log = d.log
 WHERE c.verdict = 'failed' AND NOT c.waived ORDER BY c.log;
 
 -- Where is the 95 % interval too narrow?
@@ -71,7 +71,7 @@ FROM drives GROUP BY SUBSTR(day, 1, 7) ORDER BY month;
 
 -- Does an entry of the metadata separate the drives?
 SELECT t.value, COUNT(d.sideslip_rmse_rad) AS scored, DEGREES(MEDIAN(d.sideslip_rmse_rad)) AS median_deg
-FROM metadata AS t JOIN drives AS d ON t.log = d.log WHERE t."key" = 'road' GROUP BY t.value ORDER BY median_deg DESC;
+FROM metadata AS t JOIN drives AS d ON t.log = d.log WHERE t.key = 'road' GROUP BY t.value ORDER BY median_deg DESC;
 
 -- In which drives did an estimator diverge?
 SELECT log, event, SUM(seconds) AS seconds FROM events WHERE event LIKE '% diverged'

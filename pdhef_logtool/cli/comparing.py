@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
-
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
-    from pdhef_logtool.results.gate import Figure
 
 commands = typer.Typer()
 #: Time around events: repeated crossings of a threshold are one event; a clip shows the time before and after.
@@ -56,22 +51,18 @@ def compare(
 ) -> None:
     """Compare two runs drive by drive: better, worse, or no significant difference."""
     from pdhef_logtool.cli.compare_tables import render_comparison, write_comparison_junit
-    from pdhef_logtool.evaluation.validation_plan import load_plan
-    from pdhef_logtool.results.comparing import compare_runs
-    from pdhef_logtool.results.opened_run import open_run
-    from pdhef_logtool.results.plan_against import plan_verdicts_against
+    from pdhef_logtool.results import comparing
     from pdhef_logtool.storage.object_store import is_url
     from pdhef_logtool.storage.outputs import check_no_input
 
     check_no_input(
         [*(Path(x) for x in (a, b) if not is_url(x)), plan], [file for file in (html, junit) if file is not None]
     )
-    validation = None if plan is None else load_plan(plan)
-    asked = _figures(validation, max_regression, estimator, metric)
-    run_a, run_b = open_run(a), open_run(b)
-    comparison = compare_runs(run_a, run_b, asked, allow_unpaired=allow_unpaired, cluster=cluster, strict=strict)
-    if validation is not None:
-        comparison = replace(comparison, requirements=plan_verdicts_against(validation, run_a, run_b, strict=strict))
+    comparison = comparing.compare(
+        a, b,
+        plan=plan, max_regression=max_regression, estimator=estimator, metric=metric, cluster=cluster,
+        allow_unpaired=allow_unpaired, strict=strict,
+    )  # fmt: skip
     for line in comparison.damaged:
         console.warn(line)
     if junit is not None:
@@ -82,28 +73,6 @@ def compare(
 
         write_bytes(html, comparison_page(comparison))
     console.finish(comparison, render_comparison, as_json)
-
-
-def _figures(
-    plan: ValidationPlan | None, max_regression: str | None, estimator: str | None, metric: str | None
-) -> tuple[Figure, ...]:
-    """Return the figures to compare by, with their limits, from the options; raises UsageError."""
-    from pdhef_logtool.evaluation.units import share_of
-    from pdhef_logtool.results.gate import MAIN, Figure, figure_problems, figures_of
-
-    single = {"--max-regression": max_regression, "--estimator": estimator, "--metric": metric}
-    given = [name for name, value in single.items() if value is not None]
-    if plan is not None:
-        if given:
-            raise UsageError(expected=f"--plan or {given[0]}", got="both", where="--plan")
-        return figures_of(plan)
-    limit = None if max_regression is None else share_of(max_regression)
-    if max_regression is not None and limit is None:
-        raise UsageError(expected="a share such as 5% or 0.05", got=max_regression, where="--max-regression")
-    figure = Figure(metric=metric or "rmse", estimator=estimator or MAIN, limit=limit)
-    if problems := figure_problems(figure.signal, figure.metric, figure.segment):
-        raise UsageError(expected="a figure; lower is better", got="; ".join(problems), where="--metric")
-    return (figure,)
 
 
 @options.command(commands)

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
@@ -16,13 +17,15 @@ from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.metrics.sensors import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.units import SIGNALS
+from pdhef_logtool.evaluation.validation_plan import load_plan
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.printable import listed
 from pdhef_logtool.results.changed_signals import ChangedSignal, changed_signals
-from pdhef_logtool.results.gate import MAIN, Figure
-from pdhef_logtool.results.opened_run import OpenedRun
+from pdhef_logtool.results.gate import MAIN, Figure, asked_figures
+from pdhef_logtool.results.opened_run import OpenedRun, open_run, table_file
 from pdhef_logtool.results.paired_change import PairedChange, Verdict, holm, log_ratios, paired_change
 from pdhef_logtool.results.pairing import Pair, Pairing, pair_logs
+from pdhef_logtool.results.plan_against import plan_verdicts_against
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.run_differences import run_differences
 
@@ -206,6 +209,34 @@ class Comparison:
         }
 
 
+def compare(
+    a: Path | str,
+    b: Path | str,
+    *,
+    plan: Path | str | None = None,
+    max_regression: str | None = None,
+    estimator: str | None = None,
+    metric: str | None = None,
+    cluster: str | None = None,
+    allow_unpaired: bool = False,
+    strict: bool = False,
+) -> Comparison:
+    """Compare the outputs of two runs, folders or URLs, as ``pdhef compare`` does with options of these names.
+
+    Raises
+    ------
+    UsageError : The plan is wrong, or an option.
+    OutputError : One of them is no finished run, or damaged; or no drive is in both.
+    """
+    validation = None if plan is None else load_plan(Path(plan))
+    figures = asked_figures(validation, max_regression, estimator, metric)
+    runs = open_run(a), open_run(b)
+    result = compare_runs(*runs, figures, allow_unpaired=allow_unpaired, cluster=cluster, strict=strict)
+    if validation is None:
+        return result
+    return replace(result, requirements=plan_verdicts_against(validation, *runs, strict=strict))
+
+
 def compare_runs(
     a: OpenedRun,
     b: OpenedRun,
@@ -300,7 +331,11 @@ class _Tables:
         """Return the drives of A with any figure that is not the same bit for bit."""
         import polars as pl
 
-        hashed = (run.table("metrics").select("log", row=pl.struct(_FIGURE).hash()) for run in self._runs)
+        tables = [run.table("metrics") for run in self._runs]
+        digests = {run.document.get("files", {}).get(table_file("metrics")) for run in self._runs}
+        if len(digests) == 1 and None not in digests and all(p.a.label == p.b.label for p in self._pairs):
+            return frozenset()
+        hashed = (rows.select("log", row=pl.struct(_FIGURE).hash()) for rows in tables)
         sums = (rows.group_by("log").agg(pl.col("row").sum(), pl.len()) for rows in hashed)
         a, b = (rows.collect(engine="streaming") for rows in sums)
         pairs = pl.DataFrame({"log": [p.a.label for p in self._pairs], "b": [p.b.label for p in self._pairs]})

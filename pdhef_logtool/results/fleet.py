@@ -210,7 +210,7 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
     import polars as pl
 
     rows = run.table("drives").collect().to_dicts()
-    done = [row for row in rows if row["outcome"] != "failed" or row["seconds"] is not None]
+    done = [row for row in rows if row["outcome"] != "failed"]
     faults = run.table("faults")
     sensors = faults.filter(pl.col("origin") == "sensor").group_by("log").agg(pl.col("kind").unique().sort())
     kinds = dict(sensors.collect().iter_rows())

@@ -152,20 +152,19 @@ def open_run(output: Path | str) -> OpenedRun:
     Raises
     ------
     OutputError
-        There is no finished run in the folder: run.json or a table is missing or unreadable. Its exit code is 2 where
-        there is no such folder.
+        There is no finished run in the folder: run.json is missing or unreadable. Its exit code is 2 where there is no
+        such folder.
     """
     mirror = Mirror(str(output)) if is_url(output) else None
     folder = Path(output) if mirror is None else mirror.folder
-    for name in (RUN_FILE, table_file(TABLES[0])):
-        if mirror is not None:
-            mirror.fetch(name)
-        if not (folder / name).is_file():
-            got = f"a folder without {name}" if folder.is_dir() else "no such folder"
-            where = str(folder) if mirror is None else mirror.objects.shown
-            missing = mirror is None and not folder.exists()
-            raise OutputError(expected="the outputs of a run", got=got, where=where, remedy=_REMEDY, missing=missing)
     what, path = "the run.json of a run", folder / RUN_FILE
+    if mirror is not None:
+        mirror.fetch(RUN_FILE)
+    if not path.is_file():
+        got = f"a folder without {RUN_FILE}" if folder.is_dir() else "no such folder"
+        where = str(folder) if mirror is None else mirror.objects.shown
+        missing = mirror is None and not folder.exists()
+        raise OutputError(expected="the outputs of a run", got=got, where=where, remedy=_REMEDY, missing=missing)
     document = read_sealed(path, what, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
     if document.get("format") != "pdhef.run":
         got = f"format {document.get('format')!r}"

@@ -36,7 +36,7 @@ def drive_part(outcome: LogOutcome, report: Mapping[str, Any] | None, rows: Sequ
     space, plan = report.get("operating_space") or {"cells": ()}, report.get("plan") or {}
     of_log: dict[str, Iterable[Mapping[str, Any]]] = {
         "drives": [_drive(outcome, report, rows)],
-        "checks": [{**c, "check": c["name"]} for c in report.get("checks", ())],
+        "checks": report.get("checks", ()),
         "events": [{**s, "event": s["name"], **_times(s)} for s in report.get("segments", ())],
         "faults": _faults(report),
         "exposure": [

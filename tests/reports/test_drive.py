@@ -117,6 +117,7 @@ def plan_of(*outcomes: str) -> dict:
         "title": "", "file": "plan.toml", "sha256": "a" * 64,
         "requirements": [
             {"id": f"SR-{i}", "title": f"Title {i}", "label": "sideslip RMSE ≤ 0.5°", "unit": "rad", "bound": 0.01,
+             "signal": "sideslip_rad", "metric": "rmse", "segment": "all",
              "baseline": None, "outcome": outcome, "value": 0.008, "low": None, "high": None, "margin": 0.002,
              "exposure": {"drives": 1, "minutes": 2.0, "km": 3.0}, "reason": f"reason {i}", "next": f"do {i}",
              "notes": ["interval from blocks of 10 s"]}
@@ -126,7 +127,8 @@ def plan_of(*outcomes: str) -> dict:
 
 
 def test_the_first_screen_has_answer_verdicts_what_was_tested_the_worst_place_and_next_steps_in_this_order(tmp_path):
-    check = {"name": "a.sign", "verdict": "failed", "evidence": "gain -1", "remedy": "", "waived": False}
+    check = {"name": "a.sign", "subject": "a", "verdict": "failed", "evidence": "gain -1", "remedy": ""}
+    check["waived"] = False
     answer = {"main": "pd-hef", "why": "", "texts": {"result": "Sideslip RMSE 0.1°", "assumed": "not causal"}}
     plan = plan_of("PASS", "FAIL", "INCONCLUSIVE")
     page = page_of(write_run(tmp_path, drive_tracks(), plan=plan, checks=[check], answer=answer))

@@ -96,7 +96,7 @@ def test_every_page_of_a_run_is_written_and_removed(tmp_path: Path) -> None:
 
 def test_a_damaged_table_is_told_and_stops_no_other_page(tmp_path: Path) -> None:
     folder = run_of(tmp_path, {"a": {"errors": (0.001, 0.002)}}, {"bad": "empty"})
-    (folder / "metrics.parquet").write_bytes(b"PAR1 no")
+    (folder / "tables/metrics.parquet").write_bytes(b"PAR1 no")
     written = write_pages(open_run(folder))
     assert written.fleet.file is None and written.exit_code == 3
     assert any("no page of the run" in line for line in written.wrong)

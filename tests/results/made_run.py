@@ -84,8 +84,10 @@ def write_run(
     """Write a run of drives with such RMSE of ``pd-hef``; ``entries`` and more ``rows`` as they are."""
     folder.mkdir(parents=True, exist_ok=True)
     logs = [entry(label) for label in rmse] if entries is None else list(entries)
-    known = {"format": "pdhef.run", "version": 1, "config": {"friction": "auto"}, "versions": {"numpy": "2.0"}}
-    (folder / "run.json").write_text(json.dumps(seal({**known, "logs": logs, **document})))
+    head = {"format": "pdhef.run", "version": 1, "config": {"friction": "auto"}, "versions": {"numpy": "2.0"}}
+    (folder / "run.json").write_text(json.dumps(seal({**head, "logs": logs, **document})))
+    known = {"log": {"start_ns": START_NS, "duration_s": 1.0}}
+    reports = reports or {of["log"]: known for of in logs if not of["outcome"].startswith("failed")}
     write_tables(folder, logs, [*(row(label, value) for label, value in rmse.items()), *rows], reports)
     return folder
 

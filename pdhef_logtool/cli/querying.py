@@ -1,0 +1,37 @@
+"""``pdhef query``: SQL on the tables of runs."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import typer
+from typer import Argument, Option
+
+from pdhef_logtool.cli import console, options
+from pdhef_logtool.records.printable import printable
+
+commands = typer.Typer()
+#: Largest number of rows in a table.
+_MOST_ROWS = 100
+
+
+@options.command(commands)
+def query(
+    runs: Annotated[list[str], Argument(metavar="RUN", help="Output of a run: folder or URL.")],
+    sql: Annotated[str, Argument(metavar="SQL", help="Statement on the tables.")],
+    *,
+    form: Annotated[Literal["table", "csv", "json"], Option("--format", help="Form of the answer.")] = "table",
+) -> None:
+    """Answer a question about the drives of runs, in SQL."""
+    from pdhef_logtool.results.querying import query as answer
+
+    rows = answer(runs, sql)
+    if form != "table":
+        print(rows.write_csv() if form == "csv" else rows.write_json())  # noqa: T201
+        return
+    made = console.table(*(f"{'>' * kind.is_numeric()}{name}" for name, kind in rows.schema.items()), fold=len(rows))
+    for row in rows.head(_MOST_ROWS).iter_rows():
+        made.add_row(*("-" if x is None else f"{x:.4g}" if isinstance(x, float) else printable(str(x)) for x in row))
+    console.stdout().print(made)
+    if (more := len(rows) - _MOST_ROWS) > 0:
+        console.say(f"{more} more rows: --format csv")
