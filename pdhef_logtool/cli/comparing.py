@@ -47,7 +47,6 @@ def compare(
     strict: Annotated[bool, Option("--strict", help="Inconclusive results fail.")] = False,
     html: Annotated[Path | None, Option(help="HTML file for the comparison.")] = None,
     junit: Annotated[Path | None, Option(help="JUnit XML file for the verdicts.")] = None,
-    as_json: options.JsonFlag = False,
 ) -> None:
     """Compare two runs drive by drive: better, worse, or no significant difference."""
     from pdhef_logtool.cli.compare_tables import render_comparison, write_comparison_junit
@@ -72,7 +71,7 @@ def compare(
         from pdhef_logtool.storage.files import write_bytes
 
         write_bytes(html, comparison_page(comparison))
-    console.finish(comparison, render_comparison, as_json)
+    console.finish(comparison, render_comparison)
 
 
 @options.command(commands)
@@ -97,15 +96,12 @@ def events(
     source: Annotated[
         Path | None, Option(metavar="DIR", help="Folder of the logs, for clips of a run without annotated copies.")
     ] = None,
-    parquet: Annotated[Path | None, Option(metavar="FILE", help="Parquet file for the events.")] = None,
-    as_json: options.JsonFlag = False,
 ) -> None:
     """Find the times at which a condition is true, and cut clips there."""
     from pdhef_logtool.cli.event_tables import render_events
-    from pdhef_logtool.results.events import event_condition, find_events, write_events
+    from pdhef_logtool.results.events import event_condition, find_events
     from pdhef_logtool.results.opened_run import open_run
     from pdhef_logtool.storage.object_store import is_url
-    from pdhef_logtool.storage.outputs import check_no_input
 
     condition = event_condition(where)
     least_s = _seconds(least, "--for")
@@ -114,7 +110,6 @@ def events(
         raise UsageError(expected="--clip", got="--source alone", where="--source")
     if is_url(output) and clip:
         options.local_folder(output)
-    check_no_input([] if is_url(output) else [Path(output)], [] if parquet is None else [parquet])
     run = open_run(output)
     events_found = find_events(run, condition, estimator=estimator, least_s=least_s, pad_s=pad_s)
     for line in events_found.damaged:
@@ -125,9 +120,7 @@ def events(
         named = {r.track for r in condition.references.values() if r.track is not None}
         named |= set() if estimator is None else {estimator}
         events_found = write_clips(run, events_found, pad_s=pad_s, named=named, source=source, tell=console.warn)
-    if parquet is not None:
-        write_events(parquet, events_found)
-    console.finish(events_found, render_events, as_json)
+    console.finish(events_found, render_events)
 
 
 def _seconds(text: str, option: str) -> float:

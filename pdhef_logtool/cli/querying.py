@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
@@ -20,18 +20,18 @@ def query(
     runs: Annotated[list[str], Argument(metavar="RUN", help="Output of a run: folder or URL.")],
     sql: Annotated[str, Argument(metavar="SQL", help="Statement on the tables.")],
     *,
-    form: Annotated[Literal["table", "csv", "json"], Option("--format", help="Form of the answer.")] = "table",
+    csv: Annotated[bool, Option("--csv", help="Print the answer as CSV.")] = False,
 ) -> None:
     """Answer a question about the drives of runs, in SQL."""
     from pdhef_logtool.results.querying import query as answer
 
     rows = answer(runs, sql)
-    if form != "table":
-        print(rows.write_csv() if form == "csv" else rows.write_json())  # noqa: T201
+    if csv or console.as_json:
+        print(rows.write_csv() if csv else rows.write_json())  # noqa: T201
         return
     made = console.table(*(f"{'>' * kind.is_numeric()}{name}" for name, kind in rows.schema.items()), fold=len(rows))
     for row in rows.head(_MOST_ROWS).iter_rows():
         made.add_row(*("-" if x is None else f"{x:.4g}" if isinstance(x, float) else printable(str(x)) for x in row))
     console.stdout().print(made)
     if (more := len(rows) - _MOST_ROWS) > 0:
-        console.say(f"{more} more rows: --format csv")
+        console.say(f"{more} more rows: --csv")

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
-from pathlib import Path
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from pdhef_logtool.records.tracks import TRACK_COLUMNS
 from pdhef_logtool.results.condition import Condition, Reference, parse_condition
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.results.sink import TRUTH
-from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
 if TYPE_CHECKING:
     import polars as pl
@@ -166,16 +164,6 @@ def _drives(run: OpenedRun) -> dict[str, _Drive]:
     for log, event, *span in events.iter_rows():
         drives[log].spans.setdefault(event, []).append((span[0], span[1]))
     return drives
-
-
-def write_events(path: Path, events: FoundEvents) -> None:
-    """Write the events as Parquet; raises OutputError."""
-    import polars as pl
-
-    names = (f.name for f in fields(FoundEvent))
-    schema = {n: pl.String if n == "drive" else pl.Int64 if n.endswith("_ns") else pl.Float64 for n in names}
-    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
-        pl.DataFrame([asdict(e) for e in events.events], schema=schema).write_parquet(file)
 
 
 def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str | None:

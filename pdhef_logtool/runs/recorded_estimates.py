@@ -99,7 +99,6 @@ def score_log(
     name: str | None = None,
     output: Path | None = None,
     junit: Path | None = None,
-    strict: bool = False,
     reporter: Reporter = SILENT,
 ) -> RunResult:
     """Score recorded estimates of one log against its ground truth; same figures, tables and report as a run.
@@ -110,7 +109,7 @@ def score_log(
     estimates : ``[SIGNAL=]TOPIC[.FIELD]``, together one estimator called ``name`` (default: its topic); without any,
         the mapping's ``[estimates.NAME.SIGNAL]`` tables, all or the one called ``name``.
     truth : likewise; without any, the mapping's or the recognised ground truth.
-    output : folder for the files, None to write none. junit, strict : as for :func:`pdhef_logtool.runs.fleet.run_logs`.
+    output : folder for the files, None to write none. junit : as for :func:`pdhef_logtool.runs.fleet.run_logs`.
 
     Raises
     ------
@@ -131,7 +130,7 @@ def score_log(
         drive, sources = _open(log_input, car, mapping, config, (estimates, truth, name), reporter)
         with drive:
             result = _score_drive(drive, sources, config, plan, outputs, reporter)
-        verdicts = judge(plan, [result], strict)
+        verdicts = judge(plan, [result], config.strict)
         if output is not None:
             write_run_tables(output, [result])
             write_run(output, _config_document(config, drive, sources), [result], verdicts)

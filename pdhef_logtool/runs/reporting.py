@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 
-def collect(
-    plan: Plan, config: RunConfig, validation: ValidationPlan, *, strict: bool = False
-) -> tuple[list[LogResult], PlanVerdicts | None]:
+def collect(plan: Plan, config: RunConfig, validation: ValidationPlan) -> tuple[list[LogResult], PlanVerdicts | None]:
     """Write the tables and run.json of all drives that are done.
 
     Returns their results in the order of the plan of the run, and the verdicts of the validation plan.
@@ -40,7 +38,7 @@ def collect(
     write_run_tables(output, results)
     cars = plan.journal.described["car"] | plan.cars_of_run()  # the journal's line of a car may be damaged
     networks = {cars[e.car]["network"] and tuple(cars[e.car]["network"]) for e, _ in entries if e.car is not None}
-    verdicts = judge(validation, results, strict, output / table_file("metrics"))
+    verdicts = judge(validation, results, config.strict, output / table_file("metrics"))
     network = networks.pop() if len(networks) == 1 else None
     write_run(output, config.to_dict(), results, verdicts, network, remaining)
     if remaining:

@@ -14,7 +14,7 @@ import pytest
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.results.clips import write_clips
-from pdhef_logtool.results.events import FoundEvents, event_condition, find_events, write_events
+from pdhef_logtool.results.events import FoundEvents, event_condition, find_events
 from pdhef_logtool.results.opened_run import open_run
 from tests.results import source_log
 from tests.results.made_run import START_NS, entry, write_estimates, write_run
@@ -94,14 +94,6 @@ def test_other_tracks_are_read_at_the_same_stamps(run: Path, tmp_path: Path) -> 
     with pytest.raises(UsageError, match="an estimator of this run: esc, got none named"):
         _find(scored, "vx_m_s > 0")
     assert len(_find(scored, "vx_m_s > 0", estimator="esc").events) == 1
-
-
-def test_rows_are_written_as_parquet_even_none(run: Path, tmp_path: Path) -> None:
-    write_events(tmp_path / "e.parquet", _find(run, "speed_m_s < 3"))
-    table = pl.read_parquet(tmp_path / "e.parquet")
-    assert table["drive"].to_list() == ["a", "b", "no_truth"]
-    write_events(tmp_path / "e.parquet", _find(run, "speed_m_s > 300"))
-    assert pl.read_parquet(tmp_path / "e.parquet").schema == table.schema
 
 
 @pytest.fixture
