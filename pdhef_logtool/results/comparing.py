@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -32,9 +31,6 @@ from pdhef_logtool.results.run_differences import run_differences
 if TYPE_CHECKING:
     import polars as pl
 
-    #: Rows of figures by signal, segment and metric.
-    _Rows: TypeAlias = Mapping[tuple[object, ...], pl.DataFrame]
-
 #: ``no figure``: no drive has it on both sides.
 FigureVerdict: TypeAlias = Verdict | Literal["no figure"]
 
@@ -44,7 +40,7 @@ INDEPENDENT = "none"
 MOST_FOLLOWED = 10
 #: Verdicts from grave to harmless; the gravest one is the overall verdict.
 _GRAVITY: tuple[FigureVerdict, ...] = ("worse", "no figure", "inconclusive", "not worse", "better", "equal")
-_FIGURE = ["estimator", "signal", "segment", "metric", "value", "n", "unit"]
+_FIGURE = ("estimator", "signal", "segment", "metric", "unit")
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,7 +265,6 @@ def compare_runs(
             remedy="run both on the same drives",
         )
     gated = any(f.limit is not None for f in figures)
-    damaged: dict[str, None] = {}
     tables = _Tables(a, b, pairing.pairs)
     changed = tables.changed()
     result = Comparison(
@@ -287,45 +282,39 @@ def compare_runs(
         strict=strict,
     )
     if not changed and not gated:
-        return replace(result, damaged=tuple(damaged))
-    asked = cluster not in (None, INDEPENDENT)
-    grouping = _grouping(a, pairing, cluster) if changed or asked else _Grouping()
+        return result
+    grouping = _grouping(a, pairing, cluster)
     compared = tuple(tables.compared(figures, grouping))
     tables.check_estimators(compared)
     if not changed:
-        return replace(result, figures=compared, damaged=tuple(damaged))
+        return replace(result, figures=compared)
     others = _corrected(tables.compared(_beside(figures), grouping))
     followed = _most_changed(pairing.pairs, changed, compared[0])
-    main = figures[0].estimator
     signals: list[ChangedSignal] = []
+    damaged: list[str] = []
     for pair in followed:
-        with _noted(damaged):
-            signals += changed_signals(pair, tables.name_of(pair, main))
+        try:
+            main = figures[0].estimator
+            signals += changed_signals(pair, pair.a.main() if main == MAIN else main)
+        except OutputError as error:
+            damaged.append(str(error))
     return replace(
         result, figures=compared, others=others, signals=tuple(signals), followed=len(followed), damaged=tuple(damaged)
     )
-
-
-@contextmanager
-def _noted(damaged: dict[str, None]) -> Iterator[None]:
-    """Skip a damaged log and add its line."""
-    try:
-        yield
-    except OutputError as error:
-        damaged[str(error)] = None
 
 
 class _Tables:
     """Figures of two runs for their pairs; only requested rows are read."""
 
     def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair]) -> None:
-        self._runs = (a, b)
-        self._pairs = pairs
-        self._main = [pair.a.main() for pair in pairs]
+        import polars as pl
 
-    def name_of(self, pair: Pair, estimator: str) -> str:
-        """Return the name of ``estimator`` in a pair."""
-        return self._main[self._pairs.index(pair)] if estimator == MAIN else estimator
+        columns = {
+            "a": [p.a.label for p in pairs],
+            "b": [p.b.label for p in pairs],
+            "main": [p.a.main() for p in pairs],
+        }
+        self._runs, self._pairs = (a, b), pl.DataFrame(columns).with_row_index("place")
 
     def changed(self) -> frozenset[str]:
         """Return the drives of A with any figure that is not the same bit for bit."""
@@ -333,62 +322,70 @@ class _Tables:
 
         tables = [run.table("metrics") for run in self._runs]
         digests = {run.document.get("files", {}).get(table_file("metrics")) for run in self._runs}
-        if len(digests) == 1 and None not in digests and all(p.a.label == p.b.label for p in self._pairs):
+        if len(digests) == 1 and None not in digests and self._pairs["a"].equals(self._pairs["b"]):
             return frozenset()
-        hashed = (rows.select("log", row=pl.struct(_FIGURE).hash()) for rows in tables)
+        hashed = (rows.select("log", row=pl.struct(*_FIGURE, "value", "n").hash()) for rows in tables)
         sums = (rows.group_by("log").agg(pl.col("row").sum(), pl.len()) for rows in hashed)
         a, b = (rows.collect(engine="streaming") for rows in sums)
-        pairs = pl.DataFrame({"log": [p.a.label for p in self._pairs], "b": [p.b.label for p in self._pairs]})
-        both = pairs.join(a, on="log", how="left").join(b, left_on="b", right_on="log", how="left", suffix="_b")
+        both = self._pairs.join(a, left_on="a", right_on="log", how="left")
+        both = both.join(b, left_on="b", right_on="log", how="left", suffix="_b")
         differs = pl.col("row").ne_missing(pl.col("row_b")) | pl.col("len").ne_missing(pl.col("len_b"))
-        return frozenset(both.filter(differs)["log"])
+        return frozenset(both.filter(differs)["a"])
 
     def compared(self, figures: Sequence[Figure], grouping: _Grouping) -> list[ComparedFigure]:
         """Return figures over all pairs; only their rows are read."""
-        a, b = (rows.partition_by("signal", "segment", "metric", as_dict=True) for rows in self._rows(figures))
-        return [self._compared(figure, a, b, grouping) for figure in figures]
+        rows = self._rows(figures)
+        return [self._compared(figure, rows, grouping) for figure in figures]
 
-    def _compared(self, figure: Figure, a: _Rows, b: _Rows, grouping: _Grouping) -> ComparedFigure:
-        key = (figure.signal, figure.segment, figure.metric)
-        of_a, of_b = _by_drive(a.get(key)), _by_drive(b.get(key))
-        tainted_a, tainted_b = (_by_drive(rows.get((figure.signal, "all", "not_independent"))) for rows in (a, b))
-        names = self._main if figure.estimator == MAIN else [figure.estimator] * len(self._pairs)
-        drives: list[DriveFigure] = []
-        places: list[int] = []
-        only: dict[str, list[str]] = {"a": [], "b": [], "": []}
-        unit, tainted = "", 0
-        for place, (pair, name) in enumerate(zip(self._pairs, names, strict=True)):
-            key_a, key_b = (pair.a.label, name), (pair.b.label, name)
-            if key_a not in of_a or key_b not in of_b:
-                only["a" * (key_a in of_a) + "b" * (key_b in of_b)].append(pair.a.label)
-                continue
-            (value_a, n_a, unit), (value_b, n_b, _) = of_a[key_a], of_b[key_b]
-            share = _share(value_a, value_b)
-            drives.append(DriveFigure(pair.a.label, pair.b.label, value_a, value_b, n_a, n_b, share))
-            places.append(place)
-            tainted += key_a in tainted_a or key_b in tainted_b
-        ratios = log_ratios(np.array([d.a for d in drives]), np.array([d.b for d in drives]))
-        change = paired_change(ratios, *grouping.of(places))
+    def _rows(self, figures: Sequence[Figure]) -> pl.DataFrame:
+        """Return the figures of the pairs, a row each: ``value``, ``n``, ``independent`` of A, and with ``_b`` of B."""
+        import polars as pl
+
+        named = {f.estimator for f in figures} - {MAIN} | set(self._pairs["main"])
+        asked = [named, *({getattr(f, key) for f in figures} for key in _FIGURE[1:-1])]
+        wanted = [pl.col(key).is_in(sorted(of)) for key, of in zip(_FIGURE, asked, strict=False)]
+        a, b = (
+            self._pairs.select("place", log=side)
+            .join(run.table("metrics").filter(pl.col("value").is_finite(), *wanted).collect(), on="log")
+            .drop("log", "algorithm")
+            for side, run in zip("ab", self._runs, strict=True)
+        )
+        both = a.join(b, on=["place", *_FIGURE], how="full", coalesce=True, suffix="_b")
+        return both.join(self._pairs, on="place", how="left").sort("place")
+
+    def _compared(self, figure: Figure, rows: pl.DataFrame, grouping: _Grouping) -> ComparedFigure:
+        import polars as pl
+
+        name = pl.col("main") if figure.estimator == MAIN else pl.lit(figure.estimator)
+        key = {key: getattr(figure, key) for key in ("signal", "segment", "metric")}
+        found = rows.filter(pl.col("estimator") == name, **key)
+        both = found.drop_nulls(["value", "value_b"])
+        a, b = both["value"].to_numpy(), both["value_b"].to_numpy()
+        ratios = log_ratios(a, b)
+        change = paired_change(ratios, *grouping.of(both["place"].to_list()))
         verdict: FigureVerdict = change.verdict(figure.limit or 0.0)
-        if all((d.a, d.n_a) == (d.b, d.n_b) for d in drives):
-            verdict = "equal" if drives else "no figure"
-        ordered = [drives[i] for i in np.argsort(-ratios, kind="stable")]
+        if np.array_equal(a, b) and both["n"].equals(both["n_b"]):
+            verdict = "equal" if len(both) else "no figure"
+        ordered = both.select("a", "b", "value", "value_b", "n", "n_b")[np.argsort(-ratios, kind="stable")]
         return ComparedFigure(
             figure,
             verdict,
             change,
-            unit=unit,
-            drives=tuple(ordered),
-            only_a=tuple(only["a"]),
-            only_b=tuple(only["b"]),
-            neither=len(only[""]),
-            notes=tuple(_notes(ordered, tainted)),
+            unit=both["unit"][0] if len(both) else "",
+            drives=tuple(
+                DriveFigure(drive, drive_b, x, y, n_a, n_b, _share(x, y))
+                for drive, drive_b, x, y, n_a, n_b in ordered.iter_rows()
+            ),
+            only_a=tuple(found.filter(pl.col("value_b").is_null())["a"]),
+            only_b=tuple(found.filter(pl.col("value").is_null())["a"]),
+            neither=len(self._pairs) - len(found),
+            notes=tuple(_notes(both)),
         )
 
     def check_estimators(self, figures: Sequence[ComparedFigure]) -> None:
         """Raise UsageError for an estimator that no drive of either run has, and for runs without a selected one."""
         missing = {f.figure.estimator for f in figures if f.verdict == "no figure"}
-        if any(self._main):
+        if any(self._pairs["main"]):
             missing -= {MAIN}
         if not missing:
             return
@@ -399,38 +396,14 @@ class _Tables:
             got = "none named, and none that is selected" if name == MAIN else name
             raise UsageError(expected=f"an estimator of these runs: {', '.join(single)}", got=got, where="--estimator")
 
-    def _rows(self, figures: Sequence[Figure]) -> list[pl.DataFrame]:
-        """Return the rows of figures and of the independence of their ground truth, of both runs."""
-        import polars as pl
 
-        named = {f.estimator for f in figures} - {MAIN}
-        asked = {
-            "estimator": named if named == {f.estimator for f in figures} else named | set(self._main),
-            "signal": {f.signal for f in figures},
-            "segment": {"all", *(f.segment for f in figures)},
-            "metric": {"not_independent", *(f.metric for f in figures)},
-        }
-        wanted = [pl.col(key).is_in(sorted(values)) for key, values in asked.items()]
-        rows = (run.table("metrics").filter(*wanted).select("log", *_FIGURE) for run in self._runs)
-        return [of.collect(engine="streaming") for of in rows]
-
-
-def _by_drive(rows: pl.DataFrame | None) -> dict[tuple[str, str], tuple[float, int, str]]:
-    """Return value, number of stamps and unit of a figure by log and estimator, where it has a value."""
-    if rows is None:
-        return {}
-    columns = ("log", "estimator", "value", "n", "unit")
-    table = rows.select(columns).iter_rows()
-    return {(r[0], r[1]): (r[2], r[3], r[4]) for r in table if r[2] is not None and math.isfinite(r[2])}
-
-
-def _notes(drives: Sequence[DriveFigure], tainted: int) -> Iterator[str]:
-    other = [d for d in drives if d.n_a != d.n_b]
-    if other:
-        share = _share(sum(d.n_a for d in drives), sum(d.n_b for d in drives)) or 0.0
-        yield f"other stamps are scored in {len(other)} of {len(drives)} drives, {share:+.2%} in all"
-    if tainted:
-        yield f"in {tainted} of {len(drives)} drives the ground truth is one of the estimator's inputs"
+def _notes(both: pl.DataFrame) -> Iterator[str]:
+    other = both.filter(both["n"] != both["n_b"])
+    if len(other):
+        share = _share(float(both["n"].sum()), float(both["n_b"].sum())) or 0.0
+        yield f"other stamps are scored in {len(other)} of {len(both)} drives, {share:+.2%} in all"
+    if tainted := len(both) - int((both["independent"] & both["independent_b"]).sum()):
+        yield f"in {tainted} of {len(both)} drives the ground truth is one of the estimator's inputs"
 
 
 def _share(a: float, b: float) -> float | None:

@@ -7,7 +7,6 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from pdhef_logtool.evaluation.dependence import factors_of
 from pdhef_logtool.evaluation.validation_plan import RUN, ValidationPlan
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun, open_run
@@ -42,7 +41,7 @@ def _against(plan: ValidationPlan, run: OpenedRun, logs: Sequence[OpenedLog]) ->
 def judged_drive(log: OpenedLog, read_report: Callable[[], Mapping[str, Any] | None] | None = None) -> JudgedDrive:
     """Return a log of a run for :func:`~.plan_verdicts.plan_verdicts`; ``read_report`` None: from its file."""
     main = log.entry.get("main")
-    factors = factors_of(log.entry, None)
+    factors = {"car": (log.entry.get("car") or {}).get("name"), **{k: log.entry.get(k) for k in ("day", "route")}}
     return JudgedDrive(log.label, None if main is None else str(main), read_report or partial(_report, log), factors)
 
 

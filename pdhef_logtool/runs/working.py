@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import platform
 import time
@@ -171,17 +170,10 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
         {"digest": digest_of(record["parts"]), **record},
         part,
         result.failed_checks,
-        _sideslip_error_rad(result),
+        result.part["drives"][0][0]["sideslip_rmse_rad"].as_py(),
         tuple(warned),
         outputs=states_of(task.output, [part, *(f"{log_place(task.log.stem)}/{name}" for name in LOG_FILES)]),
     )
-
-
-def _sideslip_error_rad(result: LogResult) -> float | None:
-    """Return the sideslip RMSE of the selected estimate, None if no independent ground truth scores it."""
-    wanted = (result.outcome.main, "sideslip_rad", "all", "rmse")
-    rows = (r for r in result.rows if (r.estimator, r.signal, r.segment, r.metric) == wanted)
-    return next((r.value for r in rows if r.independent and math.isfinite(r.value)), None)
 
 
 def _write_page(result: LogResult) -> list[str]:
