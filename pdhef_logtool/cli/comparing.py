@@ -62,8 +62,6 @@ def compare(
         plan=plan, max_regression=max_regression, estimator=estimator, metric=metric, cluster=cluster,
         allow_unpaired=allow_unpaired, strict=strict,
     )  # fmt: skip
-    for line in comparison.damaged:
-        console.warn(line)
     if junit is not None:
         write_comparison_junit(junit, comparison)
     if html is not None:

@@ -19,7 +19,6 @@ from pdhef_logtool.evaluation.units import SIGNALS
 from pdhef_logtool.evaluation.validation_plan import load_plan
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.printable import listed
-from pdhef_logtool.results.changed_signals import ChangedSignal, changed_signals
 from pdhef_logtool.results.gate import MAIN, Figure, asked_figures
 from pdhef_logtool.results.opened_run import OpenedRun, open_run, table_file
 from pdhef_logtool.results.paired_change import PairedChange, Verdict, holm, log_ratios, paired_change
@@ -36,8 +35,6 @@ FigureVerdict: TypeAlias = Verdict | Literal["no figure"]
 
 #: Value of ``cluster`` for drives that do not depend on one another.
 INDEPENDENT = "none"
-#: Number of drives with the largest changes for which tracks are compared.
-MOST_FOLLOWED = 10
 #: Verdicts from grave to harmless; the gravest one is the overall verdict.
 _GRAVITY: tuple[FigureVerdict, ...] = ("worse", "no figure", "inconclusive", "not worse", "better", "equal")
 _FIGURE = ("estimator", "signal", "segment", "metric", "unit")
@@ -117,8 +114,6 @@ class Comparison:
     differences : other causes of changed figures, a line each. changed : drives with any figure that is not the
         same bit for bit.
     figures : requested, or of the gate. others : shown beside them; empty if all are equal.
-    signals : where the tracks of the most changed drives part. followed : how many drives were looked at for it.
-    damaged : files of drives that could not be read, a line each.
     gated, allow_unpaired, strict : rules of the gate. requirements : verdicts of a validation plan on B.
     """
 
@@ -131,9 +126,6 @@ class Comparison:
     changed: int
     figures: tuple[ComparedFigure, ...]
     others: tuple[ComparedFigure, ...] = ()
-    signals: tuple[ChangedSignal, ...] = ()
-    followed: int = 0
-    damaged: tuple[str, ...] = ()
     cluster: str | None = None
     gated: bool = False
     allow_unpaired: bool = False
@@ -180,18 +172,16 @@ class Comparison:
 
     @property
     def exit_code(self) -> int:
-        """4 where the gate is closed, 3 for damaged files and for drives without partner and no gate, else 0."""
+        """4 where the gate is closed, 3 for drives without partner and no gate, else 0."""
         if self.failures or (self.requirements is not None and self.requirements.closes_gate):
             return EXIT_GATE
-        if self.damaged:
-            return EXIT_PARTIAL
         return EXIT_PARTIAL if self.unpaired and not self.gated and not self.allow_unpaired else EXIT_OK
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as one JSON-able document."""
         return {
             "format": "pdhef.comparison",
-            "version": 1,
+            "version": 2,
             **{key: getattr(self, key) for key in ("a", "b", "verdict", "exit_code", "failures")},
             "plan": None if self.requirements is None else self.requirements.to_dict(),
             "differences": self.differences,
@@ -199,9 +189,6 @@ class Comparison:
             **{key: getattr(self, key) for key in ("only_a", "only_b", "changed", "cluster")},
             "figures": [f.to_dict() for f in self.figures],
             "others": [f.to_dict() for f in self.others],
-            "signals": [asdict(s) for s in self.signals],
-            "followed": self.followed,
-            "damaged": self.damaged,
         }
 
 
@@ -288,19 +275,7 @@ def compare_runs(
     tables.check_estimators(compared)
     if not changed:
         return replace(result, figures=compared)
-    others = _corrected(tables.compared(_beside(figures), grouping))
-    followed = _most_changed(pairing.pairs, changed, compared[0])
-    signals: list[ChangedSignal] = []
-    damaged: list[str] = []
-    for pair in followed:
-        try:
-            main = figures[0].estimator
-            signals += changed_signals(pair, pair.a.main() if main == MAIN else main)
-        except OutputError as error:
-            damaged.append(str(error))
-    return replace(
-        result, figures=compared, others=others, signals=tuple(signals), followed=len(followed), damaged=tuple(damaged)
-    )
+    return replace(result, figures=compared, others=_corrected(tables.compared(_beside(figures), grouping)))
 
 
 class _Tables:
@@ -439,13 +414,6 @@ def _beside(asked: Sequence[Figure]) -> list[Figure]:
 def _corrected(figures: Sequence[ComparedFigure]) -> tuple[ComparedFigure, ...]:
     there = [f for f in figures if f.drives]
     return tuple(replace(f, corrected_p=p) for f, p in zip(there, holm([f.change.sign_p for f in there]), strict=True))
-
-
-def _most_changed(pairs: Sequence[Pair], changed: frozenset[str], figure: ComparedFigure) -> list[Pair]:
-    """Return the pairs with the largest changes of the figure, pairs without it last, at most :data:`MOST_FOLLOWED`."""
-    by_drive = {d.drive: abs(float(log_ratios(np.array([d.a]), np.array([d.b]))[0])) for d in figure.drives}
-    changed_pairs = [pair for pair in pairs if pair.a.label in changed]
-    return sorted(changed_pairs, key=lambda pair: -by_drive.get(pair.a.label, -1.0))[:MOST_FOLLOWED]
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,6 @@ from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.storage.documents import jsonable
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
     from pdhef_logtool.storage.object_store import Mirror
@@ -39,7 +37,7 @@ class LogResult:
     document: dict[str, Any] | None = None
     rows: tuple[MetricRow, ...] = ()
     failed_checks: int = 0
-    part: pa.Table | Path | None = None
+    part: Any = None
 
     @property
     def report(self) -> dict[str, Any] | None:

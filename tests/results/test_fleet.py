@@ -140,9 +140,7 @@ def test_effects_have_intervals_and_keys_without_one_are_not_significant(run: Ru
     assert wet.effect is not None and dry.effect is not None
     assert wet.effect.share == pytest.approx(2.0, abs=0.5) and wet.effect.low > 1.0 and wet.effect.significant
     assert 1.0 + dry.effect.share == pytest.approx(1.0 / (1.0 + wet.effect.share))
-    assert by_key["odometer"].groups[0].value == "1000 to 1010"
-    assert sum(g.drives for g in by_key["odometer"].groups) == 40
-    assert not {"same", "driver"} & set(by_key) and by_key["tyre"].p > 0.05
+    assert not {"same", "driver", "odometer"} & set(by_key) and by_key["tyre"].p > 0.05
     (only,) = run.read(by=["same"]).breakdowns
     assert [(g.value, g.scored, g.effect) for g in only.groups] == [("1", 40, None)]
     assert run.read(by=["driver"]).breakdowns[0].groups[0].value == "28 others"
