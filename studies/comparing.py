@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
 
@@ -90,29 +91,30 @@ def make_run(folder: Path, drives: int) -> int:
     """Write run.json and the tables of a run of made-up drives; return the number of figures."""
     rng = np.random.default_rng(5)
     labels = [f"drive_{i:05d}" for i in range(drives)]
-    logs = [
-        {
-            "log": label,
-            "file": f"{label}.mcap",
-            "outcome": "ok",
-            "main": "pd-hef",
-            **{f"{key}sha256": f"{i:064x}" for key in ("", "signals_", "truth_")},
-            "car": {"file": "golf", "name": "golf", "sha256": "0" * 64, "network_sha256": None},
-        }
-        for i, label in enumerate(labels)
+    car = {"file": "golf", "name": "golf", "sha256": "0" * 64, "network_sha256": None}
+    digests = [dict.fromkeys(("sha256", "signals_sha256", "truth_sha256"), f"{i:064x}") for i in range(drives)]
+    outcomes = [
+        LogOutcome(label, f"{label}.mcap", car=car, main="pd-hef", **of)
+        for label, of in zip(labels, digests, strict=True)
     ]
     rows = [
         MetricRow(label, estimator, signal, segment, metric, float(value), "rad", 1000)
         for label in labels
         for value, (estimator, signal, segment, metric) in zip(rng.random(_PER_DRIVE), _names(), strict=True)
     ]
-    by_log = {label: [*of_log] for label, of_log in groupby(rows, key=lambda row: row.log)}
-    parts = (
-        drive_part(LogOutcome(**{k: v for k, v in o.items() if k != "outcome"}), {}, by_log[o["log"]]) for o in logs
+    by_log = groupby(rows, key=lambda row: row.log)
+    write_tables(
+        folder / TABLES_FOLDER, (drive_part(o, {}, [*of]) for o, (_, of) in zip(outcomes, by_log, strict=True))
     )
-    write_tables(folder / TABLES_FOLDER, parts)
     files = {table_file(name): file_sha256(folder / table_file(name)) for name in TABLES}
-    document = {"format": "pdhef.run", "version": 1, "config": {}, "model": None, "versions": {}, "logs": logs}
+    document = {
+        "format": "pdhef.run",
+        "version": 1,
+        "config": {},
+        "model": None,
+        "versions": {},
+        "logs": [asdict(o) | {"outcome": "ok"} for o in outcomes],
+    }
     (folder / "run.json").write_text(json.dumps(seal({**document, "files": files}), indent=2))
     return len(rows)
 

@@ -11,8 +11,6 @@ from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.printable import printable
 
 commands = typer.Typer()
-#: Largest number of rows in a table.
-_MOST_ROWS = 100
 
 
 @options.command(commands)
@@ -20,18 +18,18 @@ def query(
     runs: Annotated[list[str], Argument(metavar="RUN", help="Output of a run: folder or URL.")],
     sql: Annotated[str, Argument(metavar="SQL", help="Statement on the tables.")],
     *,
-    csv: Annotated[bool, Option("--csv", help="Print the answer as CSV.")] = False,
+    csv: Annotated[bool, Option("--csv", help="Print CSV.")] = False,
 ) -> None:
-    """Answer a question about the drives of runs, in SQL."""
-    from pdhef_logtool.results.querying import query as answer
+    """Ask about the drives of one or more runs, in SQL."""
+    from pdhef_logtool.results import querying
 
-    rows = answer(runs, sql)
+    rows = querying.query(runs, sql)
     if csv or console.as_json:
         print(rows.write_csv() if csv else rows.write_json())  # noqa: T201
         return
-    made = console.table(*(f"{'>' * kind.is_numeric()}{name}" for name, kind in rows.schema.items()), fold=len(rows))
-    for row in rows.head(_MOST_ROWS).iter_rows():
+    made = console.table(
+        *(f"{'>' * kind.is_numeric()}{name}" for name, kind in rows.schema.items()), fold=len(rows.columns)
+    )
+    for row in rows.iter_rows():
         made.add_row(*("-" if x is None else f"{x:.4g}" if isinstance(x, float) else printable(str(x)) for x in row))
     console.stdout().print(made)
-    if (more := len(rows) - _MOST_ROWS) > 0:
-        console.say(f"{more} more rows: --csv")

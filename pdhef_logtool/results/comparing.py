@@ -333,8 +333,8 @@ class _Tables:
 
         name = pl.col("main") if figure.estimator == MAIN else pl.lit(figure.estimator)
         key = {key: getattr(figure, key) for key in ("signal", "segment", "metric")}
-        found = rows.filter(pl.col("estimator") == name, **key)
-        both = found.drop_nulls(["value", "value_b"])
+        of_pairs = rows.filter(pl.col("estimator") == name, **key)
+        both = of_pairs.drop_nulls(["value", "value_b"])
         a, b = both["value"].to_numpy(), both["value_b"].to_numpy()
         ratios = log_ratios(a, b)
         change = paired_change(ratios, *grouping.of(both["place"].to_list()))
@@ -351,9 +351,9 @@ class _Tables:
                 DriveFigure(drive, drive_b, x, y, n_a, n_b, _share(x, y))
                 for drive, drive_b, x, y, n_a, n_b in ordered.iter_rows()
             ),
-            only_a=tuple(found.filter(pl.col("value_b").is_null())["a"]),
-            only_b=tuple(found.filter(pl.col("value").is_null())["a"]),
-            neither=len(self._pairs) - len(found),
+            only_a=tuple(of_pairs.filter(pl.col("value_b").is_null())["a"]),
+            only_b=tuple(of_pairs.filter(pl.col("value").is_null())["a"]),
+            neither=len(self._pairs) - len(of_pairs),
             notes=tuple(_notes(both)),
         )
 

@@ -260,8 +260,8 @@ def _space(run: OpenedRun) -> Space | None:
     shape = len(SPEED_EDGES_M_S), len(AY_EDGES_M_S2)
     seconds, rmse = np.zeros(shape), np.full(shape, math.nan)
     for speed, ay, spent, error in rows:
-        at = SPEED_EDGES_M_S.index(speed), AY_EDGES_M_S2.index(ay)
-        seconds[at], rmse[at] = spent, error
+        cell = SPEED_EDGES_M_S.index(speed), AY_EDGES_M_S2.index(ay)
+        seconds[cell], rmse[cell] = spent, error
     drives = run.table("exposure").select(pl.col("log").n_unique()).collect().item()
     return Space(np.array(SPEED_EDGES_M_S), np.array(AY_EDGES_M_S2), seconds, rmse, drives)
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def query(runs: Path | str | Sequence[Path | str], sql: str) -> pl.DataFrame:
-    """Return the answer to a statement.
+    """Return the rows of a statement.
 
     Parameters
     ----------
@@ -43,8 +43,8 @@ def query(runs: Path | str | Sequence[Path | str], sql: str) -> pl.DataFrame:
             return context.execute(sql, eager=True)
     except (pl.exceptions.PolarsError, OSError) as error:
         got = str(error).partition("\n")[0].partition("; valid columns")[0]
-        known = [*TABLES, *(column for rows in frames.values() for column in rows.collect_schema())]
-        near = [m for name in re.findall(r"""["']([^"']+)["']""", got) for m in get_close_matches(name, known, n=1)]
+        right = [*TABLES, *(column for rows in frames.values() for column in rows.collect_schema())]
+        near = [m for name in re.findall(r"""["']([^"']+)["']""", got) for m in get_close_matches(name, right, n=1)]
         raise UsageError(
             expected=f"a statement on the tables {', '.join(TABLES)}",
             got=f"an error: {got}",

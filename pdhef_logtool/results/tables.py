@@ -46,7 +46,9 @@ def drive_part(outcome: LogOutcome, report: Mapping[str, Any] | None, rows: Sequ
         "metadata": [{"key": str(k), "value": str(v)} for k, v in (report.get("metadata") or {}).items()],
         "verdicts": _verdicts(plan),
     }
-    columns = {name: _list(name, [{**row, "log": outcome.log} for row in found]) for name, found in of_log.items()}
+    columns = {
+        name: _list(name, [{**row, "log": outcome.log} for row in of_table]) for name, of_table in of_log.items()
+    }
     return pa.table({**columns, "metrics": _list("metrics", rows)})
 
 
@@ -69,8 +71,7 @@ def _drive(outcome: LogOutcome, report: Mapping[str, Any], rows: Sequence[Metric
     ran = {e["name"]: e["causal"] for e in report.get("estimators", ()) if e["outcome"] == "ran"}
     main = outcome.main or next(iter(ran), None)
     kind, _, reason = outcome.outcome.partition(": ")
-    of_main = [r for r in rows if (r.estimator, r.signal, r.segment) == (main, _JUDGED, "all") and r.independent]
-    figures = {r.metric: r.value for r in of_main if math.isfinite(r.value)}
+    figures = _independent_figures(rows, main)
     faults = report.get("faults")
     return {
         **{key: getattr(outcome, key) for key in ("folder", "day", "route")},
@@ -98,6 +99,12 @@ def _drive(outcome: LogOutcome, report: Mapping[str, Any], rows: Sequence[Metric
     }
 
 
+def _independent_figures(rows: Sequence[MetricRow], estimator: str | None) -> dict[str, float]:
+    """Return the sideslip figures of a whole drive by metric, where the ground truth is independent."""
+    chosen = (r for r in rows if (r.estimator, r.signal, r.segment) == (estimator, _JUDGED, "all") and r.independent)
+    return {r.metric: r.value for r in chosen if math.isfinite(r.value)}
+
+
 def _why_unscored(report: Mapping[str, Any]) -> str | None:
     if "truth" not in report:
         return None
@@ -118,8 +125,9 @@ def _faults(report: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _times(of: Mapping[str, Any]) -> dict[str, float]:
-    known = of["start_ns"] is not None and of["end_ns"] is not None
-    return {"seconds": (of["end_ns"] - of["start_ns"]) * 1e-9} if known else {}
+    if of["start_ns"] is None or of["end_ns"] is None:
+        return {}
+    return {"seconds": (of["end_ns"] - of["start_ns"]) * 1e-9}
 
 
 def _verdicts(plan: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -143,7 +151,7 @@ def write_tables(folder: Path, parts: Iterable[pa.Table], folders: Sequence[str]
 
     ``folders``: the present folder of each log below the folder of the run; None: as in the parts.
     """
-    left, at = iter(parts), 0
+    left, done = iter(parts), 0
     schemas = {name: arrow_schema(f"{name}.parquet.json") for name in TABLES}
     with ExitStack() as stack:
         writers = {
@@ -156,9 +164,9 @@ def write_tables(folder: Path, parts: Iterable[pa.Table], folders: Sequence[str]
                 rows = pa.concat_arrays([chunk.flatten() for chunk in whole[name].chunks])
                 columns = dict(zip(schemas[name].names, rows.flatten(), strict=True))
                 if name == "drives" and folders is not None:
-                    columns["folder"] = arrow_array(folders[at : at + len(some)], pa.string())
+                    columns["folder"] = arrow_array(folders[done : done + len(some)], pa.string())
                 writer.write_table(pa.Table.from_arrays([*columns.values()], schema=schemas[name]))
-            at += len(some)
+            done += len(some)
 
 
 def add_verdicts(folder: Path, plan: Mapping[str, Any]) -> None:
