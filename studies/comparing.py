@@ -17,8 +17,8 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
-from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -90,22 +90,17 @@ def shares_of_days(shared: float, times: int, seed: int) -> tuple[float, float]:
 def make_run(folder: Path, drives: int) -> int:
     """Write run.json and the tables of a run of made-up drives; return the number of figures."""
     rng = np.random.default_rng(5)
-    labels = [f"drive_{i:05d}" for i in range(drives)]
     car = {"file": "golf", "name": "golf", "sha256": "0" * 64, "network_sha256": None}
-    digests = [dict.fromkeys(("sha256", "signals_sha256", "truth_sha256"), f"{i:064x}") for i in range(drives)]
-    outcomes = [
-        LogOutcome(label, f"{label}.mcap", car=car, main="pd-hef", **of)
-        for label, of in zip(labels, digests, strict=True)
-    ]
-    rows = [
-        MetricRow(label, estimator, signal, segment, metric, float(value), "rad", 1000)
-        for label in labels
-        for value, (estimator, signal, segment, metric) in zip(rng.random(_PER_DRIVE), _names(), strict=True)
-    ]
-    by_log = groupby(rows, key=lambda row: row.log)
-    write_tables(
-        folder / TABLES_FOLDER, (drive_part(o, {}, [*of]) for o, (_, of) in zip(outcomes, by_log, strict=True))
-    )
+    outcomes = []
+    for i in range(drives):
+        digests: Any = dict.fromkeys(("sha256", "signals_sha256", "truth_sha256"), f"{i:064x}")
+        outcomes.append(LogOutcome(f"drive_{i:05d}", f"{i}.mcap", car=car, main="pd-hef", **digests))
+
+    def rows(log: str) -> list[MetricRow]:
+        values = zip(_names(), rng.random(_PER_DRIVE).tolist(), strict=True)
+        return [MetricRow(log, *name, value, "rad", 1000) for name, value in values]
+
+    write_tables(folder / TABLES_FOLDER, (drive_part(o, {}, rows(o.log)) for o in outcomes))
     files = {table_file(name): file_sha256(folder / table_file(name)) for name in TABLES}
     document = {
         "format": "pdhef.run",
@@ -116,7 +111,7 @@ def make_run(folder: Path, drives: int) -> int:
         "logs": [asdict(o) | {"outcome": "ok"} for o in outcomes],
     }
     (folder / "run.json").write_text(json.dumps(seal({**document, "files": files}), indent=2))
-    return len(rows)
+    return drives * _PER_DRIVE
 
 
 def _names() -> Iterator[tuple[str, str, str, str]]:
