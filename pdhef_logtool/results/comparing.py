@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 #: ``no figure``: no drive has it on both sides.
 FigureVerdict: TypeAlias = Verdict | Literal["no figure"]
 
+#: Clusters of the pairs [N] that the user named, or factors with estimated influence.
+_Grouping: TypeAlias = tuple[Sequence[object] | None, Mapping[str, Sequence[object]]]
 #: Value of ``cluster`` for drives that do not depend on one another.
 INDEPENDENT = "none"
 #: Verdicts from grave to harmless; the gravest one is the overall verdict.
@@ -337,7 +339,10 @@ class _Tables:
         both = of_pairs.drop_nulls(["value", "value_b"])
         a, b = both["value"].to_numpy(), both["value_b"].to_numpy()
         ratios = log_ratios(a, b)
-        change = paired_change(ratios, *grouping.of(both["place"].to_list()))
+        clusters, factors = grouping
+        places = both["place"].to_list()
+        of_both = {name: [values[i] for i in places] for name, values in factors.items()}
+        change = paired_change(ratios, clusters and [clusters[i] for i in places], of_both)
         verdict: FigureVerdict = change.verdict(figure.limit or 0.0)
         if np.array_equal(a, b) and both["n"].equals(both["n_b"]):
             verdict = "equal" if len(both) else "no figure"
@@ -416,23 +421,10 @@ def _corrected(figures: Sequence[ComparedFigure]) -> tuple[ComparedFigure, ...]:
     return tuple(replace(f, corrected_p=p) for f, p in zip(there, holm([f.change.sign_p for f in there]), strict=True))
 
 
-@dataclass(frozen=True, slots=True)
-class _Grouping:
-    """Dependence of the pairs [N]: ``clusters`` that the user named, or ``factors`` with estimated influence."""
-
-    clusters: Sequence[object] | None = None
-    factors: Mapping[str, Sequence[object]] = field(default_factory=dict)
-
-    def of(self, places: Sequence[int]) -> tuple[list[object] | None, dict[str, list[object]]]:
-        """Return clusters and factors of some pairs."""
-        clusters = None if self.clusters is None else [self.clusters[i] for i in places]
-        return clusters, {name: [values[i] for i in places] for name, values in self.factors.items()}
-
-
 def _grouping(run: OpenedRun, pairing: Pairing, key: str | None) -> _Grouping:
-    """Return the groups of the pairs by a key, or by day, car and route without one."""
+    """Return the groups of the pairs [N] by a key, as clusters, or by day, car and route without one, as factors."""
     if key == INDEPENDENT:
-        return _Grouping()
+        return None, {}
     of_log: dict[str, dict[str, str | None]] = {}
     for log, name, value in run.table("metadata").collect().iter_rows():
         of_log.setdefault(log, {})[name] = value
@@ -440,9 +432,9 @@ def _grouping(run: OpenedRun, pairing: Pairing, key: str | None) -> _Grouping:
         of_log.setdefault(log, {}).update(zip(FACTORS, values, strict=True))
     stated = [of_log.get(pair.a.label, {}) for pair in pairing.pairs]
     if key is None:
-        return _Grouping(None, {name: [of.get(name) for of in stated] for name in FACTORS})
+        return None, {name: [of.get(name) for of in stated] for name in FACTORS}
     values = [of.get(key) for of in stated]
     if all(value is None for value in values):
         names = dict.fromkeys((*FACTORS, INDEPENDENT, *sorted({str(k) for of in stated for k in of})))
         raise UsageError(expected=f"a key of the drives: {', '.join(names)}", got=key, where="--cluster")
-    return _Grouping(values)
+    return values, {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -215,10 +214,3 @@ def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
     arrays = [arrow_array([getattr(r, f.name) for r in rows], f.type) for f in schema]
     with parquet_writer(path, schema, checksums=False) as writer:
         writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
-
-
-def read_metrics(path: Path) -> list[MetricRow]:
-    """Return the rows of a metrics.parquet, NaN for null; raises OutputError."""
-    with reading(path), pq.ParquetFile(path) as file:
-        rows = file.read(columns=arrow_schema("metrics.parquet.json").names).to_pylist()
-    return [MetricRow(**(row | {"value": math.nan if row["value"] is None else row["value"]})) for row in rows]

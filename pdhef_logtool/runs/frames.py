@@ -71,9 +71,9 @@ class Estimates:
 
     def plot(self) -> Any:
         """Draw the sideslip of all tracks over the time of the log; return the axes. Needs matplotlib."""
-        from matplotlib import pyplot
+        from matplotlib import pyplot as plt
 
-        axes = pyplot.subplots()[1]
+        axes = plt.subplots()[1]
         for name, track in self.tracks.items():
             axes.plot((track.stamps_ns - self.drive.plan.start_ns) * 1e-9, np.degrees(track.sideslip_rad), label=name)
         axes.set(xlabel="time, s", ylabel="sideslip, °")
