@@ -18,6 +18,7 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import TRACK_COLUMNS
 from pdhef_logtool.results.condition import Condition, Reference, parse_condition
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.results.parquet_sink import list_estimators
 from pdhef_logtool.results.sink import TRUTH
 
 if TYPE_CHECKING:
@@ -168,10 +169,10 @@ def _drives(run: OpenedRun) -> dict[str, _Drive]:
 
 def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str | None:
     """Return why a drive cannot be searched, otherwise None."""
-    frame = log.estimates()
-    if frame is None:
+    file = log.file(ESTIMATES_FILE)
+    if file is None:
         return log.outcome if log.outcome.startswith("failed") else f"it has no {ESTIMATES_FILE}"
-    there = _tracks(log)
+    there = list_estimators(file)
     for name in _needed(condition, estimator or log.main()):
         if name not in there:
             return "it has no ground truth" if name == TRUTH else f"it has no estimator {name}".strip()
@@ -180,7 +181,7 @@ def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str |
 
 def _check_tracks(logs: Sequence[OpenedLog], condition: Condition, estimator: str | None) -> None:
     """Raise UsageError for an estimator that none of the drives that can be read has."""
-    estimators = {name for log in logs if log.file(ESTIMATES_FILE) is not None for name in _tracks(log)}
+    estimators = {n for log in logs if (file := log.file(ESTIMATES_FILE)) is not None for n in list_estimators(file)}
     if not estimators:
         return
     expected = f"an estimator of this run: {', '.join(sorted(estimators))}"
@@ -192,14 +193,6 @@ def _check_tracks(logs: Sequence[OpenedLog], condition: Condition, estimator: st
     for name in sorted(asked - estimators - {TRUTH, None}, key=str):
         where = "--where" if name != estimator else "--estimator"
         raise UsageError(expected=expected, got=str(name), where=where)
-
-
-def _tracks(log: OpenedLog) -> frozenset[str]:
-    import polars as pl
-
-    frame = log.estimates()
-    assert frame is not None
-    return frozenset(frame.select(pl.col("estimator").cast(pl.String).unique()).collect()["estimator"])
 
 
 def _needed(condition: Condition, main: str) -> set[str]:

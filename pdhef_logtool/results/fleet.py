@@ -70,7 +70,7 @@ class FleetDrive:
     errors : RMSE by estimator and signal, where the ground truth is independent of both.
     nis, d2, naive_d2 : without ground truth: NIS and v̇_y residual of the selected estimate, v̇_y residual of sideslip 0.
     coverage : of the 95 % confidence interval.
-    failed_checks : that count. lost : data that could not be used. keys : for grouping.
+    failed_checks : that count. keys : for grouping.
     factors : day, car and route, None where not stated.
     """
 
@@ -85,7 +85,6 @@ class FleetDrive:
     d2: float
     naive_d2: float
     failed_checks: int
-    lost: str
     keys: Mapping[str, str]
     factors: Mapping[str, str | None]
 
@@ -306,7 +305,6 @@ def _drive(
         d2=figures.get((main, "vy_m_s", "d2"), math.nan),
         naive_d2=figures.get((row["naive"] or "", "vy_m_s", "d2"), math.nan),
         failed_checks=row["failed_checks"],
-        lost=row["reason"] or "" if row["outcome"] == "lost" else "",
         keys=keys,
         factors={factor: row[factor] for factor in FACTORS},
     )
