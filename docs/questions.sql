@@ -1,4 +1,5 @@
--- Questions about a fleet, a statement each: pdhef query OUT "SELECT ...", or DuckDB on OUT/tables/*.parquet.
+-- Questions about a fleet, a statement each: pdhef query OUT "SELECT ...", or DuckDB with a view of each file:
+-- CREATE VIEW drives AS SELECT * FROM 'OUT/tables/drives.parquet'
 
 -- How many drives and hours ended how?
 SELECT outcome, COUNT(*) AS drives, SUM(seconds) / 3600 AS hours FROM drives GROUP BY outcome ORDER BY drives DESC;

@@ -303,3 +303,4 @@ def test_a_fleets_summary_counts_what_the_figures_say(tmp_path: Path) -> None:
     assert told["errors"][0]["median_rad"] == pytest.approx(sum(values.values()) / 2)
     assert [w["log"] for w in told["worst"]] == sorted(values, key=lambda log: -values[log])
     assert told["failed"][0]["labels"] == ("b",)
+    assert [e["estimator"] for e in told["errors"]] == ["physics"]  # the only one that was asked for is named
