@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from pdhef_logtool.mapping import load_mapping as load_mapping
     from pdhef_logtool.records.errors import PdhefError as PdhefError
     from pdhef_logtool.records.reporter import Reporter as Reporter
+    from pdhef_logtool.results.comparing import compare as compare
+    from pdhef_logtool.results.opened_run import open_run as open_run
+    from pdhef_logtool.results.querying import query as query
     from pdhef_logtool.runs.config import RunConfig as RunConfig
     from pdhef_logtool.runs.fleet import Schedule as Schedule
     from pdhef_logtool.runs.fleet import run_logs as run  # noqa: F401
@@ -43,6 +46,9 @@ _HOMES = {
     "load_mapping": "mapping",
     "PdhefError": "records.errors",
     "Reporter": "records.reporter",
+    "compare": "results.comparing",
+    "open_run": "results.opened_run",
+    "query": "results.querying",
     "RunConfig": "runs.config",
     "Schedule": "runs.fleet",
     "choose": "runs.preparing",

@@ -16,15 +16,18 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.results.opened_run import METRICS_FILE
+from pdhef_logtool.results.opened_run import TABLES, TABLES_FOLDER, table_file
 from pdhef_logtool.results.paired_change import paired_change
-from pdhef_logtool.results.parquet_sink import write_metrics
+from pdhef_logtool.results.run_report import LogOutcome
+from pdhef_logtool.results.tables import drive_part, write_tables
 from pdhef_logtool.storage.documents import file_sha256, seal
 from studies.pages import DOCS, options, table, write
 
@@ -85,30 +88,30 @@ def shares_of_days(shared: float, times: int, seed: int) -> tuple[float, float]:
 
 
 def make_run(folder: Path, drives: int) -> int:
-    """Write run.json and metrics.parquet of a run of made-up drives; return the number of figures."""
+    """Write run.json and the tables of a run of made-up drives; return the number of figures."""
     rng = np.random.default_rng(5)
-    labels = [f"drive_{i:05d}" for i in range(drives)]
-    logs = [
-        {
-            "log": label,
-            "file": f"{label}.mcap",
-            "outcome": "ok",
-            "main": "pd-hef",
-            **{f"{key}sha256": f"{i:064x}" for key in ("", "signals_", "truth_")},
-            "car": {"file": "golf", "name": "golf", "sha256": "0" * 64, "network_sha256": None},
-        }
-        for i, label in enumerate(labels)
-    ]
-    rows = [
-        MetricRow(label, estimator, signal, segment, metric, float(value), "rad", 1000)
-        for label in labels
-        for value, (estimator, signal, segment, metric) in zip(rng.random(_PER_DRIVE), _names(), strict=True)
-    ]
-    write_metrics(folder / METRICS_FILE, rows)
-    files = {METRICS_FILE: file_sha256(folder / METRICS_FILE)}
-    document = {"format": "pdhef.run", "version": 1, "config": {}, "model": None, "versions": {}, "logs": logs}
+    car = {"file": "golf", "name": "golf", "sha256": "0" * 64, "network_sha256": None}
+    outcomes = []
+    for i in range(drives):
+        digests: Any = dict.fromkeys(("sha256", "signals_sha256", "truth_sha256"), f"{i:064x}")
+        outcomes.append(LogOutcome(f"drive_{i:05d}", f"{i}.mcap", car=car, main="pd-hef", **digests))
+
+    def rows(log: str) -> list[MetricRow]:
+        values = zip(_names(), rng.random(_PER_DRIVE).tolist(), strict=True)
+        return [MetricRow(log, *name, value, "rad", 1000) for name, value in values]
+
+    write_tables(folder / TABLES_FOLDER, (drive_part(o, {}, rows(o.log)) for o in outcomes))
+    files = {table_file(name): file_sha256(folder / table_file(name)) for name in TABLES}
+    document = {
+        "format": "pdhef.run",
+        "version": 1,
+        "config": {},
+        "model": None,
+        "versions": {},
+        "logs": [asdict(o) | {"outcome": "ok"} for o in outcomes],
+    }
     (folder / "run.json").write_text(json.dumps(seal({**document, "files": files}), indent=2))
-    return len(rows)
+    return drives * _PER_DRIVE
 
 
 def _names() -> Iterator[tuple[str, str, str, str]]:

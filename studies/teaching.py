@@ -157,7 +157,7 @@ def inputs(tool: Tool, part: TeachPart, *, receiver: bool = False, truth: bool =
         del mapping["truth"]
     name = f"{part.log}{'-gnss' if receiver else ''}{'' if truth else '-without'}.toml"
     file = write_toml(tool.work / "mappings" / name, mapping)
-    span = [text for name, value in (("--start", part.start), ("--end", part.end)) if value for text in (name, value)]
+    span = [t for k, value in (("start", part.start), ("end", part.end)) if value for t in ("--set", f"{k}={value}")]
     return [DRIVES / part.log, "--mapping", file, *span]
 
 

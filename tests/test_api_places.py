@@ -87,7 +87,7 @@ def test_what_learns_takes_texts_and_paths(kind: Callable[[object], Any], tmp_pa
 
 def test_every_name_of_the_api_is_tested_or_takes_no_file() -> None:
     tested = {"read_drive", "inspect_log", "load_mapping", "Car", "RunConfig", "ReadOptions", "run", "train"}
-    tested |= {"learn", "extract"}
+    tested |= {"learn", "extract", "query", "open_run", "compare"}  # docs/api.md and tests/results
     of_drives = {"choose", "estimate", "score", "Drive"}
     settings = {name for name in pdhef.__all__ if name.endswith("Settings")}
     assert set(pdhef.__all__) == tested | of_drives | settings | {"PdhefError", "Reporter", "Schedule", "__version__"}

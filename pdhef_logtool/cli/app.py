@@ -20,6 +20,7 @@ from pdhef_logtool.cli import (
     inspecting,
     learning,
     panels,
+    querying,
     reporting,
     running,
     simulating,
@@ -34,7 +35,6 @@ _WrongWord: type[Any] = typer.BadParameter.__bases__[0]
 _INTERRUPTED = 130
 #: Exit code if the reader of a pipe has closed it.
 _NOT_READ = 141
-_GLOBAL = frozenset({"--quiet", "-q", "--verbose", "--no-color"})
 #: Standard input, output and error.
 _STREAMS = 3
 
@@ -56,6 +56,7 @@ for _group in (
     validation,
     reporting,
     comparing,
+    querying,
     simulating,
     learning,
     converting,
@@ -77,6 +78,7 @@ def _root(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of tables.")] = False,
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Print errors and results only, no warnings, notes or progress.")
     ] = False,
@@ -88,7 +90,7 @@ def _root(
     del version
     if quiet and verbose:
         raise UsageError(expected="--quiet or --verbose", got="both", where="pdhef")
-    console.set_verbosity(quiet=quiet, verbose=verbose)
+    console.set_output(quiet=quiet, verbose=verbose, json=json)
     if no_color:
         os.environ["NO_COLOR"] = "1"
 
@@ -111,7 +113,7 @@ def main() -> NoReturn:
 
 def _run() -> int:
     try:
-        code = app(_global_options_first(sys.argv[1:]), prog_name="pdhef", standalone_mode=False) or EXIT_OK
+        code = app(sys.argv[1:], prog_name="pdhef", standalone_mode=False) or EXIT_OK
         if code == _INTERRUPTED:
             raise KeyboardInterrupt
         sys.stdout.flush()
@@ -147,13 +149,6 @@ def _run() -> int:
         )
         return EXIT_FAILURE
     return int(code)
-
-
-def _global_options_first(words: list[str]) -> list[str]:
-    """Return the words of the command line with the global options first; users may also write them at the end."""
-    end = words.index("--") if "--" in words else len(words)
-    first = [word for word in words[:end] if word in _GLOBAL]
-    return [*first, *(word for word in words[:end] if word not in _GLOBAL), *words[end:]]
 
 
 def open_standard_streams() -> None:

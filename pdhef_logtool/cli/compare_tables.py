@@ -1,4 +1,4 @@
-"""Output of ``pdhef compare``: other differences, verdicts, their drives, and first differences of tracks."""
+"""Output of ``pdhef compare``: other differences, verdicts, and their drives."""
 
 from __future__ import annotations
 
@@ -16,10 +16,8 @@ from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.comparison_words import (
     assumed_text,
     interval_text,
-    largest_text,
     next_text,
     notes_of,
-    one_signal_a_drive,
     percent,
     verdict_text,
 )
@@ -29,8 +27,8 @@ from pdhef_logtool.storage.files import write_bytes
 if TYPE_CHECKING:
     from rich.console import Console
 
-#: Number of drives at either end of a list, of compared tracks, and of names in a list.
-_MOST_DRIVES, _MOST_SIGNALS = 5, 8
+#: Number of drives at either end of a list.
+_MOST_DRIVES = 5
 
 
 def render_comparison(comparison: Comparison, console: Console) -> None:
@@ -54,8 +52,6 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
         _print_figures(comparison, console)
     if any(f.drives for f in comparison.figures) and not comparison.equal:
         _print_drives(comparison.figures[0], console)
-    if comparison.signals:
-        _print_signals(comparison, console)
     if comparison.others:
         _print_others(comparison.others, console)
     if requirements is not None:
@@ -92,22 +88,6 @@ def _print_drives(figure: ComparedFigure, console: Console) -> None:
         made.add_row(name, f"{drive.a * factor:.3g}", f"{drive.b * factor:.3g}", change)
     console.print(f"\nDrives by {figure.figure.label}, worst first", style="bold")
     console.print(made)
-
-
-def _print_signals(comparison: Comparison, console: Console) -> None:
-    made = table("drive", "track", "signal", ">first, s", ">stamps", ">largest", fold=3)
-    shown = one_signal_a_drive(comparison)
-    for row in shown[:_MOST_SIGNALS]:
-        made.add_row(
-            row.drive, row.track, row.signal, f"{row.first_s:.2f}", f"{row.stamps}/{row.of}", largest_text(row)
-        )
-    console.print(
-        f"\nFirst difference of the tracks ({comparison.followed} of {comparison.changed} changed drives)",
-        style="bold",
-    )
-    console.print(made)
-    if more := len(comparison.signals) - len(shown[:_MOST_SIGNALS]):
-        print_indented(f"{more} more signals of these drives in --json", console)
 
 
 def _print_others(others: Sequence[ComparedFigure], console: Console) -> None:

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
-
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
-    from pdhef_logtool.results.gate import Figure
 
 commands = typer.Typer()
 #: Time around events: repeated crossings of a threshold are one event; a clip shows the time before and after.
@@ -52,28 +47,21 @@ def compare(
     strict: Annotated[bool, Option("--strict", help="Inconclusive results fail.")] = False,
     html: Annotated[Path | None, Option(help="HTML file for the comparison.")] = None,
     junit: Annotated[Path | None, Option(help="JUnit XML file for the verdicts.")] = None,
-    as_json: options.JsonFlag = False,
 ) -> None:
     """Compare two runs drive by drive: better, worse, or no significant difference."""
     from pdhef_logtool.cli.compare_tables import render_comparison, write_comparison_junit
-    from pdhef_logtool.evaluation.validation_plan import load_plan
-    from pdhef_logtool.results.comparing import compare_runs
-    from pdhef_logtool.results.opened_run import open_run
-    from pdhef_logtool.results.plan_against import plan_verdicts_against
+    from pdhef_logtool.results import comparing
     from pdhef_logtool.storage.object_store import is_url
     from pdhef_logtool.storage.outputs import check_no_input
 
     check_no_input(
         [*(Path(x) for x in (a, b) if not is_url(x)), plan], [file for file in (html, junit) if file is not None]
     )
-    validation = None if plan is None else load_plan(plan)
-    asked = _figures(validation, max_regression, estimator, metric)
-    run_a, run_b = open_run(a), open_run(b)
-    comparison = compare_runs(run_a, run_b, asked, allow_unpaired=allow_unpaired, cluster=cluster, strict=strict)
-    if validation is not None:
-        comparison = replace(comparison, requirements=plan_verdicts_against(validation, run_a, run_b, strict=strict))
-    for line in comparison.damaged:
-        console.warn(line)
+    comparison = comparing.compare(
+        a, b,
+        plan=plan, max_regression=max_regression, estimator=estimator, metric=metric, cluster=cluster,
+        allow_unpaired=allow_unpaired, strict=strict,
+    )  # fmt: skip
     if junit is not None:
         write_comparison_junit(junit, comparison)
     if html is not None:
@@ -81,29 +69,7 @@ def compare(
         from pdhef_logtool.storage.files import write_bytes
 
         write_bytes(html, comparison_page(comparison))
-    console.finish(comparison, render_comparison, as_json)
-
-
-def _figures(
-    plan: ValidationPlan | None, max_regression: str | None, estimator: str | None, metric: str | None
-) -> tuple[Figure, ...]:
-    """Return the figures to compare by, with their limits, from the options; raises UsageError."""
-    from pdhef_logtool.evaluation.units import share_of
-    from pdhef_logtool.results.gate import MAIN, Figure, figure_problems, figures_of
-
-    single = {"--max-regression": max_regression, "--estimator": estimator, "--metric": metric}
-    given = [name for name, value in single.items() if value is not None]
-    if plan is not None:
-        if given:
-            raise UsageError(expected=f"--plan or {given[0]}", got="both", where="--plan")
-        return figures_of(plan)
-    limit = None if max_regression is None else share_of(max_regression)
-    if max_regression is not None and limit is None:
-        raise UsageError(expected="a share such as 5% or 0.05", got=max_regression, where="--max-regression")
-    figure = Figure(metric=metric or "rmse", estimator=estimator or MAIN, limit=limit)
-    if problems := figure_problems(figure.signal, figure.metric, figure.segment):
-        raise UsageError(expected="a figure; lower is better", got="; ".join(problems), where="--metric")
-    return (figure,)
+    console.finish(comparison, render_comparison)
 
 
 @options.command(commands)
@@ -128,15 +94,12 @@ def events(
     source: Annotated[
         Path | None, Option(metavar="DIR", help="Folder of the logs, for clips of a run without annotated copies.")
     ] = None,
-    parquet: Annotated[Path | None, Option(metavar="FILE", help="Parquet file for the events.")] = None,
-    as_json: options.JsonFlag = False,
 ) -> None:
     """Find the times at which a condition is true, and cut clips there."""
     from pdhef_logtool.cli.event_tables import render_events
-    from pdhef_logtool.results.events import event_condition, find_events, write_events
+    from pdhef_logtool.results.events import event_condition, find_events
     from pdhef_logtool.results.opened_run import open_run
     from pdhef_logtool.storage.object_store import is_url
-    from pdhef_logtool.storage.outputs import check_no_input
 
     condition = event_condition(where)
     least_s = _seconds(least, "--for")
@@ -145,7 +108,6 @@ def events(
         raise UsageError(expected="--clip", got="--source alone", where="--source")
     if is_url(output) and clip:
         options.local_folder(output)
-    check_no_input([] if is_url(output) else [Path(output)], [] if parquet is None else [parquet])
     run = open_run(output)
     events_found = find_events(run, condition, estimator=estimator, least_s=least_s, pad_s=pad_s)
     for line in events_found.damaged:
@@ -156,9 +118,7 @@ def events(
         named = {r.track for r in condition.references.values() if r.track is not None}
         named |= set() if estimator is None else {estimator}
         events_found = write_clips(run, events_found, pad_s=pad_s, named=named, source=source, tell=console.warn)
-    if parquet is not None:
-        write_events(parquet, events_found)
-    console.finish(events_found, render_events, as_json)
+    console.finish(events_found, render_events)
 
 
 def _seconds(text: str, option: str) -> float:

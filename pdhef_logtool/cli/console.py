@@ -31,6 +31,8 @@ class _Result(Protocol):
 
 _Shown = TypeVar("_Shown", bound=_Result | Mapping[str, Any])
 _verbose = False
+#: Whether results are printed as JSON.
+as_json = False
 #: Interval between lines of progress without a terminal, s.
 PROGRESS_S = 30.0
 #: A line on stderr is an error or a warning of several parts.
@@ -92,10 +94,10 @@ def cell(value: float | None, factor: float = 1.0, digits: int = 2) -> str:
     return "-" if value is None else f"{round(value * factor, digits) + 0.0:.{digits}f}"  # no -0
 
 
-def set_verbosity(*, quiet: bool = False, verbose: bool = False) -> None:
-    """Set the output on stderr, also of workers: errors only (quiet), or also progress as lines (verbose)."""
-    global _verbose
-    processes.quiet, _verbose = quiet, verbose
+def set_output(*, quiet: bool = False, verbose: bool = False, json: bool = False) -> None:
+    """Set the output on stderr, also of workers: errors only (quiet), or also progress as lines (verbose); and JSON."""
+    global _verbose, as_json
+    processes.quiet, _verbose, as_json = quiet, verbose, json
 
 
 def error(text: str) -> None:
@@ -127,12 +129,15 @@ def print_json(document: Any) -> None:
 
 
 def print_facts(facts: dict[str, Any]) -> None:
-    """Print one fact per line."""
+    """Print one fact per line, or a JSON document."""
+    if as_json:
+        print_json(facts)
+        return
     for key, value in facts.items():
         print(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {printable(value)}")  # noqa: T201
 
 
-def show(result: _Shown, render: Callable[[_Shown, Console], None], as_json: bool) -> None:
+def show(result: _Shown, render: Callable[[_Shown, Console], None]) -> None:
     """Print a result as a JSON document or as tables."""
     if as_json:
         print_json(result if isinstance(result, Mapping) else result.to_dict())
@@ -140,11 +145,9 @@ def show(result: _Shown, render: Callable[[_Shown, Console], None], as_json: boo
         render(all_printable(result), stdout())
 
 
-def finish(
-    result: _Shown, render: Callable[[_Shown, Console], None], as_json: bool, *, exit_code: int | None = None
-) -> NoReturn:
+def finish(result: _Shown, render: Callable[[_Shown, Console], None], *, exit_code: int | None = None) -> NoReturn:
     """Print a result and exit with ``exit_code``, otherwise with the exit code of the result or 0."""
-    show(result, render, as_json)
+    show(result, render)
     raise typer.Exit(getattr(result, "exit_code", EXIT_OK) if exit_code is None else exit_code)
 
 

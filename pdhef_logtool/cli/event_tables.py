@@ -33,7 +33,7 @@ def render_events(events: FoundEvents, console: Console) -> None:
             made.add_row(event.drive, f"{event.start_s:.2f}", f"{event.end_s:.2f}", lasts, peak)
         console.print(made)
         if (more := len(events.events) - _MOST_EVENTS) > 0:
-            console.print(f"  and {more} more: --json, --parquet")
+            console.print(f"  and {more} more: --json")
     reasons: dict[str, list[str]] = {}
     for drive, reason in events.left_out.items():
         reasons.setdefault(reason, []).append(drive)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 commands = typer.Typer()
 
 
-@options.command(commands)
+@options.command(commands, shared="mapping")
 def inspect(
     log: options.Log,
     config: RunConfig,
@@ -39,7 +39,6 @@ def inspect(
     whole: Annotated[
         bool, Option("--all", help="Read a large log completely, to find damage inside its chunks.")
     ] = False,
-    as_json: options.JsonFlag = False,
 ) -> None:
     """Show topics, rates, gaps and clocks of a log, and how its fields map to signals.
 
@@ -54,7 +53,7 @@ def inspect(
         raise UsageError(expected="--fields alone", got="--report or --write-mapping as well", where="--fields")
     if fields:
         topic_fields = fields_of_log(_place(log, config), topic, config.read_options)
-        console.finish(topic_fields, render_fields, as_json, exit_code=EXIT_OK)
+        console.finish(topic_fields, render_fields, exit_code=EXIT_OK)
 
     def write_files(inspection: Inspection, open_log: DriveLog) -> None:
         if write_mapping is not None:
@@ -68,10 +67,10 @@ def inspect(
 
     inspection = _inspect(log, config, whole=whole, then=write_files)
     exit_code = EXIT_PARTIAL if inspection.is_partial else EXIT_OK
-    console.finish(inspection, render_inspection, as_json, exit_code=exit_code)
+    console.finish(inspection, render_inspection, exit_code=exit_code)
 
 
-@options.command(commands, name="map")
+@options.command(commands, name="map", shared="mapping")
 def map_(
     log: options.Log,
     config: RunConfig,

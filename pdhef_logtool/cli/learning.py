@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 commands = typer.Typer()
 
 
-@options.command(commands, shared="sensors friction", car="Car to start from (mass, geometry, sensor noise, priors)")
+@options.command(commands, shared="mapping", car="Car to start from (mass, geometry, sensor noise, priors)")
 def learn(
     *,
     logs: options.TruthLogs,
@@ -28,7 +28,6 @@ def learn(
         str | None,
         Option(help="Only drives of this split of a simulated set; any: also of splits that are refused by default."),
     ] = None,
-    as_json: options.JsonFlag = False,
 ) -> None:
     """Learn a car from its drives: parameters for later drives and, with ground truth, a residual."""
     from pdhef_logtool.learning.drives import LearnSettings
@@ -37,10 +36,10 @@ def learn(
     settings = LearnSettings(config=config, split=split)
     with console.reporter() as reporter:
         result = learn_car(logs, output, settings, reporter=reporter)
-    console.finish(result, learning_tables.render_learning, as_json)
+    console.finish(result, learning_tables.render_learning)
 
 
-@options.command(commands, shared="sensors friction", car="Nominal car (default: from the manifest of a simulated set)")
+@options.command(commands, shared="mapping", car="Nominal car (default: from the manifest of a simulated set)")
 def extract(
     *,
     logs: options.TruthLogs,
@@ -53,7 +52,6 @@ def extract(
     where: Annotated[str | None, Option(metavar="EXPR", help="Condition on the rows to keep.")] = None,
     jobs: options.Jobs = 1,
     resume: Annotated[bool, Option("--resume", help="Keep drives with unchanged log and settings.")] = False,
-    as_json: options.JsonFlag = False,
 ) -> None:
     """Write the residual dataset for train: the accelerations that the physics do not explain."""
     from pdhef_logtool.learning.network.extract_command import ExtractSettings
@@ -62,7 +60,7 @@ def extract(
     settings = ExtractSettings(config, split=split, model=model, where=where)
     with console.reporter() as reporter:
         result = write_residuals(logs, output, settings, jobs=jobs, resume=resume, reporter=reporter)
-    console.finish(result, learning_tables.render_extraction, as_json)
+    console.finish(result, learning_tables.render_extraction)
 
 
 @options.command(commands)
@@ -75,7 +73,6 @@ def train(
     seed: Annotated[int, Option(help="Seed of initial weights, sample order and dropout.")] = 0,
     epochs: Annotated[int | None, Option(help="Number of epochs. Default: from the hyperparameters.")] = None,
     device: Annotated[str, Option(help="PyTorch device: cpu or cuda.")] = "cpu",
-    as_json: options.JsonFlag = False,
 ) -> None:
     """Train the residual network on a dataset of extract."""
     from pdhef_logtool.learning.network.train_command import run_training
@@ -84,4 +81,4 @@ def train(
         result = run_training(
             dataset, output, init=init, paper=paper, seed=seed, epochs=epochs, device=device, progress=reporter.progress
         )
-    console.finish(result, learning_tables.render_training, as_json)
+    console.finish(result, learning_tables.render_training)

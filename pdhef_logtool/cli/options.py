@@ -34,9 +34,7 @@ TruthLogs = Annotated[
 ]
 #: Options in a panel of the help.
 output_option, work_option = partial(Option, rich_help_panel=OUTPUT), partial(Option, rich_help_panel=WORK)
-JsonFlag = Annotated[bool, output_option("--json", help="Print one JSON document instead of tables.")]
 JunitFile = Annotated[Path | None, output_option(help="JUnit XML file for the verdicts of --plan.")]
-Strict = Annotated[bool, output_option("--strict", help="INCONCLUSIVE requirements fail, too (exit code 4).")]
 Jobs = Annotated[int, work_option("--jobs", "-j", help="Number of worker processes. Results do not depend on it.")]
 
 
@@ -64,7 +62,6 @@ _Text, _File, _Many = str | None, Path | None, list[str] | None
 #: Shared options by the name of the configuration entry, in the order of the help.
 _OPTIONS: dict[str, Any] = {
     "car": _option(_File, INPUT),
-    "cars": _option(_File, INPUT, "cars.toml, which assigns a car to each log by folder, metadata or name."),
     "mapping": _option(
         _File,
         INPUT,
@@ -135,10 +132,10 @@ def command(
     ----------
     group : commands to add it to.
     name : of the command; None = the name of the function.
-    shared : shared options in addition to --mapping, --config and --set, which every ``config`` has.
-    car : help text of --car for the command, which then also has --start and --end; empty = no car.
+    shared : shared options in addition to --config and --set, which every ``config`` has.
+    car : help text of --car for the command; empty = no car.
     """
-    wanted = {"mapping", "config_file", "assignments", *shared.split(), *(("car", "start", "end") if car else ())}
+    wanted = {"config_file", "assignments", *shared.split(), *(("car",) if car else ())}
     taken = {key: option for key, option in _OPTIONS.items() if key in wanted}
     if car:
         taken["car"] = _option(_File, INPUT, f"{car}: car folder or vehicle.toml.")

@@ -8,6 +8,7 @@ from typing import Any
 from typer.core import TyperCommand, TyperGroup
 
 #: The groups of commands, in the order of the help; ``commands.toml`` has the group of each command.
+_GLOBAL = frozenset({"--json", "--quiet", "-q", "--verbose", "--no-color"})
 _PANELS = ("Look at logs", "Run and score", "Read results", "Learn", "Tools")
 
 
@@ -22,6 +23,13 @@ class PanelCommand(TyperCommand):
 
 class CommandGroup(TyperGroup):
     """A group with panels and with commands of two words, for example ``simulate suite``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Take the global options first; users may also write them at the end."""
+        end = args.index("--") if "--" in args else len(args)
+        first = [word for word in args[:end] if word in _GLOBAL]
+        words = [*first, *(word for word in args[:end] if word not in _GLOBAL), *args[end:]]
+        return super().parse_args(ctx, words)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the global options, then the commands."""

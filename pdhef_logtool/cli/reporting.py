@@ -32,7 +32,6 @@ def report(
         bool, Option("--pdf", help="Write report.pdf to sign: cover, verdicts, drives, input hashes. Needs Chromium.")
     ] = False,
     positions: Annotated[bool, Option("--positions", help="Include the paths of the drives in report.pdf.")] = False,
-    as_json: options.JsonFlag = False,
 ) -> None:
     """Write the HTML reports of a finished run again."""
     from pdhef_logtool.reports.pages import write_pages
@@ -48,7 +47,7 @@ def report(
             from pdhef_logtool.reports.pdf import write_pdf
 
             result = replace(result, pdf=write_pdf(open_run(output), positions=positions))
-    console.show(result, _render, as_json)
+    console.show(result, _render)
     for line in result.wrong:
         console.warn(line)
     if show:

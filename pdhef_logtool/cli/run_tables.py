@@ -138,7 +138,7 @@ def _head(result: RunResult, reports: Sequence[_Report], assumed: Sequence[str])
 
 def _range(reports: Sequence[_Report]) -> str:
     """Return the lowest and highest sideslip error of the selected estimate over several logs."""
-    errors = [_figures(r).get((r["answer"]["main"], "sideslip_rad", "all", "rmse")) for r in reports if r["answer"]]
+    errors = [_figures(r).get((r["selected_estimate"], "sideslip_rad", "all", "rmse")) for r in reports if r["answer"]]
     scored = [e for e in errors if e is not None]
     if not scored:
         return f"sideslip of {len(reports)} logs is not scored" if reports else "all logs failed"
@@ -202,7 +202,7 @@ def _print_outputs(output: Path | str, console: Console, labels: Sequence[str] =
 
 def _render_one_of_several(report: _Report, assumed: Sequence[str], console: Console) -> None:
     """Print details of a log that need attention and are not in the joint table; ``assumed``: common assumptions."""
-    texts, main = _texts(report), report["answer"]["main"]
+    texts, main = _texts(report), report["selected_estimate"]
     is_scored = _figures(report).get((main, "sideslip_rad", "all", "rmse")) is not None
     rest = [clause for clause in assumptions_of(report) if clause not in assumed]
     shown = {} if is_scored or "result" not in texts else {"result": texts["result"]}
@@ -326,7 +326,7 @@ def _shown(report: _Report) -> list[Mapping[str, Any]]:
 def _figures(report: _Report) -> dict[tuple[str, str, str, str], float | None]:
     """Return the metrics by estimator, signal, segment and name, including ratios and differences of two."""
     values = {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
-    main = None if report["answer"] is None else report["answer"]["main"]
+    main = report["selected_estimate"]
     for (name, signal, segment, metric), value in list(values.items()):
         if metric == "nis" and value is not None and (dof := values.get((name, signal, segment, "nis_dof"))):
             values[name, signal, segment, "nis_ratio"] = value / dof
@@ -392,8 +392,7 @@ def _table_of(
     columns: Sequence[_Column],
     values: Mapping[tuple[str, str, str, str], float | None],
 ) -> Table:
-    dependent, answer = report["truth"]["not_independent"], report["answer"]
-    main = "" if answer is None else answer["main"]
+    dependent, main = report["truth"]["not_independent"], report["selected_estimate"] or ""
     heads = [c.head.format(main=main) + (" †" if c.signal in dependent else "") for c in columns]
     made = table("\nestimator", *(f">{head}" for head in heads))
     for column in made.columns:
@@ -407,13 +406,13 @@ def _table_of(
 
 def _joint_table(reports: Sequence[_Report]) -> Table:
     """Return one line per log: errors of the selected estimate, physics and the baseline, and points to check."""
-    mains = list(dict.fromkeys(report["answer"]["main"] for report in reports))
+    mains = list(dict.fromkeys(report["selected_estimate"] for report in reports))
     rivals = [n for n in ("physics", "zero") if [n] != mains and any(n in r["answer"]["shown"] for r in reports)]
     head = f">{mains[0]}\nRMSE °" if len(mains) == 1 else ">sideslip\nRMSE °"
     joint = table("\nlog", ">\ns", head, *(f">{n}\nRMSE °" for n in rivals), ">CI 95 %\ncovers", "\nlook at", fold=1)
     joint.columns[-1].overflow = "fold"
     for report in reports:
-        values, main = _figures(report), report["answer"]["main"]
+        values, main = _figures(report), report["selected_estimate"]
         errors = [cell(values.get((n, "sideslip_rad", "all", "rmse")), DEGREES, 3) for n in (main, *rivals)]
         compared = (values.get((n, "sideslip_rad", "all", "rmse")) for n in (main, "zero"))
         inside = values.get((main, "sideslip_rad", "all", "coverage95"))
@@ -435,7 +434,7 @@ def _look_at(report: _Report, inside: float | None, main: str, worse: bool) -> s
         f"{failed} check{'s' * (failed > 1)} failed" if failed else "",
         "input lost" if any(x["severity"] == "lost" for x in report["losses"]) else "",
         "no ground truth" if not report["truth"]["available"] else "" if scored else "not scored",
-        "diverged" if diverged_line(report, report["answer"]["main"]) else "",
+        "diverged" if diverged_line(report, report["selected_estimate"]) else "",
         "worse than a constant" if worse else "",
         "interval too narrow" if inside is not None and inside < NEARLY_HOLDS else "",
     ]

@@ -35,7 +35,7 @@ def _list_estimators(show: bool) -> None:
 
 @options.command(
     commands,
-    shared="cars estimators annotate keep friction plan network model reference gnss no_position waived",
+    shared="mapping start end estimators annotate keep friction plan network model reference gnss no_position waived",
     car="Car of the logs (default: a sedan)",
 )
 def run(  # positional: one an option of the command line
@@ -45,7 +45,6 @@ def run(  # positional: one an option of the command line
     ],
     config: RunConfig,
     junit: options.JunitFile = None,
-    strict: options.Strict = False,
     report: Annotated[
         bool, options.output_option(help="Write HTML reports: report.html per log and for the run.")
     ] = True,
@@ -59,31 +58,32 @@ def run(  # positional: one an option of the command line
     resume: Annotated[
         bool, options.work_option("--resume", help="Continue the run in the output: only new or changed logs.")
     ] = False,
-    retry: Annotated[bool, options.work_option("--retry", help="Like --resume, and repeat failed logs.")] = False,
-    only: Annotated[
+    repeat: Annotated[
         list[str] | None,
-        options.work_option(metavar="NAME", help="Repeat this log of the run and keep all its files. Repeatable."),
+        options.work_option(
+            metavar="failed|NAME",
+            help="Like --resume, and repeat failed logs; or repeat this log alone and keep all its files. Repeatable.",
+        ),
     ] = None,
     list_estimators: Annotated[
         bool,
         Option("--list-estimators", callback=_list_estimators, is_eager=True, help="List the estimators and exit."),
     ] = False,
-    as_json: options.JsonFlag = False,
 ) -> None:
     """Run estimators on logs, score them, write reports and annotated logs."""
     del list_estimators
     from pdhef_logtool.runs.fleet import Schedule, run_logs
 
-    schedule = Schedule(jobs, ray, resume, retry, only or ())
+    schedule = Schedule(jobs, ray, resume, repeat or ())
     with console.reporter() as reporter:
-        result = run_logs(
-            logs, output, config, schedule=schedule, junit=junit, report=report, strict=strict, reporter=reporter
-        )
-    _finish(result, as_json)
+        result = run_logs(logs, output, config, schedule=schedule, junit=junit, report=report, reporter=reporter)
+    _finish(result)
 
 
 @options.command(
-    commands, shared="plan reference gnss", car="Car of the log (position of the ground truth, friction, lowest speed)"
+    commands,
+    shared="mapping start end plan reference gnss",
+    car="Car of the log (position of the ground truth, friction, lowest speed)",
 )
 def metrics(  # positional: one an option of the command line
     log: options.Log,
@@ -107,8 +107,6 @@ def metrics(  # positional: one an option of the command line
         Path | None, Option("--output", "-o", help="Output folder; pdhef report writes its pages. Default: print only.")
     ] = None,
     junit: options.JunitFile = None,
-    strict: options.Strict = False,
-    as_json: options.JsonFlag = False,
 ) -> None:
     """Score an estimate that the log contains, with the metrics of pdhef run."""
     from pdhef_logtool.runs.recorded_estimates import score_log
@@ -122,10 +120,9 @@ def metrics(  # positional: one an option of the command line
             name=name,
             output=output,
             junit=junit,
-            strict=strict,
             reporter=reporter,
         )
-    _finish(result, as_json)
+    _finish(result)
 
 
 @options.command(commands)
@@ -154,7 +151,7 @@ def view(
     raise typer.Exit(open_viewer(recordings, web=web))
 
 
-def _finish(result: RunResult, as_json: bool) -> NoReturn:
+def _finish(result: RunResult) -> NoReturn:
     """Print and exit; failed requirements, and failures that the exit code does not show, are printed on stderr."""
     from pdhef_logtool.cli.run_tables import render_fleet, render_run
 
@@ -162,13 +159,14 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
         from pdhef_logtool.results.opened_run import open_run
         from pdhef_logtool.results.summary import summarise
 
-        checks_failed = [r.outcome.log for r in result.results if r.failed_checks]
-        summary = summarise(open_run(result.output), result.exit_code, checks_failed) | {"output": str(result.place)}
-        console.show(summary, render_fleet, as_json)
+        summary = summarise(open_run(result.output), result.exit_code) | {"output": str(result.place)}
+        console.show(summary, render_fleet)
     else:
-        if not as_json:  # the tables read the reports; a copy of all metric rows for the terminal would be unused
+        if (
+            not console.as_json
+        ):  # the tables read the reports; a copy of all metric rows for the terminal would be unused
             result = replace(result, results=tuple(replace(entry, rows=()) for entry in result.results))
-        console.show(result, render_run, as_json)
+        console.show(result, render_run)
         for entry in result.results:
             if entry.outcome.failed is not None and entry.report is not None:  # the tables show the others
                 console.error(f"pdhef: {entry.outcome.log}: {entry.outcome.failed}")

@@ -47,11 +47,10 @@ def simulate(
     ] = None,
     keep_spins: Annotated[bool, Option("--keep-spins", help="Keep |sideslip| > 20 degrees and lifted wheels.")] = False,
     list_all: Annotated[bool, Option("--list", help="List the manoeuvres and their defaults.")] = False,
-    as_json: options.JsonFlag = False,
 ) -> None:
     """Simulate a drive and write it as MCAP, with noisy sensors, RTK and exact ground truth."""
     if list_all:
-        _list_manoeuvres(as_json)
+        _list_manoeuvres()
         return
     if manoeuvre is None or output is None:
         raise _incomplete("manoeuvre" if manoeuvre is None else "-o FILE")
@@ -76,7 +75,7 @@ def simulate(
         keep_spins=keep_spins,
     )
     write_drive(drive, output, without=without or ())
-    (console.print_json if as_json else console.print_facts)({"output": str(output), **drive.facts()})
+    console.print_facts({"output": str(output), **drive.facts()})
 
 
 def _incomplete(missing: str) -> UsageError:
@@ -92,7 +91,6 @@ def suite(
     duration_s: Annotated[float, Option("--duration", help="Duration of a drive in s.")] = 12.5,
     vehicles: Annotated[str, Option(help="default, or randomised (a different one per drive).")] = "default",
     jobs: options.Jobs = 1,
-    as_json: options.JsonFlag = False,
 ) -> None:
     """Simulate a training set of drives."""
     from truthsim.suite import write_suite
@@ -108,7 +106,7 @@ def suite(
             progress=report.progress,
         )
     facts = {key: manifest[key] for key in ("command", "splits", "written", "dropped_draws")}
-    (console.print_json if as_json else console.print_facts)({"output": str(output), **facts})
+    console.print_facts({"output": str(output), **facts})
     for entry in manifest["drives"]:
         if "sha256" not in entry:
             console.warn(f"{entry['file']}: no drive: {entry['dropped'][-1]['reason']}")
@@ -125,11 +123,11 @@ def _numbers(pairs: Sequence[str]) -> dict[str, float]:
     return values
 
 
-def _list_manoeuvres(as_json: bool) -> None:
+def _list_manoeuvres() -> None:
     from truthsim.manoeuvres import MANOEUVRES
 
     fields = ("description", "speed_km_h", "friction", "duration_s")
-    if as_json:
+    if console.as_json:
         rows = [{"name": name, **{f: getattr(m, f) for f in fields}} for name, m in MANOEUVRES.items()]
         console.print_json({"manoeuvres": rows})
         return

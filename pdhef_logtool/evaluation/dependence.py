@@ -155,16 +155,6 @@ def _freedom(part: IntArray, means: int) -> float:
     return max(float(np.sum(counts**2) ** 2 / np.sum(counts**4)) - means, 1.0)
 
 
-def factors_of(entry: Mapping[str, Any], report: Mapping[str, Any] | None) -> dict[str, str | None]:
-    """Return day (UTC), car and route of a drive from run.json, or day and route from its report."""
-    car = (entry.get("car") or {}).get("name")
-    stated = {key: entry.get(key) for key in ("day", "route")}
-    if report is not None and not any(stated.values()):
-        of_report = day_and_route((report.get("log") or {}).get("start_ns"), report.get("metadata") or {})
-        stated = dict(zip(("day", "route"), of_report, strict=True))
-    return {"car": None if car is None else str(car), **stated}
-
-
 def day_and_route(start_ns: int | None, metadata: Mapping[str, Any]) -> tuple[str | None, str | None]:
     """Return the day (UTC) on which a log starts, and the route from its metadata."""
     from datetime import UTC, datetime

@@ -14,9 +14,7 @@ from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.comparison_words import (
     interval_text,
-    largest_text,
     notes_of,
-    one_signal_a_drive,
     paired_text,
     percent,
     verdict_text,
@@ -43,9 +41,7 @@ def comparison_page(comparison: Comparison) -> bytes:
         notes=notes_of(comparison),
         unpaired=[line for line in comparison.unpaired if line not in comparison.failures],
         drives=_drives(comparison.figures[0]) if comparison.figures and not comparison.equal else None,
-        signals=one_signal_a_drive(comparison) if comparison.signals else [],
         interval=interval_text,
-        largest=largest_text,
         percent=percent,
         expm1=math.expm1,
     )

@@ -88,8 +88,8 @@ def roles_of(report: Mapping[str, Any]) -> Roles | None:
     names: list[str] = [e["name"] for e in report["estimators"] if e["outcome"] == "ran"]
     if not names:
         return None
-    answer = report.get("answer") or {}
-    main: str = answer["main"] if answer.get("main") in names else names[0]
+    selected = report.get("selected_estimate")
+    main: str = selected if selected in names else names[0]
     identical = identical_to(report, main)
     others = [n for n in names if n not in identical]
     rival = next((n for n in (_PHYSICS, *sorted(others, key=lambda n: n == _ZERO)) if n in others and n != main), "")

@@ -11,7 +11,6 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -23,9 +22,8 @@ from pdhef_logtool.results.paired_change import holm
 LEAST_DRIVES = 5
 #: Family-wise error rate.
 SIGNIFICANT = 0.05
-#: Values of a key that are listed one by one; numbers beyond them are listed by quarters.
+#: Values of a key that are listed one by one.
 MOST_VALUES = 12
-_QUARTERS = 4
 #: Log ratios above are shown as this one.
 _LARGEST_LOG = 20.0
 
@@ -228,18 +226,11 @@ def _groups(
 
 
 def _values(key: str, drives: Sequence[BreakdownDrive]) -> list[str | None]:
-    """Return the value of each drive: its text, a quarter of the numbers, or that it is rare."""
+    """Return the value of each drive: its text, or that it is rare."""
     texts = [d.keys.get(key) for d in drives]
     counts = Counter(t for t in texts if t is not None)
     if len(counts) <= MOST_VALUES:
         return list(texts)
-    numbers = [_as_number(t) for t in texts]
-    finite = np.array([x for x in numbers if math.isfinite(x)])
-    if len(finite) == sum(counts.values()):
-        edges = np.unique(np.quantile(finite, np.linspace(0.0, 1.0, _QUARTERS + 1)))
-        quarter = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, max(len(edges) - 2, 0))
-        names = [f"{a:.4g} to {b:.4g}" for a, b in pairwise(edges)] or [f"{edges[0]:.4g}"]
-        return [names[i] if math.isfinite(x) else None for i, x in zip(quarter, numbers, strict=True)]
     common = {value for value, _ in counts.most_common(MOST_VALUES)}
     rest = f"{len(counts) - MOST_VALUES} others"
     return [t if t is None or t in common else rest for t in texts]

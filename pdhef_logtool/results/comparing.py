@@ -2,49 +2,44 @@
 
 from __future__ import annotations
 
-import filecmp
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.evaluation.dependence import FACTORS, factors_of
+from pdhef_logtool.evaluation.dependence import FACTORS
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.metrics.sensors import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.units import SIGNALS
+from pdhef_logtool.evaluation.validation_plan import load_plan
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.printable import listed
-from pdhef_logtool.results.changed_signals import ChangedSignal, changed_signals
-from pdhef_logtool.results.gate import MAIN, Figure
-from pdhef_logtool.results.opened_run import METRICS_FILE, OpenedRun
+from pdhef_logtool.results.gate import MAIN, Figure, asked_figures
+from pdhef_logtool.results.opened_run import OpenedRun, open_run, table_file
 from pdhef_logtool.results.paired_change import PairedChange, Verdict, holm, log_ratios, paired_change
 from pdhef_logtool.results.pairing import Pair, Pairing, pair_logs
+from pdhef_logtool.results.plan_against import plan_verdicts_against
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.run_differences import run_differences
 
 if TYPE_CHECKING:
     import polars as pl
 
-    #: Rows of figures by signal, segment and metric.
-    _Rows: TypeAlias = Mapping[tuple[object, ...], pl.DataFrame]
-
 #: ``no figure``: no drive has it on both sides.
 FigureVerdict: TypeAlias = Verdict | Literal["no figure"]
 
+#: Clusters of the pairs [N] that the user named, or factors with estimated influence.
+_Grouping: TypeAlias = tuple[Sequence[object] | None, Mapping[str, Sequence[object]]]
 #: Value of ``cluster`` for drives that do not depend on one another.
 INDEPENDENT = "none"
-#: Number of drives with the largest changes for which tracks are compared.
-MOST_FOLLOWED = 10
 #: Verdicts from grave to harmless; the gravest one is the overall verdict.
 _GRAVITY: tuple[FigureVerdict, ...] = ("worse", "no figure", "inconclusive", "not worse", "better", "equal")
-#: Rows of metrics.parquet that are in memory at once.
-_ROWS = 1 << 18
-_FIGURE = ["estimator", "signal", "segment", "metric", "value", "n", "unit"]
+_FIGURE = ("estimator", "signal", "segment", "metric", "unit")
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +116,6 @@ class Comparison:
     differences : other causes of changed figures, a line each. changed : drives with any figure that is not the
         same bit for bit.
     figures : requested, or of the gate. others : shown beside them; empty if all are equal.
-    signals : where the tracks of the most changed drives part. followed : how many drives were looked at for it.
-    damaged : files of drives that could not be read, a line each.
     gated, allow_unpaired, strict : rules of the gate. requirements : verdicts of a validation plan on B.
     """
 
@@ -135,9 +128,6 @@ class Comparison:
     changed: int
     figures: tuple[ComparedFigure, ...]
     others: tuple[ComparedFigure, ...] = ()
-    signals: tuple[ChangedSignal, ...] = ()
-    followed: int = 0
-    damaged: tuple[str, ...] = ()
     cluster: str | None = None
     gated: bool = False
     allow_unpaired: bool = False
@@ -184,18 +174,16 @@ class Comparison:
 
     @property
     def exit_code(self) -> int:
-        """4 where the gate is closed, 3 for damaged files and for drives without partner and no gate, else 0."""
+        """4 where the gate is closed, 3 for drives without partner and no gate, else 0."""
         if self.failures or (self.requirements is not None and self.requirements.closes_gate):
             return EXIT_GATE
-        if self.damaged:
-            return EXIT_PARTIAL
         return EXIT_PARTIAL if self.unpaired and not self.gated and not self.allow_unpaired else EXIT_OK
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as one JSON-able document."""
         return {
             "format": "pdhef.comparison",
-            "version": 1,
+            "version": 2,
             **{key: getattr(self, key) for key in ("a", "b", "verdict", "exit_code", "failures")},
             "plan": None if self.requirements is None else self.requirements.to_dict(),
             "differences": self.differences,
@@ -203,10 +191,35 @@ class Comparison:
             **{key: getattr(self, key) for key in ("only_a", "only_b", "changed", "cluster")},
             "figures": [f.to_dict() for f in self.figures],
             "others": [f.to_dict() for f in self.others],
-            "signals": [asdict(s) for s in self.signals],
-            "followed": self.followed,
-            "damaged": self.damaged,
         }
+
+
+def compare(
+    a: Path | str,
+    b: Path | str,
+    *,
+    plan: Path | str | None = None,
+    max_regression: str | None = None,
+    estimator: str | None = None,
+    metric: str | None = None,
+    cluster: str | None = None,
+    allow_unpaired: bool = False,
+    strict: bool = False,
+) -> Comparison:
+    """Compare the outputs of two runs, folders or URLs, as ``pdhef compare`` does with options of these names.
+
+    Raises
+    ------
+    UsageError : The plan is wrong, or an option.
+    OutputError : One of them is no finished run, or damaged; or no drive is in both.
+    """
+    validation = None if plan is None else load_plan(Path(plan))
+    figures = asked_figures(validation, max_regression, estimator, metric)
+    runs = open_run(a), open_run(b)
+    result = compare_runs(*runs, figures, allow_unpaired=allow_unpaired, cluster=cluster, strict=strict)
+    if validation is None:
+        return result
+    return replace(result, requirements=plan_verdicts_against(validation, *runs, strict=strict))
 
 
 def compare_runs(
@@ -241,7 +254,6 @@ def compare_runs(
             remedy="run both on the same drives",
         )
     gated = any(f.limit is not None for f in figures)
-    damaged: dict[str, None] = {}
     tables = _Tables(a, b, pairing.pairs)
     changed = tables.changed()
     result = Comparison(
@@ -259,166 +271,119 @@ def compare_runs(
         strict=strict,
     )
     if not changed and not gated:
-        return replace(result, damaged=tuple(damaged))
-    asked = cluster not in (None, INDEPENDENT)
-    grouping = _grouping(pairing, cluster, damaged) if changed or asked else _Grouping()
+        return result
+    grouping = _grouping(a, pairing, cluster)
     compared = tuple(tables.compared(figures, grouping))
     tables.check_estimators(compared)
     if not changed:
-        return replace(result, figures=compared, damaged=tuple(damaged))
-    others = _corrected(tables.compared(_beside(figures), grouping))
-    followed = _most_changed(pairing.pairs, changed, compared[0])
-    main = figures[0].estimator
-    signals: list[ChangedSignal] = []
-    for pair in followed:
-        with _noted(damaged):
-            signals += changed_signals(pair, tables.name_of(pair, main))
-    return replace(
-        result, figures=compared, others=others, signals=tuple(signals), followed=len(followed), damaged=tuple(damaged)
-    )
-
-
-@contextmanager
-def _noted(damaged: dict[str, None]) -> Iterator[None]:
-    """Skip a damaged log and add its line."""
-    try:
-        yield
-    except OutputError as error:
-        damaged[str(error)] = None
+        return replace(result, figures=compared)
+    return replace(result, figures=compared, others=_corrected(tables.compared(_beside(figures), grouping)))
 
 
 class _Tables:
     """Figures of two runs for their pairs; only requested rows are read."""
 
     def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair]) -> None:
-        self._runs = (a, b)
-        self._pairs = pairs
-        self._main = [pair.a.main() for pair in pairs]
+        import polars as pl
 
-    def name_of(self, pair: Pair, estimator: str) -> str:
-        """Return the name of ``estimator`` in a pair."""
-        return self._main[self._pairs.index(pair)] if estimator == MAIN else estimator
+        columns = {
+            "a": [p.a.label for p in pairs],
+            "b": [p.b.label for p in pairs],
+            "main": [p.a.main() for p in pairs],
+        }
+        self._runs, self._pairs = (a, b), pl.DataFrame(columns).with_row_index("place")
 
     def changed(self) -> frozenset[str]:
         """Return the drives of A with any figure that is not the same bit for bit."""
         import polars as pl
 
-        for run in self._runs:
-            run.metrics()  # raises for a damaged file
-        a_file, b_file = (run.folder / METRICS_FILE for run in self._runs)
-        if all(pair.a.label == pair.b.label for pair in self._pairs) and filecmp.cmp(a_file, b_file, shallow=False):
+        tables = [run.table("metrics") for run in self._runs]
+        digests = {run.document.get("files", {}).get(table_file("metrics")) for run in self._runs}
+        if len(digests) == 1 and None not in digests and self._pairs["a"].equals(self._pairs["b"]):
             return frozenset()
-
-        def hashed(rows: pl.LazyFrame) -> pl.LazyFrame:
-            return rows.select("log", row=pl.struct(_FIGURE).hash()).group_by("log").agg(pl.col("row").sum(), pl.len())
-
-        a, b = (_by_parts(run, hashed).group_by("log").agg(pl.col("row", "len").sum()) for run in self._runs)
-        pairs = pl.DataFrame({"log": [p.a.label for p in self._pairs], "b": [p.b.label for p in self._pairs]})
-        both = pairs.join(a, on="log", how="left").join(b, left_on="b", right_on="log", how="left", suffix="_b")
+        hashed = (rows.select("log", row=pl.struct(*_FIGURE, "value", "n").hash()) for rows in tables)
+        sums = (rows.group_by("log").agg(pl.col("row").sum(), pl.len()) for rows in hashed)
+        a, b = (rows.collect(engine="streaming") for rows in sums)
+        both = self._pairs.join(a, left_on="a", right_on="log", how="left")
+        both = both.join(b, left_on="b", right_on="log", how="left", suffix="_b")
         differs = pl.col("row").ne_missing(pl.col("row_b")) | pl.col("len").ne_missing(pl.col("len_b"))
-        return frozenset(both.filter(differs)["log"])
+        return frozenset(both.filter(differs)["a"])
 
     def compared(self, figures: Sequence[Figure], grouping: _Grouping) -> list[ComparedFigure]:
         """Return figures over all pairs; only their rows are read."""
-        a, b = (rows.partition_by("signal", "segment", "metric", as_dict=True) for rows in self._rows(figures))
-        return [self._compared(figure, a, b, grouping) for figure in figures]
+        rows = self._rows(figures)
+        return [self._compared(figure, rows, grouping) for figure in figures]
 
-    def _compared(self, figure: Figure, a: _Rows, b: _Rows, grouping: _Grouping) -> ComparedFigure:
-        key = (figure.signal, figure.segment, figure.metric)
-        of_a, of_b = _by_drive(a.get(key)), _by_drive(b.get(key))
-        tainted_a, tainted_b = (_by_drive(rows.get((figure.signal, "all", "not_independent"))) for rows in (a, b))
-        names = self._main if figure.estimator == MAIN else [figure.estimator] * len(self._pairs)
-        drives: list[DriveFigure] = []
-        places: list[int] = []
-        only: dict[str, list[str]] = {"a": [], "b": [], "": []}
-        unit, tainted = "", 0
-        for place, (pair, name) in enumerate(zip(self._pairs, names, strict=True)):
-            key_a, key_b = (pair.a.label, name), (pair.b.label, name)
-            if key_a not in of_a or key_b not in of_b:
-                only["a" * (key_a in of_a) + "b" * (key_b in of_b)].append(pair.a.label)
-                continue
-            (value_a, n_a, unit), (value_b, n_b, _) = of_a[key_a], of_b[key_b]
-            share = _share(value_a, value_b)
-            drives.append(DriveFigure(pair.a.label, pair.b.label, value_a, value_b, n_a, n_b, share))
-            places.append(place)
-            tainted += key_a in tainted_a or key_b in tainted_b
-        ratios = log_ratios(np.array([d.a for d in drives]), np.array([d.b for d in drives]))
-        change = paired_change(ratios, *grouping.of(places))
+    def _rows(self, figures: Sequence[Figure]) -> pl.DataFrame:
+        """Return the figures of the pairs, a row each: ``value``, ``n``, ``independent`` of A, and with ``_b`` of B."""
+        import polars as pl
+
+        named = {f.estimator for f in figures} - {MAIN} | set(self._pairs["main"])
+        asked = [named, *({getattr(f, key) for f in figures} for key in _FIGURE[1:-1])]
+        wanted = [pl.col(key).is_in(sorted(of)) for key, of in zip(_FIGURE, asked, strict=False)]
+        a, b = (
+            self._pairs.select("place", log=side)
+            .join(run.table("metrics").filter(pl.col("value").is_finite(), *wanted).collect(), on="log")
+            .drop("log", "algorithm")
+            for side, run in zip("ab", self._runs, strict=True)
+        )
+        both = a.join(b, on=["place", *_FIGURE], how="full", coalesce=True, suffix="_b")
+        return both.join(self._pairs, on="place", how="left").sort("place")
+
+    def _compared(self, figure: Figure, rows: pl.DataFrame, grouping: _Grouping) -> ComparedFigure:
+        import polars as pl
+
+        name = pl.col("main") if figure.estimator == MAIN else pl.lit(figure.estimator)
+        key = {key: getattr(figure, key) for key in ("signal", "segment", "metric")}
+        of_pairs = rows.filter(pl.col("estimator") == name, **key)
+        both = of_pairs.drop_nulls(["value", "value_b"])
+        a, b = both["value"].to_numpy(), both["value_b"].to_numpy()
+        ratios = log_ratios(a, b)
+        clusters, factors = grouping
+        places = both["place"].to_list()
+        of_both = {name: [values[i] for i in places] for name, values in factors.items()}
+        change = paired_change(ratios, clusters and [clusters[i] for i in places], of_both)
         verdict: FigureVerdict = change.verdict(figure.limit or 0.0)
-        if all((d.a, d.n_a) == (d.b, d.n_b) for d in drives):
-            verdict = "equal" if drives else "no figure"
-        ordered = [drives[i] for i in np.argsort(-ratios, kind="stable")]
+        if np.array_equal(a, b) and both["n"].equals(both["n_b"]):
+            verdict = "equal" if len(both) else "no figure"
+        ordered = both.select("a", "b", "value", "value_b", "n", "n_b")[np.argsort(-ratios, kind="stable")]
         return ComparedFigure(
             figure,
             verdict,
             change,
-            unit=unit,
-            drives=tuple(ordered),
-            only_a=tuple(only["a"]),
-            only_b=tuple(only["b"]),
-            neither=len(only[""]),
-            notes=tuple(_notes(ordered, tainted)),
+            unit=both["unit"][0] if len(both) else "",
+            drives=tuple(
+                DriveFigure(drive, drive_b, x, y, n_a, n_b, _share(x, y))
+                for drive, drive_b, x, y, n_a, n_b in ordered.iter_rows()
+            ),
+            only_a=tuple(of_pairs.filter(pl.col("value_b").is_null())["a"]),
+            only_b=tuple(of_pairs.filter(pl.col("value").is_null())["a"]),
+            neither=len(self._pairs) - len(of_pairs),
+            notes=tuple(_notes(both)),
         )
 
     def check_estimators(self, figures: Sequence[ComparedFigure]) -> None:
         """Raise UsageError for an estimator that no drive of either run has, and for runs without a selected one."""
         missing = {f.figure.estimator for f in figures if f.verdict == "no figure"}
-        if any(self._main):
+        if any(self._pairs["main"]):
             missing -= {MAIN}
         if not missing:
             return
-        frames = [run.metrics().select("estimator").unique().collect(engine="streaming") for run in self._runs]
+        frames = [run.table("metrics").select("estimator").unique().collect(engine="streaming") for run in self._runs]
         estimators = {name for frame in frames for name in frame["estimator"]}
         for name in sorted(missing - estimators):
             single = sorted(k for k in estimators if "~" not in k and k != SENSORS)
             got = "none named, and none that is selected" if name == MAIN else name
             raise UsageError(expected=f"an estimator of these runs: {', '.join(single)}", got=got, where="--estimator")
 
-    def _rows(self, figures: Sequence[Figure]) -> list[pl.DataFrame]:
-        """Return the rows of figures and of the independence of their ground truth, of both runs."""
-        import polars as pl
 
-        named = {f.estimator for f in figures} - {MAIN}
-        asked = {
-            "estimator": named if named == {f.estimator for f in figures} else named | set(self._main),
-            "signal": {f.signal for f in figures},
-            "segment": {"all", *(f.segment for f in figures)},
-            "metric": {"not_independent", *(f.metric for f in figures)},
-        }
-        wanted = [pl.col(key).is_in(sorted(values)) for key, values in asked.items()]
-        return [_by_parts(run, lambda rows: rows.filter(*wanted).select("log", *_FIGURE)) for run in self._runs]
-
-
-def _by_parts(run: OpenedRun, query: Callable[[pl.LazyFrame], pl.LazyFrame]) -> pl.DataFrame:
-    """Return the results of a query over each part of a run's figures; few rows are in memory at once."""
-    import polars as pl
-    import pyarrow.parquet as pq
-
-    texts = ["log", *(c for c in _FIGURE if c not in ("value", "n"))]
-    pieces = []
-    with pq.ParquetFile(run.folder / METRICS_FILE, read_dictionary=texts) as file:
-        for batch in file.iter_batches(_ROWS, columns=["log", *_FIGURE]):
-            rows = pl.DataFrame(pl.from_arrow(batch)).lazy().with_columns(pl.col(texts).cast(pl.String))
-            pieces.append(query(rows).collect())
-    return pl.concat(pieces) if pieces else query(run.metrics()).collect()
-
-
-def _by_drive(rows: pl.DataFrame | None) -> dict[tuple[str, str], tuple[float, int, str]]:
-    """Return value, number of stamps and unit of a figure by log and estimator, where it has a value."""
-    if rows is None:
-        return {}
-    columns = ("log", "estimator", "value", "n", "unit")
-    table = rows.select(columns).iter_rows()
-    return {(r[0], r[1]): (r[2], r[3], r[4]) for r in table if r[2] is not None and math.isfinite(r[2])}
-
-
-def _notes(drives: Sequence[DriveFigure], tainted: int) -> Iterator[str]:
-    other = [d for d in drives if d.n_a != d.n_b]
-    if other:
-        share = _share(sum(d.n_a for d in drives), sum(d.n_b for d in drives)) or 0.0
-        yield f"other stamps are scored in {len(other)} of {len(drives)} drives, {share:+.2%} in all"
-    if tainted:
-        yield f"in {tainted} of {len(drives)} drives the ground truth is one of the estimator's inputs"
+def _notes(both: pl.DataFrame) -> Iterator[str]:
+    other = both.filter(both["n"] != both["n_b"])
+    if len(other):
+        share = _share(float(both["n"].sum()), float(both["n_b"].sum())) or 0.0
+        yield f"other stamps are scored in {len(other)} of {len(both)} drives, {share:+.2%} in all"
+    if tainted := len(both) - int((both["independent"] & both["independent_b"]).sum()):
+        yield f"in {tainted} of {len(both)} drives the ground truth is one of the estimator's inputs"
 
 
 def _share(a: float, b: float) -> float | None:
@@ -456,39 +421,20 @@ def _corrected(figures: Sequence[ComparedFigure]) -> tuple[ComparedFigure, ...]:
     return tuple(replace(f, corrected_p=p) for f, p in zip(there, holm([f.change.sign_p for f in there]), strict=True))
 
 
-def _most_changed(pairs: Sequence[Pair], changed: frozenset[str], figure: ComparedFigure) -> list[Pair]:
-    """Return the pairs with the largest changes of the figure, pairs without it last, at most :data:`MOST_FOLLOWED`."""
-    by_drive = {d.drive: abs(float(log_ratios(np.array([d.a]), np.array([d.b]))[0])) for d in figure.drives}
-    changed_pairs = [pair for pair in pairs if pair.a.label in changed]
-    return sorted(changed_pairs, key=lambda pair: -by_drive.get(pair.a.label, -1.0))[:MOST_FOLLOWED]
-
-
-@dataclass(frozen=True, slots=True)
-class _Grouping:
-    """Dependence of the pairs [N]: ``clusters`` that the user named, or ``factors`` with estimated influence."""
-
-    clusters: Sequence[object] | None = None
-    factors: Mapping[str, Sequence[object]] = field(default_factory=dict)
-
-    def of(self, places: Sequence[int]) -> tuple[list[object] | None, dict[str, list[object]]]:
-        """Return clusters and factors of some pairs."""
-        clusters = None if self.clusters is None else [self.clusters[i] for i in places]
-        return clusters, {name: [values[i] for i in places] for name, values in self.factors.items()}
-
-
-def _grouping(pairing: Pairing, key: str | None, damaged: dict[str, None]) -> _Grouping:
-    """Return the groups of the pairs by a key, or by day, car and route without one."""
+def _grouping(run: OpenedRun, pairing: Pairing, key: str | None) -> _Grouping:
+    """Return the groups of the pairs [N] by a key, as clusters, or by day, car and route without one, as factors."""
     if key == INDEPENDENT:
-        return _Grouping()
-    stated: list[dict[str, str | None]] = [{} for _ in pairing.pairs]
-    for number, pair in enumerate(pairing.pairs):
-        with _noted(damaged):
-            report = pair.a.report()
-            stated[number] = {**((report or {}).get("metadata") or {}), **factors_of(pair.a.entry, report)}
+        return None, {}
+    of_log: dict[str, dict[str, str | None]] = {}
+    for log, name, value in run.table("metadata").collect().iter_rows():
+        of_log.setdefault(log, {})[name] = value
+    for log, *values in run.table("drives").select("log", *FACTORS).collect().iter_rows():
+        of_log.setdefault(log, {}).update(zip(FACTORS, values, strict=True))
+    stated = [of_log.get(pair.a.label, {}) for pair in pairing.pairs]
     if key is None:
-        return _Grouping(None, {name: [of.get(name) for of in stated] for name in FACTORS})
+        return None, {name: [of.get(name) for of in stated] for name in FACTORS}
     values = [of.get(key) for of in stated]
     if all(value is None for value in values):
         names = dict.fromkeys((*FACTORS, INDEPENDENT, *sorted({str(k) for of in stated for k in of})))
         raise UsageError(expected=f"a key of the drives: {', '.join(names)}", got=key, where="--cluster")
-    return _Grouping(values)
+    return values, {}

@@ -7,12 +7,9 @@ from functools import cache
 from typing import Any
 
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
-from pdhef_logtool.evaluation.units import SCORED_SIGNALS, read_unit
-from pdhef_logtool.results.changed_signals import ChangedSignal
 from pdhef_logtool.results.comparing import INDEPENDENT, ComparedFigure, Comparison
 from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
 from pdhef_logtool.results.selected_estimate import TEMPLATES
-from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.storage.templates import clauses, one_line, template
 
 
@@ -62,23 +59,6 @@ def interval_text(figure: ComparedFigure) -> str:
     """Return the 95 % interval of the median change, a dash without."""
     low, high = (math.expm1(x) for x in (figure.change.low, figure.change.high))
     return f"{percent(low)} to {percent(high)}" if math.isfinite(figure.change.low) else "-"
-
-
-def one_signal_a_drive(comparison: Comparison) -> list[ChangedSignal]:
-    """Return the signal that was asked about of each drive, else its first, and the first of a changed ground truth."""
-    asked = comparison.figures[0].figure.signal
-    shown: dict[tuple[str, bool], ChangedSignal] = {}
-    for signal in comparison.signals:
-        key = (signal.drive, signal.track == TRUTH)
-        if key not in shown or (signal.signal == asked and signal.track != TRUTH):
-            shown[key] = signal
-    return list(shown.values())
-
-
-def largest_text(signal: ChangedSignal) -> str:
-    """Return the largest difference with its unit."""
-    unit, factor = read_unit(SCORED_SIGNALS.get(signal.signal.replace("_std", ""), "1"))
-    return "-" if signal.largest is None else f"{signal.largest * factor:.3g} {unit}".strip()
 
 
 def percent(share: float) -> str:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from pathlib import Path
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,8 +18,8 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import TRACK_COLUMNS
 from pdhef_logtool.results.condition import Condition, Reference, parse_condition
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.results.parquet_sink import list_estimators
 from pdhef_logtool.results.sink import TRUTH
-from pdhef_logtool.storage.files import PendingFile, open_new, writing
 
 if TYPE_CHECKING:
     import polars as pl
@@ -120,12 +119,13 @@ def find_events(
     events: list[FoundEvent] = []
     left_out: dict[str, str] = {}
     damaged: dict[str, str] = {}
+    drives = _drives(run)
     unreadable = searched = 0
     for log in run.logs:
         try:
             reason = _unfit(log, condition, estimator)
             if reason is None:
-                events += _events_of(log, condition, estimator or log.main(), least_s, pad_s)
+                events += _events_of(log, condition, estimator or log.main(), drives[log.label], least_s, pad_s)
                 searched += 1
         except OutputError as error:
             reason = error.got
@@ -148,22 +148,31 @@ def find_events(
     )
 
 
-def write_events(path: Path, events: FoundEvents) -> None:
-    """Write the events as Parquet; raises OutputError."""
-    import polars as pl
+@dataclass(frozen=True, slots=True)
+class _Drive:
+    """Start of a log, lowest speed of scores, and intervals of its segments by name."""
 
-    names = (f.name for f in fields(FoundEvent))
-    schema = {n: pl.String if n == "drive" else pl.Int64 if n.endswith("_ns") else pl.Float64 for n in names}
-    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
-        pl.DataFrame([asdict(e) for e in events.events], schema=schema).write_parquet(file)
+    start_ns: int
+    low_speed_m_s: float
+    spans: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
+
+
+def _drives(run: OpenedRun) -> dict[str, _Drive]:
+    """Return the drives of a run by log."""
+    rows = run.table("drives").select("log", "start_ns", "low_speed_m_s").collect().iter_rows()
+    drives = {log: _Drive(start_ns or 0, slow or 0.0) for log, start_ns, slow in rows}
+    events = run.table("events").select("log", "event", "start_ns", "end_ns").collect()
+    for log, event, *span in events.iter_rows():
+        drives[log].spans.setdefault(event, []).append((span[0], span[1]))
+    return drives
 
 
 def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str | None:
     """Return why a drive cannot be searched, otherwise None."""
-    frame = log.estimates()
-    if frame is None:
+    file = log.file(ESTIMATES_FILE)
+    if file is None:
         return log.outcome if log.outcome.startswith("failed") else f"it has no {ESTIMATES_FILE}"
-    there = _tracks(log)
+    there = list_estimators(file)
     for name in _needed(condition, estimator or log.main()):
         if name not in there:
             return "it has no ground truth" if name == TRUTH else f"it has no estimator {name}".strip()
@@ -172,7 +181,7 @@ def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str |
 
 def _check_tracks(logs: Sequence[OpenedLog], condition: Condition, estimator: str | None) -> None:
     """Raise UsageError for an estimator that none of the drives that can be read has."""
-    estimators = {name for log in logs if log.file(ESTIMATES_FILE) is not None for name in _tracks(log)}
+    estimators = {n for log in logs if (file := log.file(ESTIMATES_FILE)) is not None for n in list_estimators(file)}
     if not estimators:
         return
     expected = f"an estimator of this run: {', '.join(sorted(estimators))}"
@@ -186,14 +195,6 @@ def _check_tracks(logs: Sequence[OpenedLog], condition: Condition, estimator: st
         raise UsageError(expected=expected, got=str(name), where=where)
 
 
-def _tracks(log: OpenedLog) -> frozenset[str]:
-    import polars as pl
-
-    frame = log.estimates()
-    assert frame is not None
-    return frozenset(frame.select(pl.col("estimator").cast(pl.String).unique()).collect()["estimator"])
-
-
 def _needed(condition: Condition, main: str) -> set[str]:
     """Return the tracks that a condition reads."""
     columns = condition.references.values()
@@ -201,16 +202,15 @@ def _needed(condition: Condition, main: str) -> set[str]:
     return {main} | {r.track or main for r in columns} | errors
 
 
-def _events_of(log: OpenedLog, condition: Condition, main: str, least_s: float, pad_s: float) -> list[FoundEvent]:
+def _events_of(
+    log: OpenedLog, condition: Condition, main: str, drive: _Drive, least_s: float, pad_s: float
+) -> list[FoundEvent]:
     """Return the events of one drive."""
     import polars as pl
 
     frame = log.estimates()
     assert frame is not None
-    report = log.report() or {}
-    low_speed = (report.get("vehicle") or {}).get("low_speed_blend_m_s")
-    segments = report.get("segments", [])
-    builder = _Builder(main, 0.0 if low_speed is None else float(low_speed), segments)
+    builder = _Builder(main, drive)
     named = [builder.column(reference).alias(name) for name, reference in condition.references.items()]
     peak = pl.lit(None) if condition.peak is None else condition.peak
     holds = condition.expression.fill_null(value=False)
@@ -218,7 +218,6 @@ def _events_of(log: OpenedLog, condition: Condition, main: str, least_s: float, 
     rows = columns.select("stamp_ns", holds=holds, peak=peak.cast(pl.Float64)).collect()
     stamps, mask = rows["stamp_ns"].to_numpy(), rows["holds"].to_numpy()
     values = rows["peak"].fill_null(math.nan).to_numpy()
-    log_start_ns = int((report.get("log") or {}).get("start_ns", stamps[0] if len(stamps) else 0))
     events = []
     for first, last in _spans(stamps, mask, least_s, pad_s):
         peak_row = _peak_at(values[first:last], condition.falls)
@@ -228,8 +227,8 @@ def _events_of(log: OpenedLog, condition: Condition, main: str, least_s: float, 
                 log.label,
                 start_ns,
                 end_ns,
-                (start_ns - log_start_ns) * 1e-9,
-                (end_ns - log_start_ns) * 1e-9,
+                (start_ns - drive.start_ns) * 1e-9,
+                (end_ns - drive.start_ns) * 1e-9,
                 None if peak_row is None else float(values[first + peak_row]),
                 None if peak_row is None else int(stamps[first + peak_row]),
             )
@@ -274,9 +273,8 @@ def _joined(frame: pl.LazyFrame, columns: Mapping[str, set[str]], main: str) -> 
 class _Builder:
     """Makes the columns of a condition; ``columns`` collects the stored columns that they need, by track."""
 
-    def __init__(self, main: str, low_speed_m_s: float, segments: Sequence[Mapping[str, Any]]) -> None:
-        self._main, self._segments = main, segments
-        self._low_speed_m_s = low_speed_m_s
+    def __init__(self, main: str, drive: _Drive) -> None:
+        self._main, self._drive = main, drive
         self.columns: dict[str, set[str]] = {main: set()}
 
     def column(self, reference: Reference) -> pl.Expr:
@@ -293,7 +291,7 @@ class _Builder:
         """Return where a stamp lies in a segment's intervals, which do not overlap."""
         import polars as pl
 
-        spans = sorted((s["start_ns"], s["end_ns"]) for s in self._segments if s["name"] == segment)
+        spans = sorted(self._drive.spans.get(segment, ()))
         starts, ends = np.array(spans, dtype=np.int64).reshape(-1, 2).T
 
         def inside(stamps: pl.Series) -> pl.Series:
@@ -320,5 +318,5 @@ class _Builder:
         scored = self._read(track, "valid") & self._read(TRUTH, "valid")
         if signal == "sideslip_rad":
             error = pl.arctan2(error.sin(), error.cos())
-            scored &= self._speed(TRUTH) > self._low_speed_m_s
+            scored &= self._speed(TRUTH) > self._drive.low_speed_m_s
         return pl.when(scored).then(error)

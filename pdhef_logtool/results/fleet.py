@@ -1,6 +1,6 @@
 """The figures of a whole run: errors over drives, the order of estimators, effects of conditions, and coverage.
 
-Reports are read one after the other and metrics lazily: a few figures of each drive remain in memory, never a series.
+They come from the tables of the run: a few figures of each drive are in memory, never a series.
 Scores use drives with ground truth that is independent of the estimator; other drives are listed separately.
 Intervals take the dependence of drives of one day, car or route into account.
 """
@@ -11,26 +11,32 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdhef_logtool.evaluation.dependence import FACTORS, Dependence, dependence, factors_of
+from pdhef_logtool.evaluation.dependence import FACTORS, Dependence, dependence
+from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
-from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.results.breakdown import LEAST_DRIVES, SIGNIFICANT, Breakdown, BreakdownDrive, breakdowns
-from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
+from pdhef_logtool.results.opened_run import OpenedRun
 from pdhef_logtool.results.paired_change import PairedChange, holm, log_ratios, paired_change
+
+if TYPE_CHECKING:
+    import polars as pl
 
 #: Name of the estimate that each drive's report calls its answer.
 ANSWER = "answer"
 #: Columns of errors: signal and unit.
 SIGNALS = {s: SCORED_SIGNALS[s] for s in ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s")}
 JUDGED = "sideslip_rad"
+#: The estimate without a model that others are compared with.
+_NAIVE = "zero"
 WORST = 20
+_FIGURE = ("log", "estimator", "signal", "metric", "value")
 #: Levels of folders by which drives are grouped.
 _MOST_FOLDERS = 3
 #: Most labels of a group of failures, and most groups.
@@ -66,7 +72,7 @@ class FleetDrive:
     errors : RMSE by estimator and signal, where the ground truth is independent of both.
     nis, d2, naive_d2 : without ground truth: NIS and v̇_y residual of the selected estimate, v̇_y residual of sideslip 0.
     coverage : of the 95 % confidence interval.
-    failed_checks : that count. lost : data that could not be used. keys : for grouping.
+    failed_checks : that count. keys : for grouping.
     factors : day, car and route, None where not stated.
     """
 
@@ -81,7 +87,6 @@ class FleetDrive:
     d2: float
     naive_d2: float
     failed_checks: int
-    lost: str
     keys: Mapping[str, str]
     factors: Mapping[str, str | None]
 
@@ -201,26 +206,36 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
     Raises
     ------
     OutputError
-        metrics.parquet is damaged.
+        A table is damaged.
     """
-    figures = read_figures(run)
-    gathered = _Gathered()
-    for log in run.logs:
-        gathered.add(log, figures.get(log.label, {}))
-    drives = tuple(gathered.drives)
+    import polars as pl
+
+    rows = run.table("drives").collect().to_dicts()
+    done = [row for row in rows if row["outcome"] != "failed"]
+    faults = run.table("faults")
+    sensors = faults.filter(pl.col("origin") == "sensor").group_by("log").agg(pl.col("kind").unique().sort())
+    kinds = dict(sensors.collect().iter_rows())
+    lost = faults.filter(severity="lost").select("log", "text").collect().rows()
+    metadata: dict[str, dict[str, str]] = {}
+    for log, key, value in run.table("metadata").collect().iter_rows():
+        metadata.setdefault(log, {})[key] = value
+    figures = _figures(run)
+    drives = tuple(
+        _drive(r, figures.get(r["log"], {}), _keys(r, metadata.get(r["log"], {}), kinds.get(r["log"]))) for r in done
+    )
     scored = [d for d in drives if d.truth]
     names = _estimators(scored)
     return Fleet(
-        logs=len(run.logs),
+        logs=len(rows),
         drives=drives,
         distributions=tuple(_distributions(scored, names)),
         ranking=tuple(_ranking(scored, names)) if len(scored) >= least_to_rank(len(names)) else (),
         least_to_rank=least_to_rank(len(names)),
         dependence=_dependence(scored),
         breakdowns=breakdowns([BreakdownDrive(d.error(), d.keys, d.factors) for d in drives], by),
-        space=gathered.space(),
-        failed=grouped(gathered.failed),
-        losses=grouped(gathered.lost),
+        space=_space(run),
+        failed=grouped([(r["log"], r["reason"]) for r in rows if r["outcome"] == "failed"]),
+        losses=grouped(lost),
     )
 
 
@@ -233,134 +248,84 @@ def least_to_rank(estimators: int) -> int:
     return max(LEAST_DRIVES, math.floor(math.log2(2.0 * pairs / SIGNIFICANT)) + 1)
 
 
-@dataclass(slots=True)
-class _Gathered:
-    """Accumulated contents of the reports."""
+def _space(run: OpenedRun) -> Space | None:
+    """Return the operating space of all drives."""
+    import polars as pl
 
-    drives: list[FleetDrive] = field(default_factory=list)
-    failed: list[tuple[str, str]] = field(default_factory=list)
-    lost: list[tuple[str, str]] = field(default_factory=list)
-    edges: tuple[FloatArray, FloatArray] | None = None
-    cells: FloatArray = field(default_factory=lambda: np.zeros((3, 0, 0)))
-    mapped: int = 0
-
-    def add(self, log: OpenedLog, figures: Mapping[tuple[str, str, str], float]) -> None:
-        kind, _, reason = log.outcome.partition(": ")
-        try:
-            report = log.report()
-            if kind == "failed" or report is None:
-                self.failed.append((log.label, reason or "its report is not there any more"))
-                return
-        except PdhefError as error:
-            self.failed.append((log.label, f"its report cannot be read: {error.expected}, got {error.got}"))
-            return
-        self.drives.append(_drive(log, report, figures))
-        self.lost += [(log.label, str(x["what"])) for x in report.get("losses", ()) if x.get("severity") == "lost"]
-        self._add_space(report.get("operating_space"))
-
-    def _add_space(self, space: Mapping[str, Any] | None) -> None:
-        if not space:
-            return
-        if self.edges is None:
-            self.edges = np.array(space["speed_edges_m_s"]), np.array(space["ay_edges_m_s2"])
-            self.cells = np.zeros((3, *map(len, self.edges)))
-        self.mapped += 1
-        for cell in space["cells"]:
-            scored = cell["scored"] if cell["sideslip_mse_rad2"] is not None else 0
-            share = cell["seconds"], scored, scored * (cell["sideslip_mse_rad2"] or 0.0)
-            self.cells[:, cell["speed"], cell["ay"]] += share
-
-    def space(self) -> Space | None:
-        if self.edges is None:
-            return None
-        seconds, counts, squares = self.cells
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return Space(*self.edges, seconds, np.sqrt(squares / counts), self.mapped)
+    cells = run.table("exposure").with_columns(scored=pl.when(pl.col("sideslip_mse_rad2").is_not_null()).then("scored"))
+    squares = (pl.col("sideslip_mse_rad2") * pl.col("scored")).sum() / pl.col("scored").sum()
+    sums = cells.group_by("speed_m_s", "ay_m_s2").agg(pl.col("seconds").sum(), squares.sqrt().alias("rmse"))
+    rows = sums.collect().rows()
+    if not rows:
+        return None
+    shape = len(SPEED_EDGES_M_S), len(AY_EDGES_M_S2)
+    seconds, rmse = np.zeros(shape), np.full(shape, math.nan)
+    for speed, ay, spent, error in rows:
+        cell = SPEED_EDGES_M_S.index(speed), AY_EDGES_M_S2.index(ay)
+        seconds[cell], rmse[cell] = spent, error
+    drives = run.table("exposure").select(pl.col("log").n_unique()).collect().item()
+    return Space(np.array(SPEED_EDGES_M_S), np.array(AY_EDGES_M_S2), seconds, rmse, drives)
 
 
-def independent_errors(figures: Mapping[tuple[str, str, str], float]) -> dict[tuple[str, str], float]:
-    """Return the RMSE by estimator and signal, where the ground truth is independent of both."""
-    return {
-        (e, s): value
-        for (e, s, metric), value in figures.items()
-        if metric == "rmse" and math.isfinite(value) and (e, s, "not_independent") not in figures
-    }
+def sideslip_errors(run: OpenedRun, signals: Sequence[str] = (JUDGED,)) -> pl.LazyFrame:
+    """Return the RMSE of drives by log, estimator and signal, where the ground truth is independent."""
+    import polars as pl
+
+    there = pl.col("independent") & pl.col("value").is_finite() & pl.col("signal").is_in(signals)
+    return run.table("metrics").filter(there, segment="all", metric="rmse").select(_FIGURE)
 
 
-def read_figures(run: OpenedRun) -> dict[str, dict[tuple[str, str, str], float]]:
+def _figures(run: OpenedRun) -> dict[str, dict[tuple[str, str, str], float]]:
     """Return the figures of whole drives by log, then by estimator, signal and metric."""
     import polars as pl
 
-    rows = (
-        run.metrics()
-        .filter(
-            (pl.col("segment") == "all")
-            & (
-                (pl.col("metric").is_in(["rmse", "not_independent"]) & pl.col("signal").is_in(list(SIGNALS)))
-                | ((pl.col("metric") == "coverage95") & (pl.col("signal") == JUDGED))
-                | pl.col("metric").is_in(["nis", "nis_dof", "d2"])
-            )
-        )
-        .select("log", "estimator", "signal", "metric", "value")
-    )
+    consistency = run.table("metrics").filter(pl.col("metric").is_in(["nis", "nis_dof", "d2"]), segment="all")
     values: dict[str, dict[tuple[str, str, str], float]] = {}
-    for log, estimator, signal, metric, value in rows.collect().iter_rows():
-        values.setdefault(log, {})[estimator, signal, metric] = math.nan if value is None else value
+    for rows in (sideslip_errors(run, [*SIGNALS]), consistency.select(_FIGURE)):
+        for log, *key, value in rows.collect().iter_rows():
+            values.setdefault(log, {})[key[0], key[1], key[2]] = math.nan if value is None else value
     return values
 
 
-def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str, str, str], float]) -> FleetDrive:
-    answer = report.get("answer") or {}
-    ran = [e["name"] for e in report.get("estimators", ()) if e["outcome"] == "ran"]
-    main = answer.get("main") or next(iter(ran), "")  # without an answer the first of recorded estimates
-    errors = independent_errors(figures)
+def _drive(
+    row: Mapping[str, Any], figures: Mapping[tuple[str, str, str], float], keys: Mapping[str, str]
+) -> FleetDrive:
+    """Return a drive of a row of the table of drives."""
+    main = row["estimator"] or ""
     dof = figures.get((main, "state", "nis_dof"), math.nan)
     nis = figures.get((main, "state", "nis"), math.nan)
-    kind, _, reason = log.outcome.partition(": ")
+    coverage = row["sideslip_coverage95"]
     return FleetDrive(
-        label=log.label,
-        seconds=float(report["log"]["duration_s"]),
+        label=row["log"],
+        seconds=row["seconds"],
         main=main,
-        truth=(main, JUDGED) in errors,
-        unscored="" if (main, JUDGED) in errors else _why_unscored(report),
-        errors=errors,
-        coverage=figures.get((main, JUDGED, "coverage95"), math.nan),
-        nis=nis / dof if dof and dof > 0.0 else math.nan,
+        truth=row["sideslip_rmse_rad"] is not None,
+        unscored=row["unscored"] or "",
+        errors={(e, s): value for (e, s, metric), value in figures.items() if metric == "rmse"},
+        coverage=math.nan if coverage is None else coverage,
+        nis=nis / dof if dof > 0.0 else math.nan,
         d2=figures.get((main, "vy_m_s", "d2"), math.nan),
-        naive_d2=figures.get((answer.get("naive") or "", "vy_m_s", "d2"), math.nan),
-        failed_checks=sum(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks", ())),
-        lost=reason if kind == "lost" else "",
-        keys=_keys(log, report, main),
-        factors=factors_of(log.entry, report),
+        naive_d2=figures.get((_NAIVE, "vy_m_s", "d2"), math.nan),
+        failed_checks=row["failed_checks"],
+        keys=keys,
+        factors={factor: row[factor] for factor in FACTORS},
     )
 
 
-def _why_unscored(report: Mapping[str, Any]) -> str:
-    if not report["truth"]["available"]:
-        return "the log has no ground truth"
-    if JUDGED in report["truth"]["not_independent"]:
-        return "its ground truth is not independent"
-    texts = (report.get("answer") or {}).get("texts") or {}
-    return str(texts.get("result", "")).partition(" is not scored: ")[2] or "no figure of it is scored"
-
-
-def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str]:
+def _keys(row: Mapping[str, Any], metadata: Mapping[str, str], kinds: Sequence[str] | None) -> dict[str, str]:
     """Return the keys for grouping of a drive: metadata of its log, and of the run."""
-    car = log.entry.get("car") or {}
-    source = str((report.get("friction") or {}).get("source", ""))
     from_log = {
-        "car": car.get("name") or report["vehicle"]["name"],
-        "log format": report["log"]["kind"],
-        "answer": main,
-        "friction source": source,
-        "length": _length(float(report["log"]["duration_s"])),
-        "sensor faults": _fault_text(report),
-        "month": (factors_of(log.entry, report)["day"] or "")[:7],
+        "car": row["car"],
+        "log format": row["log_format"],
+        "answer": row["estimator"],
+        "friction source": row["friction_source"],
+        "length": _length(row["seconds"]),
+        "sensor faults": None if row["sensor_faults"] is None else ", ".join(kinds or ()) or "none",
+        "month": (row["day"] or "")[:7],
     }
-    parts = str(log.entry.get("folder") or "").split("/")[:_MOST_FOLDERS]
+    parts = row["folder"].split("/")[:_MOST_FOLDERS]
     from_log |= {"folder" if i == 0 else f"folder {i + 1}": "/".join(parts[: i + 1]) for i in range(len(parts))}
-    from_metadata = {str(k): str(v) for k, v in (report.get("metadata") or {}).items()}
-    return {**from_metadata, **{k: v for k, v in from_log.items() if v}}
+    return {**metadata, **{k: v for k, v in from_log.items() if v}}
 
 
 def _length(seconds: float) -> str:
@@ -368,13 +333,6 @@ def _length(seconds: float) -> str:
         if seconds < end:
             return text
     return "above an hour"
-
-
-def _fault_text(report: Mapping[str, Any]) -> str:
-    faults = report.get("faults")
-    if faults is None:
-        return ""
-    return ", ".join(sorted({f["kind"] for f in faults})) or "none"
 
 
 def _estimators(drives: Iterable[FleetDrive]) -> list[str]:

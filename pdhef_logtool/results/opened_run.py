@@ -19,13 +19,16 @@ from pdhef_logtool.storage.object_store import Mirror, is_url
 if TYPE_CHECKING:
     import polars as pl
 
-#: Folder of logs in the outputs of a run, the figures of all logs, and the files of a log's folder.
+#: Folder of logs in the outputs of a run, and the files of a log's folder.
 LOGS = "logs"
 METRICS_FILE = "metrics.parquet"
 REPORT_FILE = "report.json"
-#: Journal of a run of several logs, a line per drive; and the folder of their figures, by run and car.
+#: Tables of a run (schemas/<name>.parquet.json), their folder, and the parts of drives there (:mod:`~.tables`).
+TABLES = ("drives", "metrics", "checks", "events", "faults", "exposure", "metadata", "verdicts")
+TABLES_FOLDER = "tables"
+PARTS = "tables/parts"
+#: Journal of a run of several logs, a line per drive.
 JOURNAL_FILE = "journal.jsonl"
-PARTS = "metrics"
 ESTIMATES_FILE = "estimates.parquet"
 RECORDING_FILE = "recording.rrd"
 #: A page for people: of a log in its folder, of all logs in the run's.
@@ -109,21 +112,23 @@ class OpenedRun:
         """Where people find it."""
         return str(self.folder) if self.mirror is None else self.mirror.objects.shown
 
-    def metrics(self) -> pl.LazyFrame:
-        """Return the figures of all logs, a row a figure (metrics.parquet), read when collected.
-
-        Raises
-        ------
-        OutputError
-            The file is not as the run wrote it.
-        """
+    def table(self, name: str) -> pl.LazyFrame:
+        """Return one of :data:`TABLES`, read when collected; raises OutputError for a file that is not as written."""
         import polars as pl
 
-        path = self.folder / METRICS_FILE
-        if METRICS_FILE not in self._sound:
-            _check(path, self.document.get("files", {}).get(METRICS_FILE), "run the logs again")
-            self._sound.add(METRICS_FILE)
+        file = table_file(name)
+        path = self.folder / file
+        if name not in self._sound:
+            if self.mirror is not None:
+                self.mirror.fetch(file)
+            _check(path, self.document.get("files", {}).get(file), "run the logs again")
+            self._sound.add(name)
         return pl.scan_parquet(path)
+
+
+def table_file(name: str) -> str:
+    """Return the file of a table below the folder of a run."""
+    return f"{TABLES_FOLDER}/{name}.parquet"
 
 
 def _check(path: Path, sha256: str | None, remedy: str) -> None:
@@ -147,20 +152,19 @@ def open_run(output: Path | str) -> OpenedRun:
     Raises
     ------
     OutputError
-        There is no finished run in the folder: run.json or metrics.parquet is missing or unreadable. Its exit code is 2
-        where there is no such folder.
+        There is no finished run in the folder: run.json is missing or unreadable. Its exit code is 2 where there is no
+        such folder.
     """
     mirror = Mirror(str(output)) if is_url(output) else None
     folder = Path(output) if mirror is None else mirror.folder
-    for name in (RUN_FILE, METRICS_FILE):
-        if mirror is not None:
-            mirror.fetch(name)
-        if not (folder / name).is_file():
-            got = f"a folder without {name}" if folder.is_dir() else "no such folder"
-            where = str(folder) if mirror is None else mirror.objects.shown
-            missing = mirror is None and not folder.exists()
-            raise OutputError(expected="the outputs of a run", got=got, where=where, remedy=_REMEDY, missing=missing)
     what, path = "the run.json of a run", folder / RUN_FILE
+    if mirror is not None:
+        mirror.fetch(RUN_FILE)
+    if not path.is_file():
+        got = f"a folder without {RUN_FILE}" if folder.is_dir() else "no such folder"
+        where = str(folder) if mirror is None else mirror.objects.shown
+        missing = mirror is None and not folder.exists()
+        raise OutputError(expected="the outputs of a run", got=got, where=where, remedy=_REMEDY, missing=missing)
     document = read_sealed(path, what, OutputError, _REMEDY, MAX_DOCUMENT_BYTES)
     if document.get("format") != "pdhef.run":
         got = f"format {document.get('format')!r}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -26,8 +25,6 @@ ROWS_A_GROUP = 32768
 
 #: Of zstd, of estimates: less work than the lowest level, and 4 % fewer bytes.
 _LEVEL = 3
-#: Files of figures that are read before a row group of theirs is written.
-_PARTS_AT_ONCE = 256
 #: Name of the copy of the selected estimate in estimates.parquet.
 SELECTED = "selected"
 _AGAIN = "run the log again"
@@ -136,7 +133,7 @@ def track_table(track: StateTrack, *, as_written: bool = False, causal: BoolArra
 
 def list_estimators(path: Path) -> tuple[str, ...]:
     """Return the names of the tracks in an estimates.parquet, by their row groups; the selected one is a copy."""
-    with _reading(path), pq.ParquetFile(path) as file:
+    with reading(path), pq.ParquetFile(path) as file:
         return tuple(dict.fromkeys(name for name in _names(file) if name != SELECTED))
 
 
@@ -163,7 +160,7 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
     """
     asked = None if columns is None else {"stamp_ns", *columns}
     wanted = [c for c in TRACK_COLUMNS if asked is None or c in asked]
-    with _reading(path), pq.ParquetFile(path) as file:
+    with reading(path), pq.ParquetFile(path) as file:
         names = _names(file)
         tables = [file.read_row_group(i, columns=wanted) for i, name in enumerate(names) if name == estimator]
     if not tables:
@@ -202,7 +199,7 @@ def _names(file: pq.ParquetFile) -> list[str]:
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[None]:
+def reading(path: Path) -> Iterator[None]:
     """Turn the errors of Arrow into an OutputError."""
     try:
         yield
@@ -217,22 +214,3 @@ def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
     arrays = [arrow_array([getattr(r, f.name) for r in rows], f.type) for f in schema]
     with parquet_writer(path, schema, checksums=False) as writer:
         writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
-
-
-def read_metrics(path: Path) -> list[MetricRow]:
-    """Return the rows of a metrics.parquet, NaN for null; raises OutputError."""
-    with _reading(path), pq.ParquetFile(path) as file:
-        rows = file.read(columns=arrow_schema("metrics.parquet.json").names).to_pylist()
-    return [MetricRow(**(row | {"value": math.nan if row["value"] is None else row["value"]})) for row in rows]
-
-
-def join_metrics(path: Path, parts: Sequence[Path]) -> None:
-    """Concatenate metrics.parquet of drives in their order, a few at a time; raises OutputError."""
-    schema = arrow_schema("metrics.parquet.json")
-    with parquet_writer(path, schema, checksums=False) as writer:
-        for first in range(0, len(parts), _PARTS_AT_ONCE):
-            tables = []
-            for part in parts[first : first + _PARTS_AT_ONCE]:
-                with _reading(part), pq.ParquetFile(part) as file:
-                    tables.append(file.read().cast(schema))
-            writer.write_table(pa.concat_tables(tables).combine_chunks())

@@ -7,7 +7,6 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from pdhef_logtool.evaluation.dependence import factors_of
 from pdhef_logtool.evaluation.validation_plan import RUN, ValidationPlan
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun, open_run
@@ -16,9 +15,9 @@ from pdhef_logtool.results.plan_verdicts import Against, JudgedDrive, PlanVerdic
 
 
 def plan_verdicts_against(plan: ValidationPlan, a: OpenedRun, b: OpenedRun, *, strict: bool) -> PlanVerdicts:
-    """Return the verdicts on the drives of B; raises OutputError where metrics.parquet is damaged."""
+    """Return the verdicts on the drives of B; raises OutputError where a table is damaged."""
     drives = [judged_drive(log) for log in b.logs]
-    figures = figures_of_file(b.metrics(), plan, [d.main for d in drives])
+    figures = figures_of_file(b.table("metrics"), plan, [d.main for d in drives])
     against = {**other_runs(plan, b.logs), RUN: _against(plan, a, b.logs)}
     return plan_verdicts(plan, figures, drives, strict=strict, against=against)
 
@@ -36,13 +35,13 @@ def other_runs(plan: ValidationPlan, logs: Sequence[OpenedLog]) -> dict[str, Aga
 
 def _against(plan: ValidationPlan, run: OpenedRun, logs: Sequence[OpenedLog]) -> Against:
     partners = {pair.b.label: judged_drive(pair.a) for pair in pair_logs(run.logs, logs).pairs}
-    return figures_of_file(run.metrics(), plan, [d.main for d in partners.values()]), partners
+    return figures_of_file(run.table("metrics"), plan, [d.main for d in partners.values()]), partners
 
 
 def judged_drive(log: OpenedLog, read_report: Callable[[], Mapping[str, Any] | None] | None = None) -> JudgedDrive:
     """Return a log of a run for :func:`~.plan_verdicts.plan_verdicts`; ``read_report`` None: from its file."""
     main = log.entry.get("main")
-    factors = factors_of(log.entry, None)
+    factors = {"car": (log.entry.get("car") or {}).get("name"), **{k: log.entry.get(k) for k in ("day", "route")}}
     return JudgedDrive(log.label, None if main is None else str(main), read_report or partial(_report, log), factors)
 
 

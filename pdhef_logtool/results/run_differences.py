@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.printable import listed
 from pdhef_logtool.results.opened_run import OpenedRun
 from pdhef_logtool.results.pairing import Pair
@@ -41,7 +40,6 @@ def run_differences(a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair]) -> tuple[
         unknown=sum(p.same("signals_sha256") is None and p.a.outcome == p.b.outcome == "ok" for p in pairs),
         MOST_NAMED=_MOST_NAMED,
         listed=partial(listed, most=_MOST_NAMED),
-        example=_example,
     )
     return tuple(filter(None, (" ".join(line.split()) for line in text.splitlines())))
 
@@ -55,16 +53,3 @@ def _cars(pairs: Sequence[Pair], key: str, *, named: bool) -> Counter[tuple[str,
 
     cars = ([log.entry.get("car") or {} for log in (pair.a, pair.b)] for pair in pairs)
     return Counter((text(left), text(right)) for left, right in cars if left.get(key) != right.get(key))
-
-
-def _example(pair: Pair, role: str) -> str:
-    """Return the first source that differs between the reports of a pair, empty where they do not state it."""
-    try:
-        reports = pair.a.report(), pair.b.report()
-    except OutputError as error:
-        return f"; {error}"
-    sources = ((r or {}).get("ledger", {}).get("samples", ()) for r in reports)
-    left, right = ({s["name"]: s["source"] for s in of if s["role"] == role} for of in sources)
-    changed = (name for name in sorted({*left, *right}) if left.get(name) != right.get(name) and None not in reports)
-    texts = (f"; {pair.a.label}: {n} of {left.get(n, 'nothing')} → {right.get(n, 'nothing')}" for n in changed)
-    return next(texts, "")

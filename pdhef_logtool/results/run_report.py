@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 _METRIC_COLUMNS = ("estimator", "signal", "segment", "metric", "value", "unit", "n")
 #: Figures of a drive without ground truth.
 _BY_REFERENCE = ("reference_rms", "reference_std", "disagreement_rms")
+#: Entries of a verdict on one drive; tables/verdicts.parquet has all.
+_OF_VERDICT = ("id", "label", "outcome", "reason", "next")
 #: Distributions that affect the results of a run; their versions are recorded.
 VERSIONED = ("pdhef-logtool", "mcap", "numba", "numpy", "polars", "pyarrow", "rerun-sdk", "rosbags", "scipy", "torch")
 
@@ -110,9 +112,13 @@ def build_report(content: Mapping[str, Any], main: MainFacts | None = None) -> d
     """
     rows = [m for m in content["metrics"] if _is_shown(m, main)]
     metrics = [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in rows]
-    entries = {"format": "pdhef.report", "version": 1, **content, "metrics": metrics}
+    entries = {"format": "pdhef.report", "version": 2, **content, "metrics": metrics}
+    if entries["plan"] is not None:
+        verdicts = [{k: v[k] for k in _OF_VERDICT} for v in entries["plan"]["requirements"]]
+        entries["plan"] = {"file": entries["plan"]["file"], "requirements": verdicts}
     document = {key: jsonable(value) for key, value in entries.items()}
-    return document | {"answer": None if main is None else answer_of(document, main)}
+    answer = None if main is None else answer_of(document, main)
+    return document | {"selected_estimate": main and main.name, "answer": answer}
 
 
 def _is_shown(metric: MetricRow, main: MainFacts | None) -> bool:

@@ -64,7 +64,7 @@ class MainFacts:
 
 
 def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
-    """Return the ``answer`` of a report's document: the selected estimator, the best in hindsight, and the words."""
+    """Return the ``answer`` of a report's document: why the estimator was selected, and the words."""
     figures = {
         (m["estimator"], m["signal"], m["metric"]): m["value"] for m in report["metrics"] if m["segment"] == "all"
     }
@@ -84,7 +84,7 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
         "next": "; ".join(clauses(words.next(report, main, value))[:_MOST_STEPS]),
     }
     texts = {key: one_line(text) for key, text in texts.items()}
-    chosen = {"main": main.name, "why": main.why, "named": main.named, "shown": list(main.shown)}
+    chosen = {"why": main.why, "named": main.named, "shown": list(main.shown)}
     return {**chosen, "sideslip_rmse_ci_rad": interval, "texts": texts}
 
 

@@ -74,7 +74,7 @@ class RunCars:
             cars.read(config.car)
             return cars
         if config.car is not None:
-            raise UsageError(expected="--car or --cars", got="both", where="--cars")
+            raise UsageError(expected="car or cars", got="both", where="settings")
         raw = read_toml(config.cars, "a TOML table of cars", UsageError)
         table = validated(CarTable, raw, str(config.cars), UsageError, expected="the entries of cars.toml")
         cars = cls(config, warn, table)

@@ -26,7 +26,7 @@ from pdhef_logtool.storage.documents import read_toml, validated
 
 _FILES = ("car", "cars", "mapping", "msgs", "plan", "network", "model", "sensor_profile")
 #: Settings that change no result.
-_NO_RESULT = ("allow_private_redirects", "log_timeout_s", "max_memory_mb", "full_worst")
+_NO_RESULT = ("allow_private_redirects", "log_timeout_s", "max_memory_mb", "strict", "full_worst")
 #: Values that replace a file.
 _KEYWORDS = {
     "car": tuple(SHIPPED_CARS),
@@ -98,6 +98,7 @@ class RunConfig:
     allow_private_redirects : follow redirects of web servers to hosts of this machine or its network.
     log_timeout_s : abort a log after this time without progress, in s.
     max_memory_mb : abort a log whose worker process exceeds this much memory, in MB.
+    strict : an INCONCLUSIVE requirement of the plan fails, too (exit code 4).
     full_worst : number of logs with the largest error that keep all files; None = 5 for more than 50 logs.
     """
 
@@ -128,6 +129,7 @@ class RunConfig:
     allow_private_redirects: bool = False
     log_timeout_s: Annotated[float, Field(ge=1)] | None = None
     max_memory_mb: Annotated[int, Field(ge=1)] | None = None
+    strict: bool = False
     full_worst: Annotated[int, Field(ge=0)] | None = None
 
     @property

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from hashlib import sha256
 from pathlib import Path
+from shutil import copyfile
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.car import SHOWN_DIGITS
@@ -23,6 +24,9 @@ from pdhef_logtool.results.opened_run import (
     PAGE_FILE,
     RECORDING_FILE,
     REPORT_FILE,
+    TABLES,
+    TABLES_FOLDER,
+    table_file,
 )
 from pdhef_logtool.results.palette import REFERENCE_COLOUR
 from pdhef_logtool.results.run_report import build_run, tool_versions, write_json
@@ -30,7 +34,7 @@ from pdhef_logtool.results.sink import TRUTH, Event
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import file_sha256
-from pdhef_logtool.storage.files import write_bytes
+from pdhef_logtool.storage.files import PendingFile, write_bytes, writing
 from pdhef_logtool.storage.outputs import FolderTransaction, check_no_input
 
 if TYPE_CHECKING:
@@ -132,7 +136,8 @@ class DriveOutputs:
         if config.kept == "metrics":
             write_json(self._change.file(REPORT_FILE), report)
         else:
-            write_tables(self._change, report, rows, self.tracks, self._main.name, self._causal_from_ns())
+            write_drive_tables(self._change, report, rows, self.tracks, self._main.name, self._causal_from_ns())
+        return report
 
     def _causal_from_ns(self) -> dict[str, int]:
         """Return the first stamp from which the rows of each causal estimator depend on past samples only."""
@@ -179,7 +184,7 @@ class DriveOutputs:
         )
 
 
-def write_tables(
+def write_drive_tables(
     change: FolderTransaction,
     report: dict[str, Any],
     rows: Sequence[MetricRow],
@@ -201,6 +206,19 @@ def files_of(folder: Path) -> dict[str, str]:
     return {path.name: file_sha256(path) for path in paths if path.is_file()}
 
 
+def write_run_tables(output: Path, results: Sequence[LogResult]) -> None:
+    """Write the tables of logs, and metrics.parquet also beside run.json, for readers of earlier versions."""
+    from pdhef_logtool.results.tables import drive_part, read_part, write_tables
+
+    parts = (
+        drive_part(r.outcome, None) if r.part is None else read_part(r.part) if isinstance(r.part, Path) else r.part
+        for r in results
+    )
+    write_tables(output / TABLES_FOLDER, parts, [r.outcome.folder for r in results])
+    with writing(output / METRICS_FILE), PendingFile(output / METRICS_FILE) as pending:
+        copyfile(output / table_file("metrics"), pending.path)
+
+
 def write_run(
     output: Path,
     config: dict[str, Any],
@@ -209,8 +227,13 @@ def write_run(
     network: tuple[str, str] | None = None,
     remaining: int = 0,
 ) -> None:
-    """Write run.json beside metrics.parquet, with the configuration as JSON-able values; arguments as of build_run."""
-    files, outcomes = {METRICS_FILE: file_sha256(output / METRICS_FILE)}, [r.outcome for r in results]
+    """Write run.json beside the tables, with the configuration as JSON-able values; arguments as of build_run."""
+    from pdhef_logtool.results.tables import add_verdicts
+
+    if verdicts is not None:
+        add_verdicts(output / TABLES_FOLDER, verdicts.to_dict())
+    files = {name: file_sha256(output / name) for name in (METRICS_FILE, *map(table_file, TABLES))}
+    outcomes = [r.outcome for r in results]
     write_json(output / RUN_FILE, build_run(config, network, outcomes, remaining=remaining, files=files, plan=verdicts))
 
 

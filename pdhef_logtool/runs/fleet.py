@@ -1,8 +1,8 @@
 """A run of one log or of a hundred thousand: planned (:mod:`~.planning`), processed (:mod:`~.working`), reported.
 
-Each drive is in the journal (:mod:`~.journal`) before the next one counts. At every end metrics.parquet and run.json
-are written from the journal and the figure files ``metrics/run=…/car=…/part-….parquet`` (:mod:`~.reporting`). No report
-and no figure is kept in memory.
+Each drive is in the journal (:mod:`~.journal`) before the next one counts. At every end the tables and run.json are
+written from the journal and the drives' parts of the tables (:mod:`~.reporting`). No report and no figure is kept in
+memory.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, Wo
 from pdhef_logtool.records.processes import process_name
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.results.no_position import neutral_stem
-from pdhef_logtool.results.opened_run import JOURNAL_FILE, LOGS, METRICS_FILE
+from pdhef_logtool.results.opened_run import JOURNAL_FILE, LOGS
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import Keep, RunConfig
-from pdhef_logtool.runs.drive_outputs import check_places, write_run
+from pdhef_logtool.runs.drive_outputs import check_places, write_run, write_run_tables
 from pdhef_logtool.runs.journal import Entry, Journal
 from pdhef_logtool.runs.judging import judge, read_validation_plan, write_verdicts
 from pdhef_logtool.runs.planning import Plan, PlannedLog, plan_logs, settings_of, sweep_parts
@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 
 #: Drives with the largest errors that keep all files if the run keeps metrics only because of their number.
 FULL_WORST = 5
+#: Value of ``Schedule.repeat`` for all logs that failed.
+FAILED = "failed"
 #: Time without progress after which a log is aborted, if several logs are processed at once or there are many.
 SILENCE_S = 600.0
 #: Modules that workers have loaded; polars starts threads at its first query, and none of these makes one.
@@ -63,27 +65,26 @@ class Schedule:
     jobs : number of processes.
     ray : address of a Ray cluster that processes the drives, one per processor at a time. The output folder, the logs
         and the files of the configuration must have the same path on every node.
-    resume : keep the drives that the output's journal has with these settings. retry : the same, but repeat failures.
-    only : labels of logs to run now with all their files; the rest of the folder's run is kept.
+    resume : keep the drives that the output's journal has with these settings.
+    repeat : :data:`FAILED` keeps them but those that failed; else labels of logs to run now with all their files.
     limits : of one log; None: from the configuration, else :data:`SILENCE_S` for several jobs or many logs.
     """
 
     jobs: int = 1
     ray: str | None = None
     resume: bool = False
-    retry: bool = False
-    only: Sequence[str] = ()
+    repeat: Sequence[str] = ()
     limits: Limits | None = None
 
     @property
     def resumes(self) -> bool:
         """Whether the journal in the output folder is read."""
-        return self.resume or self.repeats
+        return self.resume or bool(self.repeat)
 
     @property
-    def repeats(self) -> bool:
-        """Whether failed logs are repeated."""
-        return self.retry or bool(self.only)
+    def only(self) -> Sequence[str]:
+        """Labels of the only logs to run; empty: all."""
+        return [name for name in self.repeat if name != FAILED]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +97,6 @@ class _Job:
     validation: ValidationPlan
     junit: Path | None
     report: bool
-    strict: bool
 
 
 def run_logs(
@@ -107,7 +107,6 @@ def run_logs(
     schedule: Schedule = Schedule(),
     junit: Path | str | None = None,
     report: bool = True,
-    strict: bool = False,
     work: Work = run_drive,
     reporter: Reporter = SILENT,
 ) -> RunResult:
@@ -119,7 +118,7 @@ def run_logs(
     ----------
     arguments : logs, folders, glob patterns.
     output : a folder, or the URL of one in an object store.
-    junit : file for the verdicts of the validation plan as JUnit XML. strict : INCONCLUSIVE fails as FAIL does.
+    junit : file for the verdicts of the validation plan as JUnit XML.
     report : whether pages are written (:mod:`pdhef_logtool.reports`); without, pages of an earlier run are removed.
     work : processes one drive.
 
@@ -133,7 +132,7 @@ def run_logs(
     inputs = logs_of(arguments, config.read_options)
     junit = None if junit is None else Path(junit)
     validation = read_validation_plan(config.plan, junit)
-    job = _Job(config, RunCars.of(config, reporter.warn), mapping_of(config.mapping), validation, junit, report, strict)
+    job = _Job(config, RunCars.of(config, reporter.warn), mapping_of(config.mapping), validation, junit, report)
     alone = len(inputs) == 1 and schedule == Schedule() and work is run_drive and not is_url(output)
     if alone and _given_limits(config) is None:
         return _run_alone(inputs[0], Path(output), job, reporter)
@@ -179,8 +178,6 @@ def _given_limits(config: RunConfig) -> Limits | None:
 
 def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> RunResult:
     """Run one log in this process; its error ends the run."""
-    from pdhef_logtool.results.parquet_sink import write_metrics
-
     config, car = job.config, job.cars.of_log(log)
     log = replace(log, stem=neutral_stem(log_identity(log))) if config.no_position else log
     _check_names([log], output, job, reporter)
@@ -195,8 +192,8 @@ def _run_alone(log: LogInput, output: Path, job: _Job, reporter: Reporter) -> Ru
         except BaseException as stop:
             stop.add_note("0 of 1 logs are done")
             raise
-        verdicts = judge(job.validation, [result], job.strict)
-        write_metrics(output / METRICS_FILE, result.rows)
+        verdicts = judge(job.validation, [result], config.strict)
+        write_run_tables(output, [result])
         network = None if car.network is None else (Path(car.network_name).name, car.network.sha256)
         write_run(output, config.to_dict(), [result], verdicts, network)
         journal = Journal.of(output)  # of a run that this one replaces
@@ -227,7 +224,7 @@ def _prepare(
     if config.keep is None and many and not schedule.only:
         reporter.note(
             f"{len(inputs)} logs: figures and a short report of each are kept, no tracks, recordings or pages; all of "
-            f"it of the {full_worst} worst, of any other later by --only NAME, of every one by --keep full"
+            f"it of the {full_worst} worst, of any other later by --repeat NAME, of every one by --keep full"
         )
     job = replace(job, config=replace(config, keep=config.keep or ("metrics" if many else "full")))
     if stored is not None:
@@ -284,7 +281,7 @@ class _Fleet:
             if self._lost_workers or self.schedule.ray:  # a lost node was replaced without being reported
                 outputs.sweep()
                 sweep_parts(journal, output)
-            results, verdicts = collect(self.plan, self.job.config, self.job.validation, strict=self.job.strict)
+            results, verdicts = collect(self.plan, self.job.config, self.job.validation)
             if verdicts is not None:
                 write_verdicts(self.job.junit, verdicts, results)
             failed = {e.label for p in self.plan.logs if (e := self.plan.entry(p)) is not None and e.failed}
@@ -309,7 +306,7 @@ class _Fleet:
 
     def _process(self, names: Sequence[str] | None, keep: Keep) -> None:
         """Process the pending drives, of all or of those named."""
-        todo = self.plan.pending(names, keep, self.schedule.repeats, self.reporter)
+        todo = self.plan.pending(names, keep, bool(self.schedule.repeat), self.reporter)
         if not todo:
             return
         self._quiet = len(self.plan.logs) > FEW_LOGS

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from pdhef_logtool.car.parts import Algorithm
 from pdhef_logtool.drive.reading import Drive
@@ -66,6 +68,17 @@ class Estimates:
         name, added = pl.col("estimator").cast(pl.String), self._errors if errors else lambda _: {}
         tracks = self.tracks.values()
         return pl.concat(pl.DataFrame(track_table(t)).with_columns(name, **added(t)) for t in tracks)
+
+    def plot(self) -> Any:
+        """Draw the sideslip of all tracks over the time of the log; return the axes. Needs matplotlib."""
+        from matplotlib import pyplot as plt
+
+        axes = plt.subplots()[1]
+        for name, track in self.tracks.items():
+            axes.plot((track.stamps_ns - self.drive.plan.start_ns) * 1e-9, np.degrees(track.sideslip_rad), label=name)
+        axes.set(xlabel="time, s", ylabel="sideslip, °")
+        axes.legend()
+        return axes
 
     def _errors(self, track: StateTrack) -> dict[str, pl.Expr]:
         """Return the errors of a track by column; the ground truth has none."""

@@ -11,7 +11,7 @@ from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
 from pdhef_logtool.evaluation.validation_plan import default_plan
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.tracks import REFERENCE
-from pdhef_logtool.runs.run_result import FEW_LOGS, LogResult
+from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import jsonable
 
 if TYPE_CHECKING:
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
     from pdhef_logtool.evaluation.validation_plan import Requirement, ValidationPlan
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
-
-#: Entries of a verdict on one drive; run.json has all of the verdicts on the run.
-_TOLD = ("id", "label", "outcome", "reason", "next")
 
 
 def read_validation_plan(file: Path | None, junit: Path | None) -> ValidationPlan:
@@ -78,7 +75,7 @@ def judge_drive(
 
     judged = JudgedDrive(drive.name, main, lambda: entries, {"car": drive.car.vehicle.name})
     verdicts = plan_verdicts(plan, figures_of_rows(rows), [judged]).to_dict()["requirements"]
-    return {"plan": {"file": plan.file, "requirements": [{k: v[k] for k in _TOLD} for v in verdicts]}, **entries}
+    return {"plan": {"file": plan.file, "requirements": verdicts}, **entries}
 
 
 def judge(
@@ -91,15 +88,12 @@ def judge(
     done = [r for r in results if r.outcome.failed is None or r.document is not None]
     if not plan.file and len(done) < LEAST_DRIVES:
         return None
-    from pdhef_logtool.results.parquet_sink import read_metrics
     from pdhef_logtool.results.plan_against import judged_drive, other_runs
     from pdhef_logtool.results.plan_verdicts import figures_of_file, figures_of_rows, plan_verdicts
 
     drives = [judged_drive(r.opened, partial(_report, r)) for r in done]
     if metrics is None:
         figures = figures_of_rows(row for r in done for row in r.rows)
-    elif len(done) <= FEW_LOGS:
-        figures = figures_of_rows(read_metrics(metrics))
     else:
         import polars as pl
 

@@ -207,18 +207,18 @@ class Plan:
         return self._current_cars
 
     def check_only(self, names: Sequence[str]) -> None:
-        """Check the names of ``--only``; raises UsageError if one names no log or the settings of the run differ."""
+        """Check the names of ``--repeat``; raises UsageError if one names no log or the settings of the run differ."""
         labels = {p.log.stem for p in self.logs}
         if missing := [name for name in names if name not in labels]:
             near = ", ".join(sorted(labels)[:10]) + (" and more" if len(labels) > 10 else "")
-            raise UsageError(expected=f"the name of a log ({near})", got=missing[0], where="--only")
+            raise UsageError(expected=f"the name of a log ({near})", got=missing[0], where="--repeat")
         entries = (self.journal.entries.get(p.log.stem) for p in self.logs if names)
         for entry in entries:
             if entry is not None and (why := [*self._changes(entry)]):
                 raise UsageError(
                     expected="the settings of the run in the folder",
                     got=", ".join(why),
-                    where="--only",
+                    where="--repeat",
                     remedy="--resume runs its logs again",
                 )
 
@@ -260,7 +260,7 @@ class Plan:
         before = self.journal.entries.get(entry.label)
         self._damages[self.journal.add(entry, end.outcome, end.outputs).offset] = None
         if before is not None and before.part not in (None, entry.part):
-            remove_part(self.output, str(before.part))
+            (self.output / str(before.part)).unlink(missing_ok=True)
 
     def _changes(self, entry: Entry) -> Iterator[str]:
         """Yield as texts which settings and car of a drive have changed."""
@@ -278,7 +278,7 @@ class Plan:
         entries = [e for p in chosen if (e := self.journal.entries.get(p.log.stem)) is not None]
         quarantined = sum(e.quarantined for e in entries)
         if quarantined and not retry:
-            reporter.note(f"{quarantined} logs that took their worker along are not tried again; --retry does")
+            reporter.note(f"{quarantined} logs that took their worker along are not tried again; --repeat failed does")
         if other := len(self.journal.entries) - len(entries):
             reporter.note(
                 f"{other} drives in the output are of logs that are not named now: they are left out of the run"
@@ -286,17 +286,9 @@ class Plan:
 
 
 def sweep_parts(journal: Journal, output: Path) -> None:
-    """Remove figure files that no drive of the journal has, and the remains of killed workers."""
+    """Remove parts of tables that no drive of the journal has, and the remains of killed workers."""
     kept = {entry.part for entry in journal.entries.values()}
     root = output / PARTS
     for path in list(itertools.chain(root.rglob("*.parquet"), root.rglob(".*.partial"))):
         if path.relative_to(output).as_posix() not in kept:
-            remove_part(output, path.relative_to(output).as_posix())
-
-
-def remove_part(output: Path, part: str) -> None:
-    """Remove a file of figures and the folders that this leaves empty."""
-    with suppress(OSError):
-        (output / part).unlink(missing_ok=True)
-        for folder in itertools.islice((output / part).parents, 3):
-            folder.rmdir()
+            path.unlink(missing_ok=True)

@@ -57,11 +57,19 @@ from pdhef_logtool.records.signals import (
 )
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from pdhef_logtool.results.opened_run import LOGS, METRICS_FILE, PAGE_FILE
+from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
 from pdhef_logtool.results.run_report import build_report, estimator_entry
 from pdhef_logtool.results.sink import TRUTH
+from pdhef_logtool.results.tables import drive_part
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.drive_outputs import check_places, files_of, log_place, write_run, write_tables
+from pdhef_logtool.runs.drive_outputs import (
+    check_places,
+    files_of,
+    log_place,
+    write_drive_tables,
+    write_run,
+    write_run_tables,
+)
 from pdhef_logtool.runs.drive_report import drive_entries, outcome_of
 from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
 from pdhef_logtool.runs.estimating import dead_reckoned, first_pose
@@ -90,7 +98,6 @@ def score_log(
     name: str | None = None,
     output: Path | None = None,
     junit: Path | None = None,
-    strict: bool = False,
     reporter: Reporter = SILENT,
 ) -> RunResult:
     """Score recorded estimates of one log against its ground truth; same figures, tables and report as a run.
@@ -101,7 +108,7 @@ def score_log(
     estimates : ``[SIGNAL=]TOPIC[.FIELD]``, together one estimator called ``name`` (default: its topic); without any,
         the mapping's ``[estimates.NAME.SIGNAL]`` tables, all or the one called ``name``.
     truth : likewise; without any, the mapping's or the recognised ground truth.
-    output : folder for the files, None to write none. junit, strict : as for :func:`pdhef_logtool.runs.fleet.run_logs`.
+    output : folder for the files, None to write none. junit : as for :func:`pdhef_logtool.runs.fleet.run_logs`.
 
     Raises
     ------
@@ -122,11 +129,9 @@ def score_log(
         drive, sources = _open(log_input, car, mapping, config, (estimates, truth, name), reporter)
         with drive:
             result = _score_drive(drive, sources, config, plan, outputs, reporter)
-        verdicts = judge(plan, [result], strict)
+        verdicts = judge(plan, [result], config.strict)
         if output is not None:
-            from pdhef_logtool.results.parquet_sink import write_metrics
-
-            write_metrics(output / METRICS_FILE, result.rows)
+            write_run_tables(output, [result])
             write_run(output, _config_document(config, drive, sources), [result], verdicts)
         write_verdicts(junit, verdicts, [result])
     return RunResult(output, (result,), requirements=verdicts)
@@ -194,7 +199,8 @@ def _score_drive(
     rows, blocks = _score(log, plan)
     scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in log.recorded]))
     whole, seen = log.at(scored_ns)
-    report = build_report(_entries(log, plan, rows, blocks, whole, seen))
+    content = _entries(log, plan, rows, blocks, whole, seen)
+    report = build_report(content)
     folder, files = None, dict[str, str]()
     if outputs is not None:
         tracks = [*(r.track for r in log.recorded), *whole.tracks.values()]
@@ -202,11 +208,12 @@ def _score_drive(
             standstill_m_s = drive.car.vehicle.standstill_m_s
             tracks.insert(0, valid_as_a_whole(whole.truth, drive.plan.derivation, standstill_m_s))
         with outputs.begin(log_place(drive.name), stale=(PAGE_FILE,)) as change:
-            write_tables(change, report, rows, _drawn(tracks, drive.plan))
+            write_drive_tables(change, report, rows, _drawn(tracks, drive.plan))
         folder = change.target
         files = files_of(folder)
     reporter.progress(drive.name, 1.0)
-    return LogResult(outcome_of(drive, log.losses, files=files), folder, report, tuple(rows))
+    outcome = outcome_of(drive, log.losses, files=files)
+    return LogResult(outcome, folder, report, tuple(rows), part=drive_part(outcome, report, rows, content["plan"]))
 
 
 def _drawn(tracks: Sequence[StateTrack], plan: DrivePlan) -> list[StateTrack]:

@@ -1,4 +1,4 @@
-"""The files of a whole run, written from the journal and the drives' files: metrics.parquet, run.json, pages."""
+"""The files of a whole run, written from the journal and the drives' files: tables, run.json, pages."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 from pdhef_logtool.logs.discovery import folders_of
 from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.results.opened_run import METRICS_FILE, PAGE_FILE, open_run
+from pdhef_logtool.results.opened_run import PAGE_FILE, open_run, table_file
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.drive_outputs import log_place, write_run
+from pdhef_logtool.runs.drive_outputs import log_place, write_run, write_run_tables
 from pdhef_logtool.runs.journal import Entry
 from pdhef_logtool.runs.judging import judge
 from pdhef_logtool.runs.planning import Plan
@@ -23,15 +23,11 @@ if TYPE_CHECKING:
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 
-def collect(
-    plan: Plan, config: RunConfig, validation: ValidationPlan, *, strict: bool = False
-) -> tuple[list[LogResult], PlanVerdicts | None]:
-    """Write metrics.parquet and run.json of all drives that are done.
+def collect(plan: Plan, config: RunConfig, validation: ValidationPlan) -> tuple[list[LogResult], PlanVerdicts | None]:
+    """Write the tables and run.json of all drives that are done.
 
     Returns their results in the order of the plan of the run, and the verdicts of the validation plan.
     """
-    from pdhef_logtool.results.parquet_sink import join_metrics
-
     output = plan.output
     folders = folders_of([p.log for p in plan.logs])
     entries = [(e, f) for p, f in zip(plan.logs, folders, strict=True) if (e := plan.entry(p)) is not None]
@@ -39,11 +35,10 @@ def collect(
     if not entries and remaining:
         return [], None
     results = [_result(plan, entry, folder) for entry, folder in entries]
-    metrics = output / METRICS_FILE
-    join_metrics(metrics, [r.figures_file for r in results if r.figures_file is not None])
+    write_run_tables(output, results)
     cars = plan.journal.described["car"] | plan.cars_of_run()  # the journal's line of a car may be damaged
     networks = {cars[e.car]["network"] and tuple(cars[e.car]["network"]) for e, _ in entries if e.car is not None}
-    verdicts = judge(validation, results, strict, metrics)
+    verdicts = judge(validation, results, config.strict, output / table_file("metrics"))
     network = networks.pop() if len(networks) == 1 else None
     write_run(output, config.to_dict(), results, verdicts, network, remaining)
     if remaining:
@@ -55,7 +50,7 @@ def _result(plan: Plan, entry: Entry, folder: str) -> LogResult:
     outcome = replace(plan.journal.outcome(entry), folder=folder)
     part = None if entry.part is None else plan.output / entry.part
     output = None if part is None else plan.output / log_place(entry.label)
-    return LogResult(outcome, output, figures_file=part, failed_checks=entry.failed_checks)
+    return LogResult(outcome, output, part=part, failed_checks=entry.failed_checks)
 
 
 def write_run_pages(output: Path, report: bool, labels: Collection[str] | None, reporter: Reporter) -> None:

@@ -20,6 +20,7 @@ from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.tracks import REFERENCE
+from pdhef_logtool.results.tables import drive_part
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.drive_outputs import STALE_FILES, DriveOutputs, files_of, log_place
 from pdhef_logtool.runs.drive_report import car_entry, outcome_of, report_drive
@@ -81,7 +82,7 @@ def run_log(
                 report = report_drive(run, estimated, scored, main, judged, losses)
                 if annotated is not None:
                     annotated.finish(report, files.tracks, scored.events)
-            files.write(report, scored.rows, scored.events)
+            written = files.write(report, scored.rows, scored.events)
         outcome = outcome_of(
             drive,
             losses,
@@ -94,7 +95,8 @@ def run_log(
         )
         failed_checks = sum(c.verdict == "failed" and not c.waived for c in drive.checks)
     reporter.progress(drive.name, 1.0)
-    return LogResult(outcome, change.target, report, tuple(scored.rows), failed_checks=failed_checks)
+    part = drive_part(outcome, report, scored.rows, judged["plan"])
+    return LogResult(outcome, change.target, written, tuple(scored.rows), failed_checks, part)
 
 
 def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter) -> tuple[PreparedDrive, Estimated]:

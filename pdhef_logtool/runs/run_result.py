@@ -27,7 +27,8 @@ class LogResult:
     Attributes
     ----------
     output : folder of the log, None if no file was written.
-    document : report in memory, None: in the folder. rows : figures in memory; ``figures_file``: of a fleet's drive.
+    document : report in memory, None: in the folder. rows : figures in memory.
+    part : its rows of the tables (:mod:`~pdhef_logtool.results.tables`), or their file; None: it has no report.
     failed_checks : number of failed checks that are not waived.
     """
 
@@ -36,7 +37,7 @@ class LogResult:
     document: dict[str, Any] | None = None
     rows: tuple[MetricRow, ...] = ()
     failed_checks: int = 0
-    figures_file: Path | None = None
+    part: Any = None
 
     @property
     def report(self) -> dict[str, Any] | None:

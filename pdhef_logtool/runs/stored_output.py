@@ -17,7 +17,16 @@ from typing import Self
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.results.opened_run import JOURNAL_FILE, LOGS, METRICS_FILE, PAGE_FILE, PARTS, REPORT_FILE
+from pdhef_logtool.results.opened_run import (
+    JOURNAL_FILE,
+    LOGS,
+    METRICS_FILE,
+    PAGE_FILE,
+    PARTS,
+    REPORT_FILE,
+    TABLES,
+    table_file,
+)
 from pdhef_logtool.runs.drive_outputs import STALE_FILES
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, Work
 from pdhef_logtool.storage.files import open_new, scratch_folder
@@ -103,7 +112,7 @@ class StoredOutput(Mirror):
         if is_page:
             (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
             (self.folder / name).touch()
-        if is_page or parts[0] == PARTS:
+        if is_page or name.startswith(f"{PARTS}/"):
             self._own.add(name)
 
     def check_no_input(self, inputs: Iterable[LogInput]) -> None:
@@ -160,7 +169,7 @@ class StoredOutput(Mirror):
         """Upload figures, pages and run.json, and the journal last."""
         self.objects.renew()
         pages = [p for p in (self.folder / LOGS).glob(f"*/{PAGE_FILE}") if p.stat().st_size]
-        names = (METRICS_FILE, PAGE_FILE, REPORT_FILE)
+        names = (*map(table_file, TABLES), METRICS_FILE, PAGE_FILE, REPORT_FILE)
         for path in [*(self.folder / name for name in names), *pages, self.folder / RUN_FILE]:
             if path.is_file() and path.stat().st_size:
                 name = path.relative_to(self.folder).as_posix()

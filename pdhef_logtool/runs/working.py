@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import platform
 import time
@@ -12,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pdhef_logtool.car.parts import car_folder
 from pdhef_logtool.logs.byte_source import ChangedError, SourceError
 from pdhef_logtool.logs.discovery import LogInput, identity_of
 from pdhef_logtool.mapping import Mapping as LogMapping
@@ -150,7 +148,7 @@ def _identity_of_slice(log: LogInput, identity: str) -> str:
 
 
 def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
-    from pdhef_logtool.results.parquet_sink import write_metrics
+    from pdhef_logtool.results.tables import write_part
 
     cars, mapping = _cars_and_mapping(task)
     cars = replace(cars, warn=warned.append)
@@ -162,9 +160,8 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
         reporter=Reporter(progress=tell, warn=warned.append),
     )  # fmt: skip
     record = car_record(car)
-    place = car_folder(car.vehicle.name, car.physics_sha256)
-    part = f"{PARTS}/run={task.setting}/{place}/part-{digest_of(task.log.stem)}.parquet"
-    write_metrics(task.output / part, result.rows)
+    part = f"{PARTS}/part-{digest_of(task.log.stem)}.parquet"
+    write_part(task.output / part, result.part)
     if task.page:
         warned += _write_page(result)
     return DriveEnd(
@@ -173,17 +170,10 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
         {"digest": digest_of(record["parts"]), **record},
         part,
         result.failed_checks,
-        _sideslip_error_rad(result),
+        result.part["drives"][0][0]["sideslip_rmse_rad"].as_py(),
         tuple(warned),
         outputs=states_of(task.output, [part, *(f"{log_place(task.log.stem)}/{name}" for name in LOG_FILES)]),
     )
-
-
-def _sideslip_error_rad(result: LogResult) -> float | None:
-    """Return the sideslip RMSE of the selected estimate, None if no independent ground truth scores it."""
-    wanted = (result.outcome.main, "sideslip_rad", "all", "rmse")
-    rows = (r for r in result.rows if (r.estimator, r.signal, r.segment, r.metric) == wanted)
-    return next((r.value for r in rows if r.independent and math.isfinite(r.value)), None)
 
 
 def _write_page(result: LogResult) -> list[str]:

@@ -362,7 +362,6 @@ def exit_codes(tool: Tool) -> Figures:
             folder / "plan",
             "--plan",
             strict,
-            "--strict",
             *quiet,
         ),
         "run, no output given": ("run", sample),

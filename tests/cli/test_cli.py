@@ -15,7 +15,7 @@ from tests.command_line import called
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = (
-    *("inspect", "map", "convert", "plan", "run", "metrics", "report", "compare", "events", "view"),
+    *("inspect", "map", "convert", "plan", "run", "metrics", "report", "compare", "query", "events", "view"),
     *("simulate", "simulate suite"),
     *("learn", "extract", "train", "compile"),
 )

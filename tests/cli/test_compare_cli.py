@@ -41,7 +41,6 @@ def test_a_regression_is_told_with_its_drives_and_where_they_part(runs: tuple[st
     assert all(len(line) <= 80 for line in text.splitlines() if not line.startswith("A "))
     assert "configuration: friction auto → 0.3" in text
     assert re.search(r"drive_9 +0\.573 +0\.682 +\+19\.0 %", text)
-    assert "0.573 °" in text  # the largest difference of the tracks
     first = " ".join(text[: text.index("\nA ")].split())
     assert first.startswith("Result B is worse: sideslip RMSE +14.5 % (+11.4 % to +17.6 %) of 10 drives; gate closed: ")
     assert first.endswith("Next look at drive_9 first: its error increased most")
@@ -103,13 +102,12 @@ def test_a_plan_and_a_figure_of_the_command_line_do_not_go_together(runs: tuple[
         _pdhef("compare", *runs, "--max-regression", "five")
 
 
-def test_events_are_told_in_a_table_with_what_was_not_searched(runs: tuple[str, str], tmp_path: Path) -> None:
-    code, text = _pdhef("events", runs[1], "--where", "sideslip_deg > 0.5", "--parquet", str(tmp_path / "e.parquet"))
+def test_events_are_told_in_a_table_with_what_was_not_searched(runs: tuple[str, str]) -> None:
+    code, text = _pdhef("events", runs[1], "--where", "sideslip_deg > 0.5")
     assert code == 0
     assert re.search(r"drive_9 +0\.00 +0\.49 +0\.49 +0\.573", text)
     assert "1 event in 1 of 1 drives, 0.49 s in all" in text
     assert "not searched, it has no estimates.parquet: drive_0, drive_1" in text
-    assert (tmp_path / "e.parquet").is_file()
     assert json.loads(_pdhef("events", runs[1], "--where", "valid", "--json")[1])["events"][0]["drive"] == "drive_9"
     for pad in ("five", "-1s", "5 min"):
         with pytest.raises(UsageError, match="a time such as 5s"):

@@ -36,7 +36,7 @@ def extracted(sample_logs_dir: Path, folder: Path, *options: str) -> Path:
     for split, start, end in (("train", "30", "62"), ("validation", "115", "130"), ("test", "155", "170")):
         pdhef(
             "extract", sample_logs_dir / "road.mcap", "-o", folder, "--car", vehicle, "--split", split,
-            "--start", start, "--end", end, *options,
+            "--set", f"start={start}", "--set", f"end={end}", *options,
         )  # fmt: skip
     return folder
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.results.parquet_sink import write_estimates, write_metrics
+from pdhef_logtool.results.parquet_sink import write_estimates
 from pdhef_logtool.results.run_report import write_json
 from pdhef_logtool.storage.documents import seal
+from tests.results.made_run import write_tables
 
 START_NS = 1_700_000_000_000_000_000
 #: Those of `pdhef run --estimators all` with a network that has its baselines.
@@ -111,7 +112,8 @@ def report_of(tracks: list[StateTrack], label: str = "drive", **changes: Any) ->
             next(t for t in tracks if t.name == names[0]), next((t for t in tracks if t.name == "truth"), None),
             [t for t in tracks if t.name not in ("truth", names[0])], 3.0,
         )],
-        "answer": {"main": names[0], "why": "for a test", "texts": {"result": "a result", "assumed": ""}},
+        "selected_estimate": names[0],
+        "answer": {"why": "for a test", "texts": {"result": "a result", "assumed": ""}},
         **changes,
     }  # fmt: skip
 
@@ -125,7 +127,7 @@ def write_run(
     if tracks:
         write_estimates(place / "estimates.parquet", tracks)
         write_json(place / "report.json", report_of(tracks, label, **changes))
-    write_metrics(folder / "metrics.parquet", [])
     entry = {"log": label, "file": f"{label}.mcap", "sha256": None, "outcome": outcome, "car": None}
+    write_tables(folder, [entry], [], {label: report_of(tracks, label, **changes)} if tracks else {})
     write_json(folder / "run.json", seal({"format": "pdhef.run", "version": 1, "logs": [entry]}))
     return folder

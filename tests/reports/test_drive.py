@@ -125,8 +125,9 @@ def plan_of(*outcomes: str) -> dict:
 
 
 def test_the_first_screen_has_answer_verdicts_what_was_tested_the_worst_place_and_next_steps_in_this_order(tmp_path):
-    check = {"name": "a.sign", "verdict": "failed", "evidence": "gain -1", "remedy": "", "waived": False}
-    answer = {"main": "pd-hef", "why": "", "texts": {"result": "Sideslip RMSE 0.1°", "assumed": "not causal"}}
+    check = {"name": "a.sign", "subject": "a", "verdict": "failed", "evidence": "gain -1", "remedy": ""}
+    check["waived"] = False
+    answer = {"why": "", "texts": {"result": "Sideslip RMSE 0.1°", "assumed": "not causal"}}
     plan = plan_of("PASS", "FAIL", "INCONCLUSIVE")
     page = page_of(write_run(tmp_path, drive_tracks(), plan=plan, checks=[check], answer=answer))
     text = words(page)

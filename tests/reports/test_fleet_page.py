@@ -13,36 +13,37 @@ from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.reports.fleet import fleet_page
 from pdhef_logtool.reports.pages import remove_pages, write_pages
 from pdhef_logtool.results.opened_run import open_run
-from pdhef_logtool.results.parquet_sink import write_metrics
 from pdhef_logtool.storage.documents import seal
+from tests.results.made_run import write_tables
 
 HOSTILE = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>\u202egnp"
 
 
 def run_of(folder: Path, drives: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str] | None = None) -> Path:
     """Write a run: ``drives`` with RMSE in rad of pd-hef and physics, and changes of the report; ``failed`` reasons."""
-    logs, rows = [], []
+    logs, rows, reports = [], [], {}
     for label, drive in drives.items():
         given = dict(drive)
         for name, value in zip(("pd-hef", "physics"), given.pop("errors", ()), strict=False):
-            rows.append((label, name, "sideslip_rad", "all", "rmse", value))
+            rows.append(MetricRow(label, name, "sideslip_rad", "all", "rmse", value, "rad", 9))
         cells = [{"speed": 1, "ay": 0, "seconds": 90.0, "scored": 9, "sideslip_mse_rad2": 1e-4}]
         report = {
             "format": "pdhef.report",
             "log": {"name": label, "duration_s": 100.0, "kind": "mcap"},
             "vehicle": {"name": "golf"},
             "truth": {"available": True, "not_independent": []},
-            "answer": {"main": "pd-hef", "naive": "zero"},
+            "selected_estimate": "pd-hef",
             "operating_space": {"speed_edges_m_s": [0, 5, 10], "ay_edges_m_s2": [0, 1], "cells": cells},
             **given,
         }
         place = folder / "logs" / label
         place.mkdir(parents=True)
         (place / "report.json").write_text(json.dumps(report))
+        reports[label] = report
         (place / "report.html").write_text("x")
-        logs.append({"log": label, "outcome": "ok", "car": None})
+        logs.append({"log": label, "outcome": "ok", "car": None, "main": "pd-hef"})
     logs += [{"log": label, "outcome": f"failed: {reason}", "car": None} for label, reason in (failed or {}).items()]
-    write_metrics(folder / "metrics.parquet", [MetricRow(*row, unit="rad", n=9) for row in rows])
+    write_tables(folder, logs, rows, reports)
     (folder / "run.json").write_text(json.dumps(seal({"format": "pdhef.run", "logs": logs, "versions": {"a": "1"}})))
     return folder
 
@@ -95,7 +96,7 @@ def test_every_page_of_a_run_is_written_and_removed(tmp_path: Path) -> None:
 
 def test_a_damaged_table_is_told_and_stops_no_other_page(tmp_path: Path) -> None:
     folder = run_of(tmp_path, {"a": {"errors": (0.001, 0.002)}}, {"bad": "empty"})
-    (folder / "metrics.parquet").write_bytes(b"PAR1 no")
+    (folder / "tables/metrics.parquet").write_bytes(b"PAR1 no")
     written = write_pages(open_run(folder))
     assert written.fleet.file is None and written.exit_code == 3
     assert any("no page of the run" in line for line in written.wrong)

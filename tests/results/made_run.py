@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ import numpy as np
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.results.parquet_sink import write_estimates as write_estimates_file
-from pdhef_logtool.results.parquet_sink import write_metrics
+from pdhef_logtool.results.run_report import LogOutcome
+from pdhef_logtool.results.tables import drive_part
+from pdhef_logtool.results.tables import write_tables as write_files
 from pdhef_logtool.storage.documents import seal
 
 START_NS = 1_700_000_000_000_000_000
@@ -51,20 +54,41 @@ def row(label: str, value: float, **changed: Any) -> MetricRow:
     return MetricRow(log=label, value=value, **{**known, **changed})
 
 
+def write_tables(
+    folder: Path,
+    entries: Sequence[Mapping[str, Any]],
+    rows: Sequence[MetricRow],
+    reports: Mapping[str, Mapping[str, Any]] | None = None,
+) -> None:
+    """Write the tables of a run: ``entries`` as in run.json, and the report of each log that has one."""
+    names = {f.name for f in fields(LogOutcome)}
+    parts = []
+    for of in entries:
+        kind, _, reason = of["outcome"].partition(": ")
+        ends = {"failed": reason if kind == "failed" else None, "lost": [reason] if kind == "lost" else ()}
+        known = {"file": f"{of['log']}.mcap", "sha256": None, **{k: v for k, v in of.items() if k in names}}
+        report = (reports or {}).get(of["log"])
+        parts.append(drive_part(LogOutcome(**{**known, **ends}), report, [r for r in rows if r.log == of["log"]]))
+    write_files(folder / "tables", parts)
+
+
 def write_run(
     folder: Path,
     rmse: Mapping[str, float],
     *,
     entries: Sequence[dict[str, Any]] | None = None,
     rows: Sequence[MetricRow] = (),
+    reports: Mapping[str, Mapping[str, Any]] | None = None,
     **document: Any,
 ) -> Path:
     """Write a run of drives with such RMSE of ``pd-hef``; ``entries`` and more ``rows`` as they are."""
     folder.mkdir(parents=True, exist_ok=True)
     logs = [entry(label) for label in rmse] if entries is None else list(entries)
-    known = {"format": "pdhef.run", "version": 1, "config": {"friction": "auto"}, "versions": {"numpy": "2.0"}}
-    (folder / "run.json").write_text(json.dumps(seal({**known, "logs": logs, **document})))
-    write_metrics(folder / "metrics.parquet", [*(row(label, value) for label, value in rmse.items()), *rows])
+    head = {"format": "pdhef.run", "version": 1, "config": {"friction": "auto"}, "versions": {"numpy": "2.0"}}
+    (folder / "run.json").write_text(json.dumps(seal({**head, "logs": logs, **document})))
+    known = {"log": {"start_ns": START_NS, "duration_s": 1.0}}
+    reports = reports or {of["log"]: known for of in logs if not of["outcome"].startswith("failed")}
+    write_tables(folder, logs, [*(row(label, value) for label, value in rmse.items()), *rows], reports)
     return folder
 
 

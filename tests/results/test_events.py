@@ -14,7 +14,7 @@ import pytest
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.results.clips import write_clips
-from pdhef_logtool.results.events import FoundEvents, event_condition, find_events, write_events
+from pdhef_logtool.results.events import FoundEvents, event_condition, find_events
 from pdhef_logtool.results.opened_run import open_run
 from tests.results import source_log
 from tests.results.made_run import START_NS, entry, write_estimates, write_run
@@ -27,19 +27,21 @@ def _find(folder: Path, where: str, **options: Any) -> FoundEvents:
     return find_events(open_run(folder), event_condition(where), **options)
 
 
-def _report(folder: Path, label: str, **vehicle: Any) -> None:
+def _report(folder: Path, label: str, **vehicle: Any) -> dict[str, Any]:
     document = report()
     document["log"] |= {"name": label, "start_ns": START_NS - 1_000_000_000, "end_ns": START_NS + 10_000_000_000}
     document["vehicle"] |= vehicle
     place = folder / "logs" / label / "report.json"
     place.parent.mkdir(parents=True, exist_ok=True)
     place.write_text(json.dumps(document))
+    return document
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     entries = [entry("a"), entry("b"), entry("no_truth"), entry("bad", outcome="failed: empty", main=None)]
-    folder = write_run(tmp_path / "out", {}, entries=entries)
+    reports = {label: _report(tmp_path / "out", label) for label in ("a", "b", "no_truth")}
+    folder = write_run(tmp_path / "out", {}, entries=entries, reports=reports)
     slip = np.zeros(N)
     slip[100:111] = np.deg2rad(np.linspace(1.0, 3.0, 11))
     slip[130:141] = -np.deg2rad(4.0)
@@ -52,8 +54,6 @@ def run(tmp_path: Path) -> Path:
     write_estimates(folder, "a", truth=still, pd_hef={**still, "sideslip_rad": slip}, physics=still)
     write_estimates(folder, "b", truth=still, pd_hef={**wild, "valid": valid})
     write_estimates(folder, "no_truth", pd_hef=still)
-    for label in ("a", "b", "no_truth"):
-        _report(folder, label)
     return folder
 
 
@@ -71,10 +71,13 @@ def test_rows_have_drive_start_end_and_peak(run: Path) -> None:
 
 def test_an_error_is_known_only_where_it_is_scored(run: Path) -> None:
     assert [e.drive for e in _find(run, "abs(sideslip_error_deg) > 170").events] == ["b"]
-    _report(run, "b", low_speed_blend_m_s=3.0)
+    slow = {**report(), "vehicle": {**report()["vehicle"], "low_speed_blend_m_s": 3.0}}
+    entries = [entry("a"), entry("b"), entry("no_truth")]
+    write_run(run, {}, entries=entries, reports={e["log"]: slow for e in entries})
     assert not _find(run, "abs(sideslip_error_deg) > 170").events
     unknown = _find(run, "not abs(vx_error_m_s) > 1").events  # the error of an invalid value is not below 1 either
-    assert {e.drive: round(e.end_s, 2) for e in unknown} == {"a": 6.99, "b": 2.04}
+    ends = {e.drive: round((e.end_ns - START_NS) * 1e-9, 2) for e in unknown}
+    assert ends == {"a": 5.99, "b": 1.04}
 
 
 def test_other_tracks_are_read_at_the_same_stamps(run: Path, tmp_path: Path) -> None:
@@ -93,14 +96,6 @@ def test_other_tracks_are_read_at_the_same_stamps(run: Path, tmp_path: Path) -> 
     assert len(_find(scored, "vx_m_s > 0", estimator="esc").events) == 1
 
 
-def test_rows_are_written_as_parquet_even_none(run: Path, tmp_path: Path) -> None:
-    write_events(tmp_path / "e.parquet", _find(run, "speed_m_s < 3"))
-    table = pl.read_parquet(tmp_path / "e.parquet")
-    assert table["drive"].to_list() == ["a", "b", "no_truth"]
-    write_events(tmp_path / "e.parquet", _find(run, "speed_m_s > 300"))
-    assert pl.read_parquet(tmp_path / "e.parquet").schema == table.schema
-
-
 @pytest.fixture
 def clipped(tmp_path: Path) -> tuple[Path, Path]:
     """Return a run without full copies, and the folder with its log."""
@@ -110,12 +105,12 @@ def clipped(tmp_path: Path) -> tuple[Path, Path]:
     from pdhef_logtool.logs.discovery import hash_log
 
     sha256 = hash_log(logs / "drive.mcap")
-    folder = write_run(tmp_path / "out", {}, entries=[entry("drive", file="drive.mcap", sha256=sha256)])
+    entries, reports = [entry("drive", file="drive.mcap", sha256=sha256)], {"drive": _report(tmp_path / "out", "drive")}
+    folder = write_run(tmp_path / "out", {}, entries=entries, reports=reports)
     slip = np.zeros(N)
     slip[300:310] = 1.0
     stamps = source_log.START_NS + 10_000_000 * np.arange(N, dtype=np.int64)
     write_estimates(folder, "drive", pd_hef={"sideslip_rad": slip, "stamps_ns": stamps})
-    _report(folder, "drive")
     return folder, tmp_path / "logs"
 
 
@@ -146,14 +141,13 @@ def test_a_source_that_is_not_found_or_is_another_file_is_told(clipped: tuple[Pa
 
 
 def test_a_segment_bounds_what_is_found(run: Path) -> None:
-    path = run / "logs" / "a" / "report.json"
-    document = json.loads(path.read_text())
+    document = _report(run, "a")
     ends = [(1.0, 1.05), (1.32, 1.35)]
     document["segments"] = [
         {"name": "slalom", "start_ns": START_NS + round(a * 1e9), "end_ns": START_NS + round(b * 1e9), "text": ""}
         for a, b in ends
     ]
-    path.write_text(json.dumps(document))
+    write_run(run, {}, entries=[entry("a")], reports={"a": document})
     found = _find(run, "slalom")
     assert [(e.start_ns, e.end_ns) for e in found.events] == [
         (START_NS + round(a * 1e9), START_NS + round((b - 0.01) * 1e9) + 1) for a, b in ends

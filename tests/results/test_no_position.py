@@ -105,7 +105,7 @@ def _all_bytes(folder: Path) -> Iterator[tuple[str, bytes]]:
     for path in folder.rglob("*"):
         yield "names", str(path.relative_to(folder)).encode()
         if path.suffix == ".parquet":
-            yield path.name, pl.read_parquet(path).write_csv().encode()
+            yield path.name, pl.read_parquet(path).write_ndjson().encode()
         elif path.suffix == ".mcap":
             with path.open("rb") as file:
                 reader = make_reader(file)

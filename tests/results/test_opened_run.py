@@ -13,7 +13,6 @@ from pdhef_logtool.storage.documents import seal
 
 
 def _run(folder: Path, logs: list[object], **changed: object) -> Path:
-    (folder / "metrics.parquet").write_bytes(b"")
     (folder / "run.json").write_text(json.dumps(seal({"format": "pdhef.run", "logs": logs, **changed})))
     return folder
 

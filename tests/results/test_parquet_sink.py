@@ -52,7 +52,7 @@ ESTIMATE_COLUMNS = {name: kind for name, (kind, _) in COLUMNS.items()}
 #: Those that none of these tracks has.
 OPTIONAL = {"mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUMNS}
 UNITS = {name: unit for name, (_, unit) in COLUMNS.items()}
-METRIC_COLUMNS = ["log", "estimator", "signal", "segment", "metric", "value", "unit", "n", "algorithm"]
+METRIC_COLUMNS = ["log", "estimator", "signal", "segment", "metric", "value", "unit", "n", "algorithm", "independent"]
 NAMES = ("phy-ukf", "zero", "truth")
 
 
@@ -164,10 +164,10 @@ def test_polars_reads_the_metrics(tmp_path):
     path = tmp_path / "metrics.parquet"
     write_metrics(path, ROWS)
     frame = pl.read_parquet(path)
-    kinds = {"value": pl.Float64, "n": pl.Int64}
+    kinds = {"value": pl.Float64, "n": pl.Int64, "independent": pl.Boolean}
     assert list(frame.schema.items()) == [(name, kinds.get(name, pl.String)) for name in METRIC_COLUMNS]
     assert frame.rows() == [
-        ("drive", "phy-ukf", "sideslip_rad", "all", "rmse", 0.0123, "rad", 600, "0123456789ab"),
-        ("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", None, "rad", 0, ""),
+        ("drive", "phy-ukf", "sideslip_rad", "all", "rmse", 0.0123, "rad", 600, "0123456789ab", True),
+        ("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", None, "rad", 0, "", True),
     ]
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.parquet"]

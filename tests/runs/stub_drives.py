@@ -10,8 +10,8 @@ from pathlib import Path
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.logs.discovery import identity_of
-from pdhef_logtool.results.parquet_sink import write_metrics
 from pdhef_logtool.results.run_report import LogOutcome, write_json
+from pdhef_logtool.results.tables import drive_part, write_part
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.drive_outputs import files_of
 from pdhef_logtool.runs.drive_report import car_entry
@@ -27,10 +27,9 @@ def stub_drive(task: DriveTask, tell: Tell) -> DriveEnd:
     tell(log.stem, 0.0)
     car = RunCars.of(task.config, lambda _: None).of_log(log)
     record = car_record(car)
-    part = f"metrics/run={task.setting}/car={car.physics_sha256[:8]}/part-{digest_of(log.stem)}.parquet"
+    part = f"tables/parts/part-{digest_of(log.stem)}.parquet"
     value = zlib.crc32(log.stem.encode()) / 2**32
     row = MetricRow(log.stem, "physics", "sideslip_rad", "all", "rmse", value, "rad", 100)
-    write_metrics(task.output / part, [row])
     report = task.output / "logs" / log.stem / "report.json"
     write_json(report, {"format": "pdhef.report", "log": {"name": log.stem}})
     (report.parent / "metrics.parquet").write_text(log.stem)
@@ -38,6 +37,7 @@ def stub_drive(task: DriveTask, tell: Tell) -> DriveEnd:
     outcome = LogOutcome(
         log.stem, Path(str(log.path)).name, identity, car=car_entry(car), main="physics", files=files_of(report.parent)
     )
+    write_part(task.output / part, drive_part(outcome, {}, [row]))
     outputs = states_of(task.output, [part, *(f"logs/{log.stem}/{p.name}" for p in report.parent.iterdir())])
     record = {"digest": digest_of(record["parts"]), **record}
     return DriveEnd(outcome, identity, record, part, error_rad=value, outputs=outputs)

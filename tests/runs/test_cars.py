@@ -87,7 +87,7 @@ def test_a_wrong_table_is_told_before_any_log_is_opened(fleet: Path, table: str,
 
 
 def test_one_car_and_a_table_exclude_each_other_and_a_flag_wins_over_the_file(fleet: Path) -> None:
-    with pytest.raises(UsageError, match="--car or --cars"):
+    with pytest.raises(UsageError, match="car or cars"):
         cars_of(fleet, 'default = "golf.toml"\n', car=fleet / "golf.toml")
     (fleet / "pdhef.toml").write_text('car = "golf.toml"\n')
     config = load_config(fleet / "pdhef.toml", {"cars": fleet / "cars.toml"})

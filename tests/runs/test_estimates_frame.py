@@ -38,3 +38,11 @@ def test_records_print_as_one_line(estimates) -> None:
 
 def test_the_package_lists_its_public_names() -> None:
     assert dir(pdhef) == sorted(pdhef.__all__)
+
+
+def test_the_plot_has_a_line_of_each_track_in_degrees(estimates) -> None:
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.use("agg")
+    lines = estimates.plot().get_lines()
+    assert [line.get_label() for line in lines] == ["truth", "zero", "kinematic"]
+    assert lines[0].get_xdata()[0] == pytest.approx(0.0, abs=0.1) and max(abs(lines[0].get_ydata())) > 1.0

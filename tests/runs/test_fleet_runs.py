@@ -54,7 +54,7 @@ class Counted:
 
 def run(folder: Path | list[str], output: Path, config: RunConfig | None = None, **options: Any) -> Any:
     arguments = folder if isinstance(folder, list) else [str(folder)]
-    names = ("jobs", "ray", "resume", "retry", "only")
+    names = ("jobs", "ray", "resume", "repeat")
     schedule = Schedule(**{n: options.pop(n) for n in names if n in options}, limits=options.pop("limits", Limits()))
     silent = Reporter()
     warn, note = options.pop("warn", silent.warn), options.pop("say", silent.note)
@@ -75,9 +75,8 @@ def test_what_is_done_is_not_done_again_and_a_folder_added_later_runs_alone(tmp_
     assert work.asked == ["a", "b", *labels(out)[2:]]
     metrics = pl.read_parquet(out / "metrics.parquet")
     assert list(dict.fromkeys(metrics["log"])) == labels(out)
-    scanned = pl.scan_parquet(out / "metrics/**/*.parquet", hive_partitioning=True).collect()
-    assert {"run", "car"} <= set(scanned.columns)
-    assert scanned.drop("run", "car").sort("log").equals(metrics.sort("log"))
+    parts = pl.scan_parquet(out / "tables/parts/*.parquet").select(pl.col("metrics").explode().struct.unnest())
+    assert parts.collect().sort("log").equals(metrics.sort("log"))
 
 
 def test_a_log_is_known_by_what_it_holds(tmp_path: Path) -> None:
@@ -133,21 +132,21 @@ def test_what_is_run_anew_is_said_and_why(tmp_path: Path, sample_logs_dir: Path)
         "2 of 2 drives are run again: --friction auto → 0.4",
     ]
     assert work.asked == ["a", "b"] * 3
-    assert len(list((out / "metrics").rglob("*.parquet"))) == 2  # the former ones are deleted
+    assert len(list((out / "tables/parts").iterdir())) == 2
 
 
 def test_more_is_kept_when_it_is_asked_for_and_never_less(tmp_path: Path) -> None:
     logs, out, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", Counted()
     run(logs, out, RunConfig(keep="metrics"), work=work)
-    run(logs, out, RunConfig(keep="metrics"), work=work, only=["b"])
+    run(logs, out, RunConfig(keep="metrics"), work=work, repeat=["b"])
     assert work.asked == ["a", "b", "b"]
     assert labels(out) == ["a", "b"]
     run(logs, out, RunConfig(keep="estimates"), work=work, resume=True)
     assert work.asked == ["a", "b", "b", "a"]
-    with pytest.raises(UsageError, match="--only: expected the name of a log"):
-        run(logs, out, RunConfig(keep="metrics"), only=["c"])
+    with pytest.raises(UsageError, match="--repeat: expected the name of a log"):
+        run(logs, out, RunConfig(keep="metrics"), repeat=["c"])
     with pytest.raises(UsageError, match="friction"):
-        run(logs, out, RunConfig(keep="metrics", friction=0.4), only=["a"])
+        run(logs, out, RunConfig(keep="metrics", friction=0.4), repeat=["a"])
 
 
 def test_many_logs_keep_metrics_and_the_worst_in_full_and_say_so_first(
@@ -209,11 +208,11 @@ def test_a_failure_that_may_pass_is_tried_again_and_others_when_asked(tmp_path: 
 
     result = run(logs, out, work=failing)
     assert result.exit_code == 3
-    for options, asked in (({"resume": True}, ["full"]), ({"retry": True}, ["bad", "full"])):
+    for options, asked in (({"resume": True}, ["full"]), ({"repeat": ["failed"]}, ["bad", "full"])):
         work = Counted(failing)
         assert run(logs, out, work=work, **options).exit_code == 3
         assert work.asked == asked
-    assert run(logs, out, retry=True).exit_code == 0
+    assert run(logs, out, repeat=["failed"]).exit_code == 0
 
 
 @pytest.mark.slow
@@ -231,7 +230,7 @@ def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(
     work = Counted()
     assert run(logs, out, work=work, resume=True).exit_code == 3
     assert work.asked == []
-    assert run(logs, out, work=work, retry=True).exit_code == 0
+    assert run(logs, out, work=work, repeat=["failed"]).exit_code == 0
     assert work.asked == ["hangs", "kills"]
 
 
@@ -298,9 +297,10 @@ def test_a_fleets_summary_counts_what_the_figures_say(tmp_path: Path) -> None:
         return stub_drive(task, tell)
 
     result = run(logs, out, work=failing)
-    told = summarise(open_run(out), result.exit_code, ["c"])
+    told = summarise(open_run(out), result.exit_code)
     values = {log: zlib.crc32(log.encode()) / 2**32 for log in "ac"}
     assert (told["logs"], told["done"], told["scored"], told["exit_code"]) == (3, 2, 2, 3)
     assert told["errors"][0]["median_rad"] == pytest.approx(sum(values.values()) / 2)
     assert [w["log"] for w in told["worst"]] == sorted(values, key=lambda log: -values[log])
     assert told["failed"][0]["labels"] == ("b",)
+    assert [e["estimator"] for e in told["errors"]] == ["physics"]  # the only one that was asked for is named

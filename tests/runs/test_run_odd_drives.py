@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import typer
 
+from pdhef_logtool.cli import console
 from pdhef_logtool.cli.running import _finish
 from pdhef_logtool.estimators import table
 from pdhef_logtool.estimators.base import Steps
@@ -88,8 +89,9 @@ def test_no_valid_row_of_any_estimator_fails_and_keeps_the_report(
     assert result.exit_code == 1
     report = json.loads((tmp_path / "out" / "logs" / "odd" / "report.json").read_text())
     assert [x["kind"] for x in report["losses"]] == ["no-valid-row"]
+    monkeypatch.setattr(console, "as_json", True)
     with pytest.raises(typer.Exit) as left:
-        _finish(result, as_json=True)
+        _finish(result)
     assert left.value.exit_code == 1
     assert capsys.readouterr().err == "pdhef: odd: no estimator has a valid row although the car moves\n"
 

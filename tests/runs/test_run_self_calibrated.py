@@ -172,7 +172,7 @@ def test_an_estimate_that_contradicts_the_sensors_is_not_selected_and_keeps_its_
     report = run(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path, estimators=names, end=None)
     follows(report)
     assert any(w.startswith("WARNING: pd-hef contradicts the sensors") for w in report["warnings"])
-    assert report["answer"]["main"] == "physics"
+    assert report["selected_estimate"] == "physics"
     file = tmp_path / "logs" / "sweep" / "estimates.parquet"
     assert list_estimators(file) == ("truth", *names)
     selected, named, other = (read_track(file, name) for name in ("selected", "physics", "pd-hef"))

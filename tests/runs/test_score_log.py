@@ -110,7 +110,7 @@ def test_outputs_are_those_of_a_run(annotated: Path, config: RunConfig, tmp_path
     _scored(annotated, config, "/pdhef/phy_ukf/state", output=tmp_path)
     folder = tmp_path / "logs/annotated"
     assert {p.name for p in folder.iterdir()} == {"estimates.parquet", "metrics.parquet", "report.json"}
-    assert {p.name for p in tmp_path.iterdir()} == {"logs", "metrics.parquet", "run.json"}
+    assert {p.name for p in tmp_path.iterdir()} == {"logs", "metrics.parquet", "run.json", "tables"}
     report = json.loads((folder / "report.json").read_text())
     follows(report)
     run = json.loads((tmp_path / "run.json").read_text())

@@ -74,7 +74,7 @@ def test_a_store_has_what_a_folder_has_and_is_gone_on_with(tmp_path: Path, memor
     assert (opened.place, [log.label for log in opened.logs]) == (URL, ["a", "b", "c"])
     assert opened.logs[2].report() == {"format": "pdhef.report", "log": {"name": "c"}}
     assert opened.logs[2].estimates() is None
-    assert opened.metrics().collect().equals(pl.read_parquet(tmp_path / "out" / METRICS_FILE))
+    assert opened.table("metrics").collect().equals(pl.read_parquet(tmp_path / "out" / METRICS_FILE))
 
 
 @pytest.mark.slow
@@ -83,7 +83,7 @@ def test_a_name_that_is_a_pattern_means_itself(tmp_path: Path, s3: S3Store) -> N
     for url in (URL, f"{s3.url}/odd"):
         for start in ("1", "2"):
             run(logs, url, config=RunConfig(keep="metrics", start=start))
-        run(logs, url, config=RunConfig(keep="metrics", start="2"), only=["d[1]"])
+        run(logs, url, config=RunConfig(keep="metrics", start="2"), repeat=["d[1]"])
         assert [log.report() for log in open_run(url).logs] == [
             {"format": "pdhef.report", "log": {"name": name}} for name in ("d1", "d[1]")
         ]
