@@ -77,8 +77,9 @@ def run_features(
         bias = steps.x[:, [layout.steer_bias, layout.sensor_bias, layout.sensor_bias + 1, AX_BIAS]]
     of_steer, of_ay, of_rate, of_ax = bias.T
     features = make_features(
-        steps.inputs[:, U_STEER] - of_steer, usable.ay_m_s2 - of_ay, usable.yaw_rate_rad_s - of_rate, steps.x, steps.prior,
-        physics.expected_ay(steps.x, steps.inputs) - of_ay, steps.inputs[:, U_FRICTION], usable.ax_m_s2 - of_ax, body,
+        steps.inputs[:, U_STEER] - of_steer, usable.ay_m_s2 - of_ay, usable.yaw_rate_rad_s - of_rate,
+        steps.x, steps.prior, physics.expected_ay(steps.x, steps.inputs) - of_ay,
+        steps.inputs[:, U_FRICTION], usable.ax_m_s2 - of_ax, body,
     )  # fmt: skip
     steers = steps.inputs[:, U_STEER_KNOWN] > 0.0
     features[~(steps.valid & steers & rolls_forward(steps.x[:, VX], steps.inputs[:, U_SPEED]))] = np.nan

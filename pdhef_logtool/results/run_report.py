@@ -113,7 +113,7 @@ def build_report(content: Mapping[str, Any], main: MainFacts | None = None) -> d
     rows = [m for m in content["metrics"] if _is_shown(m, main)]
     metrics = [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in rows]
     entries = {"format": "pdhef.report", "version": 2, **content, "metrics": metrics}
-    if entries["plan"] is not None:
+    if entries.get("plan") is not None:
         verdicts = [{k: v[k] for k in _OF_VERDICT} for v in entries["plan"]["requirements"]]
         entries["plan"] = {"file": entries["plan"]["file"], "requirements": verdicts}
     document = {key: jsonable(value) for key, value in entries.items()}

@@ -137,7 +137,6 @@ class DriveOutputs:
             write_json(self._change.file(REPORT_FILE), report)
         else:
             write_drive_tables(self._change, report, rows, self.tracks, self._main.name, self._causal_from_ns())
-        return report
 
     def _causal_from_ns(self) -> dict[str, int]:
         """Return the first stamp from which the rows of each causal estimator depend on past samples only."""

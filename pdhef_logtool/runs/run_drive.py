@@ -82,7 +82,7 @@ def run_log(
                 report = report_drive(run, estimated, scored, main, judged, losses)
                 if annotated is not None:
                     annotated.finish(report, files.tracks, scored.events)
-            written = files.write(report, scored.rows, scored.events)
+            files.write(report, scored.rows, scored.events)
         outcome = outcome_of(
             drive,
             losses,
@@ -96,7 +96,7 @@ def run_log(
         failed_checks = sum(c.verdict == "failed" and not c.waived for c in drive.checks)
     reporter.progress(drive.name, 1.0)
     part = drive_part(outcome, report, scored.rows, judged["plan"])
-    return LogResult(outcome, change.target, written, tuple(scored.rows), failed_checks, part)
+    return LogResult(outcome, change.target, report, tuple(scored.rows), failed_checks, part)
 
 
 def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter) -> tuple[PreparedDrive, Estimated]:

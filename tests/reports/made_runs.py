@@ -83,7 +83,7 @@ def report_of(tracks: list[StateTrack], label: str = "drive", **changes: Any) ->
     ]
     return {
         "format": "pdhef.report",
-        "version": 1,
+        "version": 2,
         "log": {"name": label, "file": f"{label}.mcap", "kind": "mcap", "sha256": "0" * 64, "start_ns": int(stamps[0]),
                 "end_ns": end, "duration_s": (end - int(stamps[0])) * 1e-9},
         "mapping": {"missing": []},

@@ -48,7 +48,6 @@ CONTENT: dict[str, Any] = {
         "cells": [{"speed": 1, "ay": 1, "seconds": 9.0, "scored": 0, "sideslip_mse_rad2": None}],
     },
     "metadata": {"road": "wet"},
-    "plan": {"requirements": [REQUIREMENT]},
 }  # fmt: skip
 
 
@@ -70,7 +69,8 @@ def write(folder: Path, *logs: str) -> Path:
     """Write a run of logs with everything in it and one that failed."""
     parts = []
     for log in logs:
-        write_part(folder / f"{log}.parquet", drive_part(of_log(log), report(name=log, **CONTENT), rows(log)))
+        part = drive_part(of_log(log), report(name=log, **CONTENT), rows(log), {"requirements": [REQUIREMENT]})
+        write_part(folder / f"{log}.parquet", part)
         parts.append(read_part(folder / f"{log}.parquet"))
     parts.append(drive_part(LogOutcome("bad", "bad.mcap", None, failed="no log"), None))
     write_tables(folder / "tables", parts, [*(f"of/{log}" for log in logs), ""])
