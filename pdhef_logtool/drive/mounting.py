@@ -26,11 +26,7 @@ from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.frames import (
     IS_GRAVITY_M_S2,
     angle_deg,
-    frames_alone,
-    frames_check,
-    gravity_agrees,
     nearest_step,
-    placed_rotation,
     rotation_text,
     upright_check,
 )
@@ -50,7 +46,6 @@ from pdhef_logtool.drive.truth import (
 )
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, auto_map, fit_clocks, read_signals
-from pdhef_logtool.mapping.frames import placement_of
 from pdhef_logtool.mapping.mapping_file import entries_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check
@@ -352,18 +347,17 @@ class Survey:
     latency: LatencyEstimate | None
     triads: tuple[Triad | None, Triad | None] = (None, None)
     mounting: Mounting | None = None
-    framed: Check | None = None
     force: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
     corrected: tuple[Check, ...] = ()
     reread: Callable[[tuple[Check, ...]], tuple[Check, ...]] | None = None
 
     @property
     def mounted(self) -> tuple[Check, ...]:
-        """Checks of the axes that the IMU's signals are read from, by the drive and by recorded frames."""
+        """Checks of the axes that the IMU's signals are read from."""
         by_drive = [] if self.mounting is None else mounting_checks(self.mapping, self.mounting, self.triads)
         is_open = self.mapping.origin == "auto" and not (self.mounting is not None and self.mounting.confident)
         upright = upright_check(_named_rows(self.mapping, *self.triads), self.force) if is_open else None
-        return tuple(c for c in (*by_drive, self.framed, upright) if c is not None)
+        return (*by_drive, *([] if upright is None else [upright]))
 
     @property
     def is_mounted(self) -> bool:
@@ -470,26 +464,21 @@ def survey_log(
     if not blind and truth is not None:
         mounting = find_mounting(measured, triads, mapping)
     force = _mean_force(channels)
-    framed, by_frames = _by_frames(log, mapping, force, triads, mounting)
-    mounting = by_frames or mounting
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
     measured = measured.without(extra)
-    trusted = blind or by_frames is not None
     corrected: list[Check] = []
-    if mounting is not None and mapping.origin == "auto" and trusted and not mounting.is_as_named:
+    if mounting is not None and mapping.origin == "auto" and blind and not mounting.is_as_named:
         note = f"{mounting.text}, and is read so: {mounting.evidence}"
         signals = turned_signals(mapping, mounting, triads)
-        if by_frames is None:  # a mounting that the log records is not a correction
-            corrected = [_corrected(n, signals[n], note) for n in MOUNTED if signals.get(n) != mapping.signals.get(n)]
+        corrected = [_corrected(n, signals[n], note) for n in MOUNTED if signals.get(n) != mapping.signals.get(n)]
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
         channels = read_signals(log, mapping, clocks, *span_ns)
         mounting = replace(mounting, named=mounting.rows)
         measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     latency = truth_latency(channels, truth)
     survey = Survey(
-        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, framed, force,
-        tuple(corrected),
-    )  # fmt: skip
+        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, force, tuple(corrected)
+    )
     if not rescale:
         return survey
     if mapping.origin == "auto":
@@ -511,29 +500,6 @@ def _mean_force(channels: MappedChannels) -> FloatArray:
     """Return the mean acceleration [3] in the sensor's axes; NaN without a component."""
     components = [channels.signals.get(n) for n in ACCELERATIONS]
     return np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
-
-
-def _by_frames(
-    log: DriveLog,
-    mapping: Mapping,
-    force: FloatArray,
-    triads: tuple[Triad | None, Triad | None],
-    by_drive: Mounting | None,
-) -> tuple[Check | None, Mounting | None]:
-    """Return the check of recorded frames, and the mounting if only the frames provide it."""
-    accelerations, rates = triads
-    placed = None if accelerations is None else placement_of(log, accelerations.source.topic)
-    if placed is None or accelerations is None or rates is None:
-        return None, None
-    sure = by_drive if by_drive is not None and by_drive.confident else None
-    shown, evidence = (None, "") if sure is None else (sure.rotation, sure.evidence)
-    check = frames_check(placed, shown, evidence, force)
-    believed = "" if sure is not None else gravity_agrees(placed, force)
-    if not believed:
-        return check, None
-    rotation, named = placed_rotation(placed), _named_rows(mapping, accelerations, rates)
-    alone = Mounting(rotation, named, f"{believed}; the drive does not show the rest", confident=False)
-    return check if alone.is_as_named else frames_alone(placed, believed), alone
 
 
 def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
