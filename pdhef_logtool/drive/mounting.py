@@ -8,7 +8,7 @@ the sensor's axes to these; its correlation, gain and error decide whether the m
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -31,7 +31,6 @@ from pdhef_logtool.drive.frames import (
     upright_check,
 )
 from pdhef_logtool.drive.measured import Measured, measure
-from pdhef_logtool.drive.other_fields import with_other_fields
 from pdhef_logtool.drive.relation_checks import CERTAIN, explained_factors
 from pdhef_logtool.drive.relations import BIAS_RAD_S, compare, gentle_at, steering_references, yaw_references
 from pdhef_logtool.drive.truth import (
@@ -45,7 +44,7 @@ from pdhef_logtool.drive.truth import (
     plan_truth,
 )
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, auto_map, fit_clocks, read_signals
+from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
 from pdhef_logtool.mapping.mapping_file import entries_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check
@@ -335,7 +334,7 @@ class Survey:
     """The first minutes of a log as its mapping reads them, with the IMU rotated to the car's axes if that is certain.
 
     ``vehicle``: from the vehicle file, or the default car. ``corrected``: checks for the changes of a recognised
-    mapping. ``reread``: completes the checks of a mapping file.
+    mapping.
     """
 
     mapping: Mapping
@@ -349,7 +348,6 @@ class Survey:
     mounting: Mounting | None = None
     force: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
     corrected: tuple[Check, ...] = ()
-    reread: Callable[[tuple[Check, ...]], tuple[Check, ...]] | None = None
 
     @property
     def mounted(self) -> tuple[Check, ...]:
@@ -368,8 +366,7 @@ class Survey:
     def checks(self) -> tuple[Check, ...]:
         """Checks of the mounting and of :func:`~pdhef_logtool.drive.checks.check_drive`."""
         drive_checks = self._drive_checks(self.channels.truth, self.truth, self.latency, self.measured)
-        checks = (*self.mounted, *self.corrected, *self._of_names(drive_checks), *drive_checks)
-        return checks if self.reread is None else self.reread(checks)
+        return (*self.mounted, *self.corrected, *self._of_names(drive_checks), *drive_checks)
 
     @cached_property
     def sensor_checks(self) -> tuple[Check, ...]:
@@ -479,21 +476,7 @@ def survey_log(
     survey = Survey(
         mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, force, tuple(corrected)
     )
-    if not rescale:
-        return survey
-    if mapping.origin == "auto":
-        return _decided(survey, log, clocks, span_ns)
-
-    def survey_of(other: Mapping, *, rescale: bool) -> Survey:
-        return survey_log(log, other, fit_clocks(log, other, *span_ns), span_ns, vehicle, rescale=rescale)
-
-    def checks_of(other: Mapping) -> tuple[Check, ...]:
-        return survey_of(other, rescale=False).checks
-
-    def recognise() -> Mapping:
-        return survey_of(auto_map(log).mapping, rescale=True).mapping
-
-    return replace(survey, reread=lambda checks: with_other_fields(checks, mapping, checks_of, recognise))
+    return _decided(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
 
 
 def _mean_force(channels: MappedChannels) -> FloatArray:
