@@ -22,7 +22,6 @@ from pdhef_logtool.drive.check_table import result
 from pdhef_logtool.drive.checks import check_drive, misread_channels
 from pdhef_logtool.drive.columns import derivative, halves, independent_samples, moving_at
 from pdhef_logtool.drive.delays import LateSensor, late_sensors
-from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.frames import (
     IS_GRAVITY_M_S2,
     angle_deg,
@@ -407,9 +406,8 @@ class Survey:
 
     @cached_property
     def late(self) -> tuple[LateSensor, ...]:
-        """Sensors with late time stamps, from the signals alone. Sensors with a temporary fault are excluded."""
-        sensors = late_sensors(self.channels.signals)
-        return sensors and late_sensors(without_faulty_samples(self.channels.signals, self.vehicle)[0])
+        """Sensors with late time stamps, from the signals alone."""
+        return late_sensors(self.channels.signals)
 
     def _of_names(self, drive_checks: tuple[Check, ...]) -> Iterator[Check]:
         """Yield the mapping's undecided checks that the drive does not decide either."""
@@ -498,9 +496,6 @@ def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_
     if not turned:
         measured = replace(measured, open_signs=()).without_truth()
         factors = explained_factors(measured, mounting_is_known=is_mounted, most=1)
-        sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle) if factors else ({}, {})
-        if shares:
-            factors = explained_factors(measure(sound, vehicle=survey.vehicle), mounting_is_known=is_mounted, most=1)
     sections, notes = {"truth.": dict(mapping.truth), "": dict(mapping.signals)}, list(mapping.notes)
     checks = list(survey.corrected)
     for name, (factor, evidence) in factors.items():
@@ -516,7 +511,7 @@ def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_
     again = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=bool(turned))
     # A failing sensor resembles a wrong unit of another one, but only a right correction leaves no contradiction.
     failed = [check.name for check in again.checks if check.verdict == "failed"]
-    is_bad = not turned and any(n.endswith((".sign", ".unit", ".axis", ".fault")) for n in failed)
+    is_bad = not turned and any(n.endswith((".sign", ".unit", ".axis")) for n in failed)
     return survey if is_bad else replace(again, corrected=(*checks, *again.corrected))
 
 
