@@ -261,13 +261,11 @@ class _Weighing:
     # --------------------------------------------------------------------------------------------- steering
 
     def _steering(self, candidates: Sequence[Field]) -> None:
-        speed = self._speed()
-        rate = self._chosen("yaw_rate_rad_s")
-        ay = self._chosen("ay_m_s2")
-        wheels = [f for n, f in self.taken.items() if n.startswith("wheel_speed") and n.endswith("m_s")]
-        if speed is None and wheels:  # in their most likely unit
-            speed = wheels[0].standing_for(mean_of([f.si for f in wheels]))
-        curvature = self.fields.curvature(*(None if f is None else f.si for f in (speed, rate, ay)))
+        speed, *turning = (self._speed(), self._chosen("yaw_rate_rad_s"), self._chosen("ay_m_s2"))
+        wheels = [f.si for n, f in self.taken.items() if n.startswith("wheel_speed") and n.endswith("m_s")]
+        # Wheel speeds are in their likeliest unit.
+        pace = speed.si if speed is not None else mean_of(wheels) if wheels else None
+        curvature = self.fields.curvature(pace, *(None if f is None else f.si for f in turning))
         judged: list[tuple[float, str, Field]] = []
         for item in candidates:
             if item.is_weak:
@@ -324,7 +322,7 @@ class _Weighing:
 
     def _speed(self) -> Field | None:
         """Return the best speed to compare other signals with, selected or not."""
-        return self._chosen("speed_m_s") or self.fields.wheel_mean() or self.fields.best("speed")
+        return self._chosen("speed_m_s") or self.fields.best("speed")
 
     def _chosen(self, *names: str) -> Field | None:
         """Return the field of the first of these signals that is selected or mapped."""
