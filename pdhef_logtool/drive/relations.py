@@ -122,7 +122,10 @@ def measured_relations(
             text = f"{other} against {name}"
             sides, everywhere = (columns[name], columns[other]), np.ones(columns[name].shape[0], np.bool_)
             relations += compare(text, {other: 1, name: -1}, *sides, everywhere, expected, moves=moves, bias=bias)
-    return relations + _sideslips(columns)
+    bends = {"ay_m_s2", "yaw_rate_rad_s"}
+    agree = any(r.tells and r.accepts() for r in relations if r.powers.keys() >= bends)
+    axle = _axle_sideslips(columns, vehicle, speed_name, agree)
+    return relations + axle + _sideslips(columns, is_known=bool(axle))
 
 
 # ------------------------------------------------------------------------------------------- relations
@@ -450,12 +453,13 @@ def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
         return np.where(moving_at(speed) & (speed > 1.0), (vx * ay - vy * ax) / speed**2, np.nan)
 
 
-def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
+def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Relation]:
     """Relate the ground-truth sideslip to a_y, by kinematics and by the rear axle.
 
     a_y - v_x r is the derivative of v_y, plus terms of the accelerometer's lever arm, of body roll and of a bias, which
     are in proportion to the yaw acceleration, to v_x r and to 1. In gentle driving, sideslip is the curvature times a
-    lever arm minus a_y times the compliance of the rear tyres.
+    lever arm minus a_y times the compliance of the rear tyres; this relation is used unless both are known
+    (``is_known``) from a file.
     """
     turning = next((n for n in ("truth.yaw_rate_rad_s", "yaw_rate_rad_s") if n in columns), "")
     names = ("ay_m_s2", "truth.vx_m_s", "truth.vy_m_s", turning)
@@ -468,6 +472,8 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     of_vx = subject != "truth.sideslip_rad"  # sideslip from v_y and v_x, otherwise v_y from sideslip and v_x
     powers = {subject: -1, "ay_m_s2": 1} | ({} if of_vx else {"truth.vx_m_s": -1})
     relations = _partial(text, powers, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving, SIDESLIP_RANGE)
+    if is_known:
+        return relations
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature, ratio = rate / vx, vy / vx  # linear in a wrong v_y, unlike the angle
     sideslip = columns.get("truth.sideslip_rad", ratio)
@@ -475,6 +481,32 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     gentle = gentle_at(vx * rate, moving)
     powers = {subject: 1, "ay_m_s2": -1} | ({"truth.vx_m_s": -1} if of_vx else {})
     return relations + _partial(text, powers, -ay, sideslip, [curvature, ones], gentle, COMPLIANCE_RAD_PER_M_S2)
+
+
+def _axle_sideslips(
+    columns: Mapping[str, FloatArray], vehicle: VehicleParameters | None, speed_name: str | None, agree: bool
+) -> list[Relation]:
+    """Relate the ground-truth sideslip to the rear axle model of the vehicle file, v_y = l r - C a_y v.
+
+    The relation needs a_y and r that ``agree``; otherwise either term may be wrong.
+    """
+    subject = next((n for n in ("truth.sideslip_rad", "truth.vy_m_s") if n in columns), "")
+    ay, rate, sideslip = (columns.get(n) for n in ("ay_m_s2", "yaw_rate_rad_s", subject))
+    if vehicle is None or speed_name is None or not agree or ay is None or rate is None or sideslip is None:
+        return []
+    is_moved = subject == "truth.vy_m_s" and CG_VY not in columns
+    lever = vehicle.cg_to_rear_axle_m + (0.0 if is_moved else vehicle.truth_position_m[0])
+    stiffness = vehicle.cornering_stiffness_n_per_rad(False, vehicle.assumed_friction)
+    compliance = vehicle.mass_kg * vehicle.cg_to_front_axle_m / (vehicle.wheelbase_m * stiffness)
+    speed, text = columns[speed_name], f"{subject} against the rear axle of the vehicle file"
+    expected, gentle = lever * rate - compliance * ay * speed, gentle_at(speed * rate, _moving(columns, speed))
+    if subject == "truth.sideslip_rad":
+        with np.errstate(divide="ignore", invalid="ignore"):
+            expected /= speed
+    low, high = KNOWN_LENGTH
+    # Files without a position of ground truth imply the CG, but it may be at any axle.
+    high *= max(1.0, vehicle.wheelbase_m / (2.0 * max(lever, 1e-3)))
+    return compare(text, {subject: 1, "ay_m_s2": -1}, expected, sideslip, gentle, (low, high))
 
 
 def _partial(

@@ -19,6 +19,7 @@ from pdhef_logtool.records.signals import Channel
 from tests.drive.test_checks import drive
 
 VEHICLE = default_vehicle().model_copy(update={"mass_kg": default_vehicle().mass_kg + 1.0})
+TEXT = "truth.vy_m_s against the rear axle of the vehicle file"
 
 
 def with_truth(vehicle: VehicleParameters, vy_factor: float) -> tuple[dict[str, Channel], dict[str, Channel]]:
@@ -53,6 +54,7 @@ def test_gains_of_v_y_are_in_proportion_to_its_scale(place_m: float, factor: flo
         derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
         relations = measure(signals, truth, derived, vehicle).relations
         gains.append({r.text: abs(r.gain) ** r.powers["truth.vy_m_s"] for r in relations if "truth.vy_m_s" in r.powers})
+    assert TEXT in gains[0]
     for text in gains[0].keys() & gains[1].keys():  # one that gives no information is left out
         assert gains[1][text] == pytest.approx(factor * gains[0][text], rel=1e-6)
 
@@ -84,6 +86,14 @@ def test_an_impossible_yaw_rate_of_ground_truth_does_not_blame_the_gyro() -> Non
     truth["yaw_rate_rad_s"] = replace(rate, values=2000.0 * rate.values)
     found = check_drive(signals, truth, derive_truth(truth), VEHICLE)
     assert {c.subject for c in found if c.verdict == "failed"} == {"truth.yaw_rate_rad_s"}
+
+
+def test_ground_truth_may_be_at_any_axle_of_a_car_whose_cg_is_far_back() -> None:
+    """A file without the place of ground truth means the CG; the lever of its front axle is no other unit."""
+    back = VEHICLE.model_copy(update={"cg_to_rear_axle_m": 0.8, "cg_to_front_axle_m": 1.8})
+    signals, truth = with_truth(back, 1.0)
+    (axle,) = (r for r in measure(signals, truth, derive_truth(truth), back).relations if r.text == TEXT)
+    assert axle.expected[1] > (0.8 + 1.8) / 0.8
 
 
 @pytest.mark.parametrize("others", ["ground truth", "wheels"])
