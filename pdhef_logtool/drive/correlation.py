@@ -47,33 +47,6 @@ class Shift:
     inside: bool
 
 
-class EvenGrid:
-    """Even grid over the overlap of the stamps of two signals, at least two each, for all of their columns.
-
-    Parameters
-    ----------
-    stamps_a_ns, stamps_b_ns : int64 [N], [M], ascending; may be the same array.
-    """
-
-    def __init__(self, stamps_a_ns: IntArray, stamps_b_ns: IntArray) -> None:
-        both = [stamps_a_ns] if stamps_a_ns is stamps_b_ns else [stamps_a_ns, stamps_b_ns]
-        periods = [float(np.median(np.diff(stamps))) for stamps in both]
-        step_ns = round(float(np.clip(min(periods), MIN_STEP_S * 1e9, MAX_STEP_S * 1e9)))
-        start, end = max(int(s[0]) for s in both), min(int(s[-1]) for s in both)
-        grid = np.arange(start, end + 1, step_ns, dtype=np.int64)
-        self.step_s = step_ns * 1e-9
-        brackets = [Bracket(s, grid, round(GAP_PERIODS * p)) for s, p in zip(both, periods, strict=True)]
-        self._a, self._b = brackets[0], brackets[-1]
-
-    def of_a(self, values: FloatArray) -> FloatArray:
-        """Return a column [N] of the first signal on the grid, its linear trend removed; NaN in gaps."""
-        return without_trend(self._a.linear(values))
-
-    def of_b(self, values: FloatArray) -> FloatArray:
-        """Return a column [M] of the second signal as :meth:`of_a` does."""
-        return without_trend(self._b.linear(values))
-
-
 def without_trend(values: FloatArray) -> FloatArray:
     """Return a column [N] without its linear trend; NaN stays."""
     finite, n = np.flatnonzero(np.isfinite(values)), values.shape[0]
@@ -89,9 +62,18 @@ def without_trend(values: FloatArray) -> FloatArray:
 def on_common_grid(
     stamps_a_ns: IntArray, values_a: FloatArray, stamps_b_ns: IntArray, values_b: FloatArray
 ) -> CommonGrid:
-    """Sample two signals of at least two samples each on one even grid where they overlap, linear trends removed."""
-    grid = EvenGrid(stamps_a_ns, stamps_b_ns)
-    return CommonGrid(step_s=grid.step_s, a=grid.of_a(values_a), b=grid.of_b(values_b))
+    """Sample two signals [N], [M] of at least two samples each on one even grid where they overlap, without trends.
+
+    ``stamps_a_ns``, ``stamps_b_ns``: ascending; may be the same array.
+    """
+    both = [stamps_a_ns] if stamps_a_ns is stamps_b_ns else [stamps_a_ns, stamps_b_ns]
+    periods = [float(np.median(np.diff(stamps))) for stamps in both]
+    step_ns = round(float(np.clip(min(periods), MIN_STEP_S * 1e9, MAX_STEP_S * 1e9)))
+    start, end = max(int(s[0]) for s in both), min(int(s[-1]) for s in both)
+    grid = np.arange(start, end + 1, step_ns, dtype=np.int64)
+    brackets = [Bracket(s, grid, round(GAP_PERIODS * p)) for s, p in zip(both, periods, strict=True)]
+    a, b = (without_trend(k.linear(v)) for k, v in ((brackets[0], values_a), (brackets[-1], values_b)))
+    return CommonGrid(step_ns * 1e-9, a, b)
 
 
 def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:

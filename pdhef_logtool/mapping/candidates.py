@@ -173,12 +173,6 @@ class Field:
         score -= {"device": 0.1, "navigation": 0.1 if self.meaning.quantity == "speed" else 0.0}.get(self.role, 0.0)
         return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
 
-    def standing_for(self, speed: FloatArray) -> Field:
-        """Return a speed on the grid [M] in m/s with a known unit, computed from this field and similar ones."""
-        meaning = Meaning("speed", "x", 1.0, "m/s", 1.0, "mean of wheel speeds")
-        seen = Seen.of(speed, speed, self.seen.rate_hz)
-        return replace(self, meaning=meaning, seen=seen, factors=(("m/s", 1.0),), sign=1.0, offset=0.0, unit_known=True)
-
     def use(self, unit: str) -> None:
         """Select a unit."""
         self.factors = tuple(sorted(self.factors, key=lambda f: f[0] != unit))

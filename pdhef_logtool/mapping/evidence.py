@@ -90,8 +90,8 @@ class Pieces:
         self.starts = [log.start_ns + i * step for i in range(count)]
         self.cells_a_piece = PIECE_NS // CELL_NS
 
-    def read(self, requests: Mapping[str, Sequence[str]], most: int = MOST_COLUMNS) -> dict[tuple[str, str], Seen]:
-        """Read fields by topic; an array becomes one entry per column, ``name[i]``, at most ``most``.
+    def read(self, requests: Mapping[str, Sequence[str]]) -> dict[tuple[str, str], Seen]:
+        """Read fields by topic; an array becomes one entry per column, ``name[i]``, at most ``MOST_COLUMNS``.
 
         Unreadable fields are omitted.
         """
@@ -106,7 +106,7 @@ class Pieces:
                     if values.ndim == 1:
                         parts.setdefault((topic, path), []).append((number, cell, values))
                         continue
-                    for i, column in enumerate(values.T[:most]):
+                    for i, column in enumerate(values.T[:MOST_COLUMNS]):
                         parts.setdefault((topic, f"{path}[{i}]"), []).append((number, cell, column))
         whole = {key: np.concatenate([column for _, _, column in samples]) for key, samples in parts.items()}
         return {key: Seen(values, partial(self._on_grid, values, parts[key])) for key, values in whole.items()}
@@ -166,15 +166,6 @@ def is_enumeration(values: FloatArray) -> bool:
     """Return whether all values are whole numbers, and few."""
     single = np.unique(values[np.isfinite(values)])
     return single.shape[0] <= MOST_COLUMNS and bool((single == np.rint(single)).all())
-
-
-def is_of_both_signs(values: FloatArray) -> bool:
-    """Return whether a significant share of the values, well beyond noise, is on either side of zero."""
-    finite = values[np.isfinite(values)]
-    if finite.shape[0] == 0:
-        return False
-    low, high = np.quantile(finite, [0.05, 0.95])
-    return bool(low < 0.0 < high and min(-low, high) > 0.3 * max(-low, high))
 
 
 def spread(cells: FloatArray) -> float:

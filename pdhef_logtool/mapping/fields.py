@@ -42,14 +42,6 @@ class Fields:
         """Return the surest field of a quantity that is not constant."""
         return next(iter(self.open(quantity)), None)
 
-    def wheel_mean(self) -> Field | None:
-        """Return the mean of the wheel speeds if their unit is a known unit of speed."""
-        wheels = [f for f in self.candidates if f.meaning.quantity == "wheel speed" and (f.unit_known or f.fixed)]
-        wheels += [f for n, f in self.anchors.items() if n.startswith("wheel_speed_") and n.endswith("m_s")]
-        if not wheels:
-            return None
-        return wheels[0].standing_for(mean_of([f.si for f in wheels]))
-
     def turning(self, ay: FloatArray, rate: FloatArray, speed: FloatArray) -> Fit | None:
         """Fit a_y to v r; None if the car does not turn."""
         expected = rate * speed

@@ -115,11 +115,6 @@ def is_command(*names: str) -> bool:
     return any(_WORDS["commands"] & set(words_of(n)) for n in names)
 
 
-def is_unlabelled(name: str) -> bool:
-    """Return whether a name is empty or consists of letters, numbers and words that count or are symbols only."""
-    return all(len(w) == 1 or w.isdigit() or w in _WORDS["counting"] | _WORDS["symbols"] for w in words_of(name))
-
-
 def _plain_unit(text: str) -> str:
     """Normalize a unit of a file to the form used in field names: ``Unit_DegrePerSecon`` becomes ``deg_per_s``."""
     text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", text.strip("[](){} ")).lower()

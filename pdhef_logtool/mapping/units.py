@@ -129,7 +129,7 @@ def _by_speeding_up(fields: Fields) -> None:
 
 def _by_turning(fields: Fields) -> None:
     """Determine the units of a_y, yaw rate and speed by a_y ≈ v r."""
-    speed = fields.best("speed") or fields.wheel_mean()
+    speed = fields.best("speed")
     if speed is None:
         return
     for rate, ay in itertools.product(fields.open("rate", "z")[:4], fields.open("acceleration", "y")[:4]):

@@ -32,7 +32,6 @@ from pdhef_logtool.mapping.naming import words_of
 from pdhef_logtool.mapping.path import path_velocity
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.units import BY_DRIVING, Gain, Unit, decide_units, posterior
-from pdhef_logtool.mapping.unlabelled_fields import identified, needs_unlabelled, unlabelled_columns
 from pdhef_logtool.mapping.vendors import Vendors, names_of
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray
@@ -100,8 +99,7 @@ def weigh(
     wanted = [
         n for n in named_fields(log, topics, vendors) if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)
     ]
-    without_names = needs_unlabelled(signals, [n[3] for n in wanted])
-    if not (wanted or without_names) or log.end_ns <= log.start_ns:
+    if not wanted or log.end_ns <= log.start_ns:
         return Weighed()
     positions = [s for n, s in truth.items() if n in _POSITIONS]
     pieces, weighable = look(log, wanted, vendors, [*signals.values(), *positions])
@@ -109,13 +107,8 @@ def weigh(
     places = [f for f in weighable if f.meaning.quantity in ("latitude", "longitude", "position")]
     fields = Fields(pieces, anchors, [f for f in weighable if not f.anchor], places)
     decide_units(fields)
-    unlabelled = unlabelled_columns(log, topics, pieces) if without_names else []
-    meant, named, evidence = identified(fields, unlabelled) if unlabelled else ([], "", "")
-    fields.candidates += meant
     may_be_true = [f for f in fields.candidates if not truth or (f.role == "truth" and not has_heading(truth))]
     weighing = _Weighing(fields, truth_topic(may_be_true))
-    if named:
-        weighing.note_unlabelled(named, evidence)
     weighing.choose_signals(set(signals))
     weighing.choose_truth()
     return weighing.result()
@@ -201,13 +194,6 @@ class _Weighing:
                 beside = (f for f in self.fields.candidates if f.meaning.part == "x" and triad_of(f) == triad_of(y))
                 yield from ((x, y) for x in [f for f in beside if f.meaning.quantity == "speed" and f.seen.changes][:1])
 
-    def note_unlabelled(self, topic: str, evidence: str) -> None:
-        """Add a note that the fields of a topic were identified by their values only."""
-        self.notes.append(f"quantities of {topic} are identified by values alone: left and right may be exchanged")
-        evidence = f"the names of {topic} give no quantities; {evidence}; left and right are not observable"
-        remedy = 'look at them (pdhef inspect --fields), name them in a mapping file, or --waive "mapping.names"'
-        self.checks.append(Check("mapping.names", "mapping", "undecided", evidence, remedy))
-
     def _take(self, name: str, candidates: Sequence[Field]) -> None:
         ordered = sorted(candidates, key=lambda f: (-f.score, -f.topic.messages, f.topic.name, f.path))
         good = [f for f in ordered if f.score >= LEAST_SCORE]
@@ -275,13 +261,11 @@ class _Weighing:
     # --------------------------------------------------------------------------------------------- steering
 
     def _steering(self, candidates: Sequence[Field]) -> None:
-        speed = self._speed()
-        rate = self._chosen("yaw_rate_rad_s")
-        ay = self._chosen("ay_m_s2")
-        wheels = [f for n, f in self.taken.items() if n.startswith("wheel_speed") and n.endswith("m_s")]
-        if speed is None and wheels:  # in their most likely unit
-            speed = wheels[0].standing_for(mean_of([f.si for f in wheels]))
-        curvature = self.fields.curvature(*(None if f is None else f.si for f in (speed, rate, ay)))
+        speed, *turning = (self._speed(), self._chosen("yaw_rate_rad_s"), self._chosen("ay_m_s2"))
+        wheels = [f.si for n, f in self.taken.items() if n.startswith("wheel_speed") and n.endswith("m_s")]
+        # Wheel speeds are in their likeliest unit.
+        pace = speed.si if speed is not None else mean_of(wheels) if wheels else None
+        curvature = self.fields.curvature(pace, *(None if f is None else f.si for f in turning))
         judged: list[tuple[float, str, Field]] = []
         for item in candidates:
             if item.is_weak:
@@ -338,7 +322,7 @@ class _Weighing:
 
     def _speed(self) -> Field | None:
         """Return the best speed to compare other signals with, selected or not."""
-        return self._chosen("speed_m_s") or self.fields.wheel_mean() or self.fields.best("speed")
+        return self._chosen("speed_m_s") or self.fields.best("speed")
 
     def _chosen(self, *names: str) -> Field | None:
         """Return the field of the first of these signals that is selected or mapped."""
