@@ -67,6 +67,8 @@ BANK_TIME_S = 5.0
 _MAX_ROLL_STEP = 0.5
 #: Minimum share of the grip that braking leaves for lateral forces.
 _LEAST_GRIP = 0.2
+#: Smallest factor on the tyres' forces.
+LEAST_FORCE = 0.1
 #: Below this roll gradient, rad/(m/s²), roll does not indicate load transfer, which then follows the acceleration.
 LEAST_ROLL_GRADIENT = 1e-3
 
@@ -315,7 +317,7 @@ def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ig
                 phi, phi_dot = block[ROLL * WIDTH + j], block[ROLL_RATE * WIDTH + j]
                 angle = over.steer - block[STEER_BIAS * WIDTH + j]
                 slope = GRAVITY_M_S2 * block[BANK * WIDTH + j]
-                force = max(0.1, 1.0 + block[FORCE_SCALE * WIDTH + j])
+                force = max(LEAST_FORCE, 1.0 + block[FORCE_SCALE * WIDTH + j])
                 ax = c.ax - block[AX_BIAS * WIDTH + j]
                 w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * nominal.per_blend))
                 follow = (1.0 - w) * per_kinematic
@@ -410,7 +412,7 @@ def push(points, columns, vx, rate, dt, p):  # type: ignore[no-untyped-def]
     """
     share = dynamic_share(vx, p) * dt
     for j in range(columns):
-        force = share * max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j])
+        force = share * max(LEAST_FORCE, 1.0 + points[FORCE_SCALE * WIDTH + j])
         points[VY * WIDTH + j] += force * rate[0]
         points[YAW_RATE * WIDTH + j] += force * rate[1]
 
@@ -434,9 +436,43 @@ def read_ay(points, columns, steer, friction, rate_vy, layout, p, f, out):  # ty
             ay, turn = front + rear, inertia * (p.front_m * front - p.rear_m * rear)
         else:
             ay, turn = _nominal_accelerations(vx, vy, r, steer, nominal, p)
-        ay = w * (ay + max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j]) * rate_vy) + (1.0 - w) * vx * r
+        ay = w * (ay + max(LEAST_FORCE, 1.0 + points[FORCE_SCALE * WIDTH + j]) * rate_vy) + (1.0 - w) * vx * r
         ay = (1.0 + tilt) * ay + w * turn * p.imu_x_m - r * r * p.imu_y_m + GRAVITY_M_S2 * points[ROLL * WIDTH + j]
         out[j] = ay
+
+
+# positional: as advance.
+@_inline
+def quadratic_ay(x, P, steer, rate_vy, layout, places, p, f, slope, covariance):  # type: ignore[no-untyped-def]
+    """Write the covariance [n] of the accelerometer's reading with the state; return its mean and variance.
+
+    They are those of the sigma points of :func:`read_ay` where all are in the dynamic range of a model with axle
+    forces: it is linear except for r². ``slope`` [WIDTH] is overwritten.
+    """
+    n, turn, curve = x.shape[0], p.mass_kg / p.yaw_inertia_kg_m2 * p.imu_x_m, -p.imu_y_m
+    tilt = 1.0 if layout.roll >= 0 else 1.0 + GRAVITY_M_S2 * f.roll_gradient
+    slope[:] = 0.0
+    slope[FRONT], slope[REAR] = math.cos(steer) * (tilt + turn * p.front_m), tilt - turn * p.rear_m
+    slope[ROLL], slope[FORCE_SCALE] = GRAVITY_M_S2, tilt * rate_vy
+    mean = tilt * rate_vy
+    for i in range(n):
+        mean += slope[places[i]] * x[i]
+    rate, variance = x[YAW_RATE], P[YAW_RATE, YAW_RATE]
+    mean += curve * (rate * rate + variance)
+    slope[YAW_RATE] = 2.0 * curve * rate
+    # The row of r in the root of the covariance: the points have its fourth powers.
+    to_vx = P[YAW_RATE, VX] / math.sqrt(P[VX, VX])
+    vy_to_vx = P[VY, VX] / math.sqrt(P[VX, VX])
+    rest = P[VY, VY] - vy_to_vx * vy_to_vx
+    to_vy = (P[YAW_RATE, VY] - vy_to_vx * to_vx) / math.sqrt(rest)
+    own = variance - to_vx * to_vx - to_vy * to_vy
+    s = curve * curve * (variance * variance + n * (to_vx**4 + to_vy**4 + own * own))
+    for a in range(n):
+        covariance[a] = 0.0
+        for i in range(n):
+            covariance[a] += slope[places[i]] * P[i, a]
+        s += covariance[a] * slope[places[a]]
+    return mean, s
 
 
 @njit(cache=True)
@@ -445,7 +481,7 @@ def settle_forces(x, steer, ax, friction, layout, p, f):  # type: ignore[no-unty
     steer -= x[layout.steer_bias]
     c = _prepare(x[VX], 0.01, steer, ax, friction, p, f)
     v = max(x[VX], p.blend_low_m_s)
-    force = max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
+    force = max(LEAST_FORCE, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
     x[FRONT], x[REAR] = 0.0, 0.0
     for _ in range(3):  # converges fast
         ay = x[FRONT] * c.nominal.cos + x[REAR]
@@ -462,6 +498,6 @@ def planar_ay(x, steer, friction, rate_vy, layout, p):  # type: ignore[no-untype
     w = dynamic_share(x[VX], p)
     if layout.forces < 0:
         return planar_lateral_acceleration(x[VX], x[VY], x[YAW_RATE], steer, friction, p) + w * rate_vy
-    force = max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
+    force = max(LEAST_FORCE, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
     forces = x[FRONT] * math.cos(steer) + x[REAR]
     return w * (forces + force * rate_vy) + (1.0 - w) * x[VX] * x[YAW_RATE]

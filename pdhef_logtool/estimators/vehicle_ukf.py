@@ -38,6 +38,7 @@ from pdhef_logtool.estimators.vehicle_model import (
     FORCE_SCALE_TIME_S,
     FRONT,
     LANES,
+    LEAST_FORCE,
     MOTION,
     NOMINAL,
     PLACES,
@@ -57,6 +58,7 @@ from pdhef_logtool.estimators.vehicle_model import (
     physics_parameters,
     planar_ay,
     push,
+    quadratic_ay,
     read_ay,
     settle_forces,
 )
@@ -119,6 +121,8 @@ DIVERGED_AVERAGE_S = 1.0
 DIVERGED_SIDESLIP_RAD = math.radians(60.0)
 #: If the speed sensor last read more than this, the car does not roll backwards: a v_x below zero is divergence.
 FORWARD_M_S = 0.5
+#: Step of the differences of the prediction over a latency, in the unit of each entry.
+DIFFERENCE = 1e-4
 #: Time of a rejection at its first sample, s; 0 is "the last sample was accepted".
 _JUST_REJECTED_S = 1e-9
 
@@ -333,25 +337,29 @@ def yield_to_kinematics(x, friction, dt, rules, p, f, m):  # type: ignore[no-unt
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
 @_compiled_inside
-def predict(x, P, L, over, rate, dt, early, q, layout, places, p, f, points, rows):  # type: ignore[no-untyped-def]
+def predict(x, P, L, over, rate, dt, early, q, layout, places, p, f, points):  # type: ignore[no-untyped-def]
     """Move state and covariance by ``dt`` s with the residual ``rate`` of v̇_y and ṙ.
 
     The share ``early`` of the residual's increment comes before the model's step (Strang splitting: half of it), the
-    rest behind it. Leaves the root of the former covariance in L, and deviations in place of the moved points. Only the
-    first ``rows`` of the new covariance count.
+    rest behind it. Leaves the root of the former covariance in L, and deviations in place of the moved points.
     """
     m = changing(layout)
-    columns = columns_of(m)
     cholesky(P, L)
-    given = rate[0] != 0.0 or rate[1] != 0.0
-    vx = x[VX]
     draw(x, L, places, m, points)
+    move(points, columns_of(m), over, rate, dt, early, layout, p, f)
+    moments(points, places, m, q, x, P)
+
+
+# positional: to hand structures of arrays on at every step would cost as much as the step.
+@_compiled_inside
+def move(points, columns, over, rate, dt, early, layout, p, f):  # type: ignore[no-untyped-def]
+    """Move the states of a block by the model and the residual, as :func:`predict` describes."""
+    given, vx = rate[0] != 0.0 or rate[1] != 0.0, points[VX * WIDTH]
     if given:
         push(points, columns, vx, rate, early * dt, p)
     advance(points, columns, over, dt, layout, p, f)
     if given:
         push(points, columns, vx, rate, (1.0 - early) * dt, p)
-    moments(points, places, m, q, x, P, rows)
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
@@ -360,13 +368,19 @@ def expect(x, P, L, now, rate_vy, r, layout, places, p, f, points, reading, z_ha
     """Write the expected readings [3], the lower triangle of their covariance with R, and the cross covariance [3, n].
 
     ``r`` [3] are the variances of the sensors. The models of gyro and speed are linear, and so are the sensor biases:
-    the sigma points of a_y are sufficient. Leaves the root of P in L.
+    the sigma points of a_y are sufficient, and where its model is quadratic their moments are known without them.
     """
     m = changing(layout)
-    cholesky(P, L)
-    draw(x, L, places, m, points)
-    read_ay(points, columns_of(m), now.steer, now.friction, rate_vy, layout, p, f, reading)
-    z_hat[Z_AY], S[Z_AY, Z_AY] = reading_moments(reading, L, m, Pxz[Z_AY])
+    root = math.sqrt(x.shape[0])
+    s = layout.force_scale
+    scaled = rate_vy != 0.0 and s >= 0 and 1.0 + x[s] - root * math.sqrt(P[s, s]) < LEAST_FORCE
+    if layout.forces >= 0 and x[VX] - root * math.sqrt(P[VX, VX]) > p.blend_high_m_s and not scaled:
+        z_hat[Z_AY], S[Z_AY, Z_AY] = quadratic_ay(x, P, now.steer, rate_vy, layout, places, p, f, reading, Pxz[Z_AY])
+    else:
+        cholesky(P, L)
+        draw(x, L, places, m, points)
+        read_ay(points, columns_of(m), now.steer, now.friction, rate_vy, layout, p, f, reading)
+        z_hat[Z_AY], S[Z_AY, Z_AY] = reading_moments(reading, L, m, Pxz[Z_AY])
     for i, entry in ((Z_YAW_RATE, YAW_RATE), (Z_SPEED, VX)):
         z_hat[i] = x[entry]
         for a in range(x.shape[0]):
@@ -545,7 +559,7 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
                 factor, f = yield_to_kinematics(x, over.friction, now.dt, rules, p, f, m)
                 q_std[FRONT], q_std[REAR] = factor * front_std, factor * rear_std
             process_noise(q_std, over.ax_known, now.dt, layout, q)
-            predict(x, P, L, over, rate, now.dt, 0.5, q, layout, places, p, f, points, n)
+            predict(x, P, L, over, rate, now.dt, 0.5, q, layout, places, p, f, points)
             if linked:
                 cross_covariance(L, points, places, changing(layout), out_cross[k])
                 out_predicted_P[k] = P
@@ -593,29 +607,49 @@ def _filter(window, tuning, model, belief, out, links):  # type: ignore[no-untyp
 
 @njit(cache=True)
 def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-untyped-def]
-    """Predict the steps that are due with their inputs held; the rows of no step (−1) are left."""
+    """Predict the steps that are due with their inputs held; the rows of no step (−1) are left.
+
+    Over a latency the model is nearly linear: the covariance is J P Jᵀ + Q. J is of differences away from 0, which are
+    mirrored with the state.
+    """
     step, horizon_s = due
     held_x, held_P, inputs, residual_rate, noise = held
     out_x, out_P, out_ay = out
     layout, places, p, f = model
-    n = held_x.shape[1]
-    points, L, q = np.zeros(PLACES * WIDTH), np.zeros((n, n)), np.zeros(n)
-    x, P = np.zeros(n), np.zeros((n, n))
+    n, m = held_x.shape[1], changing(layout)
+    points, x, q = np.zeros(PLACES * WIDTH), np.zeros(n), np.zeros(n)
+    J, JP, away = np.zeros((MOTION, m)), np.zeros(m), np.zeros(m)
     for row in range(step.shape[0]):
-        k = step[row]
-        if k < 0:
+        k, dt = step[row], horizon_s[row]
+        if k < 0 or not is_finite(held_x[k], held_P[k]):
             continue
+        P, over, rate = held_P[k], held_inputs(inputs, k), (residual_rate[k, 0], residual_rate[k, 1])
         x[:] = held_x[k]
-        P[:, :] = held_P[k]
-        over = held_inputs(inputs, k)
-        rate = (residual_rate[k, 0], residual_rate[k, 1])
-        if horizon_s[row] > 0.0:
-            process_noise(q_std, over.ax_known, noise[k] * horizon_s[row], layout, q)
-            predict(x, P, L, over, rate, horizon_s[row], early, q, layout, places, p, f, points, MOTION)
-        if is_finite(x, P):
-            out_x[row] = x
-            out_P[row] = P[:MOTION, :MOTION]
-            out_ay[row] = planar_ay(x, over.steer, over.friction, rate[0], layout, p)
+        out_P[row] = P[:MOTION, :MOTION]
+        if dt > 0.0:
+            process_noise(q_std, over.ax_known, noise[k] * dt, layout, q)
+            for j in range(n):
+                points[places[j] * WIDTH : (places[j] + 1) * WIDTH] = x[j]
+            for j in range(m):
+                away[j] = math.copysign(DIFFERENCE, x[j])
+                points[places[j] * WIDTH + 1 + j] += away[j]
+            move(points, (m + LANES) // LANES * LANES, over, rate, dt, early, layout, p, f)
+            for j in range(n):
+                x[j] = points[places[j] * WIDTH]
+            for a in range(MOTION):
+                for i in range(m):
+                    J[a, i] = (points[a * WIDTH + 1 + i] - x[a]) / away[i]
+                JP[:] = 0.0
+                for i in range(m):
+                    for j in range(m):
+                        JP[j] += J[a, i] * P[i, j]
+                for b in range(a + 1):
+                    s = q[a] if a == b else 0.0
+                    for j in range(m):
+                        s += JP[j] * J[b, j]
+                    out_P[row, a, b] = out_P[row, b, a] = s
+        out_x[row] = x
+        out_ay[row] = planar_ay(x, over.steer, over.friction, rate[0], layout, p)
 
 
 # ------------------------------------------------------------------------------------------------ records
