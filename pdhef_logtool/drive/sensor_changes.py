@@ -201,6 +201,13 @@ def _mean(column: FloatArray, start: int, end: int) -> FloatArray:
     return np.where(finite, (sums[last] - sums[first]) / (end - start), np.nan)
 
 
+def _later(column: FloatArray, count: int) -> FloatArray:
+    """Return rows k + count of a column [n, c] in row k; NaN outside."""
+    moved, n = np.full(column.shape, np.nan), len(column)
+    moved[max(0, -count) : max(0, n - count)] = column[max(0, count) : max(0, n + count)]
+    return moved
+
+
 def _tables(cells: Cells) -> tuple[FloatArray, ...]:
     """Return the tables of kinematics, steering and speed."""
     ay, r, steer, v, gained = (_mean(c, 1 - MEAN_CELLS, 1) for c in (*cells[2:6], np.cumsum(cells.ax) * CELL_S))
@@ -258,17 +265,21 @@ class _Block(NamedTuple):
         return np.asarray(information)
 
 
-def _relation_block(index: int, cells: Cells, tried: Sequence[Cells]) -> _Block:
-    """Return the step of a relation's residual in the windows after each cell, with the fit of the drive before it."""
-    relation = _fitted(_tables(cells)[index])
-    units = [(_tables(other)[index] - relation.table) / TRIED for other in tried]
-    before = _mean(relation.table, -PART_CELLS, 0)
+def _relation_block(index: int, tables: Sequence[FloatArray]) -> _Block:
+    """Return the step of a relation's residual in the windows after each cell, with the fit of the drive before it.
+
+    ``tables`` : of the drive, and with each hypothesis tried.
+    """
+    relation = _fitted(tables[0])
+    units = [(other - relation.table) / TRIED for other in tables[1:]]
+    after, *moved = (_mean(table, 0, PART_CELLS) for table in (relation.table, *units))
+    before = _later(after, -PART_CELLS)
     steps, effects = [], []
     for start in range(MEAN_CELLS, WINDOW_CELLS, PART_CELLS):
-        change = _mean(relation.table, start, start + PART_CELLS) - before
+        change = _later(after, start) - before
         leverage = relation.leverage(change[:, 1:])
         steps.append(relation.residual(change) / leverage)
-        effects.append([relation.residual(_mean(unit, start, start + PART_CELLS)) / leverage for unit in units])
+        effects.append([relation.residual(_later(unit, start)) / leverage for unit in moved])
     least = np.full(len(before), LEAST_STDS[index])
     return _Block(np.stack(steps, axis=1), np.transpose(effects, (2, 1, 0)), least)
 
@@ -315,7 +326,8 @@ def _std_so_far(column: FloatArray) -> FloatArray:
 def _likeliest(signals: Signals, cells: Cells) -> tuple[BoolArray, IntArray, FloatArray, FloatArray, FloatArray]:
     """Return whether the likeliest change behind each cell is named, its hypothesis, evidence, size and 1-sigma."""
     tried = [cells.changed(FIELDS[name], kind, TRIED) for name, kind in HYPOTHESES]
-    blocks = [_relation_block(i, cells, tried) for i in range(len(LEAST_STDS))]
+    tables = zip(*map(_tables, (cells, *tried)), strict=True)
+    blocks = [_relation_block(i, of_relation) for i, of_relation in enumerate(tables)]
     blocks += [_sample_block(name, signals, cells, tried) for name in FIELDS]
     k, h = np.arange(len(cells.speed)), len(HYPOTHESES)
     match, power, total = np.zeros((2, len(k), h)), np.zeros((2, len(k), h)), np.zeros((2, len(k)))

@@ -244,7 +244,7 @@ class GateResult(NamedTuple):
 # ------------------------------------------------------------------------------------------------ one step
 
 
-@_compiled_inside
+@_inline
 def begin_step(k, window, rules, needs_steer, memory):  # type: ignore[no-untyped-def]
     """Reset after a time gap and zero-order-hold missing inputs. Return the inputs of step k."""
     dt, steers = window.dt_s[k], math.isfinite(window.steer[k])
@@ -346,12 +346,12 @@ def predict(x, P, L, over, rate, dt, early, q, layout, places, p, f, points):  #
     m = changing(layout)
     cholesky(P, L)
     draw(x, L, places, m, points)
-    move(points, columns_of(m), over, rate, dt, early, layout, p, f)
+    move(points, columns_of(2 * m), over, rate, dt, early, layout, p, f)
     moments(points, places, m, q, x, P)
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
-@_compiled_inside
+@_inline
 def move(points, columns, over, rate, dt, early, layout, p, f):  # type: ignore[no-untyped-def]
     """Move the states of a block by the model and the residual, as :func:`predict` describes."""
     given, vx = rate[0] != 0.0 or rate[1] != 0.0, points[VX * WIDTH]
@@ -363,7 +363,7 @@ def move(points, columns, over, rate, dt, early, layout, p, f):  # type: ignore[
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
-@_compiled_inside
+@_inline
 def expect(x, P, L, now, rate_vy, r, layout, places, p, f, points, reading, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
     """Write the expected readings [3], the lower triangle of their covariance with R, and the cross covariance [3, n].
 
@@ -371,15 +371,14 @@ def expect(x, P, L, now, rate_vy, r, layout, places, p, f, points, reading, z_ha
     the sigma points of a_y are sufficient, and where its model is quadratic their moments are known without them.
     """
     m = changing(layout)
-    root = math.sqrt(x.shape[0])
-    s = layout.force_scale
-    scaled = rate_vy != 0.0 and s >= 0 and 1.0 + x[s] - root * math.sqrt(P[s, s]) < LEAST_FORCE
-    if layout.forces >= 0 and x[VX] - root * math.sqrt(P[VX, VX]) > p.blend_high_m_s and not scaled:
+    s, n = layout.force_scale, x.shape[0]
+    least = 1.0 + x[s] - math.sqrt(n * P[s, s]) if s >= 0 else 1.0
+    if layout.forces >= 0 and least > LEAST_FORCE and x[VX] - math.sqrt(n * P[VX, VX]) > p.blend_high_m_s:
         z_hat[Z_AY], S[Z_AY, Z_AY] = quadratic_ay(x, P, now.steer, rate_vy, layout, places, p, f, reading, Pxz[Z_AY])
     else:
         cholesky(P, L)
         draw(x, L, places, m, points)
-        read_ay(points, columns_of(m), now.steer, now.friction, rate_vy, layout, p, f, reading)
+        read_ay(points, columns_of(2 * m), now.steer, now.friction, rate_vy, layout, p, f, reading)
         z_hat[Z_AY], S[Z_AY, Z_AY] = reading_moments(reading, L, m, Pxz[Z_AY])
     for i, entry in ((Z_YAW_RATE, YAW_RATE), (Z_SPEED, VX)):
         z_hat[i] = x[entry]
@@ -414,9 +413,9 @@ def changing(layout):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def columns_of(m):  # type: ignore[no-untyped-def]
-    """Return the columns of a block for the sigma points of m entries: whole vectors; the rest are at the centre."""
-    return (2 * m + LANES) // LANES * LANES
+def columns_of(points):  # type: ignore[no-untyped-def]
+    """Return the columns of a block for the centre and other points: whole vectors; the rest are at the centre."""
+    return (points + LANES) // LANES * LANES
 
 
 @_inline
@@ -427,7 +426,7 @@ def innovate(now, z_hat, nu):  # type: ignore[no-untyped-def]
     nu[Z_SPEED] = now.speed - z_hat[Z_SPEED]
 
 
-@_compiled_inside
+@_inline
 def gate(now, m, nu, S, at_gate, given, use):  # type: ignore[no-untyped-def]
     """Decide which samples are used; those that are out of the gate for too long open it (docs/method.md#gate).
 
@@ -455,7 +454,7 @@ def gate(now, m, nu, S, at_gate, given, use):  # type: ignore[no-untyped-def]
     return GateResult(opens, outside, seen, squares)
 
 
-@_compiled_inside
+@_inline
 def settle(now, gated, rules, standstill_std, x, P, m):  # type: ignore[no-untyped-def]
     """Average the normalised squared innovations, and contain the motion at rest; return whether the car is at rest."""
     if gated.seen > 0:
@@ -617,8 +616,7 @@ def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-un
     out_x, out_P, out_ay = out
     layout, places, p, f = model
     n, m = held_x.shape[1], changing(layout)
-    points, x, q = np.zeros(PLACES * WIDTH), np.zeros(n), np.zeros(n)
-    J, JP, away = np.zeros((MOTION, m)), np.zeros(m), np.zeros(m)
+    points, x, q, J, JP = np.zeros(PLACES * WIDTH), np.zeros(n), np.zeros(n), np.zeros((MOTION, m)), np.zeros(m)
     for row in range(step.shape[0]):
         k, dt = step[row], horizon_s[row]
         if k < 0 or not is_finite(held_x[k], held_P[k]):
@@ -630,17 +628,13 @@ def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-un
             process_noise(q_std, over.ax_known, noise[k] * dt, layout, q)
             for j in range(n):
                 points[places[j] * WIDTH : (places[j] + 1) * WIDTH] = x[j]
-            for j in range(m):
-                away[j] = math.copysign(DIFFERENCE, x[j])
-                points[places[j] * WIDTH + 1 + j] += away[j]
-            move(points, (m + LANES) // LANES * LANES, over, rate, dt, early, layout, p, f)
-            for j in range(n):
-                x[j] = points[places[j] * WIDTH]
+                if j < m:
+                    points[places[j] * WIDTH + 1 + j] += math.copysign(DIFFERENCE, x[j])
+            move(points, columns_of(m), over, rate, dt, early, layout, p, f)
             for a in range(MOTION):
-                for i in range(m):
-                    J[a, i] = (points[a * WIDTH + 1 + i] - x[a]) / away[i]
                 JP[:] = 0.0
                 for i in range(m):
+                    J[a, i] = (points[a * WIDTH + 1 + i] - points[a * WIDTH]) / math.copysign(DIFFERENCE, x[i])
                     for j in range(m):
                         JP[j] += J[a, i] * P[i, j]
                 for b in range(a + 1):
@@ -648,6 +642,8 @@ def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-un
                     for j in range(m):
                         s += JP[j] * J[b, j]
                     out_P[row, a, b] = out_P[row, b, a] = s
+            for j in range(n):
+                x[j] = points[places[j] * WIDTH]
         out_x[row] = x
         out_ay[row] = planar_ay(x, over.steer, over.friction, rate[0], layout, p)
 
