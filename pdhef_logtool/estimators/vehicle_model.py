@@ -67,8 +67,6 @@ BANK_TIME_S = 5.0
 _MAX_ROLL_STEP = 0.5
 #: Minimum share of the grip that braking leaves for lateral forces.
 _LEAST_GRIP = 0.2
-#: Smallest factor on the tyres' forces.
-LEAST_FORCE = 0.1
 #: Below this roll gradient, rad/(m/s²), roll does not indicate load transfer, which then follows the acceleration.
 LEAST_ROLL_GRADIENT = 1e-3
 
@@ -293,7 +291,7 @@ def advance(points, columns, over, dt, layout, p, f):  # type: ignore[no-untyped
 
 
 # positional: as advance.
-@_inline
+@_compiled_inside
 def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ignore[no-untyped-def]
     """Advance states of the model with axle forces in ``n`` steps."""
     h = dt / n
@@ -317,7 +315,7 @@ def _advance_forces(points, columns, vx, over, dt, n, layout, p, f):  # type: ig
                 phi, phi_dot = block[ROLL * WIDTH + j], block[ROLL_RATE * WIDTH + j]
                 angle = over.steer - block[STEER_BIAS * WIDTH + j]
                 slope = GRAVITY_M_S2 * block[BANK * WIDTH + j]
-                force = max(LEAST_FORCE, 1.0 + block[FORCE_SCALE * WIDTH + j])
+                force = max(0.1, 1.0 + block[FORCE_SCALE * WIDTH + j])
                 ax = c.ax - block[AX_BIAS * WIDTH + j]
                 w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * nominal.per_blend))
                 follow = (1.0 - w) * per_kinematic
@@ -412,7 +410,7 @@ def push(points, columns, vx, rate, dt, p):  # type: ignore[no-untyped-def]
     """
     share = dynamic_share(vx, p) * dt
     for j in range(columns):
-        force = share * max(LEAST_FORCE, 1.0 + points[FORCE_SCALE * WIDTH + j])
+        force = share * max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j])
         points[VY * WIDTH + j] += force * rate[0]
         points[YAW_RATE * WIDTH + j] += force * rate[1]
 
@@ -436,7 +434,7 @@ def read_ay(points, columns, steer, friction, rate_vy, layout, p, f, out):  # ty
             ay, turn = front + rear, inertia * (p.front_m * front - p.rear_m * rear)
         else:
             ay, turn = _nominal_accelerations(vx, vy, r, steer, nominal, p)
-        ay = w * (ay + max(LEAST_FORCE, 1.0 + points[FORCE_SCALE * WIDTH + j]) * rate_vy) + (1.0 - w) * vx * r
+        ay = w * (ay + max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j]) * rate_vy) + (1.0 - w) * vx * r
         ay = (1.0 + tilt) * ay + w * turn * p.imu_x_m - r * r * p.imu_y_m + GRAVITY_M_S2 * points[ROLL * WIDTH + j]
         out[j] = ay
 
@@ -456,11 +454,11 @@ def quadratic_ay(x, P, steer, rate_vy, layout, places, p, f, slope, covariance):
     slope[ROLL], slope[FORCE_SCALE] = GRAVITY_M_S2, tilt * rate_vy
     rate, variance = x[YAW_RATE], P[YAW_RATE, YAW_RATE]
     slope[YAW_RATE] = 2.0 * curve * rate
-    # The squares of the row of r in the root of the covariance, of which the points have the squares.
+    # The points have the fourth powers of the row of r in the root of the covariance, here its squares.
     of_vx = P[YAW_RATE, VX] ** 2 / P[VX, VX]
     of_vy = (P[YAW_RATE, VY] - P[VY, VX] * P[YAW_RATE, VX] / P[VX, VX]) ** 2 / (P[VY, VY] - P[VY, VX] ** 2 / P[VX, VX])
-    own = variance - of_vx - of_vy
-    s = curve * curve * (variance * variance + n * (of_vx * of_vx + of_vy * of_vy + own * own))
+    of_rate = variance - of_vx - of_vy
+    s = curve * curve * (variance * variance + n * (of_vx * of_vx + of_vy * of_vy + of_rate * of_rate))
     mean = tilt * rate_vy + curve * (variance - rate * rate)
     for a in range(n):
         covariance[a] = 0.0
@@ -477,7 +475,7 @@ def settle_forces(x, steer, ax, friction, layout, p, f):  # type: ignore[no-unty
     steer -= x[layout.steer_bias]
     c = _prepare(x[VX], 0.01, steer, ax, friction, p, f)
     v = max(x[VX], p.blend_low_m_s)
-    force = max(LEAST_FORCE, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
+    force = max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
     x[FRONT], x[REAR] = 0.0, 0.0
     for _ in range(3):  # converges fast
         ay = x[FRONT] * c.nominal.cos + x[REAR]
@@ -494,6 +492,6 @@ def planar_ay(x, steer, friction, rate_vy, layout, p):  # type: ignore[no-untype
     w = dynamic_share(x[VX], p)
     if layout.forces < 0:
         return planar_lateral_acceleration(x[VX], x[VY], x[YAW_RATE], steer, friction, p) + w * rate_vy
-    force = max(LEAST_FORCE, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
+    force = max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
     forces = x[FRONT] * math.cos(steer) + x[REAR]
     return w * (forces + force * rate_vy) + (1.0 - w) * x[VX] * x[YAW_RATE]

@@ -38,7 +38,6 @@ from pdhef_logtool.estimators.vehicle_model import (
     FORCE_SCALE_TIME_S,
     FRONT,
     LANES,
-    LEAST_FORCE,
     MOTION,
     NOMINAL,
     PLACES,
@@ -121,8 +120,6 @@ DIVERGED_AVERAGE_S = 1.0
 DIVERGED_SIDESLIP_RAD = math.radians(60.0)
 #: If the speed sensor last read more than this, the car does not roll backwards: a v_x below zero is divergence.
 FORWARD_M_S = 0.5
-#: Step of the differences of the prediction over a latency, in the unit of each entry.
-DIFFERENCE = 1e-4
 #: Time of a rejection at its first sample, s; 0 is "the last sample was accepted".
 _JUST_REJECTED_S = 1e-9
 
@@ -373,7 +370,7 @@ def expect(x, P, L, now, rate_vy, r, layout, places, p, f, points, reading, z_ha
     m = changing(layout)
     s, n = layout.force_scale, x.shape[0]
     least = 1.0 + x[s] - math.sqrt(n * P[s, s]) if s >= 0 else 1.0
-    if layout.forces >= 0 and least > LEAST_FORCE and x[VX] - math.sqrt(n * P[VX, VX]) > p.blend_high_m_s:
+    if layout.forces >= 0 and least > 0.1 and x[VX] - math.sqrt(n * P[VX, VX]) > p.blend_high_m_s:
         z_hat[Z_AY], S[Z_AY, Z_AY] = quadratic_ay(x, P, now.steer, rate_vy, layout, places, p, f, reading, Pxz[Z_AY])
     else:
         cholesky(P, L)
@@ -615,7 +612,7 @@ def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-un
     held_x, held_P, inputs, residual_rate, noise = held
     out_x, out_P, out_ay = out
     layout, places, p, f = model
-    n, m = held_x.shape[1], changing(layout)
+    n, m, away = held_x.shape[1], changing(layout), 1e-4  # in the unit of each entry
     points, x, q, J, JP = np.zeros(PLACES * WIDTH), np.zeros(n), np.zeros(n), np.zeros((MOTION, m)), np.zeros(m)
     for row in range(step.shape[0]):
         k, dt = step[row], horizon_s[row]
@@ -629,12 +626,12 @@ def _predict_outputs(due, held, q_std, early, model, out):  # type: ignore[no-un
             for j in range(n):
                 points[places[j] * WIDTH : (places[j] + 1) * WIDTH] = x[j]
                 if j < m:
-                    points[places[j] * WIDTH + 1 + j] += math.copysign(DIFFERENCE, x[j])
+                    points[places[j] * WIDTH + 1 + j] += math.copysign(away, x[j])
             move(points, columns_of(m), over, rate, dt, early, layout, p, f)
             for a in range(MOTION):
                 JP[:] = 0.0
                 for i in range(m):
-                    J[a, i] = (points[a * WIDTH + 1 + i] - points[a * WIDTH]) / math.copysign(DIFFERENCE, x[i])
+                    J[a, i] = (points[a * WIDTH + 1 + i] - points[a * WIDTH]) / math.copysign(away, x[i])
                     for j in range(m):
                         JP[j] += J[a, i] * P[i, j]
                 for b in range(a + 1):
