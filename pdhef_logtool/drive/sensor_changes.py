@@ -192,13 +192,19 @@ def cells_of(signals: Signals) -> Cells:
 
 def _mean(column: FloatArray, start: int, end: int) -> FloatArray:
     """Return the mean over cells k + start to k + end of a column [n] or [n, c]; NaN where a cell is not finite."""
-    n = len(column)
-    sums = np.concatenate([np.zeros_like(column[:1]), np.cumsum(np.nan_to_num(column), axis=0)])
-    gaps = np.concatenate([np.zeros_like(column[:1]), np.cumsum(~np.isfinite(column), axis=0)])
-    k = np.arange(n)
-    first, last = np.clip(k + start, 0, n), np.clip(k + end, 0, n)
-    finite = ((k + start >= 0) & (k + end <= n)).reshape((-1, *[1] * (column.ndim - 1))) & (gaps[first] == gaps[last])
-    return np.where(finite, (sums[last] - sums[first]) / (end - start), np.nan)
+    count, finite = end - start, np.isfinite(column)
+    parts = (np.cumsum(part, axis=0) for part in (np.where(finite, column, 0.0), ~finite))
+    sums, gaps = (np.concatenate([np.zeros_like(column[:1]), part]) for part in parts)
+    means = np.where(gaps[count:] == gaps[:-count], (sums[count:] - sums[:-count]) / count, np.nan)
+    return _later(means, start, len(column))
+
+
+def _later(column: FloatArray, count: int, n: int) -> FloatArray:
+    """Return rows k + count of a column in row k of n; NaN outside."""
+    moved = np.full((n, *column.shape[1:]), np.nan)
+    first, end = max(0, -count), max(0, -count, min(n, len(column) - count))
+    moved[first:end] = column[first + count : end + count]
+    return moved
 
 
 def _tables(cells: Cells) -> tuple[FloatArray, ...]:
@@ -258,19 +264,21 @@ class _Block(NamedTuple):
         return np.asarray(information)
 
 
-def _relation_block(index: int, cells: Cells, tried: Sequence[Cells]) -> _Block:
-    """Return the step of a relation's residual in the windows after each cell, with the fit of the drive before it."""
-    relation = _fitted(_tables(cells)[index])
-    units = [(_tables(other)[index] - relation.table) / TRIED for other in tried]
-    before = _mean(relation.table, -PART_CELLS, 0)
-    steps, effects = [], []
+def _relation_block(index: int, tables: Sequence[FloatArray]) -> _Block:
+    """Return the step of a relation's residual in the windows after each cell, with the fit of the drive before it.
+
+    ``tables`` : of the drive, and with each hypothesis tried.
+    """
+    relation = _fitted(tables[0])
+    units = [(other - relation.table) / TRIED for other in tables[1:]]
+    after, *moved = (_mean(table, 0, PART_CELLS) for table in (relation.table, *units))
+    before, n, steps, effects = _later(after, -PART_CELLS, len(after)), len(after), [], []
     for start in range(MEAN_CELLS, WINDOW_CELLS, PART_CELLS):
-        change = _mean(relation.table, start, start + PART_CELLS) - before
+        change = _later(after, start, n) - before
         leverage = relation.leverage(change[:, 1:])
         steps.append(relation.residual(change) / leverage)
-        effects.append([relation.residual(_mean(unit, start, start + PART_CELLS)) / leverage for unit in units])
-    least = np.full(len(before), LEAST_STDS[index])
-    return _Block(np.stack(steps, axis=1), np.transpose(effects, (2, 1, 0)), least)
+        effects.append([relation.residual(_later(unit, start, n)) / leverage for unit in moved])
+    return _Block(np.stack(steps, axis=1), np.transpose(effects, (2, 1, 0)), np.full(n, LEAST_STDS[index]))
 
 
 def _sample_block(name: str, signals: Signals, cells: Cells, tried: Sequence[Cells]) -> _Block:
@@ -315,7 +323,7 @@ def _std_so_far(column: FloatArray) -> FloatArray:
 def _likeliest(signals: Signals, cells: Cells) -> tuple[BoolArray, IntArray, FloatArray, FloatArray, FloatArray]:
     """Return whether the likeliest change behind each cell is named, its hypothesis, evidence, size and 1-sigma."""
     tried = [cells.changed(FIELDS[name], kind, TRIED) for name, kind in HYPOTHESES]
-    blocks = [_relation_block(i, cells, tried) for i in range(len(LEAST_STDS))]
+    blocks = [_relation_block(i, t) for i, t in enumerate(zip(*map(_tables, (cells, *tried)), strict=True))]
     blocks += [_sample_block(name, signals, cells, tried) for name in FIELDS]
     k, h = np.arange(len(cells.speed)), len(HYPOTHESES)
     match, power, total = np.zeros((2, len(k), h)), np.zeros((2, len(k), h)), np.zeros((2, len(k)))

@@ -145,7 +145,7 @@ def _filter(window, tuning, r0, constants, model, parallel, belief, out, adapted
             over, rate = ukf.held_over_step(now, m), (a.trust * m.rate_vy, a.trust * m.rate_r)
             noise_dt = (1.0 + process_noise_gain * a.trust) * dt  # Eq 26
             ukf.process_noise(tuning.q_std, over.ax_known, noise_dt, layout, q)
-            ukf.predict(x, P, L, over, rate, dt, 0.0, q, layout, places, p, f, points, n)  # Eq 19
+            ukf.predict(x, P, L, over, rate, dt, 0.0, q, layout, places, p, f, points)  # Eq 19
             alive = ukf.is_finite(x, P)
             out_prior[k] = x
             if alive:

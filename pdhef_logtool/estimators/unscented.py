@@ -144,15 +144,15 @@ def _covariance(L, a, row, m):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def moments(points, places, m, q, x, P, rows):  # type: ignore[no-untyped-def]
+def moments(points, places, m, q, x, P):  # type: ignore[no-untyped-def]
     """Write mean [n] and covariance [n, n] of sigma points, with ``q`` [n] added to the variances.
 
-    The points are replaced by their deviations. Only the first ``rows`` of the covariance count.
+    The points are replaced by their deviations.
     """
     n = x.shape[0]
     for j in range(n):
         x[j] = _deviate(_row(points, places, j), m, n)
-    for a in range(rows):
+    for a in range(n):
         end = min(a + 1, m)
         for b in range(0, end, 4):
             sums = _products(points, places, a, b)
