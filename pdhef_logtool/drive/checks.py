@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
 
@@ -29,10 +29,9 @@ from pdhef_logtool.drive.columns import (
     moving_at,
 )
 from pdhef_logtool.drive.delays import LateSensor
-from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.frames import IS_GRAVITY_M_S2
 from pdhef_logtool.drive.measured import Measured, measure
-from pdhef_logtool.drive.relation_checks import explained_factors, relation_checks
+from pdhef_logtool.drive.relation_checks import relation_checks
 from pdhef_logtool.drive.relations import CG_VY, GAIN_RANGE, SAME_RANGE, gentle_at, position_factors
 from pdhef_logtool.drive.sensor_changes import SensorChange
 from pdhef_logtool.drive.truth import LatencyEstimate, TruthTrack
@@ -44,8 +43,6 @@ CHANGE_SUFFIX = ".change"
 #: If a check of one of these aspects fails, the channel is not the signal that it is mapped to.
 _MISREAD = frozenset({"sign", "unit", "scale", "axis", "mounting"})
 _BADNESS = {"passed": 0, "undecided": 1, "failed": 2}
-#: Share of the drive's motion during silent samples of a sensor from which its check fails.
-FAULTY_SHARE = 0.5
 #: Half of g in the mean of an accelerometer means another axis.
 OTHER_AXIS_M_S2 = 5.0
 #: Least number of independent samples of gentle driving, so that a mean is not due to a manoeuvre: 10 s.
@@ -452,8 +449,6 @@ def check_drive(
 ) -> tuple[Check, ...]:
     """Return the checks of mapped signals, of ground truth and of the vehicle file.
 
-    If a check fails, the checks are repeated without faulty samples.
-
     Parameters
     ----------
     signals, truth : by name, SI, as mapped. derived : ground truth at the CG.
@@ -462,34 +457,10 @@ def check_drive(
     mounting_is_known : the mounting of the IMU is confirmed.
     measured : result of :func:`~pdhef_logtool.drive.measured.measure` for the channels; computed by default.
     """
-
-    def checks_of(measured: Measured) -> tuple[Check, ...]:
-        related = relation_checks(measured, mounting_is_known=mounting_is_known)
-        file, has_file = vehicle or default_vehicle(), vehicle not in (None, default_vehicle())
-        return _all_checks(CheckedDrive(measured, file, has_file, latency, late, derived is not None, related))
-
-    whole = measure(signals, truth, derived, vehicle) if measured is None else measured
-    checks = checks_of(whole)
-    if all(check.verdict != "failed" for check in checks):
-        return checks
-    sound, shares = without_faulty_samples(signals, vehicle or default_vehicle())
-    # The fault detector cannot distinguish a dead channel from a channel in another unit; the whole drive can.
-    if not shares or not shares.keys() - explained_factors(whole, mounting_is_known=mounting_is_known).keys():
-        return checks
-    faults = [result("SIGNAL.fault", "failed", n, share=s) for n, s in shares.items() if s > FAULTY_SHARE]
-    again = replace(measure(sound, truth, derived, vehicle), scales=whole.scales, open_signs=whole.open_signs)
-    # A check of a faulty sensor that passes only without the faulty samples is undecided.
-    doubted = {c.name: c.remedy for c in checks if c.verdict == "failed" and c.subject in shares}
-
-    def without_doubt(check: Check) -> Check:
-        if check.verdict != "passed" or check.name not in doubted:
-            return check
-        return replace(check, verdict="undecided", remedy=TEXTS["faulty"].format(remedy=doubted[check.name]))
-
-    return (*faults, *map(without_doubt, checks_of(again)))
-
-
-def _all_checks(drive: CheckedDrive) -> tuple[Check, ...]:
+    measured = measure(signals, truth, derived, vehicle) if measured is None else measured
+    related = relation_checks(measured, mounting_is_known=mounting_is_known)
+    file, has_file = vehicle or default_vehicle(), vehicle not in (None, default_vehicle())
+    drive = CheckedDrive(measured, file, has_file, latency, late, derived is not None, related)
     unique: dict[str, Check] = {}
     for check in (check for function in FUNCTIONS for check in function(drive)):
         if check.name not in unique or _BADNESS[check.verdict] > _BADNESS[unique[check.name].verdict]:

@@ -8,7 +8,7 @@ the sensor's axes to these; its correlation, gain and error decide whether the m
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -22,20 +22,14 @@ from pdhef_logtool.drive.check_table import result
 from pdhef_logtool.drive.checks import check_drive, misread_channels
 from pdhef_logtool.drive.columns import derivative, halves, independent_samples, moving_at
 from pdhef_logtool.drive.delays import LateSensor, late_sensors
-from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.frames import (
     IS_GRAVITY_M_S2,
     angle_deg,
-    frames_alone,
-    frames_check,
-    gravity_agrees,
     nearest_step,
-    placed_rotation,
     rotation_text,
     upright_check,
 )
 from pdhef_logtool.drive.measured import Measured, measure
-from pdhef_logtool.drive.other_fields import with_other_fields
 from pdhef_logtool.drive.relation_checks import CERTAIN, explained_factors
 from pdhef_logtool.drive.relations import BIAS_RAD_S, compare, gentle_at, steering_references, yaw_references
 from pdhef_logtool.drive.truth import (
@@ -49,8 +43,7 @@ from pdhef_logtool.drive.truth import (
     plan_truth,
 )
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, auto_map, fit_clocks, read_signals
-from pdhef_logtool.mapping.frames import placement_of
+from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
 from pdhef_logtool.mapping.mapping_file import entries_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check
@@ -340,7 +333,7 @@ class Survey:
     """The first minutes of a log as its mapping reads them, with the IMU rotated to the car's axes if that is certain.
 
     ``vehicle``: from the vehicle file, or the default car. ``corrected``: checks for the changes of a recognised
-    mapping. ``reread``: completes the checks of a mapping file.
+    mapping.
     """
 
     mapping: Mapping
@@ -352,18 +345,16 @@ class Survey:
     latency: LatencyEstimate | None
     triads: tuple[Triad | None, Triad | None] = (None, None)
     mounting: Mounting | None = None
-    framed: Check | None = None
     force: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
     corrected: tuple[Check, ...] = ()
-    reread: Callable[[tuple[Check, ...]], tuple[Check, ...]] | None = None
 
     @property
     def mounted(self) -> tuple[Check, ...]:
-        """Checks of the axes that the IMU's signals are read from, by the drive and by recorded frames."""
+        """Checks of the axes that the IMU's signals are read from."""
         by_drive = [] if self.mounting is None else mounting_checks(self.mapping, self.mounting, self.triads)
         is_open = self.mapping.origin == "auto" and not (self.mounting is not None and self.mounting.confident)
         upright = upright_check(_named_rows(self.mapping, *self.triads), self.force) if is_open else None
-        return tuple(c for c in (*by_drive, self.framed, upright) if c is not None)
+        return (*by_drive, *([] if upright is None else [upright]))
 
     @property
     def is_mounted(self) -> bool:
@@ -374,8 +365,7 @@ class Survey:
     def checks(self) -> tuple[Check, ...]:
         """Checks of the mounting and of :func:`~pdhef_logtool.drive.checks.check_drive`."""
         drive_checks = self._drive_checks(self.channels.truth, self.truth, self.latency, self.measured)
-        checks = (*self.mounted, *self.corrected, *self._of_names(drive_checks), *drive_checks)
-        return checks if self.reread is None else self.reread(checks)
+        return (*self.mounted, *self.corrected, *self._of_names(drive_checks), *drive_checks)
 
     @cached_property
     def sensor_checks(self) -> tuple[Check, ...]:
@@ -416,9 +406,8 @@ class Survey:
 
     @cached_property
     def late(self) -> tuple[LateSensor, ...]:
-        """Sensors with late time stamps, from the signals alone. Sensors with a temporary fault are excluded."""
-        sensors = late_sensors(self.channels.signals)
-        return sensors and late_sensors(without_faulty_samples(self.channels.signals, self.vehicle)[0])
+        """Sensors with late time stamps, from the signals alone."""
+        return late_sensors(self.channels.signals)
 
     def _of_names(self, drive_checks: tuple[Check, ...]) -> Iterator[Check]:
         """Yield the mapping's undecided checks that the drive does not decide either."""
@@ -470,70 +459,28 @@ def survey_log(
     if not blind and truth is not None:
         mounting = find_mounting(measured, triads, mapping)
     force = _mean_force(channels)
-    framed, by_frames = _by_frames(log, mapping, force, triads, mounting)
-    mounting = by_frames or mounting
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
     measured = measured.without(extra)
-    trusted = blind or by_frames is not None
     corrected: list[Check] = []
-    if mounting is not None and mapping.origin == "auto" and trusted and not mounting.is_as_named:
+    if mounting is not None and mapping.origin == "auto" and blind and not mounting.is_as_named:
         note = f"{mounting.text}, and is read so: {mounting.evidence}"
         signals = turned_signals(mapping, mounting, triads)
-        if by_frames is None:  # a mounting that the log records is not a correction
-            corrected = [_corrected(n, signals[n], note) for n in MOUNTED if signals.get(n) != mapping.signals.get(n)]
+        corrected = [_corrected(n, signals[n], note) for n in MOUNTED if signals.get(n) != mapping.signals.get(n)]
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
         channels = read_signals(log, mapping, clocks, *span_ns)
         mounting = replace(mounting, named=mounting.rows)
         measured = measure(channels.signals, channels.truth, truth, vehicle, mapping)
     latency = truth_latency(channels, truth)
     survey = Survey(
-        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, framed, force,
-        tuple(corrected),
-    )  # fmt: skip
-    if not rescale:
-        return survey
-    if mapping.origin == "auto":
-        return _decided(survey, log, clocks, span_ns)
-
-    def survey_of(other: Mapping, *, rescale: bool) -> Survey:
-        return survey_log(log, other, fit_clocks(log, other, *span_ns), span_ns, vehicle, rescale=rescale)
-
-    def checks_of(other: Mapping) -> tuple[Check, ...]:
-        return survey_of(other, rescale=False).checks
-
-    def recognise() -> Mapping:
-        return survey_of(auto_map(log).mapping, rescale=True).mapping
-
-    return replace(survey, reread=lambda checks: with_other_fields(checks, mapping, checks_of, recognise))
+        mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, mounting, force, tuple(corrected)
+    )
+    return _decided(survey, log, clocks, span_ns) if rescale and mapping.origin == "auto" else survey
 
 
 def _mean_force(channels: MappedChannels) -> FloatArray:
     """Return the mean acceleration [3] in the sensor's axes; NaN without a component."""
     components = [channels.signals.get(n) for n in ACCELERATIONS]
     return np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
-
-
-def _by_frames(
-    log: DriveLog,
-    mapping: Mapping,
-    force: FloatArray,
-    triads: tuple[Triad | None, Triad | None],
-    by_drive: Mounting | None,
-) -> tuple[Check | None, Mounting | None]:
-    """Return the check of recorded frames, and the mounting if only the frames provide it."""
-    accelerations, rates = triads
-    placed = None if accelerations is None else placement_of(log, accelerations.source.topic)
-    if placed is None or accelerations is None or rates is None:
-        return None, None
-    sure = by_drive if by_drive is not None and by_drive.confident else None
-    shown, evidence = (None, "") if sure is None else (sure.rotation, sure.evidence)
-    check = frames_check(placed, shown, evidence, force)
-    believed = "" if sure is not None else gravity_agrees(placed, force)
-    if not believed:
-        return check, None
-    rotation, named = placed_rotation(placed), _named_rows(mapping, accelerations, rates)
-    alone = Mounting(rotation, named, f"{believed}; the drive does not show the rest", confident=False)
-    return check if alone.is_as_named else frames_alone(placed, believed), alone
 
 
 def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_ns: tuple[int, int]) -> Survey:
@@ -549,9 +496,6 @@ def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_
     if not turned:
         measured = replace(measured, open_signs=()).without_truth()
         factors = explained_factors(measured, mounting_is_known=is_mounted, most=1)
-        sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle) if factors else ({}, {})
-        if shares:
-            factors = explained_factors(measure(sound, vehicle=survey.vehicle), mounting_is_known=is_mounted, most=1)
     sections, notes = {"truth.": dict(mapping.truth), "": dict(mapping.signals)}, list(mapping.notes)
     checks = list(survey.corrected)
     for name, (factor, evidence) in factors.items():
@@ -567,7 +511,7 @@ def _decided(survey: Survey, log: DriveLog, clocks: dict[str, ClockModel], span_
     again = survey_log(log, scaled, clocks, span_ns, survey.vehicle, rescale=bool(turned))
     # A failing sensor resembles a wrong unit of another one, but only a right correction leaves no contradiction.
     failed = [check.name for check in again.checks if check.verdict == "failed"]
-    is_bad = not turned and any(n.endswith((".sign", ".unit", ".axis", ".fault")) for n in failed)
+    is_bad = not turned and any(n.endswith((".sign", ".unit", ".axis")) for n in failed)
     return survey if is_bad else replace(again, corrected=(*checks, *again.corrected))
 
 

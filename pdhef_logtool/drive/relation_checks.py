@@ -19,8 +19,6 @@ from pdhef_logtool.records.signals import GNSS
 #: Probability of a mistake at which a check fails, below which it passes, and at which the mistake is corrected; least
 #: share of a mistake in all mistakes of a signal to be named.
 FAILS, DOUBTED, CERTAIN, NAMED = 0.85, 0.005, 0.97, 0.05
-#: Beginnings of the remedies of certain or suspected mistakes.
-SUSPICIONS = tuple(TEXTS[n].partition("{")[0].partition(":")[0] for n in ("perhaps", "several", "unexplained"))
 _JUDGED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "yaw_rad", "sideslip_rad", "ay_m_s2", "y_m")
 _JUDGED_TRUTH = {f"truth.{name}" for name in _JUDGED}
 SIGN, UNIT = "SIGNAL.sign", "SIGNAL.unit"

@@ -52,8 +52,6 @@ SIDESLIP_RANGE = (0.5, 2.0)
 COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
 #: Above this, sideslip times lateral acceleration is not small compared to the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
-#: Least share of v_x in the speed if the heading is right.
-AHEAD_SHARE = 0.9
 #: No car reverses faster for long: the sign of a faster speed is known, but not its unit.
 REVERSE_M_S = 10.0
 #: In a bend, wheels differ by less; a wheel that differs by more spins or locks.
@@ -117,7 +115,6 @@ def measured_relations(
         relations += _speeds(columns, speed_name, speed)
         relations += _wheel_differences(columns, speed_name, speed)
         relations += _courses(of_path, speed)
-    relations += _poses(of_path)
     rate = ("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S, BIAS_RAD_S)
     lateral = ("truth.ay_m_s2", "ay_m_s2", GAIN_RANGE, MOVES_M_S2, BIAS_M_S2)
     for other, name, expected, moves, bias in (("truth.yaw_rate_rad_s", *rate), (TURNING, *rate), lateral):
@@ -125,10 +122,7 @@ def measured_relations(
             text = f"{other} against {name}"
             sides, everywhere = (columns[name], columns[other]), np.ones(columns[name].shape[0], np.bool_)
             relations += compare(text, {other: 1, name: -1}, *sides, everywhere, expected, moves=moves, bias=bias)
-    bends = {"ay_m_s2", "yaw_rate_rad_s"}
-    agree = any(r.tells and r.accepts() for r in relations if r.powers.keys() >= bends)
-    axle = _axle_sideslips(columns, vehicle, speed_name, agree)
-    return relations + axle + _sideslips(columns, is_known=bool(axle))
+    return relations + _sideslips(columns)
 
 
 # ------------------------------------------------------------------------------------------- relations
@@ -448,32 +442,6 @@ def is_misscaled(factor: float) -> bool:
     return factor < 0.6 or factor > 1.7
 
 
-def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
-    """Relate the mapped ground-truth sideslip, or v_y, to the sideslip or v_y from positions and heading of one device.
-
-    The frame of a pose may be mirrored: heading and course then have the opposite sign of the yaw rates. If this
-    applies to some of the yaw rates only, the sign is unknown.
-    """
-    subject = next((n for n, of in (("truth.sideslip_rad",) * 2, ("truth.vy_m_s", CG_VY)) if of in columns), "")
-    if not {subject, "truth.pose_vy_m_s"} <= columns.keys():
-        return []
-    ahead, left, turning = (columns[f"truth.{n}"] for n in ("pose_vx_m_s", "pose_vy_m_s", "heading_rate_rad_s"))
-    moving = moving_at(ahead)
-    speed = np.where(moving, np.hypot(ahead, left), np.nan)
-    if median_known(ahead / speed) < AHEAD_SHARE:
-        return []  # the heading is not the car's
-    yaws = [columns[n] for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
-    signs = [np.sign(r.gain) for yaw in yaws for r in compare("", {}, turning, yaw, moving, GAIN_RANGE) if r.tells]
-    is_vy = subject == "truth.vy_m_s"
-    powers = {subject: 1} | ({"truth.position_speed_m_s": -1} if is_vy else {})
-    expected = min(signs, default=1.0) * (left if is_vy else left / speed)
-    sides = (f"{subject} against ground-truth positions and heading", powers, expected, columns[subject])
-    # Velocity and position may refer to different points of the car; yaw adds a velocity between them.
-    apart = _partial(*sides, [turning, np.ones_like(turning)], moving, SAME_RANGE)
-    best = _best([*compare(*sides, moving, SAME_RANGE), *apart])
-    return [replace(r, signless=len(signs) < 2 or len(set(signs)) > 1) for r in best]
-
-
 def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
     """Return the rate of a velocity's direction, rad/s [N]; NaN at low speed, where noise dominates."""
     ax, ay = derivative(vx), derivative(vy)
@@ -482,13 +450,12 @@ def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:
         return np.where(moving_at(speed) & (speed > 1.0), (vx * ay - vy * ax) / speed**2, np.nan)
 
 
-def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Relation]:
+def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     """Relate the ground-truth sideslip to a_y, by kinematics and by the rear axle.
 
     a_y - v_x r is the derivative of v_y, plus terms of the accelerometer's lever arm, of body roll and of a bias, which
     are in proportion to the yaw acceleration, to v_x r and to 1. In gentle driving, sideslip is the curvature times a
-    lever arm minus a_y times the compliance of the rear tyres; this relation is used unless both are known
-    (``is_known``) from a file.
+    lever arm minus a_y times the compliance of the rear tyres.
     """
     turning = next((n for n in ("truth.yaw_rate_rad_s", "yaw_rate_rad_s") if n in columns), "")
     names = ("ay_m_s2", "truth.vx_m_s", "truth.vy_m_s", turning)
@@ -501,8 +468,6 @@ def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Rel
     of_vx = subject != "truth.sideslip_rad"  # sideslip from v_y and v_x, otherwise v_y from sideslip and v_x
     powers = {subject: -1, "ay_m_s2": 1} | ({} if of_vx else {"truth.vx_m_s": -1})
     relations = _partial(text, powers, derivative(vy), ay, [derivative(rate), vx * rate, ones], moving, SIDESLIP_RANGE)
-    if is_known:
-        return relations
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature, ratio = rate / vx, vy / vx  # linear in a wrong v_y, unlike the angle
     sideslip = columns.get("truth.sideslip_rad", ratio)
@@ -510,32 +475,6 @@ def _sideslips(columns: Mapping[str, FloatArray], *, is_known: bool) -> list[Rel
     gentle = gentle_at(vx * rate, moving)
     powers = {subject: 1, "ay_m_s2": -1} | ({"truth.vx_m_s": -1} if of_vx else {})
     return relations + _partial(text, powers, -ay, sideslip, [curvature, ones], gentle, COMPLIANCE_RAD_PER_M_S2)
-
-
-def _axle_sideslips(
-    columns: Mapping[str, FloatArray], vehicle: VehicleParameters | None, speed_name: str | None, agree: bool
-) -> list[Relation]:
-    """Relate the ground-truth sideslip to the rear axle model of the vehicle file, v_y = l r - C a_y v.
-
-    The relation needs a_y and r that ``agree``; otherwise either term may be wrong.
-    """
-    subject = next((n for n in ("truth.sideslip_rad", "truth.vy_m_s") if n in columns), "")
-    ay, rate, sideslip = (columns.get(n) for n in ("ay_m_s2", "yaw_rate_rad_s", subject))
-    if vehicle is None or speed_name is None or not agree or ay is None or rate is None or sideslip is None:
-        return []
-    is_moved = subject == "truth.vy_m_s" and CG_VY not in columns
-    lever = vehicle.cg_to_rear_axle_m + (0.0 if is_moved else vehicle.truth_position_m[0])
-    stiffness = vehicle.cornering_stiffness_n_per_rad(False, vehicle.assumed_friction)
-    compliance = vehicle.mass_kg * vehicle.cg_to_front_axle_m / (vehicle.wheelbase_m * stiffness)
-    speed, text = columns[speed_name], f"{subject} against the rear axle of the vehicle file"
-    expected, gentle = lever * rate - compliance * ay * speed, gentle_at(speed * rate, _moving(columns, speed))
-    if subject == "truth.sideslip_rad":
-        with np.errstate(divide="ignore", invalid="ignore"):
-            expected /= speed
-    low, high = KNOWN_LENGTH
-    # Files without a position of ground truth imply the CG, but it may be at any axle.
-    high *= max(1.0, vehicle.wheelbase_m / (2.0 * max(lever, 1e-3)))
-    return compare(text, {subject: 1, "ay_m_s2": -1}, expected, sideslip, gentle, (low, high))
 
 
 def _partial(

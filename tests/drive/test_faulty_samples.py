@@ -1,4 +1,4 @@
-"""A sensor that fails for a while accuses no other signal, and a wrong unit is no fault of a sensor."""
+"""A sensor that fails for a while accuses no other signal."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.mapping import MappedChannels
-from tests.drive.test_checks import checked, drive, survey, verdicts
+from tests.drive.test_checks import checked, survey, verdicts
 
 
 @pytest.fixture(scope="module")
@@ -37,30 +35,11 @@ def spoilt(found: MappedChannels, name: str, kind: str, share: tuple[float, floa
 def test_a_gyro_that_is_silent_for_a_while_fails_nothing_else(sweep: MappedChannels, kind: str) -> None:
     known = verdicts(checked(sweep), "failed")
     assert known == set()
-    assert verdicts(checked(spoilt(sweep, "yaw_rate_rad_s", kind, (0.4, 0.7))), "failed") <= {"yaw_rate_rad_s.fault"}
+    assert verdicts(checked(spoilt(sweep, "yaw_rate_rad_s", kind, (0.4, 0.7))), "failed") == set()
     most = checked(spoilt(sweep, "yaw_rate_rad_s", kind, (0.2, 0.9)))
-    assert verdicts(most, "failed") == {"yaw_rate_rad_s.fault"}
+    assert verdicts(most, "failed") == {"yaw_rate_rad_s.gain"}
 
 
 def test_a_burst_of_noise_fails_nothing(sweep: MappedChannels) -> None:
     found = spoilt(sweep, "ay_m_s2", "noise", (0.4, 0.7))
     assert verdicts(checked(found), "failed") == set()
-    sound, shares = without_faulty_samples(found.signals, default_vehicle())
-    assert set(shares) == {"ay_m_s2"}
-    assert len(sound["ay_m_s2"]) < 0.8 * len(found.signals["ay_m_s2"])
-
-
-@pytest.mark.parametrize(("name", "factor"), [("yaw_rate_rad_s", np.pi / 180), ("ay_m_s2", 1 / 9.81)])
-def test_a_sensor_in_a_small_unit_is_not_taken_for_a_dead_one(name: str, factor: float) -> None:
-    channels = drive(3)
-    small = {**channels, name: replace(channels[name], values=factor * channels[name].values)}
-    sound, _ = without_faulty_samples(small, default_vehicle())
-    assert len(sound[name]) > 0.9 * len(small[name])
-
-
-def test_what_is_sound_loses_nothing() -> None:
-    channels = drive(2)
-    sound, shares = without_faulty_samples(channels, default_vehicle())
-    assert shares == {}
-    assert all(len(sound[n]) == len(c) for n, c in channels.items())
-    assert without_faulty_samples({}, default_vehicle()) == ({}, {})
