@@ -66,7 +66,7 @@ STEERING_WHEEL_LENGTH_M, FULL_SIZE_STEERING_WHEEL_LENGTH_M = (12.0, 240.0), (22.
 FULL_SIZE_M_S = (12.0, 70.0)
 #: The same divided by L + K v² of the vehicle file; the range includes a wrong ratio in the file and tyres near their
 #: limit. A wrong speed must not lengthen it: the lowest of speed, ground truth and a_y / r counts, up to ``FAST_M_S``.
-KNOWN_LENGTH, FAST_M_S = (0.4, 2.5), 40.0
+KNOWN_LENGTH, FAST_M_S = (0.4, 6.0), 40.0
 #: Track from a 1:10 car to a truck.
 TRACK_M = (0.12, 3.0)
 #: Share of the drive's lateral acceleration up to which the steering angle is compared with the curvature; above, the
