@@ -11,7 +11,7 @@ import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping.candidates import Field, anchors_of
-from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen, fit, ratio
+from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Fit, Pieces, Seen, fit, ratio
 from pdhef_logtool.mapping.fields import CLEAR, SLOW_M_S, Fields
 from pdhef_logtool.mapping.path import PLACES, path_speed, path_velocity
 from pdhef_logtool.mapping.records import SignalSource
@@ -21,8 +21,6 @@ from pdhef_logtool.records.signals import FloatArray
 NEAR_PATH = 0.08
 #: Speed over ground over that along the path if the axes are the earth's; share of the time that a body moves ahead.
 SAME_STEPS, AHEAD_SHARE = (0.7, 1.4), 0.6
-#: Units of a yaw rate in one rad/s: rad/s, deg/s.
-_UNITS = (1.0, math.degrees(1.0))
 #: Axes of the x and y of a velocity; empty if the drive does not show them, "not ahead" if they are not the body's.
 Axes: TypeAlias = Literal["east, north", "north, east", "body", "not ahead", ""]
 #: Note on every speed that is a length.
@@ -59,9 +57,8 @@ def axes_of(
     with np.errstate(invalid="ignore", divide="ignore"):
         turning = np.where(moving, (x * pieces.rate_of(y) - y * pieces.rate_of(x)) / length**2, np.nan)
     relation = None if rate is None else fit(pieces.smooth(rate), turning)
-    sense = 0.0 if relation is None or abs(relation.correlation) <= CLEAR else relation.correlation
-    # The direction over ground turns as fast as the car; a sideslip that follows the yaw rate is smaller.
-    if relation is not None and sense > 0.0 and any(SAME_STEPS[0] < relation.slope / u < SAME_STEPS[1] for u in _UNITS):
+    sense = _sense(relation)
+    if sense > 0.0:
         return "east, north"
     enough = np.count_nonzero(moving) >= FEWEST_CELLS
     # A car may reverse; without a path, a direction that is often opposite shows axes of the earth.
@@ -72,6 +69,17 @@ def axes_of(
     if not is_ahead:
         return "not ahead"
     return "" if relation is None else "body"
+
+
+def _sense(relation: Fit | None) -> float:
+    """Return the sign with which a direction turns with the yaw rate, rad/s or deg/s; 0 if unclear.
+
+    The direction over ground turns as fast as the car; a sideslip that follows the yaw rate turns less.
+    """
+    if relation is None or abs(relation.correlation) <= CLEAR:
+        return 0.0
+    is_equal = any(SAME_STEPS[0] < relation.slope * unit < SAME_STEPS[1] for unit in (1.0, math.radians(1.0)))
+    return math.copysign(float(is_equal or relation.slope < 0.0), relation.slope)
 
 
 def twist_axes(log: DriveLog, velocity: SignalSource, references: Sequence[SignalSource]) -> Axes:

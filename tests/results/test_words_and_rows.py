@@ -46,8 +46,9 @@ def test_the_report_for_people_is_this() -> None:
     assert diverged_line(_report(segments=spans[:1]), "ukf") == "diverged for 1.00 s, first at 5.00 s"
     assert diverged_line(_report(segments=spans), "smooth") == ""
     assert "Warnings" not in report_markdown(_report(warnings=[], losses=[]))
-    verdict = {"outcome": "FAIL", "label": "sideslip RMSE ≤ 1°", "reason": "1.2° (95 % CI 1.1° to 1.3°)"}
-    text = report_markdown(_report(plan={"requirements": [verdict]}))
+    verdict = {"id": "S", "label": "sideslip RMSE ≤ 1°", "reason": "1.2° (95 % CI 1.1° to 1.3°)", "next": ""}
+    verdict["outcome"] = "FAIL"
+    text = report_markdown(_report(plan={"file": "p.toml", "requirements": [verdict]}))
     assert "- **FAIL** sideslip RMSE ≤ 1°: 1.2° (95 % CI 1.1° to 1.3°)" in text
 
 
