@@ -477,10 +477,13 @@ def settle(now, gated, rules, standstill_std, x, P, m):  # type: ignore[no-untyp
 
 @_inline
 def diverges(rules, x, m):  # type: ignore[no-untyped-def]
-    """Return whether innovations stay far beyond their covariance, or the sideslip is impossible."""
-    return m.nis > DIVERGED_NIS_RATIO or (
-        x[VX] > rules.dynamic_speed_m_s and abs(math.atan2(x[VY], x[VX])) > DIVERGED_SIDESLIP_RAD
-    )
+    """Return whether innovations stay far beyond their covariance, or the motion is impossible.
+
+    Without a speed sensor nothing but a wrong acceleration drives a car backwards that fast.
+    """
+    reverses = not rules.use_speed and x[VX] < -rules.dynamic_speed_m_s
+    slides = x[VX] > rules.dynamic_speed_m_s and abs(math.atan2(x[VY], x[VX])) > DIVERGED_SIDESLIP_RAD
+    return m.nis > DIVERGED_NIS_RATIO or slides or reverses
 
 
 @_inline

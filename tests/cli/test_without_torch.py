@@ -54,7 +54,7 @@ def ended_without_torch(folder: Path, *commands: tuple[object, ...]) -> list[str
 
 @pytest.mark.slow
 def test_what_trains_no_network_works_without_it_and_what_trains_one_ends_with_one_line(tmp_path: Path) -> None:
-    drive = ("sample_logs/dlc.mcap", "--car", "saloon", "--end", "3")
+    drive = ("sample_logs/dlc.mcap", "--car", "saloon", "--set", "end=3")
     trained = ("train", tmp_path, "-o", tmp_path / "network")
     ran, extracted, *refused = ended_without_torch(
         tmp_path,

@@ -66,7 +66,6 @@ def test_a_check_is_in_report_terminal_page_junit_and_can_be_waived(
     assert re.fullmatch(r"the fastest speed is \d+\.\d m/s", check["evidence"])
     assert check == {
         "name": toy,
-        "subject": "speed_m_s",
         "verdict": "failed",
         "evidence": check["evidence"],
         "remedy": "check the scale of the speed, which should be in m/s",

@@ -23,14 +23,15 @@ SHIPPED = {
     "open-loop": ("open-loop 1", "5afc5962fabb"),
     "linear-regression": ("linear-regression 1", "9de17837d3ad"),
     "phy-ukf": ("vehicle-ukf 1 (equations=nominal)", "cead32189ec2"),
-    "physics": ("adaptive-physics 2 (physics=vehicle-ukf)", "da0dc5b4f520"),
+    "physics": ("adaptive-physics 2 (physics=vehicle-ukf)", "8a1f16b11617"),
     "phy-ukf:tuned": ("vehicle-ukf 1 (equations=nominal, roll_correction=True)", "2e213229f481"),
     "pure-lstm": ("direct-network 1", "4441758f4188"),
-    "pd-hef": (_HYBRID, "d246eb1c7e30"),
-    "pd-hef:fixed-r": ("adaptive-physics 2 (adaptive=False, physics=vehicle-ukf, trust=1.0)", "4ce8b9b97611"),
+    "pd-hef": (_HYBRID, "3b53c8a7ed26"),
+    "pd-hef:fixed-r": ("adaptive-physics 2 (adaptive=False, physics=vehicle-ukf, trust=1.0)", "d45f6422c9c2"),
     "pd-hef-smoothed": (
-        "smoothed-physics 2 (filtered=adaptive-physics, filtered.physics=vehicle-ukf, filtered.trust=0.75)",
-        "f20b45e944a7",
+        "smoothed-physics 2 (filtered=adaptive-physics, filtered.physics=vehicle-ukf, filtered.trust=0.75, "
+        "filtered.version=2)",
+        "222f805255c6",
     ),
     "pd-hef-paper": ("paper-hybrid-ukf 2", "87a835dda35a"),
 }

@@ -71,7 +71,7 @@ def test_the_console_obeys_nothing_and_forges_no_line(capsys: pytest.CaptureFixt
 
 @pytest.mark.parametrize("as_json", [False, True])
 def test_an_inspection_of_hostile_names_is_plain(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], as_json: bool
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, as_json: bool
 ) -> None:
     stream = io.BytesIO()
     writer = Writer(stream)
@@ -84,7 +84,8 @@ def test_an_inspection_of_hostile_names_is_plain(
     path = tmp_path / "a\n\x1b[31m[/red]\udcff.mcap"
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(stream.getvalue())
-    console.show(inspect_log(path), render_inspection, as_json)
+    monkeypatch.setattr(console, "as_json", as_json)
+    console.show(inspect_log(path), render_inspection)
     out = capsys.readouterr().out
     assert out.replace("\n", "").isprintable()
     assert "warning: forged" not in out.splitlines()

@@ -66,7 +66,9 @@ def dlc_run(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 def test_everything_that_a_run_promises_is_there_and_nothing_else(dlc_run: Path) -> None:
     assert {p.name for p in (dlc_run / "logs" / "dlc").iterdir()} == OUTPUTS
-    assert {p.name for p in dlc_run.iterdir()} == {"logs", "metrics.parquet", "report.html", "report.json", "run.json"}
+    assert {p.name for p in dlc_run.iterdir()} == {
+        "logs", "metrics.parquet", "report.html", "report.json", "run.json", "tables",
+    }  # fmt: skip
 
 
 def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) -> None:
