@@ -64,11 +64,10 @@ WHEEL_PER_RADIAN_RANGE = (1.25, 25.0)
 ROAD_WHEEL_LENGTH_M, FULL_SIZE_LENGTH_M = (0.15, 12.0), (1.2, 12.0)
 STEERING_WHEEL_LENGTH_M, FULL_SIZE_STEERING_WHEEL_LENGTH_M = (12.0, 240.0), (22.0, 240.0)
 FULL_SIZE_M_S = (12.0, 70.0)
-#: The same divided by L + K v² of the vehicle file; the range includes a wrong ratio in the file and tyres near their
-#: limit. A wrong speed must not lengthen it: the lowest of speed, ground truth and a_y / r counts, up to ``FAST_M_S``.
-KNOWN_LENGTH, FAST_M_S = (0.4, 6.0), 40.0
-#: Sideslip divided by that of the rear axle in the vehicle file.
-KNOWN_SIDESLIP = (0.4, 2.5)
+#: The same divided by L + K v² of the vehicle file, and sideslip by that of its rear axle; the range includes a wrong
+#: ratio in the file, and sliding front tyres, which lengthen it several times. A wrong speed must not lengthen it: the
+#: lowest of speed, ground truth and a_y / r counts, up to ``FAST_M_S``.
+KNOWN_LENGTH, KNOWN_SIDESLIP, FAST_M_S = (0.4, 6.0), (0.4, 2.5), 40.0
 #: Track from a 1:10 car to a truck.
 TRACK_M = (0.12, 3.0)
 #: Share of the drive's lateral acceleration up to which the steering angle is compared with the curvature; above, the
