@@ -362,6 +362,8 @@ def exit_codes(tool: Tool) -> Figures:
             folder / "plan",
             "--plan",
             strict,
+            "--set",
+            "strict=true",
             *quiet,
         ),
         "run, no output given": ("run", sample),
