@@ -52,6 +52,8 @@ SIDESLIP_RANGE = (0.5, 2.0)
 COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
 #: Above this, sideslip times lateral acceleration is not small compared to the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
+#: Least share of v_x in the speed if the heading is right.
+AHEAD_SHARE = 0.9
 #: No car reverses faster for long: the sign of a faster speed is known, but not its unit.
 REVERSE_M_S = 10.0
 #: In a bend, wheels differ by less; a wheel that differs by more spins or locks.
@@ -116,6 +118,7 @@ def measured_relations(
         relations += _speeds(columns, speed_name, speed)
         relations += _wheel_differences(columns, speed_name, speed)
         relations += _courses(of_path, speed)
+    relations += _poses(of_path)
     rate = ("yaw_rate_rad_s", SAME_RANGE, MOVES_RAD_S, BIAS_RAD_S)
     lateral = ("truth.ay_m_s2", "ay_m_s2", GAIN_RANGE, MOVES_M_S2, BIAS_M_S2)
     for other, name, expected, moves, bias in (("truth.yaw_rate_rad_s", *rate), (TURNING, *rate), lateral):
@@ -444,6 +447,32 @@ def position_factors(columns: Mapping[str, FloatArray]) -> tuple[float, float]:
 def is_misscaled(factor: float) -> bool:
     """Return whether the correction factor of a position is due to another unit (feet: 3.3)."""
     return factor < 0.6 or factor > 1.7
+
+
+def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
+    """Relate the mapped ground-truth sideslip, or v_y, to the sideslip or v_y from positions and heading of one device.
+
+    The frame of a pose may be mirrored: heading and course then have the opposite sign of the yaw rates. If this
+    applies to some of the yaw rates only, the sign is unknown.
+    """
+    subject = next((n for n, of in (("truth.sideslip_rad",) * 2, ("truth.vy_m_s", CG_VY)) if of in columns), "")
+    if not {subject, "truth.pose_vy_m_s"} <= columns.keys():
+        return []
+    ahead, left, turning = (columns[f"truth.{n}"] for n in ("pose_vx_m_s", "pose_vy_m_s", "heading_rate_rad_s"))
+    moving = moving_at(ahead)
+    speed = np.where(moving, np.hypot(ahead, left), np.nan)
+    if median_known(ahead / speed) < AHEAD_SHARE:
+        return []  # the heading is not the car's
+    yaws = [columns[n] for n in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
+    signs = [np.sign(r.gain) for yaw in yaws for r in compare("", {}, turning, yaw, moving, GAIN_RANGE) if r.tells]
+    is_vy = subject == "truth.vy_m_s"
+    powers = {subject: 1} | ({"truth.position_speed_m_s": -1} if is_vy else {})
+    expected = min(signs, default=1.0) * (left if is_vy else left / speed)
+    sides = (f"{subject} against ground-truth positions and heading", powers, expected, columns[subject])
+    # Velocity and position may refer to different points of the car; yaw adds a velocity between them.
+    apart = _partial(*sides, [turning, np.ones_like(turning)], moving, SAME_RANGE)
+    best = _best([*compare(*sides, moving, SAME_RANGE), *apart])
+    return [replace(r, signless=len(signs) < 2 or len(set(signs)) > 1) for r in best]
 
 
 def direction_rate(vx: FloatArray, vy: FloatArray) -> FloatArray:

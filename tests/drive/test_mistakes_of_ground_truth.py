@@ -70,6 +70,38 @@ def test_a_wrong_unit_of_v_y_passes_at_no_lever(place_m: float, factor: float) -
         assert checks["truth.vy_m_s.unit"].verdict != "passed"
 
 
+@pytest.mark.parametrize(("mirrored", "antenna_m"), [(False, 0.0), (True, 0.0), (False, 1.5)])
+@pytest.mark.parametrize("factor", [1.0, 3.6, 1.0 / 3.6, -1.0])
+def test_positions_and_heading_show_the_unit_and_the_sign_of_v_y(
+    factor: float, mirrored: bool, antenna_m: float
+) -> None:
+    """A rigid-body identity: a pose with y to the right, or from an antenna further ahead, fails no check."""
+    vehicle = default_vehicle().model_copy(update={"truth_position_m": (1.3, 0.0, 0.0)})
+    signals, truth = with_truth(vehicle, 1.0)
+    vx, vy, rate = (truth[n].values for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"))
+    yaw, side = np.cumsum(rate) * 0.01, -1.0 if mirrored else 1.0
+    pose = {"x_m": np.cumsum(vx * np.cos(yaw) - vy * np.sin(yaw)) * 0.01, "yaw_rad": side * yaw}
+    pose["y_m"] = side * (np.cumsum(vx * np.sin(yaw) + vy * np.cos(yaw)) * 0.01 + antenna_m * np.sin(yaw))
+    pose["x_m"] += antenna_m * np.cos(yaw)
+    truth |= {n: replace(truth["vx_m_s"], name=n, source=f"/ins.{n}", values=v) for n, v in pose.items()}
+    truth["vy_m_s"] = replace(truth["vy_m_s"], values=factor * vy)
+    truth["y_m"] = truth["y_m"].take(np.arange(vy.size) % 1000 != 500)  # a sample of one axis is missing
+    derived = derive_truth(truth, truth_position_m=vehicle.truth_position_m)
+    checks = {c.name: c for c in check_drive(signals, truth, derived, vehicle) if c.subject == "truth.vy_m_s"}
+    failed = [n for n, c in checks.items() if c.verdict == "failed"]
+    assert failed == ([] if factor == 1.0 else ["truth.vy_m_s.sign" if factor < 0.0 else "truth.vy_m_s.unit"])
+    assert factor == 1.0 or f"by {1.0 / factor:.6g}" in checks[failed[0]].remedy
+
+
+def test_a_pose_whose_heading_is_not_that_of_the_car_states_nothing() -> None:
+    signals, truth = with_truth(VEHICLE, 1.0)
+    flat = np.zeros_like(truth["vx_m_s"].values)
+    pose = {"x_m": np.cumsum(truth["vx_m_s"].values) * 0.01, "y_m": flat, "yaw_rad": flat + 0.5 * np.pi}
+    truth |= {n: replace(truth["vx_m_s"], name=n, source=f"/ins.{n}", values=v) for n, v in pose.items()}
+    relations = measure(signals, truth, derive_truth(truth), VEHICLE).relations
+    assert not [r for r in relations if "positions and heading" in r.text]
+
+
 def test_exchanged_velocities_of_ground_truth_are_named() -> None:
     signals, truth = with_truth(VEHICLE, 1.0)
     ahead, across = truth["vx_m_s"], truth["vy_m_s"]
