@@ -532,7 +532,7 @@ def _axle_sideslips(
     slip, gentle = compliance * ay * speed, gentle_at(speed * rate, _moving(columns, speed))
     expected, used = lever * rate - slip, gentle & np.isfinite(slip) & np.isfinite(rate)
     # Where the two terms cancel, the file's compliance, known to a quarter, decides the sign.
-    if not used.any() or expected[used].std() < 0.5 * slip[used].std():
+    if not used.any() or expected[used].std() < 0.25 * slip[used].std():
         return []
     if subject == "truth.sideslip_rad":
         with np.errstate(divide="ignore", invalid="ignore"):
