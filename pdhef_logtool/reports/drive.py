@@ -15,10 +15,11 @@ from pdhef_logtool.reports.drive_tables import by_segment, definitions, disagree
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.fleet import cause_and_remedy
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
+from pdhef_logtool.results.selected_estimate import NAIVE
 from pdhef_logtool.results.sink import TRUTH
 
-#: The best filter with physics only, and the baseline, whose errors would hide all others in a figure.
-_PHYSICS, _ZERO = "physics", "zero"
+#: The best filter with physics only; the errors of the baseline would hide all others in a figure.
+_PHYSICS = "physics"
 #: Keys of the figures, in the order of the page.
 OVER_TIME = ("sideslip", "error", "yaw_rate", "ay", "speed", "strip")
 IN_PLANE = ("path", "ay_sideslip")
@@ -92,7 +93,7 @@ def roles_of(report: Mapping[str, Any]) -> Roles | None:
     main: str = selected if selected in names else names[0]
     identical = identical_to(report, main)
     others = [n for n in names if n not in identical]
-    rival = next((n for n in (_PHYSICS, *sorted(others, key=lambda n: n == _ZERO)) if n in others and n != main), "")
+    rival = next((n for n in (_PHYSICS, *sorted(others, key=lambda n: n == NAIVE)) if n in others and n != main), "")
     return Roles(main, rival, tuple(n for n in names if n not in (main, rival)))
 
 

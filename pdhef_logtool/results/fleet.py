@@ -24,6 +24,7 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.results.breakdown import LEAST_DRIVES, SIGNIFICANT, Breakdown, BreakdownDrive, breakdowns
 from pdhef_logtool.results.opened_run import OpenedRun
 from pdhef_logtool.results.paired_change import PairedChange, holm, log_ratios, paired_change
+from pdhef_logtool.results.selected_estimate import NAIVE
 
 if TYPE_CHECKING:
     import polars as pl
@@ -33,8 +34,6 @@ ANSWER = "answer"
 #: Columns of errors: signal and unit.
 SIGNALS = {s: SCORED_SIGNALS[s] for s in ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s")}
 JUDGED = "sideslip_rad"
-#: The estimate without a model that others are compared with.
-_NAIVE = "zero"
 WORST = 20
 _FIGURE = ("log", "estimator", "signal", "metric", "value")
 #: Levels of folders by which drives are grouped.
@@ -305,7 +304,7 @@ def _drive(
         coverage=math.nan if coverage is None else coverage,
         nis=nis / dof if dof > 0.0 else math.nan,
         d2=figures.get((main, "vy_m_s", "d2"), math.nan),
-        naive_d2=figures.get((_NAIVE, "vy_m_s", "d2"), math.nan),
+        naive_d2=figures.get((NAIVE, "vy_m_s", "d2"), math.nan),
         failed_checks=row["failed_checks"],
         keys=keys,
         factors={factor: row[factor] for factor in FACTORS},

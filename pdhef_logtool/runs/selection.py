@@ -14,7 +14,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.estimators.table import all_names, spec_of
 from pdhef_logtool.records.tracks import REFERENCE
-from pdhef_logtool.results.selected_estimate import MainFacts
+from pdhef_logtool.results.selected_estimate import NAIVE, MainFacts
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
@@ -27,9 +27,6 @@ SIMPLE = ("open-loop", "open-loop:calibrated", "phy-ukf", "physics")
 FACTOR, YAW_FACTOR = 1.2, 3.0
 #: Their lateral figures are meaningless, because they integrate the residual that ``d2`` measures.
 _NOT_JUDGED = ("kinematic", "slip-ukf", "washout")
-#: The baseline of every score. It needs the fewest signals and cannot drift; ``kinematic`` follows the accelerometer's
-#: bias and has a higher error on half of the recorded drives.
-NAIVE = "zero"
 #: The selected estimate is the first of these that ran, unless ``d2`` contradicts it; without any, the first other one.
 _BEST_FIRST = (PREFERRED, PHYSICS, "phy-ukf:tuned", "phy-ukf", "open-loop:calibrated", "open-loop", "kinematic")
 _LAST = (NAIVE, "zero:no-lateral", REFERENCE)

@@ -14,8 +14,6 @@ import pytest
 from rich.console import Console
 
 from pdhef_logtool.cli.run_tables import render_run
-from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import auto_map, mapping_to_toml
 from pdhef_logtool.reports.drive import drive_page
 from pdhef_logtool.reports.pdf import pdf_page
 from pdhef_logtool.results.opened_run import open_run
@@ -24,6 +22,7 @@ from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.recorded_estimates import score_log
 from pdhef_logtool.runs.run_result import RunResult
 from tests.run_report import follows
+from tests.runs.wrong_mapping import wrong_sign
 
 #: Entries whose keys are names: of parameters, of quantities, of reasons, of packages, of the recorder.
 NAMED = ("assumed", "dropped", "metadata", "options", "quantities", "versions")
@@ -82,17 +81,6 @@ def told(result: RunResult) -> list[str]:
 
 def words(page: str) -> str:
     return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", page.partition("<main>")[2])).split())
-
-
-def wrong_sign(log: Path, tmp_path: Path) -> Path:
-    """Return a mapping of the log with the wrong sign of the steering."""
-    opened = open_log(log)
-    text = mapping_to_toml(auto_map(opened).mapping)
-    opened.close()
-    at = text.index("scale", text.index("[signals.steer_rad]"))
-    path = tmp_path / "mapping.toml"
-    path.write_text(text[:at] + text[at:].replace("scale = 1.0", "scale = -1.0", 1))
-    return path
 
 
 @pytest.mark.slow

@@ -27,13 +27,12 @@ def responses(drive: EvaluatedDrive) -> Iterator[Columns]:
         return
     signals, vehicle, _ = drive.calibrated
     since_s: FloatArray = (signals.stamps_ns - signals.stamps_ns[:1]) * np.float64(1e-9)
-    wheelbase_m = vehicle.cg_to_front_axle_m + vehicle.cg_to_rear_axle_m
     step, lane = (_first(drive, since_s, (name,)) for name in ("step-steer", "dlc-3888-2"))
     dwell = _first(drive, since_s, ("sine-with-dwell",), _AFTER_S)
     turn = _first(drive, since_s, ("ramp-steer", "steady-circle"))
     for track in (*drive.tracks.values(), *(() if drive.truth is None else (drive.truth,))):
         with np.errstate(divide="ignore", invalid="ignore"):
-            beyond = signals.steer_rad - wheelbase_m * track.yaw_rate_rad_s / track.vx_m_s
+            beyond = signals.steer_rad - vehicle.wheelbase_m * track.yaw_rate_rad_s / track.vx_m_s
         common = {"since_s": since_s, "steer": signals.steer_rad, "beyond": beyond}
         places = {"yaw_rate_rad_s": {"step": step, "dwell": dwell}, "ay_m_s2": {"step": step, "turn": turn}}
         for signal, masks in (*places.items(), ("vx_m_s", {"lane": lane})):
