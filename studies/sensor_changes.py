@@ -4,8 +4,9 @@
 
 A change is planted in the aligned signals of each recorded drive, at 60 % of its length, and in simulated roads of 60 s
 and 300 s. ``--hours`` of other simulated roads and all recorded drives without a change count false alarms. ``named``:
-the right sensor and kind, known within 2 s of the change; ``late``: after; ``other``: another sensor or kind;
-``silent``: none. Frozen gyros and accelerometers are faulty samples (``drive/sensor_faults.py``) and no changes.
+the right sensor and kind, known within 2 s of the change; ``late``: after; ``truth``: by ground truth alone, to 2 s;
+``other``: another sensor or kind; ``silent``: none. Frozen gyros and accelerometers are faulty samples
+(``drive/sensor_faults.py``) and no changes.
 """
 
 from __future__ import annotations
@@ -26,9 +27,12 @@ from pdhef_logtool.car.vehicle import correct_signals
 from pdhef_logtool.drive.alignment import align
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.sensor_changes import SensorChange, find_changes
+from pdhef_logtool.drive.truth import derive_truth, truth_at
+from pdhef_logtool.drive.truth_steps import steps_from_truth
 from pdhef_logtool.mapping import Mapping, read_signals
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
 from studies.pages import DRIVES, ROOT
 from studies.peers.drives import PEER_DRIVES, mapping_of, vehicle_of
 from truthsim.drive import simulate_drive, write_drive
@@ -47,24 +51,36 @@ PLANTED = {
     **{f"delayed {n.split('_')[0]}": (n, 1.0, 0.0, 0.1)
        for n in ("steer_rad", "yaw_rate_rad_s", "ay_m_s2", "speed_m_s")},
 }  # fmt: skip
+#: Signals and ground truth of a drive.
+Drive = tuple[Signals, StateTrack | None]
 #: Place of a change in a drive, and the time in which it should be known.
 PLACE, WITHIN_S = 0.6, 2.0
 
 
-def aligned(log: Path, car: Car, mapping: Mapping | None = None) -> Signals:
-    """Return the signals of a log as the search for changes receives them, [N]."""
+def aligned(log: Path, car: Car, mapping: Mapping | None = None) -> Drive:
+    """Return signals and ground truth of a log as the search for changes receives them, [N]."""
     with read_drive(log, car, mapping) as drive:
         plan = drive.plan
         part = read_signals(drive.log, plan.mapping, plan.clocks, plan.start_ns, plan.end_ns)
-    return without_impossible(correct_signals(align(part.signals, plan.alignment)[0], plan.vehicle))
+    signals = without_impossible(correct_signals(align(part.signals, plan.alignment)[0], plan.vehicle))
+    if plan.truth is None:
+        return signals, None
+    derived, low_m_s = derive_truth(part.truth, plan=plan.truth), plan.vehicle.standstill_m_s
+    return signals, truth_at(derived, signals.stamps_ns, plan.truth_latency_s, standstill_m_s=low_m_s)
 
 
-def recorded() -> dict[str, Signals]:
+def changes_of(signals: Signals, truth: StateTrack | None) -> list[SensorChange]:
+    """Return the changes that a run reports."""
+    sound, changes = find_changes(signals)
+    return [*changes, *(() if truth is None else steps_from_truth(sound, truth))]
+
+
+def recorded() -> dict[str, Drive]:
     """Return the recorded drives."""
     return {d.log: aligned(DRIVES / d.log, Car.of(vehicle_of(d)), mapping_of(d)) for d in PEER_DRIVES}
 
 
-def simulated(first: int, count: int, duration_s: float) -> Iterator[tuple[str, Signals]]:
+def simulated(first: int, count: int, duration_s: float) -> Iterator[tuple[str, Drive]]:
     """Yield roads of consecutive seeds, a third of them wet."""
     car = Car.load(ROOT / "sample_logs" / "vehicle.toml")
     with tempfile.TemporaryDirectory() as folder:
@@ -108,39 +124,40 @@ def verdict(
     first = min(new, key=lambda c: c.known_ns)
     if first.sensor != name or (first.kind == "stuck") != frozen:
         return "other"
+    if first.kind.endswith("from_truth"):
+        return "truth" if abs(first.start_ns - at_ns) <= WITHIN_S * 1e9 else "other"
     return "named" if first.known_ns - at_ns <= WITHIN_S * 1e9 else "late"
 
 
-def table(drives: dict[str, Signals]) -> dict[str, Counter[str]]:
+def table(drives: dict[str, Drive]) -> dict[str, Counter[str]]:
     """Return the verdicts of each planted change on some drives."""
     counts: dict[str, Counter[str]] = {label: Counter() for label in PLANTED}
-    for signals in drives.values():
-        before = find_changes(signals)[1]
+    for signals, truth in drives.values():
+        before = changes_of(signals, truth)
         start, end = int(signals.stamps_ns[0]), int(signals.stamps_ns[-1])
         at_ns = start + round(PLACE * (end - start))
         for label, (name, *how) in PLANTED.items():
             if not np.isfinite(getattr(signals, name)[signals.stamps_ns >= at_ns]).any():
                 continue
-            found = find_changes(changed(signals, at_ns, name, *how))[1]
+            found = changes_of(changed(signals, at_ns, name, *how), truth)
             counts[label][verdict(found, before, at_ns, name, bool(np.isnan(how[0])))] += 1
     return counts
 
 
 def tell(title: str, counts: dict[str, Counter[str]]) -> None:
     """Print a table."""
-    print(f"\n{title:24s} named  late other silent")
-    for label, count in counts.items():
-        print(f"{label:24s} {count['named']:5d} {count['late']:5d} {count['other']:5d} {count['silent']:6d}")
-    total = sum(counts.values(), Counter[str]())
-    print(f"{'sum':24s} {total['named']:5d} {total['late']:5d} {total['other']:5d} {total['silent']:6d}", flush=True)
+    columns = ("named", "late", "truth", "other", "silent")
+    print(f"\n{title:24s}" + "".join(f"{c:>7s}" for c in columns))
+    for label, count in [*counts.items(), ("sum", sum(counts.values(), Counter[str]()))]:
+        print(f"{label:24s}" + "".join(f"{count[c]:7d}" for c in columns), flush=True)
 
 
-def false_alarms(drives: Iterator[tuple[str, Signals]]) -> None:
+def false_alarms(drives: Iterator[tuple[str, Drive]]) -> None:
     """Print the changes of drives that have none, and the hours."""
     hours = 0.0
-    for name, signals in drives:
+    for name, (signals, truth) in drives:
         hours += (int(signals.stamps_ns[-1]) - int(signals.stamps_ns[0])) / 3.6e12
-        for c in find_changes(signals)[1]:
+        for c in changes_of(signals, truth):
             at_s = (c.start_ns - int(signals.stamps_ns[0])) * 1e-9
             print(f"{name}: {c.sensor} {c.kind} at {at_s:.2f} s by {c.size:.4g} ± {c.std:.2g}")
     print(f"{hours:.2f} h without a planted change", flush=True)

@@ -153,7 +153,7 @@ class Drive:
     @property
     def checks(self) -> tuple[Check, ...]:
         """Checks of signals, ground truth and vehicle file, after reading also of changes; waived checks are marked."""
-        changes = () if self._recorded is None else self._recorded.changes
+        changes = () if self._recorded is None else (*self._recorded.changes, *self._recorded.from_truth)
         return (*_checks_of(self.plan, self.options), *change_checks(changes, self.log.start_ns))
 
     @property
@@ -209,7 +209,8 @@ class Drive:
         if self._recorded is None or self._recorded.plan is not self.plan:
             unchanged = [n.removesuffix(CHANGE_SUFFIX) for n in self.options.waived]
             self._recorded = read_recorded(self.log, self.plan, unchanged)
-            for check in change_checks(self._recorded.changes, self.log.start_ns):
+            changes = (*self._recorded.changes, *self._recorded.from_truth)
+            for check in change_checks(changes, self.log.start_ns):
                 if (text := _failed_text(check)) not in self.notes:
                     self.tell(text)
         return self._recorded

@@ -15,6 +15,7 @@ from pdhef_logtool.drive.channel_hash import channels_sha256
 from pdhef_logtool.drive.plan import DrivePlan
 from pdhef_logtool.drive.sensor_changes import SensorChange, find_changes
 from pdhef_logtool.drive.truth import derive_truth, truth_at
+from pdhef_logtool.drive.truth_steps import steps_from_truth
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, clock_key, merge_losses, read_signals
 from pdhef_logtool.records.ledger import Role, SampleCount
@@ -40,7 +41,8 @@ class Recorded:
     ----------
     signals, truth : [N] at the same stamps; N may be 0, and ``truth`` is None without ground truth.
     ledger : used and dropped samples of each mapped signal.
-    changes : of the sensors in mid-drive, corrected in ``signals``.
+    changes : of the sensors in mid-drive, corrected in ``signals``. from_truth : steps from the ground truth, which
+        are not corrected.
     signals_sha256, truth_sha256 : hashes of the channels' content; None without samples.
     """
 
@@ -50,6 +52,7 @@ class Recorded:
     losses: tuple[Loss, ...]
     ledger: tuple[SampleCount, ...]
     changes: tuple[SensorChange, ...]
+    from_truth: tuple[SensorChange, ...]
     signals_sha256: str | None
     truth_sha256: str | None
 
@@ -89,6 +92,7 @@ def read_recorded(log: DriveLog, plan: DrivePlan, unchanged: Collection[str] = (
         losses=losses,
         ledger=sample_ledger(log, plan, part.counts),
         changes=changes,
+        from_truth=() if truth is None else steps_from_truth(signals, truth),
         signals_sha256=channels_sha256(part.signals, mapping.signals),
         truth_sha256=channels_sha256(part.truth, mapping.truth),
     )

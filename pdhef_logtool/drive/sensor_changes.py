@@ -283,14 +283,14 @@ def _relation_block(index: int, tables: Sequence[FloatArray]) -> _Block:
 
 def _sample_block(name: str, signals: Signals, cells: Cells, tried: Sequence[Cells]) -> _Block:
     """Return the step between neighbouring samples of a sensor; bursts of noise or motion have neighbours."""
-    step, column = _sample_steps(getattr(signals, name), cells), getattr(cells, FIELDS[name])
+    step, column = sample_steps(getattr(signals, name), cells), getattr(cells, FIELDS[name])
     units = [_mean((getattr(other, FIELDS[name]) - column) / TRIED, -1, 0) for other in tried]
     square = np.nan_to_num(step) ** 2
     beside = np.sqrt(np.fmax(_mean(square, 3, WINDOW_CELLS), _mean(square, -2 - PART_CELLS, -2)))
     return _Block(step[:, None], np.stack(units, axis=1)[..., None], np.fmax(beside, LEAST_STEPS[name]))
 
 
-def _sample_steps(column: FloatArray, cells: Cells) -> FloatArray:
+def sample_steps(column: FloatArray, cells: Cells) -> FloatArray:
     """Return the largest step between neighbouring samples of a column [N] in each cell, [n]; NaN without samples.
 
     A straight line with a step is fitted to the samples up to ``STEP_S`` before and after.

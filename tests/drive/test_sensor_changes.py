@@ -13,9 +13,11 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.sensor_changes import SensorChange, find_changes
+from pdhef_logtool.drive.truth_steps import steps_from_truth
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.estimating import estimate_drive
 from studies.peers.drives import PEER_DRIVES, mapping_of, read_peer_drive, vehicle_of
 from tests.command_line import called
@@ -29,10 +31,17 @@ CHANGES = [
 
 
 @pytest.fixture(scope="module")
-def road(sample_logs_dir: Path) -> Signals:
-    """Return 80 s of a simulated country road [8000]."""
+def road_and_truth(sample_logs_dir: Path) -> tuple[Signals, StateTrack]:
+    """Return 80 s of a simulated country road with its ground truth [8000]."""
     with read_drive(sample_logs_dir / "road.mcap", sample_logs_dir / "vehicle.toml") as drive:
-        return drive.whole().signals.rows(8000, 16000)
+        whole = drive.whole()
+    assert whole.truth is not None
+    return whole.signals.rows(8000, 16000), whole.truth.rows(8000, 16000)
+
+
+@pytest.fixture(scope="module")
+def road(road_and_truth: tuple[Signals, StateTrack]) -> Signals:
+    return road_and_truth[0]
 
 
 def seconds(signals: Signals) -> Any:
@@ -118,6 +127,34 @@ def test_a_sound_drive_stays_as_it_is(road: Signals) -> None:
 def test_stuck_readings_that_move_again_are_no_jump(sample_logs_dir: Path) -> None:
     with read_drive(sample_logs_dir / "faults.mcap", sample_logs_dir / "vehicle.toml") as drive:
         assert drive.recorded().changes == ()
+
+
+@pytest.mark.parametrize(
+    ("log", "name", "factor", "addend"),
+    [("road", "yaw_rate_rad_s", 1.0, 0.01), ("dlc", "ay_m_s2", 1.0, -0.8), ("road", "speed_m_s", 0.95, 0.0)],
+)
+def test_ground_truth_shows_smaller_steps(
+    sample_logs_dir: Path, log: str, name: str, factor: float, addend: float
+) -> None:
+    with read_drive(sample_logs_dir / f"{log}.mcap", sample_logs_dir / "vehicle.toml") as drive:
+        sound, truth = drive.whole().signals, drive.whole().truth
+    assert truth is not None
+    at_s = 0.5 * seconds(sound)[-1]
+    late = seconds(sound) >= at_s
+    signals = replace(sound, **{name: getattr(sound, name) * np.where(late, factor, 1.0) + late * addend})
+    assert steps_from_truth(sound, truth) == ()
+    (step,) = steps_from_truth(signals, truth)
+    expected = addend if addend else factor - 1.0
+    assert (step.sensor, step.kind) == (name, f"{'jump' if addend else 'gain'}_from_truth")
+    assert (step.start_ns - sound.stamps_ns[0]) * 1e-9 == pytest.approx(at_s, abs=1.0)
+    assert step.size == pytest.approx(expected, rel=0.1)
+
+
+def test_a_bank_is_no_step_from_the_ground_truth(road_and_truth: tuple[Signals, StateTrack]) -> None:
+    road, truth = road_and_truth
+    ramp = np.clip((seconds(road) - AT_S) / 2.0, 0.0, 1.0)
+    assert steps_from_truth(replace(road, ay_m_s2=road.ay_m_s2 + 1.2 * ramp), truth) == ()
+    assert steps_from_truth(road.rows(0, 1), truth.rows(0, 1)) == ()
 
 
 def test_a_waived_sensor_is_not_changed(road: Signals) -> None:
