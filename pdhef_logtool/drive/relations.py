@@ -54,8 +54,8 @@ COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
 STRAIGHT_M_S2 = 3.0
 #: Least share of v_x in the speed if the heading is right.
 AHEAD_SHARE = 0.9
-#: Least ratio of the square of a position's scale to its standard error: along an axis on which the car hardly moves, noise
-#: reached 4.6 in 500 drives.
+#: Least ratio of the square of a position's scale to its standard error: along an axis on which the car hardly moves,
+#: noise reached 4.6 in 500 drives.
 SHOWN_STD = 8.0
 #: No car reverses faster for long: the sign of a faster speed is known, but not its unit.
 REVERSE_M_S = 10.0
