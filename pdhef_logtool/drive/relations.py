@@ -39,8 +39,8 @@ POSITION = "truth.position_vx_m_s", "truth.position_vy_m_s"
 #: less (5 % are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
 MOVES_M_S2 = 1.0
 MOVES_RAD_S = 0.06
-#: 1-sigma of the offset of a gyro, and of an accelerometer on a crossfall.
-BIAS_RAD_S, BIAS_M_S2 = 0.01, 0.5
+#: 1-sigma of the offset of a gyro, and of an accelerometer on a crossfall; the share of it that changes in a drive.
+BIAS_RAD_S, BIAS_M_S2, DISTURBED = 0.01, 0.5, 0.6
 #: Gains that tyres, roll, bank, grade and noise explain; outside, a unit is wrong.
 GAIN_RANGE = (0.55, 1.8)
 #: The same quantity measured twice.
@@ -157,7 +157,7 @@ def compare(
     ``either`` False only the reference must move the measured side. ``gentle``: samples of gentle driving. The relation
     of these is returned if only it is plausible: a wrong sign, unit or axis is wrong everywhere, sliding is not.
     ``bias``: 1-sigma of the offset between the sides. The means count as far as they exceed it: on a circle the mean is
-    the signal.
+    the signal. Sides that move by less count as fewer samples: the crossfall of a straight road moves them, too.
     """
     if gentle is not None:
         relations = compare(text, powers, reference, measured, use, expected, moves=moves, bias=bias)
@@ -175,6 +175,8 @@ def compare(
     both = moves is not None and (max(spread_a, spread_b) if either else spread_a) > moves
     if min(spread_a, spread_b) <= 1e-12:
         return [Relation(text, powers, 0.0, float("nan"), expected, samples, both)]
+    if math.isfinite(bias):  # below the disturbances, both sides follow the road
+        samples *= min(1.0, max(spread_a, spread_b) / (DISTURBED * bias)) ** 2
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
     left = max(0.0, 1.0 - correlation**2) * spread_b**2
     # Weight of the means in a regression with a normal prior of the offset.

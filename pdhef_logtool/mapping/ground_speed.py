@@ -21,6 +21,8 @@ from pdhef_logtool.records.signals import FloatArray
 NEAR_PATH = 0.08
 #: Speed over ground over that along the path if the axes are the earth's; share of the time that a body moves ahead.
 SAME_STEPS, AHEAD_SHARE = (0.7, 1.4), 0.6
+#: Least share of its y axis in a path: along the x axis, velocities over ground and of the body are equal.
+ACROSS_SHARE = 0.1
 #: Axes of the x and y of a velocity; empty if the drive does not show them, "not ahead" if they are not the body's.
 Axes: TypeAlias = Literal["east, north", "north, east", "body", "not ahead", ""]
 #: Note on every speed that is a length.
@@ -50,7 +52,10 @@ def axes_of(
         orders = (("east, north", east, north), ("north, east", north, east))
     for order, *along in orders:
         fits = [fit(a, b) for a, b in zip(along, (x, y), strict=True)]
-        if all(f is not None and f.correlation > CLEAR and SAME_STEPS[0] < f.slope < SAME_STEPS[1] for f in fits):
+        is_across = np.nanmean(along[1] ** 2) > ACROSS_SHARE**2 * np.nanmean(along[0] ** 2 + along[1] ** 2)
+        if is_across and all(
+            f is not None and f.correlation > CLEAR and SAME_STEPS[0] < f.slope < SAME_STEPS[1] for f in fits
+        ):
             return order
     length = np.hypot(x, y)
     moving = length > SLOW_M_S

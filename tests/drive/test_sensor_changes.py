@@ -131,7 +131,12 @@ def test_stuck_readings_that_move_again_are_no_jump(sample_logs_dir: Path) -> No
 
 @pytest.mark.parametrize(
     ("log", "name", "factor", "addend"),
-    [("road", "yaw_rate_rad_s", 1.0, 0.01), ("dlc", "ay_m_s2", 1.0, -0.8), ("road", "speed_m_s", 0.95, 0.0)],
+    [
+        ("road", "yaw_rate_rad_s", 1.0, 0.01),
+        ("road", "yaw_rate_rad_s", 1.1, 0.0),
+        ("dlc", "ay_m_s2", 1.0, -0.8),
+        ("road", "speed_m_s", 0.95, 0.0),
+    ],
 )
 def test_ground_truth_shows_smaller_steps(
     sample_logs_dir: Path, log: str, name: str, factor: float, addend: float
@@ -146,8 +151,16 @@ def test_ground_truth_shows_smaller_steps(
     (step,) = steps_from_truth(signals, truth)
     expected = addend if addend else factor - 1.0
     assert (step.sensor, step.kind) == (name, f"{'jump' if addend else 'gain'}_from_truth")
-    assert (step.start_ns - sound.stamps_ns[0]) * 1e-9 == pytest.approx(at_s, abs=1.0)
+    assert (step.start_ns - sound.stamps_ns[0]) * 1e-9 == pytest.approx(at_s, abs=2.5)
     assert step.size == pytest.approx(expected, rel=0.1)
+
+
+def test_ground_truth_shows_a_gyro_that_becomes_late(road_and_truth: tuple[Signals, StateTrack]) -> None:
+    road, truth = road_and_truth
+    gyro, late = road.yaw_rate_rad_s, seconds(road) >= AT_S
+    (step,) = steps_from_truth(replace(road, yaw_rate_rad_s=np.where(late, np.roll(gyro, 10), gyro)), truth)
+    assert (step.sensor, step.kind) == ("yaw_rate_rad_s", "delay_from_truth")
+    assert step.size == pytest.approx(0.1, abs=0.01)
 
 
 def test_a_bank_is_no_step_from_the_ground_truth(road_and_truth: tuple[Signals, StateTrack]) -> None:
