@@ -11,13 +11,18 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.evaluation.dependence import FACTORS, Factors
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
-from pdhef_logtool.evaluation.requirement_bounds import (
+from pdhef_logtool.evaluation.statistics import (
+    FACTORS,
     LEAST_BLOCKS,
     LEAST_DRIVES,
     Bounded,
+    Factors,
+    Outcome,
+    decided,
     least_drives,
+    log_ratios,
+    paired_change,
     pooled,
     quantile,
 )
@@ -34,7 +39,6 @@ from pdhef_logtool.evaluation.validation_plan import (
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.storage.templates import clauses, one_line, template
 
-Outcome: TypeAlias = Literal["PASS", "FAIL", "INCONCLUSIVE"]
 #: Driving that is missing: amount so far (None: unknown), needed amount, and its unit.
 _Lacking: TypeAlias = tuple[float | None, float, str]
 #: Least margin relative to an estimated reference, in standard deviations of the reference.
@@ -208,7 +212,7 @@ def _statistic(requirement: Requirement, drives: Sequence[DriveValue]) -> Bounde
     if requirement.statistic != POOLED:
         return _of_drives(requirement, _ratios(drives), factors)
     if count >= LEAST_DRIVES and requirement.other_run is not None:
-        return _typical_ratio(_ratios(drives), requirement.confidence, factors)
+        return _change(drives, requirement.confidence, factors)
     weights, values = (np.array([getattr(d, key) for d in drives], dtype=np.float64) for key in ("n", "value"))
     others = np.array([d.baseline for d in drives], dtype=np.float64) if requirement.baseline else None
     total = _pooled(requirement, weights, values, others, factors)
@@ -266,13 +270,12 @@ def _pooled(
     return bounded
 
 
-def _typical_ratio(ratios: FloatArray, level: float, factors: Factors) -> Bounded:
-    """Return the geometric mean of the drives' ratios to another run, which compares each drive with itself."""
-    with np.errstate(divide="ignore"):
-        logs = np.log(ratios)
-    bounded = pooled(np.ones(len(logs)), logs, None, squares=False, positive=False, level=level, factors=factors)
-    value, low, high = (float(np.exp(x)) for x in (bounded.value, bounded.low, bounded.high))
-    return replace(bounded, value=value, low=low, high=high)
+def _change(drives: Sequence[DriveValue], level: float, factors: Factors) -> Bounded:
+    """Return the median of the drives' ratios to another run, which compares each drive with itself."""
+    values, others = (np.array([getattr(d, key) for d in drives], dtype=np.float64) for key in ("value", "baseline"))
+    change = paired_change(log_ratios(others, values), None, factors, level)
+    value, low, high = (float(np.exp(x)) for x in (change.median, change.low, change.high))
+    return Bounded(value, low, high, change.drives, change.dependence)
 
 
 def _reference_sd(requirement: Requirement, drives: Sequence[DriveValue]) -> float:
@@ -329,10 +332,12 @@ def _without_bounds(requirement: Requirement, bounded: Bounded) -> bool:
 
 
 def _outcome(requirement: Requirement, bounded: Bounded) -> Outcome:
-    low, high, bound = bounded.low, bounded.high, requirement.bound
+    low, value, high, bound = bounded.low, bounded.value, bounded.high, requirement.bound
     if requirement.metric in AT_LEAST:
-        return "PASS" if low >= bound else "FAIL" if high < bound else "INCONCLUSIVE"
-    return "PASS" if high <= bound else "FAIL" if low > bound else "INCONCLUSIVE"
+        return decided(-high, -value, -low, -bound)
+    # Another run as the baseline: a significant regression fails if it is larger than the accepted one.
+    regression = requirement.other_run is not None and requirement.statistic == POOLED
+    return decided(low, value, high, bound, least=min(1.0, bound) if regression else bound)
 
 
 def _lacking(requirement: Requirement, exposure: Exposure, drives: Sequence[DriveValue]) -> list[_Lacking]:

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.evaluation.dependence import FACTORS, dependence, deviate, numbered
+from pdhef_logtool.evaluation.statistics import FACTORS, dependence, deviate, holm, numbered
 from pdhef_logtool.records.signals import BoolArray, FloatArray
-from pdhef_logtool.results.paired_change import holm
 
 #: Scored drives on each side of a comparison, at least.
 LEAST_DRIVES = 5

@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.evaluation.dependence import FACTORS
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.metrics.sensors import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
+from pdhef_logtool.evaluation.statistics import FACTORS, PairedChange, Verdict, holm, log_ratios, paired_change
 from pdhef_logtool.evaluation.units import SIGNALS
 from pdhef_logtool.evaluation.validation_plan import load_plan
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.printable import listed
 from pdhef_logtool.results.gate import MAIN, Figure, asked_figures
 from pdhef_logtool.results.opened_run import OpenedRun, open_run, table_file
-from pdhef_logtool.results.paired_change import PairedChange, Verdict, holm, log_ratios, paired_change
 from pdhef_logtool.results.pairing import Pair, Pairing, pair_logs
 from pdhef_logtool.results.plan_against import plan_verdicts_against
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts

@@ -7,8 +7,8 @@ from functools import cache
 from typing import Any
 
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
+from pdhef_logtool.evaluation.statistics import LEAST_CLUSTERS
 from pdhef_logtool.results.comparing import INDEPENDENT, ComparedFigure, Comparison
-from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
 from pdhef_logtool.results.selected_estimate import TEMPLATES
 from pdhef_logtool.storage.templates import clauses, one_line, template
 

@@ -17,13 +17,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdhef_logtool.evaluation.dependence import FACTORS, Dependence, dependence
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S
+from pdhef_logtool.evaluation.statistics import (
+    FACTORS,
+    Dependence,
+    PairedChange,
+    dependence,
+    holm,
+    log_ratios,
+    paired_change,
+)
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.results.breakdown import LEAST_DRIVES, SIGNIFICANT, Breakdown, BreakdownDrive, breakdowns
 from pdhef_logtool.results.opened_run import OpenedRun
-from pdhef_logtool.results.paired_change import PairedChange, holm, log_ratios, paired_change
 from pdhef_logtool.results.selected_estimate import NAIVE
 
 if TYPE_CHECKING:

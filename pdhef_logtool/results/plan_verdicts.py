@@ -11,8 +11,8 @@ from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.independence import NOT_INDEPENDENT
 from pdhef_logtool.evaluation.metrics.sensors import SENSORS
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, from_document
-from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
 from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, RequirementVerdict, gates, judge
+from pdhef_logtool.evaluation.statistics import LEAST_DRIVES
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import POOLED, RUN, Requirement, ValidationPlan, names_of
 from pdhef_logtool.records.tracks import REFERENCE

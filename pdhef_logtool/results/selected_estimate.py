@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from pdhef_logtool.evaluation.requirement_blocks import from_document
-from pdhef_logtool.evaluation.requirement_bounds import LEAST_BLOCKS, pooled
+from pdhef_logtool.evaluation.statistics import LEAST_BLOCKS, pooled
 from pdhef_logtool.evaluation.validation_plan import SIDESLIP
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.tracks import REFERENCE

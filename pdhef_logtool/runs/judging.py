@@ -7,7 +7,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
+from pdhef_logtool.evaluation.statistics import LEAST_DRIVES
 from pdhef_logtool.evaluation.validation_plan import default_plan
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.tracks import REFERENCE

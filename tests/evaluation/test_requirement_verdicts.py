@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
-from pdhef_logtool.evaluation.requirement_bounds import least_drives, quantile
 from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, judge
+from pdhef_logtool.evaluation.statistics import least_drives, quantile
 from pdhef_logtool.evaluation.validation_plan import Requirement
 
 LIMIT = Requirement("A", "", "sideslip_rad", limit=0.02)

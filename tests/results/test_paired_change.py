@@ -10,8 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from pdhef_logtool.evaluation.dependence import dependence, deviate
-from pdhef_logtool.results.paired_change import holm, paired_change
+from pdhef_logtool.evaluation.statistics import dependence, deviate, holm, paired_change
 
 
 def test_bounds_are_those_of_resampled_medians() -> None:
