@@ -73,7 +73,8 @@ class Requirement:
     ----------
     estimator : None for the selected estimate of each drive, or the recorded estimate.
     limit : maximum of the metric (:data:`AT_LEAST`: minimum). None for a requirement on the ratio to ``baseline``,
-        which is at most ``max_ratio``. baseline : estimator of the same run, :data:`RUN`, or output of another run.
+        which is at most ``max_ratio`` (None: a figure that is compared without a limit).
+    baseline : estimator of the same run, :data:`RUN`, or output of another run.
     statistic : of several drives: :data:`POOLED` over all their stamps, :data:`WORST_DRIVE`, or the ``quantile`` of the
         drives. confidence : of the interval that decides.
     exposure_drives, exposure_minutes, exposure_km : the least scored driving for a verdict. exposure : the least scored
@@ -124,21 +125,25 @@ class Requirement:
         return bound
 
     @property
+    def name(self) -> str:
+        """What is limited, for example ``sideslip RMSE (nonlinear)``."""
+        return self._text("")
+
+    @property
     def label(self) -> str:
         """The requirement as text, for example ``sideslip RMSE ≤ 0.5° (nonlinear)``."""
-        what = f"{LABELS[self.signal]} {registered()[self.metric].label}"
         if self.baseline is None:
             limit = f"{'≥' if self.metric in AT_LEAST else '≤'} {shown(self.bound, self.unit)}"
         else:
             baseline = self.baseline if self.other_run is None else "run A" if self.baseline == RUN else "earlier run"
             limit = f"≤ {self.bound:.4g} × {baseline}"
-        of = [
-            "" if self.segment == "all" else self.segment,
-            "" if self.statistic == POOLED else self.statistic,
-            self.estimator or "",
-        ]
-        where = ", ".join(filter(None, of))
-        return f"{what} {limit}{f' ({where})' if where else ''}"
+        return self._text(f" {limit}")
+
+    def _text(self, limit: str) -> str:
+        segment, statistic = self.segment.removeprefix("all"), self.statistic.removeprefix(POOLED)
+        where = ", ".join(filter(None, (segment, statistic, self.estimator)))
+        what = f"{LABELS[self.signal]} {registered()[self.metric].label}{limit}"
+        return f"{what} ({where})" if where else what
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,7 +37,7 @@ class Case:
 
 #: Characters that XML 1.0 cannot contain.
 _NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
-#: By log the checks of its report.
+#: By log the rows of its checks (checks.parquet).
 _Checks: TypeAlias = Mapping[str, Sequence[Mapping[str, Any]]]
 
 

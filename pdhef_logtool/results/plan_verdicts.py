@@ -1,10 +1,15 @@
-"""The verdicts of a validation plan on the drives of a run, from metrics.parquet and the blocks of report.json."""
+"""The verdicts of a validation plan on the drives of a run, from its tables and the blocks of report.json.
+
+The baseline of a requirement can be another run: run A of a comparison, or an earlier output.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pdhef_logtool.evaluation.metrics import MetricRow
@@ -15,7 +20,10 @@ from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, Requiremen
 from pdhef_logtool.evaluation.statistics import LEAST_DRIVES
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import POOLED, RUN, Requirement, ValidationPlan, names_of
+from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.tracks import REFERENCE
+from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun, open_run
+from pdhef_logtool.results.pairing import pair_logs
 from pdhef_logtool.results.sink import TRUTH
 
 if TYPE_CHECKING:
@@ -32,13 +40,16 @@ class JudgedDrive:
     """A drive of a run: its label, and its selected estimate (None: its only recorded estimate).
 
     ``read_report`` returns its report.json: its blocks of time are used where too few drives are scored for a bootstrap
-    over drives, its operating space where the plan asks for exposure. ``factors``: its day, car and route.
+    over drives. ``factors``: its day, car and route. ``space``, ``friction``: as in
+    :class:`~pdhef_logtool.evaluation.requirement_verdicts.DriveValue`, where the plan asks for exposure.
     """
 
     log: str
     main: str | None
     read_report: Callable[[], Mapping[str, Any] | None] = dict
     factors: Mapping[str, object] = field(default_factory=dict)
+    space: Mapping[tuple[float, float], float] = field(default_factory=dict)
+    friction: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,8 +154,6 @@ def plan_verdicts(
         by_label = {d.log: d for d in drives}
         if requirement.statistic == POOLED and len(values) < LEAST_DRIVES:
             values = [_with_blocks(requirement, v, by_label[v.log], other) for v in values]
-        if requirement.exposure:
-            values = [_with_space(v, by_label[v.log].read_report() or {}) for v in values]
         missing = "" if values else _why_missing(requirement, figures, drives, other)
         verdicts.append(judge(requirement, values, missing))
     return PlanVerdicts(plan, tuple(verdicts), strict)
@@ -195,6 +204,7 @@ def _value(
     return DriveValue(
         drive.log, name, value, n, baseline, seconds, metres,
         math.nan if std is None else std[0], same=needed and value == baseline, factors=drive.factors,
+        space=drive.space, friction=drive.friction,
     )  # fmt: skip
 
 
@@ -220,15 +230,6 @@ def _blocks_of(requirement: Requirement, drive: JudgedDrive, *, estimated: bool)
     measured = requirement.measured
     blocks = from_document((drive.read_report() or {}).get("requirement_blocks") or ())
     return next((b for b in blocks if b.of == measured and b.estimated == estimated), None)
-
-
-def _with_space(value: DriveValue, report: Mapping[str, Any]) -> DriveValue:
-    """Return the metric of a drive with its operating space."""
-    space = report.get("operating_space") or {"cells": ()}
-    edges = [space.get(key) or () for key in ("speed_edges_m_s", "ay_edges_m_s2")]
-    cells = {(edges[0][c["speed"]], edges[1][c["ay"]]): c["seconds"] for c in space["cells"]}
-    friction = space.get("friction_median")
-    return replace(value, space=cells, friction=math.nan if friction is None else float(friction))
 
 
 def _exposure(requirement: Requirement, figures: Figures, drive: JudgedDrive, n: int) -> tuple[float, float]:
@@ -284,3 +285,63 @@ def _why_unscored(requirement: Requirement, figures: Figures, names: Mapping[str
         return f"{requirement.estimator} did not run; add it to the estimators of pdhef run"
     above = " above the low-speed limit" if requirement.signal == "sideslip_rad" else ""
     return f"no ground truth of {LABELS[requirement.signal]}{above}; record drives with ground truth{above}"
+
+
+def plan_verdicts_against(plan: ValidationPlan, a: OpenedRun, b: OpenedRun, *, strict: bool) -> PlanVerdicts:
+    """Return the verdicts on the drives of B with A as :data:`~.validation_plan.RUN`; raises OutputError."""
+    drives: Sequence[JudgedDrive] = [judged_drive(log) for log in b.logs]
+    drives = in_spaces(drives, plan, b.table("drives"), b.table("exposure"))
+    figures = figures_of_file(b.table("metrics"), plan, [d.main for d in drives])
+    against = {**other_runs(plan, b.logs), RUN: _against(plan, a, b.logs)}
+    return plan_verdicts(plan, figures, drives, strict=strict, against=against)
+
+
+def other_runs(plan: ValidationPlan, logs: Sequence[OpenedLog]) -> dict[str, Against]:
+    """Return the outputs that requirements name as baseline, by their path or URL, paired with logs of this run.
+
+    Raises
+    ------
+    OutputError : One of them is missing (exit code 2) or damaged.
+    """
+    names = dict.fromkeys(n for r in plan.requirements if (n := r.other_run) not in (None, RUN))
+    return {name: _against(plan, open_run(name), logs) for name in names if name is not None}
+
+
+def _against(plan: ValidationPlan, run: OpenedRun, logs: Sequence[OpenedLog]) -> Against:
+    partners = {pair.b.label: judged_drive(pair.a) for pair in pair_logs(run.logs, logs).pairs}
+    return figures_of_file(run.table("metrics"), plan, [d.main for d in partners.values()]), partners
+
+
+def judged_drive(log: OpenedLog, read_report: Callable[[], Mapping[str, Any] | None] | None = None) -> JudgedDrive:
+    """Return a log of a run to judge; ``read_report`` None: from its file."""
+    main = log.entry.get("main")
+    factors = {"car": (log.entry.get("car") or {}).get("name"), **{k: log.entry.get(k) for k in ("day", "route")}}
+    return JudgedDrive(log.label, None if main is None else str(main), read_report or partial(_report, log), factors)
+
+
+def _report(log: OpenedLog) -> Mapping[str, Any] | None:
+    with suppress(OutputError):  # the comparison states it
+        return log.report()
+    return None
+
+
+def in_space(drive: JudgedDrive, report: Mapping[str, Any]) -> JudgedDrive:
+    """Return a drive with its operating space and friction, from its report."""
+    space = report.get("operating_space") or {}
+    speeds, ays = (space.get(key, ()) for key in ("speed_edges_m_s", "ay_edges_m_s2"))
+    cells = {(speeds[c["speed"]], ays[c["ay"]]): c["seconds"] for c in space.get("cells", ())}
+    friction = space.get("friction_median")
+    return replace(drive, space=cells, friction=math.nan if friction is None else float(friction))
+
+
+def in_spaces(
+    drives: Sequence[JudgedDrive], plan: ValidationPlan, table: pl.LazyFrame, exposure: pl.LazyFrame
+) -> Sequence[JudgedDrive]:
+    """Return the same of the tables ``drives`` and ``exposure`` of a run, which are read if the plan needs them."""
+    if not any(r.exposure for r in plan.requirements):
+        return drives
+    spaces: dict[str, dict[tuple[float, float], float]] = {}
+    for log, speed, ay, seconds in exposure.select("log", "speed_m_s", "ay_m_s2", "seconds").collect().iter_rows():
+        spaces.setdefault(log, {})[speed, ay] = seconds
+    friction = dict(table.select("log", "friction_median").drop_nulls().collect().iter_rows())
+    return [replace(d, space=spaces.get(d.log, {}), friction=friction.get(d.log, math.nan)) for d in drives]

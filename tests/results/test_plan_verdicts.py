@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -189,12 +188,8 @@ def test_a_missing_earlier_run_ends_the_command_before_the_work(tmp_path: Path) 
     ],
 )
 def test_exposure_in_conditions(need: dict[str, Any], outcome: str, words: str) -> None:
-    def report(friction: float) -> dict[str, Any]:
-        edges = {"speed_edges_m_s": [0.0, 5.0, 10.0, 15.0, 20.0], "ay_edges_m_s2": [0.0, 1.0, 2.0]}
-        cells = [{"speed": s, "ay": a, "seconds": 20.0} for s, a in ((4, 0), (1, 2))]
-        return {"operating_space": {**edges, "cells": cells, "friction_median": friction}}
-
-    drives = [JudgedDrive(x, "pd-hef", partial(report, 0.3 if x < "d" else 0.9), {"car": "golf"}) for x in SIX]
+    space = {(20.0, 0.0): 20.0, (5.0, 2.0): 20.0}
+    drives = [JudgedDrive(x, "pd-hef", dict, {"car": "golf"}, space, 0.3 if x < "d" else 0.9) for x in SIX]
     verdict = judged(scored(), replace(BETA, exposure=(ExposureNeed(**need),)), drives=drives)
     assert verdict.outcome == outcome and words in verdict.reason
 
