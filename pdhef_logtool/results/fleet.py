@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
@@ -29,7 +29,7 @@ from pdhef_logtool.evaluation.statistics import (
 )
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.signals import BoolArray, FloatArray
-from pdhef_logtool.results.breakdown import LEAST_DRIVES, SIGNIFICANT, Breakdown, BreakdownDrive, breakdowns
+from pdhef_logtool.results.breakdown import LEAST_DRIVES, SIGNIFICANT, Breakdown, breakdowns
 from pdhef_logtool.results.opened_run import OpenedRun
 from pdhef_logtool.results.selected_estimate import NAIVE
 
@@ -54,6 +54,8 @@ _REMEDIES = {
     "there was no more memory": "Use fewer --jobs, or a machine with more memory.",
     "took more than": "Allow more memory: --set max_memory_mb=MB.",
 }
+#: Groups of drives by their length in s.
+_LENGTHS = (("below 10 s", 10.0), ("10 to 60 s", 60.0), ("1 to 10 min", 600.0), ("10 to 60 min", 3600.0))
 _PLACE = re.compile(r"\s*\([^()]*\)\s*$")
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
@@ -227,8 +229,9 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
         metadata.setdefault(log, {})[key] = value
     figures = _figures(run)
     drives = tuple(
-        _drive(r, figures.get(r["log"], {}), _keys(r, metadata.get(r["log"], {}), kinds.get(r["log"]))) for r in done
+        _drive(r, figures.get(r["log"], {}), metadata.get(r["log"], {}) | _keys(r, kinds.get(r["log"]))) for r in done
     )
+    errors = np.array([d.error() for d in drives])
     scored = [d for d in drives if d.truth]
     names = _estimators(scored)
     return Fleet(
@@ -238,7 +241,7 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
         ranking=tuple(_ranking(scored, names)) if len(scored) >= least_to_rank(len(names)) else (),
         least_to_rank=least_to_rank(len(names)),
         dependence=_dependence(scored),
-        breakdowns=breakdowns([BreakdownDrive(d.error(), d.keys, d.factors) for d in drives], by),
+        breakdowns=breakdowns(errors, [d.keys for d in drives], _of_all(drives), by),
         space=_space(run),
         failed=grouped([(r["log"], r["reason"]) for r in rows if r["outcome"] == "failed"]),
         losses=grouped(lost),
@@ -318,27 +321,20 @@ def _drive(
     )
 
 
-def _keys(row: Mapping[str, Any], metadata: Mapping[str, str], kinds: Sequence[str] | None) -> dict[str, str]:
-    """Return the keys for grouping of a drive: metadata of its log, and of the run."""
+def _keys(row: Mapping[str, Any], kinds: Sequence[str] | None) -> dict[str, str]:
+    """Return the keys for grouping of a drive that are not in the metadata of its log."""
     from_log = {
         "car": row["car"],
         "log format": row["log_format"],
         "answer": row["estimator"],
         "friction source": row["friction_source"],
-        "length": _length(row["seconds"]),
+        "length": next((text for text, end in _LENGTHS if row["seconds"] < end), "above an hour"),
         "sensor faults": None if row["sensor_faults"] is None else ", ".join(kinds or ()) or "none",
         "month": (row["day"] or "")[:7],
     }
     parts = row["folder"].split("/")[:_MOST_FOLDERS]
     from_log |= {"folder" if i == 0 else f"folder {i + 1}": "/".join(parts[: i + 1]) for i in range(len(parts))}
-    return {**metadata, **{k: v for k, v in from_log.items() if v}}
-
-
-def _length(seconds: float) -> str:
-    for text, end in (("below 10 s", 10.0), ("10 to 60 s", 60.0), ("1 to 10 min", 600.0), ("10 to 60 min", 3600.0)):
-        if seconds < end:
-            return text
-    return "above an hour"
+    return {k: v for k, v in from_log.items() if v}
 
 
 def _estimators(drives: Iterable[FleetDrive]) -> list[str]:
@@ -347,9 +343,10 @@ def _estimators(drives: Iterable[FleetDrive]) -> list[str]:
     return sorted(counts, key=lambda e: (-counts[e], e))
 
 
-def _of_all(drives: Sequence[FleetDrive], use: BoolArray) -> dict[str, list[str | None]]:
-    """Return day, car and route of the drives to use."""
-    return {f: [d.factors.get(f) for d, used in zip(drives, use, strict=True) if used] for f in FACTORS}
+def _of_all(drives: Sequence[FleetDrive], use: BoolArray | None = None) -> dict[str, list[str | None]]:
+    """Return day, car and route of the drives to use (None: all)."""
+    used = drives if use is None else [drives[i] for i in np.flatnonzero(use)]
+    return {f: [d.factors.get(f) for d in used] for f in FACTORS}
 
 
 def _dependence(drives: Sequence[FleetDrive]) -> Dependence:
@@ -359,8 +356,8 @@ def _dependence(drives: Sequence[FleetDrive]) -> Dependence:
     return dependence(np.log(errors[use]), _of_all(drives, use))
 
 
-def _median(change: PairedChange) -> Median:
-    return Median(change.median, change.low, change.high)
+def _median(change: PairedChange, scale: Callable[[float], float] = float) -> Median:
+    return Median(*map(scale, (change.median, change.low, change.high)))
 
 
 def _distributions(drives: Sequence[FleetDrive], names: Sequence[str]) -> Iterable[Distribution]:
@@ -384,31 +381,26 @@ def _ranking(drives: Sequence[FleetDrive], names: Sequence[str]) -> list[Rank]:
     pairs = [*combinations(names, 2)]
     changes = [change(a, b) for a, b in pairs]
     beats: dict[str, set[str]] = {name: set() for name in names}
+    score = dict.fromkeys(names, 0)
     for (a, b), of_pair, p in zip(pairs, changes, holm([c.sign_p for c in changes]), strict=True):
         if p < SIGNIFICANT and of_pair.median != 0.0:
             better, worse = (a, b) if of_pair.median > 0.0 else (b, a)
             beats[better].add(worse)
-    lost = {name: {other for other in names if name in beats[other]} for name in names}
-    medians = {name: float(np.nanmedian(errors[name])) for name in names}
-    order = sorted(names, key=lambda n: (len(lost[n]) - len(beats[n]), medians[n], n))
+            score[better] -= 1
+            score[worse] += 1
+    order = sorted(names, key=lambda n: (score[n], float(np.nanmedian(errors[n])), n))
     mains = {d.main for d in drives}
     return [
         Rank(
             # Equal places where no difference is significant, and none where this is true of all.
-            place=1 + sum(len(lost[o]) - len(beats[o]) < len(lost[name]) - len(beats[name]) for o in names)
-            if any(beats.values())
-            else None,
+            place=1 + sum(score[o] < score[name] for o in names) if any(beats.values()) else None,
             estimator=name,
             drives=int(np.isfinite(errors[name]).sum()),
             better_than=tuple(n for n in order if n in beats[name]),
-            against_answer=None if mains == {name} else _share(_median(change(ANSWER, name))),
+            against_answer=None if mains == {name} else _median(change(ANSWER, name), math.expm1),
         )
         for name in order
     ]
-
-
-def _share(of_logs: Median) -> Median:
-    return Median(*(math.expm1(x) for x in (of_logs.value, of_logs.low, of_logs.high)))
 
 
 def cause_and_remedy(reason: str) -> tuple[str, str]:
