@@ -20,13 +20,14 @@ test, with a variance multiplied by the design effect.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import combinations
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.records.student import student_quantile
@@ -35,7 +36,7 @@ Verdict: TypeAlias = Literal["equal", "worse", "not worse", "better", "inconclus
 
 Outcome: TypeAlias = Literal["PASS", "FAIL", "INCONCLUSIVE"]
 #: Values of each drive by factor (day, car, route); None if the log does not contain it.
-Factors: TypeAlias = Mapping[str, Sequence[object]]
+Factors: TypeAlias = Mapping[str, Sequence[object] | NDArray[np.object_]]
 
 #: Metadata keys of a route; the first one in the log counts.
 ROUTE_KEYS = ("route", "track", "course")
@@ -112,7 +113,7 @@ def deviate(share: float, freedom: float) -> float:
     return float(stdtrit(freedom, share))
 
 
-def numbered(values: Sequence[object]) -> IntArray:
+def numbered(values: Iterable[object]) -> IntArray:
     """Return an integer for each different value [N]; each None is a separate value."""
     numbers: dict[object, int] = {}
     return np.array(

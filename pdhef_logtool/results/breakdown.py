@@ -135,11 +135,9 @@ def _alike(errors: FloatArray, columns: Mapping[str, _Texts]) -> dict[str, tuple
     return {key: tuple(others) for key, *others in first.values()}
 
 
-def _tests(
-    key: str, errors: FloatArray, values: FloatArray, drives: Mapping[str, FloatArray]
-) -> dict[str, _Test | str]:
+def _tests(key: str, errors: FloatArray, values: _Texts, drives: Mapping[str, _Texts]) -> dict[str, _Test | str]:
     """Return the comparison of each value with the other drives, or the reason why it is impossible."""
-    use = (errors > 0.0) & np.not_equal(values, None)
+    use = (errors > 0.0) & np.array([v is not None for v in values], dtype=np.bool_)
     logs, names = np.log(errors[use]), values[use]
     part = numbered(names)
     factors = {

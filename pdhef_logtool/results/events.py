@@ -271,7 +271,7 @@ def _column(reference: Reference, main: str, drive: _Drive) -> pl.Expr:
         if signal == "sideslip_rad":
             error = pl.arctan2(error.sin(), error.cos())
             scored &= speed(TRUTH) > drive.low_speed_m_s
-        column = pl.when(scored).then(error)
+        column: pl.Expr = pl.when(scored).then(error)
     else:
         column = speed(reference.track or main) if name == SPEED else of(name)
     return column if reference.factor == 1.0 else column * reference.factor

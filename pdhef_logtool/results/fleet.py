@@ -345,7 +345,7 @@ def _estimators(drives: Iterable[FleetDrive]) -> list[str]:
 
 def _of_all(drives: Sequence[FleetDrive], use: BoolArray | None = None) -> dict[str, list[str | None]]:
     """Return day, car and route of the drives to use (None: all)."""
-    used = drives if use is None else [drives[i] for i in np.flatnonzero(use)]
+    used = drives if use is None else [drives[i] for i in np.flatnonzero(use).tolist()]
     return {f: [d.factors.get(f) for d in used] for f in FACTORS}
 
 
