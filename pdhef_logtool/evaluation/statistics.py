@@ -335,24 +335,17 @@ def quantile(values: FloatArray, share: float, level: float, factors: Factors | 
     n = len(values)
     if not n:
         return Bounded(math.nan, math.nan, math.nan, 0)
-    ascending = np.sort(values)
-    below = bdtr(np.arange(n + 1), n, share)  # P(at most k drives are below the quantile)
+    ends = [-math.inf, *np.sort(values).tolist(), math.inf]
+    below = bdtr(np.arange(n), n, share)  # P(at most k drives are below the quantile)
     tail = 0.5 * (1.0 - level)
-    upper = next((k for k in range(1, n + 1) if below[k - 1] >= 1.0 - tail), None)
-    lower = next((k for k in range(n, 0, -1) if below[k - 1] <= tail), None)
-    value = float(np.quantile(ascending, share))
+    lower = int(np.searchsorted(below, tail, side="right"))
+    upper = int(np.searchsorted(below, 1.0 - tail)) + 1
+    value = float(np.quantile(values, share))
     effect = dependence((values > value).astype(np.float64), factors or {})
     if effect.design_effect > 1.0:
         reach = deviate(1.0 - tail, effect.freedom) * math.sqrt(n * share * (1.0 - share) * effect.design_effect)
-        most, least = math.ceil(n * share + reach), math.floor(n * share - reach)
-        upper, lower = most if most <= n else None, least if least >= 1 else None
-    return Bounded(
-        value,
-        -math.inf if lower is None else float(ascending[lower - 1]),
-        math.inf if upper is None else float(ascending[upper - 1]),
-        n,
-        effect,
-    )
+        lower, upper = max(math.floor(n * share - reach), 0), min(math.ceil(n * share + reach), n + 1)
+    return Bounded(value, ends[lower], ends[upper], n, effect)
 
 
 def least_drives(share: float, level: float) -> int:

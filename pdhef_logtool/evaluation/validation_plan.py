@@ -253,31 +253,23 @@ def _placed(requirement: Requirement, folder: Path) -> Requirement:
 
 def plan_from_dict(raw: dict[str, Any], *, where: str, file: str = "") -> ValidationPlan:
     """Return the plan of parsed TOML; raises UsageError with all problems in one line."""
-    problems = [unknown(key, PlanTable.model_fields) for key in raw if key not in PlanTable.model_fields]
-    title = raw.get("title", "")
-    if not isinstance(title, str) or len(title) > 200:
-        problems.append("title: should be a text of at most 200 characters")
-    tables = raw.get("requirement", [])
-    if not isinstance(tables, list) or not tables:
-        problems.append("requirement: give at least one [[requirement]] table")
-        tables = []
-    requirements = [_read(table, f"requirement[{i}]", problems) for i, table in enumerate(tables)]
+    problems: list[str] = []
+    plan = checked(PlanTable, raw, "", problems)
+    tables = [] if plan is None else plan.requirement
+    requirements = [_read(table, f"requirement.{i}", problems) for i, table in enumerate(tables)]
     ids = [r.id for r in requirements if r is not None]
     problems += [f"id {name!r} is used {ids.count(name)} times" for name in dict.fromkeys(ids) if ids.count(name) > 1]
-    if problems:
+    if plan is None or problems:
         raise UsageError(
             expected="the entries of a validation plan",
             got="; ".join(problems),
             where=where,
             remedy="docs/formats.md#plantoml describes every entry",
         )
-    return ValidationPlan(tuple(r for r in requirements if r is not None), title, file)
+    return ValidationPlan(tuple(r for r in requirements if r is not None), plan.title, file)
 
 
-def _read(raw: object, where: str, problems: list[str]) -> Requirement | None:
-    table = checked(RequirementTable, raw, where, problems)
-    if table is None:
-        return None
+def _read(table: RequirementTable, where: str, problems: list[str]) -> Requirement | None:
     before = len(problems)
     segment = table.manoeuvre or table.segment or "all"
     if table.manoeuvre is not None and table.segment is not None:
