@@ -47,7 +47,7 @@ _LEAST_EFFECT = 0.2
 
 #: With fewer drives, blocks within them are drawn. With fewer blocks, there are no bounds.
 LEAST_DRIVES, LEAST_BLOCKS = 5, 6
-_RESAMPLES, _SEED = 2000, 0
+_RESAMPLES = 2000
 #: More units than this are drawn in groups.
 _MOST_UNITS = 1000
 #: Largest studentised deviation, in quantiles of Student's t: some resamples of few units have nearly no spread.
@@ -309,7 +309,7 @@ def _error(top: FloatArray, below: FloatArray, counts: FloatArray, power: float,
 @lru_cache(maxsize=1)
 def _resamples(n: int) -> FloatArray:
     """Return how often each of ``n`` units counts in each resample, [M, N]; all requirements have the same."""
-    counts = np.random.default_rng(_SEED).multinomial(n, np.full(n, 1.0 / n), size=_RESAMPLES).astype(np.float64)
+    counts = np.random.default_rng(0).multinomial(n, np.full(n, 1.0 / n), size=_RESAMPLES).astype(np.float64)
     counts.flags.writeable = False
     return counts
 

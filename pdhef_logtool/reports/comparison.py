@@ -60,11 +60,8 @@ def _draw_history(comparison: Comparison, charts: Charts) -> None:
 
 
 def _draw(comparison: Comparison, first: ComparedFigure, charts: Charts) -> None:
-    asked = [
-        _interval(figure, {"bad": FAULT, "good": _BLUE}.get(_KIND[figure.verdict], PLAIN))
-        for figure in comparison.figures
-        if figure.drives
-    ]
+    colours = {"bad": FAULT, "good": _BLUE, "": PLAIN}
+    asked = [_interval(f, colours[_KIND[f.verdict]]) for f in comparison.figures if f.drives]
     others = [_interval(figure, PLAIN) for figure in comparison.others]
     if asked or others:
         charts.figures["changes"] = IntervalsFigure("Median change, 95 % interval", "%", [*asked, *others], zero=0.0)

@@ -54,8 +54,6 @@ _REMEDIES = {
     "there was no more memory": "Use fewer --jobs, or a machine with more memory.",
     "took more than": "Allow more memory: --set max_memory_mb=MB.",
 }
-#: Groups of drives by their length in s.
-_LENGTHS = (("below 10 s", 10.0), ("10 to 60 s", 60.0), ("1 to 10 min", 600.0), ("10 to 60 min", 3600.0))
 _PLACE = re.compile(r"\s*\([^()]*\)\s*$")
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
@@ -323,12 +321,13 @@ def _drive(
 
 def _keys(row: Mapping[str, Any], kinds: Sequence[str] | None) -> dict[str, str]:
     """Return the keys for grouping of a drive that are not in the metadata of its log."""
+    lengths = (("below 10 s", 10.0), ("10 to 60 s", 60.0), ("1 to 10 min", 600.0), ("10 to 60 min", 3600.0))
     from_log = {
         "car": row["car"],
         "log format": row["log_format"],
         "answer": row["estimator"],
         "friction source": row["friction_source"],
-        "length": next((text for text, end in _LENGTHS if row["seconds"] < end), "above an hour"),
+        "length": next((text for text, end in lengths if row["seconds"] < end), "above an hour"),
         "sensor faults": None if row["sensor_faults"] is None else ", ".join(kinds or ()) or "none",
         "month": (row["day"] or "")[:7],
     }

@@ -15,6 +15,7 @@ from pdhef_logtool.evaluation.requirement_verdicts import RequirementVerdict
 from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.selected_estimate import TEMPLATES
+from pdhef_logtool.results.tables import checks_of
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.templates import template
 
@@ -41,9 +42,9 @@ _NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]"
 _Checks: TypeAlias = Mapping[str, Sequence[Mapping[str, Any]]]
 
 
-def write_junit(path: Path, verdicts: PlanVerdicts, checks: _Checks | None = None) -> None:
-    """Write the verdicts of a plan, and checks by log, through a temporary name; raises OutputError."""
-    write_bytes(path, junit_bytes(verdicts, checks))
+def write_junit(path: Path, verdicts: PlanVerdicts, parts: Mapping[str, Any]) -> None:
+    """Write the verdicts of a plan, and the checks of the logs' parts of tables; raises OutputError."""
+    write_bytes(path, junit_bytes(verdicts, {log: checks_of(part) for log, part in parts.items()}))
 
 
 def junit_bytes(verdicts: PlanVerdicts, checks: _Checks | None = None) -> bytes:

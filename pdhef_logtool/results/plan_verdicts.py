@@ -233,6 +233,11 @@ class _Judged:
         names = {d.log: name for d in drives if (name := self._name(d))}
         if not names:
             return "there are several recorded estimates: name one with estimator" if figures.names else "no estimate"
+        return self._why_unscored(names)
+
+    def _why_unscored(self, names: Mapping[str, str]) -> str:
+        """Return the same if the drives have the estimators ``names``."""
+        requirement, figures = self.requirement, self.figures
         scored = [log for log, name in names.items() if figures.of(log, name, requirement, requirement.metric)]
         if scored and all(self._tainted(log, names[log]) for log in scored):
             return "the ground truth is an input of the estimator: not an independent check"

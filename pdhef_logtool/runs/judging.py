@@ -98,11 +98,9 @@ def judge(
     else:
         import polars as pl
 
-        metrics, exposure, of_drives = (
-            pl.scan_parquet(tables / f"{name}.parquet") for name in ("metrics", "exposure", "drives")
-        )
+        metrics, *spaces = (pl.scan_parquet(tables / f"{x}.parquet") for x in ("metrics", "drives", "exposure"))
         figures = judging.figures_of_file(metrics, plan, [d.main for d in drives])
-        drives = judging.in_spaces(drives, plan, of_drives, exposure)
+        drives = judging.in_spaces(drives, plan, *spaces)
     against = judging.other_runs(plan, [r.opened for r in done])
     return judging.plan_verdicts(plan, figures, drives, strict=strict, against=against)
 
@@ -116,6 +114,5 @@ def write_verdicts(junit: Path | None, verdicts: PlanVerdicts | None, results: S
     """Write JUnit XML if ``junit`` is a file; raises OutputError."""
     if junit is not None and verdicts is not None:
         from pdhef_logtool.results.junit import write_junit
-        from pdhef_logtool.results.tables import checks_of
 
-        write_junit(junit, verdicts, {r.outcome.log: checks_of(r.part) for r in results})
+        write_junit(junit, verdicts, {r.outcome.log: r.part for r in results})

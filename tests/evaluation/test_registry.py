@@ -99,7 +99,7 @@ def test_plans_and_compare_accept_it(toy: str, result: RunResult) -> None:
     console = Console(width=120, record=True, file=io.StringIO())
     render_comparison(changed, console)
     assert f"sideslip {LABEL}" in console.export_text()
-    assert toy.encode() in comparison_page(changed)
+    assert LABEL.encode() in comparison_page(changed)
 
 
 def test_the_documentation_defines_it(toy: str) -> None:
