@@ -42,7 +42,7 @@ def render_comparison(comparison: Comparison, console: Console) -> None:
         for line in comparison.differences:
             print_indented(line, console)
     console.print(f"\n{sentence('changes', comparison)}")
-    if comparison.verdict != "equal":
+    if not comparison.equal:
         _print_figures(comparison, console)
         _print_drives(comparison.figures[0], console)
     if comparison.others:

@@ -70,6 +70,10 @@ def figure(
     return Requirement("", "", signal, metric, estimator, segment, baseline=RUN, max_ratio=ratio, confidence=0.9)
 
 
+def _entries(record: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(record, name) for name in names}
+
+
 @dataclass(frozen=True, slots=True)
 class ComparedFigure:
     """One figure over all drives.
@@ -109,18 +113,15 @@ class ComparedFigure:
         """Return it as JSON-able values; changes are shares: 0.05 is 5 % more."""
         change, asked = self.change, self.requirement
         return {
-            **{key: getattr(asked, key) for key in ("signal", "metric", "segment")},
+            **_entries(asked, "signal", "metric", "segment"),
             "estimator": asked.estimator or MAIN,
-            **{key: getattr(self, key) for key in ("limit", "unit", "verdict")},
-            "drives": change.drives,
-            "clusters": change.clusters,
+            **_entries(self, "limit", "unit", "verdict"),
+            **_entries(change, "drives", "clusters"),
             "design_effect": change.dependence.design_effect,
             "dependence": change.dependence.by,
             **{k: math.expm1(getattr(change, k)) for k in ("median", "low", "high", "least", "most")},
             "sign_p": change.sign_p,
-            **{
-                key: getattr(self, key) for key in ("detectable", "corrected_p", "only_a", "only_b", "neither", "notes")
-            },
+            **_entries(self, "detectable", "corrected_p", "only_a", "only_b", "neither", "notes"),
             "of_drives": self.drives,
         }
 
@@ -146,9 +147,9 @@ class HistoryRow:
         step = {} if self.step is None else self.step.to_dict()
         unchanged = 0.0 if self.verdict == "equal" else None
         return {
-            **{key: getattr(self, key) for key in ("run", "version", "unit", "verdict")},
+            **_entries(self, "run", "version", "unit", "verdict"),
             "drives": self.figure.units,
-            **{key: getattr(self.figure, key) for key in ("value", "low", "high")},
+            **_entries(self.figure, "value", "low", "high"),
             "change": [step.get(key, unchanged) for key in ("median", "low", "high")],
         }
 
@@ -230,11 +231,11 @@ class Comparison:
         return {
             "format": "pdhef.comparison",
             "version": 2,
-            **{key: getattr(self, key) for key in ("a", "b", "verdict", "exit_code", "failures")},
+            **_entries(self, "a", "b", "verdict", "exit_code", "failures"),
             "plan": None if self.requirements is None else self.requirements.to_dict(),
             "differences": self.differences,
             "pairs": dict(self.pairs),
-            **{key: getattr(self, key) for key in ("only_a", "only_b", "changed", "cluster")},
+            **_entries(self, "only_a", "only_b", "changed", "cluster"),
             **{key: [f.to_dict() for f in getattr(self, key)] for key in ("figures", "others", "history")},
         }
 
@@ -368,7 +369,7 @@ class _Tables:
         if key in (None, INDEPENDENT):
             return pairs
         metadata = pairs.select(log="a").join(run.table("metadata").collect(), on="log")
-        stated = metadata.filter(key=key).select(a="log", cluster="value")
+        stated = metadata.filter(key=key).select(a="log", cluster="value").unique("a", keep="last")
         keyed = pairs.join(stated, on="a", how="left").sort("place")
         if key in FACTORS:
             keyed = pairs.with_columns(cluster=pl.col(str(key)))
@@ -425,7 +426,7 @@ class _Tables:
         clusters = both["cluster"].to_list() if "cluster" in both.columns else None
         factors = {f: both[f].to_list() for f in FACTORS} if self._cluster is None else None
         change = paired_change(ratios, clusters, factors)
-        equal = both["value"].equals(both["value_b"], check_dtypes=False) and both["n"].equals(both["n_b"])
+        equal = both["value"].equals(both["value_b"]) and both["n"].equals(both["n_b"])
         verdict = change.verdict((asked.max_ratio or 1.0) - 1.0) if not equal else "equal" if len(both) else "no figure"
         drives = both.select(drive="a", drive_b="b", a="value", b="value_b", n_a="n", n_b="n_b")
         share = pl.when(pl.col("a") != 0.0).then(pl.col("b") / pl.col("a") - 1.0)

@@ -42,7 +42,6 @@ ANSWER = "answer"
 SIGNALS = {s: SCORED_SIGNALS[s] for s in ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s")}
 JUDGED = "sideslip_rad"
 WORST = 20
-_FIGURE = ("log", "estimator", "signal", "metric", "value")
 #: Levels of folders by which drives are grouped.
 _MOST_FOLDERS = 3
 #: Most labels of a group of failures, and most groups.
@@ -216,7 +215,7 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
     """
     import polars as pl
 
-    rows = run.table("drives").collect().to_dicts()
+    rows = _rows(run)
     done = [row for row in rows if row["outcome"] != "failed"]
     faults = run.table("faults")
     sensors = faults.filter(pl.col("origin") == "sensor").group_by("log").agg(pl.col("kind").unique().sort())
@@ -225,9 +224,11 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
     metadata: dict[str, dict[str, str]] = {}
     for log, key, value in run.table("metadata").collect().iter_rows():
         metadata.setdefault(log, {})[key] = value
-    figures = _figures(run)
+    of_log: dict[str, dict[tuple[str, str], float]] = {}
+    for log, estimator, signal, value in sideslip_errors(run, [*SIGNALS]).collect().iter_rows():
+        of_log.setdefault(log, {})[estimator, signal] = value
     drives = tuple(
-        _drive(r, figures.get(r["log"], {}), metadata.get(r["log"], {}) | _keys(r, kinds.get(r["log"]))) for r in done
+        _drive(r, of_log.get(r["log"], {}), metadata.get(r["log"], {}) | _keys(r, kinds.get(r["log"]))) for r in done
     )
     errors = np.array([d.error() for d in drives])
     scored = [d for d in drives if d.truth]
@@ -275,44 +276,46 @@ def _space(run: OpenedRun) -> Space | None:
 
 
 def sideslip_errors(run: OpenedRun, signals: Sequence[str] = (JUDGED,)) -> pl.LazyFrame:
-    """Return the RMSE of drives by log, estimator and signal, where the ground truth is independent."""
+    """Return the RMSE of drives, where the ground truth is independent: log, estimator, signal and value."""
     import polars as pl
 
     there = pl.col("independent") & pl.col("value").is_finite() & pl.col("signal").is_in(signals)
-    return run.table("metrics").filter(there, segment="all", metric="rmse").select(_FIGURE)
+    return (
+        run.table("metrics").filter(there, segment="all", metric="rmse").select("log", "estimator", "signal", "value")
+    )
 
 
-def _figures(run: OpenedRun) -> dict[str, dict[tuple[str, str, str], float]]:
-    """Return the figures of whole drives by log, then by estimator, signal and metric."""
+def _rows(run: OpenedRun) -> list[dict[str, Any]]:
+    """Return the table of drives, with NIS per degree of freedom, v̇_y residual and the residual of sideslip 0."""
     import polars as pl
 
-    consistency = run.table("metrics").filter(pl.col("metric").is_in(["nis", "nis_dof", "d2"]), segment="all")
-    values: dict[str, dict[tuple[str, str, str], float]] = {}
-    for rows in (sideslip_errors(run, [*SIGNALS]), consistency.select(_FIGURE)):
-        for log, *key, value in rows.collect().iter_rows():
-            values.setdefault(log, {})[key[0], key[1], key[2]] = math.nan if value is None else value
-    return values
+    def value(metric: str) -> pl.Expr:
+        return pl.col("value").filter(pl.col("metric") == metric).first()
+
+    metrics = run.table("metrics").filter(pl.col("metric").is_in(["nis", "nis_dof", "d2"]), segment="all")
+    checks = metrics.group_by("log", "estimator").agg(nis=value("nis") / value("nis_dof"), d2=value("d2"))
+    naive = checks.filter(estimator=NAIVE).select("log", naive_d2="d2")
+    drives = run.table("drives").with_row_index("place").join(checks, on=["log", "estimator"], how="left")
+    return drives.join(naive, on="log", how="left").sort("place").collect().to_dicts()
 
 
-def _drive(
-    row: Mapping[str, Any], figures: Mapping[tuple[str, str, str], float], keys: Mapping[str, str]
-) -> FleetDrive:
-    """Return a drive of a row of the table of drives."""
-    main = row["estimator"] or ""
-    dof = figures.get((main, "state", "nis_dof"), math.nan)
-    nis = figures.get((main, "state", "nis"), math.nan)
-    coverage = row["sideslip_coverage95"]
+def _drive(row: Mapping[str, Any], errors: Mapping[tuple[str, str], float], keys: Mapping[str, str]) -> FleetDrive:
+    """Return a drive of its row."""
+
+    def number(key: str) -> float:
+        return math.nan if row[key] is None else float(row[key])
+
     return FleetDrive(
         label=row["log"],
         seconds=row["seconds"],
-        main=main,
+        main=row["estimator"] or "",
         truth=row["sideslip_rmse_rad"] is not None,
         unscored=row["unscored"] or "",
-        errors={(e, s): value for (e, s, metric), value in figures.items() if metric == "rmse"},
-        coverage=math.nan if coverage is None else coverage,
-        nis=nis / dof if dof > 0.0 else math.nan,
-        d2=figures.get((main, "vy_m_s", "d2"), math.nan),
-        naive_d2=figures.get((NAIVE, "vy_m_s", "d2"), math.nan),
+        errors=errors,
+        coverage=number("sideslip_coverage95"),
+        nis=number("nis"),
+        d2=number("d2"),
+        naive_d2=number("naive_d2"),
         failed_checks=row["failed_checks"],
         keys=keys,
         factors={factor: row[factor] for factor in FACTORS},
