@@ -20,7 +20,7 @@ _PAD_S, _CLIP_PAD_S = 0.25, 5.0
 @options.command(commands)
 def compare(
     runs: Annotated[
-        list[str], Argument(metavar="RUN RUN", help="Outputs of two or more runs, oldest first: folder or URL.")
+        list[str], Argument(metavar="RUN", help="Outputs of two or more runs, oldest first: folder or URL.")
     ],
     *,
     plan: Annotated[
