@@ -428,9 +428,8 @@ def paired_change(
     above = (ratios > median).astype(np.float64) - (ratios < median)
     effect = dependence(above, {"cluster": clusters} if clusters is not None else factors or {})
     votes = sign_p(ratios, effect)
-    if groups < LEAST_CLUSTERS:
-        return PairedChange(n, groups, median, nan, nan, nan, nan, nan, votes, effect)
-    (low, high), (least, most) = (_bounds(ascending, share, effect) for share in (0.5 + 0.5 * level, 0.95))
+    bounds = (_bounds(ascending, share, effect) for share in (0.5 + 0.5 * level, 0.95))
+    (low, high), (least, most) = bounds if groups >= LEAST_CLUSTERS else ((nan, nan), (nan, nan))
     return PairedChange(n, groups, median, low, high, least, most, (most - least) / (2 * _BOUND_95), votes, effect)
 
 

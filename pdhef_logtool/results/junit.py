@@ -48,13 +48,19 @@ def write_junit(path: Path, verdicts: PlanVerdicts, parts: Mapping[str, Any]) ->
 
 
 def junit_bytes(verdicts: PlanVerdicts, checks: _Checks | None = None) -> bytes:
-    """Return JUnit XML in UTF-8; the same verdicts give the same bytes, so that there is no time of day in it."""
+    """Return JUnit XML in UTF-8, with checks that did not pass as properties.
+
+    The same verdicts give the same bytes, so that there is no time of day in it.
+    """
     cases = plan_cases(verdicts)
     logs = checks or {}
     properties = {
-        key if len(logs) == 1 else f"{log}: {key}": text
+        f"check {c['name']}" if len(logs) == 1 else f"{log}: check {c['name']}": (
+            f"{'waived' if c['waived'] else c['verdict']}: {c['evidence']}"
+        )
         for log, of_log in logs.items()
-        for key, text in _check_properties(of_log).items()
+        for c in of_log
+        if c["verdict"] != "passed"
     }
     return cases_bytes(cases, dict.fromkeys(cases, properties))
 
@@ -63,15 +69,6 @@ def plan_cases(verdicts: PlanVerdicts) -> dict[str, list[Case]]:
     """Return the testcases of a plan by the name of its suite."""
     name = verdicts.plan.title or verdicts.plan.file or "validation plan"
     return {name: [_case(v, name, strict=verdicts.strict) for v in verdicts.verdicts]}
-
-
-def _check_properties(checks: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Return the checks that did not pass as properties."""
-    return {
-        f"check {c['name']}": f"{'waived' if c['waived'] else c['verdict']}: {c['evidence']}"
-        for c in checks
-        if c["verdict"] != "passed"
-    }
 
 
 def cases_bytes(
