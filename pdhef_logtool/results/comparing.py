@@ -35,9 +35,8 @@ from pdhef_logtool.evaluation.validation_plan import MEANS, RUN, SQUARES, Requir
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.printable import listed
 from pdhef_logtool.results.opened_run import OpenedRun, open_run, table_file
-from pdhef_logtool.results.pairing import Pair, pair_logs
+from pdhef_logtool.results.pairing import Pair, pair_logs, run_differences
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts, plan_verdicts_against
-from pdhef_logtool.results.run_differences import run_differences
 from pdhef_logtool.storage.documents import unknown
 
 if TYPE_CHECKING:
