@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.evaluation.statistics import paired_change
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.results.opened_run import TABLES, TABLES_FOLDER, table_file
-from pdhef_logtool.results.paired_change import paired_change
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.results.tables import drive_part, write_tables
 from pdhef_logtool.storage.documents import file_sha256, seal

@@ -19,12 +19,16 @@ _PAD_S, _CLIP_PAD_S = 0.25, 5.0
 
 @options.command(commands)
 def compare(
-    a: Annotated[str, Argument(metavar="A", help="Output of the reference run: folder or URL.")],
-    b: Annotated[str, Argument(metavar="B", help="Output of the run to compare with it.")],
+    runs: Annotated[
+        list[str], Argument(metavar="RUN", help="Outputs of two or more runs, oldest first: folder or URL.")
+    ],
     *,
     plan: Annotated[
         Path | None,
-        Option(metavar="FILE", help='Validation plan for B. baseline = "run" means run A. Exit code 4 if one fails.'),
+        Option(
+            metavar="FILE",
+            help='Validation plan for the last run. baseline = "run" means the run before. Exit code 4 if one fails.',
+        ),
     ] = None,
     max_regression: Annotated[
         str | None, Option(metavar="SHARE", help="Largest accepted increase of the metric: 5% or 0.05.")
@@ -48,17 +52,18 @@ def compare(
     html: Annotated[Path | None, Option(help="HTML file for the comparison.")] = None,
     junit: Annotated[Path | None, Option(help="JUnit XML file for the verdicts.")] = None,
 ) -> None:
-    """Compare two runs drive by drive: better, worse, or no significant difference."""
+    """Compare two runs drive by drive: better, worse, or no significant difference; more runs as a history."""
     from pdhef_logtool.cli.compare_tables import render_comparison, write_comparison_junit
     from pdhef_logtool.results import comparing
     from pdhef_logtool.storage.object_store import is_url
     from pdhef_logtool.storage.outputs import check_no_input
 
-    check_no_input(
-        [*(Path(x) for x in (a, b) if not is_url(x)), plan], [file for file in (html, junit) if file is not None]
-    )
+    if len(runs) < 2:
+        raise UsageError(expected="two runs or more", got="one", where="pdhef compare", remedy="pdhef compare A B")
+    folders = [Path(run) for run in runs if not is_url(run)]
+    check_no_input([*folders, plan], [file for file in (html, junit) if file is not None])
     comparison = comparing.compare(
-        a, b,
+        *runs,
         plan=plan, max_regression=max_regression, estimator=estimator, metric=metric, cluster=cluster,
         allow_unpaired=allow_unpaired, strict=strict,
     )  # fmt: skip

@@ -118,8 +118,8 @@ def _blocks(requirement: Requirement, tracks: Sequence[StateTrack], drive: Score
     if not kept.shape[1]:
         return None
     counts, metres, variance, *scored = kept
-    root = requirement.metric in SQUARES
-    values = [_rounded(np.sqrt(s / counts) if root else s / counts) for s in scored]
+    power = 0.5 if requirement.metric in SQUARES else 1.0
+    values = [_rounded((s / counts) ** power) for s in scored]
     return RequirementBlocks(
         requirement.measured,
         block_s,
@@ -148,23 +148,19 @@ def _summands(
     rows = []
     for track in tracks:
         error = raw_error(track, truth, signal)
-        scored = track.valid & at_truth & np.isfinite(error)
+        scored = used = track.valid & at_truth & np.isfinite(error)
         if drive.estimated:
-            scored &= track.vx_m_s > drive.low_speed_m_s
+            used = scored & (track.vx_m_s > drive.low_speed_m_s)
             error = wrap_angle(error)
         if metric == "availability":
-            rows.append(np.where(at_truth, scored.astype(np.float64), np.nan))
-            continue
-        if metric == "coverage95":
+            value, used = scored.astype(np.float64), at_truth
+        elif metric == "coverage95":
             std = total_std(track, truth, signal)
-            value = (
-                np.full(len(error), np.nan)
-                if std is None
-                else np.where(np.isfinite(std), (np.abs(error) <= NORMAL_95 * std).astype(np.float64), np.nan)
-            )
+            std = np.full(len(error), np.nan) if std is None else std
+            value, used = (np.abs(error) <= NORMAL_95 * std).astype(np.float64), used & np.isfinite(std)
         else:
             value = {"rmse": error**2, "mae": np.abs(error), "bias": error}[metric]
-        rows.append(np.where(scored, value, np.nan))
+        rows.append(np.where(used, value, np.nan))
     return np.stack(rows)
 
 

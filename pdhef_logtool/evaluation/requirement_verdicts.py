@@ -11,13 +11,18 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.evaluation.dependence import FACTORS, Factors
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
-from pdhef_logtool.evaluation.requirement_bounds import (
+from pdhef_logtool.evaluation.statistics import (
+    FACTORS,
     LEAST_BLOCKS,
     LEAST_DRIVES,
     Bounded,
+    Factors,
+    Outcome,
+    decided,
     least_drives,
+    log_ratios,
+    paired_change,
     pooled,
     quantile,
 )
@@ -34,7 +39,6 @@ from pdhef_logtool.evaluation.validation_plan import (
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.storage.templates import clauses, one_line, template
 
-Outcome: TypeAlias = Literal["PASS", "FAIL", "INCONCLUSIVE"]
 #: Driving that is missing: amount so far (None: unknown), needed amount, and its unit.
 _Lacking: TypeAlias = tuple[float | None, float, str]
 #: Least margin relative to an estimated reference, in standard deviations of the reference.
@@ -160,15 +164,14 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
     reason = words.reason(case, requirement, bounded, count, lacking, why, sd, share)
     to_do = words.next(case, requirement, bounded, exposure, lacking, remedy, times)
     same = drives[0].estimator if drives and all(d.same for d in drives) else ""
-    value = bounded.value if math.isfinite(bounded.value) else None
-    margin = None if value is None else (value - bound if at_least else bound - abs(value))
+    value, low, high = (x if math.isfinite(x) else None for x in (bounded.value, bounded.low, bounded.high))
     return RequirementVerdict(
         requirement,
         outcome,
         value,
-        bounded.low if math.isfinite(bounded.low) else None,
-        bounded.high if math.isfinite(bounded.high) else None,
-        margin,
+        low,
+        high,
+        None if value is None else (value - bound if at_least else bound - abs(value)),
         exposure,
         tuple(dict.fromkeys(d.estimator for d in drives)),
         bounded.basis,
@@ -184,20 +187,15 @@ def judge(requirement: Requirement, drives: Sequence[DriveValue], missing: str =
 
 
 def _exposure(drives: Sequence[DriveValue]) -> Exposure:
-    seconds, metres = (float(np.sum([getattr(d, key) for d in drives])) for key in ("seconds", "metres"))
-    return Exposure(
-        len(drives),
-        seconds / 60.0 if math.isfinite(seconds) else None,
-        metres / 1000.0 if math.isfinite(metres) else None,
-    )
+    sums = math.fsum(d.seconds for d in drives) / 60.0, math.fsum(d.metres for d in drives) / 1000.0
+    return Exposure(len(drives), *(x if math.isfinite(x) else None for x in sums))
 
 
 def _ratios(drives: Sequence[DriveValue]) -> FloatArray:
     """Return the values of drives, or their ratios for a requirement with a baseline."""
-    values = np.array([d.value for d in drives], dtype=np.float64)
+    values, others = _column(drives, "value"), _column(drives, "baseline")
     if not drives or drives[0].baseline is None:
         return values
-    others = np.array([math.nan if d.baseline is None else d.baseline for d in drives])
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(values == others, 1.0, values / others)
 
@@ -208,10 +206,8 @@ def _statistic(requirement: Requirement, drives: Sequence[DriveValue]) -> Bounde
     if requirement.statistic != POOLED:
         return _of_drives(requirement, _ratios(drives), factors)
     if count >= LEAST_DRIVES and requirement.other_run is not None:
-        return _typical_ratio(_ratios(drives), requirement.confidence, factors)
-    weights, values = (np.array([getattr(d, key) for d in drives], dtype=np.float64) for key in ("n", "value"))
-    others = np.array([d.baseline for d in drives], dtype=np.float64) if requirement.baseline else None
-    total = _pooled(requirement, weights, values, others, factors)
+        return _change(drives, requirement.confidence, factors)
+    total = _pooled(requirement, drives, factors)
     if count >= LEAST_DRIVES or not count:
         return total
     return _from_blocks(requirement, total, [d.blocks for d in drives])
@@ -230,29 +226,29 @@ def _of_drives(requirement: Requirement, values: FloatArray, factors: Factors) -
 
 def _from_blocks(requirement: Requirement, total: Bounded, blocks: Sequence[RequirementBlocks | None]) -> Bounded:
     """Return the statistic ``total`` of few drives with bounds from the blocks of time within them."""
-    nan, present = math.nan, [b for b in blocks if b is not None]
+    present = [b for b in blocks if b is not None]
     if len(present) < len(blocks):
-        return Bounded(total.value, nan, nan, 0, basis="blocks")
-    columns = [np.concatenate([np.asarray(getattr(b, key)) for b in present]) for key in ("n", "value", "baseline")]
-    units = len(columns[0])
-    bounded = _pooled(requirement, columns[0], columns[1], columns[2] if requirement.baseline else None)
-    low, high = (bounded.low, bounded.high) if units >= LEAST_BLOCKS else (nan, nan)
+        return Bounded(total.value, math.nan, math.nan, 0, basis="blocks")
+    bounded = _pooled(requirement, present, None)
+    low, high = (bounded.low, bounded.high) if bounded.units >= LEAST_BLOCKS else (math.nan, math.nan)
     longest_s = max(b.block_s for b in present)
-    return Bounded(total.value, low, high, units, basis="blocks", block_s=longest_s)
+    return Bounded(total.value, low, high, bounded.units, basis="blocks", block_s=longest_s)
+
+
+def _column(units: Sequence[DriveValue | RequirementBlocks], key: str) -> FloatArray:
+    """Return a value of all drives, or of all blocks of time, [N]."""
+    return np.array([x for unit in units for x in np.atleast_1d(getattr(unit, key))], dtype=np.float64)
 
 
 def _pooled(
-    requirement: Requirement,
-    weights: FloatArray,
-    values: FloatArray,
-    others: FloatArray | None,
-    factors: Factors | None = None,
+    requirement: Requirement, units: Sequence[DriveValue | RequirementBlocks], factors: Factors | None
 ) -> Bounded:
+    """Return the statistic over drives, or over the blocks of time within them."""
     metric = requirement.metric
     bounded = pooled(
-        weights.astype(np.float64),
-        values.astype(np.float64),
-        others,
+        _column(units, "n"),
+        _column(units, "value"),
+        _column(units, "baseline") if requirement.baseline else None,
         squares=metric in SQUARES,
         positive=metric != "bias" and metric not in AT_LEAST,
         level=requirement.confidence,
@@ -266,24 +262,18 @@ def _pooled(
     return bounded
 
 
-def _typical_ratio(ratios: FloatArray, level: float, factors: Factors) -> Bounded:
-    """Return the geometric mean of the drives' ratios to another run, which compares each drive with itself."""
-    with np.errstate(divide="ignore"):
-        logs = np.log(ratios)
-    bounded = pooled(np.ones(len(logs)), logs, None, squares=False, positive=False, level=level, factors=factors)
-    value, low, high = (float(np.exp(x)) for x in (bounded.value, bounded.low, bounded.high))
-    return replace(bounded, value=value, low=low, high=high)
+def _change(drives: Sequence[DriveValue], level: float, factors: Factors) -> Bounded:
+    """Return the median of the drives' ratios to another run, which compares each drive with itself."""
+    change = paired_change(log_ratios(_column(drives, "baseline"), _column(drives, "value")), None, factors, level)
+    value, low, high = np.exp([change.median, change.low, change.high]).tolist()
+    return Bounded(value, low, high, change.drives, change.dependence)
 
 
 def _reference_sd(requirement: Requirement, drives: Sequence[DriveValue]) -> float:
     """Return the standard deviation of the estimated reference in the unit of the requirement."""
-    weights = np.array([d.n for d in drives], dtype=np.float64)
-    std = float(np.sqrt(np.average([d.std**2 for d in drives], weights=weights)))
-    if requirement.baseline is None:
-        return std
-    others = np.array([d.baseline for d in drives], dtype=np.float64)
-    base = float(np.sqrt(np.average(others**2, weights=weights)))
-    return std / base if base > 0.0 else math.inf
+    weights = _column(drives, "n")
+    std, base = (math.sqrt(np.average(_column(drives, key) ** 2, weights=weights)) for key in ("std", "baseline"))
+    return std if requirement.baseline is None else std / base if base > 0.0 else math.inf
 
 
 def _worst(requirement: Requirement, drives: Sequence[DriveValue]) -> str | None:
@@ -315,10 +305,9 @@ def _case(
 def _words() -> Any:
     """Return the sentences of ``requirement.txt`` as functions."""
     limits: dict[str, Any] = {"LEAST_BLOCKS": LEAST_BLOCKS, "LEAST_DRIVES": LEAST_DRIVES, "MOST_TIMES": _MOST_TIMES}
-    limits |= {"REFERENCE_SDS": REFERENCE_SDS, "AY_NOTE": AY_NOTE}
-    names = {"POOLED": POOLED, "WORST_DRIVE": WORST_DRIVE, "shown": shown, "least_drives": least_drives}
-    layout = {"layout": lambda what: "%.0f" if what.startswith("drives") else "%.1f"}
-    return template(Path(__file__).parent / "templates" / "requirement.txt", **limits, **names, **layout).module
+    limits |= {"REFERENCE_SDS": REFERENCE_SDS, "AY_NOTE": AY_NOTE, "POOLED": POOLED, "WORST_DRIVE": WORST_DRIVE}
+    path = Path(__file__).parent / "templates" / "requirement.txt"
+    return template(path, **limits, shown=shown, least_drives=least_drives).module
 
 
 def _without_bounds(requirement: Requirement, bounded: Bounded) -> bool:
@@ -329,10 +318,12 @@ def _without_bounds(requirement: Requirement, bounded: Bounded) -> bool:
 
 
 def _outcome(requirement: Requirement, bounded: Bounded) -> Outcome:
-    low, high, bound = bounded.low, bounded.high, requirement.bound
+    low, value, high, bound = bounded.low, bounded.value, bounded.high, requirement.bound
     if requirement.metric in AT_LEAST:
-        return "PASS" if low >= bound else "FAIL" if high < bound else "INCONCLUSIVE"
-    return "PASS" if high <= bound else "FAIL" if low > bound else "INCONCLUSIVE"
+        return decided(-high, -value, -low, -bound)
+    # Another run as the baseline: a significant regression fails if it is larger than the accepted one.
+    regression = requirement.other_run is not None and requirement.statistic == POOLED
+    return decided(low, value, high, bound, least=min(1.0, bound) if regression else bound)
 
 
 def _lacking(requirement: Requirement, exposure: Exposure, drives: Sequence[DriveValue]) -> list[_Lacking]:

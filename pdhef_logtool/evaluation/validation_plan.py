@@ -73,7 +73,8 @@ class Requirement:
     ----------
     estimator : None for the selected estimate of each drive, or the recorded estimate.
     limit : maximum of the metric (:data:`AT_LEAST`: minimum). None for a requirement on the ratio to ``baseline``,
-        which is at most ``max_ratio``. baseline : estimator of the same run, :data:`RUN`, or output of another run.
+        which is at most ``max_ratio`` (None: a figure that is compared without a limit).
+    baseline : estimator of the same run, :data:`RUN`, or output of another run.
     statistic : of several drives: :data:`POOLED` over all their stamps, :data:`WORST_DRIVE`, or the ``quantile`` of the
         drives. confidence : of the interval that decides.
     exposure_drives, exposure_minutes, exposure_km : the least scored driving for a verdict. exposure : the least scored
@@ -124,21 +125,25 @@ class Requirement:
         return bound
 
     @property
+    def name(self) -> str:
+        """What is limited, for example ``sideslip RMSE (nonlinear)``."""
+        return self._text("")
+
+    @property
     def label(self) -> str:
         """The requirement as text, for example ``sideslip RMSE ≤ 0.5° (nonlinear)``."""
-        what = f"{LABELS[self.signal]} {registered()[self.metric].label}"
         if self.baseline is None:
             limit = f"{'≥' if self.metric in AT_LEAST else '≤'} {shown(self.bound, self.unit)}"
         else:
             baseline = self.baseline if self.other_run is None else "run A" if self.baseline == RUN else "earlier run"
             limit = f"≤ {self.bound:.4g} × {baseline}"
-        of = [
-            "" if self.segment == "all" else self.segment,
-            "" if self.statistic == POOLED else self.statistic,
-            self.estimator or "",
-        ]
-        where = ", ".join(filter(None, of))
-        return f"{what} {limit}{f' ({where})' if where else ''}"
+        return self._text(f" {limit}")
+
+    def _text(self, limit: str) -> str:
+        segment, statistic = self.segment.removeprefix("all"), self.statistic.removeprefix(POOLED)
+        where = ", ".join(filter(None, (segment, statistic, self.estimator)))
+        what = f"{LABELS[self.signal]} {registered()[self.metric].label}{limit}"
+        return f"{what} ({where})" if where else what
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,31 +253,23 @@ def _placed(requirement: Requirement, folder: Path) -> Requirement:
 
 def plan_from_dict(raw: dict[str, Any], *, where: str, file: str = "") -> ValidationPlan:
     """Return the plan of parsed TOML; raises UsageError with all problems in one line."""
-    problems = [unknown(key, PlanTable.model_fields) for key in raw if key not in PlanTable.model_fields]
-    title = raw.get("title", "")
-    if not isinstance(title, str) or len(title) > 200:
-        problems.append("title: should be a text of at most 200 characters")
-    tables = raw.get("requirement", [])
-    if not isinstance(tables, list) or not tables:
-        problems.append("requirement: give at least one [[requirement]] table")
-        tables = []
-    requirements = [_read(table, f"requirement[{i}]", problems) for i, table in enumerate(tables)]
+    problems: list[str] = []
+    plan = checked(PlanTable, raw, "", problems)
+    tables = [] if plan is None else plan.requirement
+    requirements = [_read(table, f"requirement.{i}", problems) for i, table in enumerate(tables)]
     ids = [r.id for r in requirements if r is not None]
     problems += [f"id {name!r} is used {ids.count(name)} times" for name in dict.fromkeys(ids) if ids.count(name) > 1]
-    if problems:
+    if plan is None or problems:
         raise UsageError(
             expected="the entries of a validation plan",
             got="; ".join(problems),
             where=where,
             remedy="docs/formats.md#plantoml describes every entry",
         )
-    return ValidationPlan(tuple(r for r in requirements if r is not None), title, file)
+    return ValidationPlan(tuple(r for r in requirements if r is not None), plan.title, file)
 
 
-def _read(raw: object, where: str, problems: list[str]) -> Requirement | None:
-    table = checked(RequirementTable, raw, where, problems)
-    if table is None:
-        return None
+def _read(table: RequirementTable, where: str, problems: list[str]) -> Requirement | None:
     before = len(problems)
     segment = table.manoeuvre or table.segment or "all"
     if table.manoeuvre is not None and table.segment is not None:

@@ -1,9 +1,8 @@
-"""The page of a comparison of two runs."""
+"""The page of a comparison of two runs, and of the history of several."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -12,13 +11,7 @@ from pdhef_logtool.reports.charts import Charts, Cloud, Interval, IntervalsFigur
 from pdhef_logtool.reports.colours import FAULT, PLAIN
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
-from pdhef_logtool.results.comparison_words import (
-    interval_text,
-    notes_of,
-    paired_text,
-    percent,
-    verdict_text,
-)
+from pdhef_logtool.results.comparison_words import history_table, interval_text, notes_of, percent, sentence
 
 #: Maximum number of drives in the table, half of them from either end.
 _MOST_DRIVES = 200
@@ -29,53 +22,59 @@ _BLUE = "#0072b2"
 def comparison_page(comparison: Comparison) -> bytes:
     """Return the page of a comparison as a complete HTML file."""
     charts = Charts()
-    if comparison.figures and not comparison.equal:
-        _draw(comparison, charts)
+    heads, history = history_table(comparison)
+    first = None if comparison.equal else next(iter(comparison.figures), None)
+    if history:
+        _draw_history(comparison, charts)
+    if first is not None:
+        _draw(comparison, first, charts)
     return render(
         "comparison.html",
         charts,
         comparison=comparison,
-        paired=paired_text(comparison),
-        verdict=verdict_text(comparison),
+        **{about: sentence(about, comparison) for about in ("paired", "verdict", "changes")},
         kind=_KIND[comparison.verdict],
         notes=notes_of(comparison),
         unpaired=[line for line in comparison.unpaired if line not in comparison.failures],
-        drives=_drives(comparison.figures[0]) if comparison.figures and not comparison.equal else None,
+        first=first,
+        scale=read_unit(first.unit if first is not None else ""),
+        half=_MOST_DRIVES // 2,
+        heads=heads,
+        history=history,
         interval=interval_text,
         percent=percent,
         expm1=math.expm1,
+        zip=zip,
     )
 
 
-def _draw(comparison: Comparison, charts: Charts) -> None:
-    asked = [
-        _interval(figure, {"bad": FAULT, "good": _BLUE}.get(_KIND[figure.verdict], PLAIN))
-        for figure in comparison.figures
-        if figure.drives
-    ]
+def _draw_history(comparison: Comparison, charts: Charts) -> None:
+    unit, factor = read_unit(next((row.unit for row in comparison.history if row.unit), ""))
+    levels = []
+    for row in comparison.history:
+        low, value, high = (factor * x for x in (row.figure.low, row.figure.value, row.figure.high))
+        levels.append(Interval(row.run, low, value, high, FAULT if row.verdict == "worse" else _BLUE))
+    charts.figures["history"] = IntervalsFigure(
+        f"{comparison.history[0].requirement.name}, 95 % interval", unit, levels
+    )
+
+
+def _draw(comparison: Comparison, first: ComparedFigure, charts: Charts) -> None:
+    colours = {"bad": FAULT, "good": _BLUE, "": PLAIN}
+    asked = [_interval(f, colours[_KIND[f.verdict]]) for f in comparison.figures if f.drives]
     others = [_interval(figure, PLAIN) for figure in comparison.others]
     if asked or others:
         charts.figures["changes"] = IntervalsFigure("Median change, 95 % interval", "%", [*asked, *others], zero=0.0)
-    figure = comparison.figures[0]
-    unit, factor = read_unit(figure.unit)
-    a, b = (np.array([getattr(d, side) for d in figure.drives]) * factor for side in "ab")
+    unit, factor = read_unit(first.unit)
+    a, b = (np.array([d[side] for d in first.drives], dtype=np.float64) * factor for side in "ab")
     positive = (a > 0.0) & (b > 0.0)
     if positive.any():
         ends = np.array([min(a[positive].min(), b[positive].min()), max(a[positive].max(), b[positive].max())])
         clouds = [Cloud("no change", PLAIN, ends, ends, line=True), Cloud("drives", _BLUE, a[positive], b[positive])]
-        title = f"{figure.figure.signal} {figure.figure.metric} of each drive: above the line B is worse"
+        title = f"{first.requirement.name} of each drive: above the line B is worse"
         charts.figures["drives"] = PointsFigure(title, f"A [{unit or '1'}]", f"B [{unit or '1'}]", clouds, log=True)
 
 
 def _interval(figure: ComparedFigure, colour: str) -> Interval:
     low, middle, high = (100.0 * math.expm1(getattr(figure.change, k)) for k in ("low", "median", "high"))
-    return Interval(figure.figure.short, low, middle, high, colour)
-
-
-def _drives(figure: ComparedFigure) -> dict[str, Any]:
-    """Return the table of the drives of the first figure; of many drives, only both ends."""
-    unit, factor = read_unit(figure.unit)
-    half = _MOST_DRIVES // 2
-    shown = figure.drives if len(figure.drives) <= _MOST_DRIVES else (*figure.drives[:half], *figure.drives[-half:])
-    rest = len(figure.drives) - len(shown)
-    return {"unit": unit, "factor": factor, "label": figure.figure.label, "left_out": rest, "rows": shown}
+    return Interval(figure.requirement.name, low, middle, high, colour)

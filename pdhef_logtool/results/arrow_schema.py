@@ -27,28 +27,18 @@ def arrow_schema(name: str) -> pa.Schema:
     """
     import pyarrow as pa
 
-    types = {
-        "int64": pa.int64(),
-        "int32": pa.int32(),
-        "int16": pa.int16(),
-        "float": pa.float32(),
-        "double": pa.float64(),
-        "bool": pa.bool_(),
-        "string": pa.string(),
-        "dictionary<int32, string>": pa.dictionary(pa.int32(), pa.string()),
-    }
+    def type_of(name: str) -> pa.DataType:
+        is_dictionary = name == "dictionary<int32, string>"
+        return pa.dictionary(pa.int32(), pa.string()) if is_dictionary else pa.type_for_alias(name)
+
     document = load_schema(name)
     columns = document["columns"]
     units = {column["name"]: column["unit"] for column in columns}
-    return pa.schema(
-        [pa.field(c["name"], types[c["type"]], nullable=c["nullable"], metadata={"unit": c["unit"]}) for c in columns],
-        metadata={
-            "format": document["format"],
-            "version": str(document["version"]),
-            "units": json.dumps(units),
-            "missing": document["missing"],
-        },
-    )
+    fields = [
+        pa.field(c["name"], type_of(c["type"]), nullable=c["nullable"], metadata={"unit": c["unit"]}) for c in columns
+    ]
+    stated = document | {"version": str(document["version"]), "units": json.dumps(units)}
+    return pa.schema(fields, metadata={key: stated[key] for key in ("format", "version", "units", "missing")})
 
 
 def arrow_array(values: Any, kind: pa.DataType) -> pa.Array:

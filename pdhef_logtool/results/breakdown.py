@@ -11,12 +11,16 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pdhef_logtool.evaluation.dependence import FACTORS, dependence, deviate, numbered
+from pdhef_logtool.evaluation.statistics import FACTORS, Factors, dependence, deviate, holm, numbered
 from pdhef_logtool.records.signals import BoolArray, FloatArray
-from pdhef_logtool.results.paired_change import holm
+
+#: Values of drives [N], None where unknown.
+_Texts: TypeAlias = NDArray[np.object_]
 
 #: Scored drives on each side of a comparison, at least.
 LEAST_DRIVES = 5
@@ -26,15 +30,6 @@ SIGNIFICANT = 0.05
 MOST_VALUES = 12
 #: Log ratios above are shown as this one.
 _LARGEST_LOG = 20.0
-
-
-@dataclass(frozen=True, slots=True)
-class BreakdownDrive:
-    """Input of a breakdown, per drive: ``error`` of the selected estimate in rad (NaN: not scored), keys, factors."""
-
-    error: float
-    keys: Mapping[str, str]
-    factors: Mapping[str, str | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,56 +97,58 @@ class _Test:
         t = -abs(self.difference) / self.error
         return 2.0 * float(ndtr(t) if math.isinf(self.freedom) else stdtr(self.freedom, t))
 
-    def effect(self, p: float, level: float) -> Effect:
-        """Return it with a corrected p-value, and the interval at a level (0.05: 95 %)."""
-        width = deviate(1.0 - 0.5 * level, self.freedom) * self.error
-        low, high = self.difference - width, min(self.difference + width, _LARGEST_LOG)
-        return Effect(math.expm1(self.difference), math.expm1(low), math.expm1(high), p)
+    def effect(self, p: float, level: float, sign: float = 1.0) -> Effect:
+        """Return it with a corrected p-value, and the interval at a level (0.05: 95 %); ``sign`` -1: other group."""
+        width, difference = deviate(1.0 - 0.5 * level, self.freedom) * self.error, sign * self.difference
+        low, high = difference - width, min(difference + width, _LARGEST_LOG)
+        return Effect(math.expm1(difference), math.expm1(low), math.expm1(high), p)
 
 
-def breakdowns(drives: Sequence[BreakdownDrive], by: Sequence[str] = ()) -> tuple[Breakdown, ...]:
-    """Return the drives by each key that separates them, the strongest evidence first; ``by`` names keys, in order."""
-    all_keys = dict.fromkeys(key for d in drives for key in d.keys)
-    values = {key: _values(key, drives) for key in by or all_keys}
+def breakdowns(
+    errors: FloatArray, keys: Sequence[Mapping[str, str]], factors: Factors, by: Sequence[str] = ()
+) -> tuple[Breakdown, ...]:
+    """Return drives by each key that separates them, the strongest evidence first.
+
+    Parameters
+    ----------
+    errors : of the selected estimate [N] in rad, NaN: not scored. keys, factors : of the drives [N].
+    by : names of keys, in order; none: all that separate drives.
+    """
+    columns = {key: _values([of.get(key) for of in keys]) for key in by or dict.fromkeys(k for of in keys for k in of)}
+    also: dict[str, tuple[str, ...]] = dict.fromkeys(columns, ())
     if not by:
-        counts = {key: len({v for v in of if v is not None}) for key, of in values.items()}
-        values = {key: of for key, of in values.items() if 2 <= counts[key] <= min(MOST_VALUES, len(drives) - 1)}
-    also: dict[str, tuple[str, ...]] = dict.fromkeys(values, ()) if by else _alike(drives, values)
-    tests = {(key, value): test for key in also for value, test in _tests(key, drives, values[key]).items()}
+        most = min(MOST_VALUES, len(keys) - 1)
+        also = _alike(errors, {key: of for key, of in columns.items() if 2 <= len({*of} - {None}) <= most})
+    drives = {name: np.array(of, dtype=object) for name, of in factors.items()}
+    tests = {key: _tests(key, errors, columns[key], drives) for key in also}
     effects = _corrected(tests)
-    rows = [
-        Breakdown(key, _groups(drives, values[key], {v: e for (k, v), e in effects.items() if k == key}), others)
-        for key, others in also.items()
-    ]
+    rows = [Breakdown(key, _groups(errors, columns[key], effects[key]), others) for key, others in also.items()]
     return tuple(rows if by else sorted(rows, key=lambda b: (b.p, b.key)))
 
 
-def _alike(drives: Sequence[BreakdownDrive], values: Mapping[str, Sequence[str | None]]) -> dict[str, tuple[str, ...]]:
+def _alike(errors: FloatArray, columns: Mapping[str, _Texts]) -> dict[str, tuple[str, ...]]:
     """Return for the first key of each way to separate the scored drives the other keys that do the same."""
     first: dict[bytes, list[str]] = {}
-    scored = [i for i, d in enumerate(drives) if d.error > 0.0]
-    for key in sorted(values, key=lambda key: (key not in FACTORS, key)):
-        part = numbered([values[key][i] or "" for i in scored])
+    for key in sorted(columns, key=lambda key: (key not in FACTORS, key)):
+        part = numbered([value or "" for value in columns[key][errors > 0.0]])
         first.setdefault(part.tobytes(), []).append(key)
     return {key: tuple(others) for key, *others in first.values()}
 
 
-def _tests(key: str, drives: Sequence[BreakdownDrive], values: Sequence[str | None]) -> dict[str, _Test | str]:
+def _tests(key: str, errors: FloatArray, values: _Texts, drives: Mapping[str, _Texts]) -> dict[str, _Test | str]:
     """Return the comparison of each value with the other drives, or the reason why it is impossible."""
-    scored = [i for i, d in enumerate(drives) if d.error > 0.0 and values[i] is not None]
-    logs = np.log([drives[i].error for i in scored])
-    names = np.array([values[i] for i in scored], dtype=object)
-    factors = {f: [drives[i].factors.get(f) for i in scored] for f in FACTORS}
-    part = numbered(list(names))
+    use = (errors > 0.0) & np.array([v is not None for v in values], dtype=np.bool_)
+    logs, names = np.log(errors[use]), values[use]
+    part = numbered(names)
     factors = {
-        f: of
-        for f, of in factors.items()
-        if key != f and not np.array_equal(numbered(of), part) and len({v for v in of if v}) > 1
+        name: of[use]
+        for name, of in drives.items()
+        if key != name and not np.array_equal(numbered(of[use]), part) and len({*filter(None, of[use])}) > 1
     }
-    return {value: _test(logs, names == value, factors) for value in dict.fromkeys(v for v in values if v is not None)}
+    return {value: _test(logs, names == value, factors) for value in dict.fromkeys(values) if value is not None}
 
 
-def _test(logs: FloatArray, inside: BoolArray, factors: Mapping[str, Sequence[str | None]]) -> _Test | str:
+def _test(logs: FloatArray, inside: BoolArray, factors: Mapping[str, _Texts]) -> _Test | str:
     scores, weights = np.zeros(len(logs)), np.zeros(len(logs))
     means, variances, freedoms = [], [], []
     for side, sign in ((inside, 1.0), (~inside, -1.0)):
@@ -160,7 +157,7 @@ def _test(logs: FloatArray, inside: BoolArray, factors: Mapping[str, Sequence[st
             other = "" if side is inside else " with another value"
             return f"{n} scored drives{other}, at least {LEAST_DRIVES} are needed"
         for name, of in factors.items():
-            values = {v for v, use in zip(of, side, strict=True) if use}
+            values = {*of[side]}
             if len(values) == 1 and None not in values:
                 where = "its drives" if side is inside else "the other drives"
                 return f"{where} are all of one {name}: the two cannot be separated"
@@ -179,45 +176,40 @@ def _test(logs: FloatArray, inside: BoolArray, factors: Mapping[str, Sequence[st
     return _Test(means[0] - means[1], math.sqrt(variance * drives.design_effect), freedom)
 
 
-def _corrected(tests: Mapping[tuple[str, str], _Test | str]) -> dict[tuple[str, str], Effect | str]:
-    """Return effects with Holm's p-values, and intervals at the level of the same step."""
-    once: dict[tuple[str, frozenset[float]], list[tuple[str, str]]] = {}
-    for (key, value), test in tests.items():
-        if isinstance(test, _Test):  # the two values of a key are one comparison, with opposite signs
-            same = frozenset({round(test.difference, 12), round(-test.difference, 12)})
-            once.setdefault((key, same), []).append((key, value))
-    first = [tests[places[0]] for places in once.values()]
-    raw = [test.p for test in first if isinstance(test, _Test)]
-    corrected = holm(raw)
-    results: dict[tuple[str, str], Effect | str] = {k: t for k, t in tests.items() if isinstance(t, str)}
+def _corrected(tests: Mapping[str, Mapping[str, _Test | str]]) -> dict[str, dict[str, Effect | str]]:
+    """Return effects with Holm's p-values, and intervals at the level of the same step, by key and value."""
+    results: dict[str, dict[str, Effect | str]] = {key: {} for key in tests}
+    once: list[tuple[_Test, str, list[str]]] = []
+    for key, of_key in tests.items():
+        results[key] |= {value: test for value, test in of_key.items() if isinstance(test, str)}
+        made = {value: test for value, test in of_key.items() if isinstance(test, _Test)}
+        if len(made) == len(of_key) == 2:  # the two values of a key are one comparison, with opposite signs
+            once.append((next(iter(made.values())), key, [*made]))
+        else:
+            once += [(test, key, [value]) for value, test in made.items()]
+    raw = [test.p for test, _, _ in once]
     steps = len(raw)
-    for p, after, places in sorted(zip(raw, corrected, once.values(), strict=True)):
-        for place in places:
-            test = tests[place]
-            if isinstance(test, _Test):
-                results[place] = test.effect(after, SIGNIFICANT / steps)
-        steps -= p <= SIGNIFICANT / steps and after < SIGNIFICANT
+    for p, corrected, (test, key, values) in sorted(zip(raw, holm(raw), once, strict=True), key=lambda row: row[0]):
+        for value, sign in zip(values, (1.0, -1.0), strict=False):
+            results[key][value] = test.effect(corrected, SIGNIFICANT / steps, sign)
+        steps -= p <= SIGNIFICANT / steps and corrected < SIGNIFICANT
     return results
 
 
-def _groups(
-    drives: Sequence[BreakdownDrive], values: Sequence[str | None], effects: Mapping[str, Effect | str]
-) -> tuple[Group, ...]:
-    members: dict[str | None, list[BreakdownDrive]] = {}
-    for drive, value in zip(drives, values, strict=True):
-        members.setdefault(value, []).append(drive)
+def _groups(errors: FloatArray, values: _Texts, effects: Mapping[str, Effect | str]) -> tuple[Group, ...]:
     groups = []
-    for value, of_group in sorted(members.items(), key=lambda item: _in_order(item[0])):
-        errors = np.array([d.error for d in of_group if d.error >= 0.0])
-        effect = effects.get(value, "") if value is not None else ""
-        mean = float(np.exp(np.mean(np.log(errors)))) if errors.size and errors.min() > 0.0 else math.nan
+    for value in sorted({*values}, key=_in_order):
+        inside = np.equal(values, value)
+        scored = errors[inside & (errors >= 0.0)]
+        effect = effects.get(value, "")
+        mean = float(np.exp(np.mean(np.log(scored)))) if scored.size and scored.min() > 0.0 else math.nan
         groups.append(
             Group(
                 "not given" if value is None else value,
-                len(of_group),
-                len(errors),
+                int(np.count_nonzero(inside)),
+                len(scored),
                 mean,
-                float(errors.max()) if errors.size else math.nan,
+                float(scored.max()) if scored.size else math.nan,
                 effect if isinstance(effect, Effect) else None,
                 effect if isinstance(effect, str) else "",
             )
@@ -225,25 +217,18 @@ def _groups(
     return tuple(groups)
 
 
-def _values(key: str, drives: Sequence[BreakdownDrive]) -> list[str | None]:
-    """Return the value of each drive: its text, or that it is rare."""
-    texts = [d.keys.get(key) for d in drives]
+def _values(texts: Sequence[str | None]) -> _Texts:
+    """Return the value of each drive [N]: its text, or that it is rare; None without one."""
     counts = Counter(t for t in texts if t is not None)
-    if len(counts) <= MOST_VALUES:
-        return list(texts)
-    common = {value for value, _ in counts.most_common(MOST_VALUES)}
-    rest = f"{len(counts) - MOST_VALUES} others"
-    return [t if t is None or t in common else rest for t in texts]
-
-
-def _as_number(text: str | None) -> float:
-    try:
-        return math.nan if text is None else float(text)
-    except ValueError:
-        return math.nan
+    rare = {value for value, _ in counts.most_common()[MOST_VALUES:]}
+    return np.array([f"{len(rare)} others" if t in rare else t for t in texts], dtype=object)
 
 
 def _in_order(value: str | None) -> tuple[bool, bool, float, str]:
+    """Return the place of a value: numbers in order, then texts, then None."""
     text = value or ""
-    number = _as_number(text.partition(" to ")[0])
+    try:
+        number = float(text.partition(" to ")[0])
+    except ValueError:
+        number = math.nan
     return value is None, math.isnan(number), 0.0 if math.isnan(number) else number, text

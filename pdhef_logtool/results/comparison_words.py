@@ -7,8 +7,9 @@ from functools import cache
 from typing import Any
 
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
+from pdhef_logtool.evaluation.statistics import LEAST_CLUSTERS
+from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.results.comparing import INDEPENDENT, ComparedFigure, Comparison
-from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
 from pdhef_logtool.results.selected_estimate import TEMPLATES
 from pdhef_logtool.storage.templates import clauses, one_line, template
 
@@ -21,23 +22,10 @@ def _words() -> Any:
     return template(TEMPLATES / "comparison.txt", **context, **limits).module
 
 
-def paired_text(comparison: Comparison) -> str:
-    """Return the number of drives in both runs, and how they were paired."""
-    return one_line(_words().paired(comparison))
-
-
-def verdict_text(comparison: Comparison) -> str:
-    """Return the verdict in a sentence."""
-    return one_line(_words().verdict(comparison))
-
-
-def assumed_text(comparison: Comparison) -> str:
-    """Return the assumptions of the verdict."""
-    return one_line(_words().assumed(comparison))
-
-
-def next_text(comparison: Comparison) -> str:
-    """Return the next step."""
+def sentence(about: str, comparison: Comparison) -> str:
+    """Return a sentence of a comparison: ``paired``, ``verdict``, ``changes``, ``assumed`` or ``next``."""
+    if about != "next":
+        return one_line(getattr(_words(), about)(comparison))
     plan = comparison.requirements
     steps = next_steps(None if plan is None else plan.to_dict())
     undecided = [f.detectable for f in comparison.figures if f.verdict == comparison.verdict]
@@ -47,6 +35,20 @@ def next_text(comparison: Comparison) -> str:
 def notes_of(comparison: Comparison) -> list[str]:
     """Return remarks on the requested figures, a line each."""
     return clauses(_words().notes(comparison))
+
+
+def history_table(comparison: Comparison) -> tuple[list[str], list[list[str]]]:
+    """Return the heads of a history's table, a ``>`` before those of numbers, and the texts of its rows."""
+    rows = []
+    for row in comparison.history:
+        of, step = row.figure, row.step
+        value, *ends = (shown(x, row.unit) if math.isfinite(x) else "-" for x in (of.value, of.low, of.high))
+        change = "0 %" if row.verdict == "equal" else "-" if step is None else percent(math.expm1(step.change.median))
+        interval = "-" if step is None else interval_text(step)
+        between = "-" if "-" in ends else " to ".join(ends)
+        rows.append([row.run, row.version, str(of.units), value, between, change, interval, row.verdict or "-"])
+    name = comparison.history[0].requirement.name if rows else ""
+    return ["run", "version", ">drives", f">{name}", ">95 % interval", ">change", ">95 % interval", "verdict"], rows
 
 
 def change_text(figure: ComparedFigure) -> str:

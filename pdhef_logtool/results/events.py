@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.smoothing import runs
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.signals import BoolArray, IntArray
 from pdhef_logtool.records.tracks import TRACK_COLUMNS
 from pdhef_logtool.results.condition import Condition, Reference, parse_condition
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
@@ -57,8 +57,8 @@ class FoundEvents:
     ----------
     where : the condition. of : estimator of its columns. searched : drives that were looked at. events : in the order
         of the run's drives.
-    left_out : drives that could not be looked at, with the reason; ``unreadable``: how many of them are damaged or
-        failed; ``damaged``: a line a damaged one. failed : whether something of the run could not be read.
+    left_out : drives that could not be looked at, with the reason; ``damaged``: a line for each damaged one.
+        ``unreadable``: number of damaged and failed drives. failed : whether something of the run could not be read.
     clips : files that were written.
     """
 
@@ -119,23 +119,26 @@ def find_events(
     events: list[FoundEvent] = []
     left_out: dict[str, str] = {}
     damaged: dict[str, str] = {}
+    estimators: set[str] = set()
     drives = _drives(run)
-    unreadable = searched = 0
     for log in run.logs:
+        main = estimator or log.main()
         try:
-            reason = _unfit(log, condition, estimator)
-            if reason is None:
-                events += _events_of(log, condition, estimator or log.main(), drives[log.label], least_s, pad_s)
-                searched += 1
+            file = log.file(ESTIMATES_FILE)
+            there = [] if file is None else list_estimators(file)
+            estimators |= {*there}
+            reason = _unfit(log, there, _needed(condition, main))
+            if not reason:
+                events += _events_of(log, condition, main, drives[log.label], least_s, pad_s)
         except OutputError as error:
             reason = error.got
             damaged[log.label] = str(error)
-        if reason is not None:
+        if reason:
             left_out[log.label] = reason
-            unreadable += log.label in damaged or log.outcome.startswith("failed")
-    if not searched:
-        _check_tracks([log for log in run.logs if log.label not in damaged], condition, estimator)
-    lines = tuple(damaged.values())
+    searched = len(run.logs) - len(left_out)
+    if not searched and estimators:
+        _check_tracks(estimators, condition, estimator, selected=any(log.main() for log in run.logs))
+    unreadable = sum(log.label in damaged or log.outcome.startswith("failed") for log in run.logs)
     return FoundEvents(
         condition.text + (f" for {least_s:g} s" if least_s else ""),
         searched,
@@ -144,7 +147,7 @@ def find_events(
         estimator or "the selected estimates",
         unreadable > 0,
         unreadable,
-        lines,
+        tuple(damaged.values()),
     )
 
 
@@ -167,39 +170,28 @@ def _drives(run: OpenedRun) -> dict[str, _Drive]:
     return drives
 
 
-def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str | None:
-    """Return why a drive cannot be searched, otherwise None."""
-    file = log.file(ESTIMATES_FILE)
-    if file is None:
-        return log.outcome if log.outcome.startswith("failed") else f"it has no {ESTIMATES_FILE}"
-    there = list_estimators(file)
-    for name in _needed(condition, estimator or log.main()):
-        if name not in there:
-            return "it has no ground truth" if name == TRUTH else f"it has no estimator {name}".strip()
-    return None
-
-
-def _check_tracks(logs: Sequence[OpenedLog], condition: Condition, estimator: str | None) -> None:
-    """Raise UsageError for an estimator that none of the drives that can be read has."""
-    estimators = {n for log in logs if (file := log.file(ESTIMATES_FILE)) is not None for n in list_estimators(file)}
-    if not estimators:
-        return
-    expected = f"an estimator of this run: {', '.join(sorted(estimators))}"
-    if estimator is None and not any(log.main() for log in logs):
-        raise UsageError(expected=expected, got="none named, and none that is selected", where="--estimator")
-    asked = {r.track for r in condition.references.values() if r.track is not None} | (
-        {estimator} if estimator else set()
-    )
-    for name in sorted(asked - estimators - {TRUTH, None}, key=str):
-        where = "--where" if name != estimator else "--estimator"
-        raise UsageError(expected=expected, got=str(name), where=where)
-
-
 def _needed(condition: Condition, main: str) -> set[str]:
     """Return the tracks that a condition reads."""
     columns = condition.references.values()
-    errors = {TRUTH for r in columns if r.column in ERRORS}
-    return {main} | {r.track or main for r in columns} | errors
+    return {main, *(r.track or main for r in columns), *(TRUTH for r in columns if r.column in ERRORS)}
+
+
+def _unfit(log: OpenedLog, there: Collection[str], needed: Collection[str]) -> str:
+    """Return why a drive with the tracks ``there`` cannot be searched, otherwise nothing."""
+    if not there:
+        return log.outcome if log.outcome.startswith("failed") else f"it has no {ESTIMATES_FILE}"
+    missing = next((name for name in needed if name not in there), None)
+    return "" if missing is None else "it has no ground truth" if missing == TRUTH else f"it has no estimator {missing}"
+
+
+def _check_tracks(estimators: set[str], condition: Condition, estimator: str | None, *, selected: bool) -> None:
+    """Raise UsageError for an estimator that none of the drives has."""
+    expected = f"an estimator of this run: {', '.join(sorted(estimators))}"
+    if estimator is None and not selected:
+        raise UsageError(expected=expected, got="none named, and none that is selected", where="--estimator")
+    asked = {estimator, *(r.track for r in condition.references.values())} - {None, TRUTH, *estimators}
+    for name in sorted(map(str, asked)):
+        raise UsageError(expected=expected, got=name, where="--estimator" if name == estimator else "--where")
 
 
 def _events_of(
@@ -210,29 +202,21 @@ def _events_of(
 
     frame = log.estimates()
     assert frame is not None
-    builder = _Builder(main, drive)
-    named = [builder.column(reference).alias(name) for name, reference in condition.references.items()]
+    named = [_column(reference, main, drive).alias(name) for name, reference in condition.references.items()]
     peak = pl.lit(None) if condition.peak is None else condition.peak
     holds = condition.expression.fill_null(value=False)
-    columns = _joined(frame, builder.columns, main).select("stamp_ns", *named)
-    rows = columns.select("stamp_ns", holds=holds, peak=peak.cast(pl.Float64)).collect()
-    stamps, mask = rows["stamp_ns"].to_numpy(), rows["holds"].to_numpy()
-    values = rows["peak"].fill_null(math.nan).to_numpy()
+    columns = _joined(frame, [main, *sorted(_needed(condition, main) - {main})]).select("stamp_ns", *named)
+    rows = columns.select("stamp_ns", holds=holds, peak=peak.cast(pl.Float64).fill_null(math.nan)).collect()
+    stamps, mask, values = (rows[name].to_numpy() for name in ("stamp_ns", "holds", "peak"))
     events = []
     for first, last in _spans(stamps, mask, least_s, pad_s):
-        peak_row = _peak_at(values[first:last], condition.falls)
+        inside, peak_at = values[first:last], None
+        if not np.isnan(inside).all():
+            peak_at = first + int(np.nanargmin(inside) if condition.falls else np.nanargmax(inside))
         start_ns, end_ns = int(stamps[first]), int(stamps[last - 1]) + 1
-        events.append(
-            FoundEvent(
-                log.label,
-                start_ns,
-                end_ns,
-                (start_ns - drive.start_ns) * 1e-9,
-                (end_ns - drive.start_ns) * 1e-9,
-                None if peak_row is None else float(values[first + peak_row]),
-                None if peak_row is None else int(stamps[first + peak_row]),
-            )
-        )
+        start_s, end_s = ((ns - drive.start_ns) * 1e-9 for ns in (start_ns, end_ns))
+        of_peak = (None, None) if peak_at is None else (float(values[peak_at]), int(stamps[peak_at]))
+        events.append(FoundEvent(log.label, start_ns, end_ns, start_s, end_s, *of_peak))
     return events
 
 
@@ -249,74 +233,58 @@ def _spans(stamps_ns: IntArray, mask: BoolArray, least_s: float, pad_s: float) -
     return joined
 
 
-def _peak_at(values: FloatArray, falls: bool) -> int | None:
-    if np.isnan(values).all():
-        return None
-    return int(np.nanargmin(values) if falls else np.nanargmax(values))
+def _joined(frame: pl.LazyFrame, tracks: Sequence[str]) -> pl.LazyFrame:
+    """Return the columns of tracks at the stamps of the first one, named ``track.column``; NaN is null.
 
-
-def _joined(frame: pl.LazyFrame, columns: Mapping[str, set[str]], main: str) -> pl.LazyFrame:
-    """Return the columns by track at the stamps of the selected estimate, named ``track.column``; NaN is null."""
+    Polars reads only those that are used later.
+    """
     import polars as pl
 
     def of(track: str) -> pl.LazyFrame:
-        typed = [pl.col(c) if c in FLAGS else pl.col(c).cast(pl.Float64).fill_nan(None) for c in sorted(columns[track])]
-        named = [c.alias(f"{track}.{c.meta.output_name()}") for c in typed]
-        return frame.filter(pl.col("estimator").cast(pl.String) == track).select("stamp_ns", *named)
+        numbers = pl.col(sorted({*TRACK_COLUMNS} - {"stamp_ns", *FLAGS})).cast(pl.Float64).fill_nan(None)
+        columns = [c.name.prefix(f"{track}.") for c in (numbers, pl.col(sorted(FLAGS)))]
+        return frame.filter(pl.col("estimator").cast(pl.String) == track).select("stamp_ns", *columns)
 
-    rows = of(main)
-    for track in sorted(columns.keys() - {main}):
+    rows = of(tracks[0])
+    for track in tracks[1:]:
         rows = rows.join(of(track), on="stamp_ns", how="left")
     return rows.sort("stamp_ns")
 
 
-class _Builder:
-    """Makes the columns of a condition; ``columns`` collects the stored columns that they need, by track."""
+def _column(reference: Reference, main: str, drive: _Drive) -> pl.Expr:
+    """Return a column of a condition, of the columns of :func:`_joined`."""
+    import polars as pl
 
-    def __init__(self, main: str, drive: _Drive) -> None:
-        self._main, self._drive = main, drive
-        self.columns: dict[str, set[str]] = {main: set()}
+    def of(column: str, track: str = reference.track or main) -> pl.Expr:
+        return pl.col(f"{track}.{column}")
 
-    def column(self, reference: Reference) -> pl.Expr:
-        track, name = reference.track or self._main, reference.column
-        if name in SEGMENTS:
-            return self._within(name)
-        if name in ERRORS:
-            column = self._error(track, ERRORS[name])
-        else:
-            column = self._speed(track) if name == SPEED else self._read(track, name)
-        return column if reference.factor == 1.0 else column * reference.factor
+    def speed(track: str) -> pl.Expr:
+        return (of("vx_m_s", track) ** 2 + of("vy_m_s", track).fill_null(0.0) ** 2).sqrt()
 
-    def _within(self, segment: str) -> pl.Expr:
-        """Return where a stamp lies in a segment's intervals, which do not overlap."""
-        import polars as pl
-
-        spans = sorted(self._drive.spans.get(segment, ()))
-        starts, ends = np.array(spans, dtype=np.int64).reshape(-1, 2).T
-
-        def inside(stamps: pl.Series) -> pl.Series:
-            ns = stamps.to_numpy()
-            return pl.Series(np.searchsorted(starts, ns, side="right") > np.searchsorted(ends, ns, side="right"))
-
-        return pl.col("stamp_ns").map_batches(inside, return_dtype=pl.Boolean)
-
-    def _read(self, track: str, name: str) -> pl.Expr:
-        import polars as pl
-
-        self.columns.setdefault(track, set()).add(name)
-        return pl.col(f"{track}.{name}")
-
-    def _speed(self, track: str) -> pl.Expr:
-        vx, vy = self._read(track, "vx_m_s"), self._read(track, "vy_m_s")
-        return (vx * vx + vy.fill_null(0.0) * vy.fill_null(0.0)).sqrt()
-
-    def _error(self, track: str, signal: str) -> pl.Expr:
-        """Return estimate − ground truth at scored stamps: both valid, and for sideslip above the lowest speed."""
-        import polars as pl
-
-        error = self._read(track, signal) - self._read(TRUTH, signal)
-        scored = self._read(track, "valid") & self._read(TRUTH, "valid")
+    name = reference.column
+    if name in SEGMENTS:
+        return _within(drive.spans.get(name, ()))
+    if name in ERRORS:  # at scored stamps: both valid, and for sideslip above the lowest speed
+        signal = ERRORS[name]
+        error = of(signal) - of(signal, TRUTH)
+        scored = of("valid") & of("valid", TRUTH)
         if signal == "sideslip_rad":
             error = pl.arctan2(error.sin(), error.cos())
-            scored &= self._speed(TRUTH) > self._drive.low_speed_m_s
-        return pl.when(scored).then(error)
+            scored &= speed(TRUTH) > drive.low_speed_m_s
+        column: pl.Expr = pl.when(scored).then(error)
+    else:
+        column = speed(reference.track or main) if name == SPEED else of(name)
+    return column if reference.factor == 1.0 else column * reference.factor
+
+
+def _within(spans: Sequence[tuple[int, int]]) -> pl.Expr:
+    """Return where a stamp lies in a segment's intervals, which do not overlap."""
+    import polars as pl
+
+    starts, ends = np.array(sorted(spans), dtype=np.int64).reshape(-1, 2).T
+
+    def inside(stamps: pl.Series) -> pl.Series:
+        ns = stamps.to_numpy()
+        return pl.Series(np.searchsorted(starts, ns, side="right") > np.searchsorted(ends, ns, side="right"))
+
+    return pl.col("stamp_ns").map_batches(inside, return_dtype=pl.Boolean)

@@ -10,20 +10,27 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdhef_logtool.evaluation.dependence import FACTORS, Dependence, dependence
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S
+from pdhef_logtool.evaluation.statistics import (
+    FACTORS,
+    Dependence,
+    PairedChange,
+    dependence,
+    holm,
+    log_ratios,
+    paired_change,
+)
 from pdhef_logtool.evaluation.units import SCORED_SIGNALS
 from pdhef_logtool.records.signals import BoolArray, FloatArray
-from pdhef_logtool.results.breakdown import LEAST_DRIVES, SIGNIFICANT, Breakdown, BreakdownDrive, breakdowns
+from pdhef_logtool.results.breakdown import LEAST_DRIVES, SIGNIFICANT, Breakdown, breakdowns
 from pdhef_logtool.results.opened_run import OpenedRun
-from pdhef_logtool.results.paired_change import PairedChange, holm, log_ratios, paired_change
 from pdhef_logtool.results.selected_estimate import NAIVE
 
 if TYPE_CHECKING:
@@ -35,7 +42,6 @@ ANSWER = "answer"
 SIGNALS = {s: SCORED_SIGNALS[s] for s in ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s")}
 JUDGED = "sideslip_rad"
 WORST = 20
-_FIGURE = ("log", "estimator", "signal", "metric", "value")
 #: Levels of folders by which drives are grouped.
 _MOST_FOLDERS = 3
 #: Most labels of a group of failures, and most groups.
@@ -209,7 +215,7 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
     """
     import polars as pl
 
-    rows = run.table("drives").collect().to_dicts()
+    rows = _rows(run)
     done = [row for row in rows if row["outcome"] != "failed"]
     faults = run.table("faults")
     sensors = faults.filter(pl.col("origin") == "sensor").group_by("log").agg(pl.col("kind").unique().sort())
@@ -218,10 +224,13 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
     metadata: dict[str, dict[str, str]] = {}
     for log, key, value in run.table("metadata").collect().iter_rows():
         metadata.setdefault(log, {})[key] = value
-    figures = _figures(run)
+    of_log: dict[str, dict[tuple[str, str], float]] = {}
+    for log, estimator, signal, value in sideslip_errors(run, [*SIGNALS]).collect().iter_rows():
+        of_log.setdefault(log, {})[estimator, signal] = value
     drives = tuple(
-        _drive(r, figures.get(r["log"], {}), _keys(r, metadata.get(r["log"], {}), kinds.get(r["log"]))) for r in done
+        _drive(r, of_log.get(r["log"], {}), metadata.get(r["log"], {}) | _keys(r, kinds.get(r["log"]))) for r in done
     )
+    errors = np.array([d.error() for d in drives])
     scored = [d for d in drives if d.truth]
     names = _estimators(scored)
     return Fleet(
@@ -231,7 +240,7 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
         ranking=tuple(_ranking(scored, names)) if len(scored) >= least_to_rank(len(names)) else (),
         least_to_rank=least_to_rank(len(names)),
         dependence=_dependence(scored),
-        breakdowns=breakdowns([BreakdownDrive(d.error(), d.keys, d.factors) for d in drives], by),
+        breakdowns=breakdowns(errors, [d.keys for d in drives], _of_all(drives), by),
         space=_space(run),
         failed=grouped([(r["log"], r["reason"]) for r in rows if r["outcome"] == "failed"]),
         losses=grouped(lost),
@@ -267,71 +276,67 @@ def _space(run: OpenedRun) -> Space | None:
 
 
 def sideslip_errors(run: OpenedRun, signals: Sequence[str] = (JUDGED,)) -> pl.LazyFrame:
-    """Return the RMSE of drives by log, estimator and signal, where the ground truth is independent."""
+    """Return the RMSE of drives, where the ground truth is independent: log, estimator, signal and value."""
     import polars as pl
 
     there = pl.col("independent") & pl.col("value").is_finite() & pl.col("signal").is_in(signals)
-    return run.table("metrics").filter(there, segment="all", metric="rmse").select(_FIGURE)
+    return (
+        run.table("metrics").filter(there, segment="all", metric="rmse").select("log", "estimator", "signal", "value")
+    )
 
 
-def _figures(run: OpenedRun) -> dict[str, dict[tuple[str, str, str], float]]:
-    """Return the figures of whole drives by log, then by estimator, signal and metric."""
+def _rows(run: OpenedRun) -> list[dict[str, Any]]:
+    """Return the table of drives, with NIS per degree of freedom, v̇_y residual and the residual of sideslip 0."""
     import polars as pl
 
-    consistency = run.table("metrics").filter(pl.col("metric").is_in(["nis", "nis_dof", "d2"]), segment="all")
-    values: dict[str, dict[tuple[str, str, str], float]] = {}
-    for rows in (sideslip_errors(run, [*SIGNALS]), consistency.select(_FIGURE)):
-        for log, *key, value in rows.collect().iter_rows():
-            values.setdefault(log, {})[key[0], key[1], key[2]] = math.nan if value is None else value
-    return values
+    def value(metric: str) -> pl.Expr:
+        return pl.col("value").filter(pl.col("metric") == metric).first()
+
+    metrics = run.table("metrics").filter(pl.col("metric").is_in(["nis", "nis_dof", "d2"]), segment="all")
+    checks = metrics.group_by("log", "estimator").agg(nis=value("nis") / value("nis_dof"), d2=value("d2"))
+    naive = checks.filter(estimator=NAIVE).select("log", naive_d2="d2")
+    drives = run.table("drives").with_row_index("place").join(checks, on=["log", "estimator"], how="left")
+    return drives.join(naive, on="log", how="left").sort("place").collect().to_dicts()
 
 
-def _drive(
-    row: Mapping[str, Any], figures: Mapping[tuple[str, str, str], float], keys: Mapping[str, str]
-) -> FleetDrive:
-    """Return a drive of a row of the table of drives."""
-    main = row["estimator"] or ""
-    dof = figures.get((main, "state", "nis_dof"), math.nan)
-    nis = figures.get((main, "state", "nis"), math.nan)
-    coverage = row["sideslip_coverage95"]
+def _drive(row: Mapping[str, Any], errors: Mapping[tuple[str, str], float], keys: Mapping[str, str]) -> FleetDrive:
+    """Return a drive of its row."""
+
+    def number(key: str) -> float:
+        return math.nan if row[key] is None else float(row[key])
+
     return FleetDrive(
         label=row["log"],
         seconds=row["seconds"],
-        main=main,
+        main=row["estimator"] or "",
         truth=row["sideslip_rmse_rad"] is not None,
         unscored=row["unscored"] or "",
-        errors={(e, s): value for (e, s, metric), value in figures.items() if metric == "rmse"},
-        coverage=math.nan if coverage is None else coverage,
-        nis=nis / dof if dof > 0.0 else math.nan,
-        d2=figures.get((main, "vy_m_s", "d2"), math.nan),
-        naive_d2=figures.get((NAIVE, "vy_m_s", "d2"), math.nan),
+        errors=errors,
+        coverage=number("sideslip_coverage95"),
+        nis=number("nis"),
+        d2=number("d2"),
+        naive_d2=number("naive_d2"),
         failed_checks=row["failed_checks"],
         keys=keys,
         factors={factor: row[factor] for factor in FACTORS},
     )
 
 
-def _keys(row: Mapping[str, Any], metadata: Mapping[str, str], kinds: Sequence[str] | None) -> dict[str, str]:
-    """Return the keys for grouping of a drive: metadata of its log, and of the run."""
+def _keys(row: Mapping[str, Any], kinds: Sequence[str] | None) -> dict[str, str]:
+    """Return the keys for grouping of a drive that are not in the metadata of its log."""
+    lengths = (("below 10 s", 10.0), ("10 to 60 s", 60.0), ("1 to 10 min", 600.0), ("10 to 60 min", 3600.0))
     from_log = {
         "car": row["car"],
         "log format": row["log_format"],
         "answer": row["estimator"],
         "friction source": row["friction_source"],
-        "length": _length(row["seconds"]),
+        "length": next((text for text, end in lengths if row["seconds"] < end), "above an hour"),
         "sensor faults": None if row["sensor_faults"] is None else ", ".join(kinds or ()) or "none",
         "month": (row["day"] or "")[:7],
     }
     parts = row["folder"].split("/")[:_MOST_FOLDERS]
     from_log |= {"folder" if i == 0 else f"folder {i + 1}": "/".join(parts[: i + 1]) for i in range(len(parts))}
-    return {**metadata, **{k: v for k, v in from_log.items() if v}}
-
-
-def _length(seconds: float) -> str:
-    for text, end in (("below 10 s", 10.0), ("10 to 60 s", 60.0), ("1 to 10 min", 600.0), ("10 to 60 min", 3600.0)):
-        if seconds < end:
-            return text
-    return "above an hour"
+    return {k: v for k, v in from_log.items() if v}
 
 
 def _estimators(drives: Iterable[FleetDrive]) -> list[str]:
@@ -340,9 +345,10 @@ def _estimators(drives: Iterable[FleetDrive]) -> list[str]:
     return sorted(counts, key=lambda e: (-counts[e], e))
 
 
-def _of_all(drives: Sequence[FleetDrive], use: BoolArray) -> dict[str, list[str | None]]:
-    """Return day, car and route of the drives to use."""
-    return {f: [d.factors.get(f) for d, used in zip(drives, use, strict=True) if used] for f in FACTORS}
+def _of_all(drives: Sequence[FleetDrive], use: BoolArray | None = None) -> dict[str, list[str | None]]:
+    """Return day, car and route of the drives to use (None: all)."""
+    used = drives if use is None else [drives[i] for i in np.flatnonzero(use).tolist()]
+    return {f: [d.factors.get(f) for d in used] for f in FACTORS}
 
 
 def _dependence(drives: Sequence[FleetDrive]) -> Dependence:
@@ -352,8 +358,8 @@ def _dependence(drives: Sequence[FleetDrive]) -> Dependence:
     return dependence(np.log(errors[use]), _of_all(drives, use))
 
 
-def _median(change: PairedChange) -> Median:
-    return Median(change.median, change.low, change.high)
+def _median(change: PairedChange, scale: Callable[[float], float] = float) -> Median:
+    return Median(*map(scale, (change.median, change.low, change.high)))
 
 
 def _distributions(drives: Sequence[FleetDrive], names: Sequence[str]) -> Iterable[Distribution]:
@@ -377,31 +383,26 @@ def _ranking(drives: Sequence[FleetDrive], names: Sequence[str]) -> list[Rank]:
     pairs = [*combinations(names, 2)]
     changes = [change(a, b) for a, b in pairs]
     beats: dict[str, set[str]] = {name: set() for name in names}
+    score = dict.fromkeys(names, 0)
     for (a, b), of_pair, p in zip(pairs, changes, holm([c.sign_p for c in changes]), strict=True):
         if p < SIGNIFICANT and of_pair.median != 0.0:
             better, worse = (a, b) if of_pair.median > 0.0 else (b, a)
             beats[better].add(worse)
-    lost = {name: {other for other in names if name in beats[other]} for name in names}
-    medians = {name: float(np.nanmedian(errors[name])) for name in names}
-    order = sorted(names, key=lambda n: (len(lost[n]) - len(beats[n]), medians[n], n))
+            score[better] -= 1
+            score[worse] += 1
+    order = sorted(names, key=lambda n: (score[n], float(np.nanmedian(errors[n])), n))
     mains = {d.main for d in drives}
     return [
         Rank(
             # Equal places where no difference is significant, and none where this is true of all.
-            place=1 + sum(len(lost[o]) - len(beats[o]) < len(lost[name]) - len(beats[name]) for o in names)
-            if any(beats.values())
-            else None,
+            place=1 + sum(score[o] < score[name] for o in names) if any(beats.values()) else None,
             estimator=name,
             drives=int(np.isfinite(errors[name]).sum()),
             better_than=tuple(n for n in order if n in beats[name]),
-            against_answer=None if mains == {name} else _share(_median(change(ANSWER, name))),
+            against_answer=None if mains == {name} else _median(change(ANSWER, name), math.expm1),
         )
         for name in order
     ]
-
-
-def _share(of_logs: Median) -> Median:
-    return Median(*(math.expm1(x) for x in (of_logs.value, of_logs.low, of_logs.high)))
 
 
 def cause_and_remedy(reason: str) -> tuple[str, str]:

@@ -15,6 +15,7 @@ from pdhef_logtool.evaluation.requirement_verdicts import RequirementVerdict
 from pdhef_logtool.evaluation.validation_plan import shown
 from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 from pdhef_logtool.results.selected_estimate import TEMPLATES
+from pdhef_logtool.results.tables import checks_of
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.templates import template
 
@@ -37,23 +38,29 @@ class Case:
 
 #: Characters that XML 1.0 cannot contain.
 _NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
-#: By log the checks of its report.
+#: By log the rows of its checks (checks.parquet).
 _Checks: TypeAlias = Mapping[str, Sequence[Mapping[str, Any]]]
 
 
-def write_junit(path: Path, verdicts: PlanVerdicts, checks: _Checks | None = None) -> None:
-    """Write the verdicts of a plan, and checks by log, through a temporary name; raises OutputError."""
-    write_bytes(path, junit_bytes(verdicts, checks))
+def write_junit(path: Path, verdicts: PlanVerdicts, parts: Mapping[str, Any]) -> None:
+    """Write the verdicts of a plan, and the checks of the logs' parts of tables; raises OutputError."""
+    write_bytes(path, junit_bytes(verdicts, {log: checks_of(part) for log, part in parts.items()}))
 
 
 def junit_bytes(verdicts: PlanVerdicts, checks: _Checks | None = None) -> bytes:
-    """Return JUnit XML in UTF-8; the same verdicts give the same bytes, so that there is no time of day in it."""
+    """Return JUnit XML in UTF-8, with checks that did not pass as properties.
+
+    The same verdicts give the same bytes, so that there is no time of day in it.
+    """
     cases = plan_cases(verdicts)
     logs = checks or {}
     properties = {
-        key if len(logs) == 1 else f"{log}: {key}": text
+        f"check {c['name']}" if len(logs) == 1 else f"{log}: check {c['name']}": (
+            f"{'waived' if c['waived'] else c['verdict']}: {c['evidence']}"
+        )
         for log, of_log in logs.items()
-        for key, text in _check_properties(of_log).items()
+        for c in of_log
+        if c["verdict"] != "passed"
     }
     return cases_bytes(cases, dict.fromkeys(cases, properties))
 
@@ -62,15 +69,6 @@ def plan_cases(verdicts: PlanVerdicts) -> dict[str, list[Case]]:
     """Return the testcases of a plan by the name of its suite."""
     name = verdicts.plan.title or verdicts.plan.file or "validation plan"
     return {name: [_case(v, name, strict=verdicts.strict) for v in verdicts.verdicts]}
-
-
-def _check_properties(checks: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Return the checks that did not pass as properties."""
-    return {
-        f"check {c['name']}": f"{'waived' if c['waived'] else c['verdict']}: {c['evidence']}"
-        for c in checks
-        if c["verdict"] != "passed"
-    }
 
 
 def cases_bytes(

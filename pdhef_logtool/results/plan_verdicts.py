@@ -1,21 +1,29 @@
-"""The verdicts of a validation plan on the drives of a run, from metrics.parquet and the blocks of report.json."""
+"""The verdicts of a validation plan on the drives of a run, from its tables and the blocks of report.json.
+
+The baseline of a requirement can be another run: run A of a comparison, or an earlier output.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.metrics.independence import NOT_INDEPENDENT
 from pdhef_logtool.evaluation.metrics.sensors import SENSORS
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, from_document
-from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
 from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, RequirementVerdict, gates, judge
+from pdhef_logtool.evaluation.statistics import LEAST_DRIVES
 from pdhef_logtool.evaluation.units import LABELS
 from pdhef_logtool.evaluation.validation_plan import POOLED, RUN, Requirement, ValidationPlan, names_of
+from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.tracks import REFERENCE
+from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun, open_run
+from pdhef_logtool.results.pairing import pair_logs
 from pdhef_logtool.results.sink import TRUTH
 
 if TYPE_CHECKING:
@@ -32,13 +40,16 @@ class JudgedDrive:
     """A drive of a run: its label, and its selected estimate (None: its only recorded estimate).
 
     ``read_report`` returns its report.json: its blocks of time are used where too few drives are scored for a bootstrap
-    over drives, its operating space where the plan asks for exposure. ``factors``: its day, car and route.
+    over drives. ``factors``: its day, car and route. ``space``, ``friction``: as in
+    :class:`~pdhef_logtool.evaluation.requirement_verdicts.DriveValue`, where the plan asks for exposure.
     """
 
     log: str
     main: str | None
     read_report: Callable[[], Mapping[str, Any] | None] = dict
     factors: Mapping[str, object] = field(default_factory=dict)
+    space: Mapping[tuple[float, float], float] = field(default_factory=dict)
+    friction: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,110 +145,111 @@ def plan_verdicts(
     figures : of the drives. against : the other run by the baseline of a requirement.
     """
     others = against or {}
-    verdicts = []
-    for requirement in plan.requirements:
-        other = None if requirement.other_run is None else others.get(requirement.other_run)
-        measured = {d.log: _measured(requirement, figures, d, other) for d in drives}
-        by_truth = [v for truth, _ in measured.values() if (v := truth) is not None]
-        values = by_truth or [v for _, estimated in measured.values() if (v := estimated) is not None]
-        by_label = {d.log: d for d in drives}
-        if requirement.statistic == POOLED and len(values) < LEAST_DRIVES:
-            values = [_with_blocks(requirement, v, by_label[v.log], other) for v in values]
-        if requirement.exposure:
-            values = [_with_space(v, by_label[v.log].read_report() or {}) for v in values]
-        missing = "" if values else _why_missing(requirement, figures, drives, other)
-        verdicts.append(judge(requirement, values, missing))
-    return PlanVerdicts(plan, tuple(verdicts), strict)
+    judged = (_Judged(r, figures, others.get(r.other_run or "")) for r in plan.requirements)
+    return PlanVerdicts(plan, tuple(j.verdict(drives) for j in judged), strict)
 
 
-def _measured(
-    requirement: Requirement, figures: Figures, drive: JudgedDrive, against: Against | None
-) -> tuple[DriveValue | None, DriveValue | None]:
-    """Return the metric of a drive against ground truth, and against the estimated reference."""
-    name = requirement.estimator or figures.main(drive)
-    if name is None:
-        return None, None
-    truth = None
-    tainted = (drive.log, name, requirement.signal, "all", NOT_INDEPENDENT) in figures.values
-    if not tainted:
-        truth = _value(requirement, figures, drive, name, requirement.metric, against)
-    if (requirement.signal, requirement.metric) != ("sideslip_rad", "rmse"):
-        return truth, None
-    return truth, _value(requirement, figures, drive, name, "reference_rms", against)
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """A requirement on the figures of a run; ``against``: the run that is its baseline, if it is available."""
 
+    requirement: Requirement
+    figures: Figures
+    against: Against | None
 
-def _baseline(
-    requirement: Requirement, figures: Figures, drive: JudgedDrive, metric: str, against: Against | None
-) -> float | None:
-    """Return the metric of the baseline: an estimator of the drive, or of the drive in the other run."""
-    other, name = drive, requirement.baseline
-    if requirement.other_run is not None:
-        if against is None or drive.log not in against[1]:
+    def verdict(self, drives: Sequence[JudgedDrive]) -> RequirementVerdict:
+        """Return the verdict: against ground truth if it scores a drive, else against the estimated reference."""
+        requirement, metrics = self.requirement, [self.requirement.metric]
+        if (requirement.signal, requirement.metric) == ("sideslip_rad", "rmse"):
+            metrics.append("reference_rms")
+        measured = ([(d, v) for d in drives if (v := self._value(d, metric)) is not None] for metric in metrics)
+        rows = next(filter(None, measured), [])
+        if requirement.statistic == POOLED and len(rows) < LEAST_DRIVES:
+            rows = [(d, self._with_blocks(d, v)) for d, v in rows]
+        return judge(requirement, [v for _, v in rows], "" if rows else self._why_missing(drives))
+
+    def _name(self, drive: JudgedDrive) -> str | None:
+        return self.requirement.estimator or self.figures.main(drive)
+
+    def _tainted(self, log: str, name: str) -> bool:
+        """Return whether the ground truth is an input of an estimator."""
+        return (log, name, self.requirement.signal, "all", NOT_INDEPENDENT) in self.figures.values
+
+    def _value(self, drive: JudgedDrive, metric: str) -> DriveValue | None:
+        """Return the metric of a drive against ground truth, or its ``reference_rms``."""
+        requirement, figures, name = self.requirement, self.figures, self._name(drive)
+        if name is None or (metric == requirement.metric and self._tainted(drive.log, name)):
             return None
-        figures, other = against[0], against[1][drive.log]
-        name = requirement.estimator or figures.main(other)
-    figure = None if name is None else figures.of(other.log, name, requirement, metric)
-    return None if figure is None else figure[0]
+        figure = figures.of(drive.log, name, requirement, metric)
+        std = figures.of(drive.log, name, requirement, "reference_std") if metric == "reference_rms" else (math.nan, 0)
+        needed, baseline = requirement.baseline is not None, self._baseline(drive, metric)
+        if figure is None or std is None or (needed and baseline is None):
+            return None
+        value, n = figure
+        seconds, metres = self._exposure(drive, n)
+        return DriveValue(
+            drive.log, name, value, n, baseline, seconds, metres, std[0],
+            same=needed and value == baseline, factors=drive.factors, space=drive.space, friction=drive.friction,
+        )  # fmt: skip
 
+    def _baseline(self, drive: JudgedDrive, metric: str) -> float | None:
+        """Return the metric of the baseline: an estimator of the drive, or of the drive in the other run."""
+        figures, other, name = self.figures, drive, self.requirement.baseline
+        if self.requirement.other_run is not None:
+            if self.against is None or drive.log not in self.against[1]:
+                return None
+            figures, other = self.against[0], self.against[1][drive.log]
+            name = self.requirement.estimator or figures.main(other)
+        figure = None if name is None else figures.of(other.log, name, self.requirement, metric)
+        return None if figure is None else figure[0]
 
-def _value(
-    requirement: Requirement, figures: Figures, drive: JudgedDrive, name: str, metric: str, against: Against | None
-) -> DriveValue | None:
-    figure = figures.of(drive.log, name, requirement, metric)
-    needed, baseline = requirement.baseline is not None, _baseline(requirement, figures, drive, metric, against)
-    if figure is None or (needed and baseline is None):
-        return None
-    std = figures.of(drive.log, name, requirement, "reference_std") if metric == "reference_rms" else None
-    if metric == "reference_rms" and std is None:
-        return None
-    value, n = figure
-    seconds, metres = _exposure(requirement, figures, drive, n)
-    return DriveValue(
-        drive.log, name, value, n, baseline, seconds, metres,
-        math.nan if std is None else std[0], same=needed and value == baseline, factors=drive.factors,
-    )  # fmt: skip
+    def _exposure(self, drive: JudgedDrive, n: int) -> Iterator[float]:
+        """Yield seconds and metres behind a figure: the segment's, in proportion to the scored stamps."""
+        for metric in ("exposure_s", "exposure_m"):
+            whole = self.figures.values.get((drive.log, SENSORS, "state", self.requirement.segment, metric))
+            yield math.nan if whole is None or not whole[1] else whole[0] * min(n / whole[1], 1.0)
 
+    def _with_blocks(self, drive: JudgedDrive, value: DriveValue) -> DriveValue:
+        """Return the metric of a drive with its blocks, which also state the exposure."""
+        estimated = math.isfinite(value.std)
+        blocks = self._blocks(drive, estimated=estimated)
+        if self.requirement.other_run is not None:
+            partner = None if self.against is None else self.against[1].get(drive.log)
+            blocks = _paired(blocks, None if partner is None else self._blocks(partner, estimated=estimated))
+        if blocks is None:
+            return value
+        return replace(value, blocks=blocks, seconds=math.fsum(blocks.seconds), metres=math.fsum(blocks.metres))
 
-def _with_blocks(
-    requirement: Requirement,
-    value: DriveValue,
-    drive: JudgedDrive,
-    against: Against | None,
-) -> DriveValue:
-    """Return the metric of a drive with its blocks, which also state the exposure."""
-    estimated = math.isfinite(value.std)
-    blocks = _blocks_of(requirement, drive, estimated=estimated)
-    if requirement.other_run is not None:
-        partner = None if against is None else against[1].get(drive.log)
-        theirs = None if partner is None else _blocks_of(requirement, partner, estimated=estimated)
-        blocks = _paired(blocks, theirs)
-    if blocks is None:
-        return value
-    return replace(value, blocks=blocks, seconds=math.fsum(blocks.seconds), metres=math.fsum(blocks.metres))
+    def _blocks(self, drive: JudgedDrive, *, estimated: bool) -> RequirementBlocks | None:
+        blocks = from_document((drive.read_report() or {}).get("requirement_blocks") or ())
+        return next((b for b in blocks if b.of == self.requirement.measured and b.estimated == estimated), None)
 
+    def _why_missing(self, drives: Sequence[JudgedDrive]) -> str:
+        """Return why no drive has the metric, with a remedy after a semicolon."""
+        requirement, figures = self.requirement, self.figures
+        if requirement.other_run is not None and self.against is None:
+            how = "pdhef compare A B --plan PLAN" if requirement.other_run == RUN else "see the verdict on the run"
+            return f"the baseline is another run: {how}"
+        names = {d.log: name for d in drives if (name := self._name(d))}
+        if not names:
+            return "there are several recorded estimates: name one with estimator" if figures.names else "no estimate"
+        return self._why_unscored(names)
 
-def _blocks_of(requirement: Requirement, drive: JudgedDrive, *, estimated: bool) -> RequirementBlocks | None:
-    measured = requirement.measured
-    blocks = from_document((drive.read_report() or {}).get("requirement_blocks") or ())
-    return next((b for b in blocks if b.of == measured and b.estimated == estimated), None)
-
-
-def _with_space(value: DriveValue, report: Mapping[str, Any]) -> DriveValue:
-    """Return the metric of a drive with its operating space."""
-    space = report.get("operating_space") or {"cells": ()}
-    edges = [space.get(key) or () for key in ("speed_edges_m_s", "ay_edges_m_s2")]
-    cells = {(edges[0][c["speed"]], edges[1][c["ay"]]): c["seconds"] for c in space["cells"]}
-    friction = space.get("friction_median")
-    return replace(value, space=cells, friction=math.nan if friction is None else float(friction))
-
-
-def _exposure(requirement: Requirement, figures: Figures, drive: JudgedDrive, n: int) -> tuple[float, float]:
-    """Return seconds and metres behind a figure: the segment's, in proportion to the scored stamps."""
-    amounts = []
-    for metric in ("exposure_s", "exposure_m"):
-        whole = figures.values.get((drive.log, SENSORS, "state", requirement.segment, metric))
-        amounts.append(math.nan if whole is None or not whole[1] else whole[0] * min(n / whole[1], 1.0))
-    return amounts[0], amounts[1]
+    def _why_unscored(self, names: Mapping[str, str]) -> str:
+        """Return the same if the drives have the estimators ``names``."""
+        requirement, figures = self.requirement, self.figures
+        scored = [log for log, name in names.items() if figures.of(log, name, requirement, requirement.metric)]
+        if scored and all(self._tainted(log, names[log]) for log in scored):
+            return "the ground truth is an input of the estimator: not an independent check"
+        if scored and requirement.baseline != requirement.other_run:
+            return f"{requirement.baseline} has no such value; add it to the estimators of pdhef run"
+        whole = ((log, name, requirement.signal, "all", requirement.metric) for log, name in names.items())
+        if requirement.segment != "all" and any(key in figures.values for key in whole):
+            return f"no scored driving in {requirement.segment}"
+        if requirement.estimator is not None and not any(requirement.estimator in n for n in figures.names.values()):
+            return f"{requirement.estimator} did not run; add it to the estimators of pdhef run"
+        above = " above the low-speed limit" if requirement.signal == "sideslip_rad" else ""
+        return f"no ground truth of {LABELS[requirement.signal]}{above}; record drives with ground truth{above}"
 
 
 def _paired(blocks: RequirementBlocks | None, theirs: RequirementBlocks | None) -> RequirementBlocks | None:
@@ -246,41 +258,66 @@ def _paired(blocks: RequirementBlocks | None, theirs: RequirementBlocks | None) 
         return None
     by_number = dict(zip(theirs.number, theirs.value, strict=True))
     kept = [i for i, number in enumerate(blocks.number) if number in by_number]
-    columns = ("number", "n", "seconds", "metres", "value")
+    columns = ("number", "n", "seconds", "metres", "value", *(["std"] if blocks.std else []))
     picked: dict[str, Any] = {k: [getattr(blocks, k)[i] for i in kept] for k in columns}
-    std = [blocks.std[i] for i in kept] if blocks.std else ()
-    return replace(blocks, **picked, baseline=[by_number[blocks.number[i]] for i in kept], std=std)
+    return replace(blocks, **picked, baseline=[by_number[number] for number in picked["number"]])
 
 
-def _why_missing(
-    requirement: Requirement,
-    figures: Figures,
-    drives: Sequence[JudgedDrive],
-    against: Against | None,
-) -> str:
-    """Return why no drive has the metric of a requirement."""
-    if requirement.other_run is not None and against is None:
-        how = "pdhef compare A B --plan PLAN" if requirement.other_run == RUN else "see the verdict on the run"
-        return f"the baseline is another run: {how}"
-    names = {d.log: name for d in drives if (name := requirement.estimator or figures.main(d))}
-    if not names:
-        return "there are several recorded estimates: name one with estimator" if figures.names else "no estimate"
-    return _why_unscored(requirement, figures, names)
+def plan_verdicts_against(plan: ValidationPlan, a: OpenedRun, b: OpenedRun, *, strict: bool) -> PlanVerdicts:
+    """Return the verdicts on the drives of B with A as :data:`~.validation_plan.RUN`; raises OutputError."""
+    drives: Sequence[JudgedDrive] = [judged_drive(log) for log in b.logs]
+    drives = in_spaces(drives, plan, b.table("drives"), b.table("exposure"))
+    figures = figures_of_file(b.table("metrics"), plan, [d.main for d in drives])
+    against = {**other_runs(plan, b.logs), RUN: _against(plan, a, b.logs)}
+    return plan_verdicts(plan, figures, drives, strict=strict, against=against)
 
 
-def _why_unscored(requirement: Requirement, figures: Figures, names: Mapping[str, str]) -> str:
-    """Return why no drive has the metric of the estimators ``names`` by log, with a remedy after a semicolon."""
-    scored = [log for log, name in names.items() if figures.of(log, name, requirement, requirement.metric)]
-    tainted = [log for log in scored if (log, names[log], requirement.signal, "all", NOT_INDEPENDENT) in figures.values]
-    if scored and len(tainted) == len(scored):
-        return "the ground truth is an input of the estimator: not an independent check"
-    if scored and requirement.baseline != requirement.other_run:
-        return f"{requirement.baseline} has no such value; add it to the estimators of pdhef run"
-    if requirement.segment != "all" and any(
-        (log, name, requirement.signal, "all", requirement.metric) in figures.values for log, name in names.items()
-    ):
-        return f"no scored driving in {requirement.segment}"
-    if requirement.estimator is not None and not any(requirement.estimator in n for n in figures.names.values()):
-        return f"{requirement.estimator} did not run; add it to the estimators of pdhef run"
-    above = " above the low-speed limit" if requirement.signal == "sideslip_rad" else ""
-    return f"no ground truth of {LABELS[requirement.signal]}{above}; record drives with ground truth{above}"
+def other_runs(plan: ValidationPlan, logs: Sequence[OpenedLog]) -> dict[str, Against]:
+    """Return the outputs that requirements name as baseline, by their path or URL, paired with logs of this run.
+
+    Raises
+    ------
+    OutputError : One of them is missing (exit code 2) or damaged.
+    """
+    names = dict.fromkeys(n for r in plan.requirements if (n := r.other_run) not in (None, RUN))
+    return {name: _against(plan, open_run(name), logs) for name in names if name is not None}
+
+
+def _against(plan: ValidationPlan, run: OpenedRun, logs: Sequence[OpenedLog]) -> Against:
+    partners = {pair.b.label: judged_drive(pair.a) for pair in pair_logs(run.logs, logs).pairs}
+    return figures_of_file(run.table("metrics"), plan, [d.main for d in partners.values()]), partners
+
+
+def judged_drive(log: OpenedLog, read_report: Callable[[], Mapping[str, Any] | None] | None = None) -> JudgedDrive:
+    """Return a log of a run to judge; ``read_report`` None: from its file."""
+    main = log.entry.get("main")
+    factors = {"car": (log.entry.get("car") or {}).get("name"), **{k: log.entry.get(k) for k in ("day", "route")}}
+    return JudgedDrive(log.label, None if main is None else str(main), read_report or partial(_report, log), factors)
+
+
+def _report(log: OpenedLog) -> Mapping[str, Any] | None:
+    with suppress(OutputError):  # the comparison states it
+        return log.report()
+    return None
+
+
+def in_space(drive: JudgedDrive, report: Mapping[str, Any]) -> JudgedDrive:
+    """Return a drive with its operating space and friction, from its report."""
+    space = report.get("operating_space") or {}
+    speeds, ays = (space.get(key, ()) for key in ("speed_edges_m_s", "ay_edges_m_s2"))
+    cells = {(speeds[c["speed"]], ays[c["ay"]]): c["seconds"] for c in space.get("cells", ())}
+    friction = space.get("friction_median")
+    return replace(drive, space=cells, friction=math.nan if friction is None else float(friction))
+
+
+def in_spaces(
+    drives: Sequence[JudgedDrive], plan: ValidationPlan, table: pl.LazyFrame, exposure: pl.LazyFrame
+) -> Sequence[JudgedDrive]:
+    """Return the same of the tables ``drives`` and ``exposure`` of a run, which are read if the plan needs them."""
+    if not any(r.exposure for r in plan.requirements):
+        return drives
+    spaces: dict[str, dict[tuple[float, float], float]] = {}
+    for log, speed, ay, seconds in exposure.select("log", "speed_m_s", "ay_m_s2", "seconds").collect().iter_rows():
+        spaces.setdefault(log, {})[speed, ay] = seconds
+    friction = dict(table.select("log", "friction_median").drop_nulls().collect().iter_rows())
+    return [replace(d, space=spaces.get(d.log, {}), friction=friction.get(d.log, math.nan)) for d in drives]

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from pdhef_logtool.evaluation.requirement_blocks import from_document
-from pdhef_logtool.evaluation.requirement_bounds import LEAST_BLOCKS, pooled
+from pdhef_logtool.evaluation.statistics import LEAST_BLOCKS, pooled
 from pdhef_logtool.evaluation.validation_plan import SIDESLIP
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.tracks import REFERENCE
@@ -105,22 +105,10 @@ def _interval(report: Report) -> list[float] | None:
 @cache
 def _words() -> Any:
     """Return the sentences of ``selected_estimate.txt`` as functions."""
-    limits: dict[str, Any] = {
-        "HOLDS": HOLDS,
-        "NEARLY_HOLDS": NEARLY_HOLDS,
-        "WIDE": _WIDE,
-        "SAME": SAME,
-        "FEW": _FEW,
-        "LESS": _LESS,
-    }
-    limits |= {"NO_SIDESLIP_RAD": NO_SIDESLIP_RAD, "NIS_RANGE": _NIS_RANGE, "DEGREES": DEGREES}
-    shown = {
-        "degrees": degrees,
-        "percent": lambda share: f"{100.0 * share:.0f}",
-        "truth_of": truth_of,
-        "is_worse": is_worse,
-    }
-    return template(TEMPLATES / "selected_estimate.txt", **limits, **shown).module
+    limits: dict[str, Any] = {"HOLDS": HOLDS, "NEARLY_HOLDS": NEARLY_HOLDS, "WIDE": _WIDE, "SAME": SAME, "FEW": _FEW}
+    limits |= {"LESS": _LESS, "NO_SIDESLIP_RAD": NO_SIDESLIP_RAD, "NIS_RANGE": _NIS_RANGE, "DEGREES": DEGREES}
+    functions = {"degrees": degrees, "truth_of": truth_of, "is_worse": is_worse}
+    return template(TEMPLATES / "selected_estimate.txt", **limits, **functions).module
 
 
 def result_of(report: Report) -> str:

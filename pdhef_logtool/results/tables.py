@@ -94,6 +94,7 @@ def _drive(outcome: LogOutcome, report: Mapping[str, Any], rows: Sequence[Metric
         "car_sha256": car.get("sha256"),
         "network_sha256": car.get("network_sha256"),
         "friction_source": (report.get("friction") or {}).get("source"),
+        "friction_median": (report.get("operating_space") or {}).get("friction_median"),
         "low_speed_m_s": (report.get("vehicle") or {}).get("low_speed_blend_m_s"),
         "estimator": main,
         "causal": ran.get(main),
@@ -151,6 +152,14 @@ def read_part(path: Path) -> pa.Table:
     """Return a part; raises OutputError."""
     with reading(path), pq.ParquetFile(path) as file:
         return file.read()
+
+
+def checks_of(part: pa.Table | Path | None) -> list[dict[str, Any]]:
+    """Return the checks of a log from its part; empty for a log without one."""
+    if part is None:
+        return []
+    rows: list[dict[str, Any]] = (read_part(part) if isinstance(part, Path) else part)["checks"][0].as_py()
+    return rows
 
 
 def write_tables(folder: Path, parts: Iterable[pa.Table], folders: Sequence[str] | None = None) -> None:

@@ -14,9 +14,9 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import notes_of
 from pdhef_logtool.estimators.presets import calibration_of
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
-from pdhef_logtool.evaluation.dependence import day_and_route
 from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.evaluation.reasons import Interval, SensorFault, sensor_faults
+from pdhef_logtool.evaluation.statistics import day_and_route
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import Loss

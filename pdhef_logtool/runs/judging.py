@@ -7,7 +7,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pdhef_logtool.evaluation.requirement_bounds import LEAST_DRIVES
+from pdhef_logtool.evaluation.statistics import LEAST_DRIVES
 from pdhef_logtool.evaluation.validation_plan import default_plan
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.tracks import REFERENCE
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from pdhef_logtool.evaluation.operating_space import OperatingSpace
     from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
     from pdhef_logtool.evaluation.validation_plan import Requirement, ValidationPlan
-    from pdhef_logtool.results.plan_verdicts import PlanVerdicts
+    from pdhef_logtool.results.plan_verdicts import JudgedDrive, PlanVerdicts
 
 
 def read_validation_plan(file: Path | None, junit: Path | None) -> ValidationPlan:
     """Return the plan of a file or the default one; raises UsageError when it is wrong or missing for ``junit``."""
     if file is not None:
         from pdhef_logtool.evaluation.validation_plan import load_plan
-        from pdhef_logtool.results.plan_against import other_runs
+        from pdhef_logtool.results.plan_verdicts import other_runs
 
         plan = load_plan(file)
         other_runs(plan, ())  # a missing one ends the command before the work
@@ -71,34 +71,38 @@ def judge_drive(
     entries = {"requirement_blocks": stated, "operating_space": jsonable(space)}
     if not plan.file:
         return {"plan": None, **entries}
-    from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, plan_verdicts
+    from pdhef_logtool.results.plan_verdicts import JudgedDrive, figures_of_rows, in_space, plan_verdicts
 
     judged = JudgedDrive(drive.name, main, lambda: entries, {"car": drive.car.vehicle.name})
-    verdicts = plan_verdicts(plan, figures_of_rows(rows), [judged]).to_dict()["requirements"]
+    verdicts = plan_verdicts(plan, figures_of_rows(rows), [in_space(judged, entries)]).to_dict()["requirements"]
     return {"plan": {"file": plan.file, "requirements": verdicts}, **entries}
 
 
 def judge(
-    plan: ValidationPlan, results: Sequence[LogResult], strict: bool, metrics: Path | None = None
+    plan: ValidationPlan, results: Sequence[LogResult], strict: bool, tables: Path | None = None
 ) -> PlanVerdicts | None:
     """Return the verdicts of a plan on logs; None for the default plan on few logs.
 
-    ``metrics``: the file with the figures of all logs, None: they are in memory. A log that failed has no figures.
+    ``tables``: folder of the tables of all logs, None: figures and reports are in memory. A log that failed has no
+    figures.
     """
     done = [r for r in results if r.outcome.failed is None or r.document is not None]
     if not plan.file and len(done) < LEAST_DRIVES:
         return None
-    from pdhef_logtool.results.plan_against import judged_drive, other_runs
-    from pdhef_logtool.results.plan_verdicts import figures_of_file, figures_of_rows, plan_verdicts
+    from pdhef_logtool.results import plan_verdicts as judging
 
-    drives = [judged_drive(r.opened, partial(_report, r)) for r in done]
-    if metrics is None:
-        figures = figures_of_rows(row for r in done for row in r.rows)
+    drives: Sequence[JudgedDrive] = [judging.judged_drive(r.opened, partial(_report, r)) for r in done]
+    if tables is None:
+        figures = judging.figures_of_rows(row for r in done for row in r.rows)
+        drives = [judging.in_space(d, _report(r) or {}) for d, r in zip(drives, done, strict=True)]
     else:
         import polars as pl
 
-        figures = figures_of_file(pl.scan_parquet(metrics), plan, [d.main for d in drives])
-    return plan_verdicts(plan, figures, drives, strict=strict, against=other_runs(plan, [r.opened for r in done]))
+        metrics, *spaces = (pl.scan_parquet(tables / f"{x}.parquet") for x in ("metrics", "drives", "exposure"))
+        figures = judging.figures_of_file(metrics, plan, [d.main for d in drives])
+        drives = judging.in_spaces(drives, plan, *spaces)
+    against = judging.other_runs(plan, [r.opened for r in done])
+    return judging.plan_verdicts(plan, figures, drives, strict=strict, against=against)
 
 
 @lru_cache(maxsize=LEAST_DRIVES)
@@ -111,5 +115,4 @@ def write_verdicts(junit: Path | None, verdicts: PlanVerdicts | None, results: S
     if junit is not None and verdicts is not None:
         from pdhef_logtool.results.junit import write_junit
 
-        checks = {r.outcome.log: (r.report or {}).get("checks", ()) for r in results}
-        write_junit(junit, verdicts, checks)
+        write_junit(junit, verdicts, {r.outcome.log: r.part for r in results})

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from pdhef_logtool.logs.discovery import folders_of
 from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.results.opened_run import PAGE_FILE, open_run, table_file
+from pdhef_logtool.results.opened_run import PAGE_FILE, TABLES_FOLDER, open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.drive_outputs import log_place, write_run, write_run_tables
 from pdhef_logtool.runs.journal import Entry
@@ -38,7 +38,7 @@ def collect(plan: Plan, config: RunConfig, validation: ValidationPlan) -> tuple[
     write_run_tables(output, results)
     cars = plan.journal.described["car"] | plan.cars_of_run()  # the journal's line of a car may be damaged
     networks = {cars[e.car]["network"] and tuple(cars[e.car]["network"]) for e, _ in entries if e.car is not None}
-    verdicts = judge(validation, results, config.strict, output / table_file("metrics"))
+    verdicts = judge(validation, results, config.strict, output / TABLES_FOLDER)
     network = networks.pop() if len(networks) == 1 else None
     write_run(output, config.to_dict(), results, verdicts, network, remaining)
     if remaining:

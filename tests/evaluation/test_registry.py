@@ -21,8 +21,7 @@ from pdhef_logtool.evaluation import metrics
 from pdhef_logtool.evaluation.metrics import registry
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.reports.comparison import comparison_page
-from pdhef_logtool.results.comparing import compare_runs
-from pdhef_logtool.results.gate import Figure
+from pdhef_logtool.results.comparing import compare_runs, figure
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
@@ -91,16 +90,16 @@ def test_plans_and_compare_accept_it(toy: str, result: RunResult) -> None:
     (verdict,) = result.requirements.verdicts
     assert (verdict.outcome, result.exit_code) == ("FAIL", 4)
     assert verdict.requirement.label == f"sideslip {LABEL} ≤ 0.001° (worst drive, physics)"
-    gate = (Figure(metric=toy, limit=0.05),)
+    gate = (figure(metric=toy, limit=0.05),)
     run = open_run(str(result.place))
     found = compare_runs(run, run, gate)
-    (figure,) = found.figures
-    assert (figure.verdict, figure.unit, figure.figure.short) == ("equal", "rad", f"sideslip {LABEL}")
-    changed = replace(found, changed=1)
+    (compared,) = found.figures
+    assert (compared.verdict, compared.unit, compared.requirement.name) == ("equal", "rad", f"sideslip {LABEL}")
+    changed = replace(found, changed=1, figures=(replace(compared, verdict="worse"),))
     console = Console(width=120, record=True, file=io.StringIO())
     render_comparison(changed, console)
-    assert f"sideslip_rad {toy} (all)" in console.export_text()
-    assert toy.encode() in comparison_page(changed)
+    assert f"sideslip {LABEL}" in console.export_text()
+    assert LABEL.encode() in comparison_page(changed)
 
 
 def test_the_documentation_defines_it(toy: str) -> None:

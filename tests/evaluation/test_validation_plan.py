@@ -55,19 +55,19 @@ def test_degrees_manoeuvres_and_quantiles() -> None:
 @pytest.mark.parametrize(
     ("table", "problem"),
     [
-        ({}, "requirement[0].id: is missing"),
+        ({}, "requirement.0.id: is missing"),
         ({**WHOLE, "exposure": [{"speed_m_s": [3.0, 10.0], "drives": 1}]}, "multiples of 5"),
         ({**WHOLE, "exposure": [{"friction": [0.5, 0.4], "minutes": 1.0}]}, "should be [from, to]"),
         ({**WHOLE, "exposure": [{"car": "golf"}]}, "give drives or minutes"),
-        ({**WHOLE, "id": "a b"}, "requirement[0].id"),
+        ({**WHOLE, "id": "a b"}, "requirement.0.id"),
         ({**WHOLE, "limit": 0.1}, "give one of limit, limit_deg, limit_deg_s, or baseline"),
         ({**WHOLE, "signal": "vx_m_s"}, "vx_m_s rmse is in m/s, not in rad"),
         ({**WHOLE, "baseline": "zero", "max_ratio": 1.0}, "give limit_deg or baseline, not both"),
         ({"id": "A", "signal": "sideslip_rad", "baseline": "zero"}, "max_ratio: is missing"),
         ({**WHOLE, "max_ratio": 1.0}, "max_ratio: needs a baseline"),
         ({**WHOLE, "metric": "p95_abs"}, "p95_abs of several drives cannot be pooled; use 'worst drive'"),
-        ({**WHOLE, "metric": "nees"}, "requirement[0].metric = nees: unknown"),
-        ({**WHOLE, "segment": "curves"}, "requirement[0].segment = curves: unknown"),
+        ({**WHOLE, "metric": "nees"}, "requirement.0.metric = nees: unknown"),
+        ({**WHOLE, "segment": "curves"}, "requirement.0.segment = curves: unknown"),
         ({**WHOLE, "segment": "all", "manoeuvre": "slalom"}, "give segment or manoeuvre, not both"),
     ],
 )

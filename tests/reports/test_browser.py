@@ -19,8 +19,7 @@ from test_fleet_page import run_of
 
 from pdhef_logtool.reports.comparison import comparison_page
 from pdhef_logtool.reports.pages import write_pages
-from pdhef_logtool.results.comparing import compare_runs
-from pdhef_logtool.results.gate import Figure
+from pdhef_logtool.results.comparing import compare_runs, figure
 from pdhef_logtool.results.opened_run import open_run
 from tests.results import made_run
 
@@ -167,7 +166,7 @@ def test_axe_finds_nothing_serious_and_nothing_is_wider_than_the_screen(browser,
     drive = write_pages(run).pages[0].file
     a, b = (made_run.write_run(tmp_path / str(x), {f"d{i}": 0.001 * x * (1 + i) for i in range(10)}) for x in (1, 2))
     comparison = tmp_path / "comparison.html"
-    comparison.write_bytes(comparison_page(compare_runs(open_run(a), open_run(b), (Figure(limit=0.05),))))
+    comparison.write_bytes(comparison_page(compare_runs(open_run(a), open_run(b), (figure(limit=0.05),))))
     fleet_page, failed_page = fleet.folder / "report.html", fleet.folder / "logs/bad/report.html"
     figures = {drive: 8, fleet_page: 3, failed_page: 0, comparison: 2}
     for scheme, width, ground in (("dark", 390, "rgb(20, 24, 29)"), ("light", 1280, "rgb(255, 255, 255)")):

@@ -6,8 +6,7 @@ import re
 from pathlib import Path
 
 from pdhef_logtool.reports.comparison import comparison_page
-from pdhef_logtool.results.comparing import compare_runs
-from pdhef_logtool.results.gate import Figure
+from pdhef_logtool.results.comparing import compare_runs, figure
 from pdhef_logtool.results.opened_run import open_run
 from tests.results.made_run import entry, write_run
 
@@ -16,7 +15,7 @@ HOSTILE = "<img src=x onerror=alert(1)>"
 
 
 def _page(a: Path, b: Path, limit: float | None = 0.05) -> str:
-    return comparison_page(compare_runs(open_run(a), open_run(b), (Figure(limit=limit),))).decode()
+    return comparison_page(compare_runs(open_run(a), open_run(b), (figure(limit=limit),))).decode()
 
 
 def _text(page: str) -> str:
@@ -39,7 +38,7 @@ def test_a_page_says_what_the_terminal_says(tmp_path: Path) -> None:
 def test_an_equal_run_has_a_page_that_says_so(tmp_path: Path) -> None:
     a = write_run(tmp_path / "a", TEN)
     assert "equal: all figures of all pairs are the same bit for bit" in _text(_page(a, a))
-    assert "No figure changed." in _text(_page(a, a))
+    assert "No figure of the drives in both runs changed." in _text(_page(a, a))
 
 
 def test_names_that_are_markup_stay_texts_and_a_run_without_truth_has_a_page(tmp_path: Path) -> None:
@@ -48,5 +47,5 @@ def test_names_that_are_markup_stay_texts_and_a_run_without_truth_has_a_page(tmp
     b = write_run(tmp_path / "b", {HOSTILE: 0.1, "d": float("nan")}, entries=entries)
     page = _page(a, b)
     assert "<img" not in page
-    assert "no drive has the figure on both sides (is there ground truth?): sideslip_rad rmse (all)" in _text(page)
+    assert "no drive has the figure on both sides (is there ground truth?): sideslip RMSE" in _text(page)
     assert "No drive has the figure on both sides." in _text(page)

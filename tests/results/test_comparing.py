@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from pdhef_logtool.evaluation.validation_plan import Requirement
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.results.comparing import Comparison, compare_runs
-from pdhef_logtool.results.comparison_words import notes_of
-from pdhef_logtool.results.gate import Figure
+from pdhef_logtool.results.comparing import Comparison, compare, compare_runs, figure
+from pdhef_logtool.results.comparison_words import notes_of, sentence
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.storage.documents import jsonable
 from tests.results.made_run import digest, entry, row, write_run
 
-ASKED = (Figure(),)
-GATE = (Figure(limit=0.05),)
+ASKED = (figure(),)
+GATE = (figure(limit=0.05),)
 TEN = {f"d{i}": 0.01 * (1 + i) for i in range(10)}
 
 
-def _compare(a: Path, b: Path, gate: tuple[Figure, ...] = ASKED, **options: Any) -> Comparison:
+def _compare(a: Path, b: Path, gate: tuple[Requirement, ...] = ASKED, **options: Any) -> Comparison:
     return compare_runs(open_run(a), open_run(b), gate, **options)
 
 
@@ -66,8 +70,8 @@ def test_the_gate_closes_on_a_regression_and_not_on_an_improvement(tmp_path: Pat
     a = write_run(tmp_path / "a", TEN)
     worse = _compare(a, write_run(tmp_path / "b", _scaled(1.2)), GATE)
     assert (worse.verdict, worse.exit_code) == ("worse", 4)
-    assert worse.figures[0].drives[0].drive == "d9"
-    assert worse.figures[0].drives[0].change == pytest.approx(0.2 * 1.009 + 0.009)
+    assert worse.figures[0].drives[0]["drive"] == "d9"
+    assert worse.figures[0].drives[0]["change"] == pytest.approx(0.2 * 1.009 + 0.009)
     assert _compare(a, tmp_path / "b").exit_code == 0  # no gate
     assert _compare(a, write_run(tmp_path / "c", _scaled(1.02)), GATE).verdict == "not worse"
     assert _compare(a, write_run(tmp_path / "d", _scaled(0.9)), GATE).verdict == "better"
@@ -92,10 +96,10 @@ def test_drives_of_six_days_that_change_together_are_no_evidence_unless_the_user
     a = write_run(tmp_path / "a", rmse, entries=of_days, reports=reports)
     b = write_run(tmp_path / "b", changed)
     found = _compare(a, b, GATE)
-    (figure,) = found.figures
-    assert (found.verdict, figure.change.dependence.by) == ("inconclusive", ("day",))
-    assert figure.change.dependence.levels == (("day", 6),)
-    assert figure.change.dependence.design_effect == pytest.approx(10.0)
+    (days,) = found.figures
+    assert (found.verdict, days.change.dependence.by) == ("inconclusive", ("day",))
+    assert days.change.dependence.levels == (("day", 6),)
+    assert days.change.dependence.design_effect == pytest.approx(10.0)
     assert "60 drives of 6 days have the evidence of 6 independent drives" in "".join(notes_of(found))
     assert found.to_dict()["figures"][0]["dependence"] == ("day",)
     alone = _compare(a, b, GATE, cluster="none")
@@ -109,7 +113,7 @@ def test_the_others_are_corrected_for_being_several(tmp_path: Path) -> None:
         return [row(k, factor, signal=s) for k in TEN for s in signals] + [row(k, 1, signal="vy_m_s") for k in TEN]
 
     a, b = write_run(tmp_path / "a", TEN, rows=rows(1.0)), write_run(tmp_path / "b", _scaled(1.1), rows=rows(1.1))
-    by_signal = {f.figure.signal: f for f in _compare(a, b).others}
+    by_signal = {f.requirement.signal: f for f in _compare(a, b).others}
     assert by_signal["vx_m_s"].change.sign_p == pytest.approx(2 * 0.5**10)
     assert by_signal["vx_m_s"].corrected_p == pytest.approx(4 * 2 * 0.5**10)
     assert (by_signal["vy_m_s"].corrected_p, by_signal["vy_m_s"].verdict) == (1.0, "equal")
@@ -146,8 +150,54 @@ def test_no_pair_and_unknown_names_are_errors(tmp_path: Path) -> None:
     assert error.value.exit_code == 1
     c = write_run(tmp_path / "c", _scaled(1.1))
     with pytest.raises(UsageError, match="an estimator of these runs: pd-hef, got pd-hof"):
-        _compare(a, c, (Figure(estimator="pd-hof", limit=0.1),))
+        _compare(a, c, (figure(estimator="pd-hof", limit=0.1),))
     scored = write_run(tmp_path / "scored", _scaled(1.1), entries=[entry(label, main=None) for label in TEN])
     with pytest.raises(UsageError, match="an estimator of these runs: pd-hef, got none named"):
         _compare(scored, a)
-    assert _compare(scored, a, (Figure(estimator="pd-hef"),)).figures[0].change.drives == 10
+    assert _compare(scored, a, (figure(estimator="pd-hef"),)).figures[0].change.drives == 10
+
+
+def test_a_history_has_a_row_per_run_and_reads_only_tables(tmp_path: Path) -> None:
+    versions = [{"versions": {"pdhef-logtool": version}} for version in ("1", "2", "3", "4")]
+    rmse = [TEN, TEN, _scaled(1.2), {**_scaled(1.0), "new": 0.1}]
+    runs = [
+        write_run(tmp_path / of["versions"]["pdhef-logtool"], x, **of) for x, of in zip(rmse, versions, strict=True)
+    ]
+    assert not list(tmp_path.rglob("report.json"))
+    found = compare(*runs, max_regression="5%", allow_unpaired=True)
+    assert (found.a, found.b, found.verdict, found.exit_code) == (str(runs[2]), str(runs[3]), "better", 0)
+    rows = jsonable(found.to_dict())["history"]
+    assert [(r["version"], r["drives"], r["verdict"]) for r in rows] == [
+        ("1", 10, ""), ("2", 10, "equal"), ("3", 10, "worse"), ("4", 11, "better"),
+    ]  # fmt: skip
+    assert rows[0]["value"] == pytest.approx(math.sqrt(sum(x**2 for x in TEN.values()) / 10))
+    assert rows[0]["low"] < rows[0]["value"] < rows[0]["high"] and rows[0]["change"] == [None] * 3
+    assert rows[1]["change"][0] == 0.0 and rows[2]["change"][0] == pytest.approx(0.2, abs=0.01)
+    assert compare(*runs[:3], max_regression="5%").exit_code == 4
+    assert compare(*runs[:2]).history == ()
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    changed=st.sets(st.sampled_from(["asked", "other signal", "other estimator", "stamps"])),
+    gated=st.booleans(),
+)
+def test_verdict_and_number_of_changed_drives_never_contradict(changed: set[str], gated: bool) -> None:
+    def rows(of: set[str]) -> list[Any]:
+        more = [row(k, 1.0 + ("other signal" in of), signal="vx_m_s") for k in TEN]
+        more += [row(k, 1.0 + ("other estimator" in of), estimator="zero") for k in TEN]
+        return [*more, *(row(k, v * (1.3 if "asked" in of else 1.0), n=99 + ("stamps" in of)) for k, v in TEN.items())]
+
+    with TemporaryDirectory() as folder:
+        runs = [
+            write_run(Path(folder) / str(len(of)), dict.fromkeys(TEN, math.nan), rows=rows(of))
+            for of in (set(), changed)
+        ]
+        found = _compare(runs[0], runs[-1], GATE if gated else ASKED)
+    assert found.equal == (not changed) == (found.changed == 0)
+    assert (found.verdict == "equal") == (not changed & {"asked", "stamps"})
+    text = sentence("changes", found)
+    assert ("No figure of the drives" in text) == found.equal
+    assert ("none of the compared ones" in text) == (found.verdict == "equal" and not found.equal)
+    assert sentence("verdict", found).startswith("equal: all figures") == found.equal
+    assert "all figures" in sentence("verdict", found) or "10 of 10 drives" in text

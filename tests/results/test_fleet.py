@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,8 @@ import pytest
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.results.fleet import ANSWER, Fleet, cause_and_remedy, read_fleet
 from pdhef_logtool.results.opened_run import open_run
-from pdhef_logtool.storage.documents import seal
-from tests.results.made_run import write_tables
+from tests.results.made_run import entry, row, write_run
+from tests.run_report import TRUTH, report, truth
 
 LOST = {
     "kind": "truncated",
@@ -24,24 +23,8 @@ LOST = {
     "start_ns": None,
     "end_ns": None,
 }
-NO_TRUTH = {"available": False, "not_independent": []}
-
-
-def report(label: str, **changes: Any) -> dict[str, Any]:
-    cells = [{"speed": 4, "ay": 1, "seconds": 5.0, "scored": 100, "sideslip_mse_rad2": 1e-4}]
-    made = {
-        "format": "pdhef.report",
-        "log": {"name": label, "duration_s": 12.0, "kind": "mcap"},
-        "vehicle": {"name": "golf"},
-        "truth": {"available": True, "not_independent": []},
-        "selected_estimate": "pd-hef",
-        "friction": {"source": "option", "value": 0.9, "topic": None, "given": True},
-        "checks": [],
-        "faults": [],
-        "operating_space": {"speed_edges_m_s": [0, 5, 10, 15, 20], "ay_edges_m_s2": [0, 1, 2], "cells": cells},
-        "metadata": {},
-    }
-    return {**made, **changes}
+CELL = {"speed": 4, "ay": 1, "seconds": 5.0, "scored": 100, "sideslip_mse_rad2": 1e-4}
+SPACE = {"speed_edges_m_s": [0, 5, 10, 15, 20], "ay_edges_m_s2": [0, 1, 2], "cells": [CELL]}
 
 
 class Run:
@@ -54,26 +37,19 @@ class Run:
         self.reports: dict[str, dict[str, Any]] = {}
 
     def add(self, label: str, errors: Mapping[str, float] | None = None, outcome: str = "ok", **changes: Any) -> None:
-        entry = {"log": label, "outcome": outcome, "car": {"name": "golf"}, "folder": changes.pop("folder", "")}
-        entry["main"] = "pd-hef"
-        self.logs.append(entry)
+        self.logs.append(entry(label, outcome=outcome))
         if outcome.startswith("failed"):
             return
-        self.reports[label] = report(label, **changes)
+        self.reports[label] = report(None, **{"operating_space": SPACE, "metadata": {}, **changes})
         independent = "sideslip_rad" not in self.reports[label]["truth"]["not_independent"]
         for name, value in (errors or {}).items():
             self.rows += [
-                MetricRow(label, name, "sideslip_rad", segment, "rmse", figure, "rad", 9, independent)
+                row(label, figure, estimator=name, segment=segment, independent=independent)
                 for segment, figure in (("all", value), ("linear", 99.0))
             ]
 
-    def row(self, label: str, *figure: Any) -> None:
-        estimator, signal, metric, value = figure
-        self.rows.append(MetricRow(label, estimator, signal, "all", metric, value, "rad", 9))
-
     def read(self, **options: Any) -> Fleet:
-        write_tables(self.folder, self.logs, self.rows, self.reports)
-        (self.folder / "run.json").write_text(json.dumps(seal({"format": "pdhef.run", "logs": self.logs})))
+        write_run(self.folder, {}, entries=self.logs, rows=self.rows, reports=self.reports)
         return read_fleet(open_run(self.folder), **options)
 
 
@@ -93,10 +69,10 @@ def test_six_drives_rank_nobody_and_seven_can(run: Run) -> None:
 
 def test_drives_without_independent_truth_stand_apart_and_score_nothing(run: Run) -> None:
     run.add("good", {"pd-hef": 0.01})
-    run.add("none", truth=NO_TRUTH)
-    run.add("own", {"pd-hef": 0.0}, truth={"available": True, "not_independent": ["sideslip_rad"]})
+    run.add("none", truth=truth())
+    run.add("own", {"pd-hef": 0.0}, truth=TRUTH | {"not_independent": ["sideslip_rad"]})
     for name, d2 in (("pd-hef", 0.3), ("zero", 0.1)):
-        run.row("none", name, "vy_m_s", "d2", d2)
+        run.rows.append(row("none", d2, estimator=name, signal="vy_m_s", metric="d2"))
     found = run.read()
     assert [d.label for d in found.scored] == ["good"]
     assert [(d.label, d.unscored) for d in found.without_truth] == [
@@ -149,8 +125,7 @@ def test_effects_have_intervals_and_keys_without_one_are_not_significant(run: Ru
 
 
 def test_the_operating_space_adds_up_and_empty_cells_are_empty(run: Run) -> None:
-    cells = [{"speed": 0, "ay": 2, "seconds": 1.0, "scored": 300, "sideslip_mse_rad2": 9e-4}]
-    space = {"speed_edges_m_s": [0, 5, 10, 15, 20], "ay_edges_m_s2": [0, 1, 2], "cells": cells}
+    space = SPACE | {"cells": [{"speed": 0, "ay": 2, "seconds": 1.0, "scored": 300, "sideslip_mse_rad2": 9e-4}]}
     run.add("a", {"pd-hef": 0.1})
     run.add("b", {"pd-hef": 0.1})
     run.add("c", {"pd-hef": 0.1}, operating_space=space)

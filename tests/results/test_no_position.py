@@ -27,22 +27,15 @@ def _topics(path: Path) -> set[str]:
         return {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
 
 
+PLACES = "gps.Latitude gps.longitudeDeg pos_x north x navLatDeg breite speed.lat speed_sample.p stamp_lat"
+NO_PLACES = "latAccelG gps_speed twist.linear.z"
+
+
 @pytest.mark.parametrize(
     ("type_name", "field", "left_out"),
     [
-        ("vendor/msg/State", "gps.Latitude", True),
-        ("vendor/msg/State", "gps.longitudeDeg", True),
-        ("vendor/msg/State", "pos_x", True),
-        ("vendor/msg/State", "north", True),
-        ("vendor/msg/State", "x", True),
-        ("vendor/msg/State", "navLatDeg", True),
-        ("vendor/msg/State", "breite", True),
-        ("vendor/msg/State", "speed.lat", True),
-        ("vendor/msg/State", "speed_sample.p", True),
-        ("vendor/msg/State", "stamp_lat", True),
-        ("vendor/msg/State", "latAccelG", False),
-        ("vendor/msg/State", "gps_speed", False),
-        ("vendor/msg/State", "twist.linear.z", False),
+        *(("vendor/msg/State", field, True) for field in PLACES.split()),
+        *(("vendor/msg/State", field, False) for field in NO_PLACES.split()),
         ("vendor/msg/Pedals", "brake_pedal_position", False),
         ("vendor/msg/Imu", "angular_velocity.z", False),
         ("vendor/msg/Imu", "orientation.z", True),

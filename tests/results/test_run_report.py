@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import importlib.metadata
 import json
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
@@ -11,10 +13,19 @@ from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.operating_space import Cell, OperatingSpace
 from pdhef_logtool.evaluation.reasons import Interval, SensorFault
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.results.run_report import LogOutcome, build_run, report_markdown, write_json
+from pdhef_logtool.results.palette import colour_rgb
+from pdhef_logtool.results.run_report import (
+    LogOutcome,
+    build_run,
+    diverged_line,
+    report_markdown,
+    tool_versions,
+    write_json,
+)
 from pdhef_logtool.results.sink import Event
 from tests.run_report import SHA, VELOCITY, follows, ran, report, truth
 
+SECOND = 10**9
 SKIPPED = ran("pd-hef", algorithm=None, outcome="skipped", reason="no model", notes=["needs --model"])
 CONTENT = {
     "main": None,
@@ -49,6 +60,10 @@ def test_report_follows_its_schema(tmp_path):
     assert [m["value"] for m in document["metrics"]] == [np.deg2rad(0.5), None]
     assert document["segments"] == [{"name": "nonlinear", "start_ns": 1, "end_ns": 2, "text": "|ay| above 0.5 g"}]
     assert document["losses"][0]["severity"] == "lost"
+    space = OperatingSpace([Cell(3, 2, 1.5, 0, float("nan"))], 12.3, 2.5, 0.9)
+    more = report(metadata={"vehicle": "a"}, operating_space=space, faults=None)
+    follows({**more, "estimators": []})
+    assert more["operating_space"]["cells"][0]["sideslip_mse_rad2"] is None and more["faults"] is None
 
 
 def test_faults_are_in_words():
@@ -95,18 +110,48 @@ def test_run_says_how_each_log_ended(tmp_path):
     follows(build_run({}, ("st-resnet", SHA), []), "run.schema.json")
 
 
-def test_json_is_sorted_and_the_same_each_time(tmp_path):
-    write_json(tmp_path / "a.json", {"b": 1, "a": float("inf"), "c": {"z": 1, "y": "β"}})
+def test_json_is_sorted_and_the_same_each_time_and_versions_are_installed(tmp_path):
+    write_json(tmp_path / "a.json", {"b": [float("nan")], "a": float("inf"), "c": {"z": 1, "y": "β"}})
     assert (tmp_path / "a.json").read_bytes() == (
-        '{\n "a": null,\n "b": 1,\n "c": {\n  "y": "β",\n  "z": 1\n }\n}\n'.encode()
+        '{\n "a": null,\n "b": [\n  null\n ],\n "c": {\n  "y": "β",\n  "z": 1\n }\n}\n'.encode()
     )
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+    versions = tool_versions()
+    assert versions["numpy"] == importlib.metadata.version("numpy") and "python" in versions
 
 
-def test_records_of_a_drive_follow_the_schema() -> None:
-    fault = SensorFault("ay_m_s2", "spike", 70, 1.0, (Interval(1, 2),))
-    space = OperatingSpace([Cell(3, 2, 1.5, 0, float("nan"))], 12.3, 2.5, 0.9)
-    document = report(faults=[fault], metadata={"vehicle": "a"}, operating_space=space)
-    follows({**document, "estimators": []})
-    assert document["operating_space"]["cells"][0]["sideslip_mse_rad2"] is None
-    assert report(faults=None)["faults"] is None
+def test_colours_are_red_green_blue_and_a_names_own() -> None:
+    assert colour_rgb("phy-ukf", {"phy-ukf": 0x12_34_56}) == (0x12, 0x34, 0x56)
+    assert colour_rgb("truth", {}) == (0x8A, 0x8A, 0x8A)
+    palette = "d55e00 0072b2 e69f00 009e73 cc79a7 56b4e9"
+    found = [colour_rgb(f"recorded {i}", {"phy-ukf": 0}) for i in range(40)]
+    assert set(found) == {tuple(bytes.fromhex(colour)) for colour in palette.split()}
+    assert colour_rgb("recorded 7", {}) == found[7]
+
+
+def _report(**changes: Any) -> dict[str, Any]:
+    estimators = [ran("ukf", notes=["a", "b"]), ran("smooth", causal=False)]
+    content = {"estimators": estimators, "warnings": ["careful"], "losses": [Loss("gap", "a gap", "/imu")], **changes}
+    return report(None, **content)
+
+
+def test_the_report_for_people_is_this() -> None:
+    spans = [
+        Event("ukf diverged", 5 * SECOND, 6 * SECOND, ""),
+        Event("ukf diverged", 2 * SECOND, 2 * SECOND + 250_000_000, ""),
+    ]
+    assert report_markdown(_report(segments=spans)).splitlines() == [
+        "# drive", "", "drive.mcap (mcap), 10.0 s", "",
+        "## Warnings", "", "- careful", "",
+        "## Losses", "", "- a gap (/imu)", "",
+        "## Estimators", "",
+        "- **ukf** (causal): a; b; diverged for 1.25 s in 2 intervals, first at 2.00 s",
+        "- **smooth** (not causal)",
+    ]  # fmt: skip
+    assert diverged_line(_report(segments=spans[:1]), "ukf") == "diverged for 1.00 s, first at 5.00 s"
+    assert diverged_line(_report(segments=spans), "smooth") == ""
+    assert "Warnings" not in report_markdown(_report(warnings=[], losses=[]))
+    verdict = {"id": "S", "label": "sideslip RMSE ≤ 1°", "reason": "1.2° (95 % CI 1.1° to 1.3°)", "next": ""}
+    verdict["outcome"] = "FAIL"
+    text = report_markdown(_report(plan={"file": "p.toml", "requirements": [verdict]}))
+    assert "- **FAIL** sideslip RMSE ≤ 1°: 1.2° (95 % CI 1.1° to 1.3°)" in text

@@ -255,7 +255,7 @@ def test_the_nearest_name_is_told() -> None:
         (LOADERS[1], "truth_quallity = {}", "truth_quallity", "truth_quality"),
         (LOADERS[1], "truth_quality = {tropic = 3}", "truth_quality.tropic", "truth_quality.topic"),
         (LOADERS[1], "[estimates.a.vy_ms]\ntopic = '/a'", "estimates.a.vy_ms", "estimates.a.vy_m_s"),
-        (LOADERS[2], "[[requirement]]\nlimits = 3", "requirement[0].limits", "requirement[0].limit"),
+        (LOADERS[2], "[[requirement]]\nlimits = 3", "requirement.0.limits", "requirement.0.limit"),
         (LOADERS[3], "[sensors]\nay_std = 1.0", "sensors.ay_std", "sensors.ay_std_m_s2"),
         (LOADERS[4], "[filter.physics]\nq_sdt = [0.1, 0.1, 0.1]", "filter.physics.q_sdt", "filter.physics.q_std"),
     ],

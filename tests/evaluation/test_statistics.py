@@ -1,4 +1,4 @@
-"""The paired change of a figure over drives, its bounds and its verdict."""
+"""Statistics over drives: dependence, bounds of quantiles, the paired change of a figure and its verdict."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from pdhef_logtool.evaluation.dependence import dependence, deviate
-from pdhef_logtool.results.paired_change import holm, paired_change
+from pdhef_logtool.evaluation.statistics import decided, dependence, deviate, holm, paired_change, quantile
 
 
 def test_bounds_are_those_of_resampled_medians() -> None:
@@ -23,15 +22,35 @@ def test_bounds_are_those_of_resampled_medians() -> None:
     assert found.low <= found.least <= found.median <= found.most <= found.high
 
 
-def test_the_sign_test_is_that_of_scipy_and_the_unchanged_do_not_vote() -> None:
-    ratios = np.array([0.1] * 9 + [-0.1] * 3 + [0.0] * 5)
+def test_the_sign_test_is_that_of_scipy_and_holm_corrects_for_being_several() -> None:
+    ratios = np.array([0.1] * 9 + [-0.1] * 3 + [0.0] * 5)  # the unchanged do not vote
     assert paired_change(ratios).sign_p == pytest.approx(stats.binomtest(3, 12).pvalue)
     assert paired_change(np.zeros(8)).sign_p == 1.0
-
-
-def test_holm_corrects_for_being_several() -> None:
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([]) == []
+
+
+def test_the_bounds_of_a_quantile_are_exact() -> None:
+    rng = np.random.default_rng(0)
+    found = [quantile(rng.uniform(size=60), 0.9, 0.95) for _ in range(400)]
+    assert np.mean([f.low <= 0.9 for f in found]) >= 0.95
+    assert np.mean([f.high >= 0.9 for f in found]) >= 0.95
+
+
+@pytest.mark.parametrize(
+    ("interval", "bound", "least", "outcome"),
+    [
+        ((0.9, 1.0, 1.1), 1.1, None, "PASS"),
+        ((0.9, 1.0, 1.1), 1.0, None, "INCONCLUSIVE"),
+        ((1.1, 1.2, 1.3), 1.05, None, "FAIL"),
+        ((1.01, 1.1, 1.2), 1.05, None, "INCONCLUSIVE"),
+        ((1.01, 1.1, 1.2), 1.05, 1.0, "FAIL"),  # a significant regression, and more than accepted
+        ((1.01, 1.04, 1.2), 1.05, 1.0, "INCONCLUSIVE"),
+        ((math.nan, 2.0, math.nan), 1.0, None, "INCONCLUSIVE"),
+    ],
+)
+def test_an_interval_decides(interval: tuple[float, float, float], bound: float, least: float, outcome: str) -> None:
+    assert decided(*interval, bound, least) == outcome
 
 
 def _of_days(rng: np.random.Generator, days: int, each: int, shared: float) -> tuple[np.ndarray, dict[str, list[int]]]:
@@ -60,10 +79,7 @@ def test_the_design_effect_is_that_of_the_simulated_correlation() -> None:
         ratios, factors = _of_days(rng, 20, 10, 0.3)
         effects.append(dependence(ratios, factors).design_effect)
     assert np.mean(effects) == pytest.approx(1.0 + 0.3 * 9, abs=0.25)
-
-
-def test_a_dependence_next_to_none_takes_no_time() -> None:
-    assert deviate(0.975, 1e15) == pytest.approx(deviate(0.975, math.inf))
+    assert deviate(0.975, 1e15) == pytest.approx(deviate(0.975, math.inf))  # in no time
 
 
 def test_factors_that_are_nested_or_equal_count_once_and_crossed_ones_add() -> None:
