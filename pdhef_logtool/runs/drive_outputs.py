@@ -78,9 +78,7 @@ class DriveOutputs:
     ) -> None:
         (self._change, self._run_folder), self._run, self._main = folders, run, main
         self._signals, names = estimated.signals, run.names
-        tracks = [estimated.tracks[name] for name in names]
-        if estimated.drawn_truth is not None:
-            tracks.insert(0, estimated.drawn_truth)
+        tracks = estimated.drawn
         self.tracks = [without_pose(track) for track in tracks] if run.config.no_position else tracks
         # Recordings show the selected estimate beside physics alone, otherwise beside the naive estimate.
         order = dict.fromkeys([main.name, PHYSICS, *filter(None, [main.naive]), *main.shown])

@@ -17,7 +17,6 @@ from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.evaluation.dependence import day_and_route
 from pdhef_logtool.evaluation.largest_errors import largest_errors
 from pdhef_logtool.evaluation.reasons import Interval, SensorFault, sensor_faults
-from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
@@ -40,27 +39,34 @@ def report_drive(
     run: PreparedDrive,
     estimated: Estimated,
     scored: Evaluation,
-    main: MainFacts,
-    judged: dict[str, Any],
+    stated: dict[str, Any],
     losses: Sequence[Loss],
+    selected: str | None,
+    main: MainFacts | None = None,
 ) -> dict[str, Any]:
-    """Return the document of report.json; ``judged`` : its entries by :func:`~.judging.judge_drive`."""
-    drive, config, truth, selected = run.drive, run.config, estimated.truth, estimated.read(main.name)
+    """Return the document of report.json.
+
+    Parameters
+    ----------
+    stated : further entries, of :func:`~.judging.judge_drive` or in place of others. selected : the estimate whose
+        errors are located; None: of several recorded ones none. main : the same as a choice; None: it was recorded.
+    """
+    drive, config, truth, track = run.drive, run.config, estimated.truth, estimated.tracks.get(selected or "")
     preferred = dict.fromkeys((REFERENCE, PHYSICS, *run.names))
-    others = [t for n in preferred if n != main.name and (t := estimated.read(n)) is not None]
+    others = [t for n in preferred if n != selected and (t := estimated.read(n)) is not None]
     slow = run.car.vehicle.low_speed_blend_m_s
-    content = drive_entries(drive, run.car, losses) | judged
-    content |= {
+    content = _drive_entries(drive, run.car, losses) | {
         "estimators": [*_estimator_entries(run)],
         "metrics": scored.rows,
         "segments": scored.events,
         "friction": run.model.friction.to_dict(),
         "self_calibration": None if run.model.posterior is None else run.model.posterior.to_dict(),
         "reference": None if run.reference is None else run.reference.document,
-        "largest_errors": [] if selected is None else largest_errors(selected, truth, others, slow),
-        "faults": _faults(run, main.name, estimated.read),
-        "path_drift": None if truth is None or selected is None else path_drift(selected, truth),
+        "largest_errors": [] if track is None else largest_errors(track, truth, others, slow),
+        "faults": _faults(run, selected, estimated.read),
+        "path_drift": None if truth is None or track is None else path_drift(track, truth),
         "metadata": {} if config.no_position else _metadata(drive),
+        **stated,
     }
     report = build_report(content, main)
     return without_names(report, drive.path, drive.name) if config.no_position else report
@@ -85,12 +91,14 @@ def _estimator_entries(run: PreparedDrive) -> Iterator[dict[str, Any]]:
             yield estimator_entry(s.name, causal=s.spec.causal, outcome="skipped", reason=s.reason)
 
 
-def _faults(run: PreparedDrive, main: str, read: Callable[[str], StateTrack | None]) -> tuple[SensorFault, ...] | None:
+def _faults(
+    run: PreparedDrive, selected: str | None, read: Callable[[str], StateTrack | None]
+) -> tuple[SensorFault, ...] | None:
     """Return the changes of the sensors, and the faults that the selected estimate detects, or else physics.
 
     None without changes where neither detects any.
     """
-    tracks = [read(name) for name in dict.fromkeys((main, PHYSICS)) if name in run.names]
+    tracks = [read(name) for name in dict.fromkeys((selected, PHYSICS)) if name in run.names]
     detected = (sensor_faults(track) for track in tracks if track is not None)
     faults = next((faults for faults in detected if faults is not None), None)
     changes = tuple(
@@ -108,18 +116,8 @@ def _metadata(drive: Drive) -> dict[str, str]:
     return {k: printable(v) for k, v in [*short.items()][:_MOST_METADATA]}
 
 
-def drive_entries(
-    drive: Drive,
-    car: Car,
-    losses: Sequence[Loss],
-    ledger: Sequence[SampleCount] | None = None,
-) -> dict[str, Any]:
-    """Return the entries of report.json that do not depend on an estimate.
-
-    Parameters
-    ----------
-    car : as calibrated on the drive. ledger : of all samples; None: of the drive.
-    """
+def _drive_entries(drive: Drive, car: Car, losses: Sequence[Loss]) -> dict[str, Any]:
+    """Return the entries that do not depend on an estimate; ``car`` : as calibrated on the drive."""
     plan = drive.plan
     return {
         "log": _log(drive),
@@ -139,11 +137,8 @@ def drive_entries(
             "decided_s": plan.decided_s,
             "causal_from_s": drive.causal_from_s,
         },
-        "friction": None,
-        "self_calibration": None,
-        "reference": None,
         "losses": losses,
-        "ledger": {"samples": drive.sample_ledger if ledger is None else ledger},
+        "ledger": {"samples": drive.sample_ledger},
         "warnings": drive.notes,
         "remarks": drive.remarks,
         "checks": [{k: getattr(c, k) for k in _OF_CHECK} for c in drive.checks],
@@ -186,6 +181,8 @@ def _truth_notes(plan: DrivePlan) -> list[str]:
         if latency.gyro_delay_s:
             verdict = "so that the ground truth is not moved"
         notes.append(f"latency {measured} ({latency.reason}), {verdict}")
+    elif plan.truth is not None:
+        notes.append("no gyro, or no true yaw rate, to measure the latency with: taken as 0")
     notes += [f"{signal} is not independent: {reason}" for signal, reason in plan.dependent.items()]
     if "cg" in plan.derivation:
         notes.append(plan.derivation["cg"])

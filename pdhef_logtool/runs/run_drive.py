@@ -79,7 +79,7 @@ def run_log(
                 if annotated is not None:
                     annotated.write(files.tracks)
                 losses = merge_losses([drive.losses, *_losses(run, scored)])
-                report = report_drive(run, estimated, scored, main, judged, losses)
+                report = report_drive(run, estimated, scored, judged, losses, main.name, main)
                 if annotated is not None:
                     annotated.finish(report, files.tracks, scored.events)
             files.write(report, scored.rows, scored.events)
@@ -128,7 +128,7 @@ def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter)
 def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     """Score the tracks; add contradictions as notes of the drive."""
     drive = run.drive
-    scored = evaluate(drive, estimated, run.names, run.model.calibrated(estimated.signals))
+    scored = evaluate(drive, estimated, run.model)
     digests = {e.name: resolve(e).sha256[:SHOWN_DIGITS] for e in run.estimators}
     scored = replace(scored, rows=[replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows])
     truth, reference = estimated.truth, estimated.read(REFERENCE)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ from pdhef_logtool.results.sink import Event, ManoeuvreEvent
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
     from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
-    from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
+    from pdhef_logtool.model.drive_model import DriveModel
     from pdhef_logtool.runs.estimating import Estimated
 
 
@@ -35,31 +35,28 @@ class Evaluation:
     moves: bool
 
 
-def evaluate(drive: Drive, estimated: Estimated, names: Sequence[str], calibrated: CalibratedSignals) -> Evaluation:
-    """Score the tracks of a drive.
-
-    Parameters
-    ----------
-    names : of the estimators. calibrated : signals as the vehicle of the drive's model corrects them.
-    """
+def evaluate(
+    drive: Drive, estimated: Estimated, model: DriveModel, dependent: Mapping[str, str] | None = None
+) -> Evaluation:
+    """Score the tracks of a drive; ``dependent`` : as of :class:`EvaluatedDrive`, None: of the plan of the drive."""
     from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
     from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
     from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
 
     signals, truth, vehicle = estimated.signals, estimated.truth, drive.car.vehicle
-    manoeuvres = find_manoeuvres(signals, vehicle)
+    manoeuvres = find_manoeuvres(drive.recorded().signals, vehicle)
     masks = segment_masks(signals, truth, vehicle, manoeuvres)
     moving = moving_mask(signals, truth, vehicle)
-    tracks = {name: track for name, track in estimated.tracks.items() if name in names}
-    slow, dependent = vehicle.low_speed_blend_m_s, drive.plan.dependent
+    tracks, slow, calibrated = estimated.tracks, vehicle.low_speed_blend_m_s, model.calibrated(signals)
+    dependent = drive.plan.dependent if dependent is None else dependent
     scored = EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, calibrated, dependent)
-    events = drive_events(signals, masks, manoeuvres, [*tracks.values()])
+    events = _events(signals, masks, manoeuvres, [*tracks.values()])
     moves = bool(moving.any())
     silent = [n for n, track in tracks.items() if moves and not (moving & track.valid & track.something_known).any()]
     return Evaluation(scored, evaluate_drive(scored), events, tuple(silent), moves)
 
 
-def drive_events(
+def _events(
     stamped: Signals | StateTrack,
     masks: Mapping[str, BoolArray],
     manoeuvres: Sequence[Manoeuvre],
@@ -77,9 +74,18 @@ def drive_events(
     events += [
         ManoeuvreEvent(**{**asdict(m), "text": m.text, "side": "left" if m.side > 0 else "right"}) for m in manoeuvres
     ]
+    return in_order([*events, *divergences(tracks)])
+
+
+def divergences(tracks: Iterable[StateTrack]) -> Iterator[Event]:
+    """Yield the intervals in which an estimator reports divergence."""
+    from pdhef_logtool.evaluation.segments import find_intervals
+
     for track in tracks:
-        events += [
-            Event(f"{track.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
-            for s in find_intervals(track, {"diverged": track.diverged})
-        ]
+        for s in find_intervals(track, {"diverged": track.diverged}):
+            yield Event(f"{track.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
+
+
+def in_order(events: Iterable[Event]) -> list[Event]:
+    """Return events in order of time."""
     return sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name))
