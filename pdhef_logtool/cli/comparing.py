@@ -12,12 +12,11 @@ from typer import Argument, Option
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
 
-commands = typer.Typer()
 #: Time around events: repeated crossings of a threshold are one event; a clip shows the time before and after.
 _PAD_S, _CLIP_PAD_S = 0.25, 5.0
 
 
-@options.command(commands)
+@options.command()
 def compare(
     a: Annotated[str, Argument(metavar="A", help="Output of the reference run: folder or URL.")],
     b: Annotated[str, Argument(metavar="B", help="Output of the run to compare with it.")],
@@ -72,7 +71,7 @@ def compare(
     console.finish(comparison, render_comparison)
 
 
-@options.command(commands)
+@options.command()
 def events(
     output: Annotated[str, Argument(metavar="OUTPUT", help="Output of a run: folder or URL.")],
     *,
