@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options

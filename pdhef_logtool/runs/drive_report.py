@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import PurePath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
 from pdhef_logtool.car.parts import PHYSICS
@@ -22,13 +22,11 @@ from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.results.no_position import without_names
 from pdhef_logtool.results.run_report import LogOutcome, build_report, estimator_entry, run_versions
+from pdhef_logtool.results.selected_estimate import MainFacts
 from pdhef_logtool.runs.estimating import Estimated
 from pdhef_logtool.runs.preparing import PreparedDrive
 from pdhef_logtool.runs.scoring import Evaluation
 from pdhef_logtool.storage.documents import digest
-
-if TYPE_CHECKING:
-    from pdhef_logtool.results.selected_estimate import MainFacts
 
 #: Entries of a log's metadata that a report keeps, and signs of each.
 _MOST_METADATA, _MOST_SIGNS = 64, 200

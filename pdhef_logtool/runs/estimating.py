@@ -14,6 +14,7 @@ from pdhef_logtool.drive.truth import valid_as_a_whole
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.estimators.divergence import watched_track
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.plug_ins import package_of
@@ -68,8 +69,6 @@ def estimate_drive(
         None does not check, and a failure is raised.
     progress : called with the share of the estimators that is done.
     """
-    from pdhef_logtool.estimators.divergence import watched_track
-
     signals, vehicle = drive.signals, drive.plan.vehicle
     tracks: list[StateTrack] = []
     computations = [_computation(e, corrected.of_estimator(e.name)) for e in estimators]

@@ -21,6 +21,7 @@ from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.runs.estimating import Estimated, estimate_drive
 from pdhef_logtool.runs.preparing import choose
+from pdhef_logtool.runs.scoring import evaluate
 
 if TYPE_CHECKING:
     import polars as pl
@@ -126,8 +127,6 @@ def score(estimates: Estimates) -> pl.DataFrame:
     [0.0199, 0.0065]
     """
     import polars as pl
-
-    from pdhef_logtool.runs.scoring import evaluate
 
     rows = evaluate(estimates.drive, estimates.estimated, DriveModel.of(estimates.drive)).rows
     columns = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, one_log, read_d
 from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, dependent_signals, derive_truth, share_equal, truth_at
 from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS
 from pdhef_logtool.evaluation.operating_space import operating_space
+from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -56,9 +57,6 @@ from pdhef_logtool.runs.referencing import DriveReference, reference_of
 from pdhef_logtool.runs.run_result import LogResult, RunResult
 from pdhef_logtool.runs.scoring import Evaluation, divergences, evaluate, in_order
 from pdhef_logtool.storage.outputs import OutputFolder
-
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 
 _RECORDED = "read from the log: not recorded whether it is causal, or what it was computed from"
 

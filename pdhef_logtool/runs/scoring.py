@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.records.signals import BoolArray, Signals
+from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES, Manoeuvre, find_manoeuvres
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow, evaluate_drive
+from pdhef_logtool.evaluation.segments import find_intervals, moving_mask, segment_masks
+from pdhef_logtool.model.drive_model import DriveModel
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS, BoolArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import Event, ManoeuvreEvent
-
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
-    from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
-    from pdhef_logtool.model.drive_model import DriveModel
-    from pdhef_logtool.runs.estimating import Estimated
+from pdhef_logtool.runs.estimating import Estimated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,13 +25,13 @@ class Evaluation:
     Attributes
     ----------
     drive : what was scored. rows, events : figures, and events in order of time.
-    silent : estimators without a valid row although the car moves. moves : whether it does.
+    silent : why estimators have no valid row although the car moves. moves : whether it does.
     """
 
     drive: EvaluatedDrive
     rows: list[MetricRow]
     events: list[Event]
-    silent: tuple[str, ...]
+    silent: dict[str, str]
     moves: bool
 
 
@@ -39,10 +39,6 @@ def evaluate(
     drive: Drive, estimated: Estimated, model: DriveModel, dependent: Mapping[str, str] | None = None
 ) -> Evaluation:
     """Score the tracks of a drive; ``dependent`` : as of :class:`EvaluatedDrive`, None: of the plan of the drive."""
-    from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
-    from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
-    from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
-
     signals, truth, vehicle = estimated.signals, estimated.truth, drive.car.vehicle
     manoeuvres = find_manoeuvres(drive.recorded().signals, vehicle)
     masks = segment_masks(signals, truth, vehicle, manoeuvres)
@@ -52,8 +48,20 @@ def evaluate(
     scored = EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, calibrated, dependent)
     events = _events(signals, masks, manoeuvres, [*tracks.values()])
     moves = bool(moving.any())
-    silent = [n for n, track in tracks.items() if moves and not (moving & track.valid & track.something_known).any()]
-    return Evaluation(scored, evaluate_drive(scored), events, tuple(silent), moves)
+    silent = {
+        name: why_silent(signals, moving)
+        for name, track in tracks.items()
+        if moves and not (moving & track.valid & track.something_known).any()
+    }
+    return Evaluation(scored, evaluate_drive(scored), events, silent, moves)
+
+
+def why_silent(signals: Signals, moving: BoolArray) -> str:
+    """Return why an estimator has no valid row where the car moves (``moving`` [N])."""
+    read = [name for name in ALIGNED_SIGNALS if name in signals.available]
+    if lost := [name for name in read if not np.isfinite(getattr(signals, name)[moving]).any()]:
+        return f"no samples of {', '.join(lost)} while it does"
+    return "its signals are there, but the estimator marks none as valid"
 
 
 def _events(
@@ -66,9 +74,6 @@ def _events(
 
     The whole drive and ``linear`` are no events.
     """
-    from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES
-    from pdhef_logtool.evaluation.segments import find_intervals
-
     spans = [s for s in find_intervals(stamped, masks) if s.name not in ("all", "linear", *MANOEUVRES)]
     events = [Event(s.name, s.start_ns, s.end_ns, "") for s in spans]
     events += [
@@ -79,8 +84,6 @@ def _events(
 
 def divergences(tracks: Iterable[StateTrack]) -> Iterator[Event]:
     """Yield the intervals in which an estimator reports divergence."""
-    from pdhef_logtool.evaluation.segments import find_intervals
-
     for track in tracks:
         for s in find_intervals(track, {"diverged": track.diverged}):
             yield Event(f"{track.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")

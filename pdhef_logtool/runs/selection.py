@@ -8,16 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.estimators.table import all_names, spec_of
+from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.results.selected_estimate import NAIVE, MainFacts
-
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.metrics import MetricRow
 
 #: The preferred estimator, and those that run beside it where no driving has validated the car.
 PREFERRED = "pd-hef"

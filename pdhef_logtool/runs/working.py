@@ -10,8 +10,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 from pdhef_logtool.logs.byte_source import ChangedError, SourceError
 from pdhef_logtool.logs.discovery import LogInput, identity_of
 from pdhef_logtool.mapping import Mapping as LogMapping
@@ -21,6 +22,7 @@ from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.no_position import without_names
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, PARTS
 from pdhef_logtool.results.run_report import LogOutcome
+from pdhef_logtool.results.tables import write_part
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.drive_outputs import LOG_FILES, log_place
@@ -28,9 +30,6 @@ from pdhef_logtool.runs.journal import digest_of, states_of
 from pdhef_logtool.runs.run_drive import run_log
 from pdhef_logtool.storage.outputs import OutputFolder
 from pdhef_logtool.workers.supervisor import Tell
-
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,8 +147,6 @@ def _identity_of_slice(log: LogInput, identity: str) -> str:
 
 
 def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
-    from pdhef_logtool.results.tables import write_part
-
     cars, mapping = _cars_and_mapping(task.run, task.config)
     cars = replace(cars, warn=warned.append)
     car = cars.of_log(task.log)
