@@ -25,7 +25,6 @@ from pdhef_logtool.runs.run_result import RunResult
 from pdhef_logtool.runs.scoring import why_silent
 from studies.torture.hours import Drive, read_samples, write_samples
 
-
 SAID = "has no valid row although the car moves: its signals are there, but the estimator marks none as valid"
 
 
