@@ -52,17 +52,7 @@ _ANNOTATED, _FOXGLOVE, _PLOTJUGGLER = "annotated.mcap", "foxglove.json", "plotju
 #: Files of an earlier run, deleted unless the new run writes them.
 STALE_FILES = (MODEL_FILE, PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
 #: All files that a run writes into the folder of a log.
-LOG_FILES = (
-    MODEL_FILE,
-    _ANNOTATED,
-    _FOXGLOVE,
-    _PLOTJUGGLER,
-    ESTIMATES_FILE,
-    METRICS_FILE,
-    RECORDING_FILE,
-    REPORT_FILE,
-    PAGE_FILE,
-)
+LOG_FILES = (*STALE_FILES, _ANNOTATED, _FOXGLOVE, _PLOTJUGGLER, REPORT_FILE)
 
 _NO_COPY = "annotated.mcap contains the tool's topics only: a log of kind {} has no messages to copy"
 

@@ -116,9 +116,18 @@ def _metadata(drive: Drive) -> dict[str, str]:
 
 def _drive_entries(drive: Drive, car: Car, losses: Sequence[Loss]) -> dict[str, Any]:
     """Return the entries that do not depend on an estimate; ``car`` : as calibrated on the drive."""
-    plan = drive.plan
+    plan, sources = drive.plan, drive.plan.mapping.truth
+    derivation = {name: how for name, how in plan.derivation.items() if name != "cg"}
     return {
-        "log": _log(drive),
+        "log": {
+            "name": drive.name,
+            "file": PurePath(drive.file).name,
+            "kind": drive.log.kind,
+            "sha256": drive.sha256,
+            "start_ns": plan.start_ns,
+            "end_ns": plan.end_ns,
+            "duration_s": (plan.end_ns - plan.start_ns) * 1e-9,
+        },
         "mapping": {"missing": drive.missing},
         "vehicle": {
             "name": car.vehicle.name,
@@ -129,7 +138,13 @@ def _drive_entries(drive: Drive, car: Car, losses: Sequence[Loss]) -> dict[str, 
             "assumed": {entry.entry: entry.value for entry in drive.car.assumed},
             "low_speed_blend_m_s": car.vehicle.low_speed_blend_m_s,
         },
-        "truth": _truth(plan),
+        "truth": {
+            "available": bool(derivation),
+            "quantities": {n: sources[n].label if n in sources and not how else how for n, how in derivation.items()},
+            "latency_s": None if plan.latency is None else plan.truth_latency_s,
+            "not_independent": sorted(plan.dependent),
+            "notes": _truth_notes(plan),
+        },
         "model": {
             "source": "log" if drive.earlier is None else "file",
             "decided_s": plan.decided_s,
@@ -141,31 +156,6 @@ def _drive_entries(drive: Drive, car: Car, losses: Sequence[Loss]) -> dict[str, 
         "remarks": drive.remarks,
         "checks": [{k: getattr(c, k) for k in _OF_CHECK} for c in drive.checks],
         "versions": run_versions(),
-    }
-
-
-def _log(drive: Drive) -> dict[str, Any]:
-    plan = drive.plan
-    return {
-        "name": drive.name,
-        "file": PurePath(drive.file).name,
-        "kind": drive.log.kind,
-        "sha256": drive.sha256,
-        "start_ns": plan.start_ns,
-        "end_ns": plan.end_ns,
-        "duration_s": (plan.end_ns - plan.start_ns) * 1e-9,
-    }
-
-
-def _truth(plan: DrivePlan) -> dict[str, Any]:
-    sources = plan.mapping.truth
-    derivation = {name: how for name, how in plan.derivation.items() if name != "cg"}
-    return {
-        "available": bool(derivation),
-        "quantities": {n: sources[n].label if n in sources and not how else how for n, how in derivation.items()},
-        "latency_s": None if plan.latency is None else plan.truth_latency_s,
-        "not_independent": sorted(plan.dependent),
-        "notes": _truth_notes(plan),
     }
 
 

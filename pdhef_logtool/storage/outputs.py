@@ -102,7 +102,10 @@ class FolderTransaction(contextlib.AbstractContextManager["FolderTransaction"]):
                     shutil.copymode(self._place, self._new)
                     if self._keep:
                         _take_over(self._place, self._new, self._stale)
-                _sync_all(self._new)
+                for path in self._new.rglob("*"):
+                    if not path.is_symlink() and (path.is_file() or path.is_dir()):
+                        sync(path)
+                sync(self._new)
                 _take_place(self._new, self._place, self._old)
                 sync(self._place.parent)
         finally:
@@ -353,11 +356,6 @@ def _repair(work: Path, place: Path) -> None:
         old.rename(place)
     if work.is_dir():
         shutil.rmtree(work, ignore_errors=True)
-
-
-def _sync_all(folder: Path) -> None:
-    for path in [*(p for p in folder.rglob("*") if not p.is_symlink() and (p.is_file() or p.is_dir())), folder]:
-        sync(path)
 
 
 def _take_over(old: Path, new: Path, stale: Container[str]) -> None:

@@ -68,6 +68,7 @@ from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, PHYSICS_MODEL
 from pdhef_logtool.results.condition import parse_condition
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.reporting import FleetProgress
 from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.files import writing
 from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path
@@ -361,22 +362,21 @@ def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[D
         tell_drive(result.record, reporter.warn)
         return (result,)
     results: dict[int, DriveResult] = {}
-    shares: dict[int, float] = {}
-
-    def told(number: int, name: str, share: float) -> None:
-        shares[number] = share
-        reporter.progress(name, sum(shares.values()) / len(work))
-
-    preload = (__name__, *FILTERS)
+    progress, preload = FleetProgress(reporter.progress, len(work)), (__name__, *FILTERS)
     ends = supervise(
-        _extract_guarded, work, jobs=min(jobs, len(work)), preload=preload, progress=told, warn=reporter.warn
+        _extract_guarded,
+        work,
+        jobs=min(jobs, len(work)),
+        preload=preload,
+        progress=progress.update,
+        warn=reporter.warn,
     )
     with closing(ends):
         for ended in ends:
             result = ended.result or _failure(ended.item, ended.failure.reason if ended.failure else "")
             results[ended.number] = result
             tell_drive(result.record, reporter.warn)
-            told(ended.number, result.record.name, 1.0)
+            progress.end(ended.number)
     return tuple(results[number] for number in range(len(work)))
 
 
