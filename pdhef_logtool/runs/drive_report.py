@@ -16,6 +16,7 @@ from pdhef_logtool.estimators.presets import calibration_of
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.evaluation.dependence import day_and_route
 from pdhef_logtool.evaluation.largest_errors import largest_errors
+from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.reasons import Interval, SensorFault, sensor_faults
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import Loss
@@ -53,7 +54,7 @@ def report_drive(
     preferred = dict.fromkeys((REFERENCE, PHYSICS, *run.names))
     others = [t for n in preferred if n != selected and (t := estimated.read(n)) is not None]
     slow = run.car.vehicle.low_speed_blend_m_s
-    content = _drive_entries(drive, run.car, losses) | {
+    content = _drive_entries(drive, run.car, scored.rows, losses) | {
         "estimators": [*_estimator_entries(run)],
         "metrics": scored.rows,
         "segments": scored.events,
@@ -114,8 +115,8 @@ def _metadata(drive: Drive) -> dict[str, str]:
     return {k: printable(v) for k, v in [*short.items()][:_MOST_METADATA]}
 
 
-def _drive_entries(drive: Drive, car: Car, losses: Sequence[Loss]) -> dict[str, Any]:
-    """Return the entries that do not depend on an estimate; ``car`` : as calibrated on the drive."""
+def _drive_entries(drive: Drive, car: Car, rows: Sequence[MetricRow], losses: Sequence[Loss]) -> dict[str, Any]:
+    """Return the entries on log, car and ground truth; ``car`` : as calibrated on the drive."""
     plan, sources = drive.plan, drive.plan.mapping.truth
     derivation = {name: how for name, how in plan.derivation.items() if name != "cg"}
     return {
@@ -142,7 +143,7 @@ def _drive_entries(drive: Drive, car: Car, losses: Sequence[Loss]) -> dict[str, 
             "available": bool(derivation),
             "quantities": {n: sources[n].label if n in sources and not how else how for n, how in derivation.items()},
             "latency_s": None if plan.latency is None else plan.truth_latency_s,
-            "not_independent": sorted(plan.dependent),
+            "not_independent": sorted({row.signal for row in rows if not row.independent}),
             "notes": _truth_notes(plan),
         },
         "model": {

@@ -352,7 +352,6 @@ class _Fleet:
             planned.log,
             self.plan.output,
             replace(self.job.config, keep=keep),
-            self.plan.setting,
             self.job.validation,
             self.job.report and keep == "full",
             self._name,

@@ -39,7 +39,6 @@ class DriveTask:
     Attributes
     ----------
     log : the log with its label in the run. output : folder of the run.
-    setting : digest of the settings that the drive is run with.
     page : whether the drive's page is written.
     run : name of this run in its process, the key of cars that were read. stored : names of the drive's stored files.
     is_first : whether the log is the first of the run's list, which has the full causality check.
@@ -48,7 +47,6 @@ class DriveTask:
     log: LogInput
     output: Path
     config: RunConfig
-    setting: str
     validation: ValidationPlan
     page: bool
     run: str
