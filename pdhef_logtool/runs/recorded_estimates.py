@@ -184,7 +184,8 @@ def _score_drive(
     equal: dict[str, str] = {}
     scored = [_score(run, r, at(r.track.stamps_ns, [r.track]), equal) for r in recorded]
     drive.plan.dependent.update(equal | drive.plan.dependent)
-    selected, stamps_ns = (tracks[0].name, tracks[0].stamps_ns) if len(tracks) == 1 else (None, _all_stamps(tracks))
+    selected = tracks[0].name if len(tracks) == 1 else None
+    stamps_ns = np.unique(np.concatenate([track.stamps_ns for track in tracks]))
     whole, together = scored[0], at(stamps_ns, tracks)
     if selected is None:  # each has been scored at its own stamps; the drive is cut into segments at those of all
         parts = evaluate(drive, at(stamps_ns, []), model)
@@ -209,10 +210,6 @@ def _score_drive(
     outcome = outcome_of(drive, losses, files=files)
     part = drive_part(outcome, report, whole.rows, stated["plan"])
     return LogResult(outcome, folder, report, tuple(whole.rows), part=part)
-
-
-def _all_stamps(tracks: Sequence[StateTrack]) -> IntArray:
-    return np.unique(np.concatenate([track.stamps_ns for track in tracks]))
 
 
 def _read(drive: Drive, sources: Sequence[EstimateSource]) -> tuple[list[RecordedEstimate], list[Loss]]:

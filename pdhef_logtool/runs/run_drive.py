@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -75,7 +74,9 @@ def run_log(
             with files.annotated() as annotated:
                 if annotated is not None:
                     annotated.write(files.tracks)
-                losses = merge_losses([drive.losses, *_losses(run, scored)])
+                failed = [Loss("estimator-failed", f"{name} {text}", drive.name) for name, text in run.failed.items()]
+                silent = [Loss("no-valid-row", _SILENT.format(*why), drive.name) for why in scored.silent.items()]
+                losses = merge_losses([drive.losses, silent, failed])
                 report = report_drive(run, estimated, scored, judged, losses, main.name, main)
                 if annotated is not None:
                     annotated.finish(report, files.tracks, scored.events)
@@ -140,12 +141,6 @@ def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     if not scored.moves:
         drive.tell(_NEVER_MOVES.format(run.car.vehicle.low_speed_blend_m_s))
     return scored
-
-
-def _losses(run: PreparedDrive, scored: Evaluation) -> Iterator[list[Loss]]:
-    """Yield the estimators without a valid row and those that failed, as losses."""
-    yield [Loss("no-valid-row", _SILENT.format(*why), run.drive.name) for why in scored.silent.items()]
-    yield [Loss("estimator-failed", f"{name} {text}", run.drive.name) for name, text in run.failed.items()]
 
 
 def _judge(
