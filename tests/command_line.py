@@ -7,11 +7,13 @@ import json
 import os
 import signal
 import subprocess
+from collections.abc import Callable
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from pdhef_logtool.cli.app import app, main
 
@@ -27,6 +29,13 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, An
     pdhef(*arguments, "--json")
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
     return found
+
+
+def rendered(render: Callable[[Any, Console], None], result: object, width: int = 80) -> str:
+    """Return what a command prints of its result."""
+    out = io.StringIO()
+    render(result, Console(file=out, width=width, highlight=False, markup=False, no_color=True))
+    return out.getvalue()
 
 
 def called(

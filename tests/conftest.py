@@ -47,6 +47,13 @@ def sample_logs_dir() -> Path:
     return ROOT / "sample_logs"
 
 
+@pytest.fixture(scope="session")
+def bare_vehicle(sample_logs_dir: Path) -> str:
+    """Return the vehicle file of the sample logs without a network."""
+    head, _, rest = (sample_logs_dir / "vehicle.toml").read_text().partition("[network]")
+    return head + rest[rest.index("[sensors]") :]
+
+
 def pytest_configure() -> None:
     """Restore SIGINT, which a shell without job control ignores in background commands and all their children."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import os
 import signal
@@ -12,21 +13,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from pdhef_logtool.cli import (
-    comparing,
-    compiling,
-    console,
-    converting,
-    inspecting,
-    learning,
-    panels,
-    querying,
-    reporting,
-    running,
-    simulating,
-    stopping,
-    validation,
-)
+from pdhef_logtool.cli import console, options, panels, stopping
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, PdhefError, UsageError
 from pdhef_logtool.storage.files import OF_WRITING, cannot_write
 
@@ -50,19 +37,10 @@ app = typer.Typer(
     epilog="Exit codes: 0 ok, 1 failure, 2 usage, 3 finished but some input was lost, a check or some logs failed, "
     "4 a requirement or regression gate failed, 130 interrupted (Ctrl-C), 141 stdout was closed early, 143 terminated.",
 )
-for _group in (
-    inspecting,
-    running,
-    validation,
-    reporting,
-    comparing,
-    querying,
-    simulating,
-    learning,
-    converting,
-    compiling,
-):
-    app.registered_commands += _group.commands.registered_commands
+_MODULES = "inspecting running validation reporting comparing querying simulating learning converting compiling"
+for _module in _MODULES.split():
+    importlib.import_module(f"{__package__}.{_module}")
+app.registered_commands = options.commands.registered_commands
 
 
 def _version(show: bool) -> None:

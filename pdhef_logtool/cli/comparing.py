@@ -6,18 +6,16 @@ import re
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
 
-commands = typer.Typer()
 #: Time around events: repeated crossings of a threshold are one event; a clip shows the time before and after.
 _PAD_S, _CLIP_PAD_S = 0.25, 5.0
 
 
-@options.command(commands)
+@options.command()
 def compare(
     runs: Annotated[
         list[str], Argument(metavar="RUN", help="Outputs of two or more runs, oldest first: folder or URL.")
@@ -77,7 +75,7 @@ def compare(
     console.finish(comparison, render_comparison)
 
 
-@options.command(commands)
+@options.command()
 def events(
     output: Annotated[str, Argument(metavar="OUTPUT", help="Output of a run: folder or URL.")],
     *,

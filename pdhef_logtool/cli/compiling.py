@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import typer
-
 from pdhef_logtool.cli import console, options
-
-commands = typer.Typer()
-
 
 #: The receiver of the simulated car as a sensor.
 _GNSS_MAPPING = """fill_recognised = true
@@ -18,7 +13,7 @@ gnss_longitude_deg = { topic = "/rtk/fix", field = "longitude" }
 """
 
 
-@options.command(commands, name="compile")
+@options.command(name="compile")
 def compile_() -> None:
     """Compile the filters in advance, so that the first run starts at once."""
     import time

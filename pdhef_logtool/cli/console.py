@@ -72,13 +72,18 @@ def table(*heads: str, fold: int = 0) -> Table:
 
 def three_lines(result: str | Text, assumed: str, following: str) -> Table:
     """Return the first three lines on the terminal: result, assumptions, next step."""
+    return named_lines({"Result": result, "Assumed": assumed, "Next": following}, style="bold")
+
+
+def named_lines(texts: Mapping[str, str | Text], *, style: str = "") -> Table:
+    """Return a line per text, after its name."""
     from rich.table import Table
 
     lines = Table.grid(padding=(0, 2, 0, 0))
-    lines.add_column(no_wrap=True, style="bold")
+    lines.add_column(no_wrap=True, style=style)
     lines.add_column(overflow="fold")
-    for head, text in (("Result", result), ("Assumed", assumed), ("Next", following)):
-        lines.add_row(head, text)
+    for name, text in texts.items():
+        lines.add_row(name, text)
     return lines
 
 

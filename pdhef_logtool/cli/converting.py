@@ -14,10 +14,8 @@ from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig
 
-commands = typer.Typer()
 
-
-@options.command(commands)
+@options.command()
 def convert(
     log: options.Log,
     config: RunConfig,

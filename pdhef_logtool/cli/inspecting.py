@@ -18,10 +18,8 @@ if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig
     from pdhef_logtool.runs.inspection.report import Inspection
 
-commands = typer.Typer()
 
-
-@options.command(commands, shared="mapping")
+@options.command(shared="mapping")
 def inspect(
     log: options.Log,
     config: RunConfig,
@@ -70,7 +68,7 @@ def inspect(
     console.finish(inspection, render_inspection, exit_code=exit_code)
 
 
-@options.command(commands, name="map", shared="mapping")
+@options.command(name="map", shared="mapping")
 def map_(
     log: options.Log,
     config: RunConfig,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, learning_tables, options
@@ -13,10 +12,8 @@ from pdhef_logtool.cli import console, learning_tables, options
 if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig
 
-commands = typer.Typer()
 
-
-@options.command(commands, shared="mapping", car="Car to start from (mass, geometry, sensor noise, priors)")
+@options.command(shared="mapping", car="Car to start from (mass, geometry, sensor noise, priors)")
 def learn(
     *,
     logs: options.TruthLogs,
@@ -39,7 +36,7 @@ def learn(
     console.finish(result, learning_tables.render_learning)
 
 
-@options.command(commands, shared="mapping", car="Nominal car (default: from the manifest of a simulated set)")
+@options.command(shared="mapping", car="Nominal car (default: from the manifest of a simulated set)")
 def extract(
     *,
     logs: options.TruthLogs,
@@ -63,7 +60,7 @@ def extract(
     console.finish(result, learning_tables.render_extraction)
 
 
-@options.command(commands)
+@options.command()
 def train(
     *,
     dataset: Annotated[Path, Argument(metavar="DATASET", help="Dataset folder of pdhef extract.")],

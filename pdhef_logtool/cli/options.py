@@ -121,8 +121,12 @@ def _texts() -> dict[str, dict[str, str]]:
     return tomllib.loads((Path(__file__).parent / "commands.toml").read_text(encoding="utf-8"))
 
 
+#: All commands, in the order of their registration.
+commands = typer.Typer()
+
+
 def command(
-    group: typer.Typer, *, name: str | None = None, shared: str = "", car: str = ""
+    *, name: str | None = None, shared: str = "", car: str = ""
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Make a function a command; its parameter ``config`` receives the :class:`RunConfig` from the shared options.
 
@@ -130,7 +134,6 @@ def command(
 
     Parameters
     ----------
-    group : commands to add it to.
     name : of the command; None = the name of the function.
     shared : shared options in addition to --config and --set, which every ``config`` has.
     car : help text of --car for the command; empty = no car.
@@ -165,7 +168,7 @@ def command(
         texts = _texts()[name or function.__name__]
         # \b keeps the lines of a paragraph as they are.
         epilog = "\n  ".join(("\b\nExamples:", *texts["examples"].splitlines())) + f"\n\n{texts.get('notes', '')}"
-        return group.command(name, epilog=epilog, cls=PanelCommand, rich_help_panel=texts["panel"])(run_command)
+        return commands.command(name, epilog=epilog, cls=PanelCommand, rich_help_panel=texts["panel"])(run_command)
 
     return decorate
 

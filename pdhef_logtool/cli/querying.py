@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.printable import printable
 
-commands = typer.Typer()
 
-
-@options.command(commands)
+@options.command()
 def query(
     runs: Annotated[list[str], Argument(metavar="RUN", help="Output of a run: folder or URL.")],
     sql: Annotated[str, Argument(metavar="SQL", help="Statement on the tables.")],

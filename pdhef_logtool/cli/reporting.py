@@ -17,10 +17,8 @@ if TYPE_CHECKING:
 
     from pdhef_logtool.reports.pages import WrittenPages
 
-commands = typer.Typer()
 
-
-@options.command(commands)
+@options.command()
 def report(
     output: Annotated[Path, Argument(parser=options.local_folder, metavar="OUT", help="Output folder of a run.")],
     show: Annotated[bool, Option("--open", help="Open the page in the browser.")] = False,

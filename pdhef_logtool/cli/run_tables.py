@@ -11,7 +11,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from pdhef_logtool.cli.console import cell, print_indented, table, three_lines
+from pdhef_logtool.cli.console import cell, named_lines, print_indented, table, three_lines
 from pdhef_logtool.cli.plan_tables import outcomes_text, plan_line, render_plan
 from pdhef_logtool.evaluation.metrics.registry import registered
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
@@ -202,46 +202,41 @@ def _print_outputs(output: Path | str, console: Console, labels: Sequence[str] =
 
 def _render_one_of_several(report: _Report, assumed: Sequence[str], console: Console) -> None:
     """Print details of a log that need attention and are not in the joint table; ``assumed``: common assumptions."""
-    texts, main = _texts(report), report["selected_estimate"]
+    texts, main, is_named = _texts(report), report["selected_estimate"], report["answer"]["named"]
     is_scored = _figures(report).get((main, "sideslip_rad", "all", "rmse")) is not None
     rest = [clause for clause in assumptions_of(report) if clause not in assumed]
     shown = {} if is_scored or "result" not in texts else {"result": texts["result"]}
     shown |= {"assumed": "; ".join(rest)} if rest else {}
     lines = [*_checks(report, undecided=False), *_losses(report, notes=False)]
-    if shown or lines or report["answer"]["named"]:
-        _print_log(report, "", lines, shown, (), console, tabled=report["answer"]["named"])
+    if shown or lines or is_named:
+        _print_log(report, lines, shown, _table(report, console) if is_named else None, console)
+        console.print()
 
 
 def _render_log(report: _Report, console: Console) -> None:
     """Print the log of a run with one log."""
-    about = f"  {report['log']['kind']}, {report['log']['duration_s']:.1f} s"
     texts = _texts(report)
     later = _clauses(texts, "next")[1:]  # the head contains the first one
     shown = {key: text for key, text in texts.items() if key not in ("result", "assumed", "next")}
     shown |= {"next": "; ".join(later)} if later else {}
-    _print_log(report, about, [*_checks(report)], shown, [*_below(report)], console, tabled=True)
+    _print_log(report, _checks(report), shown, _table(report, console), console)
+    for line in _below(report):
+        print_indented(line, console)
+    console.print()
 
 
-def _print_log(  # positional: two callers in this file
-    report: _Report,
-    about: str,
-    above: Sequence[str],
-    texts: Mapping[str, str],
-    below: Sequence[str],
-    console: Console,
-    *,
-    tabled: bool,
+def _print_log(
+    report: _Report, above: Iterable[str], texts: Mapping[str, str], estimators: Table | None, console: Console
 ) -> None:
-    console.print(Text.assemble((report["log"]["name"], "bold"), about))
+    log = report["log"]
+    about = "" if estimators is None else f"  {log['kind']}, {log['duration_s']:.1f} s"
+    console.print(Text.assemble((log["name"], "bold"), about))
     for line in above:
         print_indented(line, console)
     if texts:
-        console.print(_lines(texts))
-    if tabled:
-        console.print(_table(report, console))
-    for line in below:
-        print_indented(line, console)
-    console.print()
+        console.print(named_lines({f"  {_TEXTS[key]}": text for key, text in texts.items()}))
+    if estimators is not None:
+        console.print(estimators)
 
 
 def _texts(report: _Report) -> dict[str, str]:
@@ -253,15 +248,6 @@ def _texts(report: _Report) -> dict[str, str]:
 def _clauses(texts: Mapping[str, str], key: str) -> list[str]:
     """Return the independent clauses of a text."""
     return texts[key].split("; ") if texts.get(key) else []
-
-
-def _lines(texts: Mapping[str, str]) -> Table:
-    lines = Table.grid(padding=(0, 2, 0, 0))
-    lines.add_column(no_wrap=True)
-    lines.add_column(overflow="fold")
-    for key, text in texts.items():
-        lines.add_row(f"  {_TEXTS[key]}", text)
-    return lines
 
 
 def _checks(report: _Report, *, undecided: bool = True) -> Iterable[str]:

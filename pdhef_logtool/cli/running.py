@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig
     from pdhef_logtool.runs.run_result import RunResult
 
-commands = typer.Typer()
-
 
 def _list_estimators(show: bool) -> None:
     if show:
@@ -34,7 +32,6 @@ def _list_estimators(show: bool) -> None:
 
 
 @options.command(
-    commands,
     shared="mapping start end estimators annotate keep friction plan network model reference gnss no_position waived",
     car="Car of the logs (default: a sedan)",
 )
@@ -81,7 +78,6 @@ def run(  # positional: one an option of the command line
 
 
 @options.command(
-    commands,
     shared="mapping start end plan reference gnss",
     car="Car of the log (position of the ground truth, friction, lowest speed)",
 )
@@ -125,7 +121,7 @@ def metrics(  # positional: one an option of the command line
     _finish(result)
 
 
-@options.command(commands)
+@options.command()
 def view(
     output: Annotated[
         Path,

@@ -6,20 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
 
-commands = typer.Typer()
-
-
 _Many = list[str] | None
 SetOutput = Annotated[Path, Option("--output", "-o", help="Output folder. Existing drives are kept.")]
 
 
-@options.command(commands)
+@options.command()
 def simulate(
     *,
     manoeuvre: Annotated[
@@ -83,7 +79,7 @@ def _incomplete(missing: str) -> UsageError:
     return UsageError(expected="a manoeuvre and -o FILE", got=f"no {missing}", where="pdhef simulate", remedy=remedy)
 
 
-@options.command(commands, name="simulate suite")
+@options.command(name="simulate suite")
 def suite(
     output: SetOutput,
     count: Annotated[int, Option(help="Number of drives.")] = 200,

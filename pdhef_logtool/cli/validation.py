@@ -5,16 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import UsageError
 
-commands = typer.Typer()
 
-
-@options.command(commands)
+@options.command()
 def plan(
     action: Annotated[str, Argument(metavar="init", help="init: write a commented plan.")],
     *,

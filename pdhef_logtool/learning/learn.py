@@ -135,7 +135,8 @@ def _learnt(drives: DriveSet) -> tuple[tuple[DriveRecord, ...], CarModel, dict[s
     _check(few, f"at least {LEAST_S:g} s of driving with ground truth above {slow:g} m/s")
     taught = learn_from(teachers, progress)
     sensors = next(r.sensors for r in content if r.opened is not None)
-    return records, model_of(car, sensors, **taught.entries), figures_of(taught)
+    stated = {name: getattr(taught, name) for name in ("parameters", "calibrated", "truth", "evidence")}
+    return records, model_of(car, sensors, residual=taught.ladder.model, **stated), figures_of(taught)
 
 
 def _without_truth(

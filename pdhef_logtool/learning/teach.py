@@ -87,17 +87,6 @@ class Teaching:
             f" (RMSE without constants: {tried or 'not tried'})"
         )
 
-    @property
-    def entries(self) -> dict[str, Any]:
-        """Entries of the car's model."""
-        return {
-            "parameters": self.parameters,
-            "residual": self.ladder.model,
-            "calibrated": self.calibrated,
-            "truth": self.truth,
-            "evidence": self.evidence,
-        }
-
 
 def open_drive(drive: Drive, config: RunConfig) -> tuple[DriveRecord, OpenedDrive | None]:
     """Return the record of an open drive and its content for teaching, or None with the reason in the record."""

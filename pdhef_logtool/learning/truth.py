@@ -51,9 +51,9 @@ def teaching_reference(drive: Drive, config: RunConfig) -> tuple[TruthAt | None,
     if reference is None or reference.estimator is None:
         return None, f"{lacks}, and no sideslip reference: {'' if reference is None else reference.document['refused']}"
     reference_at = reference.estimator.at
-    return lambda stamps_ns: independent(reference_at(stamps_ns)), ""
 
+    def independent(stamps_ns: IntArray) -> StateTrack:
+        track = reference_at(stamps_ns)
+        return replace(track, valid=track.valid & (track.independent > 0.0))
 
-def independent(reference: StateTrack) -> StateTrack:
-    """Return a reference without stamps at which it depends on the estimators' sensors."""
-    return replace(reference, valid=reference.valid & (reference.independent > 0.0))
+    return independent, ""

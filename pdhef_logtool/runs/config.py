@@ -216,8 +216,6 @@ def parse_assignments(texts: Sequence[str]) -> dict[str, Any]:
                 remedy=f"did you mean {near[0]}?" if near else "docs/settings.md lists the settings",
             )
         settings[key] = _toml_value(value)
-        if key in _FILES and isinstance(settings[key], str):
-            settings[key] = Path(settings[key])
     return settings
 
 

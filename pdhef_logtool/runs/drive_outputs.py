@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 from pdhef_logtool.car.car import SHOWN_DIGITS
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, all_specs
+from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
+from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.results.no_position import topics_with_position, without_pose
 from pdhef_logtool.results.opened_run import (
@@ -29,38 +31,28 @@ from pdhef_logtool.results.opened_run import (
     table_file,
 )
 from pdhef_logtool.results.palette import REFERENCE_COLOUR
+from pdhef_logtool.results.parquet_sink import write_estimates, write_metrics
 from pdhef_logtool.results.run_report import build_run, tool_versions, write_json
+from pdhef_logtool.results.selected_estimate import MainFacts
 from pdhef_logtool.results.sink import TRUTH, Event
+from pdhef_logtool.results.tables import add_verdicts, drive_part, read_part, write_tables
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.estimating import Estimated
+from pdhef_logtool.runs.preparing import PreparedDrive
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import file_sha256
 from pdhef_logtool.storage.files import PendingFile, write_bytes, writing
 from pdhef_logtool.storage.outputs import FolderTransaction, check_no_input
 
 if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.metrics import MetricRow
-    from pdhef_logtool.mapping import Mapping as SignalMapping
     from pdhef_logtool.results.mcap_sink import AnnotatedMcap
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
-    from pdhef_logtool.results.selected_estimate import MainFacts
-    from pdhef_logtool.runs.estimating import Estimated
-    from pdhef_logtool.runs.preparing import PreparedDrive
 
 _ANNOTATED, _FOXGLOVE, _PLOTJUGGLER = "annotated.mcap", "foxglove.json", "plotjuggler.xml"
 #: Files of an earlier run, deleted unless the new run writes them.
 STALE_FILES = (MODEL_FILE, PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
 #: All files that a run writes into the folder of a log.
-LOG_FILES = (
-    MODEL_FILE,
-    _ANNOTATED,
-    _FOXGLOVE,
-    _PLOTJUGGLER,
-    ESTIMATES_FILE,
-    METRICS_FILE,
-    RECORDING_FILE,
-    REPORT_FILE,
-    PAGE_FILE,
-)
+LOG_FILES = (*STALE_FILES, _ANNOTATED, _FOXGLOVE, _PLOTJUGGLER, REPORT_FILE)
 
 _NO_COPY = "annotated.mcap contains the tool's topics only: a log of kind {} has no messages to copy"
 
@@ -78,9 +70,7 @@ class DriveOutputs:
     ) -> None:
         (self._change, self._run_folder), self._run, self._main = folders, run, main
         self._signals, names = estimated.signals, run.names
-        tracks = [estimated.tracks[name] for name in names]
-        if estimated.drawn_truth is not None:
-            tracks.insert(0, estimated.drawn_truth)
+        tracks = estimated.drawn
         self.tracks = [without_pose(track) for track in tracks] if run.config.no_position else tracks
         # Recordings show the selected estimate beside physics alone, otherwise beside the naive estimate.
         order = dict.fromkeys([main.name, PHYSICS, *filter(None, [main.naive]), *main.shown])
@@ -192,8 +182,6 @@ def write_drive_tables(
     causal_from_ns: Mapping[str, int] | None = None,
 ) -> None:
     """Write estimates.parquet, metrics.parquet and report.json of a drive."""
-    from pdhef_logtool.results.parquet_sink import write_estimates, write_metrics
-
     write_estimates(change.file(ESTIMATES_FILE), tracks, selected=selected, causal_from_ns=causal_from_ns)
     write_metrics(change.file(METRICS_FILE), rows)
     write_json(change.file(REPORT_FILE), report)
@@ -207,8 +195,6 @@ def files_of(folder: Path) -> dict[str, str]:
 
 def write_run_tables(output: Path, results: Sequence[LogResult]) -> None:
     """Write the tables of logs, and metrics.parquet also beside run.json, for readers of earlier versions."""
-    from pdhef_logtool.results.tables import drive_part, read_part, write_tables
-
     parts = (
         drive_part(r.outcome, None) if r.part is None else read_part(r.part) if isinstance(r.part, Path) else r.part
         for r in results
@@ -227,8 +213,6 @@ def write_run(
     remaining: int = 0,
 ) -> None:
     """Write run.json beside the tables, with the configuration as JSON-able values; arguments as of build_run."""
-    from pdhef_logtool.results.tables import add_verdicts
-
     if verdicts is not None:
         add_verdicts(output / TABLES_FOLDER, verdicts.to_dict())
     files = {name: file_sha256(output / name) for name in (METRICS_FILE, *map(table_file, TABLES))}

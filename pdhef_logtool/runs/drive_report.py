@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import PurePath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
 from pdhef_logtool.car.parts import PHYSICS
@@ -15,21 +15,19 @@ from pdhef_logtool.estimators.base import notes_of
 from pdhef_logtool.estimators.presets import calibration_of
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
 from pdhef_logtool.evaluation.largest_errors import largest_errors
+from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.reasons import Interval, SensorFault, sensor_faults
 from pdhef_logtool.evaluation.statistics import day_and_route
-from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.results.no_position import without_names
 from pdhef_logtool.results.run_report import LogOutcome, build_report, estimator_entry, run_versions
+from pdhef_logtool.results.selected_estimate import MainFacts
 from pdhef_logtool.runs.estimating import Estimated
 from pdhef_logtool.runs.preparing import PreparedDrive
 from pdhef_logtool.runs.scoring import Evaluation
 from pdhef_logtool.storage.documents import digest
-
-if TYPE_CHECKING:
-    from pdhef_logtool.results.selected_estimate import MainFacts
 
 #: Entries of a log's metadata that a report keeps, and signs of each.
 _MOST_METADATA, _MOST_SIGNS = 64, 200
@@ -40,27 +38,34 @@ def report_drive(
     run: PreparedDrive,
     estimated: Estimated,
     scored: Evaluation,
-    main: MainFacts,
-    judged: dict[str, Any],
+    stated: dict[str, Any],
     losses: Sequence[Loss],
+    selected: str | None,
+    main: MainFacts | None = None,
 ) -> dict[str, Any]:
-    """Return the document of report.json; ``judged`` : its entries by :func:`~.judging.judge_drive`."""
-    drive, config, truth, selected = run.drive, run.config, estimated.truth, estimated.read(main.name)
+    """Return the document of report.json.
+
+    Parameters
+    ----------
+    stated : further entries, of :func:`~.judging.judge_drive` or in place of others. selected : the estimate whose
+        errors are located; None: of several recorded ones none. main : the same as a choice; None: it was recorded.
+    """
+    drive, config, truth, track = run.drive, run.config, estimated.truth, estimated.tracks.get(selected or "")
     preferred = dict.fromkeys((REFERENCE, PHYSICS, *run.names))
-    others = [t for n in preferred if n != main.name and (t := estimated.read(n)) is not None]
+    others = [t for n in preferred if n != selected and (t := estimated.read(n)) is not None]
     slow = run.car.vehicle.low_speed_blend_m_s
-    content = drive_entries(drive, run.car, losses) | judged
-    content |= {
+    content = _drive_entries(drive, run.car, scored.rows, losses) | {
         "estimators": [*_estimator_entries(run)],
         "metrics": scored.rows,
         "segments": scored.events,
         "friction": run.model.friction.to_dict(),
         "self_calibration": None if run.model.posterior is None else run.model.posterior.to_dict(),
         "reference": None if run.reference is None else run.reference.document,
-        "largest_errors": [] if selected is None else largest_errors(selected, truth, others, slow),
-        "faults": _faults(run, main.name, estimated.read),
-        "path_drift": None if truth is None or selected is None else path_drift(selected, truth),
+        "largest_errors": [] if track is None else largest_errors(track, truth, others, slow),
+        "faults": _faults(run, selected, estimated.read),
+        "path_drift": None if truth is None or track is None else path_drift(track, truth),
         "metadata": {} if config.no_position else _metadata(drive),
+        **stated,
     }
     report = build_report(content, main)
     return without_names(report, drive.path, drive.name) if config.no_position else report
@@ -85,12 +90,14 @@ def _estimator_entries(run: PreparedDrive) -> Iterator[dict[str, Any]]:
             yield estimator_entry(s.name, causal=s.spec.causal, outcome="skipped", reason=s.reason)
 
 
-def _faults(run: PreparedDrive, main: str, read: Callable[[str], StateTrack | None]) -> tuple[SensorFault, ...] | None:
+def _faults(
+    run: PreparedDrive, selected: str | None, read: Callable[[str], StateTrack | None]
+) -> tuple[SensorFault, ...] | None:
     """Return the changes of the sensors, and the faults that the selected estimate detects, or else physics.
 
     None without changes where neither detects any.
     """
-    tracks = [read(name) for name in dict.fromkeys((main, PHYSICS)) if name in run.names]
+    tracks = [read(name) for name in dict.fromkeys((selected, PHYSICS)) if name in run.names]
     detected = (sensor_faults(track) for track in tracks if track is not None)
     faults = next((faults for faults in detected if faults is not None), None)
     changes = tuple(
@@ -108,21 +115,20 @@ def _metadata(drive: Drive) -> dict[str, str]:
     return {k: printable(v) for k, v in [*short.items()][:_MOST_METADATA]}
 
 
-def drive_entries(
-    drive: Drive,
-    car: Car,
-    losses: Sequence[Loss],
-    ledger: Sequence[SampleCount] | None = None,
-) -> dict[str, Any]:
-    """Return the entries of report.json that do not depend on an estimate.
-
-    Parameters
-    ----------
-    car : as calibrated on the drive. ledger : of all samples; None: of the drive.
-    """
-    plan = drive.plan
+def _drive_entries(drive: Drive, car: Car, rows: Sequence[MetricRow], losses: Sequence[Loss]) -> dict[str, Any]:
+    """Return the entries on log, car and ground truth; ``car`` : as calibrated on the drive."""
+    plan, sources = drive.plan, drive.plan.mapping.truth
+    derivation = {name: how for name, how in plan.derivation.items() if name != "cg"}
     return {
-        "log": _log(drive),
+        "log": {
+            "name": drive.name,
+            "file": PurePath(drive.file).name,
+            "kind": drive.log.kind,
+            "sha256": drive.sha256,
+            "start_ns": plan.start_ns,
+            "end_ns": plan.end_ns,
+            "duration_s": (plan.end_ns - plan.start_ns) * 1e-9,
+        },
         "mapping": {"missing": drive.missing},
         "vehicle": {
             "name": car.vehicle.name,
@@ -133,46 +139,24 @@ def drive_entries(
             "assumed": {entry.entry: entry.value for entry in drive.car.assumed},
             "low_speed_blend_m_s": car.vehicle.low_speed_blend_m_s,
         },
-        "truth": _truth(plan),
+        "truth": {
+            "available": bool(derivation),
+            "quantities": {n: sources[n].label if n in sources and not how else how for n, how in derivation.items()},
+            "latency_s": None if plan.latency is None else plan.truth_latency_s,
+            "not_independent": sorted({row.signal for row in rows if not row.independent}),
+            "notes": _truth_notes(plan),
+        },
         "model": {
             "source": "log" if drive.earlier is None else "file",
             "decided_s": plan.decided_s,
             "causal_from_s": drive.causal_from_s,
         },
-        "friction": None,
-        "self_calibration": None,
-        "reference": None,
         "losses": losses,
-        "ledger": {"samples": drive.sample_ledger if ledger is None else ledger},
+        "ledger": {"samples": drive.sample_ledger},
         "warnings": drive.notes,
         "remarks": drive.remarks,
         "checks": [{k: getattr(c, k) for k in _OF_CHECK} for c in drive.checks],
         "versions": run_versions(),
-    }
-
-
-def _log(drive: Drive) -> dict[str, Any]:
-    plan = drive.plan
-    return {
-        "name": drive.name,
-        "file": PurePath(drive.file).name,
-        "kind": drive.log.kind,
-        "sha256": drive.sha256,
-        "start_ns": plan.start_ns,
-        "end_ns": plan.end_ns,
-        "duration_s": (plan.end_ns - plan.start_ns) * 1e-9,
-    }
-
-
-def _truth(plan: DrivePlan) -> dict[str, Any]:
-    sources = plan.mapping.truth
-    derivation = {name: how for name, how in plan.derivation.items() if name != "cg"}
-    return {
-        "available": bool(derivation),
-        "quantities": {n: sources[n].label if n in sources and not how else how for n, how in derivation.items()},
-        "latency_s": None if plan.latency is None else plan.truth_latency_s,
-        "not_independent": sorted(plan.dependent),
-        "notes": _truth_notes(plan),
     }
 
 
@@ -186,6 +170,8 @@ def _truth_notes(plan: DrivePlan) -> list[str]:
         if latency.gyro_delay_s:
             verdict = "so that the ground truth is not moved"
         notes.append(f"latency {measured} ({latency.reason}), {verdict}")
+    elif plan.truth is not None:
+        notes.append("no gyro, or no true yaw rate, to measure the latency with: taken as 0")
     notes += [f"{signal} is not independent: {reason}" for signal, reason in plan.dependent.items()]
     if "cg" in plan.derivation:
         notes.append(plan.derivation["cg"])

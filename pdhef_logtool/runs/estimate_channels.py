@@ -10,7 +10,6 @@ import numpy as np
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.estimators.vehicle_ukf import sideslip_std
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
-from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import SignalSource, clock_key, fit_clocks, resolve_mapping
 from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, si_values
@@ -83,26 +82,16 @@ def read_estimate(
                 losses.append(Loss("duplicate-stamp", text, s.topic, count=repeated, severity="note"))
             if source.covariance is not None:
                 covariance = _planar_covariance(topic, source.covariance)[kept]
-    _check_has_numbers(log, mapping, channels)
+    if not any(np.isfinite(channel.values).any() for name, channel in channels.items() if name in BASE_ORDER):
+        raise MappingError(
+            expected="numbers in the recorded estimate",
+            got="none in the chosen slice",
+            where=f"{log.path} {', '.join(s.label for n, s in mapping.signals.items() if n in BASE_ORDER)}",
+            remedy="check topic, field and slice",
+        )
     track, notes = _track(source.name, channels[base].stamps_ns, channels, covariance)
-    finite = {n: _without_nan(c) for n, c in channels.items() if n in BASE_ORDER}
+    finite = {n: c.take(np.isfinite(c.values)) for n, c in channels.items() if n in BASE_ORDER}
     return RecordedEstimate(track, finite, frozenset(channels), notes), losses
-
-
-def _check_has_numbers(log: DriveLog, mapping: SignalMapping, channels: Mapping[str, Channel]) -> None:
-    if any(np.isfinite(channels[name].values).any() for name in BASE_ORDER if name in channels):
-        return
-    raise MappingError(
-        expected="numbers in the recorded estimate",
-        got="none in the chosen slice",
-        where=f"{log.path} {', '.join(s.label for n, s in mapping.signals.items() if n in BASE_ORDER)}",
-        remedy="check topic, field and slice",
-    )
-
-
-def _without_nan(channel: Channel) -> Channel:
-    """Return the channel without the samples that are not numbers."""
-    return channel.take(np.isfinite(channel.values))
 
 
 def _in_range(values: FloatArray, source: SignalSource) -> FloatArray:
@@ -162,7 +151,7 @@ def _track(
 
 
 def _interpolated(channel: Channel, stamps_ns: IntArray) -> FloatArray:
-    finite = _without_nan(channel)
+    finite = channel.take(np.isfinite(channel.values))
     bracket = Bracket(finite.stamps_ns, stamps_ns, gap_ns(finite.stamps_ns))
     return bracket.angle(finite.values) if channel.name == "sideslip_rad" else bracket.linear(finite.values)
 

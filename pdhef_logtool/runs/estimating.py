@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from pdhef_logtool.drive.truth import valid_as_a_whole
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.estimators.divergence import watched_track
 from pdhef_logtool.estimators.drive_signals import DriveSignals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
 from pdhef_logtool.estimators.plug_ins import package_of
@@ -39,6 +40,11 @@ class Estimated:
     drawn_truth: StateTrack | None
     tracks: dict[str, StateTrack]
 
+    @property
+    def drawn(self) -> list[StateTrack]:
+        """The tracks for outputs: ground truth, then the estimators."""
+        return [*filter(None, [self.drawn_truth]), *self.tracks.values()]
+
     def read(self, name: str) -> StateTrack | None:
         """Return the track of a name (:data:`TRUTH`: ground truth), or None."""
         return self.truth if name == TRUTH else self.tracks.get(name)
@@ -63,16 +69,8 @@ def estimate_drive(
         None does not check, and a failure is raised.
     progress : called with the share of the estimators that is done.
     """
-    from pdhef_logtool.estimators.divergence import watched_track
-
-    signals, truth, vehicle = drive.signals, drive.truth, drive.plan.vehicle
-    start = first_pose(truth)
-    drawn_truth = truth
-    if drawn_truth is not None:
-        if not drive.plan.has_truth_pose:
-            drawn_truth = dead_reckoned(drawn_truth, start)
-        drawn_truth = valid_as_a_whole(drawn_truth, drive.plan.derivation, vehicle.standstill_m_s)
-    tracks: dict[str, StateTrack] = {}
+    signals, vehicle = drive.signals, drive.plan.vehicle
+    tracks: list[StateTrack] = []
     computations = [_computation(e, corrected.of_estimator(e.name)) for e in estimators]
     shared: dict[tuple[str, int], StateTrack] = {}
     for number, (estimator, computation) in enumerate(zip(estimators, computations, strict=True)):
@@ -97,9 +95,18 @@ def estimate_drive(
         track = track if intervals is None else intervals.apply(track, signals)
         if varied:
             track = widened(track, spread(track.vy_m_s, varied), vehicle.low_speed_blend_m_s, 1.0)
-        track = track.without_sideslip_below(vehicle.standstill_m_s)
-        tracks[track.name] = dead_reckoned(track, start)
-    return Estimated(signals, truth, drawn_truth, tracks)
+        tracks.append(track.without_sideslip_below(vehicle.standstill_m_s))
+    return with_poses(drive, tracks)
+
+
+def with_poses(drive: WholeDrive, tracks: Iterable[StateTrack]) -> Estimated:
+    """Return a drive with tracks, dead-reckoned from the first pose of the ground truth."""
+    plan, drawn_truth = drive.plan, drive.truth
+    start = _first_pose(drawn_truth)
+    if drawn_truth is not None:
+        drawn_truth = drawn_truth if plan.has_truth_pose else _dead_reckoned(drawn_truth, start)
+        drawn_truth = valid_as_a_whole(drawn_truth, plan.derivation, plan.vehicle.standstill_m_s)
+    return Estimated(drive.signals, drive.truth, drawn_truth, {t.name: _dead_reckoned(t, start) for t in tracks})
 
 
 def _computation(estimator: Estimator, signals: Signals) -> tuple[str, int]:
@@ -114,7 +121,7 @@ def _varied(estimator: Estimator, given: Signals, changes: Sequence[SensorChange
     return [run_estimator(estimator, signals).vy_m_s for signals in away]
 
 
-def dead_reckoned(track: StateTrack, start: tuple[float, float, float]) -> StateTrack:
+def _dead_reckoned(track: StateTrack, start: tuple[float, float, float]) -> StateTrack:
     """Return a track with its pose, dead-reckoned from ``start``."""
     vx, vy = track.vx_m_s, track.vy_m_s
     if not np.isfinite(vy).any():
@@ -122,7 +129,7 @@ def dead_reckoned(track: StateTrack, start: tuple[float, float, float]) -> State
     return track.with_pose(*dead_reckon(track.stamps_ns, vx, vy, track.yaw_rate_rad_s, start))
 
 
-def first_pose(truth: StateTrack | None) -> tuple[float, float, float]:
+def _first_pose(truth: StateTrack | None) -> tuple[float, float, float]:
     """Return the first known pose x, y, yaw of the ground truth; the origin without one."""
     if truth is not None:
         posed = np.flatnonzero(np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad))

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.drive.reading import logs_of
 from pdhef_logtool.estimators.table import FILTERS
+from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput, Logs
 from pdhef_logtool.mapping import Mapping, mapping_of
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, WorkerError
@@ -40,7 +41,6 @@ from pdhef_logtool.storage.outputs import OutputFolder
 from pdhef_logtool.workers.supervisor import Ended, Limits, Tell, supervise
 
 if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
     from pdhef_logtool.runs.stored_output import StoredOutput
 
@@ -352,7 +352,6 @@ class _Fleet:
             planned.log,
             self.plan.output,
             replace(self.job.config, keep=keep),
-            self.plan.setting,
             self.job.validation,
             self.job.report and keep == "full",
             self._name,

@@ -21,6 +21,7 @@ from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import TRUTH
 from pdhef_logtool.runs.estimating import Estimated, estimate_drive
 from pdhef_logtool.runs.preparing import choose
+from pdhef_logtool.runs.scoring import evaluate
 
 if TYPE_CHECKING:
     import polars as pl
@@ -46,8 +47,7 @@ class Estimates:
     @property
     def tracks(self) -> dict[str, StateTrack]:
         """Tracks by estimator, and ``truth`` where the log has one, with dead-reckoned poses, divergence, intervals."""
-        truth = self.estimated.drawn_truth
-        return ({} if truth is None else {TRUTH: truth}) | self.estimated.tracks
+        return {track.name: track for track in self.estimated.drawn}
 
     @property
     def signals(self) -> Signals:
@@ -128,10 +128,6 @@ def score(estimates: Estimates) -> pl.DataFrame:
     """
     import polars as pl
 
-    from pdhef_logtool.runs.scoring import evaluate
-
-    estimated = estimates.estimated
-    calibrated = DriveModel.of(estimates.drive).calibrated(estimated.signals)
-    rows = evaluate(estimates.drive, estimated, [*estimated.tracks], calibrated).rows
+    rows = evaluate(estimates.drive, estimates.estimated, DriveModel.of(estimates.drive)).rows
     columns = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
     return pl.DataFrame([[getattr(r, c) for c in columns] for r in rows], schema=columns, orient="row")

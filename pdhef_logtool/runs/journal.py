@@ -109,7 +109,8 @@ class Journal:
     Attributes
     ----------
     entries : the last of each label. described : settings and cars by digest.
-    damaged : lines that were left out when it was read.
+    damaged : lines that were left out when it was read. sizes : of all logs, in bytes.
+    labels : of the drives by identity of their content.
     """
 
     path: Path
@@ -117,8 +118,8 @@ class Journal:
     described: dict[str, dict[str, dict[str, Any]]] = field(default_factory=lambda: {"setting": {}, "car": {}})
     damaged: int = 0
     _places: dict[str, tuple[Place, str | None, str]] = field(default_factory=dict)
-    _labels: dict[str, list[str]] = field(default_factory=dict)
-    _sizes: set[int] = field(default_factory=set)
+    sizes: set[int] = field(default_factory=set)
+    labels: dict[str, list[str]] = field(default_factory=dict)
     _end: int = 0
 
     @classmethod
@@ -174,23 +175,10 @@ class Journal:
                     self._end += new.write(line)
         self._repeat_failures()
 
-    def known(self, place: Place) -> tuple[str, str | None] | None:
-        """Return label and identity of the log that lies there, if it lay there before and has not been changed."""
-        place_entry = self._places.get(place.key)
-        return (place_entry[2], place_entry[1]) if place_entry is not None and place_entry[0] == place else None
-
-    def label_at(self, place: Place) -> str | None:
-        """Return the label of the log that lay there last, whether its content is the same or not."""
-        place_entry = self._places.get(place.key)
-        return None if place_entry is None else place_entry[2]
-
-    def may_know(self, place: Place) -> bool:
-        """Whether a log of this size was seen, so that its content may be known."""
-        return place.bytes in self._sizes
-
-    def labels_of(self, identity: str) -> list[str]:
-        """Return the labels of drives with this content."""
-        return self._labels.get(identity, [])
+    def known(self, place: Place) -> tuple[str, str | None, bool]:
+        """Return label and identity of the log that lay there last, empty without one, and whether it is unchanged."""
+        was, identity, label = self._places.get(place.key, (None, None, ""))
+        return label, identity, was == place
 
     def outcome(self, entry: Entry) -> LogOutcome:
         """Return how a drive ended; raises OutputError where its line was damaged since it was read."""
@@ -257,8 +245,8 @@ class Journal:
     def _keep(self, entry: Entry) -> None:
         self.entries[entry.label] = entry
         self._places[entry.place.key] = entry.place, entry.identity, entry.label
-        self._sizes.add(entry.place.bytes)
-        if entry.identity is not None and entry.label not in (labels := self._labels.setdefault(entry.identity, [])):
+        self.sizes.add(entry.place.bytes)
+        if entry.identity is not None and entry.label not in (labels := self.labels.setdefault(entry.identity, [])):
             labels.append(entry.label)
 
 

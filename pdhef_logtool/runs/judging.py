@@ -7,26 +7,24 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pdhef_logtool.drive.reading import Drive
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
+from pdhef_logtool.evaluation.operating_space import OperatingSpace
+from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks, ScoredDrive, requirement_blocks
 from pdhef_logtool.evaluation.statistics import LEAST_DRIVES
-from pdhef_logtool.evaluation.validation_plan import default_plan
+from pdhef_logtool.evaluation.validation_plan import Requirement, ValidationPlan, default_plan, load_plan
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.documents import jsonable
 
 if TYPE_CHECKING:
-    from pdhef_logtool.drive.reading import Drive
-    from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
-    from pdhef_logtool.evaluation.operating_space import OperatingSpace
-    from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
-    from pdhef_logtool.evaluation.validation_plan import Requirement, ValidationPlan
     from pdhef_logtool.results.plan_verdicts import JudgedDrive, PlanVerdicts
 
 
 def read_validation_plan(file: Path | None, junit: Path | None) -> ValidationPlan:
     """Return the plan of a file or the default one; raises UsageError when it is wrong or missing for ``junit``."""
     if file is not None:
-        from pdhef_logtool.evaluation.validation_plan import load_plan
         from pdhef_logtool.results.plan_verdicts import other_runs
 
         plan = load_plan(file)
@@ -46,8 +44,6 @@ def drive_blocks(
 
     ``main`` : the selected estimate, for requirements that name no estimator.
     """
-    from pdhef_logtool.evaluation.requirement_blocks import ScoredDrive, requirement_blocks
-
     blocks: list[RequirementBlocks] = []
     read, slow, dependent = drive.tracks.get, drive.low_speed_m_s, frozenset(drive.dependent)
     for base in (drive.truth, read(REFERENCE)):

@@ -53,17 +53,22 @@ def plan_logs(
     A log is not read if the journal has its path, size and time; a new one only if another log has its size.
     """
     places = [Place.of(log) for log in inputs]
-    sizes = Counter(place.bytes for place in places)
+    sizes = Counter(place.bytes for place in places if place.is_local)
     labels = _Labels(journal, neutral)
-    later: list[tuple[int, str | None]] = []
+    later: dict[int, str | None] = {}
     for number, (log, place) in enumerate(zip(inputs, places, strict=True)):
-        label, identity = (place.is_local and journal.known(place)) or ("", None)
-        if label and label not in labels.claimed:
+        label, identity, unchanged = journal.known(place)
+        if unchanged and place.is_local and label not in labels.claimed:
             labels.claim(number, PlannedLog(replace(log, stem=label), place, identity))
         else:
-            later.append((number, identity))
-    unknown = [n for n, identity in later if identity is None and (neutral or _may_be_known(places[n], journal, sizes))]
-    identities = dict(later) | dict(zip(unknown, _identities([inputs[n] for n in unknown]), strict=True))
+            later[number] = identity if unchanged and place.is_local else None
+    unknown = [
+        number
+        for number, identity in later.items()
+        if identity is None and (neutral or (size := places[number].bytes) in journal.sizes or sizes[size] > 1)
+    ]
+    with ThreadPoolExecutor(_READERS) as readers:  # several at a time because servers wait
+        identities = later | dict(zip(unknown, readers.map(log_identity, [inputs[n] for n in unknown]), strict=True))
     for number, identity in identities.items():
         log = inputs[number]
         if identity in labels.owner and not twice:
@@ -96,26 +101,15 @@ class _Labels:
 
     def of(self, log: LogInput, place: Place, identity: str | None) -> PlannedLog:
         """Return a log with the first label that is free: of its content, of its path, or a new one."""
-        for label in () if identity is None else self.journal.labels_of(identity):
+        for label in () if identity is None else self.journal.labels.get(identity, ()):
             if label not in self.claimed:
                 return PlannedLog(replace(log, stem=label), place, identity, moved=True)
-        if (was := self.journal.label_at(place)) is not None and was not in self.claimed:
+        if (was := self.journal.known(place)[0]) and was not in self.claimed:
             return PlannedLog(replace(log, stem=was), place, identity)  # another content: it is run again
         log = replace(log, stem=neutral_stem(identity)) if self.neutral else log
         new = with_free_stem(log, self._taken)
         self._taken.add(as_taken(new.stem))
         return PlannedLog(new, place, identity)
-
-
-def _may_be_known(place: Place, journal: Journal, sizes: Counter[int]) -> bool:
-    """Return whether a log of an unknown path may have the content of another log."""
-    return journal.may_know(place) or (place.is_local and sizes[place.bytes] > 1)
-
-
-def _identities(logs: Sequence[LogInput]) -> list[str | None]:
-    """Return the identities of logs, several at a time because servers wait."""
-    with ThreadPoolExecutor(_READERS) as readers:
-        return list(readers.map(log_identity, logs))
 
 
 def settings_of(config: RunConfig) -> dict[str, str]:

@@ -6,33 +6,21 @@ the log has an IMU; the sensors, which only cut the drive into segments, are int
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.interpolation import Bracket
-from pdhef_logtool.drive.plan import DrivePlan
-from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
-from pdhef_logtool.drive.recorded import sample_ledger
-from pdhef_logtool.drive.truth import (
-    SAME_SHARE,
-    TruthTrack,
-    dependent_signals,
-    derive_truth,
-    share_equal,
-    truth_at,
-    valid_as_a_whole,
-)
-from pdhef_logtool.evaluation.largest_errors import largest_errors
-from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
-from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, EvaluatedDrive, evaluate_drive
+from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive, one_log, read_drive
+from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, dependent_signals, derive_truth, share_equal, truth_at
+from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS
 from pdhef_logtool.evaluation.operating_space import operating_space
-from pdhef_logtool.evaluation.segments import segment_masks
+from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -42,24 +30,14 @@ from pdhef_logtool.mapping import check_mapping, mapping_of, merge_losses, read_
 from pdhef_logtool.mapping.choosing import mapping_for_recorder
 from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
 from pdhef_logtool.model.drive_model import DriveModel
+from pdhef_logtool.model.intervals import drive_intervals
 from pdhef_logtool.records.errors import MappingError
-from pdhef_logtool.records.ledger import SampleCount, damage
 from pdhef_logtool.records.reporter import SILENT, Reporter
-from pdhef_logtool.records.signals import (
-    ALIGNED_SIGNALS,
-    TRUTH_UNITS,
-    WHEELS,
-    Channel,
-    FloatArray,
-    IntArray,
-    Loss,
-    Signals,
-)
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS, TRUTH_UNITS, WHEELS, FloatArray, IntArray, Loss, Signals
 from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
-from pdhef_logtool.results.run_report import build_report, estimator_entry
-from pdhef_logtool.results.sink import TRUTH
+from pdhef_logtool.results.run_report import estimator_entry
 from pdhef_logtool.results.tables import drive_part
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.drive_outputs import (
@@ -70,21 +48,15 @@ from pdhef_logtool.runs.drive_outputs import (
     write_run,
     write_run_tables,
 )
-from pdhef_logtool.runs.drive_report import drive_entries, outcome_of
+from pdhef_logtool.runs.drive_report import outcome_of, report_drive
 from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
-from pdhef_logtool.runs.estimating import dead_reckoned, first_pose
+from pdhef_logtool.runs.estimating import Estimated, with_poses
 from pdhef_logtool.runs.judging import drive_blocks, judge, judge_drive, read_validation_plan, write_verdicts
-from pdhef_logtool.runs.referencing import reference_of
+from pdhef_logtool.runs.preparing import PreparedDrive
+from pdhef_logtool.runs.referencing import DriveReference, reference_of
 from pdhef_logtool.runs.run_result import LogResult, RunResult
-from pdhef_logtool.runs.scoring import drive_events
+from pdhef_logtool.runs.scoring import Evaluation, divergences, evaluate, in_order
 from pdhef_logtool.storage.outputs import OutputFolder
-
-if TYPE_CHECKING:
-    from pdhef_logtool.estimators.reference.estimator import ReferenceEstimator
-    from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
-    from pdhef_logtool.evaluation.metrics import MetricRow
-    from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
-    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 
 _RECORDED = "read from the log: not recorded whether it is causal, or what it was computed from"
 
@@ -194,64 +166,55 @@ def _score_drive(
 ) -> LogResult:
     """Read, score and judge the recorded estimates; write the files of the log where there is a folder."""
     reporter.progress(drive.name, 0.1)
-    log = _read(drive, sources, config, reporter)
+    recorded, lost = _read(drive, sources)
+    truth = _read_truth(drive)
+    reporter.progress(drive.name, 0.6)
+    if not drive.available:
+        drive.tell("no IMU in the mapping: segments come from the ground truth alone")
+    model = DriveModel.of(drive)
+    reference = _reference(drive, model, config)
+    run = PreparedDrive(drive, config, model, reference, [], [], drive_intervals(drive.car, []), {})
     reporter.progress(drive.name, 0.8)
-    rows, blocks = _score(log, plan)
-    scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in log.recorded]))
-    whole, seen = log.at(scored_ns)
-    content = _entries(log, plan, rows, blocks, whole, seen)
-    report = build_report(content)
+
+    def at(stamps_ns: IntArray, tracks: Sequence[StateTrack]) -> Estimated:
+        of_reference = [] if reference is None or reference.estimator is None else [reference.estimator.at(stamps_ns)]
+        return with_poses(_drive_at(drive, truth, stamps_ns), [*tracks, *of_reference])
+
+    tracks = [r.track for r in recorded]
+    equal: dict[str, str] = {}
+    scored = [_score(run, r, at(r.track.stamps_ns, [r.track]), equal) for r in recorded]
+    drive.plan.dependent.update(equal | drive.plan.dependent)
+    selected = tracks[0].name if len(tracks) == 1 else None
+    stamps_ns = np.unique(np.concatenate([track.stamps_ns for track in tracks]))
+    whole, together = scored[0], at(stamps_ns, tracks)
+    if selected is None:  # each has been scored at its own stamps; the drive is cut into segments at those of all
+        parts = evaluate(drive, at(stamps_ns, []), model)
+        rows = {(m.estimator, m.signal, m.segment, m.metric): m for s in scored for m in s.rows}
+        whole = replace(parts, rows=[*rows.values()], events=in_order([*parts.events, *divergences(tracks)]))
+    blocks = []
+    for track, s in zip(tracks, scored, strict=True):
+        asked = [q for q in plan.requirements if q.estimator == track.name or (selected and q.estimator is None)]
+        blocks += drive_blocks(asked, selected, s.drive)
+    space = operating_space(together.signals, together.truth, together.read(selected or ""), drive.car.vehicle)
+    stated = judge_drive(plan, drive, None, whole.rows, blocks, space)
+    stated["estimators"] = [estimator_entry(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in recorded]
+    losses = merge_losses([drive.losses, lost])
+    report = report_drive(run, together, whole, stated, losses, selected)
     folder, files = None, dict[str, str]()
     if outputs is not None:
-        tracks = [*(r.track for r in log.recorded), *whole.tracks.values()]
-        if whole.truth is not None:
-            standstill_m_s = drive.car.vehicle.standstill_m_s
-            tracks.insert(0, valid_as_a_whole(whole.truth, drive.plan.derivation, standstill_m_s))
         with outputs.begin(log_place(drive.name), stale=(PAGE_FILE,)) as change:
-            write_drive_tables(change, report, rows, _drawn(tracks, drive.plan))
+            write_drive_tables(change, report, whole.rows, together.drawn)
         folder = change.target
         files = files_of(folder)
     reporter.progress(drive.name, 1.0)
-    outcome = outcome_of(drive, log.losses, files=files)
-    return LogResult(outcome, folder, report, tuple(rows), part=drive_part(outcome, report, rows, content["plan"]))
+    outcome = outcome_of(drive, losses, files=files)
+    part = drive_part(outcome, report, whole.rows, stated["plan"])
+    return LogResult(outcome, folder, report, tuple(whole.rows), part=part)
 
 
-def _drawn(tracks: Sequence[StateTrack], plan: DrivePlan) -> list[StateTrack]:
-    """Return the tracks with their poses; ground truth is the first if there is any."""
-    start = first_pose(tracks[0] if tracks[0].name == TRUTH else None)
-    return [track if track.name == TRUTH and plan.has_truth_pose else dead_reckoned(track, start) for track in tracks]
-
-
-def _entries(
-    log: _Recording,
-    plan: ValidationPlan,
-    rows: Sequence[MetricRow],
-    blocks: Sequence[RequirementBlocks],
-    whole: EvaluatedDrive,
-    seen: Signals,
-) -> dict[str, Any]:
-    """Judge the drive; return the content of report.json. ``whole``, ``seen`` : at the stamps of all estimates."""
-    drive, estimates = log.drive, [r.track for r in log.recorded]
-    alone = estimates[0] if len(estimates) == 1 else None
-    space = operating_space(seen, whole.truth, alone, drive.car.vehicle)
-    others = [*whole.tracks.values()]
-    places = [] if alone is None else largest_errors(alone, whole.truth, others, whole.low_speed_m_s)
-    entries = drive_entries(drive, drive.car, log.losses, log.ledger)
-    if log.truth is not None and drive.plan.latency is None:
-        entries["truth"]["notes"].insert(0, "no gyro to measure the ground truth's latency with: taken as 0")
-    entries |= judge_drive(plan, drive, None, rows, blocks, space)
-    return entries | {
-        "estimators": [estimator_entry(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in log.recorded],
-        "metrics": rows,
-        "segments": drive_events(seen, whole.masks, log.manoeuvres, estimates),
-        "largest_errors": places,
-    }
-
-
-def _read(drive: Drive, sources: Sequence[EstimateSource], config: RunConfig, reporter: Reporter) -> _Recording:
-    """Read estimates, ground truth and sensors; add to the plan which ground truth depends on an estimate."""
-    plan, losses = drive.plan, list[Loss]()
-    recorded, dependent = [], dict(plan.dependent)
+def _read(drive: Drive, sources: Sequence[EstimateSource]) -> tuple[list[RecordedEstimate], list[Loss]]:
+    """Read the estimates; add to the plan which ground truth depends on one."""
+    plan, recorded, losses = drive.plan, [], list[Loss]()
     for source in sources:
         estimate, lost = read_estimate(drive.log, source, plan.start_ns, plan.end_ns)
         for note in estimate.notes:
@@ -259,90 +222,77 @@ def _read(drive: Drive, sources: Sequence[EstimateSource], config: RunConfig, re
         recorded.append(estimate)
         losses += lost
         same = dependent_signals(estimate.channels, plan.survey_truth, role=f"estimate {source.name}'s")
-        dependent |= {name: why for name, why in same.items() if name not in dependent}
-    truth: TruthTrack | None = None
-    ledger: tuple[SampleCount, ...] = ()
-    if drive.mapping.truth:
-        part = read_signals(drive.log, replace(plan.mapping, signals={}), plan.clocks, plan.start_ns, plan.end_ns)
-        truth = _truth_of(part.truth, drive)
-        losses += part.losses
-        ledger = sample_ledger(drive.log, plan, part.counts)
-    reporter.progress(drive.name, 0.6)
-    signals = _read_sensors(drive)
-    drive.plan = replace(plan, dependent=dependent)
-    manoeuvres = [] if signals is None else find_manoeuvres(signals, drive.car.vehicle)
-    reference = _reference(drive, config, scored=truth is not None)
-    every_loss = merge_losses([drive.losses, losses, damage(ledger)])
-    every_sample = (*drive.sample_ledger, *ledger)
-    return _Recording(drive, recorded, truth, reference, signals, manoeuvres, every_loss, every_sample)
+        plan.dependent.update({name: why for name, why in same.items() if name not in plan.dependent})
+    return recorded, losses
 
 
-def _reference(drive: Drive, config: RunConfig, *, scored: bool) -> ReferenceEstimator | None:
-    """Return the sideslip reference of the sensors: without ground truth, or beside it where asked for."""
-    if config.reference == "off" or (scored and config.reference == "auto"):
+def _read_truth(drive: Drive) -> TruthTrack | None:
+    """Derive the ground truth on its own clock; raises MappingError where the slice contains none of a mapped one."""
+    plan = drive.plan
+    if not plan.mapping.truth:
         return None
-    reference = reference_of(drive, DriveModel.of(drive), config)
-    if reference is None or reference.estimator is None:
-        why = "the log has no IMU" if reference is None else str(reference.document["refused"])
-        if not scored:
-            raise _nothing_to_score_against(f"none, and no sideslip reference: {why}", drive.file)
-        drive.tell(f"no sideslip reference: {why}")
-        return None
-    drive.tell("estimated sideslip reference: differences from it are no errors (docs/estimators.md#reference)")
-    return reference.estimator
+    channels = read_signals(drive.log, replace(plan.mapping, signals={}), plan.clocks, plan.start_ns, plan.end_ns).truth
+    truth = None if plan.truth is None else derive_truth(channels, plan=plan.truth)
+    if truth is None or not len(truth.track):
+        raise MappingError(
+            expected="ground truth in the chosen slice",
+            got="no samples that can be used",
+            where=f"{drive.log.path} {', '.join(s.label for s in plan.mapping.truth.values())}",
+            remedy="pdhef inspect LOG shows the contents of the log and the dropped samples",
+        )
+    return replace(truth, derivation=plan.derivation)
 
 
-def _score(log: _Recording, plan: ValidationPlan) -> tuple[list[MetricRow], list[RequirementBlocks]]:
-    """Score each estimate at its own stamps; add to the plan which derived ground truth equals an estimate."""
-    rows: list[MetricRow] = []
-    blocks: list[RequirementBlocks] = []
-    drive, equal = log.drive, dict[str, str]()
-    alone = len(log.recorded) == 1
-    for r in log.recorded:
-        track, name = r.track, r.track.name
-        scored, _ = log.at(track.stamps_ns)
-        same = {
-            signal: f"the ground truth's {signal} equals that of the estimate {name}"
-            for signal in SCORED_SIGNALS
-            if scored.truth is not None and _same_column(getattr(track, signal), getattr(scored.truth, signal))
-        }
-        equal |= same
-        scored = replace(scored, tracks={name: track, **scored.tracks}, dependent={**drive.plan.dependent, **same})
-        asked = [q for q in plan.requirements if q.estimator in (name, None if alone else name)]
-        blocks += drive_blocks(asked, name if alone else None, scored)
-        figures = [row for row in evaluate_drive(scored) if row.estimator == name]
-        if not any(row.metric in ("rmse", "reference_rms") for row in figures):
-            drive.tell(f"{name}: nowhere are estimate and ground truth known together, so there are no errors")
-        # A quantity that the estimate does not contain has no availability, and so no row.
-        silent = {n for n in SCORED_SIGNALS if n not in r.claimed and not np.isfinite(getattr(track, n)).any()}
-        silent |= {"diverged"} - r.claimed
-        rows += [row for row in figures if silent.isdisjoint((row.signal, row.metric))]
-    drive.plan = replace(drive.plan, dependent={**equal, **drive.plan.dependent})
-    return rows, blocks
+def _reference(drive: Drive, model: DriveModel, config: RunConfig) -> DriveReference | None:
+    """Return the sideslip reference; raises MappingError where there is nothing to score against."""
+    reference = reference_of(drive, model, config)
+    if reference is not None and reference.estimator is not None:
+        drive.tell("estimated sideslip reference: differences from it are no errors (docs/estimators.md#reference)")
+    elif reference is not None and not drive.mapping.truth:
+        refused = str(reference.document["refused"])
+        raise _nothing_to_score_against(f"none, and no sideslip reference: {refused}", drive.file)
+    return reference
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Recording:
-    """The content of a log: estimates, ground truth, reference and signals, each at its own stamps."""
+def _drive_at(drive: Drive, truth: TruthTrack | None, stamps_ns: IntArray) -> WholeDrive:
+    """Return the drive at stamps [N]: its sensors are interpolated between samples, never across gaps."""
+    plan, recorded = drive.plan, drive.recorded()
 
-    drive: Drive
-    recorded: Sequence[RecordedEstimate]
-    truth: TruthTrack | None
-    reference: ReferenceEstimator | None
-    signals: Signals | None
-    manoeuvres: Sequence[Manoeuvre]
-    losses: tuple[Loss, ...]
-    ledger: tuple[SampleCount, ...]
+    def column(name: str) -> FloatArray:
+        values: FloatArray = getattr(recorded.signals, name)
+        is_finite = np.isfinite(values)
+        stamps = recorded.signals.stamps_ns[is_finite]
+        return Bracket(stamps, stamps_ns, gap_ns(stamps)).linear(values[is_finite])
 
-    def at(self, stamps_ns: IntArray) -> tuple[EvaluatedDrive, Signals]:
-        """Return ground truth, reference and segments at stamps [N], and the signals interpolated to them."""
-        latency_s, vehicle, truth = self.drive.plan.truth_latency_s, self.drive.car.vehicle, None
-        if self.truth is not None:
-            truth = truth_at(self.truth, stamps_ns, latency_s, standstill_m_s=vehicle.standstill_m_s)
-        tracks = {} if self.reference is None else {REFERENCE: self.reference.at(stamps_ns)}
-        seen = signals_at(self.signals, stamps_ns)
-        masks = segment_masks(seen, truth, vehicle, self.manoeuvres)
-        return EvaluatedDrive(self.drive.name, tracks, truth, None, masks, vehicle.low_speed_blend_m_s), seen
+    signals = Signals(
+        stamps_ns=stamps_ns,
+        ready_ns=stamps_ns,
+        wheel_speed_m_s=np.full((len(stamps_ns), len(WHEELS)), np.nan),
+        available=recorded.signals.available,
+        **{name: column(name) for name in ALIGNED_SIGNALS},
+    )
+    latency_s, standstill_m_s = plan.truth_latency_s, plan.vehicle.standstill_m_s
+    true = None if truth is None else truth_at(truth, stamps_ns, latency_s, standstill_m_s=standstill_m_s)
+    return WholeDrive(drive.name, plan, drive.friction.fill(signals), true, drive.log.start_ns, recorded.changes)
+
+
+def _score(run: PreparedDrive, recorded: RecordedEstimate, estimated: Estimated, equal: dict[str, str]) -> Evaluation:
+    """Score an estimate at its own stamps; add to ``equal`` the ground truth that equals it."""
+    drive, track, truth = run.drive, recorded.track, estimated.truth
+    same = {
+        signal: f"the ground truth's {signal} equals that of the estimate {track.name}"
+        for signal in SCORED_SIGNALS
+        if truth is not None and _same_column(getattr(track, signal), getattr(truth, signal))
+    }
+    equal |= same
+    scored = evaluate(drive, estimated, run.model, {**same, **drive.plan.dependent})
+    if not any(m.estimator == track.name and m.metric in ("rmse", "reference_rms") for m in scored.rows):
+        drive.tell(f"{track.name}: nowhere are estimate and ground truth known together, so there are no errors")
+    # A quantity that the estimate does not contain has no availability, and so no row.
+    silent = {n for n in SCORED_SIGNALS if n not in recorded.claimed and not np.isfinite(getattr(track, n)).any()}
+    silent |= {"diverged"} - recorded.claimed
+    rows = [m for m in scored.rows if m.estimator != track.name or silent.isdisjoint((m.signal, m.metric))]
+    return replace(scored, rows=[m for m in rows if m.estimator != REFERENCE])
 
 
 def _nothing_to_score_against(got: str, where: str) -> MappingError:
@@ -354,51 +304,6 @@ def _nothing_to_score_against(got: str, where: str) -> MappingError:
     )
 
 
-def _read_sensors(drive: Drive) -> Signals | None:
-    """Return the signals of the mapped sensors, None without any; the drive then has their losses and samples."""
-    if not drive.plan.alignment.channels:
-        drive.tell("no IMU in the mapping: segments come from the ground truth alone")
-        return None
-    drive.plan = replace(drive.plan, truth=None, mapping=replace(drive.mapping, truth={}, quality=None))
-    signals = drive.recorded().signals
-    return drive.friction.fill(signals) if len(signals) else None
-
-
 def _same_column(estimate: FloatArray, truth: FloatArray) -> bool:
     usable = np.isfinite(estimate) & np.isfinite(truth)
     return int(np.count_nonzero(usable)) >= 10 and share_equal(estimate[usable], truth[usable]) >= SAME_SHARE
-
-
-def _truth_of(channels: Mapping[str, Channel], drive: Drive) -> TruthTrack:
-    """Derive the ground truth on its own clock; raises MappingError where the slice contains none."""
-    plan = drive.plan.truth
-    track = None if plan is None else derive_truth(channels, plan=plan).track
-    if plan is None or track is None or not len(track):
-        raise MappingError(
-            expected="ground truth in the chosen slice",
-            got="no samples that can be used",
-            where=f"{drive.log.path} {', '.join(s.label for s in drive.plan.mapping.truth.values())}",
-            remedy="pdhef inspect LOG shows the contents of the log and the dropped samples",
-        )
-    return TruthTrack(track, plan.max_gap_s[plan.base], drive.plan.derivation)
-
-
-def signals_at(signals: Signals | None, stamps_ns: IntArray) -> Signals:
-    """Return the sensors at other stamps [N], interpolated between samples, never across gaps; all NaN without any."""
-    n = stamps_ns.shape[0]
-
-    def column(name: str) -> FloatArray:
-        if signals is None:
-            return np.full(n, np.nan)
-        values: FloatArray = getattr(signals, name)
-        is_finite = np.isfinite(values)
-        stamps = signals.stamps_ns[is_finite]
-        return Bracket(stamps, stamps_ns, gap_ns(stamps)).linear(values[is_finite])
-
-    return Signals(
-        stamps_ns=stamps_ns,
-        ready_ns=stamps_ns,
-        wheel_speed_m_s=np.full((n, len(WHEELS)), np.nan),
-        available=frozenset() if signals is None else signals.available,
-        **{name: column(name) for name in ALIGNED_SIGNALS},
-    )

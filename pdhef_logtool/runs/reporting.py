@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 from pdhef_logtool.logs.discovery import folders_of
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.opened_run import PAGE_FILE, TABLES_FOLDER, open_run
@@ -19,7 +20,6 @@ from pdhef_logtool.runs.planning import Plan
 from pdhef_logtool.runs.run_result import FEW_LOGS, LogResult
 
 if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
     from pdhef_logtool.results.plan_verdicts import PlanVerdicts
 
 

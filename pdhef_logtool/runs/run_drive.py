@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
 from pdhef_logtool.drive.reading import read_drive
@@ -12,7 +11,7 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.plug_ins import package_of
 from pdhef_logtool.evaluation.operating_space import operating_space
-from pdhef_logtool.evaluation.validation_plan import SIDESLIP
+from pdhef_logtool.evaluation.validation_plan import SIDESLIP, ValidationPlan
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import merge_losses
@@ -20,6 +19,7 @@ from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.reporter import SILENT, Reporter
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.tracks import REFERENCE
+from pdhef_logtool.results.selected_estimate import MainFacts
 from pdhef_logtool.results.tables import drive_part
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.drive_outputs import STALE_FILES, DriveOutputs, files_of, log_place
@@ -33,12 +33,8 @@ from pdhef_logtool.runs.scoring import Evaluation, evaluate
 from pdhef_logtool.runs.selection import choose_main, contradiction
 from pdhef_logtool.storage.outputs import OutputFolder
 
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
-    from pdhef_logtool.results.selected_estimate import MainFacts
-
-_SILENT = "{} has no valid row although the car moves"
-_ALL_SILENT = "no estimator has a valid row although the car moves"
+_SILENT = "{} has no valid row although the car moves: {}"
+_ALL_SILENT = "no estimator has a valid row although the car moves: {}"
 _NEVER_MOVES = "the car is never faster than {:g} m/s: there is nothing to score"
 
 
@@ -78,11 +74,14 @@ def run_log(
             with files.annotated() as annotated:
                 if annotated is not None:
                     annotated.write(files.tracks)
-                losses = merge_losses([drive.losses, *_losses(run, scored)])
-                report = report_drive(run, estimated, scored, main, judged, losses)
+                failed = [Loss("estimator-failed", f"{name} {text}", drive.name) for name, text in run.failed.items()]
+                silent = [Loss("no-valid-row", _SILENT.format(*why), drive.name) for why in scored.silent.items()]
+                losses = merge_losses([drive.losses, silent, failed])
+                report = report_drive(run, estimated, scored, judged, losses, main.name, main)
                 if annotated is not None:
                     annotated.finish(report, files.tracks, scored.events)
             files.write(report, scored.rows, scored.events)
+        all_silent = len(scored.silent) == len(run.estimators)
         outcome = outcome_of(
             drive,
             losses,
@@ -91,7 +90,7 @@ def run_log(
             main=main.name,
             algorithms={e.name: resolve(e).identity for e in run.estimators},
             files=files_of(change.target),
-            failed=_ALL_SILENT if len(scored.silent) == len(run.estimators) else None,
+            failed=_ALL_SILENT.format("; ".join(dict.fromkeys(scored.silent.values()))) if all_silent else None,
         )
         failed_checks = sum(c.verdict == "failed" and not c.waived for c in drive.checks)
     reporter.progress(drive.name, 1.0)
@@ -128,7 +127,7 @@ def _estimate(run: PreparedDrive, causality: CausalityCheck, reporter: Reporter)
 def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     """Score the tracks; add contradictions as notes of the drive."""
     drive = run.drive
-    scored = evaluate(drive, estimated, run.names, run.model.calibrated(estimated.signals))
+    scored = evaluate(drive, estimated, run.model)
     digests = {e.name: resolve(e).sha256[:SHOWN_DIGITS] for e in run.estimators}
     scored = replace(scored, rows=[replace(r, algorithm=digests.get(r.estimator, "")) for r in scored.rows])
     truth, reference = estimated.truth, estimated.read(REFERENCE)
@@ -142,12 +141,6 @@ def _score(run: PreparedDrive, estimated: Estimated) -> Evaluation:
     if not scored.moves:
         drive.tell(_NEVER_MOVES.format(run.car.vehicle.low_speed_blend_m_s))
     return scored
-
-
-def _losses(run: PreparedDrive, scored: Evaluation) -> Iterator[list[Loss]]:
-    """Yield the estimators without a valid row and those that failed, as losses."""
-    yield [Loss("no-valid-row", _SILENT.format(name), run.drive.name) for name in scored.silent]
-    yield [Loss("estimator-failed", f"{name} {text}", run.drive.name) for name, text in run.failed.items()]
 
 
 def _judge(

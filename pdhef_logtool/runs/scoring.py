@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.records.signals import BoolArray, Signals
+from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES, Manoeuvre, find_manoeuvres
+from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow, evaluate_drive
+from pdhef_logtool.evaluation.segments import find_intervals, moving_mask, segment_masks
+from pdhef_logtool.model.drive_model import DriveModel
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS, BoolArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.sink import Event, ManoeuvreEvent
-
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.manoeuvres import Manoeuvre
-    from pdhef_logtool.evaluation.metrics import EvaluatedDrive, MetricRow
-    from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
-    from pdhef_logtool.runs.estimating import Estimated
+from pdhef_logtool.runs.estimating import Estimated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,41 +25,46 @@ class Evaluation:
     Attributes
     ----------
     drive : what was scored. rows, events : figures, and events in order of time.
-    silent : estimators without a valid row although the car moves. moves : whether it does.
+    silent : why estimators have no valid row although the car moves. moves : whether it does.
     """
 
     drive: EvaluatedDrive
     rows: list[MetricRow]
     events: list[Event]
-    silent: tuple[str, ...]
+    silent: dict[str, str]
     moves: bool
 
 
-def evaluate(drive: Drive, estimated: Estimated, names: Sequence[str], calibrated: CalibratedSignals) -> Evaluation:
-    """Score the tracks of a drive.
-
-    Parameters
-    ----------
-    names : of the estimators. calibrated : signals as the vehicle of the drive's model corrects them.
-    """
-    from pdhef_logtool.evaluation.manoeuvres import find_manoeuvres
-    from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive
-    from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
-
+def evaluate(
+    drive: Drive, estimated: Estimated, model: DriveModel, dependent: Mapping[str, str] | None = None
+) -> Evaluation:
+    """Score the tracks of a drive; ``dependent`` : as of :class:`EvaluatedDrive`, None: of the plan of the drive."""
     signals, truth, vehicle = estimated.signals, estimated.truth, drive.car.vehicle
-    manoeuvres = find_manoeuvres(signals, vehicle)
+    manoeuvres = find_manoeuvres(drive.recorded().signals, vehicle)
     masks = segment_masks(signals, truth, vehicle, manoeuvres)
     moving = moving_mask(signals, truth, vehicle)
-    tracks = {name: track for name, track in estimated.tracks.items() if name in names}
-    slow, dependent = vehicle.low_speed_blend_m_s, drive.plan.dependent
+    tracks, slow, calibrated = estimated.tracks, vehicle.low_speed_blend_m_s, model.calibrated(signals)
+    dependent = drive.plan.dependent if dependent is None else dependent
     scored = EvaluatedDrive(drive.name, tracks, truth, signals, masks, slow, calibrated, dependent)
-    events = drive_events(signals, masks, manoeuvres, [*tracks.values()])
+    events = _events(signals, masks, manoeuvres, [*tracks.values()])
     moves = bool(moving.any())
-    silent = [n for n, track in tracks.items() if moves and not (moving & track.valid & track.something_known).any()]
-    return Evaluation(scored, evaluate_drive(scored), events, tuple(silent), moves)
+    silent = {
+        name: why_silent(signals, moving)
+        for name, track in tracks.items()
+        if moves and not (moving & track.valid & track.something_known).any()
+    }
+    return Evaluation(scored, evaluate_drive(scored), events, silent, moves)
 
 
-def drive_events(
+def why_silent(signals: Signals, moving: BoolArray) -> str:
+    """Return why an estimator has no valid row where the car moves (``moving`` [N])."""
+    read = [name for name in ALIGNED_SIGNALS if name in signals.available]
+    if lost := [name for name in read if not np.isfinite(getattr(signals, name)[moving]).any()]:
+        return f"no samples of {', '.join(lost)} while it does"
+    return "its signals are there, but the estimator marks none as valid"
+
+
+def _events(
     stamped: Signals | StateTrack,
     masks: Mapping[str, BoolArray],
     manoeuvres: Sequence[Manoeuvre],
@@ -69,17 +74,21 @@ def drive_events(
 
     The whole drive and ``linear`` are no events.
     """
-    from pdhef_logtool.evaluation.manoeuvres import MANOEUVRES
-    from pdhef_logtool.evaluation.segments import find_intervals
-
     spans = [s for s in find_intervals(stamped, masks) if s.name not in ("all", "linear", *MANOEUVRES)]
     events = [Event(s.name, s.start_ns, s.end_ns, "") for s in spans]
     events += [
         ManoeuvreEvent(**{**asdict(m), "text": m.text, "side": "left" if m.side > 0 else "right"}) for m in manoeuvres
     ]
+    return in_order([*events, *divergences(tracks)])
+
+
+def divergences(tracks: Iterable[StateTrack]) -> Iterator[Event]:
+    """Yield the intervals in which an estimator reports divergence."""
     for track in tracks:
-        events += [
-            Event(f"{track.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
-            for s in find_intervals(track, {"diverged": track.diverged})
-        ]
+        for s in find_intervals(track, {"diverged": track.diverged}):
+            yield Event(f"{track.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
+
+
+def in_order(events: Iterable[Event]) -> list[Event]:
+    """Return events in order of time."""
     return sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name))

@@ -8,16 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.estimators.table import all_names, spec_of
+from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.tracks import REFERENCE
 from pdhef_logtool.results.selected_estimate import NAIVE, MainFacts
-
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.metrics import MetricRow
 
 #: The preferred estimator, and those that run beside it where no driving has validated the car.
 PREFERRED = "pd-hef"
@@ -67,12 +64,6 @@ def _figures(rows: Iterable[MetricRow]) -> tuple[dict[str, float], dict[str, flo
     return d2, yaw
 
 
-def _fails(rows: Iterable[MetricRow], name: str) -> bool:
-    """Return whether sideslip 0 agrees better with the sensors, at their estimated positions, than an estimate."""
-    d2, _ = _figures(rows)
-    return name in d2 and NAIVE in d2 and name != NAIVE and d2[name] > FACTOR * d2[NAIVE]
-
-
 def default_names(car: Car, available: frozenset[str]) -> tuple[str, ...]:
     """Return the estimators that run where none are named.
 
@@ -111,7 +102,9 @@ def choose_main(names: Sequence[str], rows: Iterable[MetricRow], *, proven: bool
         why = "no simple estimator agrees better with the sensors"
     else:
         why = "the best that the log's signals allow"
-    fails = not proven and _fails(rows, name)
+    d2, _ = _figures(rows)
+    # Sideslip 0 agrees better with the sensors, at their estimated positions.
+    fails = not proven and name != NAIVE and d2.get(name, 0.0) > FACTOR * d2.get(NAIVE, math.inf)
     if fails:
         why = f"no estimate agrees with the sensors as well as sideslip 0 does; {name} is the least bad one"
     return MainFacts(

@@ -8,9 +8,11 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 from pdhef_logtool.logs.byte_source import ChangedError, SourceError
 from pdhef_logtool.logs.discovery import LogInput, identity_of
 from pdhef_logtool.mapping import Mapping as LogMapping
@@ -20,17 +22,14 @@ from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.no_position import without_names
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, PARTS
 from pdhef_logtool.results.run_report import LogOutcome
+from pdhef_logtool.results.tables import write_part
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.drive_outputs import LOG_FILES, log_place
 from pdhef_logtool.runs.journal import digest_of, states_of
 from pdhef_logtool.runs.run_drive import run_log
-from pdhef_logtool.runs.run_result import LogResult
 from pdhef_logtool.storage.outputs import OutputFolder
 from pdhef_logtool.workers.supervisor import Tell
-
-if TYPE_CHECKING:
-    from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +39,6 @@ class DriveTask:
     Attributes
     ----------
     log : the log with its label in the run. output : folder of the run.
-    setting : digest of the settings that the drive is run with.
     page : whether the drive's page is written.
     run : name of this run in its process, the key of cars that were read. stored : names of the drive's stored files.
     is_first : whether the log is the first of the run's list, which has the full causality check.
@@ -49,7 +47,6 @@ class DriveTask:
     log: LogInput
     output: Path
     config: RunConfig
-    setting: str
     validation: ValidationPlan
     page: bool
     run: str
@@ -148,9 +145,7 @@ def _identity_of_slice(log: LogInput, identity: str) -> str:
 
 
 def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
-    from pdhef_logtool.results.tables import write_part
-
-    cars, mapping = _cars_and_mapping(task)
+    cars, mapping = _cars_and_mapping(task.run, task.config)
     cars = replace(cars, warn=warned.append)
     car = cars.of_log(task.log)
     outputs = OutputFolder(task.output)  # locked by the run
@@ -163,7 +158,10 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
     part = f"{PARTS}/part-{digest_of(task.log.stem)}.parquet"
     write_part(task.output / part, result.part)
     if task.page:
-        warned += _write_page(result)
+        from pdhef_logtool.reports.pages import write_drive_page
+
+        if wrong := write_drive_page(result.opened).wrong:
+            warned.append(f"no page of {result.outcome.log}: {wrong}")
     return DriveEnd(
         result.outcome,
         _identity_of_slice(task.log, str(result.outcome.sha256)),
@@ -176,22 +174,7 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
     )
 
 
-def _write_page(result: LogResult) -> list[str]:
-    """Write the page of a drive; return warnings."""
-    from pdhef_logtool.reports.pages import write_drive_page
-
-    wrong = write_drive_page(result.opened).wrong
-    return [f"no page of {result.outcome.log}: {wrong}"] if wrong else []
-
-
-#: Cars and mapping of the run that this process works for, by the run's name.
-_opened: dict[str, tuple[RunCars, LogMapping | None]] = {}
-
-
-def _cars_and_mapping(task: DriveTask) -> tuple[RunCars, LogMapping | None]:
-    """Return cars and mapping of a task, read once per run."""
-    if task.run not in _opened:
-        _opened.clear()
-        config = task.config
-        _opened[task.run] = RunCars.of(config, lambda _: None), mapping_of(config.mapping)
-    return _opened[task.run]
+@lru_cache(maxsize=1)
+def _cars_and_mapping(_run: str, config: RunConfig) -> tuple[RunCars, LogMapping | None]:
+    """Return cars and mapping of a run, read once by this process."""
+    return RunCars.of(config, lambda _: None), mapping_of(config.mapping)

@@ -21,7 +21,7 @@ from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.records.processes import is_alive, process_name
 from pdhef_logtool.storage.files import OF_WRITING, WINDOWS, cannot_write, open_new, sweep_files, sync, writing
 
-#: The hidden folder beside outputs in which changes are prepared: ``.pdhef/NAME/{new,old,scratch}``.
+#: The hidden folder beside outputs in which changes are prepared: ``.pdhef/NAME/{new,old}``.
 WORK = ".pdhef"
 #: Lock file for file systems without the kernel's lock.
 LOCK_FILE = ".pdhef.lock"
@@ -40,7 +40,7 @@ class FolderTransaction(contextlib.AbstractContextManager["FolderTransaction"]):
 
     Attributes
     ----------
-    scratch : a local folder for temporary files, removed at the end. target : location of the outputs in messages.
+    target : location of the outputs in messages.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class FolderTransaction(contextlib.AbstractContextManager["FolderTransaction"]):
         self._place = Path(os.path.realpath(target))
         self._keep = keep
         self._work = self._place.parent / WORK / self._place.name
-        self._new, self._old, self.scratch = (self._work / name for name in ("new", "old", "scratch"))
+        self._new, self._old = self._work / "new", self._work / "old"
         try:
             with writing(target):
                 if self._place.exists() and not self._place.is_dir():
@@ -77,8 +77,7 @@ class FolderTransaction(contextlib.AbstractContextManager["FolderTransaction"]):
             return
         self.discard()
         if isinstance(error, OutputError):
-            for folder in (self._new, self.scratch):
-                error.where = error.where.replace(str(folder), str(self.target))
+            error.where = error.where.replace(str(self._new), str(self.target))
         if isinstance(error, OSError) and error.errno in OF_WRITING:
             raise cannot_write(self.target, error) from error
 
@@ -90,7 +89,6 @@ class FolderTransaction(contextlib.AbstractContextManager["FolderTransaction"]):
             except FileNotFoundError:  # a command beside this one has removed the folder of both while it was empty
                 if not left:
                     raise
-        self.scratch.mkdir()
 
     def file(self, name: str) -> Path:
         """Return where to write the file of a name."""
@@ -100,12 +98,14 @@ class FolderTransaction(contextlib.AbstractContextManager["FolderTransaction"]):
         """Flush all files, link those that are kept, exchange the folders; OutputError leaves all unchanged."""
         try:
             with writing(self.target):
-                shutil.rmtree(self.scratch)
                 if self._place.is_dir():
                     shutil.copymode(self._place, self._new)
                     if self._keep:
                         _take_over(self._place, self._new, self._stale)
-                _sync_all(self._new)
+                for path in self._new.rglob("*"):
+                    if not path.is_symlink() and (path.is_file() or path.is_dir()):
+                        sync(path)
+                sync(self._new)
                 _take_place(self._new, self._place, self._old)
                 sync(self._place.parent)
         finally:
@@ -356,11 +356,6 @@ def _repair(work: Path, place: Path) -> None:
         old.rename(place)
     if work.is_dir():
         shutil.rmtree(work, ignore_errors=True)
-
-
-def _sync_all(folder: Path) -> None:
-    for path in [*(p for p in folder.rglob("*") if not p.is_symlink() and (p.is_file() or p.is_dir())), folder]:
-        sync(path)
 
 
 def _take_over(old: Path, new: Path, stale: Container[str]) -> None:

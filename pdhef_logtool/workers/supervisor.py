@@ -12,7 +12,7 @@ import pickle
 import platform
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -171,28 +171,26 @@ class _Worker(Generic[T]):
             return 0
 
 
+@dataclass(eq=False)
 class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
     """Workers for several lists of items; arguments and errors as for :func:`supervise`."""
 
-    def __init__(
-        self,
-        work: Callable[[T, Tell], R],
-        *,
-        jobs: int,
-        limits: Limits = Limits(),
-        preload: Sequence[str] = (),
-        warn: Callable[[str], None] = lambda _text: None,
-    ) -> None:
+    work: Callable[[T, Tell], R]
+    jobs: int
+    limits: Limits = Limits()
+    preload: Sequence[str] = ()
+    warn: Callable[[str], None] = lambda _text: None
+    _progress: Progress = _silent
+    _server: ForkServer | None = None
+    _deaths: int = 0
+    _workers: list[_Worker[T]] = field(default_factory=list)
+    #: Items that are tried next because their server died, and those that are tried again alone.
+    _returned: list[_Attempt[T]] = field(default_factory=list)
+    _lost: list[_Attempt[T]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
         if not can_fork():
             raise UsageError(expected="Linux, for worker processes", got=platform.system(), where="Ray node")
-        self._work, self._jobs, self._limits, self._preload, self._warn = work, jobs, limits, preload, warn
-        self._progress: Progress = _silent
-        self._server: ForkServer | None = None
-        self._deaths = 0
-        self._workers: list[_Worker[T]] = []
-        #: Items that are tried next because their server died, and those that are tried again alone.
-        self._returned: list[_Attempt[T]] = []
-        self._lost: list[_Attempt[T]] = []
 
     def __exit__(self, *_: object) -> None:
         """End all processes."""
@@ -204,7 +202,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
         """Do the work on every item, as :func:`supervise` does."""
         self._progress, self._deaths, self._lost, self._returned = progress, 0, [], []
         try:
-            yield from self._run((_Attempt(n, item) for n, item in enumerate(items)), self._jobs)
+            yield from self._run((_Attempt(n, item) for n, item in enumerate(items)), self.jobs)
             while self._lost:
                 self._dismiss(self._workers)
                 yield from self._run(iter([self._lost.pop(0)]), 1)
@@ -241,7 +239,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
                 return
             attempt.tries, attempt.last = attempt.tries + 1, ""
             try:
-                packed = pickle.dumps((self._work, attempt.item))
+                packed = pickle.dumps((self.work, attempt.item))
             except Exception as error:  # noqa: BLE001 (any error of a pickler)
                 yield attempt.failed(f"it cannot be sent to a worker: {describe_error(error)}")
                 continue
@@ -259,14 +257,14 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
         WorkerError : the server died more often than it is restarted.
         """
         while True:
-            self._server = self._server or ForkServer(self._preload)
+            self._server = self._server or ForkServer(self.preload)
             try:
                 worker = _Worker[T](self._server.fork(f"{__name__}:work_on_items", timeout_s=_MESSAGE_S))
             except EOFError:
                 self._note_death(self._server)
                 continue
             self._workers.append(worker)
-            most = self._limits.memory_bytes
+            most = self.limits.memory_bytes
             with contextlib.suppress(OSError):
                 worker.child.connection.send(None if most is None else most + _RESERVED_BYTES)
             return worker
@@ -284,7 +282,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
                 where="worker processes",
                 remedy="find the process that kills them, for example the system for lack of memory",
             )
-        self._warn(f"the fork server died ({how}): restart {self._deaths} of {_RESTARTS}, no item is lost")
+        self.warn(f"the fork server died ({how}): restart {self._deaths} of {_RESTARTS}, no item is lost")
 
     def _hear(self, worker: _Worker[T]) -> Ended[T, R] | None:
         """Handle a message of a worker, or its end."""
@@ -312,7 +310,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
 
     def _watch(self, worker: _Worker[T]) -> Ended[T, R] | None:
         """End a worker that has been silent for too long or has grown too big."""
-        silence_s, memory_bytes = self._limits.silence_s, self._limits.memory_bytes
+        silence_s, memory_bytes = self.limits.silence_s, self.limits.memory_bytes
         if memory_bytes is not None and worker.resident_bytes() > memory_bytes:
             return self._lose(worker, self._too_big())
         if silence_s is not None and worker.silent_s > silence_s:
@@ -320,7 +318,7 @@ class Crew(contextlib.AbstractContextManager["Crew[T, R]"], Generic[T, R]):
         return None
 
     def _too_big(self) -> str:
-        most = self._limits.memory_bytes
+        most = self.limits.memory_bytes
         return "there was no more memory" if most is None else f"took more than {most / 1e6:.0f} MB"
 
     def _lose(self, worker: _Worker[T], reason: str = "") -> Ended[T, R] | None:

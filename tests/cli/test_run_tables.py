@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 from run_report import MAIN, SHA, errors_deg, figures, ran, report, truth
 
 from pdhef_logtool.cli.run_tables import render_fleet, render_run
@@ -16,6 +14,7 @@ from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs.run_result import LogResult, RunResult
+from tests.command_line import rendered
 
 NAMES = [s.name for s in SPECS]
 GOOD = [
@@ -41,9 +40,7 @@ def shown(*reports: dict[str, Any], width: int = 80, failed: str = "") -> str:
     ]
     if failed:
         results.append(LogResult(LogOutcome("bad", "bad.mcap", None, failed=failed), None, None, ()))
-    console = Console(width=width, record=True, file=io.StringIO(), highlight=False, markup=False)
-    render_run(RunResult(Path("out"), tuple(results)), console)
-    return console.export_text()
+    return rendered(render_run, RunResult(Path("out"), tuple(results)), width)
 
 
 def named(name: str, **changes: Any) -> dict[str, Any]:
@@ -127,7 +124,6 @@ def test_estimators_that_were_skipped_are_named_with_the_reason_once() -> None:
 
 
 def test_a_fleet_is_told_in_a_few_lines_within_80_columns() -> None:
-    console = Console(width=80, record=True, file=io.StringIO(), highlight=False, markup=False)
     spread = {"drives": 290, "median_rad": 0.001, "p90_rad": 0.003, "max_rad": 0.01}
     errors_rad = {"pd-hef": 0.01, "zero": 0.2}
     worst = [{"log": f"a_day_in_may__drive_{i:05d}", "main": "pd-hef", "errors_rad": errors_rad} for i in range(10)]
@@ -138,8 +134,7 @@ def test_a_fleet_is_told_in_a_few_lines_within_80_columns() -> None:
         "failed": [{"reason": "expected a log, got a FIFO", "count": 12, "labels": labels}],
         "checks_failed": ["drive_7"], "plan": None,
     }  # fmt: skip
-    render_fleet(summary, console)
-    text = console.export_text()
+    text = rendered(render_fleet, summary)
     assert all(len(line) <= 80 for line in text.splitlines())
     assert rows(text, "answer")[0].split() == ["answer", "290", "0.057", "0.172", "0.573"]
     assert rows(text, "a_day_in_may__drive_00000")[0].split()[1:] == ["pd-hef", "0.573", "11.459"]

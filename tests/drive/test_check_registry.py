@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import xml.etree.ElementTree as ET
@@ -11,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive import checks
@@ -21,6 +19,7 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.inspection import inspect_log
 from studies.documentation_tables import on_page_markdown
+from tests.command_line import rendered
 
 NAME = "speed_m_s.range"
 ENTRY = {
@@ -71,10 +70,8 @@ def test_a_check_is_in_report_terminal_page_junit_and_can_be_waived(
         "remedy": "check the scale of the speed, which should be in m/s",
         "waived": waived,
     }
-    console = Console(width=200, record=True, file=io.StringIO(), highlight=False, markup=False)
-    render_run(result, console)
     word = "waived" if waived else "FAILED"
-    assert f"{word}: {toy}: {check['evidence']}. Remedy: {check['remedy']}" in console.export_text()
+    assert f"{word}: {toy}: {check['evidence']}. Remedy: {check['remedy']}" in rendered(render_run, result, 200)
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert f'<td class="failed">{toy}{" (waived)" if waived else ""}</td><td>{check["evidence"]}</td>' in page
     (found,) = ET.parse(tmp_path / "junit.xml").getroot().iterfind(f".//property[@name='check {toy}']")

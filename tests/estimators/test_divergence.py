@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from dataclasses import fields, replace
@@ -14,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, make_signals
-from rich.console import Console
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
 from pdhef_logtool.cli.run_tables import render_run
@@ -24,6 +22,7 @@ from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.results.run_report import diverged_line, report_markdown
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from tests.command_line import rendered
 from truthsim.drive import simulate_drive, write_drive
 
 pytestmark = pytest.mark.slow
@@ -150,8 +149,7 @@ def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(
     table = pl.read_parquet(folder / "estimates.parquet")
     true = table.filter(pl.col("estimator") == "truth").select("stamp_ns", true="sideslip_rad")
     report = json.loads((folder / "report.json").read_text())
-    text, markdown = io.StringIO(), report_markdown(report)
-    render_run(result, Console(file=text, width=160))
+    text, markdown = rendered(render_run, result, 160), report_markdown(report)
     for name in names[:2]:
         of = table.filter(pl.col("estimator") == name).join(true, on="stamp_ns").sort("stamp_ns")
         beta, truth = np.degrees(of["sideslip_rad"].to_numpy()), np.degrees(of["true"].to_numpy())
@@ -173,7 +171,7 @@ def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(
         assert line.startswith("diverged for ")
         of_log = (spans[0]["start_ns"] - report["log"]["start_ns"]) * 1e-9
         assert f"first at {of_log:.2f} s" in line
-        assert line in text.getvalue()
+        assert line in text
         assert line in markdown
     assert not table.filter(pl.col("estimator") == "zero")["diverged"].any()
     assert diverged_line(report, "zero") == ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import sys
@@ -13,7 +12,6 @@ from pathlib import Path
 import polars as pl
 import pytest
 from mcap.reader import make_reader
-from rich.console import Console
 
 from pdhef_logtool.cli.compare_tables import render_comparison
 from pdhef_logtool.cli.run_tables import render_run
@@ -27,6 +25,7 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
 from studies.documentation_tables import on_page_markdown
+from tests.command_line import rendered
 
 NAME, LABEL = "interval_width", "interval width"
 
@@ -76,10 +75,7 @@ def test_figures_are_in_parquet_json_and_mcap(toy: str, result: RunResult) -> No
 
 
 def test_it_has_a_column_in_the_terminal_and_on_the_page_with_its_definition(toy: str, result: RunResult) -> None:
-    console = Console(width=200, record=True, file=io.StringIO(), highlight=False, markup=False)
-    render_run(result, console)
-    text = console.export_text()
-    assert re.search(r"interval\s*\n?.*width °", text)
+    assert re.search(r"interval\s*\n?.*width °", rendered(render_run, result, 200))
     page = (Path(str(result.place)) / "logs" / "dlc" / "report.html").read_text(encoding="utf-8")
     assert f'<th class="n">{LABEL}</th>' in page
     assert registered()[toy].definition in page
@@ -96,9 +92,7 @@ def test_plans_and_compare_accept_it(toy: str, result: RunResult) -> None:
     (compared,) = found.figures
     assert (compared.verdict, compared.unit, compared.requirement.name) == ("equal", "rad", f"sideslip {LABEL}")
     changed = replace(found, changed=1, figures=(replace(compared, verdict="worse"),))
-    console = Console(width=120, record=True, file=io.StringIO())
-    render_comparison(changed, console)
-    assert f"sideslip {LABEL}" in console.export_text()
+    assert f"sideslip {LABEL}" in rendered(render_comparison, changed, 120)
     assert LABEL.encode() in comparison_page(changed)
 
 

@@ -195,11 +195,10 @@ def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
     }  # fmt: skip
 
 
-def test_a_taught_car_is_calibrated_on_each_drive(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_a_taught_car_is_calibrated_on_each_drive(sample_logs_dir: Path, bare_vehicle: str, tmp_path: Path) -> None:
     car = tmp_path / "car"
     car.mkdir()
-    text = (sample_logs_dir / "vehicle.toml").read_text()
-    (car / "vehicle.toml").write_text(text[: text.index("[network]")] + "\n" + text[text.index("[sensors]") :])
+    (car / "vehicle.toml").write_text(bare_vehicle)
     logs, settings = [str(sample_logs_dir / "dlc.mcap")], ExtractSettings(RunConfig(car=car))
     bare = extract(logs, tmp_path / "bare", settings).manifest
     model = CarModel(physics_sha256=Car.load(car, network="none").physics_sha256)

@@ -9,15 +9,14 @@ from typing import Any
 
 import pytest
 
-from pdhef_logtool.learning.drives import LearnSettings
+from pdhef_logtool.learning.drives import DriveRecord, LearnSettings, exit_code, tell_drive
 from pdhef_logtool.learning.learn import learn
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.records.errors import EXIT_PARTIAL
 from pdhef_logtool.records.reporter import Reporter
+from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-
-pytestmark = pytest.mark.slow
 
 
 def _losses_by_command(log: Path, out: Path, config: RunConfig) -> dict[str, tuple[list[dict[str, Any]], list[str]]]:
@@ -45,6 +44,7 @@ def _losses_by_command(log: Path, out: Path, config: RunConfig) -> dict[str, tup
     return found
 
 
+@pytest.mark.slow
 def test_a_truncated_simulated_log(sample_logs_dir: Path, tmp_path: Path) -> None:
     data = (sample_logs_dir / "road.mcap").read_bytes()
     log = tmp_path / "cut.mcap"
@@ -58,3 +58,17 @@ def test_a_truncated_simulated_log(sample_logs_dir: Path, tmp_path: Path) -> Non
         assert losses == expected, command
         if command != "run":
             assert [text for text in told if text in lost] == lost, command
+
+
+def record(name: str, **changes: Any) -> DriveRecord:
+    return replace(DriveRecord(name, f"{name}.mcap", sha256=name * 64, seconds=6.0, span_s=(1.5, 7.5)), **changes)
+
+
+def test_what_a_user_must_know_of_a_drive_is_told_in_order_and_decides_the_exit_code() -> None:
+    lost = Loss("gap", "2 s are gone", "/imu")
+    note = Loss("late", "late", "/imu", severity="note")
+    told: list[str] = []
+    tell_drive(record("a", notes=("perfect ground truth",), losses=(lost, note), left_out="it is short"), told.append)
+    assert told == ["a: perfect ground truth", "a: 2 s are gone (/imu)", "a is left out: it is short"]
+    good, bad = record("a", losses=(note,)), record("b", left_out="x")
+    assert [exit_code(r) for r in ([good], [good, bad], [good, record("c", losses=(lost,))], [bad])] == [0, 3, 3, 1]

@@ -54,19 +54,14 @@ def recorded(sample_logs_dir: Path) -> tuple[FakeLog, IntArray, FloatArray]:
 
 @pytest.fixture
 def config(
-    recorded: tuple[FakeLog, IntArray, FloatArray],
-    sample_logs_dir: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    recorded: tuple[FakeLog, IntArray, FloatArray], bare_vehicle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> RunConfig:
     monkeypatch.setattr(reading, "open_log", lambda *_, **__: recorded[0])
     monkeypatch.setattr(reading, "identity_of", lambda _: "0" * 64)
     monkeypatch.setattr(reading, "check_unchanged", lambda *_: None)
     (tmp_path / "drive.mcap").write_bytes(b"in memory")
     (tmp_path / "m.toml").write_text(MAPPING)
-    text = (sample_logs_dir / "vehicle.toml").read_text()
-    head, _, rest = text.partition("[network]")
-    (tmp_path / "vehicle.toml").write_text(head + rest[rest.index("[sensors]") :])
+    (tmp_path / "vehicle.toml").write_text(bare_vehicle)
     return RunConfig(car=tmp_path / "vehicle.toml", mapping=tmp_path / "m.toml", reference="on")
 
 

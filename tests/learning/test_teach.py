@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.model import read_model
@@ -24,17 +22,16 @@ from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.model.priors import REAR_STIFFNESS, TYRES, prior_of
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.runs.config import RunConfig
+from tests.command_line import rendered
 
 SPAN = {"start": "60", "end": "130"}
 
 
 @pytest.fixture(scope="module")
-def bare(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bare(bare_vehicle: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the vehicle file of the sample logs with a front axle that is too soft, and without a network."""
-    text = (sample_logs_dir / "vehicle.toml").read_text()
-    head, _, rest = text.partition("[network]")
     path = tmp_path_factory.mktemp("car") / "vehicle.toml"
-    path.write_text(head + rest[rest.index("[sensors]") :].replace("B = 11.146", "B = 7.0"))
+    path.write_text(bare_vehicle.replace("B = 11.146", "B = 7.0"))
     return path
 
 
@@ -79,9 +76,7 @@ def test_the_figures_say_which_rung_is_used(result: LearnResult) -> None:
     figures = result.figures
     assert [t["rung"] for t in figures["rungs"]][:2] == ["none", "linear"]
     assert figures["rung"] in ("none", "linear", "random") and figures["evidence"] in result.text
-    console = Console(width=150, record=True, file=io.StringIO())
-    render_learning(result, console)
-    text = console.export_text()
+    text = rendered(render_learning, result, 150)
     assert "held-out" in text and "1 drive;" in text
     model = read_model(result.car / MODEL_FILE)
     assert [d.name for d in model.drives] == ["road"] and model.evidence == figures["evidence"]

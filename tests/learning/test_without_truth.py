@@ -26,12 +26,10 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def config(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> RunConfig:
+def config(bare_vehicle: str, tmp_path_factory: pytest.TempPathFactory) -> RunConfig:
     """Return the sample logs' car with a front axle that is half as stiff."""
-    text = (sample_logs_dir / "vehicle.toml").read_text()
-    head, _, rest = text.partition("[network]")
     path = tmp_path_factory.mktemp("car") / "vehicle.toml"
-    path.write_text(head + rest[rest.index("[sensors]") :].replace("B = 11.146", "B = 5.6"))
+    path.write_text(bare_vehicle.replace("B = 11.146", "B = 5.6"))
     return RunConfig(car=path)
 
 

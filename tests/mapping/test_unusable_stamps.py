@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
 
 from pdhef_logtool.mapping import Mapping, SignalSource, fit_clocks, read_signals
 from pdhef_logtool.mapping.clocks import why_unusable, with_usable_stamps
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.runs.inspection import inspect_drive_log, render_inspection
 from pdhef_logtool.runs.inspection.step_statistics import Steps
+from tests.command_line import rendered
 
 MS, S = 1_000_000, 1_000_000_000
 T0 = 1_700_000_000 * S
@@ -192,9 +190,7 @@ def test_a_delay_of_another_clock_is_named_and_not_shown_as_a_delay() -> None:
         stamps = T0 + count * 10 * MS - offset
         fields = {"header.stamp": stamps, "angular_velocity.z": np.sin(count * 0.01)}
         log = FakeLog({"/imu": FakeTopic("sensor_msgs/msg/Imu", T0 + count * 10 * MS, fields, publish_time_ns=stamps)})
-        out = io.StringIO()
-        render_inspection(inspect_drive_log(log), Console(file=out, width=120, no_color=True))
-        text[name] = out.getvalue()
+        text[name] = rendered(render_inspection, inspect_drive_log(log), 120)
     assert "simulation clock" in text["simulation"]
     assert "other clock" in text["boot"]
     assert "clock" not in text["arrival"].split("Mapping")[0]

@@ -41,14 +41,16 @@ def cars_of(fleet: Path, table: str, **changes: Any) -> dict[str, str]:
 EACH = {"golf_1": "golf", "mini_1": "mini"}
 
 
-def test_the_deepest_folder_names_the_car(fleet: Path) -> None:
-    text = '[folders]\n"fleet" = "mini.toml"\n"fleet/golf" = "golf.toml"\n'
-    assert cars_of(fleet, text) == EACH
-
-
-def test_a_name_or_pattern_wins_and_the_rest_takes_the_default(fleet: Path) -> None:
-    text = 'default = "mini.toml"\n[logs]\n"golf_*.mcap" = "golf.toml"\n[folders]\n"fleet/golf" = "mini.toml"\n'
-    assert cars_of(fleet, text) == EACH
+@pytest.mark.parametrize(
+    "table",
+    [
+        '[folders]\n"fleet" = "mini.toml"\n"fleet/golf" = "golf.toml"\n',
+        'default = "mini.toml"\n[logs]\n"golf_*.mcap" = "golf.toml"\n[folders]\n"fleet/golf" = "mini.toml"\n',
+    ],
+    ids=["the deepest folder", "a pattern before folders, and the default"],
+)
+def test_an_entry_names_the_car(fleet: Path, table: str) -> None:
+    assert cars_of(fleet, table) == EACH
 
 
 def test_the_metadata_of_a_log_names_its_car(fleet: Path, sample_logs_dir: Path) -> None:

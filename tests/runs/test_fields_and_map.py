@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
 from pdhef_logtool.records.errors import UsageError
@@ -20,12 +18,7 @@ from pdhef_logtool.runs.inspection import (
     render_inspection,
     write_mapping,
 )
-
-
-def text_of(render: object, found: object, width: int = 80) -> str:
-    out = io.StringIO()
-    render(found, Console(file=out, width=width, highlight=False))  # type: ignore[operator]
-    return out.getvalue()
+from tests.command_line import rendered
 
 
 def sources(*names: str) -> dict[str, SignalSource]:
@@ -42,7 +35,7 @@ def test_covariances_do_not_hide_the_gyro(sample_logs_dir: Path) -> None:
     assert gravity.type == "float64"
     assert gravity.minimum <= gravity.mean <= gravity.maximum
     assert found.whole
-    text = text_of(render_fields, found)
+    text = rendered(render_fields, found)
     assert max(map(len, text.splitlines()[1:])) <= 80
     json.dumps(found.to_dict(), allow_nan=False)
 
@@ -56,7 +49,7 @@ def test_all_topics_are_listed_and_a_wrong_one_is_refused(sample_logs_dir: Path)
 
 def test_estimators_that_can_run(sample_logs_dir: Path) -> None:
     found = inspect_log(sample_logs_dir / "dlc.mcap")
-    assert "can run" in text_of(render_inspection, found, 200)
+    assert "can run" in rendered(render_inspection, found, 200)
     for signals, able in (
         ((), ()),
         (("ax_m_s2", "speed_m_s"), ()),
@@ -73,7 +66,7 @@ def test_missing_signals_are_named_and_doubtful_candidates_stand_in_the_file_as_
     shared_dir: Path, tmp_path: Path
 ) -> None:
     found = inspect_log(shared_dir / "reader_corpus" / "dart_ros1" / "4_sept_random_driving_fast.bag")
-    text = text_of(render_inspection, found, 200)
+    text = rendered(render_inspection, found, 200)
     assert "speed_m_s" in next(line for line in text.splitlines() if line.startswith("missing"))
     assert "pdhef map LOG" in text
     write_mapping(found, tmp_path / "m.toml")

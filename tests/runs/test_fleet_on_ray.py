@@ -20,18 +20,9 @@ from pdhef_logtool.runs.fleet import Schedule, run_logs
 from pdhef_logtool.runs.working import DriveTask, run_on_node
 from pdhef_logtool.workers.supervisor import Limits
 from tests.runs.stub_drives import stub_drive, waiting_drive
-from tests.runs.test_fleet_runs import named_logs
+from tests.runs.test_fleet_runs import contents, named_logs
 from tests.s3_store import s3_store
 from tests.workers.ray_nodes import START_S, cluster_of_one, grow, processes_of
-
-
-def files_of(output: Path) -> dict[str, bytes]:
-    """Return the files of a run that contain no time."""
-    return {
-        p.relative_to(output).as_posix(): p.read_bytes()
-        for p in sorted(output.rglob("*"))
-        if p.is_file() and p.name not in ("run.json", "journal.jsonl")
-    }
 
 
 @pytest.mark.fleet
@@ -70,8 +61,8 @@ def test_a_fleet_on_three_nodes_one_of_which_goes_equals_one_here(
     assert result.exit_code == 0
     assert [log.label for log in open_run(Path("out")).logs] == sorted(f"drive_{i}" for i in range(12))
     run(output=Path("here"), work=stub_drive)
-    assert files_of(Path("out")) == files_of(Path("here"))
-    assert METRICS_FILE in files_of(Path("out"))
+    assert contents(Path("out"), "run.json") == contents(Path("here"), "run.json")
+    assert METRICS_FILE in contents(Path("out"), "run.json")
     again = Schedule(ray="127.0.0.1:1", resume=True)
     assert run(output=Path("out"), schedule=again, work=work).exit_code == 0, (
         "nothing is left to do: no cluster is asked for"
@@ -92,13 +83,13 @@ def test_a_fleet_on_a_cluster_whose_output_is_in_a_store_equals_one_here(
         found = store.objects("out")
     run(output=tmp_path / "out")
     timed = ("run.json", "journal.jsonl")
-    assert {name: data for name, data in found.items() if name not in timed} == files_of(tmp_path / "out")
+    assert {name: data for name, data in found.items() if name not in timed} == contents(tmp_path / "out", "run.json")
 
 
 def test_an_output_that_a_node_does_not_see_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (log,) = find_logs([str(named_logs(tmp_path / "logs", "a"))])
-    task = DriveTask(log, Path("out"), RunConfig(), "", default_plan(), page=False, run="")
+    task = DriveTask(log, Path("out"), RunConfig(), default_plan(), page=False, run="")
     told = run_on_node(stub_drive, tmp_path, True, task, lambda *_: None)
     assert isinstance(told, OutputError)
     assert "a folder that all nodes of the cluster see" in str(told)

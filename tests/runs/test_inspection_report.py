@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
-from rich.console import Console
 
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.inspection import inspect_drive_log, inspect_log, render_inspection, write_mapping
+from tests.command_line import rendered
+from tests.runs.wrong_mapping import wrong_sign
 
 T0 = 1_700_000_000_000_000_000
 
@@ -39,12 +42,6 @@ def small_log(n: int = 3000, period_ms: int = 10) -> FakeLog:
     vendor = FakeTopic("vendor_msgs/msg/Box", stamps[::10] + 3_000_000, {"speed_kmh": np.full(len(stamps[::10]), 50.0)})
     lost = (Loss("truncated", "the file ends early", "memory.mcap", start_ns=int(stamps[-1])),)
     return FakeLog({"/imu": imu, "/vendor": vendor}, lost=lost)
-
-
-def text_of(inspection: object, width: int) -> str:
-    out = io.StringIO()
-    render_inspection(inspection, Console(file=out, width=width, no_color=True))  # type: ignore[arg-type]
-    return out.getvalue()
 
 
 def test_topics_are_measured() -> None:
@@ -91,12 +88,12 @@ def test_an_empty_log_is_reported() -> None:
     found = inspect_drive_log(FakeLog({}))
     assert found.topics == ()
     json.dumps(found.to_dict(), allow_nan=False)
-    assert "missing" in text_of(found, 80)
+    assert "missing" in rendered(render_inspection, found, 80)
 
 
 @pytest.mark.parametrize("width", [80, 120])
 def test_tables_fit_and_say_what_matters(width: int) -> None:
-    text = text_of(inspect_drive_log(small_log()), width)
+    text = rendered(render_inspection, inspect_drive_log(small_log()), width)
     assert max(len(line) for line in text.splitlines()) <= width
     for part in (
         "/imu",
@@ -123,6 +120,27 @@ def test_the_written_mapping_loads_and_names_the_candidates(tmp_path: Path) -> N
     assert "/vendor (vendor_msgs/msg/Box): speed_kmh" in text
     assert "# sensor_msgs/msg/Imu, 100 Hz, " in text
     assert [p.name for p in tmp_path.iterdir()] == ["m.toml"]
+
+
+def test_a_drive_has_its_checks_and_tells_the_failed_ones(sample_logs_dir: Path, tmp_path: Path) -> None:
+    told: list[str] = []
+    log, car = sample_logs_dir / "sweep.mcap", Car.load(sample_logs_dir / "vehicle.toml")
+    mapping = load_mapping(wrong_sign(log, tmp_path))
+    options = ReadOptions(waived=("steer_rad.sign", "steer.sign"))
+    with read_drive(log, car, mapping, options, tell=told.append) as drive:
+        (failed,) = (c for c in drive.checks if c.verdict == "failed")
+    assert (failed.name, failed.waived) == ("steer_rad.sign", True)
+    assert any("check steer_rad.sign failed (waived)" in text for text in told)
+    assert any("--waive steer.sign: no check of this log is called that" in text for text in told)
+
+
+def test_inspecting_shows_checks_of_the_same_names(sample_logs_dir: Path, tmp_path: Path) -> None:
+    log = sample_logs_dir / "sweep.mcap"
+    found = inspect_log(log, load_mapping(wrong_sign(log, tmp_path)))
+    assert [c.name for c in found.checks if c.verdict == "failed"] == ["steer_rad.sign"]
+    assert not found.is_partial
+    (check,) = (c for c in json.loads(json.dumps(found.to_dict()))["checks"] if c["verdict"] == "failed")
+    assert check["subject"] == "steer_rad"
 
 
 # --------------------------------------------------------------------------------------------- real drives

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import html
-import io
 import json
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.reports.drive import drive_page
@@ -21,6 +20,7 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.recorded_estimates import score_log
 from pdhef_logtool.runs.run_result import RunResult
+from tests.command_line import rendered
 from tests.run_report import follows
 from tests.runs.wrong_mapping import wrong_sign
 
@@ -68,9 +68,7 @@ def test_the_document_of_ten_seconds_is_short(
 
 def told(result: RunResult) -> list[str]:
     """Return the assumptions and failed checks that the terminal names, one by one."""
-    out = io.StringIO()
-    render_run(result, Console(file=out, width=5000))
-    lines = [line.strip() for line in out.getvalue().splitlines()]
+    lines = [line.strip() for line in rendered(render_run, result, 5000).splitlines()]
     assumed = [line.partition("Assumed")[2].strip() for line in lines if line.startswith("Assumed")]
     assert assumed
     return [
@@ -113,3 +111,28 @@ def test_the_page_of_a_step_has_its_key_figures_of_estimate_and_ground_truth(
     text = words(drive_page(log).html.decode()).partition("Key figures of manoeuvres")[2]
     times = re.search(r"^ truth pd-hef physics zero yaw rate: response time ms ([\d.]+) ([\d.]+)", text)
     assert times is not None and 50.0 < float(times[1]) == pytest.approx(float(times[2]), abs=10.0)
+
+
+@pytest.mark.slow
+def test_a_drive_with_truth_has_all_of_it(sample_logs_dir: Path, tmp_path: Path) -> None:
+    plan = tmp_path / "plan.toml"
+    plan.write_text('[[requirement]]\nid = "a"\nsignal = "sideslip_rad"\nlimit_deg = 90.0\n')
+    config = RunConfig(car=Path("saloon"), keep="estimates", plan=plan, start="+60", end="+130")
+    run_logs([str(sample_logs_dir / "road.mcap")], tmp_path / "out", config, report=False)
+    report = json.loads((tmp_path / "out/logs/road/report.json").read_text())
+    follows(report)
+    of_run = json.loads((tmp_path / "out" / "run.json").read_text())
+    figure = {(m["estimator"], m["signal"], m["metric"], m["segment"]): m["value"] for m in report["metrics"]}
+    low, high = report["answer"]["sideslip_rmse_ci_rad"]
+    assert low < figure["pd-hef", "sideslip_rad", "rmse", "all"] < high
+    assert f"(95 % CI {math.degrees(low):.3f}° to {math.degrees(high):.3f}°; " in report["answer"]["texts"]["result"]
+    assert report["plan"]["requirements"][0]["outcome"] == "PASS"
+    (judged,) = of_run["plan"]["requirements"]
+    assert (judged["outcome"], judged["basis"], judged["units"]) == ("PASS", "blocks", 7)
+    assert judged["exposure"]["minutes"] == pytest.approx(62.5 / 60.0, rel=0.02)  # of 70 s
+    largest = report["largest_errors"][0]
+    assert abs(largest["error_rad"]) <= figure["pd-hef", "sideslip_rad", "max_abs", "all"] * 1.001
+    assert all(place["stamp_ns"] >= report["log"]["start_ns"] + 2e9 for place in report["largest_errors"])
+    seconds = sum(c["seconds"] for c in report["operating_space"]["cells"])
+    assert seconds == pytest.approx(report["log"]["duration_s"], rel=0.05)
+    assert report["metadata"]

@@ -14,6 +14,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.presets import OPEN_LOOP
 from pdhef_logtool.estimators.table import SPECS, all_names
 from pdhef_logtool.records.errors import LogError, MappingError, UsageError, VehicleError
+from pdhef_logtool.runs import scoring
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from tests.run_report import follows
@@ -163,8 +164,6 @@ def test_wrong_files_for_all_logs_stop_the_run_before_it_starts(sample_logs_dir:
 def test_an_error_half_way_keeps_the_outputs_of_the_run_before(
     sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pdhef_logtool.evaluation import metrics
-
     log = str(sample_logs_dir / "dlc.mcap")
     config = _config(sample_logs_dir, estimators=("zero",))
     run_logs([log], tmp_path, config)
@@ -173,7 +172,7 @@ def test_an_error_half_way_keeps_the_outputs_of_the_run_before(
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("broken on purpose")
 
-    monkeypatch.setattr(metrics, "evaluate_drive", broken)
+    monkeypatch.setattr(scoring, "evaluate_drive", broken)
     with pytest.raises(RuntimeError, match="on purpose"):
         run_logs([log], tmp_path, config)
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
+from reference_car import signals_at
 
 from pdhef_logtool.cli import console
 from pdhef_logtool.cli.running import _finish
@@ -21,7 +22,10 @@ from pdhef_logtool.runs import preparing
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
+from pdhef_logtool.runs.scoring import why_silent
 from studies.torture.hours import Drive, read_samples, write_samples
+
+SAID = "has no valid row although the car moves: its signals are there, but the estimator marks none as valid"
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ def test_an_estimator_without_a_valid_row_while_the_car_moves(tmp_path: Path, sa
     assert result.exit_code == 3
     assert log.report is not None
     silent = [x["what"] for x in log.report["losses"] if x["kind"] == "no-valid-row"]
-    assert silent == ["silent has no valid row although the car moves"]
+    assert silent == [f"silent {SAID}"]
 
 
 @pytest.mark.usefixtures("silenced")
@@ -93,7 +97,15 @@ def test_no_valid_row_of_any_estimator_fails_and_keeps_the_report(
     with pytest.raises(typer.Exit) as left:
         _finish(result)
     assert left.value.exit_code == 1
-    assert capsys.readouterr().err == "pdhef: odd: no estimator has a valid row although the car moves\n"
+    said = f"no estimator {SAID.replace('no', 'a', 1)}"
+    assert capsys.readouterr().err == f"pdhef: odd: {said}\n"
+
+
+def test_a_signal_that_ends_before_the_car_moves_is_named_as_the_cause() -> None:
+    stamps = np.arange(200, dtype=np.int64) * 10_000_000
+    moving = stamps > stamps[99]
+    signals = signals_at(stamps, ay_m_s2=np.where(moving, np.nan, 0.1), yaw_rate_rad_s=0.1, speed_m_s=10.0)
+    assert why_silent(signals, moving) == "no samples of ay_m_s2 while it does"
 
 
 @pytest.mark.parametrize(("share", "code"), [(0.005, 0), (0.03, 3)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.records.reasons import STUCK_AY
@@ -19,6 +17,7 @@ from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.run_result import RunResult
+from tests.command_line import rendered
 from tests.run_report import follows
 
 pytestmark = pytest.mark.slow
@@ -72,8 +71,6 @@ def test_the_track_has_the_bit_where_the_sensor_stuck_and_nowhere_else(
 
 
 def test_the_terminal_says_it_in_one_line(result: RunResult) -> None:
-    out = io.StringIO()
-    render_run(result, Console(file=out, width=200))
-    (line,) = [one for one in out.getvalue().splitlines() if "a_y stuck" in one]
+    (line,) = [one for one in rendered(render_run, result, 200).splitlines() if "a_y stuck" in one]
     assert line.strip().startswith("faults of the sensors: ")
     assert told(line) == pytest.approx((START_S, END_S), abs=0.11)

@@ -33,12 +33,10 @@ NAMES = ("zero", "open-loop", "open-loop:calibrated", "phy-ukf", "physics")
 
 
 @pytest.fixture(scope="module")
-def wrong_car(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wrong_car(bare_vehicle: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bare vehicle file of the sample logs' car with half the front axle stiffness."""
-    text = (sample_logs_dir / "vehicle.toml").read_text()
-    head, _, rest = text.partition("[network]")
     path = tmp_path_factory.mktemp("car") / "vehicle.toml"
-    path.write_text(head + rest[rest.index("[sensors]") :].replace("B = 11.146", "B = 5.6"))
+    path.write_text(bare_vehicle.replace("B = 11.146", "B = 5.6"))
     return path
 
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from pdhef_logtool.logs.byte_source import LocalFile
 from pdhef_logtool.logs.mcap_index import read_index
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.runs.inspection import fields_of_log, inspect_log, render_inspection
 from pdhef_logtool.runs.inspection.report import Inspection
+from tests.command_line import rendered
 from tests.counting_server import serving
 
 S = 1_000_000_000
@@ -30,12 +29,6 @@ def _small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pdhef_logtool.mapping.clocks.SURVEY_WINDOWS", 4)
     monkeypatch.setattr("pdhef_logtool.mapping.clocks.SURVEY_WINDOW_NS", 3 * S)
     monkeypatch.setattr("pdhef_logtool.mapping.evidence.PIECES", 3)
-
-
-def _text(found: Inspection, width: int = 80) -> str:
-    out = io.StringIO()
-    render_inspection(found, Console(file=out, width=width, no_color=True))
-    return out.getvalue()
 
 
 def _by_times(found: Inspection) -> list[dict[str, object]]:
@@ -63,10 +56,10 @@ def test_a_sample_tells_what_the_whole_tells(sample_logs_dir: Path) -> None:
         assert report.rate_hz == pytest.approx(whole.signals[name].rate_hz)
         assert report.gaps == 0, "what lies between two windows is no gap"
     line = f"values from {some.sample.chunks} of 41 chunks, counts and rates from the index; --all reads"
-    assert line in " ".join(_text(some).split())
+    assert line in " ".join(rendered(render_inspection, some).split())
     assert some.to_dict()["sample"] == {"chunks": some.sample.chunks, "of_chunks": 41, "times": "index"}
     assert whole.to_dict()["sample"] is None
-    assert "--all" not in _text(whole)
+    assert "--all" not in rendered(render_inspection, whole)
 
 
 def test_a_small_log_is_read_whole(sample_logs_dir: Path) -> None:

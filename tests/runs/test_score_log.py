@@ -80,6 +80,21 @@ def test_state_topic_gives_the_figures_of_the_run_that_wrote_it(annotated: Path,
         assert again[key][0] == (value if value is None else pytest.approx(value, rel=1e-3, abs=1e-6)), key
 
 
+def test_key_figures_of_manoeuvres_are_those_of_the_run(sample_logs_dir: Path, tmp_path: Path) -> None:
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", estimators=("zero",))
+    run_logs([str(sample_logs_dir / "step.mcap")], tmp_path, config)
+
+    def steps(metrics: list[dict[str, Any]]) -> dict[Key, float]:
+        chosen = [m for m in metrics if m["metric"].startswith("step_")]
+        return {(m["estimator"], m["signal"], m["metric"]): m["value"] for m in chosen}
+
+    of_run = steps(pl.read_parquet(tmp_path / "logs/step/metrics.parquet").to_dicts())
+    (log,) = score_log(str(tmp_path / "logs/step/annotated.mcap"), config, estimates=["/pdhef/zero/state"]).results
+    assert log.report is not None
+    assert steps(log.report["metrics"]) == pytest.approx(of_run, rel=1e-5)
+    assert {estimator for estimator, *_ in of_run} == {"zero", "truth"}
+
+
 @pytest.mark.slow
 def test_named_fields_and_a_table_with_scale_give_the_same(
     annotated: Path, sample_logs_dir: Path, tmp_path: Path, config: RunConfig
@@ -101,7 +116,7 @@ def test_named_fields_and_a_table_with_scale_give_the_same(
         assert _value(both, "sideslip_rad", metric, "same") == expected
     assert _value(named, "sideslip_rad", "coverage95") == _value(whole, "sideslip_rad", "coverage95")
     assert _value(both, "sideslip_rad", "rmse", "turned") > 2.0 * _value(both, "sideslip_rad", "rmse", "same")
-    assert {m["estimator"] for m in _scored(annotated, tables, name="same")["metrics"]} == {"same"}
+    assert {m["estimator"] for m in _scored(annotated, tables, name="same")["metrics"]} == {"same", "sensors"}
     with pytest.raises(UsageError, match="turned"):
         _scored(annotated, tables, name="third")
 
@@ -175,7 +190,8 @@ def test_an_estimate_that_is_the_truth_is_marked(annotated: Path, config: RunCon
     report = _scored(annotated, config, "/truth/perfect/odometry", name="copy")
     dependent = {m["signal"] for m in report["metrics"] if m["metric"] == "not_independent"}
     assert dependent == {"vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad"}
-    assert set(report["truth"]["not_independent"]) >= dependent
+    marked = {m["signal"] for m in report["metrics"] if not m["independent"]}
+    assert set(report["truth"]["not_independent"]) == marked >= dependent
     honest = _scored(annotated, config, "/pdhef/phy_ukf/state")
     assert "not_independent" not in {m["metric"] for m in honest["metrics"]}
 

@@ -20,7 +20,7 @@ from pdhef_logtool.storage.object_store import LEFT_OVER_S, HeldError
 from pdhef_logtool.storage.outputs import LOCK_FILE
 from pdhef_logtool.workers.supervisor import Tell
 from tests.runs.stub_drives import stub_drive
-from tests.runs.test_fleet_runs import Counted, named_logs, run
+from tests.runs.test_fleet_runs import Counted, contents, named_logs, run
 from tests.s3_store import S3Store, forget_file_systems, s3_store
 
 #: Files with times or locations of logs.
@@ -51,16 +51,11 @@ def stored(store: Any, url: str = URL) -> dict[str, bytes]:
     return {path.removeprefix(root): store.cat_file(path) for path in store.find(root) if Path(path).name not in TIMED}
 
 
-def local(output: Path) -> dict[str, bytes]:
-    files = [p for p in output.rglob("*") if p.is_file() and p.name not in TIMED]
-    return {p.relative_to(output).as_posix(): p.read_bytes() for p in sorted(files)}
-
-
 def test_a_store_has_what_a_folder_has_and_is_gone_on_with(tmp_path: Path, memory: Any) -> None:
     logs, work = named_logs(tmp_path / "logs", "a", "b"), Counted()
     result = run(logs, URL, work=work)
     run(logs, tmp_path / "out")
-    assert stored(memory) == local(tmp_path / "out")
+    assert stored(memory) == contents(tmp_path / "out", "run.json")
     assert result.to_dict()["output"] == URL
     assert result.to_dict()["logs"][0]["output"] == f"{URL}/logs/a"
     assert result.results[0].report == {"format": "pdhef.report", "log": {"name": "a"}}
@@ -69,7 +64,7 @@ def test_a_store_has_what_a_folder_has_and_is_gone_on_with(tmp_path: Path, memor
     run(logs, URL, work=work, resume=True, say=said.append)
     run(logs, tmp_path / "out", resume=True)
     assert work.asked == ["a", "b", "c"], "only the new log"
-    assert (said, stored(memory)) == ([], local(tmp_path / "out"))
+    assert (said, stored(memory)) == ([], contents(tmp_path / "out", "run.json"))
     opened = open_run(URL)
     assert (opened.place, [log.label for log in opened.logs]) == (URL, ["a", "b", "c"])
     assert opened.logs[2].report() == {"format": "pdhef.report", "log": {"name": "c"}}
@@ -124,7 +119,7 @@ def test_a_store_that_fails_ends_the_run_and_what_is_put_counts(
     assert (raised.value.exit_code, work.asked) == (1, ["a", "b"]), "the third log is not started"
     run(logs, URL, work=work, resume=True)
     run(logs, tmp_path / "out")
-    assert (work.asked[2:], stored(memory)) == (["b", "c"], local(tmp_path / "out"))
+    assert (work.asked[2:], stored(memory)) == (["b", "c"], contents(tmp_path / "out", "run.json"))
 
 
 def test_one_command_at_a_time_holds_the_place(tmp_path: Path, memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:

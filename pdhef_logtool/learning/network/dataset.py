@@ -74,20 +74,16 @@ def write_drive(
         When the file cannot be written.
     """
     schema = arrow_schema(_SCHEMA)
-    with parquet_writer(path, schema, ["segment"]) as writer:
-        writer.write_table(_table(rows, chosen, truth_source, schema), row_group_size=ROWS_A_GROUP)
-        writer.add_key_value_metadata({_ENTRY.decode(): json.dumps(seal(entry), sort_keys=True)})
-
-
-def _table(rows: ResidualRows, chosen: BoolArray, truth_source: str, schema: pa.Schema) -> pa.Table:
     columns: dict[str, Any] = {name: rows.features[:, i] for i, name in enumerate(FEATURES)}
     columns |= {name: rows.targets[:, i] for i, (name, _) in enumerate(TARGETS)}
     columns |= {name: rows.truth_velocity[:, i] for i, name in enumerate(TRUTH)}
     columns |= {"stamp_ns": rows.stamps_ns, "weight": rows.weight, "segment": rows.segment.astype(np.int32)}
     columns |= {"truth_std_rad": rows.truth_std_rad, "chosen": chosen}
     columns |= {"truth_source": np.full(len(rows), truth_source)}
-    arrays = [arrow_array(columns[f.name], f.type) for f in schema]
-    return pa.Table.from_arrays(arrays, schema=schema)
+    table = pa.Table.from_arrays([arrow_array(columns[f.name], f.type) for f in schema], schema=schema)
+    with parquet_writer(path, schema, ["segment"]) as writer:
+        writer.write_table(table, row_group_size=ROWS_A_GROUP)
+        writer.add_key_value_metadata({_ENTRY.decode(): json.dumps(seal(entry), sort_keys=True)})
 
 
 def read_entry(path: Path) -> dict[str, Any] | None:

@@ -68,6 +68,7 @@ from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, PHYSICS_MODEL
 from pdhef_logtool.results.condition import parse_condition
 from pdhef_logtool.results.run_report import tool_versions
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.reporting import FleetProgress
 from pdhef_logtool.storage.documents import digest
 from pdhef_logtool.storage.files import writing
 from pdhef_logtool.storage.outputs import OutputFolder, check_no_input, local_path
@@ -345,17 +346,13 @@ def _plan_jobs(
     resume: bool,
     warn: Tell,
 ) -> Iterator[_Job]:
-    cars, manifests = cache(_car), cache(set_manifest)
+    cars, manifests = cache(partial(Car.load, network=NO_MODEL)), cache(set_manifest)
     listed = [_listed(i, manifests(i.folder)) for i in inputs]
     for log_input, (split, vehicle) in zip(inputs, listed, strict=True):
         car = cars(settings.config.car or vehicle)
         yield _Job(log_input, output, settings, car, mapping, split, resume)
     if settings.config.car is None and any(vehicle is None for _, vehicle in listed):
         warn(f"no --car: residuals refer to the default {cars(None).vehicle.name}")
-
-
-def _car(path: Path | None) -> Car:
-    return Car.load(path, network=NO_MODEL)
 
 
 def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[DriveResult, ...]:
@@ -365,22 +362,21 @@ def _extract_all(work: Sequence[_Job], jobs: int, reporter: Reporter) -> tuple[D
         tell_drive(result.record, reporter.warn)
         return (result,)
     results: dict[int, DriveResult] = {}
-    shares: dict[int, float] = {}
-
-    def told(number: int, name: str, share: float) -> None:
-        shares[number] = share
-        reporter.progress(name, sum(shares.values()) / len(work))
-
-    preload = (__name__, *FILTERS)
+    progress, preload = FleetProgress(reporter.progress, len(work)), (__name__, *FILTERS)
     ends = supervise(
-        _extract_guarded, work, jobs=min(jobs, len(work)), preload=preload, progress=told, warn=reporter.warn
+        _extract_guarded,
+        work,
+        jobs=min(jobs, len(work)),
+        preload=preload,
+        progress=progress.update,
+        warn=reporter.warn,
     )
     with closing(ends):
         for ended in ends:
             result = ended.result or _failure(ended.item, ended.failure.reason if ended.failure else "")
             results[ended.number] = result
             tell_drive(result.record, reporter.warn)
-            told(ended.number, result.record.name, 1.0)
+            progress.end(ended.number)
     return tuple(results[number] for number in range(len(work)))
 
 
@@ -409,12 +405,11 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         drive.plan = plan = _strict_truth(drive.plan)
         reference, _ = teaching_reference(drive, settings.config)
         _check_plan(plan, job, estimated=reference is not None)
-        smoothing = _choose_smoothing(plan)
-        truth = _truth_facts(plan, smoothing, estimated=reference is not None)
+        truth = _truth_facts(plan, estimated=reference is not None)
         model, calibration = _in_service(drive, job)
         physics = filter_of(model.car.calibrated_car, settings.model, use_speed=drive.options.use_speed)
         drive.friction = friction_of(plan, physics.vehicle, drive.options, of_truth=True)
-        rows = _residuals(drive, physics, smoothing, model, reference)
+        rows = _residuals(drive, physics, truth, model, reference)
         if not len(rows):
             raise no_samples(job.log_input.path)
         chosen = _chosen(rows, settings.where)
@@ -468,27 +463,20 @@ def _kept(job: _Job, target: Path, source: str, split: str, fingerprint: str) ->
 
 
 def _residuals(
-    drive: Drive,
-    physics: VehicleUkf,
-    smoothing: _Smoothing,
-    model: DriveModel,
-    reference: TruthAt | None,
+    drive: Drive, physics: VehicleUkf, facts: Mapping[str, Any], model: DriveModel, reference: TruthAt | None
 ) -> ResidualRows:
-    """Return the residuals of a drive."""
+    """Return the residuals of a drive; ``facts`` on its ground truth."""
     whole = drive.whole()
     truth = whole.truth if reference is None else reference(whole.signals.stamps_ns)
     assert truth is not None, "the plan of the drive derives it"
-    period_s = drive.plan.alignment.grid_period_s
-    half_window = round(smoothing.half_s / period_s)
-    is_physics = physics.equations == "forces"
-    noise = smoothing.noise[0] * period_s / math.sqrt(2.0)  # of v_y itself
+    period_s, noise = drive.plan.alignment.grid_period_s, facts["difference_noise"]["vy_dot_m_s2"] or 0.0
     return residual_rows(
-        model.apply(whole.signals).calibrated if is_physics else whole.signals,
+        model.apply(whole.signals).calibrated if physics.equations == "forces" else whole.signals,
         truth,
         physics,
         period_s=period_s,
-        half_window=half_window,
-        truth_std_m_s=noise if math.isfinite(noise) else 0.0,
+        half_window=round(facts["smoothing_half_s"] / period_s),
+        truth_std_m_s=noise * period_s / math.sqrt(2.0),  # of v_y itself
     )
 
 
@@ -543,37 +531,22 @@ def _check_plan(plan: DrivePlan, job: _Job, *, estimated: bool = False) -> None:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class _Smoothing:
-    half_s: float
-    reason: str
-    noise: tuple[float, float]
-
-
-def _choose_smoothing(plan: DrivePlan) -> _Smoothing:
-    """Decide by the survey whether one-step differences of the ground truth need smoothing."""
-    truth = derive_truth(plan.survey_truth, plan=plan.truth).track
-    noise = (
-        difference_noise(truth.stamps_ns, truth.vy_m_s),
-        difference_noise(truth.stamps_ns, truth.yaw_rate_rad_s),
-    )
-    said = f"one-step noise of the ground truth {noise[0]:.3g} m/s² and {noise[1]:.3g} rad/s²"
-    limits = f"{NEGLIGIBLE_NOISE[0]:g} m/s² and {NEGLIGIBLE_NOISE[1]:g} rad/s²"
-    if all(n <= limit for n, limit in zip(noise, NEGLIGIBLE_NOISE, strict=True)):  # False for NaN
-        return _Smoothing(0.0, f"{said}: within {limits}", noise)
-    return _Smoothing(SMOOTHING_HALF_S, f"{said}: not within {limits}", noise)
-
-
-def _truth_facts(plan: DrivePlan, smoothing: _Smoothing, *, estimated: bool = False) -> dict[str, Any]:
+def _truth_facts(plan: DrivePlan, *, estimated: bool = False) -> dict[str, Any]:
+    """Return the entry on the ground truth: by the survey, whether its one-step differences need smoothing."""
     topics = {s.topic for s in plan.mapping.truth.values()}
     perfect = bool(topics) and all(t.startswith(PERFECT_PREFIX) for t in topics)
+    truth = derive_truth(plan.survey_truth, plan=plan.truth).track
+    noise = [difference_noise(truth.stamps_ns, column) for column in (truth.vy_m_s, truth.yaw_rate_rad_s)]
+    said = f"one-step noise of the ground truth {noise[0]:.3g} m/s² and {noise[1]:.3g} rad/s²"
+    limits = f"{NEGLIGIBLE_NOISE[0]:g} m/s² and {NEGLIGIBLE_NOISE[1]:g} rad/s²"
+    within = all(n <= limit for n, limit in zip(noise, NEGLIGIBLE_NOISE, strict=True))  # False for NaN
     return {
         "kind": ESTIMATED if estimated else "perfect" if perfect else "recorded",
         "quantities": dict(plan.derivation),
         "latency_s": plan.truth_latency_s,
-        "smoothing_half_s": smoothing.half_s,
-        "smoothing_reason": smoothing.reason,
-        "difference_noise": _pair(smoothing.noise),
+        "smoothing_half_s": 0.0 if within else SMOOTHING_HALF_S,
+        "smoothing_reason": f"{said}: {'' if within else 'not '}within {limits}",
+        "difference_noise": _pair(noise),
         "not_independent": dict(plan.dependent),
     }
 

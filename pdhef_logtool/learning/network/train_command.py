@@ -142,6 +142,8 @@ def train_on(
     progress: Callable[[str, float], None] = lambda _text, _share: None,
 ) -> TrainResult:
     """Train one network by a recipe, which contains the target; otherwise as :func:`run_training`."""
+    import polars as pl
+
     splits = {name: SplitSequences(data, name, recipe.target, recipe.odd) for name in SPLITS}
 
     def tell(epoch: Epoch, of: int) -> None:
@@ -163,7 +165,9 @@ def train_on(
         "test_loss": test_loss,
     }
     bundle = replace(bundle, provenance=provenance, model=data.model, physics_sha256=data.physics_sha256)
-    write_bytes(output / HISTORY_FILE, _history_table(history))
+    table = io.BytesIO()  # polars raises errors of other types for a full disk
+    pl.DataFrame([asdict(e) for e in history]).write_parquet(table)
+    write_bytes(output / HISTORY_FILE, table.getvalue())
     bundle.save(output)
     (output / CHECKPOINT).unlink(missing_ok=True)
     return TrainResult(output, bundle, tuple(history), test_loss)
@@ -262,11 +266,3 @@ class SplitSequences:
                 values[weight == 0.0] = 0.0
                 if weight.sum() > 0.0:
                     yield FeatureSequence(drive.entry["name"], features, values, weight)
-
-
-def _history_table(history: Iterable[Epoch]) -> bytes:
-    import polars as pl
-
-    whole = io.BytesIO()  # polars raises errors of other types for a full disk
-    pl.DataFrame([asdict(e) for e in history]).write_parquet(whole)
-    return whole.getvalue()

@@ -6,9 +6,10 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from rich.console import Console
 from rich.text import Text
 
 from pdhef_logtool.drive.options import AS_IT_IS, ReadOptions
@@ -23,9 +24,6 @@ from pdhef_logtool.runs.inspection.rendering import table_of
 from pdhef_logtool.runs.inspection.report import COVARIANCE, INDEX, collapsed
 from pdhef_logtool.runs.inspection.step_statistics import number_text
 from pdhef_logtool.storage.documents import jsonable
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 #: Arrays inside of arrays, or of structs.
 INNER_ARRAY = re.compile(r"\[\].")

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich import box
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
@@ -16,9 +17,6 @@ from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
 from pdhef_logtool.runs.inspection.report import Inspection, SignalReport, TopicReport
 from pdhef_logtool.runs.inspection.step_statistics import number_text
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 #: Candidates of a signal that are shown beside the one that was taken.
 CANDIDATES_SHOWN = 2

@@ -240,25 +240,19 @@ def inspect_log(
     MappingError : The mapping names a topic or field that the log does not contain.
     """
     mapping = mapping_of(mapping)
-    tables, prefer = tables_for(mapping, options.tables), options.prefer_truth
-    limits, msgs = options.limits, options.msgs
-    if not whole:
-        with closing(open_log(path, limits, msgs, Wanted(frozenset(), above_bytes=WHOLE_BYTES), tables)) as log:
-            index = log.index
-            # Most of a shorter one is read anyway.
-            long = index is not None and (index.is_remote or log.end_ns - log.start_ns > 2 * WINDOW_NS)
-            if index is not None and not (long and index.size > WHOLE_BYTES):
-                index = None
-            partial = inspect_drive_log(log, mapping, prefer_truth=prefer, index=index)
-            damaged = any(loss.severity == "lost" for loss in log.lost)
-            sample = partial.sample
-            if sample is None or not (damaged or sample.chunks > MOST_SAMPLED * sample.of_chunks):
-                then(partial, log)
-                return partial
-    with closing(open_log(path, limits, msgs, settings=tables)) as log:
-        inspection = inspect_drive_log(log, mapping, prefer_truth=prefer)
-        then(inspection, log)
-        return inspection
+    wanted = Wanted() if whole else Wanted(frozenset(), above_bytes=WHOLE_BYTES)
+    with closing(open_log(path, options.limits, options.msgs, wanted, tables_for(mapping, options.tables))) as log:
+        index = None if whole else log.index
+        # Most of a shorter one is read anyway.
+        long = index is not None and (index.is_remote or log.end_ns - log.start_ns > 2 * WINDOW_NS)
+        if index is not None and not (long and index.size > WHOLE_BYTES):
+            index = None
+        inspection = inspect_drive_log(log, mapping, prefer_truth=options.prefer_truth, index=index)
+        sample, damaged = inspection.sample, any(loss.severity == "lost" for loss in log.lost)
+        if sample is None or not (damaged or sample.chunks > MOST_SAMPLED * sample.of_chunks):
+            then(inspection, log)
+            return inspection
+    return inspect_log(path, mapping, options, whole=True, then=then)
 
 
 def inspect_drive_log(
