@@ -21,7 +21,7 @@ from pdhef_logtool.results.sink import TRUTH
 #: The best filter with physics only; the errors of the baseline would hide all others in a figure.
 _PHYSICS = "physics"
 #: Keys of the figures, in the order of the page.
-OVER_TIME = ("sideslip", "error", "yaw_rate", "ay", "speed", "strip")
+OVER_TIME = ("sideslip", "error", "steer", "yaw_rate", "ay", "speed", "strip")
 IN_PLANE = ("path", "ay_sideslip")
 #: Maximum number of rows of tables that grow with the length of the log.
 _MOST_ROWS = 200

@@ -28,7 +28,7 @@ from pdhef_logtool.reports.charts import (
     TimeFigure,
     joined,
 )
-from pdhef_logtool.reports.colours import FAULT, NOTE, PLAIN, colour
+from pdhef_logtool.reports.colours import FAULT, INK, NOTE, PLAIN, colour
 from pdhef_logtool.reports.drive_series import DriveSeries, Reference, Tracks, gather, thinned
 from pdhef_logtool.reports.encoding import grid_of
 from pdhef_logtool.results.sink import TRUTH
@@ -199,6 +199,10 @@ def _add_error(
 
 
 def _add_motion(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
+    steer = series[roles.main].steer
+    if steer is not None and np.isfinite(steer).any():
+        lines = [Series("measured", INK, steer)]
+        charts.figures["steer"] = TimeFigure("Steering, road-wheel angle", "°", lines, resolution=_SEEN, height=120)
     for key, title, unit in (
         ("yaw_rate", "Yaw rate", "°/s"),
         ("ay", "Lateral acceleration, specific force", "m/s²"),

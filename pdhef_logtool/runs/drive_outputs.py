@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from shutil import copyfile
@@ -78,7 +79,7 @@ class DriveOutputs:
     ) -> None:
         (self._change, self._run_folder), self._run, self._main = folders, run, main
         self._signals, names = estimated.signals, run.names
-        tracks = [estimated.tracks[name] for name in names]
+        tracks = [replace(estimated.tracks[name], steer_rad=estimated.signals.steer_rad) for name in names]
         if estimated.drawn_truth is not None:
             tracks.insert(0, estimated.drawn_truth)
         self.tracks = [without_pose(track) for track in tracks] if run.config.no_position else tracks

@@ -110,7 +110,7 @@ def test_a_sine_with_dwell_displaces_the_car_by_its_lateral_acceleration(side):
     steer = side * wheel * since / 0.205  # 5 degrees at the steering wheel between 0.20 and 0.21 s
     slide, rate = -0.3 * since**2, 0.4 * since
     motion = {"vx_m_s": 0.0 * T + speed, "vy_m_s": side * slide, "yaw_rate_rad_s": side * rate}
-    found = figures(steer, "sine-with-dwell", (T >= start) & (T < 3.0), motion, straight={**motion, "vy_m_s": 0.0 * T})
+    found = figures(steer, "sine-with-dwell", (start <= T) & (T < 3.0), motion, straight={**motion, "vy_m_s": 0.0 * T})
     a, b = 0.21, 1.28  # v_y - v_y(a), and v_x r integrated twice, both from a to b
     slid = -0.1 * (b**3 - a**3) + 0.3 * a**2 * (b - a)
     turned = 0.4 * speed * ((b**3 - a**3) / 6.0 - a**2 * (b - a) / 2.0)

@@ -153,7 +153,7 @@ def _brake_yaw(_: VehicleParameters, time_s: FloatArray, __: FloatArray, rate: F
 
 
 def _brake_speed(_: VehicleParameters, time_s: FloatArray, __: FloatArray, vx: FloatArray) -> _Figures:
-    _, since_s, speed = _braking(time_s, vx)
+    since_s, speed = _braking(time_s, vx)[1:]
     return {"brake_deceleration": float((speed[0] - speed[-1]) / np.ptp(since_s))} if len(since_s) > 1 else {}
 
 
