@@ -47,8 +47,8 @@ class DriveSeries:
     """Series of one track for the figures; angles in degrees.
 
     Envelopes [cells, 2] of sideslip, yaw rate, speed, a_y and steering; largest values [cells] of the absolute
-    ``error``; the 95 % CI [cells]; points [3, K] in the planes: stamp, x and y. ``invalid``, ``reason`` at each stamp [N]. Confidence
-    interval, motion and planes are None except for the ground truth and the selected estimate.
+    ``error``; the 95 % CI [cells]; points [3, K] in the planes: stamp, x and y. ``invalid``, ``reason`` at each stamp
+    [N]. Confidence interval, motion and planes are None except for the ground truth and the selected estimate.
     """
 
     name: str

@@ -111,7 +111,8 @@ def write_recording(
     Each track is one entity with a row a stamp (of a drive above ten minutes 10 a second, of other estimators 5) and a
     component a quantity, with value and confidence interval. Entities are named by the use of a track (``/truth``,
     ``/main``, ``/baseline``, ``/other/1``), so that one blueprint suits all drives of a run with any estimators; the
-    lines have their names. Errors are where ground truth and estimate share a stamp.
+    lines have their names. Errors are where ground truth and estimate share a stamp. The recording's properties have
+    RMSE, verdicts, car, faults and version.
 
     Parameters
     ----------
@@ -151,6 +152,9 @@ def write_recording(
             drawing.draw_track(track, truth, places[track.name], colour_rgb(track.name, colours or {}))
             drawing.draw_reasons(track)
         drawing.draw_texts(report, events, tracks)
+        for name, values in _properties(report).items():
+            if values:
+                recording.send_property(name, rr.AnyValues(**values))
         data = memory.drain_as_bytes()
     except RuntimeError as error:
         raise OutputError(
@@ -158,6 +162,27 @@ def write_recording(
         ) from error
     with writing(path), open_new(path) as file:
         file.write(data)
+
+
+def _properties(report: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the properties by which a catalog of recordings can be filtered, None and empty lists if unknown."""
+    whole = [
+        m for m in report["metrics"] if (m["signal"], m["metric"], m["segment"]) == ("sideslip_rad", "rmse", "all")
+    ]
+    plan = report.get("plan") or {}
+    failed = [c["name"] for c in report.get("checks", ()) if c["verdict"] == "failed"]
+    faults = [f"{f['kind']} {f['sensor']}" for f in report.get("faults") or ()]
+    return {
+        "sideslip_rmse_deg": {m["estimator"]: m["value"] * DEGREES for m in whole if m["value"] is not None},
+        "verdicts": {r["id"]: r["outcome"] for r in plan.get("requirements", ())},
+        "drive": {
+            "car": report["vehicle"]["name"],
+            "selected": report.get("selected_estimate"),
+            "faults": faults,
+            "failed_checks": failed,
+            "version": report["versions"].get("pdhef-logtool"),
+        },
+    }
 
 
 def _places(names: Sequence[str], shown: Sequence[str]) -> dict[str, str]:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.results import rerun_sink as rerun
 from pdhef_logtool.results.rerun_sink import LONGEST_BRIDGE_NS, MOST_OTHERS, write_recording
 from pdhef_logtool.results.sink import Event
+from tests import run_report
 
 HASH = "0123456789abcdef" * 4
 #: Of one track only: the others use the colours of the palette.
@@ -57,7 +59,7 @@ HELD = {
     "/events": (2, ()),
 }
 STATIC = {
-    *("/__properties", "/report", "/truth", "/main", "/other/1"),
+    *("/__properties", "/__properties/drive", "/report", "/truth", "/main", "/other/1"),
     *(f"/plan/{place}{now}" for place in ("truth", "main", "other/1") for now in ("", "/now")),
 }
 
@@ -133,6 +135,34 @@ def test_identity_and_footer(recording):
     properties = {k: v for b in static["/__properties"] for k, v in b.to_pydict().items()}
     assert properties["RecordingInfo:name"] == [["drive"]]
     assert properties["RecordingInfo:start_time"] == [[START_NS]]
+
+
+def test_properties_filter_a_catalog(tmp_path):
+    check = {"name": "ay.scale", "verdict": "failed", "waived": False, "evidence": "3 %", "remedy": ""}
+    report = run_report.report(
+        metrics=run_report.errors_deg(phy_ukf=0.5, zero=math.nan),
+        checks=[check, {**check, "name": "ay.sign", "verdict": "passed"}],
+        faults=[{"sensor": "a_y", "kind": "stuck", "count": 1, "seconds": 1.0, "intervals": []}],
+        versions={"pdhef-logtool": "1.2.3"},
+    )
+    report |= {"plan": {"file": "", "requirements": [{"id": "SR-1", "label": "x", "outcome": "PASS", "reason": ""}]}}
+    record(tmp_path / "x.rrd", [], report=report)
+    _, static = tables(tmp_path / "x.rrd")
+    found = {
+        (entity.removeprefix("/__properties/"), name): values[0]
+        for entity, batches in static.items()
+        if entity.startswith("/__properties/")
+        for name, values in plain(*batches).items()
+    }
+    assert found == {
+        ("sideslip_rmse_deg", "phy-ukf"): [pytest.approx(0.5)],
+        ("verdicts", "SR-1"): ["PASS"],
+        ("drive", "car"): ["sedan"],
+        ("drive", "selected"): ["pd-hef"],
+        ("drive", "faults"): ["stuck a_y"],
+        ("drive", "failed_checks"): ["ay.scale"],
+        ("drive", "version"): ["1.2.3"],
+    }
 
 
 def blueprint_of(path: Path) -> dict[str, list]:
