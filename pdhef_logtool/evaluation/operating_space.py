@@ -88,6 +88,8 @@ def operating_space(
         for i in np.flatnonzero(seconds)
     ]
     friction = signals.friction[np.isfinite(signals.friction)]
-    top_speed, top_ay = (float(c[finite].max()) if finite.any() else None for c in (speed, ay))
+    everywhere = np.where(np.isfinite(speed), speed, signals.speed_m_s)  # ground truth may end before the drive
+    known = [c[np.isfinite(c)] for c in (everywhere, ay)]
+    top_speed, top_ay = (float(c.max()) if c.size else None for c in known)
     usual = float(np.median(friction)) if friction.size else vehicle.assumed_friction
     return OperatingSpace(cells, top_speed, top_ay, usual)
