@@ -29,7 +29,7 @@ PDF_FILE = "report.pdf"
 #: Maximum number of drives with a section; drives with the worst verdicts come first.
 _MOST_DRIVES = 20
 #: Figures of a drive in the document. The path contains the positions of the car.
-_FIGURES, _POSITIONS = ("worst", "sideslip", "error", "ay"), ("path",)
+_FIGURES, _POSITIONS = ("worst", "sideslip", "error", "steer", "yaw_rate", "ay"), ("path",)
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _TIMEOUT_S = 180.0
 
@@ -150,7 +150,7 @@ def _gravity(report: Mapping[str, Any] | None) -> tuple[int, float]:
     if report is None:
         return (1, 0.0)
     fails = sum(r["outcome"] == "FAIL" for r in (report.get("plan") or {}).get("requirements") or ())
-    wanted = ((report.get("answer") or {}).get("main"), "sideslip_rad", "all", "rmse")
+    wanted = (report.get("selected_estimate"), "sideslip_rad", "all", "rmse")
     figures = {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
     return -fails, -(figures.get(wanted) or 0.0)
 
