@@ -89,7 +89,6 @@ def operating_space(
     ]
     friction = signals.friction[np.isfinite(signals.friction)]
     everywhere = np.where(np.isfinite(speed), speed, signals.speed_m_s)  # ground truth may end before the drive
-    known = [c[np.isfinite(c)] for c in (everywhere, ay)]
-    top_speed, top_ay = (float(c.max()) if c.size else None for c in known)
+    top_speed, top_ay = (float(np.nanmax(c)) if np.isfinite(c).any() else None for c in (everywhere, ay))
     usual = float(np.median(friction)) if friction.size else vehicle.assumed_friction
     return OperatingSpace(cells, top_speed, top_ay, usual)

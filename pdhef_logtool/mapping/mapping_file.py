@@ -256,10 +256,10 @@ def _scale(name: str, model: _SourceTable) -> tuple[float | list[float], str]:
         return model.scale, ""
     si = (SIGNAL_UNITS | TRUTH_UNITS | ESTIMATE_UNITS)[name]
     kind = "wheel rate" if si == "rad/s" and name.startswith("wheel") else _KINDS.get(si, "")
-    known = UNITS.get(kind, {})
-    factor = unit_of(f"x_{plain_unit(model.unit)}", kind)[1] if known else None
+    units = UNITS.get(kind, {})
+    factor = unit_of(f"x_{plain_unit(model.unit)}", kind)[1] if units else None
     if factor is None:
-        return model.scale, f'unit = "{model.unit}" is unknown for {si}, known are {", ".join(known) or si}'
+        return model.scale, f'unit = "{model.unit}" is unknown for {si}, known are {", ".join(units) or si}'
     if isinstance(model.scale, list) or abs(model.scale) != 1.0:
         return model.scale, "give unit or scale, not both; scale = -1 reverses the sign"
     return factor * model.scale, ""
