@@ -270,7 +270,9 @@ def _add_worst(
         at_s = np.asarray((stamps[::step] - origin_ns) * 1e-9, dtype=np.float64)
         clouds.append(Cloud(track.name, colour(track.name), at_s, beta[::step], line=True))
     kind = "error" if reference.scored else "difference"
-    title = f"Largest {kind}: {abs(worst.error_rad) * DEGREES:.2f}° at {worst.at_s:.1f} s"
+    here = np.array([worst.at_s]), np.array([worst.estimate_rad * DEGREES])
+    clouds.append(Cloud(f"largest {kind}", FAULT, *here))
+    title = f"Largest {kind} after the first 2 s: {abs(worst.error_rad) * DEGREES:.2f}° at {worst.at_s:.1f} s"
     title += f" during {worst.during}" if worst.during else ""
     charts.figures["worst"] = PointsFigure(title, "s from the log's start", "sideslip in °", clouds)
 

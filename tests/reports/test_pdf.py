@@ -56,6 +56,21 @@ def test_a_drive_without_dates_has_none(tmp_path):
         assert not re.search(r"1970|UTC", text_of(page.partition(b"</main>")[0]))
 
 
+@pytest.mark.parametrize(("file", "title"), [("", "Validation of 1 drive"), ("plan.toml", "Release 3")])
+def test_the_title_is_that_of_a_plan_of_the_user(tmp_path, file, title):
+    run = open_run(write_run(tmp_path, drive_tracks(3.0)))
+    run = replace(run, document=run.document | {"plan": {"file": file, "title": "Release 3", "requirements": []}})
+    assert f"<h1>{title}</h1>" in pdf_page(run).decode()
+
+
+def test_the_document_has_the_key_figures_of_manoeuvres(tmp_path):
+    figure = {"signal": "yaw_rate_rad_s", "segment": "all", "metric": "step_response_time", "unit": "s", "n": 9}
+    metrics = [{**figure, "estimator": n, "value": v} for n, v in (("truth", 0.101), ("pd-hef", 0.123))]
+    run = open_run(write_run(tmp_path, drive_tracks(3.0), metrics=metrics))
+    for page in (pdf_page(run), drive_page(run.logs[0]).html):
+        assert "Key figures of manoeuvres truth pd-hef yaw rate: response time ms 101 123" in text_of(page)
+
+
 def test_of_more_drives_than_sections_those_with_the_largest_errors_have_one(tmp_path, monkeypatch):
     monkeypatch.setattr(pdf, "_MOST_DRIVES", 1)
     run = open_run(write_run(tmp_path, drive_tracks(3.0)))
