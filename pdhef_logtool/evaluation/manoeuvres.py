@@ -363,56 +363,33 @@ def _swings(run: _Run, rules: ManoeuvreRules) -> list[_Swing]:
     return sorted(swings, key=lambda s: s.start)
 
 
-def _chains(swings: Sequence[_Swing], gap_s: float, *, alternate: bool) -> Iterator[list[_Swing]]:
-    """Yield the longest chains of swings with gaps up to a time, optionally of alternating sign."""
-    chain: list[_Swing] = []
-    for swing in swings:
-        close = bool(chain) and (swing.start - chain[-1].end) * _STEP_S <= gap_s
-        if close and not (alternate and swing.sign == chain[-1].sign):
-            chain.append(swing)
-            continue
-        if chain:
-            yield chain
-        chain = [swing]
-    if chain:
-        yield chain
-
-
 def _repeated(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
     """Slalom, continuous sine and sine sweep: swings of alternating sign with regular spacing."""
-    for part in _regular_chains(swings, rules):
+    for part in _regular_parts(swings, rules):
         yield _name_of_repeated(part, rules), part[0].start, part[-1].end
 
 
 def _long_repeated(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
     """Repeated swings that are too long and too regular for a lane change with corrections after it."""
-    for part in _regular_chains(swings, rules):
+    for part in _regular_parts(swings, rules):
         if len(part) >= rules.sweep_repeated and min(s.peak for s in part[-2:]) >= 0.5 * max(s.peak for s in part):
             yield _name_of_repeated(part, rules), part[0].start, part[-1].end
 
 
-def _regular_chains(swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[list[_Swing]]:
+def _regular_parts(swings: Sequence[_Swing], rules: ManoeuvreRules) -> list[list[_Swing]]:
+    """Return the chains of short swings to alternating sides, with regular spacing and enough swings."""
     short = [s for s in swings if s.half_s <= rules.swing_s]
-    for chain in _chains(short, rules.swing_gap_s, alternate=True):
-        for part in _regular_parts(chain, rules):
-            if np.mean([s.peak for s in part]) >= 0.8 * rules.peak_m_s2:
-                yield part
-
-
-def _regular_parts(chain: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[list[_Swing]]:
-    """Yield the parts of a chain with regular spacing and enough swings."""
-    part = list(chain[:1])
-    for swing in chain[1:]:
-        spacing = _middle(swing) - _middle(part[-1])
-        before = _middle(part[-1]) - _middle(part[-2]) if len(part) > 1 else spacing
-        if abs(spacing - before) <= rules.regular * max(before, spacing):
-            part.append(swing)
-            continue
-        if len(part) >= rules.repeated:
-            yield part
-        part = [part[-1], swing]
-    if len(part) >= rules.repeated:
-        yield part
+    part = short[:1]
+    parts = [part]
+    for before, swing in pairwise(short):
+        follows = swing.sign != before.sign and (swing.start - before.end) * _STEP_S <= rules.swing_gap_s
+        spacing = np.diff([_middle(s) for s in (*part[-2:], swing)])
+        if not follows or np.ptp(spacing) > rules.regular * spacing.max():
+            part = [before] if follows else []
+            parts.append(part)
+        part.append(swing)
+    high = 0.8 * rules.peak_m_s2
+    return [p for p in parts if len(p) >= rules.repeated and np.mean([s.peak for s in p]) >= high]
 
 
 def _middle(swing: _Swing) -> float:
