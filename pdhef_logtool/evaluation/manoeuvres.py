@@ -35,8 +35,7 @@ MANOEUVRES = (
     "brake-in-turn",
     "power-off-in-turn",
 )
-_STEP_NS = 20_000_000
-_STEP_S = 0.02
+_STEP_NS, _STEP_S = 20_000_000, 0.02
 #: The zero of the steering is computed from one row in this many.
 _ZERO_EVERY = 10
 

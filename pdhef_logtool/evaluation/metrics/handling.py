@@ -19,14 +19,12 @@ from pdhef_logtool.evaluation.manoeuvres import RULES
 from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
-#: Driving after a manoeuvre that its figures need, the end of a step that is its steady state, s, and the share of its
-#: peak below which steering is at zero.
-_AFTER_S, _STEADY_S, _AT_ZERO = 2.0, 0.5, 0.05
-#: Range of a_y in which the understeer gradient is constant, and least range that determines it; m/s².
-_LINEAR_M_S2, _LEAST_RANGE_M_S2 = 4.0, 1.0
-#: Sine with dwell: steering-wheel angle at its beginning, and the time of the displacement after it. Braking in a turn:
-#: the circle is measured between these times before the onset, s.
-_BEGINNING_RAD, _DISPLACED_S, _CIRCLE_S = np.deg2rad(5.0), 1.07, (1.3, 0.3)
+#: Sine with dwell: driving after it, share of its peak below which steering is at zero, steering-wheel angle at its
+#: beginning, and the time of the displacement after that.
+_AFTER_S, _AT_ZERO, _BEGINNING_RAD, _DISPLACED_S = 2.0, 0.05, np.deg2rad(5.0), 1.07
+#: Steady states: the end of a step, s; between these times before braking, s; range of a_y in which the understeer
+#: gradient is constant, and least range that determines it, m/s².
+_STEADY_S, _CIRCLE_S, _LINEAR_M_S2, _LEAST_RANGE_M_S2 = 0.5, (1.3, 0.3), 4.0, 1.0
 #: Sweep: duration of a spectrum and its distance from the next, rate of the samples, and least share of the steering's
 #: largest spectral density at an excited frequency.
 _SPECTRUM_S, _NEXT_S, _RATE_HZ, _EXCITED = 4.0, 1.0, 50.0, 0.05
