@@ -86,14 +86,11 @@ def vehicle_of_entries(raw: Mapping[str, Any], *, where: str) -> VehicleFile:
     problems: list[str] = []
     checked(_Wheelbase, {name: raw[name] for name in _Wheelbase.model_fields if name in raw}, "", problems)
     entries, assumed = completed(raw)
-    file = checked(VehicleEntries, entries, "", problems)
-    if file is None or problems:
+    file = None if problems else checked(VehicleEntries, entries, "", problems)
+    if file is None:
         # Values that follow from a wrong entry, such as a length in mm, are wrong too.
-        given = (*raw, "mass_kg")
-        stated = [
-            p for p in problems if re.split("[:.]", p)[0] in given and not re.match("(wheelb|front_).*: unknown", p)
-        ]
-        got = "; ".join(dict.fromkeys(stated or problems))
+        stated = [p for p in problems if re.split("[:.]", p)[0] in (*raw, "mass_kg")]
+        got = "; ".join(stated or problems)
         raise VehicleError(expected="the entries of vehicle.toml", got=got, where=where, remedy=REMEDY)
     fields = VehicleParameters.model_fields
     vehicle = VehicleParameters.model_construct(
