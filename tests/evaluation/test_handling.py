@@ -159,3 +159,20 @@ def test_braking_in_a_turn_has_the_figures_of_its_ramps(side):
     assert found["truth", "vx_m_s", "brake_deceleration"] == pytest.approx(4.0, rel=1e-6)
     assert found["truth", "sideslip_rad", "brake_sideslip"] == pytest.approx(-0.02 * side, rel=1e-3)
     assert ("holds", "sideslip_rad", "brake_sideslip") not in found
+
+
+NAMES = ("step-steer", "sine-with-dwell", "ramp-steer", "dlc-3888-2", "brake-in-turn", "sine-sweep")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_unknown_steering_leaves_the_figures_that_need_none(name):
+    rate = 0.2 + 0.1 * np.sin(4.0 * T)
+    motion = {"vx_m_s": 20.0 - T, "vy_m_s": -0.1 * rate, "yaw_rate_rad_s": rate, "ay_m_s2": 20.0 * rate}
+    steer = 0.03 * np.clip(T - 1.0, 0.0, 1.0) + 0.01 * np.sin(4.0 * T)
+    none = figures(np.full(len(T), np.nan), name, T < 7.5, motion)
+    without = {"entry_speed", "brake_yaw_ratio", "brake_deceleration", "brake_sideslip", "step_peak", "step_overshoot"}
+    assert {metric for _, _, metric in none} <= without
+    whole = figures(steer, name, T < 7.5, motion)
+    some = figures(np.where((T < 0.05) | (np.arange(len(T)) % 7 == 3), np.nan, steer), name, T < 7.5, motion)
+    assert whole.keys() == some.keys() and len(whole) >= 1 and all(map(math.isfinite, some.values()))
+    assert some["truth", "vx_m_s", "entry_speed"] == pytest.approx(19.95, abs=0.02) if name == "dlc-3888-2" else True

@@ -47,11 +47,12 @@ def responses(drive: EvaluatedDrive) -> Iterator[Columns]:
     signals, vehicle, _ = drive.calibrated
     since_s: FloatArray = (signals.stamps_ns - signals.stamps_ns[:1]) * np.float64(1e-9)
     kinds = [(_first(drive, since_s, names.split()), needed.split(), figures) for names, needed, figures in _KINDS]
-    signals_of = {m.name: m.brief for m in METRICS}
+    signals_of, steered = {m.name: m.brief for m in METRICS}, np.isfinite(signals.steer_rad)
     for track in (*drive.tracks.values(), *(() if drive.truth is None else (drive.truth,))):
         for inside, needed, figures in kinds:
             columns = [getattr(track, column) for column in needed]
             use = inside & np.isfinite(columns[0]) & (track.valid | (track is drive.truth))
+            use &= steered | ~steered[inside].any()  # some figures need no steering
             if not use.any():
                 continue
             of = _Steering(vehicle, since_s[use] - since_s[inside][0], signals.steer_rad[use])
@@ -149,7 +150,7 @@ def _sweep(of: _Steering, rate: FloatArray) -> _Figures:
     """Return figures of the frequency response: cross-spectrum of steering and yaw rate over that of the steering."""
     n, step = round(_SPECTRUM_S * _RATE_HZ), round(_NEXT_S * _RATE_HZ)
     at_s = np.arange(of.time_s[0], of.time_s[-1], 1.0 / _RATE_HZ)
-    if len(at_s) < n:
+    if len(at_s) < n or not np.isfinite(of.steer).all():
         return {}
     columns = (np.interp(at_s, of.time_s, c) for c in (of.steer, rate))
     pieces = (np.lib.stride_tricks.sliding_window_view(c, n)[::step] for c in columns)
