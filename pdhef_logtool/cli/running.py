@@ -138,9 +138,7 @@ def view(
     ],
     log: Annotated[list[str] | None, Option(metavar="NAME", help="Log of the run. Repeatable. Default: all.")] = None,
     web: Annotated[bool, Option("--web", help="Open in the browser, for machines without a display.")] = False,
-    catalog: Annotated[
-        bool, Option("--catalog", help="Serve a catalog of the recordings, to filter by error, verdict, car or fault.")
-    ] = False,
+    catalog: Annotated[bool, Option("--catalog", help="Serve a catalog to filter the recordings.")] = False,
 ) -> None:
     """Open the recordings of a run in the Rerun viewer."""
     recordings = find_recordings(output, log or ())
@@ -227,15 +225,11 @@ def serve_catalog(recordings: Sequence[Path], name: str, *, web: bool) -> int:
     try:
         from rerun.server import Server
     except ImportError as error:
-        raise UsageError(
-            expected="Rerun with a catalog server",
-            got=str(error),
-            where="--catalog",
-            remedy="pip install --upgrade rerun-sdk, or leave out --catalog",
-        ) from error
+        remedy = "pip install --upgrade rerun-sdk, or leave out --catalog"
+        raise UsageError(expected="a catalog server", got=str(error), where="--catalog", remedy=remedy) from error
     with Server(host="127.0.0.1", datasets={name: recordings}) as server:
-        text = f"catalog of {len(recordings)} recordings at {server.url()}, dataset {name}; Ctrl-C ends it"
-        console.stdout().print(text, soft_wrap=True)
+        shown = f"catalog of {len(recordings)} recordings at {server.url()}, dataset {name}; Ctrl-C ends it"
+        console.stdout().print(shown, soft_wrap=True)
         if web or console.has_display():
             return open_viewer([server.url()], web=web)
         threading.Event().wait()
