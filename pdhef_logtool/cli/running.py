@@ -228,8 +228,7 @@ def serve_catalog(recordings: Sequence[Path], name: str, *, web: bool) -> int:
         remedy = "pip install --upgrade rerun-sdk, or leave out --catalog"
         raise UsageError(expected="a catalog server", got=str(error), where="--catalog", remedy=remedy) from error
     with Server(host="127.0.0.1", datasets={name: recordings}) as server:
-        shown = f"catalog of {len(recordings)} recordings at {server.url()}, dataset {name}; Ctrl-C ends it"
-        console.stdout().print(shown, soft_wrap=True)
+        console.stdout().print(f"catalog at {server.url()}, dataset {name}; Ctrl-C ends it", soft_wrap=True)
         if web or console.has_display():
             return open_viewer([server.url()], web=web)
         threading.Event().wait()

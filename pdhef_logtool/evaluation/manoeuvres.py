@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -258,45 +259,32 @@ def _runs_of(signals: Signals, wheelbase_m: float, zeros: tuple[float, float], r
     finite = np.isfinite(speed) & np.isfinite(yaw_rate) & np.isfinite(steer) & (speed > rules.least_speed_m_s)
     for a, b in runs(stamps, _bridged(stamps, finite)):
         rows = np.flatnonzero(finite[a:b]) + a
-        start = -(-int(stamps[rows[0]]) // _STEP_NS)
-        count = int(stamps[rows[-1]]) // _STEP_NS - start + 1
-        if count * _STEP_S < 1.0:
+        first, last = -(-int(stamps[rows[0]]) // _STEP_NS), int(stamps[rows[-1]]) // _STEP_NS
+        grid_ns = np.arange(first, last + 1, dtype=np.int64) * _STEP_NS
+        if len(grid_ns) * _STEP_S < 1.0:
             continue
-        yield _on_grid(signals, (speed, steer, yaw_rate), rows, (start, count), wheelbase_m, rules)
+        smoothed = partial(_on_grid, stamps[rows], grid_ns)
+        v, r = smoothed(speed[rows], 2.0), smoothed(yaw_rate[rows], 3.0)
+        yield _Run(
+            start_ns=int(grid_ns[0]),
+            speed=v,
+            steer=smoothed(steer[rows], 5.0),
+            yaw_rate=r,
+            ax=smoothed(signals.ax_m_s2[rows], 2.0),
+            ay=smoothed(signals.ay_m_s2[rows], 3.0),
+            gain=_gain(v, wheelbase_m, rules),
+            turn=v * r,
+            curvature=smoothed(yaw_rate[rows], 1.0) / v,
+        )
 
 
-def _on_grid(
-    signals: Signals,
-    columns: tuple[FloatArray, FloatArray, FloatArray],
-    rows: IntArray,
-    span: tuple[int, int],
-    wheelbase_m: float,
-    rules: ManoeuvreRules,
-) -> _Run:
-    """Return the run from speed, steering and yaw rate (``columns`` [N]), known at ``rows``; ``span`` in steps."""
-    grid = (span[0] + np.arange(span[1], dtype=np.int64)) * _STEP_NS
-    zero_ns = int(signals.stamps_ns[rows[0]])
-    times, to = (signals.stamps_ns[rows] - zero_ns) * 1e-9, (grid - zero_ns) * 1e-9
-
-    def smoothed(values: FloatArray, cutoff_hz: float) -> FloatArray:
-        finite = np.isfinite(values[rows])
-        if not finite.any():
-            return np.zeros(len(to))
-        return smooth(grid, np.interp(to, times[finite], values[rows][finite]), cutoff_hz, _STEP_NS)
-
-    speed, steer, rate = columns
-    v, r = smoothed(speed, 2.0), smoothed(rate, 3.0)
-    return _Run(
-        start_ns=int(grid[0]),
-        speed=v,
-        steer=smoothed(steer, 5.0),
-        yaw_rate=r,
-        ax=smoothed(signals.ax_m_s2, 2.0),
-        ay=smoothed(signals.ay_m_s2, 3.0),
-        gain=_gain(v, wheelbase_m, rules),
-        turn=v * r,
-        curvature=smoothed(rate, 1.0) / v,
-    )
+def _on_grid(stamps_ns: IntArray, grid_ns: IntArray, values: FloatArray, cutoff_hz: float) -> FloatArray:
+    """Return values [N] at stamps as a smoothed column of a grid [K]; 0 if all are unknown."""
+    finite = np.isfinite(values)
+    if not finite.any():
+        return np.zeros(len(grid_ns))
+    times_s, to_s = ((t - stamps_ns[0]) * 1e-9 for t in (stamps_ns[finite], grid_ns))
+    return smooth(grid_ns, np.interp(to_s, times_s, values[finite]), cutoff_hz, _STEP_NS)
 
 
 def _bridged(stamps_ns: IntArray, finite: BoolArray) -> BoolArray:
