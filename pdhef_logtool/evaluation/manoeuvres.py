@@ -302,16 +302,12 @@ def _manoeuvres_of(run: _Run, rules: ManoeuvreRules) -> list[Manoeuvre]:
     swings = _swings(run, rules)
     spans: list[tuple[str, int, int]] = []
     taken = np.zeros(len(run), dtype=np.bool_)
-    for rule in (_lane_changes, _long_repeated, _repeated, _two_swings, _slowing, _steps, _ramps):
+    for rule in (_lane_changes, _repeated, _two_swings, _slowing, _steps, _ramps, _circles):
         for name, start, end in rule(run, swings, rules):
             a, b = max(start, 0), min(end, len(run))
             if b - a > 1 and not taken[a:b].any():
                 taken[a:b] = True
                 spans.append((name, a, b))
-    for name, start, end in _circles(run, rules):
-        free = ~taken[start:end]
-        if free.all():
-            spans.append((name, start, end))
     return [_measured(run, *span) for span in sorted(spans, key=lambda f: f[1])]
 
 
@@ -351,16 +347,12 @@ def _swings(run: _Run, rules: ManoeuvreRules) -> list[_Swing]:
 
 
 def _repeated(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
-    """Slalom, continuous sine and sine sweep: swings of alternating sign with regular spacing."""
-    for part in _regular_parts(swings, rules):
+    """Slalom, continuous sine and sine sweep: swings of alternating sign with regular spacing, long series first."""
+    parts = _regular_parts(swings, rules)
+    long = [p for p in parts if len(p) >= rules.sweep_repeated]
+    steady = [p for p in long if min(s.peak for s in p[-2:]) >= 0.5 * max(s.peak for s in p)]
+    for part in (*steady, *parts):
         yield _name_of_repeated(part, rules), part[0].start, part[-1].end
-
-
-def _long_repeated(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
-    """Repeated swings that are too long and too regular for a lane change with corrections after it."""
-    for part in _regular_parts(swings, rules):
-        if len(part) >= rules.sweep_repeated and min(s.peak for s in part[-2:]) >= 0.5 * max(s.peak for s in part):
-            yield _name_of_repeated(part, rules), part[0].start, part[-1].end
 
 
 def _regular_parts(swings: Sequence[_Swing], rules: ManoeuvreRules) -> list[list[_Swing]]:
@@ -518,7 +510,7 @@ def _ramps(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterat
             yield "ramp-steer", swing.start, row
 
 
-def _circles(run: _Run, rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
+def _circles(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
     """ISO 4138: half a circle or more at a curvature that stays within a share of its median."""
     stamps = np.arange(len(run), dtype=np.int64) * _STEP_NS
     for sign in (1, -1):
