@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import doctest
 import importlib
+import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,29 @@ def test_the_api_page_runs_as_it_stands(
     exec(code, {"__name__": "page"})
     assert "adaptive-physics" in capsys.readouterr().out
     assert (tmp_path / "out" / "mycar" / "model.toml").is_file()
+
+
+def test_the_notebook_runs_cell_by_cell(
+    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.use("agg")
+    notebook = json.loads((ROOT / "docs" / "notebook.ipynb").read_text(encoding="utf-8"))
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert len(notebook["cells"]) == 15
+    assert all(not cell.get("outputs") and cell.get("execution_count") is None for cell in notebook["cells"])
+    (tmp_path / "sample_logs").symlink_to(sample_logs_dir)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {"__name__": "notebook"}
+    for cell in cells:
+        exec(cell, names)
+    said = capsys.readouterr().out
+    assert "Sideslip RMSE of pd-hef: " in said and "Assumed: " in said and "no-slip: " in said
+    assert names["frame"]["steer_deg"].abs().max() > 1.0
+    by_name = dict(names["errors"].group_by("estimator").agg(names["rmse"]).iter_rows())
+    assert by_name["pd-hef"] < 0.2 < by_name["zero"]
+    assert {"step_tb", "step_overshoot"} <= set(names["figures"].collect()["metric"])
+    assert 0.2 < math.degrees(names["own_rmse"]) < 10.0
 
 
 def test_every_name_of_the_api_is_there() -> None:

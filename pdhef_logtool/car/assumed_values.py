@@ -117,19 +117,12 @@ def completed(raw: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[AssumedValu
         for inner in tables:
             table = table.setdefault(inner, {})
         if name in table:
-            if _is_positive(table[name]):
-                values[name] = float(table[name])
-            continue
-        if any(missing not in values for missing in _NEEDS.get(name, ())):
+            values[name] = float(table[name]) if _is_positive(table[name]) else math.nan
             continue
         value = float(f"{rule.value(values):.4g}")
         table[name] = values[name] = value
         assumed.append(AssumedValue(rule.entry, value, rule.spread, rule.text))
     return entries, tuple(assumed)
-
-
-#: Errors of rules that depend on a wrong entry.
-_NEEDS = {"relaxation_length_m": ("wheel_radius_m",), "cg_over_roll_axis_m": ("cg_height_m",)}
 
 
 def _axle_distances(entries: dict[str, Any], assumed: list[AssumedValue]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +13,19 @@ from pydantic import ConfigDict, Field
 from pdhef_logtool.car.assumed_values import AssumedValue, completed
 from pdhef_logtool.car.vehicle import REMEDY, SENSOR_PROFILES, Record, Sensors, VehicleParameters
 from pdhef_logtool.records.errors import VehicleError
-from pdhef_logtool.storage.documents import read_toml, validated
+from pdhef_logtool.storage.documents import checked, read_toml, validated
 from pdhef_logtool.storage.toml_text import toml_text
 
 
 class _Network(Record):
     gain: Annotated[float, Field(ge=0, le=1)]
+
+
+class _Wheelbase(Record):
+    """Entries that a file may state in place of the axle distances."""
+
+    wheelbase_m: Annotated[float, Field(gt=0, le=30)] = 1.0
+    front_weight_share: Annotated[float, Field(gt=0, lt=1)] = 0.5
 
 
 def _what_may_be_left_out(schema: dict[str, Any]) -> None:
@@ -75,9 +83,15 @@ def with_sensors(vehicle: VehicleParameters, profile: Path | str) -> VehiclePara
 
 def vehicle_of_entries(raw: Mapping[str, Any], *, where: str) -> VehicleFile:
     """Return the vehicle of the entries of a vehicle.toml; raises VehicleError as :func:`read_vehicle_file`."""
+    problems: list[str] = []
+    checked(_Wheelbase, {name: raw[name] for name in _Wheelbase.model_fields if name in raw}, "", problems)
     entries, assumed = completed(raw)
-    expected = "the entries of vehicle.toml"
-    file = validated(VehicleEntries, entries, where, VehicleError, expected=expected, remedy=REMEDY)
+    file = None if problems else checked(VehicleEntries, entries, "", problems)
+    if file is None:
+        # Values that follow from a wrong entry, such as a length in mm, are wrong too.
+        stated = [p for p in problems if re.split("[:.]", p)[0] in (*raw, "mass_kg")]
+        got = "; ".join(stated or problems)
+        raise VehicleError(expected="the entries of vehicle.toml", got=got, where=where, remedy=REMEDY)
     fields = VehicleParameters.model_fields
     vehicle = VehicleParameters.model_construct(
         file.model_fields_set & fields.keys(), **{name: getattr(file, name) for name in fields}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -133,9 +134,12 @@ def view(
     ],
     log: Annotated[list[str] | None, Option(metavar="NAME", help="Log of the run. Repeatable. Default: all.")] = None,
     web: Annotated[bool, Option("--web", help="Open in the browser, for machines without a display.")] = False,
+    catalog: Annotated[bool, Option("--catalog", help="Serve a catalog to filter the recordings.")] = False,
 ) -> None:
     """Open the recordings of a run in the Rerun viewer."""
     recordings = find_recordings(output, log or ())
+    if catalog:
+        raise typer.Exit(serve_catalog(recordings, output.resolve().stem, web=web))
     if not web and not console.has_display():
         raise UsageError(
             expected="a display to open the viewer on",
@@ -209,7 +213,25 @@ def find_recordings(output: Path, logs: Sequence[str]) -> list[Path]:
     return [recordings[name] for name in dict.fromkeys(logs)] if logs else list(recordings.values())
 
 
-def open_viewer(recordings: Sequence[Path], *, web: bool) -> int:
-    """Open recordings in one viewer, which is not reachable from the network, and return its exit code."""
+def serve_catalog(recordings: Sequence[Path], name: str, *, web: bool) -> int:
+    """Serve recordings as one dataset of Rerun's catalog on this machine, until the viewer or the command ends.
+
+    Raises UsageError if the installed Rerun has no server.
+    """
+    try:
+        from rerun.server import Server
+    except ImportError as error:
+        remedy = "pip install --upgrade rerun-sdk, or leave out --catalog"
+        raise UsageError(expected="a catalog server", got=str(error), where="--catalog", remedy=remedy) from error
+    with Server(host="127.0.0.1", datasets={name: recordings}) as server:
+        console.stdout().print(f"catalog at {server.url()}, dataset {name}; Ctrl-C ends it", soft_wrap=True)
+        if web or console.has_display():
+            return open_viewer([server.url()], web=web)
+        threading.Event().wait()
+    return 0
+
+
+def open_viewer(recordings: Sequence[Path | str], *, web: bool) -> int:
+    """Open recordings or a catalog in one viewer, not reachable from the network, and return its exit code."""
     command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--new", *(["--web-viewer"] if web else [])]
     return subprocess.call([*command, *map(str, recordings)])  # noqa: S603 (our own interpreter)

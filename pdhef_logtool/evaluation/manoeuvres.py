@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -35,8 +36,7 @@ MANOEUVRES = (
     "brake-in-turn",
     "power-off-in-turn",
 )
-_STEP_NS = 20_000_000
-_STEP_S = 0.02
+_STEP_NS, _STEP_S = 20_000_000, 0.02
 #: The zero of the steering is computed from one row in this many.
 _ZERO_EVERY = 10
 
@@ -259,45 +259,32 @@ def _runs_of(signals: Signals, wheelbase_m: float, zeros: tuple[float, float], r
     finite = np.isfinite(speed) & np.isfinite(yaw_rate) & np.isfinite(steer) & (speed > rules.least_speed_m_s)
     for a, b in runs(stamps, _bridged(stamps, finite)):
         rows = np.flatnonzero(finite[a:b]) + a
-        start = -(-int(stamps[rows[0]]) // _STEP_NS)
-        count = int(stamps[rows[-1]]) // _STEP_NS - start + 1
-        if count * _STEP_S < 1.0:
+        first, last = -(-int(stamps[rows[0]]) // _STEP_NS), int(stamps[rows[-1]]) // _STEP_NS
+        grid_ns = np.arange(first, last + 1, dtype=np.int64) * _STEP_NS
+        if len(grid_ns) * _STEP_S < 1.0:
             continue
-        yield _on_grid(signals, (speed, steer, yaw_rate), rows, (start, count), wheelbase_m, rules)
+        smoothed = partial(_on_grid, stamps[rows], grid_ns)
+        v, r = smoothed(speed[rows], 2.0), smoothed(yaw_rate[rows], 3.0)
+        yield _Run(
+            start_ns=int(grid_ns[0]),
+            speed=v,
+            steer=smoothed(steer[rows], 5.0),
+            yaw_rate=r,
+            ax=smoothed(signals.ax_m_s2[rows], 2.0),
+            ay=smoothed(signals.ay_m_s2[rows], 3.0),
+            gain=_gain(v, wheelbase_m, rules),
+            turn=v * r,
+            curvature=smoothed(yaw_rate[rows], 1.0) / v,
+        )
 
 
-def _on_grid(
-    signals: Signals,
-    columns: tuple[FloatArray, FloatArray, FloatArray],
-    rows: IntArray,
-    span: tuple[int, int],
-    wheelbase_m: float,
-    rules: ManoeuvreRules,
-) -> _Run:
-    """Return the run from speed, steering and yaw rate (``columns`` [N]), known at ``rows``; ``span`` in steps."""
-    grid = (span[0] + np.arange(span[1], dtype=np.int64)) * _STEP_NS
-    zero_ns = int(signals.stamps_ns[rows[0]])
-    times, to = (signals.stamps_ns[rows] - zero_ns) * 1e-9, (grid - zero_ns) * 1e-9
-
-    def smoothed(values: FloatArray, cutoff_hz: float) -> FloatArray:
-        finite = np.isfinite(values[rows])
-        if not finite.any():
-            return np.zeros(len(to))
-        return smooth(grid, np.interp(to, times[finite], values[rows][finite]), cutoff_hz, _STEP_NS)
-
-    speed, steer, rate = columns
-    v, r = smoothed(speed, 2.0), smoothed(rate, 3.0)
-    return _Run(
-        start_ns=int(grid[0]),
-        speed=v,
-        steer=smoothed(steer, 5.0),
-        yaw_rate=r,
-        ax=smoothed(signals.ax_m_s2, 2.0),
-        ay=smoothed(signals.ay_m_s2, 3.0),
-        gain=_gain(v, wheelbase_m, rules),
-        turn=v * r,
-        curvature=smoothed(rate, 1.0) / v,
-    )
+def _on_grid(stamps_ns: IntArray, grid_ns: IntArray, values: FloatArray, cutoff_hz: float) -> FloatArray:
+    """Return values [N] at stamps as a smoothed column of a grid [K]; 0 if all are unknown."""
+    finite = np.isfinite(values)
+    if not finite.any():
+        return np.zeros(len(grid_ns))
+    times_s, to_s = ((t - stamps_ns[0]) * 1e-9 for t in (stamps_ns[finite], grid_ns))
+    return smooth(grid_ns, np.interp(to_s, times_s, values[finite]), cutoff_hz, _STEP_NS)
 
 
 def _bridged(stamps_ns: IntArray, finite: BoolArray) -> BoolArray:
@@ -315,16 +302,12 @@ def _manoeuvres_of(run: _Run, rules: ManoeuvreRules) -> list[Manoeuvre]:
     swings = _swings(run, rules)
     spans: list[tuple[str, int, int]] = []
     taken = np.zeros(len(run), dtype=np.bool_)
-    for rule in (_lane_changes, _long_repeated, _repeated, _two_swings, _slowing, _steps, _ramps):
+    for rule in (_lane_changes, _repeated, _two_swings, _slowing, _steps, _ramps, _circles):
         for name, start, end in rule(run, swings, rules):
             a, b = max(start, 0), min(end, len(run))
             if b - a > 1 and not taken[a:b].any():
                 taken[a:b] = True
                 spans.append((name, a, b))
-    for name, start, end in _circles(run, rules):
-        free = ~taken[start:end]
-        if free.all():
-            spans.append((name, start, end))
     return [_measured(run, *span) for span in sorted(spans, key=lambda f: f[1])]
 
 
@@ -363,56 +346,29 @@ def _swings(run: _Run, rules: ManoeuvreRules) -> list[_Swing]:
     return sorted(swings, key=lambda s: s.start)
 
 
-def _chains(swings: Sequence[_Swing], gap_s: float, *, alternate: bool) -> Iterator[list[_Swing]]:
-    """Yield the longest chains of swings with gaps up to a time, optionally of alternating sign."""
-    chain: list[_Swing] = []
-    for swing in swings:
-        close = bool(chain) and (swing.start - chain[-1].end) * _STEP_S <= gap_s
-        if close and not (alternate and swing.sign == chain[-1].sign):
-            chain.append(swing)
-            continue
-        if chain:
-            yield chain
-        chain = [swing]
-    if chain:
-        yield chain
-
-
 def _repeated(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
-    """Slalom, continuous sine and sine sweep: swings of alternating sign with regular spacing."""
-    for part in _regular_chains(swings, rules):
+    """Slalom, continuous sine and sine sweep: swings of alternating sign with regular spacing, long series first."""
+    parts = _regular_parts(swings, rules)
+    long = [p for p in parts if len(p) >= rules.sweep_repeated]
+    steady = [p for p in long if min(s.peak for s in p[-2:]) >= 0.5 * max(s.peak for s in p)]
+    for part in (*steady, *parts):
         yield _name_of_repeated(part, rules), part[0].start, part[-1].end
 
 
-def _long_repeated(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
-    """Repeated swings that are too long and too regular for a lane change with corrections after it."""
-    for part in _regular_chains(swings, rules):
-        if len(part) >= rules.sweep_repeated and min(s.peak for s in part[-2:]) >= 0.5 * max(s.peak for s in part):
-            yield _name_of_repeated(part, rules), part[0].start, part[-1].end
-
-
-def _regular_chains(swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[list[_Swing]]:
+def _regular_parts(swings: Sequence[_Swing], rules: ManoeuvreRules) -> list[list[_Swing]]:
+    """Return the chains of short swings to alternating sides, with regular spacing and enough swings."""
     short = [s for s in swings if s.half_s <= rules.swing_s]
-    for chain in _chains(short, rules.swing_gap_s, alternate=True):
-        for part in _regular_parts(chain, rules):
-            if np.mean([s.peak for s in part]) >= 0.8 * rules.peak_m_s2:
-                yield part
-
-
-def _regular_parts(chain: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[list[_Swing]]:
-    """Yield the parts of a chain with regular spacing and enough swings."""
-    part = list(chain[:1])
-    for swing in chain[1:]:
-        spacing = _middle(swing) - _middle(part[-1])
-        before = _middle(part[-1]) - _middle(part[-2]) if len(part) > 1 else spacing
-        if abs(spacing - before) <= rules.regular * max(before, spacing):
-            part.append(swing)
-            continue
-        if len(part) >= rules.repeated:
-            yield part
-        part = [part[-1], swing]
-    if len(part) >= rules.repeated:
-        yield part
+    part = short[:1]
+    parts = [part]
+    for before, swing in pairwise(short):
+        follows = swing.sign != before.sign and (swing.start - before.end) * _STEP_S <= rules.swing_gap_s
+        spacing = np.diff([_middle(s) for s in (*part[-2:], swing)])
+        if not follows or np.ptp(spacing) > rules.regular * spacing.max():
+            part = [before] if follows else []
+            parts.append(part)
+        part.append(swing)
+    high = 0.8 * rules.peak_m_s2
+    return [p for p in parts if len(p) >= rules.repeated and np.mean([s.peak for s in p]) >= high]
 
 
 def _middle(swing: _Swing) -> float:
@@ -554,7 +510,7 @@ def _ramps(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterat
             yield "ramp-steer", swing.start, row
 
 
-def _circles(run: _Run, rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:
+def _circles(run: _Run, swings: Sequence[_Swing], rules: ManoeuvreRules) -> Iterator[tuple[str, int, int]]:  # noqa: ARG001
     """ISO 4138: half a circle or more at a curvature that stays within a share of its median."""
     stamps = np.arange(len(run), dtype=np.int64) * _STEP_NS
     for sign in (1, -1):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.evaluation.segments import MANOEUVRE_SMOOTHING_HZ, known_of, speed_and_ay
+from pdhef_logtool.evaluation.segments import MANOEUVRE_SMOOTHING_HZ, driven_speed, taken
 from pdhef_logtool.evaluation.smoothing import median_step_ns, smooth
 from pdhef_logtool.evaluation.track_errors import signal_error
 from pdhef_logtool.records.signals import Signals
@@ -66,7 +66,7 @@ def operating_space(
     size = shape[0] * shape[1]
     stamps = signals.stamps_ns
     step_ns = median_step_ns(stamps)
-    speed, lateral = speed_and_ay(signals, truth, known_of(truth))
+    speed, lateral = driven_speed(signals, truth), taken(signals, truth, "ay_m_s2")
     ay = np.abs(smooth(stamps, lateral, MANOEUVRE_SMOOTHING_HZ, step_ns))
     steps = np.diff(stamps, append=stamps[-1:]) * 1e-9
     steps = np.minimum(np.where(steps > 0.0, steps, step_ns * 1e-9), MAX_STEP_S)
@@ -88,6 +88,7 @@ def operating_space(
         for i in np.flatnonzero(seconds)
     ]
     friction = signals.friction[np.isfinite(signals.friction)]
-    top_speed, top_ay = (float(c[finite].max()) if finite.any() else None for c in (speed, ay))
+    everywhere = np.where(np.isfinite(speed), speed, signals.speed_m_s)  # ground truth may end before the drive
+    top_speed, top_ay = (float(np.nanmax(c)) if np.isfinite(c).any() else None for c in (everywhere, ay))
     usual = float(np.median(friction)) if friction.size else vehicle.assumed_friction
     return OperatingSpace(cells, top_speed, top_ay, usual)

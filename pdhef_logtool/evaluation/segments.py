@@ -76,21 +76,20 @@ def segment_masks(
     manoeuvres : of the drive; None detects them.
     """
     manoeuvres = find_manoeuvres(signals, vehicle) if manoeuvres is None else manoeuvres
-    of_truth = known_of(truth)
     step_ns = median_step_ns(signals.stamps_ns)
     stamps = signals.stamps_ns
     slow = vehicle.low_speed_blend_m_s
-    lateral = _taken(signals, truth, of_truth, "ay_m_s2")
-    friction = _taken(signals, truth, of_truth, "friction")
+    lateral = taken(signals, truth, "ay_m_s2")
+    friction = taken(signals, truth, "friction")
     linear, nonlinear = _grip_masks(friction, stamps, lateral, step_ns, vehicle)
     ay = smooth(stamps, lateral, MANOEUVRE_SMOOTHING_HZ, step_ns)
     driven = manoeuvre_masks(stamps, manoeuvres)
     slalom = driven["slalom"]
     left = _lasting(stamps, (ay > CORNERING_M_S2) & ~slalom, CORNERING_S)
     right = _lasting(stamps, (ay < -CORNERING_M_S2) & ~slalom, CORNERING_S)
-    speed = _speed(signals, truth, of_truth)
+    speed = driven_speed(signals, truth)
     straight = _lasting(stamps, (speed > slow) & (np.abs(ay) < STRAIGHT_M_S2), STRAIGHT_S)
-    rate = _taken(signals, truth, of_truth, "yaw_rate_rad_s")
+    rate = taken(signals, truth, "yaw_rate_rad_s")
     turning = np.abs(smooth(stamps, rate, MANOEUVRE_SMOOTHING_HZ, step_ns)) < STANDSTILL_YAW_RATE_RAD_S
     standing = _lasting(stamps, (speed < vehicle.standstill_m_s) & turning, STANDSTILL_S)
     moving = ~standing
@@ -123,33 +122,19 @@ def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehiclePara
 
     ``signals``, ``truth`` as for :func:`segment_masks`.
     """
-    of_truth = known_of(truth)
-    if "vx_m_s" not in of_truth and not np.isfinite(signals.speed_m_s).any():
-        return np.ones(len(signals), dtype=np.bool_)
-    return np.asarray(_speed(signals, truth, of_truth) > vehicle.low_speed_blend_m_s)
+    speed = driven_speed(signals, truth)
+    return np.asarray((speed > vehicle.low_speed_blend_m_s) | ~np.isfinite(speed).any())
 
 
-def known_of(truth: StateTrack | None) -> frozenset[str]:
-    """Return the columns to use from ground truth: all with any finite value, so that a drive has one source each."""
-    if truth is None:
-        return frozenset()
-    columns = ("ay_m_s2", "yaw_rate_rad_s", "vx_m_s", "friction")
-    return frozenset(c for c in columns if np.isfinite(getattr(truth, c)).any())
+def taken(signals: Signals, truth: StateTrack | None, column: str) -> FloatArray:
+    """Return a column [N] of the ground truth if it has any finite value, else of the sensors: one source a drive."""
+    of_truth = truth is not None and np.isfinite(getattr(truth, column)).any()
+    return np.asarray(getattr(truth if of_truth else signals, column))
 
 
-def speed_and_ay(signals: Signals, truth: StateTrack | None, of_truth: frozenset[str]) -> tuple[FloatArray, FloatArray]:
-    """Return speed in m/s and lateral acceleration in m/s², [N] each; ``of_truth`` from :func:`known_of`."""
-    return _speed(signals, truth, of_truth), _taken(signals, truth, of_truth, "ay_m_s2")
-
-
-def _taken(signals: Signals, truth: StateTrack | None, of_truth: frozenset[str], column: str) -> FloatArray:
-    values: FloatArray = getattr(truth if column in of_truth else signals, column)
-    return values
-
-
-def _speed(signals: Signals, truth: StateTrack | None, of_truth: frozenset[str]) -> FloatArray:
+def driven_speed(signals: Signals, truth: StateTrack | None) -> FloatArray:
     """Return the speed [N] in m/s, of one source."""
-    if truth is not None and "vx_m_s" in of_truth:
+    if truth is not None and np.isfinite(truth.vx_m_s).any():
         return np.abs(truth.vx_m_s)
     return last_known(signals.stamps_ns, signals.speed_m_s)
 

@@ -33,7 +33,8 @@ LABELS = {
     "state": "state",
 }
 #: Unit for display and factor to it, by unit of metrics.parquet.
-_READ = {"rad": ("°", DEGREES), "rad/s": ("°/s", DEGREES), "m/s^2": ("m/s²", 1.0), "s": ("ms", 1e3), "1": ("", 1.0)}
+_READ = {u: (u.replace("rad", "°").replace("*", "·"), DEGREES) for u in ("rad", "rad/s", "rad*s")}
+_READ |= {"m/s^2": ("m/s²", 1.0), "s": ("ms", 1e3), "1": ("", 1.0)}
 
 
 def read_unit(unit: str) -> tuple[str, float]:

@@ -269,6 +269,10 @@ def plan_from_dict(raw: dict[str, Any], *, where: str, file: str = "") -> Valida
     return ValidationPlan(tuple(r for r in requirements if r is not None), plan.title, file)
 
 
+#: Signals by their symbols, which have no letters in common with the names.
+_SYMBOLS = {"beta": "sideslip_rad", "β": "sideslip_rad", "psi_dot": "yaw_rate_rad_s", "r": "yaw_rate_rad_s"}
+
+
 def _read(table: RequirementTable, where: str, problems: list[str]) -> Requirement | None:
     before = len(problems)
     segment = table.manoeuvre or table.segment or "all"
@@ -280,7 +284,8 @@ def _read(table: RequirementTable, where: str, problems: list[str]) -> Requireme
         ("manoeuvre" if table.manoeuvre else "segment", segment, SEGMENTS),
     ):
         if value not in allowed:
-            problems.append(f"{where}.{key} = {unknown(value, allowed)}")
+            problem = unknown(_SYMBOLS.get(value, value), allowed).partition(": ")[2]
+            problems.append(f"{where}.{key} = {value}: {problem}")
     if len(problems) > before:
         return None
     limit = _limit(table, where, problems)

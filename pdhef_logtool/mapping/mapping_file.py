@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from pdhef_logtool.mapping.naming import UNITS, plain_unit, unit_of
 from pdhef_logtool.mapping.records import (
     AUTO_STAMP,
     CAN_PREFIX,
@@ -39,6 +40,9 @@ _STEERING = ("steer_rad", "steering_wheel_rad")
 #: Table names that are not available for estimators.
 RESERVED_NAMES = ("truth", "sensors", "reference")
 
+#: Kind of unit of a quantity by its SI unit.
+_KINDS = {"rad": "angle", "rad/s": "rate", "m/s": "speed", "m/s^2": "acceleration", "m": "position"}
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1)]
 
@@ -62,6 +66,7 @@ class _Timed(BaseModel):
 class _SourceTable(_Timed):
     field: Name | Annotated[list[Name], Field(min_length=1)]
     scale: Finite | list[Finite] = 1.0
+    unit: Name | None = None
     offset: Finite | list[Finite] = 0.0
     valid_min: Finite | None = None
     valid_max: Finite | None = None
@@ -204,11 +209,13 @@ def _read_section(
         model = checked(_SourceTable, table, where, problems)
         if model is None:
             continue
-        problem = _shape_problem(name, model)
+        scale, problem = _scale(name, model)
+        problem = problem or _shape_problem(name, model)
         if problem:
             problems.append(f"{where}: {problem}")
             continue
-        values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in model.model_dump().items()}
+        entries = model.model_dump(exclude={"unit"}) | {"scale": scale}
+        values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in entries.items()}
         out[name] = SignalSource(name=name, **values)
     return out
 
@@ -241,6 +248,21 @@ def _read_can(raw: object, folder: Path, problems: list[str]) -> CanSettings | N
         return None
     files = model.dbc if isinstance(model.dbc, list) else [model.dbc]
     return CanSettings(dbc=tuple(folder / f for f in files), **model.model_dump(exclude={"dbc"}))
+
+
+def _scale(name: str, model: _SourceTable) -> tuple[float | list[float], str]:
+    """Return the scale to SI, from the unit if there is one, and a problem of the unit."""
+    if model.unit is None:
+        return model.scale, ""
+    si = (SIGNAL_UNITS | TRUTH_UNITS | ESTIMATE_UNITS)[name]
+    kind = "wheel rate" if si == "rad/s" and name.startswith("wheel") else _KINDS.get(si, "")
+    units = UNITS.get(kind, {})
+    factor = unit_of(f"x_{plain_unit(model.unit)}", kind)[1] if units else None
+    if factor is None:
+        return model.scale, f'unit = "{model.unit}" is unknown for {si}, known are {", ".join(units) or si}'
+    if isinstance(model.scale, list) or abs(model.scale) != 1.0:
+        return model.scale, "give unit or scale, not both; scale = -1 reverses the sign"
+    return factor * model.scale, ""
 
 
 def _shape_problem(name: str, model: _SourceTable) -> str:

@@ -115,7 +115,7 @@ def is_command(*names: str) -> bool:
     return any(_WORDS["commands"] & set(words_of(n)) for n in names)
 
 
-def _plain_unit(text: str) -> str:
+def plain_unit(text: str) -> str:
     """Normalize a unit of a file to the form used in field names: ``Unit_DegrePerSecon`` becomes ``deg_per_s``."""
     text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", text.strip("[](){} ")).lower()
     for pattern, sign in _SPELLED_UNITS:
@@ -167,7 +167,7 @@ def _meaning_of_path(topic: str, type_name: str, path: str, unit_text: str) -> M
         return None
     index = re.search(r"\[(\d+)\]$", leaf)
     column = None if index is None else int(index[1])
-    named = f"{leaf}_{_plain_unit(unit_text)}" if unit_text else leaf
+    named = f"{leaf}_{plain_unit(unit_text)}" if unit_text else leaf
     of_leaf = _strength_of_leaf(leaf_words, inner, named, has_unit=bool(unit_text))
     if of_leaf is None:
         return None

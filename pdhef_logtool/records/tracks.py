@@ -44,11 +44,12 @@ TRACK_COLUMNS = (
     "reason",
     *ESTIMATED_COLUMNS,
     *SHARE_COLUMNS,
+    "steer_rad",
 )
 #: Above this share of GNSS in its information the reference is independent of estimators that use the same IMU.
 INDEPENDENT_SHARE = 0.5
 #: Columns that a source may lack.
-OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUMNS, "measured_speed_m_s")
+OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUMNS, "measured_speed_m_s", "steer_rad")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +64,7 @@ class StateTrack:
     if the source provides none; the same applies to roll and bank, the relative excess of all lateral forces, the
     sensor biases, and the shares of axle law, kinematics and GNSS in the sideslip reference. ``measured_speed_m_s`` of
     the ground truth is the speed of the log's sensors; it decides where sideslip is scored if v_x is unknown.
+    ``steer_rad`` is the road-wheel angle that an estimator received.
     """
 
     name: str
@@ -97,6 +99,7 @@ class StateTrack:
     share_gnss: FloatArray = field(default_factory=lambda: np.empty(0))
     independent: FloatArray = field(default_factory=lambda: np.empty(0))
     measured_speed_m_s: FloatArray = field(default_factory=lambda: np.empty(0))
+    steer_rad: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __len__(self) -> int:
         """Return the number of stamps."""

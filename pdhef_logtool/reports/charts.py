@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from pdhef_logtool.records.printable import all_printable
 from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.reports.colours import PLAIN
 from pdhef_logtool.reports.encoding import Grid, encode
 
 #: Maximum number of intervals in a row of a strip; beyond, the intervals closest to each other are joined.
@@ -149,6 +149,13 @@ class PointsFigure(Figure):
     log: bool = False
 
 
+def against(title: str, x_label: str, y_label: str, x: FloatArray, y: FloatArray, colour: str) -> PointsFigure:
+    """Return the figure of two positive values [M] of each drive, and the line on which they are equal."""
+    ends = np.array([min(x.min(), y.min()), max(x.max(), y.max())])
+    clouds = [Cloud("equal", PLAIN, ends, ends, line=True), Cloud("drives", colour, x, y)]
+    return PointsFigure(title, x_label, y_label, clouds, log=True)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class IntervalsFigure(Figure):
     """Figures with their intervals, one below the other; ``zero``: value of a vertical line."""
@@ -235,17 +242,11 @@ def _label(text: str) -> str:
 
 
 def joined(spans: Sequence[Span]) -> list[Span]:
-    """Return the spans in order of time, at most :data:`_MOST_SPANS`, by closing the narrowest gaps between them."""
-    ordered = sorted(spans, key=lambda s: (s.start_s, s.end_s))
-    if len(ordered) <= _MOST_SPANS:
-        return ordered
-    gaps = np.array([b.start_s - a.end_s for a, b in pairwise(ordered)])
-    kept = set(np.argsort(-gaps, kind="stable")[: _MOST_SPANS - 1].tolist())
-    made = [ordered[0]]
-    for i, span in enumerate(ordered[1:]):
-        if i in kept:
-            made.append(span)
-        else:
-            last = made[-1]
-            made[-1] = Span(last.start_s, max(last.end_s, span.end_s), last.text or span.text)
+    """Return the spans in order of time, at most :data:`_MOST_SPANS`; those closer than their share are joined."""
+    made = sorted(spans, key=lambda s: (s.start_s, s.end_s))
+    least_s = (made[-1].end_s - made[0].start_s) / (_MOST_SPANS - 1) if len(made) > _MOST_SPANS else 0.0
+    for i in range(len(made) - 1, 0, -1):
+        if made[i].start_s - made[i - 1].end_s < least_s:
+            last, span = made[i - 1], made.pop(i)
+            made[i - 1] = Span(last.start_s, max(last.end_s, span.end_s), last.text or span.text)
     return made

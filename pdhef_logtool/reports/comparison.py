@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from pdhef_logtool.evaluation.units import read_unit
-from pdhef_logtool.reports.charts import Charts, Cloud, Interval, IntervalsFigure, PointsFigure
+from pdhef_logtool.reports.charts import Charts, Interval, IntervalsFigure, against
 from pdhef_logtool.reports.colours import FAULT, PLAIN
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
@@ -69,10 +69,9 @@ def _draw(comparison: Comparison, first: ComparedFigure, charts: Charts) -> None
     a, b = (np.array([d[side] for d in first.drives], dtype=np.float64) * factor for side in "ab")
     positive = (a > 0.0) & (b > 0.0)
     if positive.any():
-        ends = np.array([min(a[positive].min(), b[positive].min()), max(a[positive].max(), b[positive].max())])
-        clouds = [Cloud("no change", PLAIN, ends, ends, line=True), Cloud("drives", _BLUE, a[positive], b[positive])]
         title = f"{first.requirement.name} of each drive: above the line B is worse"
-        charts.figures["drives"] = PointsFigure(title, f"A [{unit or '1'}]", f"B [{unit or '1'}]", clouds, log=True)
+        labels = f"A [{unit or '1'}]", f"B [{unit or '1'}]"
+        charts.figures["drives"] = against(title, *labels, a[positive], b[positive], _BLUE)
 
 
 def _interval(figure: ComparedFigure, colour: str) -> Interval:

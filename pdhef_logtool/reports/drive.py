@@ -21,7 +21,7 @@ from pdhef_logtool.results.sink import TRUTH
 #: The best filter with physics only; the errors of the baseline would hide all others in a figure.
 _PHYSICS = "physics"
 #: Keys of the figures, in the order of the page.
-OVER_TIME = ("sideslip", "error", "yaw_rate", "ay", "speed", "strip")
+OVER_TIME = ("sideslip", "error", "steer", "yaw_rate", "ay", "speed", "strip")
 IN_PLANE = ("path", "ay_sideslip")
 #: Maximum number of rows of tables that grow with the length of the log.
 _MOST_ROWS = 200
@@ -29,11 +29,12 @@ _MOST_ROWS = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivePage:
-    """The page of a drive: the HTML, its figures, and the error of a file that could not be read."""
+    """The page of a drive: the HTML, its figures, the error of a file that could not be read, the key figures."""
 
     html: bytes
     charts: Charts
     wrong: str = ""
+    key_figures: dict[str, Any] | None = None
 
 
 def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
@@ -55,6 +56,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
             wrong = f"the figures cannot be drawn: {error}"
     charts = Charts() if figures is None else figures.charts
     texts, names = (report.get("answer") or {}).get("texts") or {}, () if roles is None else roles.names
+    key_figures = whole_figures(report, (TRUTH, *names), manoeuvres=True)
     html = render(
         "drive.html",
         charts,
@@ -71,7 +73,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         scores=[] if roles is None else scores(report, roles),
         segments=[] if roles is None else by_segment(report, roles),
         consistency=whole_figures(report, names, manoeuvres=False),
-        key_figures=whole_figures(report, (TRUTH, *names), manoeuvres=True),
+        key_figures=key_figures,
         apart={} if roles is None else disagreements(report, roles),
         definitions=definitions(report),
         checks=sorted(report.get("checks") or (), key=lambda c: ("failed", "undecided", "passed").index(c["verdict"])),
@@ -81,7 +83,7 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         over_time=OVER_TIME,
         in_plane=IN_PLANE,
     )
-    return DrivePage(html, charts, wrong)
+    return DrivePage(html, charts, wrong, key_figures)
 
 
 def roles_of(report: Mapping[str, Any]) -> Roles | None:

@@ -28,7 +28,7 @@ from pdhef_logtool.reports.charts import (
     TimeFigure,
     joined,
 )
-from pdhef_logtool.reports.colours import FAULT, NOTE, PLAIN, colour
+from pdhef_logtool.reports.colours import FAULT, INK, NOTE, PLAIN, colour
 from pdhef_logtool.reports.drive_series import DriveSeries, Reference, Tracks, gather, thinned
 from pdhef_logtool.reports.encoding import grid_of
 from pdhef_logtool.results.sink import TRUTH
@@ -199,6 +199,10 @@ def _add_error(
 
 
 def _add_motion(charts: Charts, series: Mapping[str, DriveSeries], roles: Roles) -> None:
+    steer = series[roles.main].steer
+    if steer is not None and np.isfinite(steer).any():
+        lines = [Series("measured", INK, steer)]
+        charts.figures["steer"] = TimeFigure("Steering, road-wheel angle", "°", lines, resolution=_SEEN, height=120)
     for key, title, unit in (
         ("yaw_rate", "Yaw rate", "°/s"),
         ("ay", "Lateral acceleration, specific force", "m/s²"),
@@ -266,7 +270,9 @@ def _add_worst(
         at_s = np.asarray((stamps[::step] - origin_ns) * 1e-9, dtype=np.float64)
         clouds.append(Cloud(track.name, colour(track.name), at_s, beta[::step], line=True))
     kind = "error" if reference.scored else "difference"
-    title = f"Largest {kind}: {abs(worst.error_rad) * DEGREES:.2f}° at {worst.at_s:.1f} s"
+    here = np.array([worst.at_s]), np.array([worst.estimate_rad * DEGREES])
+    clouds.append(Cloud(f"largest {kind}", FAULT, *here))
+    title = f"Largest {kind} after the first 2 s: {abs(worst.error_rad) * DEGREES:.2f}° at {worst.at_s:.1f} s"
     title += f" during {worst.during}" if worst.during else ""
     charts.figures["worst"] = PointsFigure(title, "s from the log's start", "sideslip in °", clouds)
 

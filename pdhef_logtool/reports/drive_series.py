@@ -18,7 +18,7 @@ from pdhef_logtool.results.sink import TRUTH
 
 #: Columns to draw of every track, and further columns of the ground truth and the selected estimate.
 _COLUMNS = ("vx_m_s", "vy_m_s", "sideslip_rad", "valid", "reason")
-_MORE_COLUMNS = ("yaw_rate_rad_s", "ay_m_s2", "x_m", "y_m", "sideslip_std_rad")
+_MORE_COLUMNS = ("yaw_rate_rad_s", "ay_m_s2", "x_m", "y_m", "sideslip_std_rad", "steer_rad")
 #: Columns that determine errors and gaps of the sideslip.
 OF_SIDESLIP = ("vx_m_s", "vy_m_s", "sideslip_rad", "valid")
 
@@ -46,9 +46,9 @@ class Tracks:
 class DriveSeries:
     """Series of one track for the figures; angles in degrees.
 
-    Envelopes [cells, 2] of sideslip, yaw rate, speed and a_y; largest values [cells] of the absolute ``error``; the
-    95 % CI [cells]; points [3, K] in the planes: stamp, x and y. ``invalid``, ``reason`` at each stamp [N]. Confidence
-    interval, motion and planes are None except for the ground truth and the selected estimate.
+    Envelopes [cells, 2] of sideslip, yaw rate, speed, a_y and steering; largest values [cells] of the absolute
+    ``error``; the 95 % CI [cells]; points [3, K] in the planes: stamp, x and y. ``invalid``, ``reason`` at each stamp
+    [N]. Confidence interval, motion and planes are None except for the ground truth and the selected estimate.
     """
 
     name: str
@@ -62,6 +62,7 @@ class DriveSeries:
     ay: FloatArray | None = None
     path: FloatArray | None = None
     ay_sideslip: FloatArray | None = None
+    steer: FloatArray | None = None
 
 
 def thinned(points: FloatArray | None, most: int) -> FloatArray:
@@ -121,4 +122,5 @@ def gather(name: str, tracks: Tracks, grid: Grid, reference: Reference | None, *
         ay=in_cells(track.ay_m_s2),
         path=points(track.x_m, track.y_m),
         ay_sideslip=points(np.abs(track.ay_m_s2), beta),
+        steer=in_cells(track.steer_rad * DEGREES) if len(track.steer_rad) else None,
     )

@@ -12,8 +12,8 @@ import numpy as np
 from pdhef_logtool.evaluation.requirement_verdicts import next_steps
 from pdhef_logtool.evaluation.units import LABELS, read_unit
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.reports.charts import BarsFigure, Charts, Cloud, Interval, IntervalsFigure, PointsFigure
-from pdhef_logtool.reports.colours import INK, PLAIN, colour
+from pdhef_logtool.reports.charts import BarsFigure, Charts, Interval, IntervalsFigure, against
+from pdhef_logtool.reports.colours import INK, colour
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.breakdown import LEAST_DRIVES
 from pdhef_logtool.results.fleet import ANSWER, JUDGED, Distribution, Fleet, Space, read_fleet
@@ -134,17 +134,9 @@ def _add_figures(charts: Charts, fleet: Fleet) -> None:
         ours, other = (np.array([d.error(name) * degree for d in drives]) for name in (ANSWER, rival))
         both = np.isfinite(ours) & np.isfinite(other) & (ours > 0.0) & (other > 0.0)
         if np.count_nonzero(both) > 2:
-            ends = np.array([min(ours[both].min(), other[both].min()), max(ours[both].max(), other[both].max())])
-            charts.figures["against"] = PointsFigure(
-                f"One point per drive; below the line the selected estimate has the lower error, above it {rival}",
-                f"RMSE of {rival}, °",
-                "RMSE of the selected estimate, °",
-                [
-                    Cloud("equal", PLAIN, ends, ends, line=True),
-                    Cloud("drives", INK, other[both], ours[both]),
-                ],
-                log=True,
-            )
+            title = f"One point per drive; below the line the selected estimate has the lower error, above it {rival}"
+            labels = f"RMSE of {rival}, °", "RMSE of the selected estimate, °"
+            charts.figures["against"] = against(title, *labels, other[both], ours[both], INK)
 
 
 def _rival(fleet: Fleet) -> str | None:

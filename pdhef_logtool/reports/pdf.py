@@ -29,19 +29,20 @@ PDF_FILE = "report.pdf"
 #: Maximum number of drives with a section; drives with the worst verdicts come first.
 _MOST_DRIVES = 20
 #: Figures of a drive in the document. The path contains the positions of the car.
-_FIGURES, _POSITIONS = ("worst", "sideslip", "error", "ay"), ("path",)
+_FIGURES, _POSITIONS = ("worst", "sideslip", "error", "steer", "yaw_rate", "ay"), ("path",)
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _TIMEOUT_S = 180.0
 
 
 @dataclass(frozen=True, slots=True)
 class DriveSection:
-    """One drive of the document: its report, and keys of its figures."""
+    """One drive of the document: its report, keys of its figures, and its key figures of manoeuvres."""
 
     label: str
     outcome: str
     report: Mapping[str, Any] | None
     figures: Sequence[str]
+    key_figures: dict[str, Any] | None = None
 
 
 def write_pdf(run: OpenedRun, *, positions: bool = False) -> Path:
@@ -109,12 +110,12 @@ def pdf_page(run: OpenedRun, *, positions: bool = False) -> bytes:
     reports = [(log, _report(log)) for log in run.logs]
     ranked = sorted(reports, key=lambda pair: _gravity(pair[1]))[:_MOST_DRIVES]
     seconds = sum(r["log"]["duration_s"] for _, r in reports if r is not None)
-    plan = document.get("plan")
+    plan = document.get("plan") or {}
     charts = Charts()
     return render(
         "pdf.html",
         charts,
-        title=(plan or {}).get("title")
+        title=(plan.get("file") and plan.get("title"))
         or f"Validation of {len(run.logs)} {'drive' if len(run.logs) == 1 else 'drives'}",
         run=document,
         seconds=seconds,
@@ -150,7 +151,7 @@ def _gravity(report: Mapping[str, Any] | None) -> tuple[int, float]:
     if report is None:
         return (1, 0.0)
     fails = sum(r["outcome"] == "FAIL" for r in (report.get("plan") or {}).get("requirements") or ())
-    wanted = ((report.get("answer") or {}).get("main"), "sideslip_rad", "all", "rmse")
+    wanted = (report.get("selected_estimate"), "sideslip_rad", "all", "rmse")
     figures = {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
     return -fails, -(figures.get(wanted) or 0.0)
 
@@ -159,10 +160,10 @@ def _section(log: OpenedLog, report: Mapping[str, Any] | None, charts: Charts, *
     """Return a drive of the document; add its figures, each with its own time, to ``charts``."""
     if report is None:
         return DriveSection(log.label, log.outcome, None, ())
-    drawn, keys = drive_page(log).charts, []
+    page, keys = drive_page(log), list[str]()
     for key in (*_FIGURES, *(_POSITIONS if positions else ())):
-        if (figure := drawn.figures.get(key)) is not None:
+        if (figure := page.charts.figures.get(key)) is not None:
             keys.append(f"{key}-{len(charts.figures)}")
-            figure = replace(figure, time=drawn.time()) if isinstance(figure, TimeFigure) else figure
+            figure = replace(figure, time=page.charts.time()) if isinstance(figure, TimeFigure) else figure
             charts.figures[keys[-1]] = figure
-    return DriveSection(log.label, log.outcome, report, keys)
+    return DriveSection(log.label, log.outcome, report, keys, page.key_figures)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
@@ -18,7 +17,7 @@ from pdhef_logtool.evaluation.track_errors import NORMAL_95
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results.log_lines import LEVEL_NAMES, log_lines
 from pdhef_logtool.results.palette import colour_rgb
@@ -60,7 +59,6 @@ class _Plot:
     column: str
     factor: float = 1.0
     std: str | None = None
-    sparse: bool = False
     from_low_speed: bool = True
 
 
@@ -73,7 +71,7 @@ _STATES = (
 )
 _ERRORS = tuple(plot for plot in _STATES if plot.name in ERRORS)
 _HEALTH = (
-    _Plot("nis", "normalised innovation squared", "nis", sparse=True),
+    _Plot("nis", "normalised innovation squared", "nis"),
     _Plot("network_trust", "residual gain", "network_trust"),
     _Plot("r_scale", "factor on R", "r_scale"),
     _Plot("mixture_weight", "weight of the filters with a force scale or a bank", "mixture_weight"),
@@ -86,6 +84,8 @@ _INPUTS = (
     _Plot("ay_m_s2", "measured a_y [m/s²]", "ay_m_s2"),
     _Plot("yaw_rate_deg_s", "measured yaw rate [deg/s]", "yaw_rate_rad_s", DEGREES),
 )
+#: Components of a track that are known at few stamps only.
+_SPARSE = frozenset({"nis"})
 _TRACK, _SIGNALS = "track", "signals"
 _REASON_TEXTS = {r.name: r.text for r in REASONS}
 
@@ -111,7 +111,8 @@ def write_recording(
     Each track is one entity with a row a stamp (of a drive above ten minutes 10 a second, of other estimators 5) and a
     component a quantity, with value and confidence interval. Entities are named by the use of a track (``/truth``,
     ``/main``, ``/baseline``, ``/other/1``), so that one blueprint suits all drives of a run with any estimators; the
-    lines have their names. Errors are where ground truth and estimate share a stamp.
+    lines have their names. Errors are where ground truth and estimate share a stamp. The recording's properties have
+    RMSE, verdicts, car, faults and version.
 
     Parameters
     ----------
@@ -151,6 +152,9 @@ def write_recording(
             drawing.draw_track(track, truth, places[track.name], colour_rgb(track.name, colours or {}))
             drawing.draw_reasons(track)
         drawing.draw_texts(report, events, tracks)
+        for name, values in _properties(report).items():
+            if values:
+                recording.send_property(name, rr.AnyValues(**values))
         data = memory.drain_as_bytes()
     except RuntimeError as error:
         raise OutputError(
@@ -158,6 +162,27 @@ def write_recording(
         ) from error
     with writing(path), open_new(path) as file:
         file.write(data)
+
+
+def _properties(report: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the properties by which a catalog of recordings can be filtered, None and empty lists if unknown."""
+    whole = [
+        m for m in report["metrics"] if (m["signal"], m["metric"], m["segment"]) == ("sideslip_rad", "rmse", "all")
+    ]
+    plan = report.get("plan") or {}
+    failed = [c["name"] for c in report.get("checks", ()) if c["verdict"] == "failed"]
+    faults = [f"{f['kind']} {f['sensor']}" for f in report.get("faults") or ()]
+    return {
+        "sideslip_rmse_deg": {m["estimator"]: m["value"] * DEGREES for m in whole if m["value"] is not None},
+        "verdicts": {r["id"]: r["outcome"] for r in plan.get("requirements", ())},
+        "drive": {
+            "car": report["vehicle"]["name"],
+            "selected": report.get("selected_estimate"),
+            "faults": faults,
+            "failed_checks": failed,
+            "version": report["versions"].get("pdhef-logtool"),
+        },
+    }
 
 
 def _places(names: Sequence[str], shown: Sequence[str]) -> dict[str, str]:
@@ -191,7 +216,7 @@ class _Drawing:
     def draw_signals(self, signals: Signals) -> None:
         """Draw the inputs of the estimators."""
         columns = {plot.name: np.asarray(getattr(signals, plot.column))[:, None] * plot.factor for plot in _INPUTS}
-        self._send_rows("/inputs", _SIGNALS, signals.stamps_ns, columns, frozenset(columns))
+        self._send_sparse("/inputs", _SIGNALS, signals.stamps_ns, columns)
 
     def draw_track(self, track: StateTrack, truth: StateTrack | None, place: str, rgb: tuple[int, int, int]) -> None:
         """Draw a track with its errors and its way."""
@@ -204,8 +229,8 @@ class _Drawing:
         if track.name != TRUTH:
             by_name = errors(track, truth, self.min_speed_m_s)
             columns |= {f"error_{name}": values[:, None] for name, values in by_name.items()}
-        sparse = frozenset(p.name for p in _HEALTH if p.sparse)
-        self._send_rows(f"/{place}", _TRACK, track.stamps_ns, columns, sparse)
+        self._send_sparse(f"/{place}", _TRACK, track.stamps_ns, {n: columns.pop(n) for n in _SPARSE & columns.keys()})
+        self._send_rows(f"/{place}", _TRACK, track.stamps_ns, columns)
         self._draw_path(track, place, rgb)
 
     def _columns(self, track: StateTrack, plots: Sequence[_Plot]) -> dict[str, FloatArray]:
@@ -227,41 +252,37 @@ class _Drawing:
             columns[plot.name] = np.stack(drawn, axis=1)
         return columns
 
-    def _send_rows(
-        self,
-        entity: str,
-        archetype: str,
-        stamps_ns: IntArray,
-        columns: Mapping[str, FloatArray],
-        sparse: frozenset[str],
-    ) -> None:
+    def _send_sparse(self, entity: str, archetype: str, stamps_ns: IntArray, columns: Mapping[str, FloatArray]) -> None:
+        """Send each component [N, k] where it is known, so that its line continues between; unknown at one stamp."""
+        for name, values in columns.items():
+            sent = ~np.isnan(values[:, 0])
+            sent[:1] |= not sent.any()  # the blueprint needs the component
+            self._send_rows(entity, archetype, stamps_ns[sent], {name: values[sent]})
+
+    def _send_rows(self, entity: str, archetype: str, stamps_ns: IntArray, columns: Mapping[str, FloatArray]) -> None:
         """Send the rows of one entity: [N] stamps, and by component [N, k] values, NaN where unknown.
 
-        Lines of ``sparse`` components continue over unknown rows for up to LONGEST_BRIDGE_NS. Of a long drive the
-        first row of each step is sent, with the largest value that a sparse component has in the step.
+        Lines break where stamps are more than LONGEST_BRIDGE_NS apart. Of a long drive, the first row of each step is
+        sent, of sparse components the largest value.
         """
         if len(stamps_ns) == 0:
             return
         if self.is_long:
             first = first_of_slots(stamps_ns, OTHERS_STEP_NS if entity.startswith("/other/") else LONG_STEP_NS)
             columns = {
-                name: np.fmax.reduceat(values, first) if name in sparse else values[first]
+                name: np.maximum.reduceat(values, first) if name in _SPARSE else values[first]
                 for name, values in columns.items()
             }
             stamps_ns = stamps_ns[first]
-        gaps = np.flatnonzero(np.diff(stamps_ns) > LONGEST_BRIDGE_NS) + 1  # lines break there
+        gaps = np.flatnonzero(np.diff(stamps_ns) > LONGEST_BRIDGE_NS) + 1
         times_ns = np.insert(stamps_ns, gaps, stamps_ns[gaps - 1] + 1)
-        absent = {
-            name: np.insert(_bridged(stamps_ns, ~np.isnan(columns[name][:, 0])), gaps, False)
-            for name in columns
-            if name in sparse
-        }
-        columns = {name: np.insert(values, gaps, np.nan, axis=0) for name, values in columns.items()}
+        columns = {name: np.insert(values.astype(np.float32), gaps, np.nan, axis=0) for name, values in columns.items()}
         for first_row in range(0, len(times_ns), _CHUNK_ROWS):
             rows = slice(first_row, first_row + _CHUNK_ROWS)
             sent = [
-                _Column(f"{archetype}:{name}", archetype, values[rows], absent[name][rows] if name in absent else None)
+                column.partition(np.full(len(values[rows]), values.shape[1]))
                 for name, values in columns.items()
+                for column in rr.DynamicArchetype.columns(archetype, components={name: values[rows].reshape(-1)})
             ]
             self._send(entity, times_ns[rows], sent)
 
@@ -295,34 +316,6 @@ class _Drawing:
             self._send("/events", np.array([x.stamp_ns for x in lines], dtype=np.int64), text)
         document = rr.TextDocument(report_markdown(report), media_type=rr.MediaType.MARKDOWN)
         self._log_static("/report", document)
-
-
-class _Column:
-    """A component [N, k] as single precision floats; rows that are ``absent`` contain neither value nor gap."""
-
-    def __init__(self, component: str, archetype: str, values: FloatArray, absent: BoolArray | None) -> None:
-        self._descriptor = rr.ComponentDescriptor(component, archetype=archetype)
-        kept = values if absent is None else values[~absent]
-        lengths = np.full(len(values), values.shape[1]) if absent is None else np.where(absent, 0, values.shape[1])
-        offsets = pa.array(np.concatenate([[0], np.cumsum(lengths)]), pa.int32())
-        mask = None if absent is None else pa.array(absent)
-        flat = pa.array(kept.astype(np.float32).reshape(-1))
-        self._array = pa.ListArray.from_arrays(offsets, flat, mask=mask)
-
-    def component_descriptor(self) -> rr.ComponentDescriptor:
-        """Return its name and archetype."""
-        return self._descriptor
-
-    def as_arrow_array(self) -> pa.Array:
-        """Return its rows."""
-        return self._array
-
-
-def _bridged(stamps_ns: IntArray, is_known: BoolArray) -> BoolArray:
-    """Return the unknown rows that a line continues over: all but those too long after the last known one."""
-    latest = np.maximum.accumulate(np.where(is_known, np.arange(len(stamps_ns)), -1))
-    since_ns = np.where(latest < 0, 0, stamps_ns - stamps_ns[latest])
-    return np.asarray(~is_known & (since_ns <= LONGEST_BRIDGE_NS), dtype=np.bool_)
 
 
 def _strips(points: FloatArray) -> list[FloatArray]:

@@ -24,6 +24,7 @@ _STEPS = {
     "yaw_rate_rad_s": 2.0**-17,
     "sideslip_rad": 2.0**-20,
     "ay_m_s2": 2.0**-12,
+    "steer_rad": 2.0**-17,
     "orientation": 2.0**-18,
 }
 #: Columns in single precision: values that a user has given, such as 0.85.

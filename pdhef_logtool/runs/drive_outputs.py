@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from shutil import copyfile
@@ -70,7 +71,8 @@ class DriveOutputs:
     ) -> None:
         (self._change, self._run_folder), self._run, self._main = folders, run, main
         self._signals, names = estimated.signals, run.names
-        tracks = estimated.drawn
+        steer_rad = estimated.signals.steer_rad
+        tracks = [t if t.name == TRUTH else replace(t, steer_rad=steer_rad) for t in estimated.drawn]
         self.tracks = [without_pose(track) for track in tracks] if run.config.no_position else tracks
         # Recordings show the selected estimate beside physics alone, otherwise beside the naive estimate.
         order = dict.fromkeys([main.name, PHYSICS, *filter(None, [main.naive]), *main.shown])

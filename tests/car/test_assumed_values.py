@@ -69,8 +69,19 @@ def test_without_a_weight_split_that_of_a_passenger_car_is_assumed_and_named(tmp
     ("entries", "named"),
     [
         ({"wheelbase_m": 2.6, "front_weight_share": 0.6}, "mass_kg"),
-        ({"mass_kg": 1500, "wheelbase_m": 2.6, "front_weight_share": 60}, "front_weight_share"),
-        ({"mass_kg": 1500, "wheelbase_m": 2600, "front_weight_share": 0.6}, "cg_to_front_axle_m"),
+        (
+            {"mass_kg": 1500, "wheelbase_m": 2.6, "front_weight_share": 60},
+            r"got front_weight_share: should be less than 1, got 60;",
+        ),
+        (
+            {"mass_kg": 1500, "wheelbase_m": 2600, "front_weight_share": 0.6},
+            r"got wheelbase_m: should [^;]*30, got 2600;",
+        ),
+        ({"mass_kg": 1500, "wheelbase_m": 2.6, "cg_height_m": 550}, r"got cg_height_m: should [^;]*, got 550;"),
+        (
+            {"mass_kg": 1500, "cg_to_front_axle_m": 1.1, "cg_to_rear_axle_m": 1500, "mas": 1},
+            r"got cg_to_rear_axle_m: should [^;]*, got 1500; mas: unknown[^;]*;",
+        ),
         ({"mass_kg": 1500, "wheelbase_m": 2.6, "cg_to_front_axle_m": 1.1, "cg_to_rear_axle_m": 1.5}, "wheelbase_m"),
         ({"mass_kg": -3, "wheelbase_m": 2.6}, "mass_kg"),
     ],

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import re
+import socket
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+import rerun
 
 from pdhef_logtool import __version__
 from pdhef_logtool.storage.documents import seal
@@ -201,6 +204,34 @@ def test_view_takes_all_recordings_of_a_run_or_the_named_ones(tmp_path: Path, mo
     monkeypatch.setattr(running.subprocess, "call", lambda command: called.append(command) or 0)
     running.open_viewer([of["b"], of["a"]], web=True)
     assert called[0][1:] == ["-m", "rerun", "--bind", "127.0.0.1", "--new", "--web-viewer", str(of["b"]), str(of["a"])]
+
+
+def test_view_serves_a_catalog_of_the_recordings(
+    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pdhef_logtool.cli import running
+
+    recording = tmp_path / "recording.rrd"
+    stream = rerun.RecordingStream("pdhef-x", recording_id="a")
+    stream.save(recording)
+    stream.flush()
+    opened: list[str] = []
+
+    def call(command: list[str]) -> int:
+        host, _, port = command[-1].removeprefix("rerun+http://").partition(":")
+        socket.create_connection((host, int(port)), timeout=5.0).close()  # the server is up while the viewer is
+        opened.append(command[-1])
+        return 0
+
+    monkeypatch.setattr(running.subprocess, "call", call)
+    done = called("view", str(recording), "--catalog", "--web")
+    assert done.returncode == 0
+    assert opened[0].startswith("rerun+http://127.0.0.1:")
+    assert f"catalog at {opened[0]}, dataset recording" in done.stdout
+    monkeypatch.setitem(sys.modules, "rerun.server", None)
+    without = called("view", str(recording), "--catalog")
+    assert without.returncode == 2
+    assert "pip install --upgrade rerun-sdk" in _one_line_error(without)
 
 
 def test_a_bug_of_ours_is_one_line_too(sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,7 +45,10 @@ def test_a_step_has_the_figures_of_its_oscillator(side):
     rise = np.clip((T - 1.0) / 0.1, 0.0, 1.0)  # half of it at 1.05 s
     found = figures(
         side * 0.03 * rise, "step-steer", (T > 0.5) & (T < 6.0),
-        {"yaw_rate_rad_s": side * 0.3 * second_order(T - 1.05), "ay_m_s2": side * 6.0 * second_order(T - 1.05)},
+        {
+            "yaw_rate_rad_s": side * 0.3 * second_order(T - 1.05), "ay_m_s2": side * 6.0 * second_order(T - 1.05),
+            "sideslip_rad": side * (0.001 - 0.02 * second_order(T - 1.05)),
+        },
         late={"yaw_rate_rad_s": side * 0.3 * second_order(T - 1.15), "ay_m_s2": np.full(len(T), np.nan)},
     )  # fmt: skip
     fine = np.arange(0.0, 1.0, 1e-5)
@@ -55,6 +58,10 @@ def test_a_step_has_the_figures_of_its_oscillator(side):
         assert found["truth", signal, "step_response_time"] == pytest.approx(time, abs=1e-3)
         assert found["truth", signal, "step_overshoot"] == pytest.approx(overshoot, abs=2e-3)
         assert found["truth", signal, "step_peak"] == pytest.approx(side * size * (1.0 + overshoot), rel=2e-3)
+    peak_s = math.pi / (OMEGA * math.sqrt(1.0 - DAMPING**2))
+    assert found["truth", "yaw_rate_rad_s", "step_peak_time"] == pytest.approx(peak_s, abs=0.006)  # stamps every 10 ms
+    tb = found["truth", "yaw_rate_rad_s", "step_peak_time"] * side * -0.02
+    assert found["truth", "sideslip_rad", "step_tb"] == pytest.approx(tb, rel=1e-3)
     assert found["late", "yaw_rate_rad_s", "step_response_time"] == pytest.approx(time + 0.1, abs=1e-3)
     assert ("late", "ay_m_s2", "step_peak") not in found
 
@@ -93,3 +100,79 @@ def test_a_lane_change_has_the_speed_of_its_first_stamp_and_other_drives_no_figu
     found = figures(0.0 * T, "dlc-3888-2", ((T > 1.995) & (T < 4.0)) | (T > 6.0), speed)
     assert found == {("truth", "vx_m_s", "entry_speed"): pytest.approx(18.0)}
     assert figures(0.0 * T, "straight", T > 2.0, speed) == {}
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_sine_with_dwell_displaces_the_car_by_its_lateral_acceleration(side):
+    start, speed = 1.0, 20.0
+    since = np.maximum(T - start, 0.0)
+    wheel = np.deg2rad(5.0) / VEHICLE.steering_ratio
+    steer = side * wheel * since / 0.205  # 5 degrees at the steering wheel between 0.20 and 0.21 s
+    slide, rate = -0.3 * since**2, 0.4 * since
+    motion = {"vx_m_s": 0.0 * T + speed, "vy_m_s": side * slide, "yaw_rate_rad_s": side * rate}
+    found = figures(steer, "sine-with-dwell", (start <= T) & (T < 3.0), motion, straight={**motion, "vy_m_s": 0.0 * T})
+    a, b = 0.21, 1.28  # v_y - v_y(a), and v_x r integrated twice, both from a to b
+    slid = -0.1 * (b**3 - a**3) + 0.3 * a**2 * (b - a)
+    turned = 0.4 * speed * ((b**3 - a**3) / 6.0 - a**2 * (b - a) / 2.0)
+    assert found["truth", "position_m", "dwell_displacement"] == pytest.approx(slid + turned, rel=2e-3)
+    assert found["straight", "position_m", "dwell_displacement"] == pytest.approx(turned, rel=2e-3)
+
+
+def test_a_sine_sweep_has_the_frequency_response_of_its_lag():
+    corner, gain, delay = 1.2, 8.0, 0.05
+    hz = np.arange(0.5, 2.01, 0.25)  # whole periods in each spectrum
+    time = np.arange(0.0, 20.0, 0.01)
+
+    def answer(f):
+        return gain / (1.0 + 1j * f / corner) * np.exp(-2j * np.pi * f * delay)
+
+    def summed(f_response):
+        return sum((np.exp(2j * np.pi * f * time + 1j * f**2) * f_response(f)).imag for f in hz)
+
+    stamps = T0 + np.round(time * 1e9).astype(np.int64)
+    signals = signals_at(stamps, steer_rad=0.01 * summed(lambda _: 1.0))
+    noise = np.random.default_rng(1).normal(0.0, 0.1, len(time))
+    rates = {"exact": 0.01 * summed(answer), "noisy": 0.01 * summed(answer) + noise}
+    tracks = {name: make_track(name, stamps, yaw_rate_rad_s=rate) for name, rate in rates.items()}
+    inside = {"sine-sweep": time >= 0.0}
+    drive = EvaluatedDrive("x", tracks, None, signals, inside, 3.0, CalibratedSignals(signals, VEHICLE))
+    found = {(r.estimator, r.metric): r.value for r in evaluate_drive(drive, [m.name for m in METRICS])}
+    low = hz[0]
+    bandwidth = corner * math.sqrt(2.0 * (1.0 + (low / corner) ** 2) - 1.0)
+    assert found["exact", "sweep_gain"] == pytest.approx(abs(answer(low)), rel=0.02)
+    assert found["exact", "sweep_phase"] == pytest.approx(-math.atan(1.0 / corner) - 2.0 * math.pi * delay, abs=0.02)
+    assert found["exact", "sweep_bandwidth"] == pytest.approx(bandwidth, rel=0.02)
+    assert found["exact", "sweep_coherence"] > 0.98 > 0.93 > found["noisy", "sweep_coherence"]
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_braking_in_a_turn_has_the_figures_of_its_ramps(side):
+    since = np.maximum(T - 2.5, 0.0)  # the manoeuvre begins 1.5 s before the brake
+    vx = 20.0 - 4.0 * since
+    rate, slip = 0.2 * vx / 20.0 * (1.0 + 0.1 * since), -0.01 - 0.02 * np.sin(np.pi * since)
+    motion = {"vx_m_s": vx, "yaw_rate_rad_s": side * rate, "sideslip_rad": side * slip}
+    holds = motion | {"yaw_rate_rad_s": side * 0.01 * vx, "sideslip_rad": np.full(len(T), np.nan)}
+    inside = (T > 0.995) & (T < 4.505)
+    found = figures(0.0 * T + 0.03 * side, "brake-in-turn", inside, motion, holds=holds)
+    assert found["truth", "yaw_rate_rad_s", "brake_yaw_ratio"] == pytest.approx(1.1, rel=1e-6)
+    assert found["holds", "yaw_rate_rad_s", "brake_yaw_ratio"] == pytest.approx(1.0, rel=1e-6)
+    assert found["truth", "vx_m_s", "brake_deceleration"] == pytest.approx(4.0, rel=1e-6)
+    assert found["truth", "sideslip_rad", "brake_sideslip"] == pytest.approx(-0.02 * side, rel=1e-3)
+    assert ("holds", "sideslip_rad", "brake_sideslip") not in found
+
+
+NAMES = ("step-steer", "sine-with-dwell", "ramp-steer", "dlc-3888-2", "brake-in-turn", "sine-sweep")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_unknown_steering_leaves_the_figures_that_need_none(name):
+    rate = 0.2 + 0.1 * np.sin(4.0 * T)
+    motion = {"vx_m_s": 20.0 - T, "vy_m_s": -0.1 * rate, "yaw_rate_rad_s": rate, "ay_m_s2": 20.0 * rate}
+    steer = 0.03 * np.clip(T - 1.0, 0.0, 1.0) + 0.01 * np.sin(4.0 * T)
+    none = figures(np.full(len(T), np.nan), name, T < 7.5, motion)
+    without = {"entry_speed", "brake_yaw_ratio", "brake_deceleration", "brake_sideslip", "step_peak", "step_overshoot"}
+    assert {metric for _, _, metric in none} <= without
+    whole = figures(steer, name, T < 7.5, motion)
+    some = figures(np.where((T < 0.05) | (np.arange(len(T)) % 7 == 3), np.nan, steer), name, T < 7.5, motion)
+    assert whole.keys() == some.keys() and len(whole) >= 1 and all(map(math.isfinite, some.values()))
+    assert some["truth", "vx_m_s", "entry_speed"] == pytest.approx(19.95, abs=0.02) if name == "dlc-3888-2" else True

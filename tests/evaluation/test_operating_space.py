@@ -44,6 +44,18 @@ def test_cells_have_the_error_of_their_stamps() -> None:
     assert sum(c.seconds for c in whole) == pytest.approx(20.0)
 
 
+def test_the_top_speed_is_that_of_the_drive_also_where_other_signals_are_unknown() -> None:
+    made = signals(20.0, 2.0)
+    n, at = len(made), np.arange(len(made))
+    columns = {"speed_m_s": np.where(at == n // 2, 41.0, 20.0), "ay_m_s2": np.where(at > n // 4, np.nan, 2.0)}
+    some = Signals(**{**{f: getattr(made, f) for f in made.__slots__}, **columns})
+    part = np.where(at < n // 4, 19.0, np.nan)  # ground truth of a part
+    truth = make_track("truth", made.stamps_ns, vx_m_s=part, vy_m_s=0.0 * part, ay_m_s2=part / 10.0)
+    for of in (None, truth):
+        space = operating_space(some, of, None, VEHICLE)
+        assert (space.speed_max_m_s, space.ay_max_m_s2) == (41.0, pytest.approx(2.0, abs=0.11))
+
+
 def test_a_gap_is_no_driving() -> None:
     made = signals(10.0, 1.5, 4.0)
     stamps = made.stamps_ns + np.where(np.arange(len(made)) < 200, 0, 60_000_000_000)

@@ -77,6 +77,15 @@ def test_a_wrong_entry_is_named(table: dict[str, Any], problem: str) -> None:
     assert problem in str(error.value) and error.value.exit_code == 2
 
 
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [("beta", "sideslip_rad"), ("slip_angle", "sideslip_rad"), ("psi_dot", "yaw_rate_rad_s"), ("ay", "ay_m_s2")],
+)
+def test_a_signal_by_its_symbol_is_told_its_name(given: str, meant: str) -> None:
+    with pytest.raises(UsageError, match=rf"signal = {given}: unknown, did you mean {meant}\?"):
+        read({**WHOLE, "signal": given})
+
+
 def test_ids_are_unique_and_a_missing_file_is_a_usage_error(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="id 'A' is used 2 times"):
         read(WHOLE, WHOLE)

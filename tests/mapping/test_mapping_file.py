@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import string
 from pathlib import Path
 
@@ -54,6 +55,28 @@ def test_the_documented_example_loads(tmp_path: Path) -> None:
     assert mapping.truth["vy_m_s"].field == "twist.twist.linear.y"
     assert mapping.quality == QualityGate(topic="/ins/status", field="mode", values=(4.0,))
     assert mapping.origin == "file"
+
+
+@pytest.mark.parametrize(
+    ("signal", "unit", "scale"),
+    [
+        ("steer_rad", "deg", math.pi / 180.0),
+        ("yaw_rate_rad_s", "°/s", math.pi / 180.0),
+        ("yaw_rate_rad_s", "deg/s", math.pi / 180.0),
+        ("ay_m_s2", "g", 9.80665),
+        ("ay_m_s2", "m/s²", 1.0),
+        ("speed_m_s", "km/h", 1.0 / 3.6),
+        ("wheel_speed_fl_rad_s", "rpm", math.pi / 30.0),
+    ],
+)
+def test_a_unit_states_the_scale(tmp_path: Path, signal: str, unit: str, scale: float) -> None:
+    entry = f'[signals.{signal}]\ntopic = "/x"\nfield = "y"\nunit = "{unit}"\n'
+    assert load_text(tmp_path, entry).signals[signal].scale == pytest.approx(scale)
+    assert load_text(tmp_path, f"{entry}scale = -1.0\n").signals[signal].scale == pytest.approx(-scale)
+    with pytest.raises(MappingError, match="give unit or scale, not both"):
+        load_text(tmp_path, f"{entry}scale = 0.5\n")
+    with pytest.raises(MappingError, match=f'{signal}: unit = "furlong" is unknown for .*, known are '):
+        load_text(tmp_path, entry.replace(f'"{unit}"', '"furlong"'))
 
 
 def test_all_problems_come_in_one_line(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from made_runs import START_NS, drive_tracks, write_run
 
 from pdhef_logtool.evaluation.dead_reckoned import path_drift
-from pdhef_logtool.reports.drive import drive_page
+from pdhef_logtool.reports.drive import OVER_TIME, drive_page
 from pdhef_logtool.reports.page import _environment, stamp
 from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
@@ -168,6 +168,37 @@ def test_the_path_is_aligned_at_the_start_and_its_drift_is_stated(tmp_path):
     figure = page.charts.figures["path"]
     assert figure.clouds[0].label == "truth" and all("°" in cloud.label for cloud in figure.clouds[1:])
     assert figure.x_label == "m, along the heading at the start"  # this log has neither position nor heading
+
+
+@pytest.mark.parametrize(
+    ("quantities", "names", "axis"),
+    [
+        (("position_m", "yaw_rad"), ("lat_deg", "lon_deg"), "m east"),
+        (("position_m", "yaw_rad"), ("x_m", "y_m", "yaw_rad"), "x of the log in m"),
+        (("position_m",), ("x_m", "y_m"), "m, along the heading at the start"),
+        ((), (), "m, along the heading at the start"),
+    ],
+)
+def test_the_axes_of_the_path_are_those_of_its_ground_truth(tmp_path, quantities, names, axis):
+    truth = {"available": True, "latency_s": None, "notes": [], "not_independent": []}
+    sample = {"role": "truth", "source": "/ins", "total": 1, "used": 1, "dropped": {}}
+    changes = {
+        "truth": truth | {"quantities": dict.fromkeys(quantities, "/ins")},
+        "ledger": {"samples": [{"name": n, **sample} for n in names]},
+    }
+    figure = drive_page(open_run(write_run(tmp_path, drive_tracks(), **changes)).logs[0]).charts.figures["path"]
+    assert figure.x_label == axis and figure.equal
+
+
+def test_steering_and_motion_are_drawn_over_time(tmp_path):
+    tracks = drive_tracks()
+    steer = np.radians(2.0) * np.sin(np.arange(len(tracks[1])) / 100.0)
+    tracks[1] = replace(tracks[1], steer_rad=steer)
+    page = drive_page(open_run(write_run(tmp_path, tracks)).logs[0])
+    over_time = [key for key in OVER_TIME if f'data-figure="{key}"' in page.html.decode()]
+    assert over_time == ["sideslip", "error", "steer", "yaw_rate", "ay", "speed", "strip"]
+    (line,) = page.charts.figures["steer"].series
+    assert line.label == "measured" and np.nanmax(line.values) == pytest.approx(2.0, abs=1e-3)
 
 
 @pytest.mark.parametrize(("start_s", "dated"), [(86_400, False), (1_700_000_000, True)])

@@ -4,6 +4,7 @@ import zlib
 import numpy as np
 import pytest
 
+from pdhef_logtool.reports.charts import Span, joined
 from pdhef_logtool.reports.encoding import GAP, MOST_CELLS, encode, envelope, grid_of
 
 
@@ -66,3 +67,12 @@ def test_cells_are_a_tenth_of_a_second_finer_for_short_drives_and_never_emptied_
     assert grid.cell_s == pytest.approx(cell_s, rel=0.02)
     assert grid.cells <= MOST_CELLS
     assert np.isfinite(envelope(grid, at, np.ones(n))).all()
+
+
+def test_of_many_spans_the_closest_are_joined_and_all_time_is_covered():
+    edges = np.cumsum(np.random.default_rng(0).uniform(0.1, 1.0, 8000))
+    spans = [Span(a, b) for a, b in edges.reshape(-1, 2)]
+    few = joined(spans)
+    assert joined(few) == few and len(few) <= 1500 < len(spans)
+    assert all(any(f.start_s <= s.start_s and s.end_s <= f.end_s for f in few) for s in spans[::50])
+    assert joined(spans[100::-1]) == spans[:101]

@@ -6,17 +6,22 @@ import html
 import re
 import shutil
 import sys
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from pypdf import PdfReader
 
 sys.path.insert(0, str(Path(__file__).parent))
 from browser import CHROMIUM, WHY_NOT
-from made_runs import drive_tracks, write_run
+from made_runs import drive_tracks, report_of, write_run
 from test_drive import plan_of
 
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.reports import pdf
+from pdhef_logtool.reports.drive import drive_page
 from pdhef_logtool.reports.pdf import pdf_page, write_pdf
 from pdhef_logtool.results.opened_run import open_run
 
@@ -37,9 +42,47 @@ def test_the_document_has_a_cover_contents_verdicts_figures_and_hashes_but_no_po
     )
     assert str(run.document["logs"][0]["sha256"]) in text
     captions = r"<figcaption>(\w+)"
-    assert re.findall(captions, page.decode()) == ["Largest", "Sideslip", "Absolute", "Lateral"]
+    assert re.findall(captions, page.decode()) == ["Largest", "Sideslip", "Absolute", "Yaw", "Lateral"]
     assert not re.search(rb"""(src|href)="http""", page)
     assert "Path" in re.findall(captions, pdf_page(run, positions=True).decode())
+
+
+def test_a_drive_without_dates_has_none(tmp_path):
+    run = open_run(write_run(tmp_path, [replace(t, stamps_ns=t.stamps_ns - t.stamps_ns[0]) for t in drive_tracks(3.0)]))
+    dated = open_run(write_run(tmp_path / "dated", drive_tracks(3.0)))
+    assert "drive.mcap, 3.0 s; sha256" in text_of(pdf_page(run))
+    assert "drive.mcap, 3.0 s from 20" in text_of(pdf_page(dated)) and " UTC; sha256" in text_of(pdf_page(dated))
+    for page in (pdf_page(run), drive_page(run.logs[0]).html):
+        assert not re.search(r"1970|UTC", text_of(page.partition(b"</main>")[0]))
+
+
+@pytest.mark.parametrize(("file", "title"), [("", "Validation of 1 drive"), ("plan.toml", "Release 3")])
+def test_the_title_is_that_of_a_plan_of_the_user(tmp_path, file, title):
+    run = open_run(write_run(tmp_path, drive_tracks(3.0)))
+    run = replace(run, document=run.document | {"plan": {"file": file, "title": "Release 3", "requirements": []}})
+    assert f"<h1>{title}</h1>" in pdf_page(run).decode()
+
+
+def test_the_document_has_the_key_figures_of_manoeuvres(tmp_path):
+    figure = {"signal": "yaw_rate_rad_s", "segment": "all", "metric": "step_response_time", "unit": "s", "n": 9}
+    metrics = [{**figure, "estimator": n, "value": v} for n, v in (("truth", 0.101), ("pd-hef", 0.123))]
+    run = open_run(write_run(tmp_path, drive_tracks(3.0), metrics=metrics))
+    for page in (pdf_page(run), drive_page(run.logs[0]).html):
+        assert "Key figures of manoeuvres truth pd-hef yaw rate: response time ms 101 123" in text_of(page)
+
+
+def test_of_more_drives_than_sections_those_with_the_largest_errors_have_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(pdf, "_MOST_DRIVES", 1)
+    run = open_run(write_run(tmp_path, drive_tracks(3.0)))
+    small, large = (
+        SimpleNamespace(label=label, outcome="ok", file=run.logs[0].file, report=partial(report_of, tracks, label))
+        for label, tracks in (("small", drive_tracks(3.0)), ("large", drive_tracks(3.0, ("zero", "physics", "pd-hef"))))
+    )
+    worse = large.report()
+    worse["metrics"][0]["value"] = 0.1
+    large.report = lambda: worse
+    page = text_of(pdf_page(replace(run, logs=(small, large))))
+    assert "Drives large" in page and "1 more drives are in the pages" in page
 
 
 def test_without_chromium_there_is_one_clear_line(tmp_path, monkeypatch):

@@ -46,11 +46,12 @@ COLUMNS = {
     "ay_bias_m_s2": (pl.Float64, "m/s^2"),
     "yaw_rate_bias_rad_s": (pl.Float64, "rad/s"),
     **dict.fromkeys(("share_law", "share_kinematics", "share_gnss", "independent"), (pl.Float64, "1")),
+    "steer_rad": (pl.Float64, "rad"),
     "causal": (pl.Boolean, ""),
 }
 ESTIMATE_COLUMNS = {name: kind for name, (kind, _) in COLUMNS.items()}
 #: Those that none of these tracks has.
-OPTIONAL = {"mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUMNS}
+OPTIONAL = {"mixture_weight", "reason", *ESTIMATED_COLUMNS, *SHARE_COLUMNS, "steer_rad"}
 UNITS = {name: unit for name, (_, unit) in COLUMNS.items()}
 METRIC_COLUMNS = ["log", "estimator", "signal", "segment", "metric", "value", "unit", "n", "algorithm", "independent"]
 NAMES = ("phy-ukf", "zero", "truth")

@@ -1,138 +1,214 @@
 """Key figures of manoeuvres, of estimates and of ground truth alike, so that an estimator's effect on them is visible.
 
-Each is of the first manoeuvre of its kind in a drive. Steps: ISO 7401:2011; understeer gradient: ISO 4138:2021; entry
-speed of a lane change: ISO 3888-2:2011; sine with dwell: 49 CFR 571.126, S5.2.
+Each is of the first manoeuvre of its kind in a drive.
+
+Sources: ISO 7401:2011, clauses 10 (step input: response times, overshoot, TB) and 14 (continuous sine: gain, phase,
+coherence); ISO 4138:2021 (understeer gradient); ISO 3888-2:2011 (entry speed of a lane change); ISO 7975:2019 (braking
+in a turn, against the circle before it); 49 CFR 571.126, S5.2.1 to S5.2.3 (sine with dwell).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.evaluation.manoeuvres import RULES
 from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
-#: Driving after a manoeuvre that its figures need, the end of a step that is its steady state, s, and the share of its
-#: peak below which steering is at zero.
-_AFTER_S, _STEADY_S, _AT_ZERO = 2.0, 0.5, 0.05
-#: Range of a_y in which the understeer gradient is constant, and least range that determines it; m/s².
-_LINEAR_M_S2, _LEAST_RANGE_M_S2 = 4.0, 1.0
+#: Sine with dwell: driving after it, share of its peak below which steering is at zero, steering-wheel angle at its
+#: beginning, and the time of the displacement after that.
+_AFTER_S, _AT_ZERO, _BEGINNING_RAD, _DISPLACED_S = 2.0, 0.05, np.deg2rad(5.0), 1.07
+#: Steady states: the end of a step, s; between these times before braking, s; range of a_y in which the understeer
+#: gradient is constant, and least range that determines it, m/s².
+_STEADY_S, _CIRCLE_S, _LINEAR_M_S2, _LEAST_RANGE_M_S2 = 0.5, (1.3, 0.3), 4.0, 1.0
+#: Sweep: duration of a spectrum and its distance from the next, rate of the samples, and least share of the steering's
+#: largest spectral density at an excited frequency.
+_SPECTRUM_S, _NEXT_S, _RATE_HZ, _EXCITED = 4.0, 1.0, 50.0, 0.05
+
+_Figures: TypeAlias = "dict[str, float]"
+
+
+class _Steering(NamedTuple):
+    """A manoeuvre [N]: the vehicle, time since the manoeuvre's start, and road-wheel angle."""
+
+    vehicle: VehicleParameters
+    time_s: FloatArray
+    steer: FloatArray
 
 
 def responses(drive: EvaluatedDrive) -> Iterator[Columns]:
-    """Yield the response of each track during the first step, lane change, sine with dwell and ramp or circle."""
+    """Yield the figures of each track, one column a figure with the same value at all stamps of its manoeuvre."""
     if drive.calibrated is None:
         return
     signals, vehicle, _ = drive.calibrated
     since_s: FloatArray = (signals.stamps_ns - signals.stamps_ns[:1]) * np.float64(1e-9)
-    step, lane = (_first(drive, since_s, (name,)) for name in ("step-steer", "dlc-3888-2"))
-    dwell = _first(drive, since_s, ("sine-with-dwell",), _AFTER_S)
-    turn = _first(drive, since_s, ("ramp-steer", "steady-circle"))
+    kinds = [(_first(drive, since_s, names.split()), needed.split(), figures) for names, needed, figures in _KINDS]
+    signals_of, steered = {m.name: m.brief for m in METRICS}, np.isfinite(signals.steer_rad)
     for track in (*drive.tracks.values(), *(() if drive.truth is None else (drive.truth,))):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            beyond = signals.steer_rad - vehicle.wheelbase_m * track.yaw_rate_rad_s / track.vx_m_s
-        common = {"since_s": since_s, "steer": signals.steer_rad, "beyond": beyond}
-        places = {"yaw_rate_rad_s": {"step": step, "dwell": dwell}, "ay_m_s2": {"step": step, "turn": turn}}
-        for signal, masks in (*places.items(), ("vx_m_s", {"lane": lane})):
-            usable = np.isfinite(getattr(track, signal)) & (track.valid | (track is drive.truth))
-            response = {n: np.where(mask & usable, getattr(track, signal), np.nan) for n, mask in masks.items()}
-            yield Columns(track.name, signal, response | common)
+        for inside, needed, figures in kinds:
+            columns = [getattr(track, column) for column in needed]
+            use = inside & np.isfinite(columns[0]) & (track.valid | (track is drive.truth))
+            use &= steered | ~steered[inside].any()  # some figures need no steering
+            if not use.any():
+                continue
+            of = _Steering(vehicle, since_s[use] - since_s[inside][0], signals.steer_rad[use])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                values = figures(of, *(c[use] for c in columns))
+            for name, value in values.items():
+                signal = needed[0] if needed[0] in signals_of[name] else signals_of[name][0]
+                yield Columns(track.name, signal, {name: np.full(len(of.steer), value)}, whole=True)
 
 
-def _first(drive: EvaluatedDrive, since_s: FloatArray, names: tuple[str, ...], after_s: float = 0.0) -> BoolArray:
-    """Return the mask [N] of the first manoeuvre with one of these names and of the time after it."""
+def _first(drive: EvaluatedDrive, since_s: FloatArray, names: list[str]) -> BoolArray:
+    """Return the mask [N] of the first manoeuvre with one of these names, and of the time after a sine with dwell."""
     none = np.zeros(len(since_s), dtype=np.bool_)
     rows = np.flatnonzero(np.logical_or.reduce([none, *(drive.masks[n] for n in names if n in drive.masks)]))
     if not len(rows):
         return none
     last = rows[np.append(np.flatnonzero(np.diff(rows) > 1), len(rows) - 1)[0]]
-    return np.asarray((since_s >= since_s[rows[0]]) & (since_s <= since_s[last] + after_s), dtype=np.bool_)
+    end_s = since_s[last] + _AFTER_S * ("sine-with-dwell" in names)
+    return np.asarray((since_s >= since_s[rows[0]]) & (since_s <= end_s), dtype=np.bool_)
 
 
-def _step(response: FloatArray, since_s: FloatArray, steer: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return steering and response [N] as shares of their steady change, and the steady response."""
-    settled = since_s >= since_s[-1] - _STEADY_S
-    changes = [c - c[0] for c in (steer, response)]
-    steady = [float(np.mean(c[settled])) for c in changes]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return changes[0] / steady[0], changes[1] / steady[1], steady[1]
-
-
-def _reached(since_s: FloatArray, share: FloatArray, level: float) -> float | None:
-    """Return the first time at which a share [N] reaches a level, between stamps; None if it does not."""
+def _reached(time_s: FloatArray, share: FloatArray, level: float) -> float:
+    """Return the first time at which a share [N] reaches a level, between stamps; NaN if it does not."""
     row = int(np.argmax(share >= level))
-    if not share[row] >= level:
-        return None
     pair = slice(max(row - 1, 0), row + 1)
-    return float(np.interp(level, share[pair], since_s[pair]))
+    return float(np.interp(level, share[pair], time_s[pair])) if share[row] >= level else np.nan
 
 
-def _response_time(response: FloatArray, since_s: FloatArray, steer: FloatArray) -> float | None:
-    steering, answer, _ = _step(response, since_s, steer)
-    start, end = _reached(since_s, steering, 0.5), _reached(since_s, answer, 0.9)
-    return None if start is None or end is None else end - start
+def _step(of: _Steering, response: FloatArray, slip: FloatArray | None = None) -> _Figures:
+    settled = of.time_s >= of.time_s[-1] - _STEADY_S
+    changes = [c - c[0] for c in (of.steer, response)]
+    steady = [float(np.mean(c[settled])) for c in changes]
+    steering, answer = (c / s for c, s in zip(changes, steady, strict=True))
+    start_s, peak = _reached(of.time_s, steering, 0.5), float(np.max(answer))
+    peak_s = float(of.time_s[np.argmax(answer)]) - start_s
+    return {
+        "step_response_time": _reached(of.time_s, answer, 0.9) - start_s,
+        "step_peak_time": peak_s,
+        "step_peak": peak * steady[1],
+        "step_overshoot": max(peak - 1.0, 0.0),
+    } | ({} if slip is None else {"step_tb": peak_s * float(np.mean(slip[settled]) - slip[0])})
 
 
-def _overshoot(response: FloatArray, since_s: FloatArray, steer: FloatArray) -> float:
-    return max(float(np.max(_step(response, since_s, steer)[1])) - 1.0, 0.0)
-
-
-def _peak(response: FloatArray, since_s: FloatArray, steer: FloatArray) -> float:
-    _, answer, steady = _step(response, since_s, steer)
-    return float(np.max(answer)) * steady
-
-
-def _ratio(rate: FloatArray, since_s: FloatArray, steer: FloatArray, *, after_s: float) -> float | None:
+def _ratios(of: _Steering, rate: FloatArray) -> _Figures:
     """Return the yaw rate some time after the steering is complete, over its peak after the steering reverses."""
-    first = int(np.argmax(np.abs(steer) > 0.5 * np.max(np.abs(steer))))
-    back = -np.sign(steer[first]) * steer
+    first = int(np.argmax(np.abs(of.steer) > 0.5 * np.max(np.abs(of.steer))))
+    side = np.sign(of.steer[first])
+    back, answer = -side * of.steer, -side * rate
     reversal = first + int(np.argmax(back[first:] > 0.0))
     second = reversal + int(np.argmax(back[reversal:]))
     complete = second + int(np.argmax(back[second:] < _AT_ZERO * back[second]))
-    answer = -np.sign(steer[first]) * rate
     peak = float(np.max(answer[reversal : complete + 1]))
-    at_s = since_s[complete] + after_s
-    if complete == second or peak <= 0.0 or at_s > since_s[-1]:
-        return None
-    return float(np.interp(at_s, since_s, answer)) / peak
+    if complete == second or peak <= 0.0:
+        return {}
+    after = {"dwell_ratio_1s": 1.0, "dwell_ratio_1_75s": 1.75}
+    return {n: np.interp(of.time_s[complete] + s, of.time_s, answer, right=np.nan) / peak for n, s in after.items()}
 
 
-def _understeer(ay: FloatArray, beyond: FloatArray) -> float | None:
+def _displacement(of: _Steering, vx: FloatArray, vy: FloatArray, rate: FloatArray) -> _Figures:
+    """Return the double integral of the lateral acceleration v̇_y + v_x r from the beginning of steer."""
+    row = int(np.argmax(np.abs(of.steer) * of.vehicle.steering_ratio >= _BEGINNING_RAD))
+    time_s = of.time_s[row:]
+
+    def integral(values: FloatArray) -> FloatArray:
+        return np.append(0.0, np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(time_s)))
+
+    sideways = integral(vy[row:] - vy[row] + integral(vx[row:] * rate[row:]))
+    displaced = np.interp(time_s[0] + _DISPLACED_S, time_s, sideways, right=np.nan)
+    return {"dwell_displacement": float(np.sign(of.steer[row]) * displaced)}
+
+
+def _understeer(of: _Steering, ay: FloatArray, rate: FloatArray, vx: FloatArray) -> _Figures:
+    beyond = of.steer - of.vehicle.wheelbase_m * rate / vx
     linear = np.isfinite(beyond) & (np.abs(ay) <= _LINEAR_M_S2)
     if not linear.any() or np.ptp(ay[linear]) < _LEAST_RANGE_M_S2:
-        return None
-    return float(np.polyfit(ay[linear], beyond[linear], 1)[0])
+        return {}
+    return {"understeer_gradient": float(np.polyfit(ay[linear], beyond[linear], 1)[0])}
 
 
-_HANDLING = partial(Metric, columns=responses, whole=True)
-_STEP = partial(_HANDLING, over=("step", "since_s", "steer"), brief=("yaw_rate_rad_s", "ay_m_s2"))
-_DWELL = partial(_HANDLING, over=("dwell", "since_s", "steer"), unit="1", brief=("yaw_rate_rad_s",))
-_RESPONSE = "of the first step steer: from half of the steady steering angle to 90 % of the steady response"
+def _brake(of: _Steering, vx: FloatArray, rate: FloatArray, slip: FloatArray) -> _Figures:
+    since_s = of.time_s - RULES.turn_s
+    circle, braking = (since_s >= -_CIRCLE_S[0]) & (since_s <= -_CIRCLE_S[1]), since_s >= 0.0
+    if not circle.any() or np.count_nonzero(braking) < 2:
+        return {}
+    curvature, change = rate / vx, (slip - np.mean(slip[circle]))[braking & np.isfinite(slip)]
+    speed, end_s = vx[braking], since_s[braking][[0, -1]]
+    return {
+        "brake_yaw_ratio": np.interp(1.0, since_s, curvature, right=np.nan) / np.mean(curvature[circle]),
+        "brake_deceleration": float((speed[0] - speed[-1]) / np.ptp(end_s)),
+        "brake_sideslip": float(max(change, key=abs, default=np.nan)),
+    }
+
+
+def _sweep(of: _Steering, rate: FloatArray) -> _Figures:
+    """Return figures of the frequency response: cross-spectrum of steering and yaw rate over that of the steering."""
+    n, step = round(_SPECTRUM_S * _RATE_HZ), round(_NEXT_S * _RATE_HZ)
+    at_s = np.arange(of.time_s[0], of.time_s[-1], 1.0 / _RATE_HZ)
+    if len(at_s) < n or not np.isfinite(of.steer).all():
+        return {}
+    columns = (np.interp(at_s, of.time_s, c) for c in (of.steer, rate))
+    pieces = (np.lib.stride_tricks.sliding_window_view(c, n)[::step] for c in columns)
+    x, y = (np.fft.rfft((p - p.mean(axis=1, keepdims=True)) * np.hanning(n)) for p in pieces)
+    xx, xy, yy = (np.mean(a.conj() * b, axis=0) for a, b in ((x, x), (x, y), (y, y)))
+    excited = np.flatnonzero(np.abs(xx) >= _EXCITED * np.max(np.abs(xx)))
+    use = slice(excited[0], excited[-1] + 1)
+    hz, response = (np.arange(len(xx)) / _SPECTRUM_S)[use], (xy / xx)[use]
+    gain = np.abs(response)
+    return {
+        "sweep_gain": float(gain[0]),
+        "sweep_phase": np.interp(1.0, hz, np.unwrap(np.angle(response)), left=np.nan, right=np.nan),
+        "sweep_bandwidth": _reached(hz, -gain / gain[0], -np.sqrt(0.5)),
+        "sweep_coherence": float(np.mean((np.abs(xy) ** 2 / np.abs(xx * yy))[use])),
+    }
+
+
+#: Manoeuvres, columns of a track (the first one determines the stamps), and the function that returns the figures.
+_KINDS: tuple[tuple[str, str, Callable[..., _Figures]], ...] = (
+    ("step-steer", "yaw_rate_rad_s sideslip_rad", _step),
+    ("step-steer", "ay_m_s2", _step),
+    ("sine-with-dwell", "yaw_rate_rad_s", _ratios),
+    ("sine-with-dwell", "vx_m_s vy_m_s yaw_rate_rad_s", _displacement),
+    ("ramp-steer steady-circle", "ay_m_s2 yaw_rate_rad_s vx_m_s", _understeer),
+    ("dlc-3888-2", "vx_m_s", lambda _, vx: {"entry_speed": float(vx[0])}),
+    ("brake-in-turn", "vx_m_s yaw_rate_rad_s sideslip_rad", _brake),
+    ("sine-sweep", "yaw_rate_rad_s", _sweep),
+)
+
+
+def _figure(name: str, label: str, unit: str | None, signals: str, definition: str) -> Metric:
+    """Return a metric with one value for a drive."""
+    brief = tuple(signals.split())
+    return Metric(name, label, definition, responses, lambda v: float(v[0]), whole=True, unit=unit, brief=brief)
+
+
+_RATE, _BOTH, _STEP = "yaw_rate_rad_s", "yaw_rate_rad_s ay_m_s2", "of the first step steer: from half of the steady "
 _RATIO = "of the first sine with dwell: yaw rate {} s after completion of steer over its peak after the reversal"
+_DISPLACED = "of the first sine with dwell: lateral displacement 1.07 s after the steering wheel reaches 5°; "
+_CURVATURE = "of the first braking in a turn: curvature r / v_x 1 s after the onset over that of the circle before"
 _SLOPE = "slope of the road-wheel angle less L r / v over a_y up to 4 m/s², of the first ramp or steady circle"
+_GAIN = "of the first sine sweep: yaw rate over road-wheel angle at the lowest frequency with 5 % of the densest"
 METRICS = (
-    _STEP("step_response_time", "response time", _RESPONSE, formula=_response_time, unit="s"),
-    _STEP("step_peak", "peak of step", "largest response to the first step steer", formula=_peak),
-    _STEP("step_overshoot", "overshoot", "`step_peak` over the steady response, less 1", formula=_overshoot, unit="1"),
-    _DWELL("dwell_ratio_1s", "ratio 1 s", _RATIO.format("1"), formula=partial(_ratio, after_s=1.0)),
-    _DWELL("dwell_ratio_1_75s", "ratio 1.75 s", _RATIO.format("1.75"), formula=partial(_ratio, after_s=1.75)),
-    _HANDLING(
-        "understeer_gradient",
-        "understeer gradient",
-        _SLOPE,
-        formula=_understeer,
-        over=("turn", "beyond"),
-        unit="rad/(m/s^2)",
-        brief=("ay_m_s2",),
-    ),
-    _HANDLING(
-        "entry_speed",
-        "entry speed",
-        "v_x at the start of the first severe lane change",
-        formula=lambda speed: float(speed[0]),
-        over=("lane",),
-        brief=("vx_m_s",),
-    ),
+    _figure("step_response_time", "response time", "s", _BOTH, f"{_STEP}steering to 90 % of the steady response"),
+    _figure("step_peak_time", "peak response time", "s", _BOTH, f"{_STEP}steering to the peak of the response"),
+    _figure("step_tb", "TB", "rad*s", "sideslip_rad", "`step_peak_time` of the yaw rate times the steady sideslip"),
+    _figure("step_peak", "peak of step", None, _BOTH, "largest response to the first step steer"),
+    _figure("step_overshoot", "overshoot", "1", _BOTH, "`step_peak` over the steady response, less 1"),
+    _figure("dwell_ratio_1s", "yaw-rate ratio 1 s", "1", _RATE, _RATIO.format("1")),
+    _figure("dwell_ratio_1_75s", "yaw-rate ratio 1.75 s", "1", _RATE, _RATIO.format("1.75")),
+    _figure("dwell_displacement", "displacement", None, "position_m", f"{_DISPLACED}positive to the first side"),
+    _figure("understeer_gradient", "understeer gradient", "rad/(m/s^2)", "ay_m_s2", _SLOPE),
+    _figure("entry_speed", "entry speed", None, "vx_m_s", "v_x at the start of the first severe lane change"),
+    _figure("sweep_gain", "yaw gain", "1/s", _RATE, _GAIN),
+    _figure("sweep_phase", "yaw phase at 1 Hz", "rad", _RATE, "of the yaw rate against the steering; negative: late"),
+    _figure("sweep_bandwidth", "bandwidth", "Hz", _RATE, "frequency at which the gain is 3 dB below `sweep_gain`"),
+    _figure("sweep_coherence", "coherence", "1", _RATE, "of steering and yaw rate, mean of the swept frequencies"),
+    _figure("brake_yaw_ratio", "curvature after 1 s", "1", _RATE, _CURVATURE),
+    _figure("brake_deceleration", "deceleration", "m/s^2", "vx_m_s", "mean from the onset to the end of braking"),
+    _figure("brake_sideslip", "sideslip by braking", None, "sideslip_rad", "largest change from the circle before"),
 )

@@ -8,7 +8,7 @@ import numpy as np
 
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.evaluation.metrics.metric import Columns, EvaluatedDrive, Metric
-from pdhef_logtool.evaluation.segments import known_of, speed_and_ay
+from pdhef_logtool.evaluation.segments import driven_speed
 from pdhef_logtool.evaluation.smoothing import median_step_ns
 from pdhef_logtool.records.signals import FloatArray, Signals
 
@@ -27,7 +27,7 @@ def carried_speed(signals: Signals) -> FloatArray:
 def _exposure(drive: EvaluatedDrive) -> Iterator[Columns]:
     if (signals := drive.signals) is None:
         return
-    speed = np.nan_to_num(speed_and_ay(signals, drive.truth, known_of(drive.truth))[0])
+    speed = np.nan_to_num(driven_speed(signals, drive.truth))
     step_s = np.full(len(signals), median_step_ns(signals.stamps_ns) * 1e-9)
     yield Columns(SENSORS, "state", {"step_s": step_s, "way_m": np.abs(speed) * step_s})
 
