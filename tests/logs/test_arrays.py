@@ -156,10 +156,7 @@ def test_what_is_no_array_of_numbers_is_named() -> None:
     assert _names(tables) == {"ay"}
     assert {severity for severity, _ in _losses(tables)} == {"note"}
     text = " ".join(what for _, what in _losses(tables))
-    assert all(
-        part in text
-        for part in ("deep/d/d", "s is not used: a sparse", "c is not used", "cube (3, 4, 5)", "wide (40, 30)")
-    )
+    assert all(part in text for part in ("deep/d/d/d/d/d/d/d/d: too deep", "s: a sparse", "c: complex", "cube (3, 4, 5)", "wide (40, 30)"))
 
 
 def test_dimensions_without_their_values_cost_one_variable() -> None:
@@ -290,4 +287,6 @@ def test_structs_texts_units_and_cells_of_version_7_3(tmp_path: Path) -> None:
     assert {(t.name, f.path, f.unit) for t in tables.tables for f in t.fields} == {
         ("mat", "ay", ""), ("loop", "data", "m/s^2"),
     }  # fmt: skip
-    assert [(severity, what.partition(" is")[0]) for severity, what in _losses(tables)] == [("note", "cell")]
+    ((severity, what),) = _losses(tables)
+    assert severity == "note"
+    assert ": cell: " in what
