@@ -38,20 +38,24 @@ _RECORDS_A_CHECK = 256  # of the time that a walk takes
 
 @dataclass(frozen=True, slots=True)
 class ChannelRecord:
-    """One channel of a file. Several channels may carry the same topic.
-
-    ``type_name`` is in ROS 2 form for ROS messages; ``schema_name`` is as the file has it.
-    """
+    """One channel of a file. Several channels may carry the same topic."""
 
     id: int
     topic: str
-    type_name: str
     encoding: str  # "cdr" | "ros1" | "json" | "protobuf" | ...
-    schema_name: str
+    schema_name: str  # as the file has it
     schema_encoding: str  # "ros2msg" | "ros2idl" | "ros1msg" | "jsonschema" | "protobuf" | ""
     schema_data: bytes
     metadata: Mapping[str, str] = field(default_factory=dict)
     schema_id: int = 0  # in an MCAP file; 0: no schema
+
+    @property
+    def type_name(self) -> str:
+        """Name of the type; of ROS messages in ROS 2 form, ``pkg/msg/Type``, also for ``pkg/Type``."""
+        parts = self.schema_name.replace("::", "/").split("/")
+        if self.encoding not in ("cdr", "ros1"):
+            return self.schema_name
+        return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 and all(parts) else "/".join(parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +238,7 @@ class Container(ABC):
     channels : by their id in this file. spans : in file order. lost : damage found while the file was opened.
     undeclared : messages by span that are not in its counts, as no record declares their channels.
     size : bytes of the file. cut : whether the file ends before its time. meter : resource limits.
-    form : ``mcap``, ``rosbag1`` or ``sqlite3``.
+    kind : of a log with this file only, as :class:`~.drive_log.DriveLog` has it.
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
     remedy : remedy for a file of another format.
@@ -242,7 +246,7 @@ class Container(ABC):
     is_remote : whether each read is a network request. by_index : whether a sound index names all messages.
     """
 
-    form = ""
+    kind = ""
     selective = False
     is_remote = False
     by_index = False

@@ -238,34 +238,17 @@ def _tolerant(decode: Callable[[bytes], object], schema: MessageSchema) -> Calla
 
 def _affordable_bytes(schema: MessageSchema) -> float:
     """Return the largest message for which decoded objects fit the memory: 100 bytes per field of a byte or two."""
-    if schema.wire == "protobuf":
-        return schema.limits.chunk_bytes / 4
-    if schema.wire == "json":
-        return schema.limits.chunk_bytes / 16
-    return schema.limits.chunk_bytes / 128 * _bytes_an_object(schema.root)
+    if schema.wire in ("cdr", "ros1") and not _contains_objects(schema.root):
+        return math.inf
+    return schema.limits.chunk_bytes / {"protobuf": 4, "json": 16}.get(schema.wire, 128)
 
 
-def _bytes_an_object(node: Node) -> float:
-    """Return the fewest bytes of a ROS message that become an object, for arrays of objects."""
+def _contains_objects(node: Node) -> bool:
+    """Return whether a type has arrays of objects."""
     if isinstance(node, Struct):
-        return min((_bytes_an_object(m) for m in node.members.values()), default=math.inf)
-    if isinstance(node, Array) and (isinstance(node.item, Struct) or node.item == Scalar("string")):
-        size, objects = _least_size(node.item)
-        return min(max(size, 1) / objects, _bytes_an_object(node.item))
-    return math.inf
-
-
-def _least_size(node: Node) -> tuple[int, int]:
-    """Return the fewest bytes of a place, and the objects that it becomes."""
-    if isinstance(node, Struct):
-        parts = [_least_size(m) for m in node.members.values()]
-        return sum(size for size, _ in parts), 1 + sum(n for _, n in parts)
-    if isinstance(node, Array):
-        size, objects = _least_size(node.item) if node.length is not None else (4, 1)
-        return (size * node.length, objects * node.length) if node.length is not None else (size, objects)
-    if isinstance(node, Scalar) and node.kind != "string":
-        return np.dtype(node.code).itemsize, 0
-    return 4, 1
+        return any(map(_contains_objects, node.members.values()))
+    item = node.item if isinstance(node, Array) else None
+    return isinstance(item, Struct) or item == Scalar("string") or (item is not None and _contains_objects(item))
 
 
 def _most_columns(rows: int) -> int:

@@ -22,7 +22,7 @@ from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, Header, Metadata, Schema, Statistics
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_source import ByteSource
@@ -42,17 +42,15 @@ from pdhef_logtool.logs.container import (
     block_from_lists,
     describe_damage,
 )
-from pdhef_logtool.logs.mcap_index import FOOTER, RECORD, IndexedChunk, chunk_places, read_index
+from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_RECORD, RECORD, IndexedChunk, chunk_places, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
-from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.signals import IntArray, Loss
 
 UintArray: TypeAlias = NDArray[np.uint64]
 
 _MESSAGE_RECORD = struct.Struct("<BQHIQ")
 _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, uncompressed CRC, length of the compression's name
-_INDEX_RECORD = struct.Struct("<BQHI")  # opcode, size, channel, bytes of the pairs
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 _UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
 _CRC_BLOCK_BYTES = 4 << 20
@@ -100,7 +98,7 @@ class _Run:
 class McapContainer(FileContainer):
     """One MCAP 1.0 file; its spans are chunks and runs of unchunked messages, in file order."""
 
-    form = "mcap"
+    kind = "mcap"
     magic = MCAP_MAGIC
     magic_text = "the MCAP magic bytes"
     remedy = "is it an MCAP 1.0 recording?"
@@ -246,15 +244,11 @@ class McapContainer(FileContainer):
 
     def _read_header(self, offset: int, length: int) -> None:
         self.meter.limits.check("metadata_bytes", length, "the header record")
-        payload = self.source.read(offset + RECORD.size, length)
         try:
-            (n,) = _U32.unpack_from(payload, 0)
-            self.profile = payload[_U32.size : _U32.size + n].decode()
-            (m,) = _U32.unpack_from(payload, _U32.size + n)
-        except (struct.error, UnicodeDecodeError) as error:
-            raise self.no_log("a header record with profile and library", "a malformed one") from error
-        if 2 * _U32.size + n + m > length:
-            raise self.no_log("a header record with profile and library", "a draft of the format before 1.0")
+            self.profile = _parsed(Header, self.source.read(offset + RECORD.size, length)).profile
+        except (struct.error, UnicodeDecodeError, McapError) as error:
+            got = "a malformed one, or a draft of the format before 1.0"
+            raise self.no_log("a header record with profile and library", got) from error
 
     def _next_chunk(self, after: int) -> int | None:
         """Return the first chunk behind a damaged place that a damaged summary names, or None."""
@@ -276,10 +270,10 @@ class McapContainer(FileContainer):
         elif opcode == Opcode.DATA_END:
             self._data_end = (start, end)
         elif opcode == Opcode.METADATA:
-            Metadata.read(ReadDataStream(BytesIO(self._payload(start, end))))
+            _parsed(Metadata, self._payload(start, end))
             self._metadata_at.append((start, end))
         elif opcode == Opcode.STATISTICS and self._data_end:
-            self._statistics = Statistics.read(ReadDataStream(BytesIO(self._payload(start, end))))
+            self._statistics = _parsed(Statistics, self._payload(start, end))
         elif opcode == Opcode.FOOTER and self._data_end:
             self._footer = start
         elif opcode == _OP_MESSAGE_INDEX or (
@@ -299,10 +293,10 @@ class McapContainer(FileContainer):
         """Add a schema or channel record."""
         self.meter.limits.check("metadata_bytes", len(payload), "a declaration")
         if opcode == _OP_SCHEMA:
-            schema = Schema.read(ReadDataStream(BytesIO(payload)))
+            schema = _parsed(Schema, payload)
             self._schemas.setdefault(schema.id, schema)
             return
-        channel = Channel.read(ReadDataStream(BytesIO(payload)))
+        channel = _parsed(Channel, payload)
         if channel.id not in self._raw_channels:
             self.meter.limits.check("channels", len(self._raw_channels) + 1, f"channel {channel.id}")
             self._raw_channels[channel.id] = channel
@@ -363,7 +357,7 @@ class McapContainer(FileContainer):
         Its content describes it. In a file without an end, message indexes that agree with the head of the chunk do.
         """
         index_end, size = end, self.source.size
-        while index_end + _INDEX_RECORD.size <= size:
+        while index_end + INDEX_RECORD.size <= size:
             opcode, length = RECORD.unpack(self.source.read(index_end, RECORD.size))
             if opcode & ~_FIRST_PRIVATE != _OP_MESSAGE_INDEX or index_end + RECORD.size + length > size:
                 break  # one wrong bit makes an index a private record
@@ -415,14 +409,11 @@ class McapContainer(FileContainer):
         """Join channels and schemas once all are known."""
         for id_, channel in self._raw_channels.items():
             schema = self._schemas.get(channel.schema_id)
-            name = schema.name if schema else ""
-            is_ros = channel.message_encoding in ("cdr", "ros1")
             self.channels[id_] = ChannelRecord(
                 id=id_,
                 topic=channel.topic,
-                type_name=ros2_type_name(name) if is_ros else name,
                 encoding=channel.message_encoding,
-                schema_name=name,
+                schema_name=schema.name if schema else "",
                 schema_encoding=schema.encoding if schema else "",
                 schema_data=schema.data if schema else b"",
                 metadata=dict(channel.metadata),
@@ -572,10 +563,10 @@ class McapContainer(FileContainer):
         """Return whether a record of a chunk declares kept channels only, as this file declares them."""
         try:
             if opcode == Opcode.CHANNEL:
-                channel = Channel.read(ReadDataStream(BytesIO(payload)))
+                channel = _parsed(Channel, payload)
                 return channel.id in kept and channel == self._raw_channels[channel.id]
             if opcode == Opcode.SCHEMA:
-                schema = Schema.read(ReadDataStream(BytesIO(payload)))
+                schema = _parsed(Schema, payload)
                 used = {self._raw_channels[id_].schema_id for id_ in kept}
                 return schema.id in used and schema == self._schemas[schema.id]
         except (struct.error, UnicodeDecodeError, ValueError, McapError):
@@ -603,8 +594,7 @@ class McapContainer(FileContainer):
     def _sound_records(self, extents: Iterable[tuple[int, int]], kind: Any) -> Iterator[Any]:
         for start, end in extents:
             try:
-                payload = self.source.read(start + RECORD.size, end - start - RECORD.size)
-                record = kind.read(ReadDataStream(BytesIO(payload)))
+                record = _parsed(kind, self.source.read(start + RECORD.size, end - start - RECORD.size))
             except Exception as error:  # noqa: BLE001 (the boundary)
                 self.lose_record(start, error)
                 continue
@@ -627,6 +617,11 @@ class McapContainer(FileContainer):
         self._attachment_at.append((start - RECORD.size, end))
 
 
+def _parsed(kind: Any, payload: bytes) -> Any:
+    """Return a record of a kind from its content."""
+    return kind.read(ReadDataStream(BytesIO(payload)))
+
+
 def _chunk_head(record: bytes, end: int) -> tuple[int, int, str, int, int]:
     """Return size, CRC, compression, and place and length of the stored bytes of the chunk record up to ``end``."""
     try:
@@ -645,13 +640,13 @@ def _message_indexes(record: bytes, offset: int) -> list[tuple[int, UintArray, U
     """Return channel, log times [N] and offsets [N] of each message index from a byte on; None if one is malformed."""
     indexes: list[tuple[int, UintArray, UintArray]] = []
     while offset < len(record):
-        if offset + _INDEX_RECORD.size > len(record):
+        if offset + INDEX_RECORD.size > len(record):
             return None
-        opcode, length, channel, n = _INDEX_RECORD.unpack_from(record, offset)
+        opcode, length, channel, n = INDEX_RECORD.unpack_from(record, offset)
         end = offset + RECORD.size + length
-        if opcode != _OP_MESSAGE_INDEX or n % _INDEX_PAIR.itemsize or offset + _INDEX_RECORD.size + n > end:
+        if opcode != _OP_MESSAGE_INDEX or n % _INDEX_PAIR.itemsize or offset + INDEX_RECORD.size + n > end:
             return None
-        pairs = np.frombuffer(record, _INDEX_PAIR, n // _INDEX_PAIR.itemsize, offset + _INDEX_RECORD.size)
+        pairs = np.frombuffer(record, _INDEX_PAIR, n // _INDEX_PAIR.itemsize, offset + INDEX_RECORD.size)
         indexes.append((channel, pairs["log"], pairs["offset"]))
         offset = end
     return indexes

@@ -28,7 +28,6 @@ from pdhef_logtool.logs.container import (
 )
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import Meter
-from pdhef_logtool.logs.type_names import ros2_type_name
 
 _OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CHUNK_INFO, _OP_CONNECTION = 2, 3, 4, 5, 6, 7
 _U32 = struct.Struct("<I")
@@ -56,7 +55,7 @@ class _Chunk:
 class Rosbag1Container(FileContainer):
     """One ROS 1 bag of format 2.0, its connections as channels."""
 
-    form = "rosbag1"
+    kind = "rosbag1"
     profile = ""  # of ROS 1 messages beside ours of ROS 2
     magic = ROSBAG1_MAGIC
     magic_text = "'#ROSBAG V2.0' at its start"
@@ -179,7 +178,6 @@ class Rosbag1Container(FileContainer):
         if id_ in self.channels:
             return
         self.meter.limits.check("channels", len(self.channels) + 1, f"connection {id_}")
-        type_name = inner["type"].decode()
         metadata: dict[str, str] = {
             name: inner[name].decode("utf-8", errors="replace")
             for name in ("callerid", "latching", "md5sum")
@@ -188,9 +186,8 @@ class Rosbag1Container(FileContainer):
         self.channels[id_] = ChannelRecord(
             id=id_,
             topic=fields["topic"].decode(),
-            type_name=ros2_type_name(type_name),
             encoding="ros1",
-            schema_name=type_name,
+            schema_name=inner["type"].decode(),
             schema_encoding="ros1msg",
             schema_data=inner.get("message_definition", b""),
             metadata=metadata,

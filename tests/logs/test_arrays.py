@@ -156,7 +156,10 @@ def test_what_is_no_array_of_numbers_is_named() -> None:
     assert _names(tables) == {"ay"}
     assert {severity for severity, _ in _losses(tables)} == {"note"}
     text = " ".join(what for _, what in _losses(tables))
-    assert all(part in text for part in ("deep/d/d/d/d/d/d/d/d: too deep", "s: a sparse", "c: complex", "cube (3, 4, 5)", "wide (40, 30)"))
+    assert all(
+        part in text
+        for part in ("deep/d/d/d/d/d/d/d/d: too deep", "s: a sparse", "c: complex", "cube (3, 4, 5)", "wide (40, 30)")
+    )
 
 
 def test_dimensions_without_their_values_cost_one_variable() -> None:

@@ -16,7 +16,7 @@ CASES = {
     "hostile/t_min.csv": ("csv", 1500, 29.98, 86_400, {}),
     "hostile/excel.csv": ("csv", 1500, 29.98, 1_765_238_400, {"clock": "note"}),
     "hostile/dropout5s.csv": ("csv", 2000, 39.98, 86_400, {}),
-    "hostile/mat5_segv_a.mat": ("mat", 300, 5.98, 86_400, {"bad-variable": "lost"}),
+    "hostile/mat5_segv_a.mat": ("mat", 300, 5.98, 86_400, {"bad-variable": "lost", "no-numbers": "note"}),
     "hostile/mat73_19kB_15GiB.mat": ("mat", 300, 5.98, 86_400, {"bad-variable": "lost"}),
     "hostile/mat73_external_storage.mat": ("mat", 300, 5.98, 86_400, {"bad-variable": "lost"}),
     "tables/reference.csv": ("csv", 1000, 19.98, 86_400, {}),

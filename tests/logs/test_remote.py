@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import read_drive
-from pdhef_logtool.logs import remote_copy, remote_source
+from pdhef_logtool.logs import remote_source
 from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
@@ -201,7 +201,7 @@ def test_a_later_command_fetches_no_byte_again(served: CountingServer, sample_lo
 def test_copies_in_use_stay_and_the_others_are_removed(served: CountingServer, monkeypatch: pytest.MonkeyPatch) -> None:
     served.files["again.mcap"] = served.files["dlc.mcap"]
     log = open_log(_place(served, "dlc.mcap"))
-    monkeypatch.setattr(remote_copy, "CACHE_BYTES", 0)
+    monkeypatch.setattr(remote_source, "CACHE_BYTES", 0)
     _read(_place(served, "again.mcap"))
     assert [path.name for path in _copies()] == ["dlc.mcap"]
     log.close()
