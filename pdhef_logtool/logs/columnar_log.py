@@ -26,7 +26,7 @@ from pdhef_logtool.logs.decoding import (
     missing_column,
 )
 from pdhef_logtool.logs.definitions import SHIPPED
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window, nearest
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, Window
 from pdhef_logtool.logs.message_schema import (
     FieldInfo,
     MessageSchema,
@@ -35,6 +35,7 @@ from pdhef_logtool.logs.message_schema import (
     SchemaError,
     Selection,
     leaves,
+    nearest,
     resolve,
     stated_units,
 )

@@ -418,16 +418,27 @@ class FileContainer(Container):
         self.chunks.append(chunk)
         self.spans.append(replace(span, index=len(self.spans)))
 
-    def add_content(self, chunk: Any, claimed: Span | None, read: Callable[[], Block]) -> Block | None:
+    def extent(self, span: Span) -> tuple[int, int]:
+        """Return the bytes of the span's chunk, which has them as ``start`` and ``end``."""
+        chunk = self.chunks[span.index]
+        return chunk.start, chunk.end
+
+    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
+        """Decode one chunk; see :class:`Container`."""
+        del want
+        return self._decoded(self.chunks[span.index], declare=False)
+
+    @abstractmethod
+    def _decoded(self, chunk: Any, *, declare: bool) -> Block:
+        """Return the messages of a chunk; with ``declare``, add the channels that it declares."""
+
+    def add_content(self, chunk: Any, claimed: Span | None = None) -> Block | None:
         """Add a chunk by its content; return None if it is damaged, which is a loss.
 
-        Parameters
-        ----------
-        chunk : with ``start`` and ``end`` of its bytes. read : decodes it.
-        claimed : times and counts by its header and index, if these are known.
+        ``claimed`` : times and counts by its header and index, if these are known.
         """
         try:
-            block = read()
+            block = self._decoded(chunk, declare=True)
         except Exception as error:  # noqa: BLE001 (the boundary)
             kind, text = describe_damage(error)
             count = sum(claimed.counts.values()) or None if claimed else None

@@ -115,19 +115,16 @@ class ChannelDecoder:
         """Decode the messages ``rows`` of a block: float64 [N] or [N, k], or int64 nanoseconds [N], by path."""
         self.undecodable = []
         partial: _Parts = []
-        left = every = np.arange(len(rows))
+        left = np.arange(len(rows))
         if self.schema.wire in ("cdr", "ros1"):
             left = self._read_records(block, rows, left, partial)
         if left.size or not partial:
             partial.append((left, self._read_singly(block, rows[left])))
-        if len(partial) == 1 and len(partial[0][0]) == len(rows):
-            order, columns = partial[0]
-            if order is every or np.all(order[1:] >= order[:-1]):
-                return columns
-            back = np.argsort(order)
-            return {path: column[back] for path, column in columns.items()}
         joined = {s.path: concatenate_columns([part[s.path] for _, part in partial]) for s in self.selections}
-        back = np.argsort(np.concatenate([part_rows for part_rows, _ in partial]), kind="stable")
+        order = np.concatenate([part_rows for part_rows, _ in partial])
+        if np.all(order[1:] >= order[:-1]):
+            return joined
+        back = np.argsort(order, kind="stable")
         return {path: column[back] for path, column in joined.items()}
 
     def _read_records(self, block: Block, rows: IntArray, left: IntArray, partial: _Parts) -> IntArray:
@@ -342,19 +339,15 @@ def _number(value: object) -> float:
 
 def _shape_of_values(values: Sequence[object]) -> tuple[str, int]:
     """Judge a place that the schema leaves open by its first value."""
-    for value in values:
-        if value is None:
-            continue
-        if isinstance(value, (list, tuple)):
-            return "array", 0
-        if isinstance(value, dict):
-            names = frozenset(value)
-            if any(names == set(pair) for pair in TIME_MEMBERS):
-                return "time", 0
-            if names in VECTOR_ORDERS:
-                return "vector", len(VECTOR_ORDERS[names])
-        return "scalar", 0
-    return "", 0
+    value = next((value for value in values if value is not None), None)
+    if isinstance(value, (list, tuple)):
+        return "array", 0
+    names = frozenset(value) if isinstance(value, dict) else frozenset()
+    if any(names == set(pair) for pair in TIME_MEMBERS):
+        return "time", 0
+    if names in VECTOR_ORDERS:
+        return "vector", len(VECTOR_ORDERS[names])
+    return "" if value is None else "scalar", 0
 
 
 def _column(shape: str, values: Sequence[object], width: int | None) -> NDArray[Any]:

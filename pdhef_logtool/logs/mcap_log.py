@@ -375,7 +375,7 @@ class McapContainer(FileContainer):
                 self.add_span(extent, claimed)
                 return index_end
         self._opened_chunks += 1
-        block = self.add_content(extent, claimed, lambda: self._decoded(extent, declare=True))
+        block = self.add_content(extent, claimed)
         if block is not None:
             held = block.counts
             missing = sum(max(n - held.get(id_, 0), 0) for id_, n in claimed.counts.items())
@@ -467,23 +467,13 @@ class McapContainer(FileContainer):
             crc = crc32(self.source.read(offset, min(_CRC_BLOCK_BYTES, end - offset)), crc)
         return crc
 
-    def extent(self, span: Span) -> tuple[int, int]:
-        """Return the bytes of the span's record or records."""
-        extent = self.chunks[span.index]
-        return extent.start, extent.end
-
     def prefetch(self, spans: Iterable[Span]) -> None:
         """See :class:`~pdhef_logtool.logs.container.Container`."""
         if self.source.is_remote:
             extents = (self.chunks[span.index] for span in spans)
             self.source.prefetch((extent.start, extent.index_end) for extent in extents)
 
-    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
-        """Decode one span."""
-        del want
-        return self._decoded(self.chunks[span.index])
-
-    def _decoded(self, extent: _Extent, *, declare: bool = False) -> Block:
+    def _decoded(self, extent: _Extent, *, declare: bool) -> Block:
         """Return the messages of a chunk or run; with ``declare``, add the schemas and channels in it.
 
         The message indexes are used only if the chunk contains the messages that they name, and no others.

@@ -485,7 +485,8 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
             return Selection(path, "dynamic", (steps,))
         node = _part(node, step)
     if node is None:
-        raise _no_such_path(schema, topic, path)
+        paths = [leaf.path for leaf in leaves(schema.root)]
+        raise nearest(path, paths, f"a field of {schema.type_name or 'the message'}", topic)
     if ending:
         # Records of ROS messages are read without their texts.
         is_text = isinstance(node, Unknown) or (isinstance(node, Scalar) and node.kind == "string")
@@ -530,18 +531,14 @@ def _select_array(node: Array, schema: MessageSchema, topic: str, path: str, ste
     return Selection(path, "array", (steps,), node.length)
 
 
-def _no_such_path(schema: MessageSchema, topic: str, path: str) -> MappingError:
-    paths = [leaf.path for leaf in leaves(schema.root)]
-    near = difflib.get_close_matches(path, paths, n=3, cutoff=0.4)
+def nearest(name: str, names: Sequence[str], expected: str, where: object) -> MappingError:
+    """Return the error for a topic or field that is not among these names."""
+    near = difflib.get_close_matches(name, names, n=3, cutoff=0.4)
     if not near:
-        last = path.rsplit(".", 1)[-1]
-        near = [p for p in paths if p.rsplit(".", 1)[-1] == last][:3] or paths[:3]
-    return MappingError(
-        expected=f"a field of {schema.type_name or 'the message'}",
-        got=repr(path),
-        where=topic,
-        remedy=f"nearest: {', '.join(near)}" if near else "the type has no fields",
-    )
+        last = name.rsplit(".", 1)[-1]
+        near = [n for n in names if n.rsplit(".", 1)[-1] == last][:3] or list(names[:5])
+    remedy = f"nearest: {', '.join(near)}" if near else "there are none"
+    return MappingError(expected=expected, got=repr(name), where=str(where), remedy=remedy)
 
 
 def _no_number(schema: MessageSchema, topic: str, path: str, what: str) -> MappingError:

@@ -143,7 +143,7 @@ class Rosbag1Container(FileContainer):
             if self._infos.get(chunk.start, chunk.counts) == chunk.counts:
                 self.add_span(chunk, span)
             else:
-                self._open_chunk(chunk)
+                self.add_content(chunk)
         if missing > 0 and not self.lost:
             self.lose("missing-messages", f"the bag's header names {chunks} chunks, {missing} of them are not there")
 
@@ -170,7 +170,7 @@ class Rosbag1Container(FileContainer):
         for span in self.spans:
             if not set(span.counts) <= set(self.channels):
                 with contextlib.suppress(Exception):  # a read of the span reports the damage
-                    self._decode(self.chunks[span.index], declare=True)
+                    self._decoded(self.chunks[span.index], declare=True)
 
     def _add_connection(self, fields: Mapping[str, bytes], payload: bytes) -> None:
         inner = _header_fields(payload)
@@ -200,25 +200,11 @@ class Rosbag1Container(FileContainer):
             return
         self._found += 1
         if not complete or not chunk.counts or chunk.counts.total() * _LEAST_MESSAGE_BYTES > chunk.size:
-            self._open_chunk(chunk)
+            self.add_content(chunk)
         else:
             self.add_span(chunk, Span(0, chunk.first_ns, chunk.last_ns + 1, dict(chunk.counts), chunk.ordered))
 
-    def _open_chunk(self, chunk: _Chunk) -> None:
-        """Add a chunk by its content; a damaged chunk is a loss."""
-        self.add_content(chunk, None, lambda: self._decode(chunk, declare=True))
-
-    def extent(self, span: Span) -> tuple[int, int]:
-        """Return the bytes of the chunk's record."""
-        chunk = self.chunks[span.index]
-        return chunk.start, chunk.end
-
-    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
-        """Decode one chunk; see :class:`~pdhef_logtool.logs.container.Container`."""
-        del want
-        return self._decode(self.chunks[span.index], declare=False)
-
-    def _decode(self, chunk: _Chunk, declare: bool) -> Block:
+    def _decoded(self, chunk: _Chunk, *, declare: bool) -> Block:
         self.meter.limits.check("chunk_bytes", chunk.end - chunk.stored_start, "a chunk")
         stored = self.source.read(chunk.stored_start, chunk.end - chunk.stored_start)
         content = decompress(chunk.compression or "unnamed", stored, chunk.size, self.meter.limits)

@@ -252,12 +252,10 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
         schema_data: bytes,
         message_encoding: str,
         metadata: Mapping[str, str],
-        channel_id: int = -1,
-        schema_id: int = 0,
     ) -> int:
         """Add a channel for :class:`RawMessage`, as :meth:`add_channel`."""
         schema = schema_name, schema_encoding, schema_data
-        return self.add_channel(ChannelRecord(channel_id, topic, message_encoding, *schema, metadata, schema_id))
+        return self.add_channel(ChannelRecord(-1, topic, message_encoding, *schema, metadata))
 
     def has_ids_of(self, channel_id: int, record: ChannelRecord) -> bool:
         """Return whether a channel has the ids of a record, which a :class:`RawChunk` of its file needs."""
@@ -371,16 +369,13 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
     def _emit_chunk(self, chunk: RawChunk) -> None:
         channel, log_time, offset, stored = chunk.channel, chunk.log_time_ns, chunk.offset, chunk.stored
         start_ns, end_ns = int(log_time.min()), int(log_time.max())
-        chunk_start, chunk_length = self._emit_record(
-            Chunk(
-                compression=chunk.compression,
-                data=stored,
-                message_start_time=start_ns,
-                message_end_time=end_ns,
-                uncompressed_crc=chunk.crc,
-                uncompressed_size=chunk.size,
-            )
-        )
+        about: dict[str, Any] = {
+            "compression": chunk.compression,
+            "message_start_time": start_ns,
+            "message_end_time": end_ns,
+            "uncompressed_size": chunk.size,
+        }
+        chunk_start, chunk_length = self._emit_record(Chunk(data=stored, uncompressed_crc=chunk.crc, **about))
         index_at = self._at
         offsets: dict[int, int] = {}
         index = bytearray()
@@ -398,13 +393,10 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
             ChunkIndex(
                 chunk_start_offset=chunk_start,
                 chunk_length=chunk_length,
-                message_start_time=start_ns,
-                message_end_time=end_ns,
                 message_index_offsets=offsets,
                 message_index_length=self._at - index_at,
-                compression=chunk.compression,
                 compressed_size=len(stored),
-                uncompressed_size=chunk.size,
+                **about,
             )
         )
         self._first_ns = start_ns if self._first_ns is None else min(self._first_ns, start_ns)
@@ -413,17 +405,9 @@ class McapLogWriter(contextlib.AbstractContextManager["McapLogWriter"]):
     def attachment(self, record: Attachment) -> None:
         """Add a file."""
         start, length = self._emit_record(record)
-        self._attachment_indexes.append(
-            AttachmentIndex(
-                offset=start,
-                length=length,
-                create_time=record.create_time,
-                log_time=record.log_time,
-                data_size=len(record.data),
-                name=record.name,
-                media_type=record.media_type,
-            )
-        )
+        about = {name: getattr(record, name) for name in ("create_time", "log_time", "name", "media_type")}
+        index = AttachmentIndex(offset=start, length=length, data_size=len(record.data), **about)
+        self._attachment_indexes.append(index)
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add a record of key-value pairs."""

@@ -2,6 +2,7 @@
 
 import json
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -179,15 +180,25 @@ def test_a_schema_that_does_not_parse_is_a_loss_of_its_channel_and_no_other(tmp_
             schema = writer.register_schema(topic, encoding, text)
             channel = writer.register_channel(topic, messages, schema)
             writer.add_message(channel, 5, b'{"x": 1}', 5)
-    log = open_log(path)
-    assert [len(log.fields(topic)) for topic in ("/bomb", "/bomb", "/sound", "/other")] == [0, 0, 1, 0]
-    (loss,) = log.lost
-    assert (loss.kind, loss.where, loss.severity) == ("bad-schema", "/bomb", "lost")
-    log.close()
+    with closing(open_log(path)) as log:
+        assert [len(log.fields(topic)) for topic in ("/bomb", "/bomb", "/sound", "/other")] == [0, 0, 1, 0]
+        (loss,) = log.lost
+        assert (loss.kind, loss.where, loss.severity) == ("bad-schema", "/bomb", "lost")
 
 
 @pytest.mark.parametrize(
-    "name", ["../../x", "p/msg/../../../x", "/etc/x", "p/msg/T\n", "p/T", "", "p/msg/", "sensor_msgs/msg/Imu/../Imu"]
+    "name",
+    [
+        "../../x",
+        "p/msg/../../../x",
+        "/etc/x",
+        "p/msg/T\n",
+        "p/T",
+        "",
+        "no_such/msg/Type",
+        "p/msg/",
+        "sensor_msgs/msg/Imu/../Imu",
+    ],
 )
 def test_a_type_name_becomes_no_path(name: str) -> None:
     with pytest.raises(KeyError):
