@@ -12,7 +12,7 @@ from array import array
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -49,10 +49,8 @@ from pdhef_logtool.records.signals import IntArray, Loss
 
 UintArray: TypeAlias = NDArray[np.uint64]
 
-_MESSAGE_RECORD = struct.Struct("<BQHIQ")
 _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, uncompressed CRC, length of the compression's name
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
-_UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
 _CRC_BLOCK_BYTES = 4 << 20
 _CHUNK_HEAD_BYTES = RECORD.size + _CHUNK.size + _U64.size  # without the name of the compression
 _LONGEST_NAME = 4  # of a compression
@@ -83,18 +81,6 @@ class _Extent:
     index_end: int
 
 
-@dataclass(slots=True)
-class _Run:
-    """Consecutive unchunked messages in bytes [start, end)."""
-
-    start: int
-    end: int
-    first_ns: int = MAX_TIME_NS
-    last_ns: int = 0
-    counts: Counter[int] = field(default_factory=Counter)
-    ordered: bool = True  # whether no log time steps back
-
-
 class McapContainer(FileContainer):
     """One MCAP 1.0 file; its spans are chunks and runs of unchunked messages, in file order."""
 
@@ -122,7 +108,6 @@ class McapContainer(FileContainer):
             int, int
         ] = {}  # chunks and attachments of a remote file that are not wanted, from start to end
         self._indexed: list[int] | None = None  # places of the chunks that a damaged summary names
-        self._run: _Run | None = None
         self._closed = False
         self._data_end: tuple[int, int] | None = None  # extent of the record
         self._footer: int | None = None  # place of the record
@@ -152,7 +137,6 @@ class McapContainer(FileContainer):
                 if not header_seen:
                     raise self.no_log("a complete header record", "none, or one that runs past the end of the file")
                 resume = places[n] if places[n] < size else self._next_chunk(offset)
-                self._end_run()
                 if resume is None:
                     self.lose_end(offset)
                     return
@@ -205,7 +189,6 @@ class McapContainer(FileContainer):
 
     def _add_indexed(self, indexed: IndexedChunk | tuple[int, int]) -> int:
         """Add a chunk or an attachment by its entry in the summary; return the start of the next record."""
-        self._end_run()
         if not isinstance(indexed, IndexedChunk):
             self._attachment_at.append(indexed)
             return indexed[1]
@@ -259,10 +242,9 @@ class McapContainer(FileContainer):
 
     def _record(self, opcode: int, start: int, end: int) -> int:
         """Handle one complete record that is no message; return the start of the next one."""
-        if opcode in _DECLARATIONS:  # also inside of a run: writers interleave them with the messages
+        if opcode in _DECLARATIONS:
             self._declare(opcode, self._payload(start, end))
             return end
-        self._end_run()
         if opcode == _OP_CHUNK:
             return self._add_chunk(start, end)
         if opcode == Opcode.ATTACHMENT:
@@ -313,43 +295,25 @@ class McapContainer(FileContainer):
     def _messages(self, offset: int) -> int:
         """Add the message records from here on with heads that are read ahead; return the start of the next record."""
         size = self.source.size
-        block, place = self.source.ahead(offset, min(_MESSAGE_RECORD.size, size - offset))
-        base = offset - place
-        last = min(len(block), size - base) - _MESSAGE_RECORD.size
-        if self._run is None or offset - self._run.start >= _UNCHUNKED_RUN_BYTES:
-            self._end_run()
-        run = self._run or _Run(offset, offset)
-        unpack, counts, first_ns, last_ns = _MESSAGE_RECORD.unpack_from, run.counts, run.first_ns, run.last_ns
-        while place <= last and block[place] == _OP_MESSAGE and base + place - run.start < _UNCHUNKED_RUN_BYTES:
-            _, length, channel, _, log_time = unpack(block, place)
+        block, place = self.source.ahead(offset, min(MESSAGE_HEAD.itemsize, size - offset))
+        base, last = offset - place, len(block) - MESSAGE_HEAD.itemsize
+        places = array("q")
+        while place <= last and block[place] == _OP_MESSAGE:
+            _, length = RECORD.unpack_from(block, place)
             end = place + RECORD.size + length
             if length < _MESSAGE_BYTES or base + end > size:
                 break
-            if log_time < first_ns:
-                first_ns = log_time
-            if log_time > last_ns:
-                last_ns = log_time
-            elif log_time < last_ns:
-                run.ordered = False
-            counts[channel] += 1
+            places.append(place)
             place = end
-        if base + place == offset:  # not even the first one is a message
-            end = offset + RECORD.size + int(RECORD.unpack(self.source.read(offset, RECORD.size))[1])
-            self._end_run()
+        if not places:
             self.lose_record(offset, SpanDamageError("a message record is too short"))
-            return end
-        run.end, run.first_ns, run.last_ns = base + place, first_ns, last_ns
-        self._run = run
-        return run.end
-
-    def _end_run(self) -> None:
-        """Add the run of unchunked messages that ends here."""
-        run, self._run = self._run, None
-        if run is not None:
-            first, last = min(run.first_ns, MAX_TIME_NS), min(run.last_ns, MAX_TIME_NS)
-            self.add_span(
-                _Extent(run.start, run.end, False, run.end), Span(0, first, last + 1, run.counts, run.ordered)
-            )
+            return offset + RECORD.size + int(RECORD.unpack(self.source.read(offset, RECORD.size))[1])
+        heads = _heads(block, np.array(places, dtype=np.int64))
+        times, counts = _held_times(heads["log"]), Counter(heads["channel"].tolist())
+        ordered = bool((times[1:] >= times[:-1]).all())
+        span = Span(0, int(times.min()), int(times.max()) + 1, counts, ordered)
+        self.add_span(_Extent(offset, base + place, False, base + place), span)
+        return base + place
 
     def _add_chunk(self, start: int, end: int) -> int:
         """Add a chunk that no summary describes; return the end of its message indexes.
@@ -385,7 +349,6 @@ class McapContainer(FileContainer):
         return index_end
 
     def _finish(self) -> None:
-        self._end_run()
         if self._closed and not self._data_end:
             if not self.spans and all(loss.kind == "bad-record" for loss in self.lost):
                 raise self.no_log("an MCAP 1.0 file", "a draft of the format before 1.0")
@@ -652,15 +615,20 @@ def _indexed_messages(content: bytes, record: bytes, index_start: int) -> Block 
     return _gather_messages(content, offset)
 
 
+def _heads(content: bytes, offset: IntArray) -> NDArray[np.void]:
+    """Return the heads of messages at offsets [N]."""
+    # Gathered as plain bytes: NumPy copies structured items member by member.
+    plain = np.dtype((np.void, MESSAGE_HEAD.itemsize))
+    places = np.ndarray((len(content) - plain.itemsize + 1,), dtype=plain, buffer=content, strides=(1,))
+    return places[offset].view(MESSAGE_HEAD)
+
+
 def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
     """Read message headers at known ascending offsets; None if the content has other messages than these."""
     n = len(content)
     if offset.size == 0 or offset[0] < 0 or offset[-1] + MESSAGE_HEAD.itemsize > n:
         return None
-    # Gathered as plain bytes: NumPy copies structured items member by member.
-    plain = np.dtype((np.void, MESSAGE_HEAD.itemsize))
-    heads = np.ndarray((n - plain.itemsize + 1,), dtype=plain, buffer=content, strides=(1,))[offset]
-    heads = heads.view(MESSAGE_HEAD)
+    heads = _heads(content, offset)
     size = heads["size"].astype(np.int64)  # what does not fit is below 0
     if (heads["op"] != _OP_MESSAGE).any() or size.min() < _MESSAGE_BYTES or size.max() > n:
         return None
