@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from mcap.records import Attachment, Metadata
+from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, raise_source_error
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -479,6 +481,21 @@ class FileContainer(Container):
     @abstractmethod
     def _finish(self) -> None:
         """Finish open records and check the file as a whole."""
+
+
+def span_of_indexes(indexes: Sequence[tuple[int, NDArray[Any]]]) -> Span:
+    """Return the span that message indexes describe: channel and log times [N] of each, in file order."""
+    indexes = [(id_, times) for id_, times in indexes if len(times)]
+    counts: Counter[int] = Counter()
+    for id_, its in indexes:
+        counts[id_] += len(its)
+    if not counts:
+        return Span(0, 0, 0, counts)
+    times = np.concatenate([its for _, its in indexes])
+    falls = times[1:] < times[:-1]
+    falls[np.cumsum([len(its) for _, its in indexes])[:-1] - 1] = False  # from an index to the next one
+    first, last = (min(int(ns), MAX_TIME_NS) for ns in (times.min(), times.max()))
+    return Span(0, first, last + 1, counts, ordered=not falls.any())
 
 
 def block_from_lists(buffer: bytes | memoryview, *columns: Sequence[int]) -> Block:

@@ -41,6 +41,7 @@ from pdhef_logtool.logs.container import (
     Wanted,
     block_from_lists,
     describe_damage,
+    span_of_indexes,
 )
 from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_RECORD, RECORD, IndexedChunk, chunk_places, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -208,16 +209,7 @@ class McapContainer(FileContainer):
     def _span_by_indexes(self, extent: _Extent) -> Span | None:
         """Return the span that the message indexes of a chunk describe; None if one of them is malformed."""
         indexes = self._indexes(extent)
-        if indexes is None:
-            return None
-        counts = {id_: len(its) for id_, its, _ in indexes if len(its)}
-        if not counts:
-            return Span(0, 0, 0, counts)
-        times = np.concatenate([its for _, its, _ in indexes])
-        falls = times[1:] < times[:-1]
-        falls[np.cumsum([*counts.values()])[:-1] - 1] = False  # from a channel to the next one
-        first, last = (min(int(ns), MAX_TIME_NS) for ns in (times.min(), times.max()))
-        return Span(0, first, last + 1, counts, ordered=not falls.any())
+        return None if indexes is None else span_of_indexes([(id_, times) for id_, times, _ in indexes])
 
     def _lose_indexes(self, extent: _Extent) -> None:
         what = (

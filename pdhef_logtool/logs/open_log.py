@@ -159,10 +159,9 @@ def _open_remote(file: LogFile, place: RemotePlace, wanted: Wanted) -> Container
 
             return McapContainer(source, place, file.meter, wanted)
         file = replace(file, path=source.path, release=source.close)
-        is_compressed = head.startswith(ZSTD_MAGIC)
-        if is_compressed or recognised_format(head, source.path.name) is not None:
+        if head.startswith(ZSTD_MAGIC) or recognised_format(head, source.path.name) is not None:
             source.fetch_whole()
-        return _open_compressed(file) if is_compressed else _open_plain(file)
+        return _open_file(file)
     except BaseException:
         source.close()
         raise

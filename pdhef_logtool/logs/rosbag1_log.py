@@ -22,12 +22,13 @@ from pdhef_logtool.logs.container import (
     Block,
     ChannelRecord,
     FileContainer,
-    Span,
     SpanDamageError,
     block_from_lists,
+    span_of_indexes,
 )
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import Meter
+from pdhef_logtool.records.signals import IntArray
 
 _OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CHUNK_INFO, _OP_CONNECTION = 2, 3, 4, 5, 6, 7
 _U32 = struct.Struct("<I")
@@ -46,10 +47,7 @@ class _Chunk:
     end: int
     compression: str
     size: int
-    counts: Counter[int] = field(default_factory=Counter)
-    first_ns: int = 0
-    last_ns: int = 0
-    ordered: bool = True  # whether no log time of a connection steps back
+    indexes: list[tuple[int, IntArray]] = field(default_factory=list)  # connection and log times
 
 
 class Rosbag1Container(FileContainer):
@@ -140,7 +138,7 @@ class Rosbag1Container(FileContainer):
         self.chunks = []
         self.spans.clear()
         for chunk, span in zip(chunks_read, spans, strict=True):
-            if self._infos.get(chunk.start, chunk.counts) == chunk.counts:
+            if self._infos.get(chunk.start, span.counts) == span.counts:
                 self.add_span(chunk, span)
             else:
                 self.add_content(chunk)
@@ -157,13 +155,7 @@ class Rosbag1Container(FileContainer):
         """Add the connection and the log times of an index record."""
         (connection,), (count,) = _U32.unpack(fields["conn"]), _U32.unpack(fields["count"])
         words = np.frombuffer(payload, dtype="<u4", count=3 * count).reshape(count, 3).astype(np.int64)
-        if count:
-            times = words[:, 0] * 1_000_000_000 + words[:, 1]
-            first, last = int(times.min()), int(times.max())
-            chunk.first_ns = min(chunk.first_ns, first) if chunk.counts else first
-            chunk.last_ns = max(chunk.last_ns, last)
-            chunk.counts[connection] += count
-            chunk.ordered &= bool((times[1:] >= times[:-1]).all())
+        chunk.indexes.append((connection, words[:, 0] * 1_000_000_000 + words[:, 1]))
 
     def _declare_from_chunks(self) -> None:
         """Find connections that only the chunks declare, as in a bag without its index section."""
@@ -199,10 +191,11 @@ class Rosbag1Container(FileContainer):
         if chunk is None:
             return
         self._found += 1
-        if not complete or not chunk.counts or chunk.counts.total() * _LEAST_MESSAGE_BYTES > chunk.size:
+        span = span_of_indexes(chunk.indexes)
+        if not complete or not span.counts or sum(span.counts.values()) * _LEAST_MESSAGE_BYTES > chunk.size:
             self.add_content(chunk)
         else:
-            self.add_span(chunk, Span(0, chunk.first_ns, chunk.last_ns + 1, dict(chunk.counts), chunk.ordered))
+            self.add_span(chunk, span)
 
     def _decoded(self, chunk: _Chunk, *, declare: bool) -> Block:
         self.meter.limits.check("chunk_bytes", chunk.end - chunk.stored_start, "a chunk")
