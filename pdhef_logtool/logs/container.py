@@ -198,10 +198,10 @@ class Wanted:
     end_ns: int | None = None
     above_bytes: int = 0
 
-    def has(self, topics: Iterable[str], first_ns: int, last_ns: int) -> bool:
-        """Return whether messages of these topics and log times are wanted."""
-        inside = (self.start_ns is None or last_ns >= self.start_ns) and (self.end_ns is None or first_ns < self.end_ns)
-        return inside and (self.topics is None or not self.topics.isdisjoint(topics))
+    def has(self, topics: Iterable[str], span: Span) -> bool:
+        """Return whether messages of these topics in a span are wanted."""
+        is_wanted = self.topics is None or not self.topics.isdisjoint(topics)
+        return is_wanted and span.overlaps(self.start_ns, self.end_ns)
 
 
 #: Of a log that is read as a whole.

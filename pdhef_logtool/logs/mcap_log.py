@@ -12,7 +12,7 @@ from array import array
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -43,7 +43,7 @@ from pdhef_logtool.logs.container import (
     describe_damage,
     span_of_indexes,
 )
-from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_RECORD, RECORD, IndexedChunk, chunk_places, read_index
+from pdhef_logtool.logs.mcap_index import FOOTER, INDEX_RECORD, RECORD, Extent, chunk_places, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.resource_limits import LimitError, Meter
 from pdhef_logtool.records.signals import IntArray, Loss
@@ -72,16 +72,6 @@ _MESSAGE_BYTES = MESSAGE_HEAD.itemsize - RECORD.size
 _INDEX_PAIR = np.dtype([("log", "<u8"), ("offset", "<u8")])
 
 
-@dataclass(frozen=True, slots=True)
-class _Extent:
-    """Bytes [start, end) of a chunk record or a run of message records; message indexes follow up to ``index_end``."""
-
-    start: int
-    end: int
-    is_chunk: bool
-    index_end: int
-
-
 class McapContainer(FileContainer):
     """One MCAP 1.0 file; its spans are chunks and runs of unchunked messages, in file order."""
 
@@ -90,7 +80,7 @@ class McapContainer(FileContainer):
     magic_text = "the MCAP magic bytes"
     remedy = "is it an MCAP 1.0 recording?"
     whole_chunks = True
-    chunks: list[_Extent]
+    chunks: list[Extent]
 
     def __init__(
         self,
@@ -125,7 +115,7 @@ class McapContainer(FileContainer):
         header_seen = False
         for offset in self._places():
             if offset in indexed:
-                self.position = self._add_indexed(indexed[offset])
+                self.position = self._add_indexed(*indexed[offset])
                 continue
             if size - offset == len(MCAP_MAGIC) and source.read(offset, len(MCAP_MAGIC)) == MCAP_MAGIC:
                 self._closed = True
@@ -161,7 +151,7 @@ class McapContainer(FileContainer):
         if not header_seen:
             raise self.no_log("a header record after the magic bytes", "none")
 
-    def _indexed_places(self) -> dict[int, IndexedChunk | tuple[int, int]]:
+    def _indexed_places(self) -> dict[int, tuple[Extent, Span | None]]:
         """Return by their places the chunks, and attachments that are not read, that a sound summary describes.
 
         All parts of a remote file that are read are requested. Its message indexes are not examined.
@@ -176,42 +166,42 @@ class McapContainer(FileContainer):
             return {}
         self._schemas.update(index.schemas)
         self._raw_channels.update(index.channels)
-        places: dict[int, IndexedChunk | tuple[int, int]] = {chunk.start: chunk for chunk in index.chunks}
+        places: dict[int, tuple[Extent, Span | None]] = {extent.start: (extent, span) for extent, span in index.chunks}
         if not is_whole:
-            places |= {extent[0]: extent for extent in index.attachments}
+            places |= {start: (Extent(start, end, end), None) for start, end in index.attachments}
             topics = {id_: channel.topic for id_, channel in self._raw_channels.items()}
             unread = dict(index.attachments)
-            for chunk in index.chunks:
-                if not self._wanted.has([topics[id_] for id_ in chunk.counts], chunk.first_ns, chunk.last_ns):
-                    unread[chunk.start] = chunk.index_end
+            for extent, span in index.chunks:
+                if not self._wanted.has([topics[id_] for id_ in span.counts], span):
+                    unread[extent.start] = extent.index_end
             self._unread = dict(sorted(unread.items()))
             source.prefetch(zip([0, *self._unread.values()], [*self._unread, source.size], strict=True))
         return places
 
-    def _add_indexed(self, indexed: IndexedChunk | tuple[int, int]) -> int:
-        """Add a chunk or an attachment by its entry in the summary; return the start of the next record."""
-        if not isinstance(indexed, IndexedChunk):
-            self._attachment_at.append(indexed)
-            return indexed[1]
-        extent, ordered = _Extent(indexed.start, indexed.end, True, indexed.index_end), self.source.is_remote
+    def _add_indexed(self, extent: Extent, span: Span | None) -> int:
+        """Add a chunk, or an attachment, by its entry in the summary; return the start of the next record."""
+        if span is None:
+            self._attachment_at.append((extent.start, extent.end))
+            return extent.end
+        ordered = self.source.is_remote
         if not ordered:
             named = self._span_by_indexes(extent)
             ordered = named is not None and named.ordered
-            if named is None or named.counts != indexed.counts:
+            if named is None or named.counts != span.counts:
                 self._lose_indexes(extent)
-        self.add_span(extent, Span(0, indexed.first_ns, indexed.last_ns + 1, indexed.counts, ordered))
-        return indexed.index_end
+        self.add_span(extent, replace(span, ordered=ordered))
+        return extent.index_end
 
-    def _indexes(self, extent: _Extent) -> list[tuple[int, UintArray, UintArray]] | None:
+    def _indexes(self, extent: Extent) -> list[tuple[int, UintArray, UintArray]] | None:
         """Return channel, log times [N] and offsets [N] of each message index of a chunk; None if one is malformed."""
         return _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
 
-    def _span_by_indexes(self, extent: _Extent) -> Span | None:
+    def _span_by_indexes(self, extent: Extent) -> Span | None:
         """Return the span that the message indexes of a chunk describe; None if one of them is malformed."""
         indexes = self._indexes(extent)
         return None if indexes is None else span_of_indexes([(id_, times) for id_, times, _ in indexes])
 
-    def _lose_indexes(self, extent: _Extent) -> None:
+    def _lose_indexes(self, extent: Extent) -> None:
         what = (
             f"the message indexes of the chunk at byte {extent.start} are damaged: its messages are found without them"
         )
@@ -304,7 +294,7 @@ class McapContainer(FileContainer):
         times, counts = _held_times(heads["log"]), Counter(heads["channel"].tolist())
         ordered = bool((times[1:] >= times[:-1]).all())
         span = Span(0, int(times.min()), int(times.max()) + 1, counts, ordered)
-        self.add_span(_Extent(offset, base + place, False, base + place), span)
+        self.add_span(Extent(offset, base + place, base + place, is_chunk=False), span)
         return base + place
 
     def _add_chunk(self, start: int, end: int) -> int:
@@ -318,7 +308,7 @@ class McapContainer(FileContainer):
             if opcode & ~_FIRST_PRIVATE != _OP_MESSAGE_INDEX or index_end + RECORD.size + length > size:
                 break  # one wrong bit makes an index a private record
             index_end += RECORD.size + length
-        extent = _Extent(start, end, True, index_end)
+        extent = Extent(start, end, index_end)
         first, last, unpacked, _, _ = _CHUNK.unpack(self.source.read(start + RECORD.size, _CHUNK.size))
         claimed = Span(0, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS) + 1, {})
         named = self._span_by_indexes(extent)
@@ -397,7 +387,7 @@ class McapContainer(FileContainer):
             )
             self.lose("bad-data-crc", what)
 
-    def _has_crc(self, extent: _Extent) -> bool:
+    def _has_crc(self, extent: Extent) -> bool:
         """Return whether messages are in a chunk with a CRC."""
         if not extent.is_chunk:
             return False
@@ -428,7 +418,7 @@ class McapContainer(FileContainer):
             extents = (self.chunks[span.index] for span in spans)
             self.source.prefetch((extent.start, extent.index_end) for extent in extents)
 
-    def _decoded(self, extent: _Extent, *, declare: bool) -> Block:
+    def _decoded(self, extent: Extent, *, declare: bool) -> Block:
         """Return the messages of a chunk or run; with ``declare``, add the schemas and channels in it.
 
         The message indexes are used only if the chunk contains the messages that they name, and no others.
