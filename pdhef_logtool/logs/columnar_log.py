@@ -143,6 +143,9 @@ class ColumnarLog(DriveLog):
     def lost(self) -> tuple[Loss, ...]:
         """Losses so far."""
         losses = [*self._opened_lost, *self.recording_span.losses]
+        undecodable: Counter[tuple[int, int]] = Counter()
+        for (c, channel, _), rows in self._undecodable.items():
+            undecodable[c, channel] += len(rows)
         for c, container in enumerate(self.containers):
             losses.extend(container.lost)
             losses.extend(loss for (of, _, _), loss in self._found.items() if of == c)
@@ -150,15 +153,15 @@ class ColumnarLog(DriveLog):
                 losses.append(_out_of_time(container, list(self._late[c].values())))
             for of, channel in sorted(self._asked):
                 if of == c:
-                    losses.extend(self._channel_losses(c, container.channels[channel]))
+                    losses.extend(self._channel_losses(c, container.channels[channel], undecodable[c, channel]))
         return tuple(losses)
 
-    def _channel_losses(self, c: int, channel: ChannelRecord) -> Iterator[Loss]:
+    def _channel_losses(self, c: int, channel: ChannelRecord, undecodable: int) -> Iterator[Loss]:
         """Yield what is lost and noted of the messages of one channel."""
         schema = self._schemas.get((c, channel.id))
-        n = sum(len(rows) for key, rows in self._undecodable.items() if key[:2] == (c, channel.id))
-        if n:
-            yield Loss("undecodable", f"{n} messages do not fit the type of their topic", channel.topic, count=n)
+        if undecodable:
+            what = f"{undecodable} messages do not fit the type of their topic"
+            yield Loss("undecodable", what, channel.topic, count=undecodable)
         if isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
             yield Loss("bad-schema", f"its messages cannot be decoded: {schema}", channel.topic)
         if isinstance(schema, MessageSchema) and schema.borrowed:
@@ -514,7 +517,7 @@ class ColumnarLog(DriveLog):
             if block is None:
                 return
             stored = stored | self._decode_span(request, c, span, block)
-        for columns in (stored[id_] for id_ in channels if id_ in stored):
+        for _, columns in sorted(stored.items()):
             if columns.topic in plans:
                 keep = in_window(columns.log_time_ns, *request.window_ns)
                 parts[columns.topic].append(columns if keep is None else columns.rows(keep))
