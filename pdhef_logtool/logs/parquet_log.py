@@ -152,6 +152,7 @@ def _texts(column: Any, name: str, file: TableFile, losses: list[Loss]) -> NDArr
     import pyarrow as pa
     import pyarrow.compute as pc
 
+    column.validate(full=True)  # polars ends the process at texts that are no UTF-8
     dictionaries = [chunk for chunk in column.chunks if pa.types.is_dictionary(chunk.type)]
     sizes = (pc.sum(pc.take(pc.binary_length(c.dictionary), c.indices)).as_py() or 0 for c in dictionaries)
     file.limits.check_table(sum(sizes), file.size, f"{file.name}, {name}")

@@ -106,6 +106,14 @@ def test_a_damaged_column_costs_its_rows_of_one_group() -> None:
         np.testing.assert_array_equal(_column(tables, f"c{i}"), np.where(is_lost, np.nan, AY + i))
 
 
+def test_a_text_that_is_no_utf_8_costs_its_column() -> None:
+    out = io.BytesIO()
+    pq.write_table(pa.table({"t": TIME_S, "ay": AY, "x": ["text"] * N}), out, compression="none", use_dictionary=False)
+    tables = open_parquet(_file(out.getvalue().replace(b"\4\0\0\0text", b"\4\0\0\0te\xd1t")))
+    assert _names(tables) == {"ay"}
+    assert tables.losses[0].what.startswith("x cannot be read: ")
+
+
 def test_rows_and_texts_above_the_limits_are_refused_before_they_are_read() -> None:
     constant = {"t": np.zeros(1_000_000), "ay": np.zeros(1_000_000)}
     with pytest.raises(LogError, match="table bytes"):
